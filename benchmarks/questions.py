@@ -52,6 +52,7 @@ QUESTIONS = (
             "structure_from_motion",
             "few_photographs",
             "sample_intervals",
+            "exposure",
             "training_step",
             "hash_encoding",
         ),

@@ -38,6 +38,8 @@ class TrainConfig:
             alpha, which tell what is transparent.
         refine_depth: Optical depth of crossing a fine cell from which rendering looks into it. Surfaces of a finished room are
             dense; where they may still be haze, as in large boxes or after short trainings, 0.005 keeps them whole.
+        exposure: Whether a gain per channel is learned for each photograph, for cameras that choose exposure and white balance
+            themselves. The scene gets the mean exposure.
         seed: Seed of everything random.
         checkpoint_every_s: Time between checkpoints [s].
         backend: ``numba`` (CPU kernels), ``torch`` (any device), or ``auto``: torch where it sees an accelerator, else numba.
@@ -59,6 +61,7 @@ class TrainConfig:
     interval_px: float | None = None
     opacity: float = 1.5e-3
     refine_depth: float = 0.05
+    exposure: bool = False
     seed: int = 0
     checkpoint_every_s: float = 60.0
     backend: str = "auto"
@@ -104,9 +107,11 @@ class TrainedScene:
         occupied: Cells where something is ``[X, Y, Z]``, finer than in training.
         march: How samples were placed, and are for rendering.
         history: One row per report: step, elapsed [s], PSNR [dB].
+        gains: Factors on the colours for each photograph ``[P, 3]``, whose logarithms have mean zero; None if not learned.
     """
 
     scene: SceneField
     occupied: NDArray[np.bool_]
     march: MarchConfig
     history: list[tuple[int, float, float]]
+    gains: NDArray[np.float32] | None = None

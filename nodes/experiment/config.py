@@ -72,6 +72,12 @@ class SceneConfig(_Section):
         default=None,
         description="Sample intervals in pixels of the policy's view; none: the default of pixel_intervals.",
     )
+    # Left out where it changes nothing, so that keys of scenes without it do not depend on it.
+    exposure: bool = Field(
+        default=False,
+        exclude_if=lambda on: not on,
+        description="Learn a gain per channel for each photograph; for worlds whose camera chooses its exposure.",
+    )
     seed: int = 0
 
 
