@@ -33,6 +33,7 @@ QUESTIONS = (
             "adjoint_memory",
             "gradient_pass",
             "baked_scene",
+            "floors",
             "closed_loop_cosine",
             "mesh_render",
             "black_box",
