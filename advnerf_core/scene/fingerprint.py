@@ -13,6 +13,9 @@ from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.field import SceneFieldConfig
 from advnerf_core.scene.train_config import TrainConfig
 
+# Settings that older checkpoints do not know, and the value at which they change nothing.
+_LATER = {"exposure": False, "decay": "exponential"}
+
 
 def training_fingerprint(
     images: ImageSet, field: SceneFieldConfig, config: TrainConfig, march: MarchConfig
@@ -26,8 +29,9 @@ def training_fingerprint(
         march: The intervals as they were chosen: they also depend on the cameras and on the rule.
     """
     training = {**asdict(config), "march": asdict(march)}
-    if not config.exposure:
-        del training["exposure"]  # so that a training without it keeps its checkpoints
+    for name, usual in _LATER.items():
+        if training[name] == usual:
+            del training[name]
     digest = hashlib.sha256(json.dumps([field.to_dict(), training], sort_keys=True).encode())
     digest.update(str(images.rgb.shape).encode() + images.T_world_from_camera.tobytes())
     digest.update(images.rgb[:, ::16, ::16].tobytes())

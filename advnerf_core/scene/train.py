@@ -241,7 +241,7 @@ class Trainer:
                 f"expected a finite loss, got {result.loss} at step {self.step}; lower the learning rate "
                 f"({self.config.learning_rate}) or check the camera poses"
             )
-        rate = self.config.learning_rate * self.config.final_rate**self.fraction
+        rate = self.config.rate(self.fraction)
         self.stepper.update(self.step, rate)
         if self.exposures is not None and exposure is not None:
             self.exposures.update(exposure, self.step, rate)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -72,7 +72,12 @@ class SceneConfig(_Section):
         default=None,
         description="Sample intervals in pixels of the policy's view; none: the default of pixel_intervals.",
     )
-    # Left out where it changes nothing, so that keys of scenes without it do not depend on it.
+    # Both are left out where they change nothing, so that keys of scenes without them do not depend on them.
+    decay: Literal["exponential", "cosine"] = Field(
+        default="exponential",
+        exclude_if=lambda decay: decay == "exponential",
+        description="How the learning rate falls; cosine stays high for longer and learns more in the same steps.",
+    )
     exposure: bool = Field(
         default=False,
         exclude_if=lambda on: not on,

@@ -44,6 +44,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         march=march,
         refine_depth=config.refine_depth,
         occupancy_resolution=config.occupancy,
+        decay=config.decay,
         exposure=config.exposure,
     )
     checkpoint = folder / "checkpoint.safetensors"
