@@ -67,10 +67,12 @@ def main() -> None:
         images = exposed(case.training, logs)
         off, on = (learn(name, case, images, logs, arguments.steps, exposure) for exposure in (False, True))
         gain_db = on.plain_db - off.plain_db
+        gains = f"gains found: spread {on.log_spread:.3f}"
+        if arguments.spread:
+            gains += f", {on.log_error:.3f} from the known ones"
         note = (
             f"held-out PSNR {on.plain_db:.2f} against {off.plain_db:.2f} dB; after fitting a gain to each picture "
-            f"{on.fitted_db:.2f} against {off.fitted_db:.2f} dB; gains found: spread {on.log_spread:.3f}, error "
-            f"{on.log_error if arguments.spread else float('nan'):.3f}; {arguments.steps} steps each"
+            f"{on.fitted_db:.2f} against {off.fitted_db:.2f} dB; {gains}; {arguments.steps} steps each"
         )
         print(f"{name}: {gain_db:+.2f} dB; {note}", flush=True)
         if arguments.steps == STEPS:
