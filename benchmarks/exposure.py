@@ -86,7 +86,9 @@ def record(name: str, spread: float, gain_db: float, note: str) -> None:
     command = f"{COMMAND} --cases {name}" + (f" --spread {spread:g}" if spread else "")
     target = None if name == "fox" and not spread else gain_db >= least_db
     words = "printed" if target is None else f">= {least_db:g} dB"
-    record_row(f"exposure per photograph, {name}, {taken}: PSNR gained", gain_db, "dB", words, target, command, note)  # fmt: skip
+    record_row(
+        f"exposure per photograph, {name}, {taken}: PSNR gained", gain_db, "dB", words, target, command, note
+    )
 
 
 def known_gains(count: int, spread: float) -> Array:

@@ -88,11 +88,27 @@ def training_parts(batch: Batch, stepper: CpuStep) -> list[Part]:
         two_layers_backward(w1, b1, w2, gradient, slope, *bounds[slot], *slots[slot])
 
     return [
-        Part(f"training step, encoding of {count} samples", lambda: encode(samples.points, count, table, levels, everything), least_work.encoding(samples.points, config.grid)),
-        Part(f"training step, network of {visible} samples, forward", lambda: run_slots(lambda s: density_network(w1, b1, w2, b2, encoded, field, *bounds[s]), SLOTS), least_work.two_layers(visible, widths, False)),
-        Part(f"training step, network of {visible} samples, backward", lambda: run_slots(backward, SLOTS), least_work.two_layers(visible, widths, True)),
-        Part(f"training step, scatter of {visible} samples", lambda: scatter(shown.points, visible, gradient, levels, of_table), least_work.encoding(shown.points, config.grid)),
-    ]  # fmt: skip
+        Part(
+            f"training step, encoding of {count} samples",
+            lambda: encode(samples.points, count, table, levels, everything),
+            least_work.encoding(samples.points, config.grid),
+        ),
+        Part(
+            f"training step, network of {visible} samples, forward",
+            lambda: run_slots(lambda s: density_network(w1, b1, w2, b2, encoded, field, *bounds[s]), SLOTS),
+            least_work.two_layers(visible, widths, False),
+        ),
+        Part(
+            f"training step, network of {visible} samples, backward",
+            lambda: run_slots(backward, SLOTS),
+            least_work.two_layers(visible, widths, True),
+        ),
+        Part(
+            f"training step, scatter of {visible} samples",
+            lambda: scatter(shown.points, visible, gradient, levels, of_table),
+            least_work.encoding(shown.points, config.grid),
+        ),
+    ]
 
 
 def tick_parts(batch: Batch, resolution: int) -> list[Part]:
@@ -112,14 +128,23 @@ def tick_parts(batch: Batch, resolution: int) -> list[Part]:
     rgb, depth_m = surrogate.coloured_background(pose)
     image = surrogate.render(pose, theta).images
     weights = cast_objects([thing], pose, view)[0].weights
-    background = least_work.baked_frame(*frame_samples(baked, trained.scene, pose, view), baked.least_transmittance, baked.voxels, baked.leaps.cells)  # fmt: skip
+    background = least_work.baked_frame(
+        *frame_samples(baked, trained.scene, pose, view),
+        baked.least_transmittance,
+        baked.voxels,
+        baked.leaps.cells,
+    )
     density_bytes = 8 * resolution**3
     return [
         Part("tick, background", lambda: surrogate.coloured_background(pose), background),
         Part(CASTING, lambda: cast_objects([thing], pose, view), least_work.casting(weights, density_bytes)),
-        Part(COMPOSING, lambda: surrogate.overlay(rgb, depth_m, pose, theta), least_work.composing(weights, view.width * view.height)),
+        Part(
+            COMPOSING,
+            lambda: surrogate.overlay(rgb, depth_m, pose, theta),
+            least_work.composing(weights, view.width * view.height),
+        ),
         Part("tick, policy", lambda: policy(image), least_work.network(policy, image)),
-    ]  # fmt: skip
+    ]
 
 
 def frame_samples(

@@ -104,9 +104,14 @@ def machine_rows(floors: Floors, sizes: Sizes) -> list[tuple[str, float, str, st
     rows = []
     for name, value, single, unit in (
         ("bandwidth in a row", floors.stream_bps / 1e9, one.stream_bps / 1e9, "GB/s"),
-        ("lines of 64 bytes at random, table of 256 MiB", 64e-9 / floors.line_of(_LARGE_BYTES), 64e-9 / one.line_of(_LARGE_BYTES), "GB/s"),
+        (
+            "lines of 64 bytes at random, table of 256 MiB",
+            64e-9 / floors.line_of(_LARGE_BYTES),
+            64e-9 / one.line_of(_LARGE_BYTES),
+            "GB/s",
+        ),
         ("multiply-adds in float32", floors.flops / 1e9, one.flops / 1e9, "GFLOP/s"),
-    ):  # fmt: skip
+    ):
         rows.append((f"machine: {name}", value, unit, f"{threads}; one thread {single:.3g} {unit}"))
     note = f"shortest of {sizes.repeats} runs; one thread, each read waits for the one before"
     return [*rows, ("machine: latency of a line, table of 256 MiB", latency_ns, "ns", note)]

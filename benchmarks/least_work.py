@@ -136,7 +136,11 @@ def baked_rows(points: NDArray[np.float32], voxels: Voxels, cells: NDArray[np.fl
 def casting(weights: sparse.csr_matrix, density_bytes: int) -> Work:
     """Casting an object: the voxels that show are read, and the weights written; two operations for each weight."""
     lines = float(len(np.unique(weights.indices.astype(np.int64) * 8 // LINE_BYTES)))
-    return Work(weights.nnz * (weights.data.itemsize + weights.indices.itemsize), {density_bytes: lines}, 2.0 * weights.nnz)  # fmt: skip
+    return Work(
+        weights.nnz * (weights.data.itemsize + weights.indices.itemsize),
+        {density_bytes: lines},
+        2.0 * weights.nnz,
+    )
 
 
 def composing(weights: sparse.csr_matrix, pixels: int) -> Work:

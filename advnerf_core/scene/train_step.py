@@ -272,9 +272,19 @@ class CpuStep:
             before = matte or _opaque(len(rays))
             cover = np.ones_like(alpha) if matte is None else alpha
             sums = exposed_loss(
-                colours, targets, before.opacities, before.behind, cover, exposure.gains,
-                start, stop, self.huber, scale, mixed, exposure.grad_log,
-            )  # fmt: skip
+                colours,
+                targets,
+                before.opacities,
+                before.behind,
+                cover,
+                exposure.gains,
+                start,
+                stop,
+                self.huber,
+                scale,
+                mixed,
+                exposure.grad_log,
+            )
         elif matte is None:
             sums = colour_loss(colours, targets, start, stop, self.huber, scale)
         else:
