@@ -31,8 +31,6 @@ from benchmarks.least_work import Work
 from benchmarks.training_step import Batch
 from hardware.worlds.lab.config import LabConfig
 
-CASTING, COMPOSING = "tick, casting one object", "tick, composing"
-
 
 @dataclass(frozen=True)
 class Part:
@@ -89,22 +87,22 @@ def training_parts(batch: Batch, stepper: CpuStep) -> list[Part]:
 
     return [
         Part(
-            f"training step, encoding of {count} samples",
+            "training step, encoding of all samples",
             lambda: encode(samples.points, count, table, levels, everything),
             least_work.encoding(samples.points, config.grid),
         ),
         Part(
-            f"training step, network of {visible} samples, forward",
+            "training step, network of visible samples, forward",
             lambda: run_slots(lambda s: density_network(w1, b1, w2, b2, encoded, field, *bounds[s]), SLOTS),
             least_work.two_layers(visible, widths, False),
         ),
         Part(
-            f"training step, network of {visible} samples, backward",
+            "training step, network of visible samples, backward",
             lambda: run_slots(backward, SLOTS),
             least_work.two_layers(visible, widths, True),
         ),
         Part(
-            f"training step, scatter of {visible} samples",
+            "training step, scatter of visible samples",
             lambda: scatter(shown.points, visible, gradient, levels, of_table),
             least_work.encoding(shown.points, config.grid),
         ),
@@ -112,11 +110,7 @@ def training_parts(batch: Batch, stepper: CpuStep) -> list[Part]:
 
 
 def tick_parts(batch: Batch, resolution: int) -> list[Part]:
-    """One tick of the surrogate: background, casting of one object, composing, and the policy, for one frame.
-
-    Composing has no name of its own in the code: `Surrogate.overlay` casts and composes, so its time less that of casting is taken by
-    `benchmarks.floors`.
-    """
+    """One tick of the surrogate: background, casting of one object, composing, and the policy, for one frame."""
     trained, config = batch.trainer.run(), LabConfig()
     view, mount = PolicyView(config.camera.pinhole).pinhole, config.camera.T_car_from_camera
     states = np.stack([np.linspace(-1.0, 1.0, 8), np.zeros(8), np.linspace(-0.3, 0.3, 8)], axis=1)
@@ -127,7 +121,8 @@ def tick_parts(batch: Batch, resolution: int) -> list[Part]:
     theta, policy = surrogate.plain_theta(), PilotNet(0, 0.4).eval().requires_grad_(False)
     rgb, depth_m = surrogate.coloured_background(pose)
     image = surrogate.render(pose, theta).images
-    weights = cast_objects([thing], pose, view)[0].weights
+    casts = cast_objects([thing], pose, view)
+    weights = casts[0].weights
     background = least_work.baked_frame(
         *frame_samples(baked, trained.scene, pose, view),
         baked.least_transmittance,
@@ -137,10 +132,14 @@ def tick_parts(batch: Batch, resolution: int) -> list[Part]:
     density_bytes = 8 * resolution**3
     return [
         Part("tick, background", lambda: surrogate.coloured_background(pose), background),
-        Part(CASTING, lambda: cast_objects([thing], pose, view), least_work.casting(weights, density_bytes)),
         Part(
-            COMPOSING,
-            lambda: surrogate.overlay(rgb, depth_m, pose, theta),
+            "tick, casting one object",
+            lambda: cast_objects([thing], pose, view),
+            least_work.casting(weights, density_bytes),
+        ),
+        Part(
+            "tick, composing",
+            lambda: surrogate.composed(casts, rgb, depth_m).render(theta),
             least_work.composing(weights, view.width * view.height),
         ),
         Part("tick, policy", lambda: policy(image), least_work.network(policy, image)),

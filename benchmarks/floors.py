@@ -2,7 +2,7 @@
 
 First the machine: bandwidth in a row, lines of 64 bytes at random, and multiply-adds (`benchmarks.machine_floors`). Then the parts of a
 tick of the surrogate, of a training step, and the hash encoding, each with what it must do at least (`benchmarks.least_work`). The scene
-is the simulated lab, learned for a few hundred steps. The rows also become the table of docs/performance.md.
+is the simulated lab, learned for a thousand steps. The rows also become the table of docs/performance.md.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import advnerf_core as advnerf_core  # isort: skip  # before torch, as in the commands
@@ -19,10 +18,10 @@ import torch
 from advnerf_core.files import write_atomically
 from advnerf_core.parallel import thread_count
 from benchmarks import machine_floors
-from benchmarks.floor_parts import CASTING, COMPOSING, Part, encoding_parts, tick_parts, training_parts
+from benchmarks.floor_parts import Part, encoding_parts, tick_parts, training_parts
 from benchmarks.machine_floors import Floors, of_one_thread
 from benchmarks.results import REPOSITORY, read_rows, record_row
-from benchmarks.timing import runs_in_turns
+from benchmarks.timing import seconds_in_turns
 from benchmarks.training_step import photograph_lab, prepare
 
 COMMAND = "python -m benchmarks.floors"
@@ -48,8 +47,8 @@ class Sizes:
 
     points: int = 1 << 17
     rays: int = 1024
-    steps: int = 300
-    photographs: int = 40
+    steps: int = 1000
+    photographs: int = 80
     resolution: int = 64
     megabytes: int = 128
     repeats: int = 9
@@ -89,10 +88,7 @@ def measure(sizes: Sizes) -> list[tuple[str, float, str, str]]:
     ]
     tables = {table for part in parts for table in part.work.lines} | {_LARGE_BYTES}
     floors = machine_floors.measure(tuple(tables), sizes.megabytes, sizes.repeats)
-    runs = runs_in_turns({part.name: part.run for part in parts}, sizes.repeats)
-    # Composing casts first: what is left is taken turn by turn.
-    runs[COMPOSING] = [max(a - b, 0.0) for a, b in zip(runs[COMPOSING], runs[CASTING], strict=True)]
-    taken = {name: median(seconds) for name, seconds in runs.items()}
+    taken = seconds_in_turns({part.name: part.run for part in parts}, sizes.repeats)
     return [*machine_rows(floors, sizes), *(part_row(part, taken[part.name], floors) for part in parts)]
 
 
