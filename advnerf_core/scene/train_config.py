@@ -27,7 +27,7 @@ class TrainConfig:
         max_rays: Most rays in a step.
         learning_rate: Adam's rate at the start.
         final_rate: Factor on the rate at the end.
-        decay: How the rate falls to it: ``exponential`` or ``cosine``, which stays high for longer and learns more in few steps.
+        decay: How the rate falls to it: ``exponential`` or ``cosine``, which stays high for longer.
         huber: Where the loss turns from square to linear, in colour units 0..1.
         distortion: Weight of the distortion loss, which turns fog into surfaces.
         occupancy_resolution: Cells along the longest side of the box, or of the cube that a contracted field lies in.

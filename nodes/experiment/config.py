@@ -76,7 +76,7 @@ class SceneConfig(_Section):
     decay: Literal["exponential", "cosine"] = Field(
         default="exponential",
         exclude_if=lambda decay: decay == "exponential",
-        description="How the learning rate falls; cosine stays high for longer and learns more in the same steps.",
+        description="How the learning rate falls; cosine stays high for longer.",
     )
     exposure: bool = Field(
         default=False,
