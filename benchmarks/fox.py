@@ -21,6 +21,7 @@ from advnerf_core.scene.metrics import psnr
 from advnerf_core.scene.presets import PHOTOGRAPH_BANDS, PRESETS, scene_preset
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.train import Progress, TrainConfig, TrainedScene, train_scene
+from advnerf_core.scene.train_config import DECAYS
 from benchmarks.results import record_row
 from benchmarks.timing import ProcessorUse
 
@@ -57,6 +58,9 @@ def main() -> None:
     parser.add_argument(
         "--refine-depth", type=float, default=REFINE_DEPTH, help="other than the default: not recorded"
     )
+    parser.add_argument(
+        "--decay", choices=DECAYS, help="how the learning rate falls; other than the preset's: not recorded"
+    )
     parser.add_argument("--pictures", type=Path, help="folder for rendered and real held-out images")
     arguments = parser.parse_args()
 
@@ -81,6 +85,7 @@ def main() -> None:
         steps=arguments.steps or preset.training.steps,
         max_seconds=None if arguments.steps else arguments.seconds - (time.perf_counter() - began),
         opacity=arguments.opacity,
+        decay=arguments.decay or preset.training.decay,
         refine_depth=arguments.refine_depth,
         near_m=NEAR,
     )
@@ -89,13 +94,14 @@ def main() -> None:
     minutes = (time.perf_counter() - began) / 60.0
     note = f"preset {arguments.preset or usual}: {trained.history[-1][0]} steps on {thread_count()} threads, {use.text()}; {minutes:.1f} min with loading and evaluation"
     print(f"{mean_db:.2f} dB: {note}")
-    chosen = (arguments.steps, arguments.preset or usual, arguments.opacity, arguments.refine_depth)
-    as_recorded = chosen == (
-        None,
-        usual,
-        TrainConfig.opacity,
-        REFINE_DEPTH,
+    chosen = (
+        arguments.steps,
+        arguments.preset or usual,
+        config.decay,
+        arguments.opacity,
+        arguments.refine_depth,
     )
+    as_recorded = chosen == (None, usual, preset.training.decay, TrainConfig.opacity, REFINE_DEPTH)
     if as_recorded and arguments.seconds in TARGETS_DB:
         command = f"python -m benchmarks.fox --data ../shared/data/fox --seconds {arguments.seconds:g}"
         for line, target_db in TARGETS_DB[arguments.seconds].items():

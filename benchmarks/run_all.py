@@ -17,7 +17,7 @@ from benchmarks.results import REPOSITORY
 
 QUICK = (
     "hash_encoding", "adjoint_gradient", "adjoint_memory", "fault_stops", "hydrant", "structure_from_motion", "few_photographs",
-    "training_step", "coverage",
+    "training_step", "coverage", "floors",
 )  # fmt: skip
 LONG = ("attack_kill", "scene_kill", "adjoint_memory --compare", "newcomer")
 CAMPAIGN = (

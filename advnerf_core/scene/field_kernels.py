@@ -161,6 +161,57 @@ def matte_loss(
 
 
 @njit(**KERNEL_OPTIONS)
+def exposed_loss(
+    raw: Array32, targets: NDArray[np.uint8], opacities: NDArray[np.uint8], behind: Array32, alpha: Array32,
+    gains: Array32, first: int, stop: int, huber: np.float32, scale: np.float32, grad_alpha: Array32,
+    grad_log_gains: Array32,
+) -> tuple[float, float]:  # fmt: skip
+    """``matte_loss`` where the field's colours are first multiplied by the gain of each ray's photograph.
+
+    A pixel at 255 says only that the light was at least so bright: a brighter colour has no error there.
+
+    Args:
+        raw: Network outputs ``[ray tiles, 4, TILE]``, overwritten by the gradient; the fourth row is unused.
+        targets: Pixels ``[R, 3]``, not premultiplied.
+        opacities: Of the pixels ``[R]``; 255 for photographs without alpha.
+        behind: Colour behind both ``[R, 3]`` in 0..1.
+        alpha: Opacity of the field ``[R]``; 1 for a field with a learned background, whose colours include it.
+        gains: Factors on the colours ``[R, 3]``.
+        first: First ray.
+        stop: One past the last ray.
+        huber: Where the loss turns from square to linear.
+        scale: Factor on the gradient: 1 / number of values.
+        grad_alpha: ``[R]``, written: gradient to ``alpha`` where it mixes the two colours.
+        grad_log_gains: ``[R, 3]``, written: gradient to the logarithms of the gains.
+
+    Returns:
+        Sum of the Huber losses and sum of the squared errors.
+    """
+    loss, square = 0.0, 0.0
+    for r in range(first, stop):
+        block, column = r // TILE, r % TILE
+        opacity, total = _f(opacities[r]) * _f(1.0 / 255.0), _f(0.0)
+        for c in range(3):
+            value = _ONE / (_ONE + np.exp(-raw[block, c, column]))
+            shown, target = gains[r, c] * value, _f(targets[r, c]) * _f(1.0 / 255.0)
+            saturated = targets[r, c] == 255 and shown > _ONE
+            shown = min(shown, _ONE) if saturated else shown
+            real = opacity * target + (_ONE - opacity) * behind[r, c]
+            error = alpha[r] * shown + (_ONE - alpha[r]) * behind[r, c] - real
+            size = abs(error)
+            square += error * error
+            loss += 0.5 * error * error if size <= huber else huber * (size - _f(0.5) * huber)
+            slope = min(max(error, -huber), huber) * scale
+            total += slope * (shown - behind[r, c])
+            to_log = _f(0.0) if saturated else slope * alpha[r] * shown
+            grad_log_gains[r, c] = to_log
+            raw[block, c, column] = to_log * (_ONE - value)
+        raw[block, 3, column] = _f(0.0)
+        grad_alpha[r] = total
+    return loss, square
+
+
+@njit(**KERNEL_OPTIONS)
 def background_backward(
     grad_inputs: Array32, alpha: Array32, background: Array32, first: int, stop: int, grad_alpha: Array32,
     grad: Array32, pull: np.float32,

@@ -1,4 +1,4 @@
-"""Image fidelity: PSNR and SSIM."""
+"""Image fidelity: PSNR, SSIM, and the gain that fits best before either."""
 
 from __future__ import annotations
 
@@ -13,6 +13,25 @@ def psnr(image: ArrayLike, reference: ArrayLike) -> float:
     _same_shape(a.shape, b.shape)
     mse = float(np.mean((a - b) ** 2))
     return float("inf") if mse == 0.0 else -10.0 * float(np.log10(mse))
+
+
+def gain_fitted(image: ArrayLike, reference: ArrayLike, background: ArrayLike = 0.0) -> np.ndarray:
+    """The image times the gain per channel that brings it closest to the reference, by least squares; clipped to 0..1.
+
+    A photograph whose exposure the scene cannot know is compared so. The figure is no substitute for the PSNR as rendered: it does not
+    count wrong brightness or tint.
+
+    Args:
+        image: Colours ``[..., 3]`` in 0..1 (uint8 is divided by 255).
+        reference: What they should be, same shape.
+        background: Part of both that the gain does not change, e.g. white behind transparent pixels; broadcast to ``image``.
+    """
+    a, b = _unit(image), _unit(reference)
+    _same_shape(a.shape, b.shape)
+    behind = np.broadcast_to(np.asarray(background, np.float64), a.shape)
+    ours, theirs = (a - behind).reshape(-1, 3), (b - behind).reshape(-1, 3)
+    gains = (ours * theirs).sum(axis=0) / np.maximum((ours * ours).sum(axis=0), 1e-12)
+    return np.clip(behind + gains * (a - behind), 0.0, 1.0)
 
 
 def ssim(image: ArrayLike, reference: ArrayLike) -> float:

@@ -216,6 +216,10 @@ class Surrogate:
         casts = cast_objects(self.objects, poses, self.camera, self.supersample, rgb.numpy().dtype)
         if self.opaque:
             casts = [made_opaque(cast) for cast in casts]
+        return self.composed(casts, rgb, depth_m)
+
+    def composed(self, casts: Sequence[ObjectCast], rgb: Tensor, depth_m: Tensor) -> Frames:
+        """Compose casts of the objects with a background, colours ``[B, H, W, 3]`` and planar depth ``[B, H, W]`` [m]."""
         background, shares = sparse_shares(
             [cast.pixels for cast in casts],
             [cast.alpha for cast in casts],

@@ -13,8 +13,10 @@ from torch.nn.functional import huber_loss
 
 from advnerf_core.render.march import Samples
 from advnerf_core.render.volume_kernels import MIN_TRANSMITTANCE
+from advnerf_core.scene.exposure import RayGains
 from advnerf_core.scene.field import SceneField
-from advnerf_core.scene.train_step import Array32, Matte, StepResult, distortion_distances
+from advnerf_core.scene.train_config import TrainConfig
+from advnerf_core.scene.train_step import Array32, CpuStep, Matte, StepResult, distortion_distances
 
 _MEAN_DECAY, _SQUARE_DECAY, _TINY = 0.9, 0.99, 1e-15
 
@@ -44,10 +46,15 @@ class TorchStep:
         return {n: torch.zeros_like(v) if v.grad is None else v.grad for n, v in self.values.items()}
 
     def step(
-        self, rays: Array32, targets: NDArray[np.uint8], samples: Samples, matte: Matte | None = None
+        self,
+        rays: Array32,
+        targets: NDArray[np.uint8],
+        samples: Samples,
+        matte: Matte | None = None,
+        exposure: RayGains | None = None,
     ) -> StepResult:
         """Add the gradient of a batch, of the samples that show; arguments as in ``gradients``."""
-        return self.gradients(rays, targets, self.visible(samples), matte)
+        return self.gradients(rays, targets, self.visible(samples), matte, exposure)
 
     def visible(self, samples: Samples, least_weight: float = 5e-4) -> Samples:
         """Samples that show in the image."""
@@ -61,7 +68,12 @@ class TorchStep:
         )
 
     def gradients(
-        self, rays: Array32, targets: NDArray[np.uint8], samples: Samples, matte: Matte | None = None
+        self,
+        rays: Array32,
+        targets: NDArray[np.uint8],
+        samples: Samples,
+        matte: Matte | None = None,
+        exposure: RayGains | None = None,
     ) -> StepResult:
         """Add the gradient of the mean Huber loss of a batch to the parameters' ``grad``.
 
@@ -70,9 +82,13 @@ class TorchStep:
             targets: Pixels ``[R, 3]``.
             samples: Samples of those rays.
             matte: Opacities of the pixels and what is behind them; for a field without a learned background.
+            exposure: Gains on the field's colours, whose gradient is written.
         """
         with torch.enable_grad():
             colours, weights, alpha = render_rays(self.scene, self._tensor(rays), samples)
+            logs = None if exposure is None else self._tensor(exposure.gains).log().requires_grad_()
+            if logs is not None:
+                colours = exposed(colours, logs, self._tensor(targets))
             real = self._tensor(targets) / 255.0
             if matte is not None:
                 behind, opacity = self._tensor(matte.behind), self._tensor(matte.opacities)[:, None] / 255.0
@@ -85,6 +101,8 @@ class TorchStep:
                 spread = distortion_loss(weights, self._tensor(middles), self._tensor(lengths), samples)
                 total = total + self.distortion * spread / max(len(rays), 1)
             total.backward()
+        if exposure is not None and logs is not None and logs.grad is not None:
+            exposure.grad_log[...] = logs.grad.float().cpu().numpy()
         mse = torch.mean((colours.detach() - real) ** 2)
         return StepResult(loss.item(), mse.item(), len(rays), len(samples.points))
 
@@ -142,6 +160,15 @@ class TorchStep:
         return torch.from_numpy(np.ascontiguousarray(array)).to(background.device, background.dtype)
 
 
+def stepper_for(scene: SceneField, config: TrainConfig) -> CpuStep | TorchStep:
+    """The training step of a configuration; one in torch runs on an accelerator, if there is one."""
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    opacity = config.opacity if scene.config.learned_background else 0.0
+    if config.backend == "torch" or (config.backend == "auto" and device != "cpu"):
+        return TorchStep(scene.to(device), config.huber, opacity=opacity)
+    return CpuStep(scene, config.huber, opacity=opacity)
+
+
 def render_rays(scene: SceneField, rays: Tensor, samples: Samples) -> tuple[Tensor, Tensor, Tensor]:
     """Volume rendering in plain torch, differentiable to the scene's parameters.
 
@@ -161,6 +188,12 @@ def render_rays(scene: SceneField, rays: Tensor, samples: Samples) -> tuple[Tens
     alpha = torch.zeros(samples.rays, device=device, dtype=dtype).index_add(0, ray_of, weights)
     directions = torch.nn.functional.normalize(rays[:, 3:].to(device, dtype), dim=-1)
     return scene.decode(total + (1.0 - alpha)[:, None] * scene.background, directions), weights, alpha
+
+
+def exposed(colours: Tensor, log_gains: Tensor, targets: Tensor) -> Tensor:
+    """Colours ``[R, 3]`` times gains; no brighter than 1 where the pixel ``[R, 3]`` is 255, which only says that it is no darker."""
+    shown = colours * torch.exp(log_gains)
+    return torch.where(targets == 255.0, shown.clamp(max=1.0), shown)
 
 
 def distortion_loss(weights: Tensor, middles: Tensor, widths: Tensor, samples: Samples) -> Tensor:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +21,13 @@ from advnerf_core.files import write_atomically
 from advnerf_core.render.march import Marcher, Samples
 from advnerf_core.render.occupancy import Leaps, OccupancyGrid, leap_distances, refine_occupied
 from advnerf_core.render.rays import intrinsics_row, pixel_rays, poses_in_box
+from advnerf_core.scene.exposure import Exposures, RayGains
 from advnerf_core.scene.field import SceneField, SceneFieldConfig
+from advnerf_core.scene.fingerprint import training_fingerprint
 from advnerf_core.scene.intervals import pixel_intervals
-from advnerf_core.scene.torch_step import TorchStep
+from advnerf_core.scene.torch_step import stepper_for
 from advnerf_core.scene.train_config import Progress, TrainConfig, TrainedScene
-from advnerf_core.scene.train_step import CpuStep, Matte, StepResult
+from advnerf_core.scene.train_step import Matte, StepResult
 
 Array32 = NDArray[np.float32]
 
@@ -47,6 +47,7 @@ class Trainer:
 
     Attributes:
         march: How samples are placed, in training and for rendering.
+        exposures: Gains of the photographs; None if they are not learned.
     """
 
     def __init__(
@@ -58,7 +59,8 @@ class Trainer:
                 "expected images with alpha for a field without a learned background, got opaque ones"
             )
         self.scene = SceneField(field_config, seed=self.config.seed)
-        self.stepper = _stepper(self.scene, self.config)
+        self.stepper = stepper_for(self.scene, self.config)
+        self.exposures = Exposures(len(images.rgb)) if self.config.exposure else None
         self.occupancy = OccupancyGrid(
             field_config.box_high,
             self.config.occupancy_resolution,
@@ -85,6 +87,7 @@ class Trainer:
             raise AdvnerfError(
                 "expected pixels to learn from, the masks leave none: are they the right way round?"
             )
+        self._fingerprint = training_fingerprint(images, field_config, self.config, self.march)
         self._leaps: Leaps | None = None
         self._recent: list[StepResult] = []
 
@@ -132,7 +135,8 @@ class Trainer:
             self.config.refine_depth,
             contracted=self.scene.config.contraction,
         )
-        return TrainedScene(self.scene.cpu(), occupied, self.march, self.history)
+        gains = None if self.exposures is None else np.exp(self.exposures.logs)
+        return TrainedScene(self.scene.cpu(), occupied, self.march, self.history, gains)
 
     def train_step(self) -> StepResult:
         """One batch of random pixels; all randomness follows from the seed and the step number."""
@@ -140,17 +144,17 @@ class Trainer:
         self._refresh_occupancy()
         assert self._leaps is not None
         rng = np.random.Generator(np.random.Philox(key=[config.seed, 2 * self.step]))
-        if self._usable is None:
-            pixels = rng.integers(0, self.images.rgb[..., 0].size, self.rays_per_step)
-        else:
-            pixels = self._usable[rng.integers(0, len(self._usable), self.rays_per_step)]
+        count = self.images.rgb[..., 0].size if self._usable is None else len(self._usable)
+        drawn = rng.integers(0, count, self.rays_per_step)
+        pixels = drawn if self._usable is None else self._usable[drawn]
         rays = np.empty((self.rays_per_step, 6), np.float32)
         colours = np.empty((self.rays_per_step, 3), np.uint8)
         pixel_rays(pixels, self.images.rgb, self._poses, self._intrinsics, rays, colours)
         samples, kept = self._marcher(
             rays, rng.random(len(rays), dtype=np.float32), self._leaps, self._step_scale()
         )
-        result = self._optimise(rays[kept], colours[kept], samples, self._matte(pixels, kept, rng))
+        matte, exposure = self._matte(pixels, kept, rng), self._exposure(pixels[kept])
+        result = self._optimise(rays[kept], colours[kept], samples, matte, exposure)
         per_ray = max(len(samples.points) / max(len(kept), 1), 1.0)
         wanted = config.samples_per_step / per_ray
         # Follow slowly: the next batch may hold more samples per ray than this one.
@@ -166,13 +170,13 @@ class Trainer:
 
     def save(self, path: Path) -> None:
         """Write a checkpoint, atomically."""
-        tensors = {**self.stepper.state(), "occupancy": self.occupancy.density}
+        tensors = {**self.stepper.state(), **self._exposure_state(), "occupancy": self.occupancy.density}
         state = {
             "step": self.step,
             "elapsed_s": self.elapsed_s,
             "rays_per_step": self.rays_per_step,
             "history": self.history,
-            "fingerprint": self._fingerprint(),
+            "fingerprint": self._fingerprint,
         }
         write_atomically(path, save_arrays(tensors, {"state": json.dumps(state)}))
 
@@ -190,17 +194,27 @@ class Trainer:
             raise CheckpointError(
                 f"expected a training checkpoint at {path}, got: {error!r}; delete it to train from the start"
             ) from error
-        if state["fingerprint"] != self._fingerprint():
+        if state["fingerprint"] != self._fingerprint:
             raise CheckpointError(
                 f"expected a checkpoint of these images and settings at {path}, got one of others; delete it to train anew"
             )
         self.stepper.load_state(tensors)
         self.occupancy.density[...] = tensors["occupancy"]
+        for name, array in self._exposure_state().items():
+            array[...] = tensors[name]
         self.step, self.elapsed_s = int(state["step"]), float(state["elapsed_s"])
         self.rays_per_step = int(state["rays_per_step"])
         self.history = [(int(a), float(b), float(c)) for a, b, c in state["history"]]
         # The grid in use is the one of the last update, which the saved densities are.
         self._leaps = leap_distances(self.occupied(), self.occupancy.cells) if self.step else None
+
+    def _exposure(self, pixels: NDArray[np.int64]) -> RayGains | None:
+        return (
+            None if self.exposures is None else self.exposures.of(pixels // self.images.rgb[0, ..., 0].size)
+        )
+
+    def _exposure_state(self) -> dict[str, Array32]:
+        return {} if self.exposures is None else self.exposures.state()
 
     def _matte(
         self, pixels: NDArray[np.int64], kept: NDArray[np.int64], rng: np.random.Generator
@@ -212,17 +226,25 @@ class Trainer:
         return Matte(self.images.alpha.reshape(-1)[pixels[kept]], behind[kept])
 
     def _optimise(
-        self, rays: Array32, colours: NDArray[np.uint8], samples: Samples, matte: Matte | None
+        self,
+        rays: Array32,
+        colours: NDArray[np.uint8],
+        samples: Samples,
+        matte: Matte | None,
+        exposure: RayGains | None,
     ) -> StepResult:
         # Only once geometry is found: earlier, pulling weights together freezes surfaces at wrong depths.
         self.stepper.distortion = self.config.distortion * min(1.0, max(0.0, 4.0 * self.fraction - 2.0))
-        result = self.stepper.step(rays, colours, samples, matte)
+        result = self.stepper.step(rays, colours, samples, matte, exposure)
         if not math.isfinite(result.loss):
             raise AdvnerfError(
                 f"expected a finite loss, got {result.loss} at step {self.step}; lower the learning rate "
                 f"({self.config.learning_rate}) or check the camera poses"
             )
-        self.stepper.update(self.step, self.config.learning_rate * self.config.final_rate**self.fraction)
+        rate = self.config.rate(self.fraction)
+        self.stepper.update(self.step, rate)
+        if self.exposures is not None and exposure is not None:
+            self.exposures.update(exposure, self.step, rate)
         return result
 
     def _refresh_occupancy(self) -> None:
@@ -250,26 +272,6 @@ class Trainer:
         progress(
             Progress(self.step, self.fraction, loss, psnr_db, left, recent[-1].rays, samples / max(rays, 1))
         )
-
-    def _fingerprint(self) -> str:
-        # The intervals as they were chosen: they also depend on the cameras and on the rule.
-        settings = [self.scene.config.to_dict(), {**asdict(self.config), "march": asdict(self.march)}]
-        digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
-        digest.update(str(self.images.rgb.shape).encode() + self.images.T_world_from_camera.tobytes())
-        digest.update(self.images.rgb[:, ::16, ::16].tobytes())
-        if self.images.alpha is not None and not self.scene.config.learned_background:
-            digest.update(self.images.alpha[:, ::16, ::16].tobytes())
-        if self._usable is not None:
-            digest.update(self._usable.tobytes())
-        return digest.hexdigest()[:16]
-
-
-def _stepper(scene: SceneField, config: TrainConfig) -> CpuStep | TorchStep:
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    opacity = config.opacity if scene.config.learned_background else 0.0
-    if config.backend == "torch" or (config.backend == "auto" and device != "cpu"):
-        return TorchStep(scene.to(device), config.huber, opacity=opacity)
-    return CpuStep(scene, config.huber, opacity=opacity)
 
 
 def train_scene(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.field import SceneField
 
 BACKENDS = ("auto", "numba", "torch")
+DECAYS = ("exponential", "cosine")
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,8 @@ class TrainConfig:
         samples_per_step: Samples that a step aims at; the number of rays follows from it.
         max_rays: Most rays in a step.
         learning_rate: Adam's rate at the start.
-        final_rate: Factor on the rate at the end; between, it falls exponentially.
+        final_rate: Factor on the rate at the end.
+        decay: How the rate falls to it: ``exponential`` or ``cosine``, which stays high for longer.
         huber: Where the loss turns from square to linear, in colour units 0..1.
         distortion: Weight of the distortion loss, which turns fog into surfaces.
         occupancy_resolution: Cells along the longest side of the box, or of the cube that a contracted field lies in.
@@ -38,6 +41,8 @@ class TrainConfig:
             alpha, which tell what is transparent.
         refine_depth: Optical depth of crossing a fine cell from which rendering looks into it. Surfaces of a finished room are
             dense; where they may still be haze, as in large boxes or after short trainings, 0.005 keeps them whole.
+        exposure: Whether a gain per channel is learned for each photograph, for cameras that choose exposure and white balance
+            themselves. The scene gets the mean exposure.
         seed: Seed of everything random.
         checkpoint_every_s: Time between checkpoints [s].
         backend: ``numba`` (CPU kernels), ``torch`` (any device), or ``auto``: torch where it sees an accelerator, else numba.
@@ -49,6 +54,7 @@ class TrainConfig:
     max_rays: int = 1 << 14
     learning_rate: float = 1e-2
     final_rate: float = 0.03
+    decay: str = "exponential"
     huber: float = 0.1
     distortion: float = 1e-2
     occupancy_resolution: int = 128
@@ -59,6 +65,7 @@ class TrainConfig:
     interval_px: float | None = None
     opacity: float = 1.5e-3
     refine_depth: float = 0.05
+    exposure: bool = False
     seed: int = 0
     checkpoint_every_s: float = 60.0
     backend: str = "auto"
@@ -70,6 +77,15 @@ class TrainConfig:
             raise ValueError(f"expected max_seconds > 0 or none, got {self.max_seconds}")
         if self.backend not in BACKENDS:
             raise ValueError(f"expected a backend of {', '.join(BACKENDS)}, got {self.backend!r}")
+        if self.decay not in DECAYS:
+            raise ValueError(f"expected a decay of {', '.join(DECAYS)}, got {self.decay!r}")
+
+    def rate(self, fraction: float) -> float:
+        """Adam's rate when so much of the training is done, 0..1."""
+        if self.decay == "exponential":
+            return self.learning_rate * self.final_rate**fraction
+        high = 0.5 * (1.0 + math.cos(math.pi * fraction))
+        return self.learning_rate * (self.final_rate + (1.0 - self.final_rate) * high)
 
 
 @dataclass(frozen=True)
@@ -104,9 +120,11 @@ class TrainedScene:
         occupied: Cells where something is ``[X, Y, Z]``, finer than in training.
         march: How samples were placed, and are for rendering.
         history: One row per report: step, elapsed [s], PSNR [dB].
+        gains: Factors on the colours for each photograph ``[P, 3]``, whose logarithms have mean zero; None if not learned.
     """
 
     scene: SceneField
     occupied: NDArray[np.bool_]
     march: MarchConfig
     history: list[tuple[int, float, float]]
+    gains: NDArray[np.float32] | None = None

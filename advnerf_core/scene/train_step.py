@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from advnerf_core.data.image_files import OPAQUE
 from advnerf_core.fields.hash_grid import encode, scatter
 from advnerf_core.fields.mlp_kernels import TILE
 from advnerf_core.parallel import SLOTS, run_slots, slot_bounds
@@ -23,6 +24,7 @@ from advnerf_core.render.volume_kernels import (
     gather_columns,
     mark_visible,
 )
+from advnerf_core.scene.exposure import RayGains
 from advnerf_core.scene.field import SceneField, SceneFieldConfig
 from advnerf_core.scene.field_kernels import (
     adam,
@@ -30,6 +32,7 @@ from advnerf_core.scene.field_kernels import (
     colour_loss,
     complete_colour_inputs,
     density_network,
+    exposed_loss,
     matte_loss,
     two_layers,
     two_layers_backward,
@@ -68,6 +71,11 @@ class Matte:
     behind: Array32
 
 
+def _opaque(rays: int) -> Matte:
+    """The matte of photographs without alpha: nothing behind them shows."""
+    return Matte(np.full(rays, OPAQUE, np.uint8), np.zeros((rays, 3), np.float32))
+
+
 class CpuStep:
     """Gradients and Adam for a scene field on the CPU.
 
@@ -90,10 +98,15 @@ class CpuStep:
         self._buffers: dict[str, Array32] = {}
 
     def step(
-        self, rays: Array32, targets: NDArray[np.uint8], samples: Samples, matte: Matte | None = None
+        self,
+        rays: Array32,
+        targets: NDArray[np.uint8],
+        samples: Samples,
+        matte: Matte | None = None,
+        exposure: RayGains | None = None,
     ) -> StepResult:
         """Add the gradient of a batch, of the samples that show; arguments as in ``gradients``."""
-        return self.gradients(rays, targets, *self.visible(samples), matte)
+        return self.gradients(rays, targets, *self.visible(samples), matte, exposure)
 
     def visible(self, samples: Samples, least_weight: float = 5e-4) -> tuple[Samples, Array32]:
         """Samples that show in the image, and their encodings in tiles ``[tiles, K, TILE]``.
@@ -136,6 +149,7 @@ class CpuStep:
         samples: Samples,
         encoded: Array32,
         matte: Matte | None = None,
+        exposure: RayGains | None = None,
     ) -> StepResult:
         """Add the gradient of the mean Huber loss of a batch to ``grads``.
 
@@ -145,6 +159,7 @@ class CpuStep:
             samples: Samples of those rays.
             encoded: Their encodings ``[tiles, K, TILE]``, overwritten.
             matte: Opacities of the pixels and what is behind them; for a field without a learned background.
+            exposure: Gains on the field's colours, whose gradient is written.
         """
         v, n_rays, n = self.values, len(rays), len(samples.points)
         tiles, ray_tiles = -(-n // TILE), -(-n_rays // TILE)
@@ -168,7 +183,16 @@ class CpuStep:
         def shade(slot: int) -> None:
             accumulate(field, samples.widths, samples.begins, *ray_slots[slot], weights, inputs, alpha)
             sums[slot] = self._shade(
-                slot_grads[slot], rays, targets, inputs, colours, alpha, grad_alpha, ray_slots[slot], matte
+                slot_grads[slot],
+                rays,
+                targets,
+                inputs,
+                colours,
+                alpha,
+                grad_alpha,
+                ray_slots[slot],
+                matte,
+                exposure,
             )
             if self.distortion > 0.0:
                 add_distortion_gradient(
@@ -230,6 +254,7 @@ class CpuStep:
         grad_alpha: Array32,
         bounds: tuple[int, int],
         matte: Matte | None,
+        exposure: RayGains | None,
     ) -> tuple[float, float]:
         """Decode, compare and differentiate the rays of a slot; ``inputs`` become their gradient."""
         v, (start, stop) = self.values, bounds
@@ -242,8 +267,25 @@ class CpuStep:
         scale = np.float32(1.0 / (3.0 * len(rays)))
         if stop % TILE:
             colours[tiles[1] - 1, :, stop % TILE :] = 0.0  # columns without a ray have no gradient
-        mixed = np.zeros(0 if matte is None else len(rays), np.float32)
-        if matte is None:
+        mixed = np.zeros(0 if matte is None and exposure is None else len(rays), np.float32)
+        if exposure is not None:
+            before = matte or _opaque(len(rays))
+            cover = np.ones_like(alpha) if matte is None else alpha
+            sums = exposed_loss(
+                colours,
+                targets,
+                before.opacities,
+                before.behind,
+                cover,
+                exposure.gains,
+                start,
+                stop,
+                self.huber,
+                scale,
+                mixed,
+                exposure.grad_log,
+            )
+        elif matte is None:
             sums = colour_loss(colours, targets, start, stop, self.huber, scale)
         else:
             sums = matte_loss(

@@ -115,6 +115,13 @@ def scene_train(
             show_default="--interval-px / focal length",
         ),
     ] = None,
+    exposure: Annotated[
+        bool,
+        typer.Option(
+            "--exposure",
+            help="Learn a gain per channel for each photograph, for cameras that choose exposure and white balance themselves.",
+        ),
+    ] = False,
 ) -> None:
     """Train a scene on posed images and print PSNR and SSIM on the held-out images.
 
@@ -146,6 +153,7 @@ def scene_train(
         interval_px,
         interval,
         interval_growth,
+        exposure,
     )
     output.mkdir(parents=True, exist_ok=True)
     try:
@@ -235,8 +243,8 @@ def scene_view(
 
 
 def _print_figures(figures: dict[str, Any]) -> None:
-    rows = table("held-out image", "PSNR", "SSIM")
-    for row in figures["images"]:
-        rows.add_row(row["image"], f"{row['psnr_db']:.2f} dB", f"{row['ssim']:.3f}")
-    rows.add_row("mean", f"{figures['mean']['psnr_db']:.2f} dB", f"{figures['mean']['ssim']:.3f}")
+    rows = table("held-out image", "PSNR", "PSNR, gain fitted", "SSIM")
+    for row in [*figures["images"], {"image": "mean", **figures["mean"]}]:
+        plain, fitted = (f"{row[key]:.2f} dB" for key in ("psnr_db", "gain_fitted_psnr_db"))
+        rows.add_row(row["image"], plain, fitted, f"{row['ssim']:.3f}")
     print_table(rows)

@@ -72,6 +72,17 @@ class SceneConfig(_Section):
         default=None,
         description="Sample intervals in pixels of the policy's view; none: the default of pixel_intervals.",
     )
+    # Both are left out where they change nothing, so that keys of scenes without them do not depend on them.
+    decay: Literal["exponential", "cosine"] = Field(
+        default="exponential",
+        exclude_if=lambda decay: decay == "exponential",
+        description="How the learning rate falls; cosine stays high for longer.",
+    )
+    exposure: bool = Field(
+        default=False,
+        exclude_if=lambda on: not on,
+        description="Learn a gain per channel for each photograph; for worlds whose camera chooses its exposure.",
+    )
     seed: int = 0
 
 

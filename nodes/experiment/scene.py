@@ -45,6 +45,8 @@ def run(experiment: Experiment, folder: Path, report: MeasuringReport) -> None:
         march=march,
         refine_depth=config.refine_depth,
         occupancy_resolution=config.occupancy,
+        decay=config.decay,
+        exposure=config.exposure,
     )
     checkpoint = folder / "checkpoint.safetensors"
     trained = train_scene(photographs, field, training, checkpoint, progress)

@@ -21,7 +21,7 @@ from advnerf_core.geometry import Array
 from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.field import SceneFieldConfig, save_scene
 from advnerf_core.scene.intervals import pixel_intervals
-from advnerf_core.scene.metrics import psnr, ssim
+from advnerf_core.scene.metrics import gain_fitted, psnr, ssim
 from advnerf_core.scene.presets import PHOTOGRAPH_BANDS
 from advnerf_core.scene.presets import PRESETS as SCENE_PRESETS
 from advnerf_core.scene.render_field import FieldRenderer
@@ -29,12 +29,18 @@ from advnerf_core.scene.train import Progress, TrainConfig, train_scene
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import Report
 
-SCENE, CHECKPOINT, FIGURES = "scene.safetensors", "checkpoint.safetensors", "held_out.json"
+SCENE, CHECKPOINT, FIGURES, EXPOSURE = (
+    "scene.safetensors",
+    "checkpoint.safetensors",
+    "held_out.json",
+    "exposure.json",
+)
 MM_PER_M = 1000.0
 _DEFAULT_STEPS, _NO_TIME_LIMIT_STEPS = 1000, 1_000_000
 PRESETS = ("room", "instant-ngp", *SCENE_PRESETS)
 _WHITE = (1.0, 1.0, 1.0)
 _VIDEO_FPS = 10
+_MEASURES = ("psnr_db", "gain_fitted_psnr_db", "ssim")
 
 
 @dataclass(frozen=True)
@@ -59,6 +65,7 @@ class TrainingRequest:
         interval_px: Sample intervals in pixels of the training images; None uses the default rule, see `pixel_intervals`.
         interval: Shortest and longest sample interval, which override the rule, in the data set's unit.
         interval_growth: Interval per distance, which overrides the rule.
+        exposure: Whether a gain per channel is learned for each photograph.
     """
 
     transforms: Path
@@ -77,6 +84,7 @@ class TrainingRequest:
     interval_px: float | None = None
     interval: tuple[float, float] | None = None
     interval_growth: float | None = None
+    exposure: bool = False
 
     def __post_init__(self) -> None:
         """Check the settings."""
@@ -118,30 +126,43 @@ def train(request: TrainingRequest, report: Report) -> dict[str, Any]:
         "dataset": str(request.transforms),
     }
     save_scene(request.output / SCENE, trained.scene, trained.occupied, metadata)
+    if trained.gains is not None:
+        names = [frame.path.name for frame in training.frames]
+        rows = [
+            {"image": name, "gain": gain.tolist()} for name, gain in zip(names, trained.gains, strict=True)
+        ]
+        write_atomically(request.output / EXPOSURE, json.dumps(rows, indent=1) + "\n")
     figures = evaluate(FieldRenderer.from_file(request.output / SCENE), held_out, request.size)
     write_atomically(request.output / FIGURES, json.dumps(figures, indent=1) + "\n")
     return figures
 
 
 def evaluate(renderer: FieldRenderer, listed: PosedImages, size: tuple[int, int] | None) -> dict[str, Any]:
-    """PSNR [dB] and SSIM on held-out images, per image and on average. Masked pixels are excluded from the PSNR."""
+    """Compare with held-out images: PSNR [dB], PSNR after a gain fitted to each image [dB], and SSIM.
+
+    Masked pixels are excluded from both PSNR.
+    """
     views = listed.load(size)
-    rows = []
     # Images with alpha are compared over white, which the renderer uses too.
-    for index, real in enumerate(views.on_background(_WHITE)):
-        rendered = renderer.render(views.T_world_from_camera[index][None], views.pinholes[index])[0][
-            0
-        ].numpy()
-        usable = np.ones(real.shape[:2], dtype=bool) if views.valid is None else views.valid[index]
-        rows.append(
-            {
-                "image": listed.frames[index].path.name,
-                "psnr_db": psnr(rendered[usable], real[usable] / 255.0),
-                "ssim": ssim(rendered, real / 255.0),
-            }
-        )
-    means = {key: float(np.mean([row[key] for row in rows])) for key in ("psnr_db", "ssim")}
-    return {"mean": means, "images": rows}
+    rows = [
+        {"image": listed.frames[index].path.name, **_compared(renderer, views, index, real)}
+        for index, real in enumerate(views.on_background(_WHITE))
+    ]
+    return {"mean": {key: float(np.mean([row[key] for row in rows])) for key in _MEASURES}, "images": rows}
+
+
+def _compared(
+    renderer: FieldRenderer, views: ImageSet, index: int, real: NDArray[np.uint8]
+) -> dict[str, float]:
+    rgb, _, alpha = (
+        each[0].numpy()
+        for each in renderer.render(views.T_world_from_camera[index][None], views.pinholes[index])
+    )
+    usable = np.ones(real.shape[:2], dtype=bool) if views.valid is None else views.valid[index]
+    white = 0.0 if renderer.config.learned_background else 1.0 - alpha[usable][:, None]
+    ours, theirs = rgb[usable], real[usable] / 255.0
+    fitted_db = psnr(gain_fitted(ours, theirs, white), theirs)
+    return dict(zip(_MEASURES, (psnr(ours, theirs), fitted_db, ssim(rgb, real / 255.0)), strict=True))
 
 
 def render(
@@ -258,6 +279,7 @@ def _train_config(request: TrainingRequest, field: SceneFieldConfig, march: Marc
             checkpoint_every_s=request.checkpoint_every_s,
             march=march,
             opacity=0.0 if is_open else TrainConfig.opacity,
+            exposure=request.exposure,
         )
     return TrainConfig(
         steps=request.steps or _NO_TIME_LIMIT_STEPS,
@@ -267,6 +289,7 @@ def _train_config(request: TrainingRequest, field: SceneFieldConfig, march: Marc
         march=march,
         opacity=0.0 if is_open else TrainConfig.opacity,
         distortion=2e-3 if is_open else TrainConfig.distortion,
+        exposure=request.exposure,
     )
 
 

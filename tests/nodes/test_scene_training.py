@@ -131,6 +131,26 @@ def test_presets_have_their_sizes_train_and_render(
     assert (depth_m > 0.0).all()
 
 
+@pytest.mark.slow
+def test_photographs_of_changing_exposure_are_learned_with_gains(tmp_path: Path) -> None:
+    folder = write_set(tmp_path, 24)
+    for k, file in enumerate(sorted(folder.glob("*.png"))):
+        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        image[..., :3] = np.rint(image[..., :3] * (0.6 if k % 2 else 1.0))
+        cv2.imwrite(str(file), image)
+    box = ((-0.8,) * 3, (0.8,) * 3)
+    figures = scene_training.train(
+        request_for(folder, exposure=True, steps=150, box_m=box), lambda part, text="": None
+    )
+    rows = json.loads((folder / "learned" / scene_training.EXPOSURE).read_text())
+    gains = {row["image"]: np.mean(row["gain"]) for row in rows}
+    # So few steps find most of the difference.
+    dark, bright = ([g for name, g in gains.items() if int(name[:2]) % 2 == odd] for odd in (1, 0))
+    assert np.mean(dark) / np.mean(bright) == pytest.approx(0.6, abs=0.15)
+    # The held-out pictures are bright ones, which the mean exposure is not.
+    assert figures["mean"]["gain_fitted_psnr_db"] > figures["mean"]["psnr_db"] + 1.0
+
+
 def test_an_unknown_preset_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="room, instant-ngp, minutes, best, got 'huge'"):
         request_for(tmp_path, preset="huge")

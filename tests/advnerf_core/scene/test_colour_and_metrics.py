@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from advnerf_core.scene.colour import IDENTITY, ColourMap, fit_colour_map
-from advnerf_core.scene.metrics import psnr, ssim
+from advnerf_core.scene.metrics import gain_fitted, psnr, ssim
 
 RNG = np.random.default_rng(0)
 
@@ -48,6 +48,18 @@ def test_psnr_of_a_known_error() -> None:
     assert psnr(np.full((4, 4, 3), 255, np.uint8), np.ones((4, 4, 3))) == math.inf
     with pytest.raises(ValueError, match="one shape"):
         psnr(a, a[:4])
+
+
+def test_a_fitted_gain_takes_brightness_and_tint_out_and_nothing_else() -> None:
+    picture, gains = 0.1 + 0.5 * RNG.random((16, 16, 3)), np.array([1.2, 0.7, 1.0])
+    np.testing.assert_allclose(gain_fitted(picture, picture * gains), picture * gains, atol=1e-12)
+    offset = picture + 0.1
+    assert 20.0 < psnr(gain_fitted(picture, offset), offset) < 40.0  # an offset is no gain
+    opacity = RNG.random((16, 16, 1))
+    ours, theirs = (opacity * each + (1.0 - opacity) for each in (picture, picture * gains))
+    np.testing.assert_allclose(gain_fitted(ours, theirs, 1.0 - opacity), theirs, atol=1e-12)
+    with pytest.raises(ValueError, match="one shape"):
+        gain_fitted(picture, picture[:4])
 
 
 def test_ssim_of_constant_images_is_the_luminance_term() -> None:

@@ -11,7 +11,7 @@ from advnerf_core.geometry import Pinhole, look_at
 from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.field import SceneFieldConfig
 from advnerf_core.scene.presets import PRESETS, PresetError, scene_preset
-from advnerf_core.scene.train import Trainer
+from advnerf_core.scene.train import TrainConfig, Trainer
 
 
 def test_presets_end_by_time_unless_steps_are_given() -> None:
@@ -53,3 +53,15 @@ def test_a_preset_trains(name: str) -> None:
     trainer = Trainer(images(), field, config)
     results = [trainer.train_step() for _ in range(8)]
     assert results[-1].loss < results[0].loss
+
+
+def test_rates_fall_from_the_first_to_the_last_either_way() -> None:
+    exponential = TrainConfig(learning_rate=0.02, final_rate=0.01)
+    cosine = dataclasses.replace(exponential, decay="cosine")
+    for config in (exponential, cosine):
+        assert config.rate(0.0) == pytest.approx(0.02)
+        assert config.rate(1.0) == pytest.approx(0.0002)
+    assert exponential.rate(0.5) == pytest.approx(0.002)  # the geometric mean
+    assert cosine.rate(0.5) == pytest.approx(0.0101)  # the arithmetic mean
+    with pytest.raises(ValueError, match="exponential, cosine, got 'linear'"):
+        TrainConfig(decay="linear")

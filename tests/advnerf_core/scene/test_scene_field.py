@@ -7,11 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 
-from advnerf_core.data.dataset import ImageSet
 from advnerf_core.fields.hash_grid import HashGridConfig
-from advnerf_core.geometry import Array, Pinhole, look_at
+from advnerf_core.geometry import Array, look_at
 from advnerf_core.parallel import set_thread_count
 from advnerf_core.render.march import MarchConfig, Marcher
 from advnerf_core.render.march_kernels import span_in_box
@@ -27,8 +25,8 @@ from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.torch_step import render_rays
 from advnerf_core.scene.train import CheckpointError, TrainConfig, TrainedScene, Trainer
 from advnerf_core.scene.train_step import CpuStep
+from tests.support.colour_room import CAMERA, room_images, room_poses, room_view
 
-HALF = np.array([1.0, 1.0, 0.5])
 BOX = ((-1.05, -1.05, -0.55), (1.05, 1.05, 0.55))
 FIELD = SceneFieldConfig(
     *BOX, grid=HashGridConfig(levels=6, features=2, log2_entries=12, coarsest=8, finest=96), hidden=16
@@ -38,32 +36,6 @@ MARCH = MarchConfig(near_m=0.05, smallest_step_m=0.01, largest_step_m=0.05, step
 TRAIN = TrainConfig(
     steps=500, samples_per_step=1 << 13, max_rays=1024, occupancy_resolution=32, warmup_steps=60, march=MARCH
 )
-CAMERA = Pinhole(48, 36, 30.0, 30.0, 24.0, 18.0)
-
-
-def room_view(T: Array) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """Image and planar depth from inside an empty box room whose colours vary smoothly with position."""
-    directions = CAMERA.directions() @ T[:3, :3].T
-    with np.errstate(divide="ignore"):
-        t = ((np.sign(directions) * HALF - T[:3, 3]) / directions).min(-1)
-    hit = T[:3, 3] + t[..., None] * directions
-    rgb = 0.5 + 0.4 * np.sin(
-        7.0 * hit[..., [0, 1, 2]] + 5.0 * hit[..., [1, 2, 0]] + np.array([0.0, 1.0, 2.0])
-    )
-    return np.round(255 * rgb).astype(np.uint8), t
-
-
-def room_poses(count: int, seed: int) -> Array:
-    rng = np.random.default_rng(seed)
-    eyes = rng.uniform(-0.6, 0.6, (count, 3)) * HALF
-    return np.stack(
-        [look_at(eye, eye + np.append(rng.normal(size=2), rng.uniform(-0.5, 0.5))) for eye in eyes]
-    )
-
-
-def room_images(count: int = 90, seed: int = 0) -> ImageSet:
-    poses = room_poses(count, seed)
-    return ImageSet(np.stack([room_view(T)[0] for T in poses]), (CAMERA,) * count, poses)
 
 
 @pytest.fixture(scope="module")
