@@ -10,6 +10,12 @@ from typing import Any
 
 from advnerf_core.report.conditions import style_of
 
+# Published sets from worlds that this project did not write, or did not draw.
+_FOREIGN = {
+    "gap_metadrive": "MetaDrive, with its own renderer and its own car",
+    "gap_filament": "the room as MuJoCo 4's renderer Filament draws it",
+    "gap_duckietown": "Duckietown, with its own renderer and its own robot",
+}
 _HARDENED = "python -m benchmarks.hardening"
 
 
@@ -54,7 +60,17 @@ def table(found: Sequence[Answer]) -> str:
 
 
 def _joined(answer: Any, sets: Sequence[Mapping[str, Any]]) -> str:
-    return " ".join(answer(each["name"], test, each["rows"]) for each in sets for test in each["primary"])
+    return " ".join(answer(each["name"], test, each["rows"]) for each in sets for test in _told(each))
+
+
+def _told(found: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
+    """The tests that are told here: of a set with contrasts that under its last condition, in which everything is the world's own."""
+    tests: Sequence[Mapping[str, Any]] = found["primary"]
+    return tests[-1:] if found.get("contrasts") else tests
+
+
+def _where(name: str, test: Mapping[str, Any]) -> str:
+    return f"{name}, {test['test']['scenario']}".replace("_", " ")
 
 
 def _row(rows: Sequence[Mapping[str, Any]], test: Mapping[str, Any], domain: str) -> Mapping[str, Any]:
@@ -69,7 +85,7 @@ def _transfers(name: str, test: Mapping[str, Any], rows: Sequence[Mapping[str, A
         "" if there["low_m"] is None else f" (95 % interval {there['low_m']:.2f} to {there['high_m']:.2f} m)"
     )
     return (
-        f"{name}, {test['test']['scenario']}: attacks move the car {there['excess_m']:.2f} m per tick further from its path where they are "
+        f"{_where(name, test)}: attacks move the car {there['excess_m']:.2f} m per tick further from its path where they are "
         f"deployed{band}, {here['excess_m']:.2f} m in the learned copy; {there['off_track']} of {there['drives']} deployed drives leave the track."
     )
 
@@ -79,7 +95,7 @@ def _better(name: str, test: Mapping[str, Any], rows: Sequence[Mapping[str, Any]
     p = "no test is claimed" if test["p_holm"] is None else f"p = {test['p_holm']:.4f}"
     others = "; ".join(style_of(each).title for each in test["test"]["against"])
     return (
-        f"{name}, {test['test']['scenario']}: the gradient adds {test['difference_m']:.2f} m per tick to "
+        f"{_where(name, test)}: the gradient adds {test['difference_m']:.2f} m per tick to "
         f"*{style_of(test['baseline']).title}* ({p}), the strongest of these in the learned copy: {others}."
     )
 
@@ -111,7 +127,9 @@ def _worlds(sets: Sequence[Mapping[str, Any]]) -> str:
         return ""
     words = {"nodes": "by the live nodes, against emulated devices", "world": "in the simulator itself"}
     driven = " and ".join(words.get(each, each) for each in through)
-    return f"In this project's own simulated places, driven {driven}. No real car was driven."
+    foreign = [_FOREIGN[found["name"]] for found in sets if found["name"] in _FOREIGN]
+    elsewhere = f" Also in {' and in '.join(foreign)}." if foreign else ""
+    return f"In this project's own simulated places, driven {driven}.{elsewhere} No real car was driven."
 
 
 def _fast(rows: Sequence[Mapping[str, Any]]) -> str:

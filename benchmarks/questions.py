@@ -130,6 +130,12 @@ QUESTIONS = (
         ),
     ),
     Question(
+        "other_worlds",
+        "What is left of an attack in another world?",
+        "Attacks on a panel that the world's own renderer shows, driven by the world's own car, and how well that was predicted.",
+        ("gap", "predictions"),
+    ),
+    Question(
         "nothing_is_lost",
         "Is anything lost when something breaks?",
         "Damaged and cut files, killed processes, and hostile input.",
