@@ -133,7 +133,7 @@ QUESTIONS = (
         "other_worlds",
         "What is left of an attack in another world?",
         "Attacks on a panel that the world's own renderer shows, driven by the world's own car, and how well that was predicted.",
-        ("gap", "predictions"),
+        ("gap", "predictions", "learned_roads"),
     ),
     Question(
         "nothing_is_lost",

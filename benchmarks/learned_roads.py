@@ -1,0 +1,80 @@
+"""Is the learned copy of a foreign road good enough, and does the victim drive well there? ``python -m benchmarks.learned_roads RUN_FOLDER...``.
+
+Reads run folders of experiments in worlds of other people: held-out views of the driving camera at the policy's size, the policy's control on
+true and learned views, and the deployed drives without attack of the hardened victim, judged by the limit that registrations fix.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+
+from advnerf_core.driving.metrics import drives as drives_well
+from advnerf_core.driving.metrics import mean_cte_limit_m
+from benchmarks.results import record_row
+
+_LEAST_DB, _MOST_SHARE = 25.0, 0.02
+
+
+def main() -> None:
+    """Record the rows of each run folder."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run_folders", nargs="+", type=Path)
+    for folder in parser.parse_args().run_folders:
+        record(folder)
+
+
+def record(folder: Path) -> None:
+    """The three rows of one road."""
+    world = json.loads((folder / "manifest.json").read_text())["config"]["world"]
+    about = json.loads((folder / "capture" / "world.json").read_text())["description"]
+    name, command = road_of(world), f"python -m benchmarks.learned_roads {folder}"
+    psnr_db = json.loads((folder / "scene" / "fidelity.json").read_text())["mean"]["psnr_policy_db"]
+    record_row(
+        f"{name}: held-out driving views, 200x66",
+        psnr_db,
+        "dB",
+        f">= {_LEAST_DB:g} dB",
+        psnr_db >= _LEAST_DB,
+        command,
+    )
+    views = json.loads((folder / "policy" / "policy.json").read_text())["on_held_out_views"]
+    right, left = about["car"]["control_limits"]
+    share = float(np.mean([abs(view["real"] - view["surrogate"]) for view in views])) / (left - right)
+    record_row(f"{name}: control on true and learned views, mean difference", 100.0 * share, "% of the range", f"<= {100 * _MOST_SHARE:g} %", share <= _MOST_SHARE, command, f"{len(views)} views")  # fmt: skip
+    drives = without_attack(folder)
+    if drives:
+        mean_m, off = float(np.mean([drive[0] for drive in drives])), sum(drive[1] for drive in drives)
+        limit_m = mean_cte_limit_m(about["off_track_m"])
+        well = drives_well(mean_m, off > 0, about["off_track_m"])
+        record_row(f"{name}: hardened victim without attack, mean abs. CTE deployed", mean_m, "m", f"<= {limit_m:.2f} m, none off the track", well, command, f"{len(drives)} drives, {off} off the track, worst {max(drive[0] for drive in drives):.3f} m")  # fmt: skip
+    print(
+        f"{name}: {psnr_db:.1f} dB, control {100 * share:.2f} % of its range, {len(drives)} drives without attack"
+    )
+
+
+def road_of(world: dict[str, object]) -> str:
+    """A world and its road in words."""
+    road = world.get("road")
+    where = (
+        f"road {road['blocks']} of seed {road['seed']}"
+        if isinstance(road, dict)
+        else str(world.get("map_name", ""))
+    )
+    return f"{world['kind']}, {where}".rstrip(", ")
+
+
+def without_attack(folder: Path) -> list[tuple[float, bool]]:
+    """Mean |CTE| [m] of each deployed drive without attack of the hardened victim, and whether it left the track."""
+    kept = next(iter(sorted((folder / "cells" / "shared").glob("*_hardened_none_0_*/drives.json"))), None)
+    if kept is None:
+        return []
+    found = json.loads(kept.read_text())
+    return list(zip(found["mean_cte_m"], found["off_track"], strict=True))
+
+
+if __name__ == "__main__":
+    main()
