@@ -60,10 +60,13 @@ def _means(shown: list[Row]) -> Figure:
             if row.low_m is not None and row.high_m is not None:
                 ax.plot([row.low_m, row.high_m], [down, down], color=style.light, lw=1.2, zorder=2)
             label = f"{style.title}, {row.domain}"
-            face = style.light if filled else LIGHT["paper"]
-            ax.plot(
-                row.excess_m, down, style.marker, color=style.light, mfc=face, ms=5, label=label, zorder=3
-            )
+            drawn = {
+                "color": style.light,
+                "mfc": style.light if filled else LIGHT["paper"],
+                "ms": 5,
+                "zorder": 3,
+            }
+            ax.plot([row.excess_m], [down], marker=style.marker, ls="none", label=label, **drawn)
         entries = dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
         ax.figure.legend(entries.values(), entries.keys(), loc="outside upper left", ncols=3)
         names = [f"{' '.join(filter(None, place[:2]))}, {place[2]}" for place in places]

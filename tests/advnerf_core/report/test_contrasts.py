@@ -1,5 +1,6 @@
 """The same attacks under two conditions, against sums by hand."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -9,9 +10,9 @@ from advnerf_core.report.cells import CellResult, read_cells
 from advnerf_core.report.evidence.contrasts import contrast_data, contrast_rows
 from advnerf_core.report.evidence.intervals import clustered_interval
 from advnerf_core.report.evidence.page import results_page
-from advnerf_core.report.evidence.plot import excess_plot
+from advnerf_core.report.evidence.plot import _means, excess_plot
 from advnerf_core.report.evidence.registration import Contrast, RegisteredCell, read_registration
-from advnerf_core.report.evidence.results import Evidence, as_data
+from advnerf_core.report.evidence.results import Evidence, as_data, rows
 from benchmarks.planted_changes import write_simulated_set
 
 
@@ -108,3 +109,23 @@ def test_the_page_and_the_picture_name_the_conditions(evidence: Evidence) -> Non
     assert "| native | hardened | gradient | deployed |" in text
     names = [label.get_text() for label in excess_plot(evidence).axes[0].get_xticklabels()]
     assert any("native" in name for name in names)
+
+
+def test_many_conditions_are_drawn_by_their_means(evidence: Evidence) -> None:
+    # Its marker is no name but corners.
+    pink = {"random": "random_pink"}
+    shown = [
+        dataclasses.replace(row, method=pink.get(row.method, row.method))
+        for row in rows(evidence)
+        if row.method != "none"
+    ]
+    figure = _means(shown)
+    drawn = {(round(float(x), 9)) for line in figure.axes[0].lines for x in line.get_xdata()}
+    assert {round(row.excess_m, 9) for row in shown} <= drawn
+    assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == [
+        "track, hardened",
+        "native, hardened",
+    ]
+    widest = max(abs(value) for row in shown for value in (row.low_m or 0.0, row.high_m or 0.0, row.excess_m))
+    low, high = figure.axes[0].get_xlim()
+    assert high - low < 3.0 * widest
