@@ -17,4 +17,4 @@ def test_something_is_published():
 def test_a_published_set_verifies(name):
     found = verify_set(PUBLISHED / name)
     assert found.problems == ()
-    assert found.numbers > 0
+    assert found.numbers > 0 or found.awaits_results

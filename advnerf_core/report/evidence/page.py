@@ -140,7 +140,7 @@ def _where(through: Sequence[str]) -> str:
     """Where it was deployed, so that no simulation passes for a real car."""
     known = {
         "nodes": "the simulated lab, driven in real time by the live nodes",
-        "world": "the simulator of the place, with its own car",
+        "world": "the simulator of the place, with its own car where the condition names no other",
         "nothing": "nowhere",
     }
     return f"*Deployed* is {' and '.join(known.get(each, each) for each in through) or 'nowhere'}. No real car was driven."
@@ -161,13 +161,11 @@ def _sentences(test: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> st
         "track."
     )
     baseline = f"{style_of(test['baseline']).title}, the strongest baseline in the surrogate"
-    if test["p"] is None:
-        return f"{first} The difference to {baseline}, is {test['difference_m']:.3f} m. {test['reason']}."
     between = "" if test["low_m"] is None else f", 95 % interval {_ends(test)} m"
-    return (
-        f"{first} The difference to {baseline}, is {test['difference_m']:.3f} m per tick{between} (exact permutation test over searches, "
-        f"p = {_p(test['p_holm'])} after Holm's adjustment)."
-    )
+    difference = f"{first} The difference to {baseline}, is {test['difference_m']:.3f} m per tick{between}"
+    if test["p"] is None:
+        return f"{difference}. {test['reason']}."
+    return f"{difference} (exact permutation test over searches, p = {_p(test['p_holm'])} after Holm's adjustment)."
 
 
 def _between(row: Mapping[str, Any]) -> str:

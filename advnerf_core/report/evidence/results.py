@@ -184,7 +184,8 @@ def rows(evidence: Evidence) -> list[Row]:
 def primary_tests(evidence: Evidence) -> list[TestResult]:
     """The registered tests, adjusted by Holm over these alone."""
     found = [test for each in evidence.registration.primary if (test := _test(evidence, each)) is not None]
-    adjusted = iter(holm([test.p for test in found if test.p is not None]))
+    p_values = [test.p for test in found if test.p is not None]
+    adjusted = iter(holm(p_values) if p_values else ())  # too few searches for any: the intervals remain
     return [test if test.p is None else replace(test, p_holm=next(adjusted)) for test in found]
 
 

@@ -50,12 +50,14 @@ class Verified:
         numbers: Published numbers that were computed again.
         drives: Drives that they were computed from.
         problems: What is wrong, in words; none if all is well.
+        awaits_results: It is registered, and nothing of it was published yet.
     """
 
     name: str
     numbers: int
     drives: int
     problems: tuple[str, ...]
+    awaits_results: bool = False
 
 
 def sets_in(published: Path) -> list[str]:
@@ -111,6 +113,8 @@ def verify_set(folder: Path) -> Verified:
         registration, cells = _read(folder)
     except (SetError, RegistrationError, CellError) as error:
         return Verified(folder.name, 0, 0, (str(error),))
+    if not cells and not (folder / SET).exists() and folder.name not in _known_digests(folder.parent):
+        return Verified(folder.name, 0, 0, (), awaits_results=True)
     evidence = Evidence(registration, cells)
     problems = [*_files(folder), *_against_registration(evidence, cells)]
     numbers = 0

@@ -146,6 +146,26 @@ def test_the_command_verifies_all_sets_and_fails_where_one_is_wrong(copied):
     assert "expected a set of simulated" in str(call("other").exception)
 
 
+def test_what_is_only_registered_awaits_its_results_and_what_vanished_does_not(copied):
+    for file in (*copied.glob("*.json"), copied / SET):
+        file.unlink()
+    assert "cannot be read" in verify_set(copied).problems[0]
+    (copied.parent / DIGESTS).write_text("{}")
+    found = verify_set(copied)
+    assert found.problems == () and found.awaits_results
+    done = CliRunner().invoke(app, ["verify", "--in", str(copied.parent)])
+    assert done.exit_code == 0
+    assert "registered, nothing published yet" in done.output
+
+
+def test_too_few_searches_for_any_test_leave_the_interval(copied):
+    whole = evidence_of(copied)
+    few = {name: cell for name, cell in whole.cells.items() if cell.seed < 5}
+    (test,) = primary_tests(Evidence(whole.registration, list(few.values())))
+    assert test.p is None and test.p_holm is None
+    assert test.low_m <= test.difference_m <= test.high_m
+
+
 def test_verifying_needs_no_torch(original):
     code = (
         "import sys; sys.modules['torch'] = None\n"
