@@ -14,6 +14,7 @@ import numpy as np
 
 from advnerf_core.driving.metrics import drives as drives_well
 from advnerf_core.driving.metrics import mean_cte_limit_m
+from advnerf_core.report.cells import read_cell
 from benchmarks.results import record_row
 
 _LEAST_DB, _MOST_SHARE = 25.0, 0.02
@@ -23,15 +24,22 @@ def main() -> None:
     """Record the rows of each run folder."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run_folders", nargs="+", type=Path)
-    for folder in parser.parse_args().run_folders:
-        record(folder)
+    parser.add_argument(
+        "--cell", type=Path, help="cell without attack, of one run folder whose drives lie elsewhere"
+    )
+    arguments = parser.parse_args()
+    if arguments.cell is not None and len(arguments.run_folders) > 1:
+        parser.error("expected one run folder with --cell, got several")
+    for folder in arguments.run_folders:
+        record(folder, arguments.cell)
 
 
-def record(folder: Path) -> None:
+def record(folder: Path, cell: Path | None = None) -> None:
     """The three rows of one road."""
     world = json.loads((folder / "manifest.json").read_text())["config"]["world"]
     about = json.loads((folder / "capture" / "world.json").read_text())["description"]
-    name, command = road_of(world), f"python -m benchmarks.learned_roads {folder}"
+    name = road_of(world)
+    command = f"python -m benchmarks.learned_roads {folder}{f' --cell {cell}' if cell else ''}"
     psnr_db = json.loads((folder / "scene" / "fidelity.json").read_text())["mean"]["psnr_policy_db"]
     record_row(
         f"{name}: held-out driving views, 200x66",
@@ -45,7 +53,8 @@ def record(folder: Path) -> None:
     right, left = about["car"]["control_limits"]
     share = float(np.mean([abs(view["real"] - view["surrogate"]) for view in views])) / (left - right)
     record_row(f"{name}: control on true and learned views, mean difference", 100.0 * share, "% of the range", f"<= {100 * _MOST_SHARE:g} %", share <= _MOST_SHARE, command, f"{len(views)} views")  # fmt: skip
-    drives = without_attack(folder)
+    cell = cell or next(iter(sorted((folder / "cells").glob("*_hardened_none_0.json"))), None)
+    drives = without_attack(cell)
     if drives:
         mean_m, off = float(np.mean([drive[0] for drive in drives])), sum(drive[1] for drive in drives)
         limit_m = mean_cte_limit_m(about["off_track_m"])
@@ -67,13 +76,17 @@ def road_of(world: dict[str, object]) -> str:
     return f"{world['kind']}, {where}".rstrip(", ")
 
 
-def without_attack(folder: Path) -> list[tuple[float, bool]]:
-    """Mean |CTE| [m] of each deployed drive without attack of the hardened victim, and whether it left the track."""
-    kept = next(iter(sorted((folder / "cells" / "shared").glob("*_hardened_none_0_*/drives.json"))), None)
-    if kept is None:
+def without_attack(file: Path | None) -> list[tuple[float, bool]]:
+    """Mean |CTE| [m] of each deployed drive of a cell, and whether it left the track."""
+    cell = read_cell(file) if file is not None else None
+    if cell is None or cell.deployed is None:
         return []
-    found = json.loads(kept.read_text())
-    return list(zip(found["mean_cte_m"], found["off_track"], strict=True))
+    return [
+        (total_m / kept.driven_ticks, off)
+        for total_m, off, kept in zip(
+            cell.deployed.total_cte_m, cell.deployed.off_track, cell.kept["deployed"], strict=True
+        )
+    ]
 
 
 if __name__ == "__main__":

@@ -152,7 +152,8 @@ def test_what_is_only_registered_awaits_its_results_and_what_vanished_does_not(c
     assert "cannot be read" in verify_set(copied).problems[0]
     (copied.parent / DIGESTS).write_text("{}")
     found = verify_set(copied)
-    assert found.problems == () and found.awaits_results
+    assert found.problems == ()
+    assert found.awaits_results
     done = CliRunner().invoke(app, ["verify", "--in", str(copied.parent)])
     assert done.exit_code == 0
     assert "registered, nothing published yet" in done.output
@@ -162,7 +163,8 @@ def test_too_few_searches_for_any_test_leave_the_interval(copied):
     whole = evidence_of(copied)
     few = {name: cell for name, cell in whole.cells.items() if cell.seed < 5}
     (test,) = primary_tests(Evidence(whole.registration, list(few.values())))
-    assert test.p is None and test.p_holm is None
+    assert test.p is None
+    assert test.p_holm is None
     assert test.low_m <= test.difference_m <= test.high_m
 
 
