@@ -82,6 +82,7 @@ class Map:
         self._aim(T_world_from_camera, view)
         sim.objects = [*self._things, *self._panels.values()]
         fine = sim._render_img(*view.size, view.drawn, view.resolved, view.pixels, top_down=False)
+        sim.objects = self._things  # a panel is no thing that a robot runs into
         found = {"rgb": view.mean(fine), "T_world_from_camera": taken_from()}
         if depth:
             found["depth"] = view.depth()

@@ -42,6 +42,7 @@ def panels_are_native(bench: Bench) -> str:
         world.add_panel(_NAME, standing, _texture())
         for view, (before, _) in zip(views, plain, strict=True):
             overlaps.append(_stands_there(bench, standing, view, before))
+        _drives_on(bench, place)
         world.add_panel(_NAME, sunk := _panel(bench, place, 0.0), _texture())
         hidden = _is_hidden_by_the_ground(bench, sunk, place, plain[0][0])
     finally:
@@ -53,6 +54,17 @@ def panels_are_native(bench: Bench) -> str:
         f"{100 * min(overlaps):.0f} % of its outline is where it should be, the right way round, at its depth; {100 * hidden:.0f} % where the ground hides "
         "its lower half"
     )
+
+
+def _drives_on(bench: Bench, place: Pose) -> None:
+    """A car is put down and drives while a panel is in the scene, also after a picture of it."""
+    world, car = bench.world, bench.description.car
+    world.reset(*place)
+    world.step(0.0, car.speed_mps, bench.tick_s)
+    if world.state.speed_mps <= 0.0:
+        raise NotMet(
+            f"expected the car to drive while a panel stands {_AHEAD:g} half lanes ahead of it; it stands still"
+        )
 
 
 def _panel(bench: Bench, place: Pose, height_m: float) -> Panel:
