@@ -11,7 +11,7 @@ from advnerf_core.attack.methods import method_name
 from advnerf_core.scene.gate_limits import GateLimits
 from nodes.experiment.deploy_config import DeployConfig
 from nodes.experiment.method_names import MethodReference
-from nodes.experiment.placed import PANEL, WantedObject
+from nodes.experiment.placed import PANEL, PlacedObject, WantedObject
 from nodes.experiment.robustness_config import RobustnessConfig
 from nodes.experiment.space_config import (
     ColoursConfig,
@@ -136,6 +136,12 @@ class PolicyConfig(_Section):
         default="composed",
         exclude_if=lambda way: way == "composed",
         description="How frames of the deployment scene show panels, as deploy.panels; all deployments share the victim.",
+    )
+    learns_in: tuple[tuple[str, ...], ...] = Field(
+        default=(),
+        exclude_if=lambda places: not places,
+        description="Places that the victim learns in instead of the attacked one and its learned scene: changes of the section world, as --set takes "
+        "them, one list per place. deployed_stills and deployed_drives are then those of each place, and half of them show no object.",
     )
     deployed_stills: Count = Field(default=320, description="Poses about each path in the deployment scene.")
     surrogate_stills: Count = Field(default=240, description="The same in the surrogate.")
@@ -339,6 +345,17 @@ class ExperimentConfig(_Section):
         ):
             raise ValueError(
                 f"expected space.kind colours or places with deploy.world, got {self.space.kind}, which is bound to the world that was captured"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _learns_past_objects_with_a_rule(self) -> ExperimentConfig:
+        policy = self.policy
+        by_hand = [each.name for each in self.objects if isinstance(each, PlacedObject)]
+        if policy.learns_in and (by_hand or not self.objects or policy.own_car):
+            raise ValueError(
+                "expected objects that all stand by a rule (stands), and policy.own_car off, with policy.learns_in; got "
+                f"{', '.join(by_hand) or f'{len(self.objects)} objects'} placed by hand, own_car {policy.own_car}"
             )
         return self
 

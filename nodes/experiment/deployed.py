@@ -22,6 +22,7 @@ from advnerf_core.driving.path import Path
 from advnerf_core.driving.rollout import drive
 from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.geometry import Array, Pinhole, planar_poses
+from advnerf_core.learning.sources import Show
 from advnerf_core.policies.pilotnet import Policy, images_to_tensor
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.surrogate import Frames, Surrogate
@@ -56,6 +57,16 @@ class Dressed(Protocol):
 
     def paint(self, rgb: Rgb, state: Array, theta: Tensor, /) -> NDArray[np.uint8]:
         """A camera image ``[H, W, 3]`` with the attack, from one without it that was seen from the same state ``[3]``."""
+
+
+def seen_in(scene: Dressed) -> Callable[[Array], Show]:
+    """Takes car states ``[B, 3]``, does what does not depend on the attack, and gives what the policy sees of an attack from them."""
+
+    def seen(states: Array) -> Show:
+        frames = scene.prepare(states)
+        return lambda theta: images_to_tensor(scene.policy_images(frames, theta))
+
+    return seen
 
 
 class DressedScene:

@@ -1,9 +1,10 @@
-"""Stage policy: one goal-conditioned network learns all drives, from the deployment scene and the surrogate, by DAgger."""
+"""Stage policy: one goal-conditioned network learns all drives, from the deployment scene and the surrogate or in other places, by DAgger."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,8 @@ from advnerf_core.policies.pilotnet import images_to_tensor, load_policy
 from hardware.worlds.world import World
 from nodes.experiment import capture
 from nodes.experiment.context import Experiment
-from nodes.experiment.deployed import Dressed
+from nodes.experiment.deployed import Dressed, seen_in
+from nodes.experiment.elsewhere import plans_elsewhere
 from nodes.experiment.faces import PaintedScene, face_object, face_space, has_face
 from nodes.experiment.images import as_uint8
 from nodes.experiment.learned_scene import load_background
@@ -64,10 +66,15 @@ def run(experiment: Experiment, folder: Path, report: MeasuringReport) -> None:
         max_steering_rad=experiment.car.largest_control,
     )
     write_placement(experiment, folder)
-    with experiment.open_world() as scene:
+    with ExitStack() as opened:
+        learned_from = (
+            plans_elsewhere(experiment, opened)
+            if config.learns_in
+            else plans(experiment, opened.enter_context(experiment.open_world()))
+        )
         trained = train_policy(
             settings,
-            plans(experiment, scene),
+            learned_from,
             experiment.expert(experiment.config.scenarios[0]),
             experiment.view,
             folder,
@@ -144,10 +151,6 @@ def plans(
     def any_colours(rng: np.random.Generator) -> torch.Tensor:
         return random_theta(shape, sigma, rng)
 
-    def seen_in_scene(states: Array) -> Show:
-        frames = dressed.prepare(states)
-        return lambda theta: images_to_tensor(dressed.policy_images(frames, theta))
-
     def source(domain: str, name: str) -> FrameSource:
         called, drawn = f"{domain}-{name}{ending}", sample or any_colours
         if domain == "surrogate":
@@ -155,7 +158,7 @@ def plans(
         if config.own_car:
             speed_mps, dt_s = experiment.car.speed_mps, experiment.config.dt_s
             return SceneSource(called, scene, experiment.view, speed_mps, dt_s, dressed.paint, drawn)
-        return RenderedSource(called, seen_in_scene, experiment.dynamics, drawn)
+        return RenderedSource(called, seen_in(dressed), experiment.dynamics, drawn)
 
     found = []
     for name in experiment.config.scenarios:
