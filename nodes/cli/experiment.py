@@ -18,6 +18,7 @@ from nodes.runtime.termination import ends_in_order
 if TYPE_CHECKING:
     from advnerf_core.report.transfer import TransferTable
     from nodes.experiment.campaign.config import Campaign
+    from nodes.experiment.campaign.published import PublishedBuild
     from nodes.experiment.campaign.run import Options
     from nodes.experiment.campaign.worker import Ended
     from nodes.experiment.cell import Cell
@@ -409,6 +410,12 @@ def publish(
     prune: Annotated[
         bool, typer.Option("--prune", help="Remove cells there that other settings have made.")
     ] = False,
+    build: Annotated[
+        bool,
+        typer.Option(
+            "--build/--no-build", help="Keep the scenes and victims too, some 20 MB for each place."
+        ),
+    ] = True,
     overrides: Overrides = None,
 ) -> None:
     """Copy the finished cells, and the scenes, victims and objects that they were run with, to where they are kept with the code."""
@@ -428,12 +435,8 @@ def publish(
         if (film := write_film(campaign, to / campaign.name)) is not None:
             print(film)
         print(write_page(to))
-    build = publish_build(campaign, cells, to, prune)
-    for each in build.written:
-        print(each)
-    for each in build.removed:
-        print(f"{each}: removed, as no published cell was run with it")
-    print(f"{build.folder}: {build.size_bytes / 1e6:.1f} MB")
+    if build:
+        _say_build(publish_build(campaign, cells, to, prune))
     unfinished = len(cells) - len(found.written) - len(found.same)
     print(f"{len(found.written)} cells written, {len(found.same)} were there, {unfinished} are not finished")
     if found.stale:
@@ -441,6 +444,14 @@ def publish(
             "are removed" if prune else "stay, until --prune removes them"
         )
         print(f"{len(found.stale)} of those there {what}: {', '.join(found.stale)}")
+
+
+def _say_build(build: PublishedBuild) -> None:
+    for each in build.written:
+        print(each)
+    for each in build.removed:
+        print(f"{each}: removed, as no published cell was run with it")
+    print(f"{build.folder}: {build.size_bytes / 1e6:.1f} MB")
 
 
 def add_to(app: typer.Typer) -> None:

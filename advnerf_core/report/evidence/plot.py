@@ -10,7 +10,7 @@ from advnerf_core.report.evidence.results import Evidence, Row, rows
 from advnerf_core.report.palette import LIGHT
 from advnerf_core.report.plots import new_axes
 
-_MOST_COLUMNS = 12
+_MOST_COLUMNS = 8
 
 
 def excess_plot(evidence: Evidence) -> Figure:

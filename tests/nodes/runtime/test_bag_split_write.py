@@ -255,7 +255,7 @@ def test_memory_does_not_grow_with_the_number_of_parts(tmp_path, minutes):
     command = [sys.executable, "-c", STREAM, str(tmp_path / "bag"), os.getcwd(), str(chunks)]
     result = subprocess.run(command, capture_output=True, text=True, timeout=100, check=True)
     rows = [tuple(map(int, line.split())) for line in result.stdout.splitlines()]
-    assert rows[-1][1] >= 15
+    assert rows[-1][1] >= 10  # a part grows until the one before it is on the disk
     minute = 36  # rows in a minute
     early = np.median([size for size, parts in rows[3 * minute : 4 * minute]])
     late = np.median([size for size, parts in rows[-minute:]])
