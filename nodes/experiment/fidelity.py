@@ -101,6 +101,8 @@ def lacks(experiment: Experiment, cell: Cell, folder: Path, clean: Path) -> str:
             clean_bag(cell, clean)
         except RuntimeFault:
             return "the live drive without attack: run the cell of method none first"
+    elif experiment.config.deploy.car == "own" and not (clean / DRIVES).exists():
+        return "the deployed drives without attack, which show the car: run the cell of method none first (--only method=none)"
     return ""
 
 
@@ -147,9 +149,9 @@ def loop(
 
 
 def _measured_car(experiment: Experiment, clean: Path) -> RespondingCar:
-    """The deployed car as its drives without attack have shown it; an ideal one until there are any."""
+    """The deployed car as its drives without attack have shown it; the search's own where it drives."""
     ideal = experiment.dynamics
-    if not (clean / DRIVES).exists():
+    if experiment.config.deploy.car == "ideal" or not (clean / DRIVES).exists():
         return RespondingCar(ideal, CarResponse(ideal.speed_mps))
     kept = json.loads((clean / DRIVES).read_text(encoding="utf-8"))
     ends = [

@@ -9,7 +9,7 @@ import pytest
 
 from nodes.experiment.campaign.gate import predict_cell
 from nodes.experiment.cell import Cell
-from nodes.experiment.cells import search_cell
+from nodes.experiment.cells import run_cell, search_cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.deployed import DressedScene
 from nodes.experiment.drives import deployed_drives
@@ -20,15 +20,22 @@ WHICH = Cell("right", "hardened", "random", 0)
 KIND = load_kind("experiment")
 
 
+def _quiet(fraction: float, text: str = "") -> None:
+    """Report of a test."""
+
+
 @pytest.fixture(scope="module")
 def searched(trained: Experiment, tmp_path_factory: pytest.TempPathFactory) -> tuple[Experiment, Path]:
-    """A cell's folder with a finished search, nothing deployed; its own copy of the experiment."""
+    """A cell's folder with a finished search, deployed without attack alone; its own copy of the experiment."""
     folder = tmp_path_factory.mktemp("fidelity")
     experiment = replace(trained, folder=shutil.copytree(trained.folder, folder / "run"))
     cell = folder / "cell"
     cell.mkdir()
+    (folder / "none").mkdir()
     assert KIND.lacks(experiment, WHICH, cell) == "its search"
-    search_cell(experiment, WHICH, cell, lambda fraction, text="": None)
+    search_cell(experiment, WHICH, cell, _quiet)
+    assert "method=none" in KIND.lacks(experiment, WHICH, cell)
+    run_cell(experiment, WHICH.clean, folder / "none", _quiet)
     assert KIND.lacks(experiment, WHICH, cell) == ""
     return experiment, cell
 
