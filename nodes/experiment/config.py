@@ -334,6 +334,12 @@ class ExperimentConfig(_Section):
                 raise ValueError(
                     f"expected objects of kind panel alone with {section}.panels native, got {', '.join(others) or 'none'}"
                 )
+        policy = self.policy
+        if policy.panels == "native" and policy.own_car and policy.naive_steps:
+            raise ValueError(
+                "expected policy.naive_steps 0 or policy.own_car off with policy.panels native, got "
+                f"{policy.naive_steps} and on: the world shows what was last put on a panel, so that the naive victim would learn from random textures"
+            )
         if isinstance(self.space, (MeshTextureConfig, MeshShapeConfig)) and len(others) < len(self.objects):
             raise ValueError(f"expected objects with a mesh with space.kind {self.space.kind}, got a panel")
         return self

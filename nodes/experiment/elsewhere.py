@@ -42,12 +42,23 @@ def plans_elsewhere(experiment: Experiment, opened: ExitStack) -> list[SourcePla
     return [
         plan
         for number, changes in enumerate(experiment.config.policy.learns_in)
-        for plan in _plans(*_open(experiment, changes, opened), f"place{number}")
+        for plan in _plans(*place_elsewhere(experiment, changes, opened), f"place{number}")
     ]
 
 
-def _open(experiment: Experiment, changes: Sequence[str], opened: ExitStack) -> tuple[Experiment, World]:
-    """The experiment in another place, and that place, open."""
+def place_elsewhere(
+    experiment: Experiment, changes: Sequence[str], opened: ExitStack
+) -> tuple[Experiment, World]:
+    """The experiment in another place, its objects where their rule puts them there, and that place, open.
+
+    Args:
+        experiment: In the attacked place.
+        changes: Of the section ``world``, as ``--set`` takes them.
+        opened: Closes the world.
+
+    Raises:
+        ConfigError: The place has another car or camera, or no spot for an object.
+    """
     document = Document(copy.deepcopy(experiment.config.world), str(experiment.file))
     apply_overrides(document, changes)
     there = replace(experiment, config=experiment.config.model_copy(update={"world": document.data}))

@@ -122,6 +122,9 @@ def test_a_panel_is_an_object_of_an_experiment(tmp_path: Path) -> None:
     assert "panels" not in dumped["deploy"]
     with pytest.raises(ConfigError, match="objects of kind panel alone"):
         load_experiment(LAUNCH / "junction.experiment.yaml", "demo", ["deploy.panels=native"], tmp_path)
+    naive = [*changes, "policy.panels=native", "policy.own_car=true", "policy.naive_steps=10"]
+    with pytest.raises(ConfigError, match="would learn from random textures"):
+        load_experiment(LAUNCH / "junction.experiment.yaml", "demo", naive, tmp_path)
     mesh = [*changes, "space={kind: mesh_texture}"]
     with pytest.raises(ConfigError, match="objects with a mesh"):
         load_experiment(LAUNCH / "junction.experiment.yaml", "demo", mesh, tmp_path)
