@@ -39,6 +39,7 @@ def experiment_in(folder: Path, *changes: str) -> Experiment:
             "deployed_drives": 3,
             "drive_steps": 2,
             "driven_m": None,
+            "naive_steps": 0,
         },
         "settings": {"tiny": {}},
     }
@@ -64,7 +65,7 @@ def test_each_place_is_seen_bare_and_with_the_panel_in_random_colours(
         ("place0-round-bare", 2, 1), ("place0-round", 3, 2), ("place1-round-bare", 2, 1), ("place1-round", 3, 2)
     ]  # fmt: skip
     rng = np.random.default_rng(0)
-    looks = [plan.source.look(_along(plan.expert, 12), rng) for plan in plans]
+    looks = [plan.source.look(_along(plan.expert, 8), rng) for plan in plans]
     for seed, bare in ((2, looks[0]), (3, looks[2])):
         assert not bare.textured.any()
         with FlatWorld(FlatConfig(seed=seed)) as there:

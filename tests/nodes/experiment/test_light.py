@@ -27,6 +27,7 @@ CHANGES = [
     "deploy.through=world",
     "object.panel_resolution=8",
     "object.panel_light=measured",
+    "policy.naive_steps=0",
     "policy.panels=native",
 ]
 
@@ -96,7 +97,7 @@ def test_light_needs_a_panel_and_a_world_that_takes_it(tmp_path: Path) -> None:
         measure_light(junction, world)
     with LabWorld() as world, pytest.raises(ConfigError, match="hidden, turned away or too small"):
         measure_light(load("room", *CHANGES, f"objects=[{BOARD.replace('2.8, scale', '0.3, scale')}]"), world)
-    plain = load("room", *CHANGES[:3], "policy.panels=native", f"objects=[{BOARD}]")
+    plain = load("room", *CHANGES[:3], *CHANGES[4:], f"objects=[{BOARD}]")
     measured = load("room", *CHANGES, f"objects=[{BOARD}]")
     assert "panel_light" not in plain.config.model_dump(mode="json")["object"]
     assert stages_of(plain)[0].settings != stages_of(measured)[0].settings
