@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).parents[2]
 RECORDED = ROOT / "tests" / "nodes" / "experiment" / "versions.json"
-_TINY = (
+TINY = (
     "capture.photos=12", "capture.colour_pairs=2", "capture.held_out=3", "scene.steps=12", "scene.log2_entries=12",
     "policy.deployed_stills=12", "policy.surrogate_stills=8", "policy.deployed_drives=1", "policy.surrogate_drives=2",
     "policy.drive_steps=3", "policy.first_steps=6", "policy.round_steps=3", "policy.naive_steps=0",
@@ -81,7 +81,7 @@ def tiny_experiment(folder: Path) -> Experiment:
     """
     from nodes.experiment.run import load_experiment
 
-    return load_experiment(ROOT / "launch" / "room.experiment.yaml", "demo", _TINY, folder)
+    return load_experiment(ROOT / "launch" / "room.experiment.yaml", "demo", TINY, folder)
 
 
 def main() -> None:
