@@ -102,11 +102,16 @@ def run_campaign(
         )
         return []
     _require_positive(options)
+    if options.search_only:
+        wanted = _searching(wanted, say)
     if options.here:
         return _run_here(store, wanted, experiments, options, say, ProgressDisplay(console, watcher))
     jobs, threads = _shares(options)
     if options.search_only:
-        return _search(wanted, jobs, threads, options, say)
+        say(f"{len(wanted)} cells to search, {_at_a_time(jobs, threads)}")
+        return _run_beside(
+            [replace(each.job, threads=threads, phase="search") for each in wanted], jobs, options, say
+        )
     say(f"{len(wanted)} of {len(cells)} cells to run, {_at_a_time(jobs, threads)}")
     beside = [replace(each.job, threads=threads) for each in wanted if not each.live]
     beside += [
@@ -150,18 +155,16 @@ def _run_here(
     return ended
 
 
-def _search(wanted: Sequence[Planned], jobs: int, threads: int, options: Options, say: Say) -> list[Ended]:
-    """Only the searches of cells; what has none apart from its drives waits."""
-    found = [replace(each.job, threads=threads, phase="search") for each in wanted if each.searches]
+def _searching(wanted: Sequence[Planned], say: Say) -> list[Planned]:
+    """Those whose search can be run without their drives; the others wait."""
     kinds = sorted({each.job.kind for each in wanted if not each.searches})
-    if not found:
-        raise ConfigError(
-            f"expected cells whose search can be run alone, got kinds {', '.join(kinds)}; run them without --search-only"
-        )
-    for kind in kinds:
-        say(f"cells of kind {kind} search and drive in one and are left out")
-    say(f"{len(found)} cells to search, {_at_a_time(jobs, threads)}")
-    return _run_beside(found, jobs, options, say)
+    if found := [each for each in wanted if each.searches]:
+        for kind in kinds:
+            say(f"cells of kind {kind} search and drive in one and are left out")
+        return found
+    raise ConfigError(
+        f"expected cells whose search can be run alone, got kinds {', '.join(kinds)}; run them without --search-only"
+    )
 
 
 def _at_a_time(jobs: int, threads: int) -> str:

@@ -27,7 +27,7 @@ HEAD = "seeds: [0]\nmethods: [gradient, none]\nvictims: [hardened]\n"
 
 def run(bench, **options):
     campaign, said = load_campaign(bench.file), []
-    return run_campaign(campaign, campaign.cells, Options(jobs=2, **options), said.append), said
+    return run_campaign(campaign, campaign.cells, Options(here=True, **options), said.append), said
 
 
 def times_judged(bench):

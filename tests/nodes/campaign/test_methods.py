@@ -49,7 +49,7 @@ def searching(here):
 
 def run(bench, **options):
     campaign, said = load_campaign(bench.file), []
-    return run_campaign(campaign, campaign.cells, Options(jobs=2, **options), said.append), said
+    return run_campaign(campaign, campaign.cells, Options(**options), said.append), said
 
 
 def states(bench):
@@ -67,7 +67,7 @@ def test_a_method_of_a_file_runs_in_worker_processes_and_appears_in_the_table(
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     monkeypatch.chdir(elsewhere)  # references are relative to the campaign file
-    ended, _ = run(searching)
+    ended, _ = run(searching, jobs=2)
     assert {end.how for end in ended} == {"done"}
     assert f"begin straight_hardened_{searching.folder / 'spiral.py'}:Spiral_1" in searching.calls
     result = json.loads((searching.cells / f"{names[2]}.json").read_text())
@@ -82,21 +82,21 @@ def test_a_method_of_a_file_runs_in_worker_processes_and_appears_in_the_table(
 
 def test_its_cells_run_again_when_its_code_changes_and_no_others(searching):
     searching.write("seeds: [1]\nmethods: [spiral.py:Spiral, none]\nvictims: [hardened]\n")
-    run(searching)
+    run(searching, here=True)
     (searching.folder / "spiral.py").write_text(
         spiral_code().replace("growth: float = 0.2", "growth: float = 0.4")
     )
     assert [name for name, state in states(searching).items() if state != "done"] == [
         "straight_hardened_Spiral_1"
     ]
-    ended, _ = run(searching)
+    ended, _ = run(searching, here=True)
     assert [(end.name, end.how) for end in ended] == [("straight_hardened_Spiral_1", "done")]
 
 
 def test_a_broken_method_fails_alone_and_in_one_line(searching):
     searching.write("seeds: [1]\nmethods: [spiral.py:Spiral, none]\nvictims: [hardened]\n")
     (searching.folder / "spiral.py").write_text("turns = 1 / 0\n")
-    ended, _ = run(searching)
+    ended, _ = run(searching, here=True)
     how = {end.name: (end.how, end.text) for end in ended}
     state, text = how.pop("straight_hardened_Spiral_1")
     assert state == "failed"
@@ -110,7 +110,7 @@ def test_a_method_of_an_installed_package_runs_in_worker_processes(here, monkeyp
     here.kind = "toy_cells.py:Searching"
     install_method(here.folder, monkeypatch, spiral_code())
     here.write("seeds: [0]\nmethods: [spiral]\nvictims: [hardened]\n")
-    ended, _ = run(here)
+    ended, _ = run(here, jobs=1)
     assert [(end.name, end.how) for end in ended] == [("straight_hardened_spiral_0", "done")]
 
 

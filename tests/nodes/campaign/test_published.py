@@ -115,7 +115,7 @@ def test_a_published_cell_whose_key_matches_is_done_on_any_machine(here, tmp_pat
         (folder / "stage.json").write_text(json.dumps(record))
     campaign = load_campaign(here.file)
     cells = select(campaign.cells, "seed=0")
-    assert [end.how for end in run_campaign(campaign, cells, Options(jobs=2), lambda text: None)] == [
+    assert [end.how for end in run_campaign(campaign, cells, Options(here=True), lambda text: None)] == [
         "done",
         "done",
     ]
@@ -131,7 +131,7 @@ def test_a_published_cell_whose_key_matches_is_done_on_any_machine(here, tmp_pat
     (attacked,) = [row for row in rows if (row["method"], row["domain"]) == ("gradient", "deployed")]
     assert float(attacked["ratio"]) == 3.0
     assert not (here.folder / "table").exists()  # the page of all cells of this file
-    assert run_campaign(campaign, cells, Options(jobs=2), lambda text: None) == []
+    assert run_campaign(campaign, cells, Options(here=True), lambda text: None) == []
     assert {each.text for each in statuses(campaign, cells)} == {
         f"from {file.relative_to(tmp_path)}"
         for file in (kept / "toy" / first.name, kept / "toy" / second.name)
@@ -141,7 +141,7 @@ def test_a_published_cell_whose_key_matches_is_done_on_any_machine(here, tmp_pat
     (here.folder / "toy.experiment.yaml").write_text("base: 2.0\nother: 1\n")
     assert [each.state for each in statuses(campaign, cells)] == ["missing", "missing"]
     (here.folder / "toy.experiment.yaml").write_text("base: 2.0\n")
-    ended = run_campaign(campaign, cells, Options(jobs=2), lambda text: None)
+    ended = run_campaign(campaign, cells, Options(here=True), lambda text: None)
     assert [end.name for end in ended] == [second.stem]
 
 

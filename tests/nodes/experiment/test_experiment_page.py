@@ -23,7 +23,6 @@ from nodes.runtime.errors import BusError
 from tests.support.experiment_page import CELLS, record_of, search_so_far, state_of
 from tests.support.stage_versions import TINY, tiny_experiment
 
-pytestmark = pytest.mark.live
 OTHER_PATHS = [
     "/../secret.png",
     "/report/../../secret.png",
@@ -189,6 +188,7 @@ def test_a_taken_port_is_one_error_before_anything_is_run(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.live
 def test_clients_that_never_read_do_not_reach_the_experiment(served):
     folder, record, port = served
     film = folder / "cells" / RANDOM / "clip.mp4"
