@@ -1,7 +1,9 @@
 """Is the learned copy of a foreign road good enough, and does the victim drive well there? ``python -m benchmarks.learned_roads RUN_FOLDER...``.
 
 Reads run folders of experiments in worlds of other people: held-out views of the driving camera at the policy's size, the policy's control on
-true and learned views, and the deployed drives without attack of the hardened victim, judged by the limit that registrations fix.
+true and learned views, and the deployed drives without attack of the hardened victim, judged by the limit that registrations fix. A road
+of which there are photographs and a scene alone (``advnerf experiment ... --until bake``) is looked at by the victim of another run folder,
+with ``--victim-of``.
 """
 
 from __future__ import annotations
@@ -14,8 +16,11 @@ import numpy as np
 
 from advnerf_core.driving.metrics import drives as drives_well
 from advnerf_core.driving.metrics import mean_cte_limit_m
+from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.report.cells import read_cell
 from benchmarks.results import record_row
+from nodes.experiment.context import Experiment
+from nodes.experiment.policy import HARDENED, agreement, victim_file
 
 _LEAST_DB, _MOST_SHARE = 25.0, 0.02
 
@@ -27,19 +32,20 @@ def main() -> None:
     parser.add_argument(
         "--cell", type=Path, help="cell without attack, of one run folder whose drives lie elsewhere"
     )
+    parser.add_argument("--victim-of", type=Path, help="run folder with the victim, where there is none")
     arguments = parser.parse_args()
     if arguments.cell is not None and len(arguments.run_folders) > 1:
         parser.error("expected one run folder with --cell, got several")
     for folder in arguments.run_folders:
-        record(folder, arguments.cell)
+        record(folder, arguments.cell, arguments.victim_of)
 
 
-def record(folder: Path, cell: Path | None = None) -> None:
-    """The three rows of one road."""
-    world = json.loads((folder / "manifest.json").read_text())["config"]["world"]
+def record(folder: Path, cell: Path | None = None, victim_of: Path | None = None) -> None:
+    """The rows of one road: three, or without drives two."""
+    experiment = Experiment.resolved_in(folder)
     about = json.loads((folder / "capture" / "world.json").read_text())["description"]
-    name = road_of(world)
-    command = f"python -m benchmarks.learned_roads {folder}{f' --cell {cell}' if cell else ''}"
+    name = road_of(experiment.config.world)
+    command = f"python -m benchmarks.learned_roads {folder}{f' --cell {cell}' if cell else ''}{f' --victim-of {victim_of}' if victim_of else ''}"
     psnr_db = json.loads((folder / "scene" / "fidelity.json").read_text())["mean"]["psnr_policy_db"]
     record_row(
         f"{name}: held-out driving views, 200x66",
@@ -49,7 +55,11 @@ def record(folder: Path, cell: Path | None = None) -> None:
         psnr_db >= _LEAST_DB,
         command,
     )
-    views = json.loads((folder / "policy" / "policy.json").read_text())["on_held_out_views"]
+    if victim_of is None:
+        views = json.loads((folder / "policy" / "policy.json").read_text())["on_held_out_views"]
+    else:
+        victim = victim_file(Experiment.resolved_in(victim_of), HARDENED)
+        views = agreement(experiment, load_policy(victim).policy)
     right, left = about["car"]["control_limits"]
     share = float(np.mean([abs(view["real"] - view["surrogate"]) for view in views])) / (left - right)
     record_row(f"{name}: control on true and learned views, mean difference", 100.0 * share, "% of the range", f"<= {100 * _MOST_SHARE:g} %", share <= _MOST_SHARE, command, f"{len(views)} views")  # fmt: skip

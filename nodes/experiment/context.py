@@ -50,6 +50,13 @@ class Experiment(RunFolder[ExperimentConfig]):
 
     kept: Mapping[str, str] = field(default_factory=dict)
 
+    @classmethod
+    def resolved_in(cls, folder: FilePath) -> Experiment:
+        """The experiment that a run folder is of, as its manifest resolved it."""
+        manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+        config = ExperimentConfig.model_validate(manifest["config"])
+        return cls(config, FilePath(manifest["file"]), folder, manifest["setting"])
+
     @cached_property
     def named_world(self) -> NamedWorld:
         """The world as the file names it, with its changes."""

@@ -20,7 +20,6 @@ from advnerf_core.memory import RETURNS_WHAT_IS_FREED, peak_mib, restart_peak
 from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.report.data import MemoryRow
 from nodes.experiment.attack import attack_problem
-from nodes.experiment.config import ExperimentConfig
 from nodes.experiment.context import Experiment
 from nodes.experiment.faces import face_space
 from nodes.experiment.policy import HARDENED, victim_file
@@ -63,9 +62,7 @@ def peak_above_idle_mib(experiment: Experiment, ticks: int) -> float:
 def main() -> None:
     """Measure one horizon of a run folder."""
     folder, ticks = Path(sys.argv[1]), int(sys.argv[2])
-    manifest = json.loads((folder / "manifest.json").read_text())
-    config = ExperimentConfig.model_validate(manifest["config"])
-    print(peak_above_idle_mib(Experiment(config, Path(manifest["file"]), folder, manifest["setting"]), ticks))
+    print(peak_above_idle_mib(Experiment.resolved_in(folder), ticks))
 
 
 if __name__ == "__main__":

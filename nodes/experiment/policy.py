@@ -22,7 +22,7 @@ from advnerf_core.files import write_atomically
 from advnerf_core.geometry import planar_pose
 from advnerf_core.learning.imitation import ImitationConfig, Learned, Progress, SourcePlan, train_policy
 from advnerf_core.learning.sources import FrameSource, RenderedSource, SceneSource, Show
-from advnerf_core.policies.pilotnet import images_to_tensor, load_policy
+from advnerf_core.policies.pilotnet import Policy, images_to_tensor, load_policy
 from hardware.worlds.world import World
 from nodes.experiment import capture
 from nodes.experiment.context import Experiment
@@ -258,10 +258,15 @@ def _seen_face(experiment: Experiment) -> tuple[FaceSpace, Callable[[Array], Sho
     return space, seen
 
 
-def agreement(experiment: Experiment) -> list[dict[str, float]]:
-    """Control of the hardened victim on each held-out view and on the surrogate's image of it, told to follow the first path."""
+def agreement(experiment: Experiment, policy: Policy | None = None) -> list[dict[str, float]]:
+    """Control of a policy on each held-out view and on the surrogate's image of it, told to follow the first path.
+
+    Args:
+        experiment: With photographs and a scene.
+        policy: By default the experiment's hardened victim.
+    """
     views = load_transforms(experiment.stage_folder("capture") / capture.HELD_OUT / "transforms.json")
-    policy = load_policy(victim_file(experiment, HARDENED)).policy
+    policy = policy or load_policy(victim_file(experiment, HARDENED)).policy
     surrogate = surrogate_of(experiment, [])
     goal = torch.tensor([experiment.goal(experiment.config.scenarios[0])], dtype=torch.float32)
     rows = []
