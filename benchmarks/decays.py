@@ -1,0 +1,97 @@
+"""Which fall of the learning rate makes the sharper scene? ``python -m benchmarks.decays SCENE... [--steps N]``.
+
+Trains the preset ``minutes`` for equally many steps with each fall and compares held-out photographs, every eighth. A scene is a folder with
+``transforms.json`` and Instant-NGP's box (``../shared/data/fox``), or a run folder, of which the photographs and the world's box are taken.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+from statistics import mean
+
+from advnerf_core.data.dataset import ImageSet, PosedImages, load_transforms
+from advnerf_core.scene.field import SceneFieldConfig
+from advnerf_core.scene.metrics import psnr
+from advnerf_core.scene.presets import PHOTOGRAPH_BANDS, scene_preset
+from advnerf_core.scene.render_field import FieldRenderer
+from advnerf_core.scene.train import TrainConfig, train_scene
+from advnerf_core.scene.train_config import DECAYS
+from benchmarks.results import record_row
+from nodes.experiment import capture
+from nodes.experiment.context import Experiment
+from nodes.experiment.scene import field_config
+
+_EVERY, _MOST_HELD_OUT = 8, 12
+_NEAR = 0.3  # in the unit of a transforms.json; run folders have their own
+
+
+def main() -> None:
+    """Train each scene with each fall, and record the gain over the exponential one."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scenes", nargs="+", type=Path)
+    parser.add_argument("--steps", type=int, default=1000)
+    parser.add_argument("--width", type=int, default=320, help="photographs are brought to this width")
+    arguments = parser.parse_args()
+    for folder in arguments.scenes:
+        name, photographs, field, near = _scene(folder)
+        training, held_out = (_loaded(part, arguments.width) for part in photographs.split(_EVERY))
+        found = {}
+        for decay in DECAYS:
+            config = replace(
+                scene_preset("minutes").train_config(steps=arguments.steps), near_m=near, decay=decay
+            )
+            if field.contraction:
+                config = replace(config, opacity=0.0)
+            found[decay] = _held_out_db(training, held_out, field, config)
+            print(f"{name}, {decay}: {found[decay]:.2f} dB", flush=True)
+        gain_db = found["cosine"] - found["exponential"]
+        record_row(
+            f"{name}: cosine against exponential fall of the learning rate, held-out PSNR",
+            gain_db,
+            "dB",
+            "printed",
+            None,
+            f"python -m benchmarks.decays {folder} --steps {arguments.steps}",
+            f"{found['cosine']:.2f} against {found['exponential']:.2f} dB, {len(training.rgb)} photographs at {arguments.width} pixels' width",
+        )
+
+
+def _scene(folder: Path) -> tuple[str, PosedImages, SceneFieldConfig, float]:
+    """Name, photographs, field and nearest distance of what is learned."""
+    preset = scene_preset("minutes")
+    if (folder / "manifest.json").exists():
+        experiment = Experiment.resolved_in(folder.resolve())
+        name = json.loads((folder / "manifest.json").read_text())["config"]["name"]
+        field = field_config(experiment)
+        field = replace(field, grid=preset.grid_for(field.contraction), direction_bands=PHOTOGRAPH_BANDS)
+        photographs = load_transforms(experiment.stage_folder("capture") / capture.PHOTOS)
+        return name, photographs, field, experiment.config.scene.near_m
+    listed = load_transforms(folder).sorted_by_name()
+    low, high = (tuple(map(float, corner)) for corner in listed.box())
+    field = SceneFieldConfig(low, high, preset.grid_for(False), direction_bands=PHOTOGRAPH_BANDS)  # type: ignore[arg-type]
+    return folder.name, listed, field, _NEAR
+
+
+def _loaded(listed: PosedImages, width: int) -> ImageSet:
+    whole = listed.frames[0]
+    height = round(width * whole.pinhole.height / whole.pinhole.width)
+    return listed.load((width, height))
+
+
+def _held_out_db(
+    training: ImageSet, held_out: ImageSet, field: SceneFieldConfig, config: TrainConfig
+) -> float:
+    trained = train_scene(training, field, config)
+    renderer = FieldRenderer(trained.scene, trained.occupied, trained.march, least_transmittance=1e-3)
+    views = zip(held_out.rgb, held_out.T_world_from_camera, held_out.pinholes, strict=True)
+    return mean(
+        psnr(renderer.render(pose[None], pinhole)[0][0].numpy(), real / 255.0)
+        for real, pose, pinhole in list(views)[:_MOST_HELD_OUT]
+    )
+
+
+if __name__ == "__main__":
+    main()
