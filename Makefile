@@ -7,7 +7,7 @@ export MUJOCO_GL ?= egl
 export PYTHONDONTWRITEBYTECODE :=
 DEFAULT_TESTS := not slow and not gpu and not hardware and not data and not browser and not ros2
 
-.PHONY: help setup demo experiment evidence test test-slow test-gpu test-hardware test-browser setup-ros2 test-ros2 check bench bench-quick campaign rooms api docs fmt clean
+.PHONY: help setup demo experiment evidence world test test-slow test-gpu test-hardware test-browser setup-ros2 test-ros2 check bench bench-quick campaign rooms api docs fmt clean
 
 help:  ## Show this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -35,6 +35,14 @@ evidence: setup  ## The registered experiment, six searches x five live starts (
 	@$(BIN)/advnerf experiment launch/room.experiment.yaml --setting evidence --run-folder runs/evidence --only victim=hardened
 	@$(BIN)/advnerf publish launch/room.experiment.yaml --setting evidence --run-folder runs/evidence --only victim=hardened
 	@$(BIN)/advnerf verify
+
+NAME ?= metadrive
+CHANGES ?=
+world: setup  ## A simulator of other people, from its installation to its table: make world NAME=duckietown (under an hour on 2 cores)
+	@began=$$(date +%s) && \
+	$(BIN)/advnerf world install $(NAME) && \
+	$(BIN)/advnerf experiment launch/$(NAME).experiment.yaml --setting panel --run-folder runs/$(NAME) $(CHANGES) && \
+	$(BIN)/python -m benchmarks.learned_roads runs/$(NAME) --wall-s $$(( $$(date +%s) - began ))
 
 test: setup  ## The default tests (about five minutes on 2 cores)
 	@# Tests that measure time or start nodes run one after the other and mostly wait. Those that compute use what that leaves of the
