@@ -14,6 +14,7 @@ from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem, adjoint_gradient
 from advnerf_core.driving.rollout import Rollout
+from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.scene.surrogate import Frames, Surrogate
 from benchmarks.attack_toy import toy_problem
 from benchmarks.results import record_row
@@ -47,6 +48,7 @@ def backpropagated_gradient(problem: AttackProblem, theta: Tensor, rollout: Roll
 
 def _differentiable_images(frames: Frames, theta: Tensor) -> Tensor:
     (seen,), (W,), (pixels,) = frames.seen, frames.weights, frames.pixels
+    assert isinstance(seen.field, VoxelGridObject)
     colours = seen.field.colours(theta)[torch.from_numpy(seen.rows)]
     flat = frames.background.reshape(-1, 3)
     flat = flat.index_add(0, pixels, torch.as_tensor(W.toarray(), dtype=theta.dtype) @ colours)

@@ -159,10 +159,10 @@ def compare(repeats: int, trial: bool, horizons: tuple[int, int, int] = (60, 200
             f"{way}, T = {steps}: {found[way, steps]['mib']:.1f} MiB, {found[way, steps]['seconds']:.2f} s",
             flush=True,
         )
-    ours, cached, plain, steps = (found[way, middle] for way in WAYS)
+    ours, cached, plain, stepwise = (found[way, middle] for way in WAYS)
     grown = found["adjoint", long]["mib"] / found["adjoint", short]["mib"]
-    share, more = ours["mib"] / plain["mib"], cached["mib"] / steps["mib"]
-    faster = steps["seconds"] / cached["seconds"]
+    share, more = ours["mib"] / plain["mib"], cached["mib"] / stepwise["mib"]
+    faster = stepwise["seconds"] / cached["seconds"]
     above = found["cached", long]["mib"] - found["adjoint", long]["mib"]
     least = found["adjoint", short]["mib"]
     per_tick_kib = 1024.0 * (found["adjoint", long]["mib"] - least) / (long - short)
@@ -189,7 +189,7 @@ def compare(repeats: int, trial: bool, horizons: tuple[int, int, int] = (60, 200
             "x",
             "> 1 x",
             faster > 1.0,
-            f"{CACHE_MIB} MiB cache: {cached['seconds']:.2f} against {steps['seconds']:.2f} s at {more:.2f} x memory",
+            f"{CACHE_MIB} MiB cache: {cached['seconds']:.2f} against {stepwise['seconds']:.2f} s at {more:.2f} x memory",
         ),
         (
             "against one checkpoint per step, T = 200, memory",

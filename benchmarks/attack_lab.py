@@ -10,7 +10,7 @@ import torch
 
 from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.driving.dynamics import Ackermann
-from advnerf_core.fields.voxel_grid import VoxelGridObject
+from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.surrogate import Surrogate
@@ -19,9 +19,7 @@ from calibration.schema import CameraCalibration, RoomCalibration, VehicleCalibr
 SPEED_MPS, PERIOD_S = 0.8, 0.1
 
 
-def lab_problem(
-    folder: Path, objects: Sequence[VoxelGridObject], steps: int, **options: Any
-) -> AttackProblem:
+def lab_problem(folder: Path, objects: Sequence[ColouredObject], steps: int, **options: Any) -> AttackProblem:
     """One start pose, the nominal one; ``options`` go to the problem.
 
     Args:

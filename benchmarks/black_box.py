@@ -22,7 +22,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -47,7 +47,8 @@ from benchmarks.results import record_row
 from calibration.schema import RoomCalibration, load_calibration
 
 LINE = "black box"
-METHODS = ("distilled", "guided", "evolution", "cem", "random")
+MethodName = Literal["distilled", "guided", "evolution", "cem", "random"]
+METHODS: tuple[MethodName, ...] = get_args(MethodName)
 MARKS = (1, 2, 5, 10, 20, 50)
 TARGET_SHARE, TARGET_MULTIPLE = 0.6, 50
 ITERATIONS, STARTS = 50, 3
@@ -113,7 +114,7 @@ class Search:
 
 
 def runner(
-    name: str, problem: AttackProblem, calls: int, lessons: Distillation
+    name: MethodName, problem: AttackProblem, calls: int, lessons: Distillation
 ) -> tuple[int, int, Callable[..., Any]]:
     """First calls, calls of a step, and the search of a method within a budget of calls."""
     each = calls_per_evaluation(problem)
@@ -276,10 +277,10 @@ def _piece(options: argparse.Namespace) -> tuple[bool, dict[str, Any]]:
     searches = [Search(name, options.out, calls_per_evaluation(problem)) for name in METHODS]
     lessons = Distillation(warm_pairs=24) if options.trial else Distillation()
     finished = True
-    for search in searches:
-        if search.name not in options.methods:
+    for name, search in zip(METHODS, searches, strict=True):
+        if name not in options.methods:
             continue
-        first, step, go = runner(search.name, problem, round(options.multiple * white_calls), lessons)
+        first, step, go = runner(name, problem, round(options.multiple * white_calls), lessons)
         try:
             go(state_path=search.state_path, on_evaluation=search.listen(first, step, end_s))
         except OutOfTimeError:

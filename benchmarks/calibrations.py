@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from datetime import date
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -80,7 +81,7 @@ def measure_camera_to_car(lab: Lab, seed: int) -> tuple[float, float, int]:
     rng, detector = np.random.default_rng(seed), BoardDetector(BOARD)
     pinhole, truth = lab.camera_pinhole, lab.config.camera.T_car_from_camera
     lens = LensCalibration(
-        date="2026-11-21",
+        date=date(2026, 11, 21),
         method="twin",
         width=pinhole.width,
         height=pinhole.height,
@@ -175,11 +176,13 @@ def measure_time_offset(lab: Lab, seed: int) -> float:
         yaw = float(np.sum(amplitude * np.sin(rate * t + phase)))
         return -1.1 + slip * math.sin(0.7 * t), -2.0 + slip * math.sin(1.3 * t), yaw
 
-    frame_s, pose_s = np.arange(1.0, 21.0, 0.1), np.arange(0.0, 22.0, 0.01)
+    frame_s, pose_s = np.arange(1.0, 21.0, 0.1), np.arange(0.0, 22.0, 0.01, np.float64)
     camera = twin_calibrations(lab.config)["camera"]
     assert isinstance(camera, CameraCalibration)
-    frames = ((t + OFFSET_S, noisy_image(lab.observe_at(*car_at(t), depth=False)[0], rng)) for t in frame_s)
-    yaw = np.array([car_at(t)[2] for t in pose_s]) + rng.normal(0.0, MOCAP_RAD, len(pose_s))
+    frames = (
+        (t + OFFSET_S, noisy_image(lab.observe_at(*car_at(t), depth=False)[0], rng)) for t in frame_s.tolist()
+    )
+    yaw = np.array([car_at(t)[2] for t in pose_s.tolist()]) + rng.normal(0.0, MOCAP_RAD, len(pose_s))
     fit = fit_offset(image_turns(frames, camera), pose_s, yaw)
     error = abs(fit.camera_minus_mocap_s - OFFSET_S)
     print(

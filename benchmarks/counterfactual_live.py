@@ -21,7 +21,7 @@ from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.live import LiveRun, drive_live
 from nodes.experiment.run import load_experiment
-from nodes.lab.trials.series import COUNTED_STOPS
+from nodes.lab.trials.trial import counts
 
 CELL = Cell("track", "hardened", "gradient", 0)
 
@@ -36,7 +36,7 @@ def drive(experiment: Experiment, folder: Path, compare: bool) -> dict[str, Any]
     drive_live(experiment, live, folder)
     measured: dict[str, Any] = json.loads((folder / f"{live.name}.json").read_text(encoding="utf-8"))
     stopped = measured["outcome"]["stopped_early"]
-    if stopped and not any(word in stopped for word in COUNTED_STOPS):
+    if not counts(stopped, measured["metrics"]["off_track"]):
         raise SystemExit(f"the stack stopped the drive: {stopped}; run it again on idle cores")
     return measured
 

@@ -156,8 +156,8 @@ def wrong_type(domain: int, seconds: float, rng: random.Random) -> None:
     """The name of the command topic with other types."""
     dds, pose = Dds(domain), pose_message(planar_pose(rng.random(), 0.0, 0.0), time.time_ns())
     for message in (drive_message(0.5, -0.2, time.time_ns()), pose):
-        cdr = encode(message)
-        flood([dds.writer(COMMANDS, type_name(message))], lambda cdr=cdr: [cdr], seconds / 2, 0.002)
+        messages = [encode(message)]
+        flood([dds.writer(COMMANDS, type_name(message))], messages.copy, seconds / 2, 0.002)
 
 
 def wrong_bytes(domain: int, seconds: float, rng: random.Random) -> None:

@@ -92,6 +92,8 @@ def fox(folder: Path, data: Path, step: int, ten_cameras: bool) -> Found:
     folder.mkdir(parents=True)
     for index, frame in enumerate(frames[::step][: 10 if ten_cameras else 11]):
         image = cv2.imread(str(frame.path))
+        if image is None:
+            raise OSError(f"expected a photograph in {frame.path}, got a file that OpenCV cannot read")
         height, width = image.shape[:2]
         kept = rng.uniform(0.75, 1.0) if ten_cameras else 1.0
         size = (300 + 35 * index, round((300 + 35 * index) * height / width)) if ten_cameras else FOX_SIZE

@@ -14,6 +14,7 @@ import argparse
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from statistics import median
 
@@ -89,9 +90,7 @@ def main() -> None:
     problem = lab_problem(arguments.folder, [ball], arguments.steps, time_batch=16, cache_bytes=2**40)
     theta = problem.sensor.initial_theta(torch.Generator().manual_seed(0))
     adjoint_gradient(replace(problem, steps=2), theta)
-    seconds = in_turns(
-        {way: lambda way=way: one_pass(problem, theta, way) for way in WAYS}, arguments.repeats
-    )
+    seconds = in_turns({way: partial(one_pass, problem, theta, way) for way in WAYS}, arguments.repeats)
     frame_ms = {way: 1e3 * taken / arguments.steps for way, taken in seconds.items()}
     stepwise, rendering = (frame_ms[way] / frame_ms["batched"] for way in WAYS[1:])
     print("\n".join(f"{way}: {taken:.2f} ms a frame" for way, taken in frame_ms.items()))

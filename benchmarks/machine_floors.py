@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numba import njit
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from advnerf_core.parallel import run_slots, set_thread_count, slot_bounds, thread_count
 
 Array32 = NDArray[np.float32]
+Measured = TypeVar("Measured")
 
 LINE_BYTES = 64
 _LINE_FLOATS = 16
@@ -78,7 +79,7 @@ def _multiply_add(x: Array32, a: np.float32, b: np.float32, rounds: int) -> None
 
 
 @njit(**_OPTIONS)
-def _gather(table: Array32, rows: NDArray[np.uint32], first: int, stop: int) -> float:
+def _gather(table: Array32, rows: NDArray[np.uint32], first: int, stop: int) -> np.float32:
     """Sum of one value of each of the lines ``rows[first:stop]``; four sums, so that adding is not what is measured."""
     s0, s1, s2, s3 = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
     for n in range(first, stop - 3, 4):
@@ -156,7 +157,7 @@ def measure(table_sizes: tuple[int, ...], megabytes: int, repeats: int) -> Floor
     return Floors(stream_bps(megabytes, repeats), multiply_adds(repeats), lines)
 
 
-def of_one_thread(work: Callable[[], float]) -> float:
+def of_one_thread(work: Callable[[], Measured]) -> Measured:
     """The same with one thread."""
     before = thread_count()
     set_thread_count(1)

@@ -61,7 +61,8 @@ def without_leaps(field: VoxelGridObject) -> VoxelGridObject:
 
 def frame_rate(folder: Path, model: ObjectModel, frames: int, repeats: int) -> tuple[float, float, float]:
     """Frames a second with five objects, dB of their difference from exhaustive sampling, frames a second of that."""
-    problem = lab_problem(folder, crowd(model, 5), frames)
+    five = crowd(model, 5)
+    problem = lab_problem(folder, five, frames)
     scene = problem.sensor
     assert isinstance(scene, Surrogate)
     scene_file = folder / "scene" / "scene.safetensors"
@@ -71,7 +72,7 @@ def frame_rate(folder: Path, model: ObjectModel, frames: int, repeats: int) -> t
         renderer,
         scene.camera,
         scene.T_car_from_camera,
-        [without_leaps(field) for field in scene.objects],
+        [without_leaps(field) for field in five],
         supersample=4,
     )
     x_m = np.linspace(-1.1, -0.4, frames)

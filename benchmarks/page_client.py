@@ -13,6 +13,7 @@ from typing import Any
 
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
+from websockets.typing import Origin
 
 
 def request(
@@ -73,7 +74,7 @@ class Browser:
         self._stack = contextlib.ExitStack()
         opening = connect(
             f"{'wss' if tls else 'ws'}://127.0.0.1:{port}/live",
-            origin=f"{scheme}://127.0.0.1:{port}" if origin is None else origin,
+            origin=Origin(f"{scheme}://127.0.0.1:{port}" if origin is None else origin),
             additional_headers=headers,
             ssl=context,
             compression=None,

@@ -18,6 +18,7 @@ from typing import Any
 
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
+from websockets.typing import Origin
 
 from benchmarks.operator import LiveOperator
 from benchmarks.page_browser import door_of, live_page
@@ -142,7 +143,7 @@ def _pester(port: int, cookie: str, seed: int) -> int:
         try:
             with connect(
                 f"wss://127.0.0.1:{port}/live",
-                origin=f"https://127.0.0.1:{port}",
+                origin=Origin(f"https://127.0.0.1:{port}"),
                 additional_headers={"Cookie": cookie},
                 ssl=unchecked(),
                 compression=None,

@@ -100,11 +100,11 @@ def make_scene(folder: Path, frames: int, steps: int) -> tuple[Path, str]:
     )
     placing, model = imported.report["placing"], imported.report["structure_from_motion"]
     listed = load_transforms(data / "transforms_phone.json")
-    low, high = (tuple(float(v) for v in corner) for corner in listed.box())
+    low, high = ((float(x), float(y), float(z)) for x, y, z in listed.box())
     trained = train_scene(
         listed.load(TRAINING_SIZE),
         SceneFieldConfig(low, high),
-        TrainConfig(steps=steps, seed=0),  # type: ignore[arg-type]
+        TrainConfig(steps=steps, seed=0),
         folder / "checkpoint.safetensors",
         lambda at: say(at.fraction, f"step {at.step}, {at.psnr_db:.1f} dB on training rays"),
     )

@@ -140,9 +140,9 @@ def _common() -> list[str]:
     return [f"params.vicon_port={port}", f"params.calibration={_CALIBRATION}"]
 
 
-def _say(share: float, text: str) -> None:
-    if share in (0.0, 1.0) or round(1000 * share) % 100 == 0:
-        print(f"{100 * share:.0f} % {text}", flush=True)
+def _say(fraction: float, text: str = "") -> None:
+    if fraction in (0.0, 1.0) or round(1000 * fraction) % 100 == 0:
+        print(f"{100 * fraction:.0f} % {text}", flush=True)
 
 
 if __name__ == "__main__":

@@ -40,8 +40,7 @@ COMMAND = "python -m benchmarks.pose_jumps"
 CALIBRATION = REPOSITORY / "calibration" / "twin"
 COUNT, HOURS, CHUNK_H = 1000, 10.0, 0.5
 SMALLEST_M, LARGEST_M = 0.05, 2.4
-NOISE = {"noise_m": 5e-4, "noise_rad": 1e-3}
-NETWORK = {"loss": 0.002, "duplication": 0.002, "reordering": 0.001}
+MOCAP = ViconEmulatorConfig(noise_m=5e-4, noise_rad=1e-3, loss=0.002, duplication=0.002, reordering=0.001)
 HELD_UP_EVERY_S, HELD_UP_S = 10.0, 0.08
 HIDDEN_EVERY_S, HIDDEN_S = 20.0, 0.09
 STEP_S = 0.01
@@ -60,7 +59,7 @@ class SimulatedDrive:
 
     def __init__(self, seed: int) -> None:
         self.rng = np.random.default_rng([seed, 7])
-        self.frames = ViconFrames(ViconEmulatorConfig(seed=seed, **NOISE, **NETWORK))
+        self.frames = ViconFrames(MOCAP.model_copy(update={"seed": seed}))
         calibration = load_calibration(VehicleCalibration, CALIBRATION / "vehicle.yaml")
         self._gains, self._limiter = calibration.vehicle_gains, DriveLimiter(calibration.drive_limits)
         self._tracker = SubjectTracker(ViconConfig(("car",)))

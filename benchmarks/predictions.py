@@ -70,7 +70,9 @@ def record(name: str, found: list[ScoredCell], command: str, afterwards: bool) -
         float(np.mean([getattr(each, which) for each in found])) for which in ("score", "trivial_score")
     )
     note = f"{len(found)} attacks, {drives} deployed drives of the set {name}"
-    which, held, better = name, _HOLD[0] <= share <= _HOLD[1], ours < trivial
+    which = name
+    held: bool | None = _HOLD[0] <= share <= _HOLD[1]
+    better: bool | None = ours < trivial
     if afterwards:
         which, held, better = f"{name}, predicted afterwards", None, None
         note += "; the predictor reads no attacked drive, but these were made after them"

@@ -192,9 +192,9 @@ def _rules(
 
 
 def _field(low: Array, high: Array, bands: int, learned_background: bool = True) -> SceneFieldConfig:
-    corners = [(float(c[0]), float(c[1]), float(c[2])) for c in (low, high)]
+    low_m, high_m = ((float(x), float(y), float(z)) for x, y, z in (low, high))
     grid = HashGridConfig(levels=8, features=4, finest=2048)
-    return SceneFieldConfig(*corners, grid, direction_bands=bands, learned_background=learned_background)
+    return SceneFieldConfig(low_m, high_m, grid, direction_bands=bands, learned_background=learned_background)
 
 
 def _some(images: ImageSet, chosen: Array) -> ImageSet:

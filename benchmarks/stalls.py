@@ -29,7 +29,9 @@ def stall(count: int) -> tuple[list[tuple[str, float, str]], list[str]]:
     A drive that another check stops before the stall is noticed, such as a late command on a busy machine, says nothing about stalls
     and is repeated.
     """
-    moments, found, others = random.Random(SEED), [], []
+    moments = random.Random(SEED)
+    found: list[tuple[str, float, str]] = []
+    others: list[str] = []
     with tempfile.TemporaryDirectory(prefix="advnerf-") as folder:
         graph = Graph(Path(folder), SETTINGS)
         try:

@@ -88,12 +88,12 @@ def main() -> None:
 _last_s = 0.0
 
 
-def say(share: float, text: str) -> None:
+def say(fraction: float, text: str = "") -> None:
     """A line now and then."""
     global _last_s
     if time.monotonic() - _last_s > 10.0:
         _last_s = time.monotonic()
-        print(f"{100 * share:3.0f} %  {text}", flush=True)
+        print(f"{100 * fraction:3.0f} %  {text}", flush=True)
 
 
 if __name__ == "__main__":

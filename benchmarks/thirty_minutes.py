@@ -105,7 +105,8 @@ class Stops:
 
 def live(graph: Graph, duration_s: float, pauses: HostPauses) -> tuple[list[dict[str, Any]], Stops]:
     """Drive for so long; the samples, and the stops after which a person armed again."""
-    numbers, stops, samples = Numbers(graph.folder), Stops(), []
+    numbers, stops = Numbers(graph.folder), Stops()
+    samples: list[dict[str, Any]] = []
     try:
         graph.operator.bus.subscribe("/status/recorder")
         graph.ready()

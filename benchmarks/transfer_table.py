@@ -10,6 +10,7 @@ import argparse
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypedDict
 
 import numpy as np
 
@@ -109,7 +110,14 @@ def build_text(cells: Sequence[CellResult]) -> str:
     )
 
 
-def measured_where(cells: Sequence[CellResult]) -> dict[str, str]:
+class MeasuredWhere(TypedDict):
+    """What a row of the ledger says about its machines and its day."""
+
+    machine: str
+    date: str
+
+
+def measured_where(cells: Sequence[CellResult]) -> MeasuredWhere:
     """Machines and the last day of some cells, for the ledger."""
     return {
         "machine": "; ".join(sorted({cell.machine for cell in cells})),
