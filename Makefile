@@ -38,9 +38,11 @@ evidence: setup  ## The registered experiment, six searches x five live starts (
 
 NAME ?= metadrive
 CHANGES ?=
+# --yes, where no terminal asks whether the licence is accepted.
+CONSENT ?=
 world: setup  ## A simulator of other people, from its installation to its table: make world NAME=duckietown (under an hour on 2 cores)
 	@began=$$(date +%s) && \
-	$(BIN)/advnerf world install $(NAME) && \
+	$(BIN)/advnerf world install $(NAME) $(CONSENT) && \
 	$(BIN)/advnerf experiment launch/$(NAME).experiment.yaml --setting panel --run-folder runs/$(NAME) $(CHANGES) && \
 	$(BIN)/python -m benchmarks.learned_roads runs/$(NAME) --wall-s $$(( $$(date +%s) - began ))
 

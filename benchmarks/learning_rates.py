@@ -24,7 +24,7 @@ from nodes.experiment import capture
 from nodes.experiment.context import Experiment
 from nodes.experiment.scene import field_config
 
-WAYS = (("exponential", 0.01), ("exponential", 0.02), ("cosine", 0.01), ("cosine", 0.02), ("cosine", 0.03))
+WAYS = (("exponential", 0.01), ("cosine", 0.01), ("cosine", 0.02), ("cosine", 0.03))
 _EVERY, _MOST_HELD_OUT = 8, 12
 _NEAR = 0.3  # in the unit of a transforms.json; run folders have their own
 
