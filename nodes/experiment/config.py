@@ -72,11 +72,16 @@ class SceneConfig(_Section):
         default=None,
         description="Sample intervals in pixels of the policy's view; none: the default of pixel_intervals.",
     )
-    # Both are left out where they change nothing, so that keys of scenes without them do not depend on them.
+    # These are left out where they change nothing, so that keys of scenes without them do not depend on them.
     decay: Literal["exponential", "cosine"] = Field(
         default="exponential",
         exclude_if=lambda decay: decay == "exponential",
         description="How the learning rate falls; cosine stays high for longer.",
+    )
+    learning_rate: PositiveNumber = Field(
+        default=0.01,
+        exclude_if=lambda rate: rate == 0.01,
+        description="Learning rate at the start; with decay cosine 0.02 makes sharper scenes.",
     )
     exposure: bool = Field(
         default=False,

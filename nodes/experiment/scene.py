@@ -46,6 +46,7 @@ def run(experiment: Experiment, folder: Path, report: MeasuringReport) -> None:
         refine_depth=config.refine_depth,
         occupancy_resolution=config.occupancy,
         decay=config.decay,
+        learning_rate=config.learning_rate,
         exposure=config.exposure,
     )
     checkpoint = folder / "checkpoint.safetensors"

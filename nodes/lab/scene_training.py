@@ -22,7 +22,7 @@ from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.field import SceneFieldConfig, save_scene
 from advnerf_core.scene.intervals import pixel_intervals
 from advnerf_core.scene.metrics import gain_fitted, psnr, ssim
-from advnerf_core.scene.presets import PHOTOGRAPH_BANDS
+from advnerf_core.scene.presets import FAST, PHOTOGRAPH_BANDS
 from advnerf_core.scene.presets import PRESETS as SCENE_PRESETS
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.train import Progress, TrainConfig, train_scene
@@ -281,7 +281,8 @@ def _train_config(request: TrainingRequest, field: SceneFieldConfig, march: Marc
             opacity=0.0 if is_open else TrainConfig.opacity,
             exposure=request.exposure,
         )
-    return TrainConfig(
+    return replace(
+        FAST,
         steps=request.steps or _NO_TIME_LIMIT_STEPS,
         seed=request.seed,
         checkpoint_every_s=request.checkpoint_every_s,

@@ -103,8 +103,9 @@ def test_a_stage_depends_on_its_own_settings_and_on_no_others(tmp_path):
     assert changed("attack.evaluations=7") == changed("space.cells=4") == changed("deploy.starts=2") == set()
     assert changed("attack.random_sigma=4") == {"policy"}
     assert changed("scene.exposure=true") == changed("scene.decay=cosine") == {"scene"}
+    assert changed("scene.learning_rate=0.02") == {"scene"}
     assert changed("scene.exposure=false") == changed("scene.decay=exponential") == set()
-    assert not {"exposure", "decay"} & room(tmp_path).config.scene.model_dump().keys()
+    assert not {"exposure", "decay", "learning_rate"} & room(tmp_path).config.scene.model_dump().keys()
     # What the panel shows without an attack is photographed and learned from.
     assert changed("space.plain_rgb=[0.5, 0.5, 0.5]") == {"capture", "policy"}
 
