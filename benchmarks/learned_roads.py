@@ -40,8 +40,26 @@ def main() -> None:
     for folder in arguments.run_folders:
         name = record(folder, arguments.cell, arguments.victim_of)
         if arguments.wall_s is not None:
-            minutes = arguments.wall_s / 60.0
-            record_row(f"{name}: from its installation to its table, setting panel", minutes, "min", f"<= {_MOST_MIN:g} min", minutes <= _MOST_MIN, f"make world NAME={name.partition(',')[0]}", "2 searches, 20 starts")  # fmt: skip
+            _record_time(folder, name, arguments.wall_s / 60.0)
+
+
+def _record_time(folder: Path, name: str, minutes: float) -> None:
+    """The row of `make world`."""
+    experiment = Experiment.resolved_in(folder)
+    world, measured = experiment.config.world, experiment.config.measure
+    road = world.get("road", {})
+    changes = " ".join(f"--set world.road.{key}={road[key]}" for key in ("blocks", "seed") if key in road)
+    command = f"make world NAME={world['kind']}" + (f' CHANGES="{changes}"' if changes else "")
+    note = f"{len(experiment.config.attack.methods)} searches, {measured.starts} starts"
+    record_row(
+        f"{name}: from its installation to its table, setting {experiment.setting}",
+        minutes,
+        "min",
+        f"<= {_MOST_MIN:g} min",
+        minutes <= _MOST_MIN,
+        command,
+        note,
+    )
 
 
 def record(folder: Path, cell: Path | None = None, victim_of: Path | None = None) -> str:
