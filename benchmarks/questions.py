@@ -34,6 +34,7 @@ QUESTIONS = (
             "gradient_pass",
             "baked_scene",
             "floors",
+            "seeds_together",
             "closed_loop_cosine",
             "mesh_render",
             "black_box",
@@ -46,6 +47,7 @@ QUESTIONS = (
         "Held-out photographs, poses found from them, objects learned from meshes, and the speed of training.",
         (
             "fox",
+            "learning_rates",
             "hydrant",
             "objects",
             "object_pictures",
@@ -133,7 +135,7 @@ QUESTIONS = (
         "other_worlds",
         "What is left of an attack in another world?",
         "Attacks on a panel that the world's own renderer shows, driven by the world's own car, and how well that was predicted.",
-        ("gap", "predictions", "learned_roads"),
+        ("gap", "predictions", "learned_roads", "unseen_roads", "make world"),
     ),
     Question(
         "nothing_is_lost",
