@@ -249,6 +249,7 @@ writer.close()
 """
 
 
+@pytest.mark.live  # what waits for the disk counts as memory, so that nothing else may keep the writer from it
 @pytest.mark.parametrize("minutes", [8, pytest.param(30, marks=pytest.mark.slow)])
 def test_memory_does_not_grow_with_the_number_of_parts(tmp_path, minutes):
     chunks = minutes * 60 * 60
