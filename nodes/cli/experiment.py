@@ -7,6 +7,7 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -100,7 +101,7 @@ def experiment(
             "--jobs",
             min=1,
             help="Cells at a time, each in a process of its own.",
-            show_default="one after another in this process; of a campaign one per core",
+            show_default="one per core; with one seed, one after another in this process",
         ),
     ] = None,
     threads: Annotated[
@@ -187,6 +188,9 @@ def _run_one(
 
     with ends_in_order():
         loaded = load_experiment(file, setting, overrides, folder)
+        if options.here and len(loaded.config.attack.seeds) > 1:
+            # Searches with one core each are faster than one after another on all: `python -m benchmarks.seeds_together`.
+            options = replace(options, here=False)
 
         def run(record: ProgressRecord | None) -> list[Ended]:
             return run_experiment(loaded, until, options, only, overrides, anew=anew, record=record)
