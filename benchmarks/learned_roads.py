@@ -77,14 +77,16 @@ def record(folder: Path, cell: Path | None = None, victim_of: Path | None = None
         psnr_db >= _LEAST_DB,
         command,
     )
+    whose = ""
     if victim_of is None:
         views = json.loads((folder / "policy" / "policy.json").read_text())["on_held_out_views"]
     else:
-        victim = victim_file(Experiment.resolved_in(victim_of), HARDENED)
+        other = Experiment.resolved_in(victim_of)
+        victim, whose = victim_file(other, HARDENED), f"; by the victim of {road_of(other.config.world)}"
         views = agreement(experiment, load_policy(victim).policy)
     right, left = about["car"]["control_limits"]
     share = float(np.mean([abs(view["real"] - view["surrogate"]) for view in views])) / (left - right)
-    record_row(f"{name}: control on true and learned views, mean difference", 100.0 * share, "% of the range", f"<= {100 * _MOST_SHARE:g} %", share <= _MOST_SHARE, command, f"{len(views)} views")  # fmt: skip
+    record_row(f"{name}: control on true and learned views, mean difference", 100.0 * share, "% of the range", f"<= {100 * _MOST_SHARE:g} %", share <= _MOST_SHARE, command, f"{len(views)} views{whose}")  # fmt: skip
     cell = cell or next(iter(sorted((folder / "cells").glob("*_hardened_none_0.json"))), None)
     drives = without_attack(cell)
     if drives:
