@@ -51,6 +51,7 @@ test: setup  ## The default tests (about five minutes on 2 cores)
 	@# processors and nothing else: the kernel gives an idle-class process no time that another one wants.
 	@OMP_NUM_THREADS=1 chrt --idle 0 $(BIN)/pytest -q -n auto --maxprocesses 4 --dist worksteal -p no:cacheprovider \
 		-m '$(DEFAULT_TESTS) and not live' >$(VENV)/computing-tests.log 2>&1 & computing=$$!; \
+	trap "kill $$computing; exit 130" INT TERM; \
 	$(BIN)/pytest -q -m '$(DEFAULT_TESTS) and live'; live=$$?; \
 	echo "waiting for the tests that compute ($(VENV)/computing-tests.log)"; \
 	wait $$computing; computing=$$?; cat $(VENV)/computing-tests.log; \
