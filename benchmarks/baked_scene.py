@@ -34,7 +34,6 @@ from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.scene.bake import bake
 from advnerf_core.scene.surrogate import BackgroundRenderer
 from benchmarks.results import REPOSITORY, record_row
-from benchmarks.ticks import run_of
 from nodes.experiment import bake as bake_stage
 from nodes.experiment.attack import attack_problem, search_settings
 from nodes.experiment.context import Experiment
@@ -255,7 +254,7 @@ def main() -> None:
     )
     options = parser.parse_args()
     os.environ.setdefault("MUJOCO_GL", "egl")
-    experiment = run_of(options.run)
+    experiment = Experiment.resolved_in(options.run.resolve())
     backgrounds: Backgrounds = {"field": load_field(experiment), "baked": load_background(experiment)}
     if options.pairs:
         pairs(experiment, backgrounds)

@@ -10,11 +10,11 @@ import os
 from pathlib import Path
 
 from benchmarks.results import record_row
-from benchmarks.ticks import run_of
 
 
 def main() -> None:
     os.environ.setdefault("MUJOCO_GL", "egl")
+    from nodes.experiment.context import Experiment
     from nodes.experiment.hardening import TRAINED_ON, hardness, margin_m
     from nodes.experiment.policy import HARDENED
 
@@ -22,7 +22,7 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--textures", type=int, default=12)
     options = parser.parse_args()
-    experiment = run_of(options.run)
+    experiment = Experiment.resolved_in(options.run.resolve())
     limit_m = margin_m(experiment)
     for found in hardness(experiment, HARDENED, options.textures):
         test, role = found.test, "trained on" if found.family == TRAINED_ON else "validates"

@@ -38,21 +38,21 @@ def main() -> None:
     if arguments.cell is not None and len(arguments.run_folders) > 1:
         parser.error("expected one run folder with --cell, got several")
     for folder in arguments.run_folders:
-        name = record(folder, arguments.cell, arguments.victim_of)
+        experiment = Experiment.resolved_in(folder)
+        record(experiment, arguments.cell, arguments.victim_of)
         if arguments.wall_s is not None:
-            _record_time(folder, name, arguments.wall_s / 60.0)
+            _record_time(experiment, arguments.wall_s / 60.0)
 
 
-def _record_time(folder: Path, name: str, minutes: float) -> None:
+def _record_time(experiment: Experiment, minutes: float) -> None:
     """The row of `make world`."""
-    experiment = Experiment.resolved_in(folder)
     world, measured = experiment.config.world, experiment.config.measure
     road = world.get("road", {})
     changes = " ".join(f"--set world.road.{key}={road[key]}" for key in ("blocks", "seed") if key in road)
     command = f"make world NAME={world['kind']}" + (f' CHANGES="{changes}"' if changes else "")
     note = f"{len(experiment.config.attack.methods)} searches, {measured.starts} starts"
     record_row(
-        f"{name}: from its installation to its table, setting {experiment.setting}",
+        f"{road_of(world)}: from its installation to its table, setting {experiment.setting}",
         minutes,
         "min",
         f"<= {_MOST_MIN:g} min",
@@ -62,9 +62,9 @@ def _record_time(folder: Path, name: str, minutes: float) -> None:
     )
 
 
-def record(folder: Path, cell: Path | None = None, victim_of: Path | None = None) -> str:
-    """The rows of one road, three, or without drives two; its name."""
-    experiment = Experiment.resolved_in(folder)
+def record(experiment: Experiment, cell: Path | None = None, victim_of: Path | None = None) -> None:
+    """The rows of one road: three, or without drives two."""
+    folder = experiment.folder
     about = json.loads((folder / "capture" / "world.json").read_text())["description"]
     name = road_of(experiment.config.world)
     command = f"python -m benchmarks.learned_roads {folder}{f' --cell {cell}' if cell else ''}{f' --victim-of {victim_of}' if victim_of else ''}"
@@ -97,7 +97,6 @@ def record(folder: Path, cell: Path | None = None, victim_of: Path | None = None
     print(
         f"{name}: {psnr_db:.1f} dB, control {100 * share:.2f} % of its range, {len(drives)} drives without attack"
     )
-    return name
 
 
 def road_of(world: dict[str, object]) -> str:

@@ -8,17 +8,14 @@ world's box are taken.
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import replace
 from pathlib import Path
-from statistics import mean
 
 from advnerf_core.data.dataset import ImageSet, PosedImages, load_transforms
 from advnerf_core.scene.field import SceneFieldConfig
-from advnerf_core.scene.metrics import psnr
 from advnerf_core.scene.presets import PHOTOGRAPH_BANDS, scene_preset
-from advnerf_core.scene.render_field import FieldRenderer
-from advnerf_core.scene.train import TrainConfig, train_scene
+from advnerf_core.scene.train import train_scene
+from benchmarks.exposure import compare
 from benchmarks.results import record_row
 from nodes.experiment import capture
 from nodes.experiment.context import Experiment
@@ -38,7 +35,9 @@ def main() -> None:
     arguments = parser.parse_args()
     for folder in arguments.scenes:
         name, photographs, field, near = _scene(folder)
-        training, held_out = (_loaded(part, arguments.width) for part in photographs.split(_EVERY))
+        learned, kept = photographs.split(_EVERY)
+        kept = replace(kept, frames=kept.frames[:_MOST_HELD_OUT])
+        training, held_out = (_loaded(part, arguments.width) for part in (learned, kept))
         found = {}
         for decay, rate in WAYS:
             config = replace(
@@ -49,7 +48,7 @@ def main() -> None:
             )
             if field.contraction:
                 config = replace(config, opacity=0.0)
-            found[decay, rate] = _held_out_db(training, held_out, field, config)
+            found[decay, rate], _ = compare(train_scene(training, field, config), held_out)
             print(f"{name}, {decay} from {rate:g}: {found[decay, rate]:.2f} dB", flush=True)
         chosen = scene_preset("minutes").training
         gain_db = found[chosen.decay, chosen.learning_rate] - found[WAYS[0]]
@@ -70,14 +69,13 @@ def _scene(folder: Path) -> tuple[str, PosedImages, SceneFieldConfig, float]:
     preset = scene_preset("minutes")
     if (folder / "manifest.json").exists():
         experiment = Experiment.resolved_in(folder.resolve())
-        name = json.loads((folder / "manifest.json").read_text())["config"]["name"]
         field = field_config(experiment)
         field = replace(field, grid=preset.grid_for(field.contraction), direction_bands=PHOTOGRAPH_BANDS)
         photographs = load_transforms(experiment.stage_folder("capture") / capture.PHOTOS)
-        return name, photographs, field, experiment.config.scene.near_m
+        return experiment.config.name, photographs, field, experiment.config.scene.near_m
     listed = load_transforms(folder).sorted_by_name()
-    low, high = (tuple(map(float, corner)) for corner in listed.box())
-    field = SceneFieldConfig(low, high, preset.grid_for(False), direction_bands=PHOTOGRAPH_BANDS)  # type: ignore[arg-type]
+    low, high = ((float(x), float(y), float(z)) for x, y, z in listed.box())
+    field = SceneFieldConfig(low, high, preset.grid_for(False), direction_bands=PHOTOGRAPH_BANDS)
     return folder.name, listed, field, _NEAR
 
 
@@ -85,18 +83,6 @@ def _loaded(listed: PosedImages, width: int) -> ImageSet:
     whole = listed.frames[0]
     height = round(width * whole.pinhole.height / whole.pinhole.width)
     return listed.load((width, height))
-
-
-def _held_out_db(
-    training: ImageSet, held_out: ImageSet, field: SceneFieldConfig, config: TrainConfig
-) -> float:
-    trained = train_scene(training, field, config)
-    renderer = FieldRenderer(trained.scene, trained.occupied, trained.march, least_transmittance=1e-3)
-    views = zip(held_out.rgb, held_out.T_world_from_camera, held_out.pinholes, strict=True)
-    return mean(
-        psnr(renderer.render(pose[None], pinhole)[0][0].numpy(), real / 255.0)
-        for real, pose, pinhole in list(views)[:_MOST_HELD_OUT]
-    )
 
 
 if __name__ == "__main__":

@@ -34,7 +34,7 @@ from nodes.experiment.policy import HARDENED, victim_file
 STEPS, OBJECTS = 40, (1, 5)
 
 
-def run_of(folder: Path) -> Experiment:
+def _run_of(folder: Path) -> Experiment:
     """The experiment of a run folder, as it was run."""
     manifest = json.loads((folder / "manifest.json").read_text())
     config = ExperimentConfig.model_validate(manifest["config"])
@@ -50,7 +50,7 @@ def hydrants(count: int) -> list[VoxelGridObject]:
 
 def measured(folder: Path, repeats: int = 5) -> dict[str, float]:
     """Milliseconds of a tick with one object and with five (scene, objects and policy, 200 x 66), and of an iteration on the face."""
-    experiment = run_of(folder)
+    experiment = _run_of(folder)
     scenario, background = experiment.config.scenarios[0], load_background(experiment)
     path, loaded = experiment.paths[scenario], load_policy(victim_file(experiment, HARDENED))
     states = np.array([path.pose_at(float(s)) for s in np.linspace(0.0, 3.0, 30)])

@@ -101,7 +101,7 @@ def experiment(
             "--jobs",
             min=1,
             help="Cells at a time, each in a process of its own.",
-            show_default="one per core; with one seed, one after another in this process",
+            show_default="one per core; of an experiment with one seed, one after another in this process",
         ),
     ] = None,
     threads: Annotated[
