@@ -373,7 +373,7 @@ def predict(
     setting: Setting = "demo",
     folder: Folder = None,
     only: Only = "",
-    draws: Annotated[int, typer.Option("--draws", min=2, help="Drives per prediction.")] = 6,
+    draws: Annotated[int, typer.Option("--draws", min=9, help="Drives per prediction.")] = 20,
     overrides: Overrides = None,
 ) -> None:
     """Predict how the attacks transfer from pictures without a deployed drive with them; the table then says how good that was."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from advnerf_core.attack.transfer import TransferPrediction, predict_transfer
+from advnerf_core.attack.transfer import DEFAULT_DRAWS, TransferPrediction, predict_transfer
 from advnerf_core.files import write_atomically
 from advnerf_core.scene.fidelity import Agreement, Effect, Pictures, Verdict, agreement, judge
 from advnerf_core.scene.gate_limits import GateLimits
@@ -97,7 +97,7 @@ def predict_cell(
     experiment: Any,
     cell: Cell,
     folder: Path,
-    draws: int = 6,
+    draws: int = DEFAULT_DRAWS,
     clean: CleanDrive | None = None,
 ) -> tuple[TransferPrediction, CleanDrive]:
     """Predict the deployed drives of a cell whose search is finished, from pictures and the surrogate alone.

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from advnerf_core.attack.transfer import DEFAULT_DRAWS
 from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import CellResult
 from advnerf_core.report.conditions import CONTROLS
@@ -25,7 +26,7 @@ _KEYS = {"ratio", "ratio_low", "ratio_high", "retained", "total_cte_m", "clean_d
 
 
 def predict_campaign(
-    campaign: Campaign, cells: Sequence[Cell], say: Callable[[str], None], draws: int = 6
+    campaign: Campaign, cells: Sequence[Cell], say: Callable[[str], None], draws: int = DEFAULT_DRAWS
 ) -> int:
     """Predict every attacked cell that has been searched and is not predicted yet; returns how many were.
 

@@ -56,53 +56,64 @@ def driven(turn):
 @pytest.mark.parametrize("share", [1.0, 0.5, 0.0])
 def test_without_disagreement_it_is_the_drive_with_that_share_of_the_effect(share):
     clean, effect = views(np.zeros(16), np.full(16, TURN), np.full(16, share * TURN))
-    found = predict_transfer(problem(), images, clean, effect, START, HORIZON, draws=3)
-    assert found.attacked_m == pytest.approx([driven(share * TURN)] * 3)
+    found = predict_transfer(problem(), images, clean, effect, START, HORIZON, draws=9)
+    assert found.attacked_m == pytest.approx([driven(share * TURN)] * 9)
     assert found.retained == pytest.approx(share)
 
 
 def test_a_constant_disagreement_moves_the_clean_drive_by_its_size():
     # Learned pictures say 0.2 more than real ones, so the deployed car steers 0.2 less.
     clean, effect = views(np.full(16, 0.2), np.full(16, TURN), np.full(16, TURN))
-    found = predict_transfer(problem(), images, clean, effect, START, HORIZON, draws=2)
-    assert found.none_m == pytest.approx([driven(-0.2)] * 2)
-    assert found.attacked_m == pytest.approx([driven(TURN - 0.2)] * 2)
+    found = predict_transfer(problem(), images, clean, effect, START, HORIZON, draws=9)
+    assert found.none_m == pytest.approx([driven(-0.2)] * 9)
+    assert found.attacked_m == pytest.approx([driven(TURN - 0.2)] * 9)
     assert found.ratio == pytest.approx(driven(TURN - 0.2) / driven(-0.2))
 
 
 def test_draws_differ_by_what_was_measured_and_repeat_with_the_seed():
     noise = np.random.default_rng(0).normal(0.0, 0.3, 40)
     clean, effect = views(noise, np.full(40, TURN), np.full(40, TURN) + noise)
-    first = predict_transfer(problem(), images, clean, effect, START, HORIZON, draws=8, seed=3)
-    again = predict_transfer(problem(), images, clean, effect, START, HORIZON, draws=8, seed=3)
+    first = predict_transfer(problem(), images, clean, effect, START, HORIZON, draws=12, seed=3)
+    again = predict_transfer(problem(), images, clean, effect, START, HORIZON, draws=12, seed=3)
     assert first == again
-    assert len(set(first.attacked_m)) == 8
+    assert len(set(first.attacked_m)) == 12
     low, high = first.ratio_band
     assert low < first.ratio < high
     assert set(first.record()) >= {"ratio", "ratio_low", "ratio_high", "retained", "draws"}
     other = Effect(effect.learned, 0.5 * effect.real)
-    alone = predict_transfer(problem(), images, clean, other, START, HORIZON, draws=8, seed=3)
+    alone = predict_transfer(problem(), images, clean, other, START, HORIZON, draws=12, seed=3)
     assert alone.none_m == first.none_m != alone.attacked_m  # the drive without attack knows nothing of it
     assert (
         predict_transfer(
-            problem(), images, clean, other, START, HORIZON, draws=8, seed=3, none_m=first.none_m
+            problem(), images, clean, other, START, HORIZON, draws=12, seed=3, none_m=first.none_m
         )
         == alone
     )
-    with pytest.raises(ValueError, match="two draws"):
-        predict_transfer(problem(), images, clean, effect, START, HORIZON, draws=1)
+    with pytest.raises(ValueError, match="at least 9 draws"):
+        predict_transfer(problem(), images, clean, effect, START, HORIZON, draws=8)
 
 
 def test_the_fence_stops_a_car_as_the_protocol_does():
     clean, effect = views(np.zeros(16), np.full(16, TURN), np.full(16, TURN))
     fenced = AttackProblem(Reads(), Nothing(), Dubins(1.0, 0.1), PATH, START, 20, fence_m=1.0, held_cap_m=0.1)
-    found = predict_transfer(fenced, images, clean, effect, START, HORIZON, draws=2)
+    found = predict_transfer(fenced, images, clean, effect, START, HORIZON, draws=9)
     assert found.attacked_m[0] < driven(TURN)
 
 
 def test_the_excess_per_tick_is_that_of_each_draw_over_its_own_without_attack():
-    found = TransferPrediction((4.0, 6.0, 8.0), (2.0, 2.0, 3.0), 1.0, 20)
+    none_m = (2.0, 2.0, 3.0) * 3
+    found = TransferPrediction((4.0, 6.0, 8.0) * 3, none_m, 1.0, 20)
     low, mean, high = found.excess_m_per_tick
-    assert mean == pytest.approx((0.1 + 0.2 + 0.25) / 3)
-    assert (low, high) == pytest.approx(tuple(np.quantile([0.1, 0.2, 0.25], (0.1, 0.9))))
+    assert (low, mean, high) == pytest.approx((0.1, (0.1 + 0.2 + 0.25) / 3, 0.25))
     assert found.record()["excess_m"] == mean
+
+
+@pytest.mark.parametrize("draws", [9, 20])
+@pytest.mark.parametrize("kind", ["normal", "exponential"])
+def test_bands_hold_the_next_drive_in_80_percent_of_cases(draws, kind):
+    values = getattr(np.random.default_rng(0), kind)(size=(4000, draws + 1))
+    bands = np.array(
+        [TransferPrediction(tuple(each), (0.0,) * draws, 1.0, 1).excess_m_per_tick for each in values[:, 1:]]
+    )
+    held = np.mean((bands[:, 0] <= values[:, 0]) & (values[:, 0] <= bands[:, 2]))
+    assert held == pytest.approx(0.8, abs=0.025)  # four standard deviations

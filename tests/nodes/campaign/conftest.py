@@ -36,7 +36,7 @@ class Toy(CellKind):
         return {"capture": {}, "policy": {}}
 
     def run(self, experiment, cell, folder, report):
-        _note(folder, f"begin {cell.name} {os.environ['OMP_NUM_THREADS']}")
+        _note(folder, f"begin {cell.name} {os.environ.get('OMP_NUM_THREADS')}")
         if (folder.parent.parent / "fail").exists() and cell.method == "cem":
             raise RuntimeError("the search came to nothing")
         done = folder / "half"

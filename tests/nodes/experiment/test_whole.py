@@ -96,6 +96,6 @@ def test_a_cell_of_another_seed_is_searched_and_driven_live_once(tmp_path):
     kind, folder = load_kind("experiment"), tmp_path / "cells" / "one"
     assert kind.lacks(experiment, replace(asked[1], seed=2), tmp_path / "cells" / "two") == "its search"
     assert kind.lacks(experiment, asked[1], folder) == ""
-    found, clean = predict_cell(kind, experiment, asked[1], folder, draws=2)
+    found, clean = predict_cell(kind, experiment, asked[1], folder, draws=9)
     assert found.ratio > 0.0
     assert clean.agreement.summary()["views"] >= 10
