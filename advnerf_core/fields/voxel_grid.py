@@ -41,8 +41,9 @@ class VoxelGridObject:
         box_max: Opposite corner, ``[3]``.
         T_world_from_object: Rigid pose ``[4, 4]``.
         scale: World metres per object unit; ``sigma * length`` is taken in object units.
-        density: Extinction at voxel centres per object unit, ``[nx, ny, nz]``; None is an opaque solid box (the limit of
-            infinite density: one sample where the ray enters).
+        density: Extinction at voxel centres per object unit, ``[nx, ny, nz]``; what is negative after interpolation is empty, so that a
+            surface can lie anywhere between voxel centres. None is an opaque solid box (the limit of infinite density: one sample
+            where the ray enters).
         one_sided: Only rays that enter through the ``+x`` face hit. This is what a projected or displayed texture does: it has
             a front and no sides.
         step_units: Length of a ray-marching step in object units; used with a density only.
@@ -81,9 +82,9 @@ class VoxelGridObject:
             )
         if not (np.asarray(self.box_max) > np.asarray(self.box_min)).all():
             raise ValueError(f"expected box_max above box_min, got {self.box_min} and {self.box_max}")
-        if self.density is not None and (self.density.shape != self.slots.shape or (self.density < 0).any()):
+        if self.density is not None and self.density.shape != self.slots.shape:
             raise ValueError(
-                f"expected a density >= 0 of shape {self.slots.shape}, got shape {self.density.shape}"
+                f"expected a density of shape {self.slots.shape}, got shape {self.density.shape}"
             )
         if self.mixing is not None and self.mixing.shape[1] != self.parameter_count:
             raise ValueError(f"expected mixing of {self.parameter_count} parameters, got {self.mixing.shape}")

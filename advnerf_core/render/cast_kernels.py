@@ -175,7 +175,7 @@ def _march(o: Any, d: Any, edges: Any, t_in: float, t_out: float, nearest: float
                     + (density[cx, ay, cz] * (1.0 - fz) + density[cx, ay, az] * fz) * fy)  # fmt: skip
             far = ((density[ax, cy, cz] * (1.0 - fz) + density[ax, cy, az] * fz) * (1.0 - fy)
                    + (density[ax, ay, cz] * (1.0 - fz) + density[ax, ay, az] * fz) * fy)  # fmt: skip
-            opacity = 1.0 - np.exp(-(near * (1.0 - fx) + far * fx) * dt * speed)
+            opacity = 1.0 - np.exp(-max(near * (1.0 - fx) + far * fx, 0.0) * dt * speed)
             if transmittance * (1.0 - opacity) < LEAST_TRANSMITTANCE:
                 opacity = 1.0
         weight = transmittance * opacity * share

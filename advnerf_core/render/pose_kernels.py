@@ -66,12 +66,15 @@ def _walk(o: Any, d: Any, density: Any, clear: Any, one_sided: bool, step_m: flo
             )
             k += max(leap, 1)
             continue
-        depths[count], taus[count] = t, _extinction(x, y, z, density) * length
+        k += 1
+        sigma = _extinction(x, y, z, density)
+        if sigma <= 0.0:  # outside a surface between voxels
+            continue
+        depths[count], taus[count] = t, sigma * length
         light *= np.exp(-taus[count])
         count += 1
         if light < least:
             break
-        k += 1
     return count
 
 

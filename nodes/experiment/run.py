@@ -238,7 +238,7 @@ def stages_of(experiment: Experiment) -> list[Stage]:
             {"view": view, "driven": {**measured, "world": world}},
             ("capture", "scene"),
         ),
-        stage("object", objects, {"object": part("object"), "kinds": kinds}, ()),
+        stage("object", objects, {"object": part("object"), "kinds": kinds, **objects.version_of(kinds)}, ()),
         stage(
             "policy",
             policy,

@@ -39,7 +39,7 @@ def measured(folder: Path) -> dict[str, dict[str, Any]]:
     from advnerf_core.objects.voxel.build import build_from_mesh
     from advnerf_core.objects.voxel.generators import GENERATORS
     from advnerf_core.objects.voxel.mesh import stand
-    from nodes.experiment import keys
+    from nodes.experiment import keys, objects
     from nodes.experiment.cell import Cell
     from nodes.experiment.cells import ExperimentCells
     from nodes.experiment.run import VERSIONS, make_ready
@@ -69,7 +69,7 @@ def measured(folder: Path) -> dict[str, dict[str, Any]]:
         },
         "cells": totals,
     }
-    versions = {**VERSIONS, "cells": keys.VERSION}
+    versions = {**VERSIONS, "object": objects.MESH_VERSION, "cells": keys.VERSION}
     return {name: {"version": versions[name], "numbers": each} for name, each in numbers.items()}
 
 

@@ -2,7 +2,8 @@
 
 The pictures are drawn from a mesh (to repair what voxelising loses at thin and slanted parts) or are photographs that were cut out.
 Density and colours are fitted together by Adam over random rays, each with a background of its own, so that transparency cannot
-be faked by a colour.
+be faked by a colour. Density may be negative at voxels and is cut off after interpolation (Karnewar et al. 2022, "ReLU Fields"): edges
+are then sharp, and lie anywhere between voxel centres.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from advnerf_core.objects.voxel.voxelise import OPAQUE_PER_VOXEL, ObjectGrids
 _LEARNING_RATE = 0.15
 _EDGE = 1e-3  # the logistic function of the density never reaches 0 or 1 at the start
 _SPARSITY = 1e-3
+_FAINT = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +125,7 @@ class _Field:
     def __init__(self, start: ObjectGrids) -> None:
         self._start = start
         self._densest = OPAQUE_PER_VOXEL / start.voxel
-        share = np.clip(start.density / self._densest, _EDGE, 1.0 - _EDGE)
+        share = np.clip(0.5 + 0.5 * start.density / self._densest, _EDGE, 1.0 - _EDGE)
         self._raw = torch.tensor(np.log(share) - np.log1p(-share), requires_grad=True)
         colours = np.clip(start.colours, _EDGE, 1.0 - _EDGE)
         self._theta = torch.tensor(np.log(colours) - np.log1p(-colours), requires_grad=True)
@@ -135,13 +137,14 @@ class _Field:
         self._step = start.voxel / 2.0
         self.parameters = [self._raw, self._theta]
 
-    def _density(self) -> Tensor:
-        return self._densest * torch.sigmoid(self._raw) * self._active
+    def _share(self) -> Tensor:
+        """Density as a share of the largest, from -1 to 1."""
+        return (2.0 * torch.sigmoid(self._raw) - 1.0) * self._active
 
     def opacity_between(self) -> Tensor:
         """Mean of ``p (1 - p)``: zero when every voxel is either empty or opaque."""
-        share = torch.sigmoid(self._raw)
-        return (share * (1.0 - share) * self._active).mean()
+        share = torch.relu(self._share())
+        return (share * (1.0 - share)).mean()
 
     def render(self, origins: Tensor, directions: Tensor, jitter: Tensor) -> tuple[Tensor, Tensor]:
         """Premultiplied colours ``[R, 3]`` and coverage ``[R, 1]`` of rays with unit directions."""
@@ -154,12 +157,14 @@ class _Field:
         index = (unit * sizes).long().clamp(min=0)
         index = torch.minimum(index, sizes - 1)
         inside = (t < far[:, None]) & self._reached[index[..., 0], index[..., 1], index[..., 2]]
-        grid = torch.cat([self._density()[None], torch.sigmoid(self._theta).permute(3, 0, 1, 2)])
+        grid = torch.cat(
+            [self._densest * self._share()[None], torch.sigmoid(self._theta).permute(3, 0, 1, 2)]
+        )
         where = (2.0 * unit[inside] - 1.0).flip(-1)
         values = grid_sample(
             grid[None], where[None, None, None], mode="bilinear", padding_mode="border", align_corners=False
         )[0, :, 0, 0].T
-        sigma = torch.zeros(t.shape).index_put((inside,), values[:, 0])
+        sigma = torch.zeros(t.shape).index_put((inside,), torch.relu(values[:, 0]))
         depth = torch.cumsum(sigma * self._step, dim=1)
         weights = torch.exp(-(depth - sigma * self._step)) - torch.exp(-depth)
         colours = torch.zeros(*t.shape, 3).index_put((inside,), values[:, 1:])
@@ -167,11 +172,15 @@ class _Field:
 
     def grids(self) -> ObjectGrids:
         with torch.no_grad():
-            density = self._density().numpy()
+            share = self._share().numpy()
             # What lets through more than nearly everything is empty: it costs time in every picture.
-            density = np.where(density < 0.01 * self._densest, 0.0, density).astype(np.float32)
+            filled = share >= _FAINT
+            share = np.where(filled, share, np.minimum(share, 0.0))
+            # Further out, negative values change nothing.
+            share[~ndimage.binary_dilation(filled, np.ones((3, 3, 3)))] = 0.0
+            density = (self._densest * share).astype(np.float32)
             colours = torch.sigmoid(self._theta).numpy()
-        if not density.any():
+        if not filled.any():
             raise FitError(
                 "expected an object in the box, the pictures agree that it is empty: are box and poses right?"
             )

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from advnerf_core.geometry import Array, invert_transform, transform_points
 from advnerf_core.objects.voxel.pictures import FitError, PosedRgba
 from advnerf_core.objects.voxel.voxelise import OPAQUE_PER_VOXEL, ObjectGrids
 
 _SEEN_THROUGH = 0.1
-_COARSE = 48
-_MARGIN_VOXELS = 2
+_COARSE, _FINE = 48, 96
+_MARGIN_VOXELS = 1
+_ROUNDING = 1e-6
 # The hull is never smaller than the object, so its border starts half transparent and may go.
 _START_SHARE = 0.5
 
@@ -32,12 +34,14 @@ def visual_hull(views: PosedRgba, resolution: int = 64) -> ObjectGrids:
         raise FitError(
             "expected silhouettes that agree on an object, they have no point in common: are the poses right?"
         )
-    filled = np.argwhere(coarse)
-    step = 2 * radius / _COARSE
-    low = centre - radius + step * (filled.min(axis=0) - 1)
-    high = centre - radius + step * (filled.max(axis=0) + 2)
+    low, high = _box_of(coarse, centre - radius, 2 * radius / _COARSE)
+    # Once more in finer cells: voxels beside the object are wasted.
+    step = float((high - low).max()) / _FINE
+    fine = _carve(views, low, step, tuple(np.ceil((high - low) / step).astype(int)))
+    if fine.any():  # a thread may lie between the cells' centres
+        low, high = _box_of(fine, low, step)
     voxel = float((high - low).max()) / (resolution - 2 * _MARGIN_VOXELS)
-    counts = np.ceil((high - low) / voxel).astype(int) + 2 * _MARGIN_VOXELS
+    counts = np.ceil((high - low) / voxel - _ROUNDING).astype(int) + 2 * _MARGIN_VOXELS
     box_min = (low + high) / 2 - 0.5 * voxel * counts
     inside = _carve(views, box_min, voxel, tuple(counts))
     # Picture by picture: a sum over all at once would copy them.
@@ -46,6 +50,12 @@ def visual_hull(views: PosedRgba, resolution: int = 64) -> ObjectGrids:
     density = np.where(inside, _START_SHARE * OPAQUE_PER_VOXEL / voxel, 0.0).astype(np.float32)
     colours = np.broadcast_to(mean, (*counts, 3)).astype(np.float32)
     return ObjectGrids(density, colours, box_min, box_min + voxel * counts)
+
+
+def _box_of(inside: NDArray[np.bool_], origin: Array, step: float) -> tuple[Array, Array]:
+    """Corners of the box around the cells of edge ``step`` that are inside, and one cell more on each side."""
+    filled = np.argwhere(inside)
+    return origin + step * (filled.min(axis=0) - 1), origin + step * (filled.max(axis=0) + 2)
 
 
 def _looked_at(views: PosedRgba) -> tuple[Array, float]:
@@ -60,7 +70,7 @@ def _looked_at(views: PosedRgba) -> tuple[Array, float]:
     return centre, 0.5 * float(np.linalg.norm(eyes - centre, axis=1).min())
 
 
-def _carve(views: PosedRgba, box_min: Array, voxel: float, counts: tuple[int, ...]) -> Array:
+def _carve(views: PosedRgba, box_min: Array, voxel: float, counts: tuple[int, ...]) -> NDArray[np.bool_]:
     """Voxels whose centre no picture sees through, and at least half of the pictures show."""
     axes = [low + voxel * (np.arange(count) + 0.5) for low, count in zip(box_min, counts, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -146,5 +146,5 @@ def _check(path: Path, density: Any, colours: Any, box: Any) -> None:
             f"expected {path} to hold finite grids [nx, ny, nz] and [nx, ny, nz, 3] and a box [2, 3], "
             f"got {list(density.shape)}, {list(colours.shape)} and {list(box.shape)}; build it again"
         )
-    if density.min() < 0 or density.max() <= 0 or (box[1] <= box[0]).any():
+    if density.max() <= 0 or (box[1] <= box[0]).any():
         raise ObjectFileError(f"expected {path} to hold something that is not empty; build it again")

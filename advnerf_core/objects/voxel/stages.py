@@ -15,8 +15,6 @@ from advnerf_core.objects.voxel.pictures import PosedRgba
 from advnerf_core.objects.voxel.voxelise import OPAQUE_PER_VOXEL, ObjectGrids
 
 _COARSEST = 32
-# Voxels that keep less than this share of full density start empty.
-_LEAST_SHARE = 0.02
 # The last stage, which is the one that counts, gets this share of the steps or of the time.
 _LAST_SHARE = 0.6
 
@@ -54,7 +52,7 @@ def resampled(grids: ObjectGrids, onto: ObjectGrids) -> ObjectGrids:
 
     share = at_places(grids.density * np.float32(grids.voxel / OPAQUE_PER_VOXEL))
     near = ndimage.binary_dilation(onto.density > 0.0, np.ones((3, 3, 3)), iterations=2)
-    share = np.where(near & (share >= _LEAST_SHARE), share, 0.0)
+    share = np.where(near, share, 0.0)
     colours = np.stack([at_places(grids.colours[..., channel]) for channel in range(3)], axis=-1)
     density = (share * (OPAQUE_PER_VOXEL / onto.voxel)).astype(np.float32)
     return ObjectGrids(density, colours, onto.box_min, onto.box_max)

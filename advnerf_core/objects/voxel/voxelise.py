@@ -24,8 +24,6 @@ OPAQUE_PER_VOXEL = 20.0
 _PADDING = 2
 # An open shell counts as filled where so many of the six axis directions meet its surface.
 _SHUT_IN = 5
-# Where density must begin outside the surface for a ray that meets it at a right angle to lose half its light on the surface.
-_OFFSET_VOXELS = np.sqrt(2.0 * np.log(2.0) / OPAQUE_PER_VOXEL)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +31,8 @@ class ObjectGrids:
     """Density and colour at voxel centres.
 
     Attributes:
-        density: Extinction per object unit, ``[nx, ny, nz]`` float32, >= 0.
+        density: Extinction per object unit, ``[nx, ny, nz]`` float32; negative values stand for empty space, and the surface is where
+            the interpolated density passes zero.
         colours: ``[nx, ny, nz, 3]`` float32 in 0..1, defined everywhere.
         box_min: Corner of the box in object units, ``[3]``.
         box_max: Opposite corner.
@@ -71,7 +70,10 @@ def voxelise(mesh: SurfaceMesh, resolution: int = 64) -> ObjectGrids:
     surface, sums, hits = _drawn_surface(mesh, box_min, voxel, counts, fine)
     if not surface.any():
         raise MeshError("expected a mesh with a surface, all its triangles are degenerate")
-    ramp = np.clip(_OFFSET_VOXELS - _coarse(_signed_distance(surface), fine) / fine, 0.0, 1.0)
+    # The body ends in the middle of its outermost fine cells, the surface at their border, half a fine cell further out.
+    ramp = np.clip((0.5 - _coarse(_signed_distance(surface), fine)) / fine, -1.0, 1.0)
+    # Where nothing is near, it is plainly empty: such cells are leapt over.
+    ramp[~ndimage.binary_dilation(ramp > 0.0, np.ones((3, 3, 3)))] = 0.0
     density = (OPAQUE_PER_VOXEL / voxel * ramp).astype(np.float32)
     return ObjectGrids(density, _spread_colours(sums, hits), box_min, box_min + voxel * counts)
 

@@ -39,17 +39,28 @@ def ball(radius=0.5, hole=False):
 
 
 @pytest.mark.parametrize("hole", [False, True])
-def test_a_ray_loses_half_its_light_at_the_surface_and_all_of_it_inside(hole):
+def test_density_passes_zero_at_the_surface_and_is_opaque_inside(hole):
     grids = voxelise(ball(hole=hole), 32)
     axis = grids.box_min[2] + grids.voxel * (np.arange(grids.density.shape[2]) + 0.5)
     middle = grids.density.shape[0] // 2
-    line = np.interp(np.linspace(axis[-1], axis[0], 4000), axis, grids.density[middle, middle])
+    places = np.linspace(axis[-1], axis[0], 4000)
+    line = np.maximum(np.interp(places, axis, grids.density[middle, middle]), 0.0)
+    assert places[np.argmax(line > 0.0)] == pytest.approx(0.5, abs=0.25 * grids.voxel)
     through = np.exp(-np.cumsum(line) * (axis[-1] - axis[0]) / 3999)
-    half = np.linspace(axis[-1], axis[0], 4000)[np.argmax(through < 0.5)]
-    assert half == pytest.approx(0.5, abs=0.75 * grids.voxel)
+    assert places[np.argmax(through < 0.5)] == pytest.approx(0.5, abs=0.75 * grids.voxel)
     assert through[2000] < 1e-10
     assert grids.density[middle, middle, middle] == pytest.approx(OPAQUE_PER_VOXEL / grids.voxel)
-    assert grids.density[0].max() == 0.0
+    assert grids.density[0].max() <= 0.0
+
+
+@pytest.mark.parametrize("resolution", [16, 32])
+def test_the_silhouette_of_a_ball_has_its_size(resolution):
+    model = ObjectModel("ball", voxelise(ball(), resolution))
+    lens = viewing_lens(200)
+    picture = draw_object(model, look_at(np.array([0.0, -6.0, 0.0]), np.zeros(3)), lens)[0]
+    radius_px = lens.fx * np.tan(np.arcsin(0.5 / 6.0))
+    voxel_px = lens.fx * model.grids.voxel / 6.0
+    assert np.sqrt(picture[..., 3].sum() / np.pi) == pytest.approx(radius_px, abs=0.1 * voxel_px)
 
 
 def test_colours_reach_beyond_the_surface():

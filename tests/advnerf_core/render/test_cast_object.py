@@ -149,10 +149,11 @@ def test_an_object_out_of_view_gives_an_empty_cast():
         cast_object(cube_face_object(0.8, 4), camera(), PINHOLE, supersample=0)
 
 
-def test_a_thin_cloud_equals_a_ray_march_written_out():
+@pytest.mark.parametrize("least", [0.0, -3.0], ids=["positive", "signed"])
+def test_a_thin_cloud_equals_a_ray_march_written_out(least):
     generator = np.random.default_rng(0)
     shape, step = (5, 6, 7), 0.01
-    density = generator.uniform(0.0, 3.0, shape)
+    density = generator.uniform(least, 3.0, shape)
     cloud = VoxelGridObject(
         np.arange(210, dtype=np.int32).reshape(shape),
         (210, 3),
@@ -180,11 +181,36 @@ def test_a_thin_cloud_equals_a_ray_march_written_out():
         for t in t_in + (np.arange(count) + 0.5) * dt:
             g = np.clip((origin + t * d + 0.5) * shape - 0.5, 0, np.array(shape) - 1)
             sigma, colour = (trilinear(grid, g) for grid in (density, colours.reshape(*shape, 3)))
-            opacity = 1 - np.exp(-sigma * dt * np.linalg.norm(d))
+            opacity = 1 - np.exp(-max(sigma, 0.0) * dt * np.linalg.norm(d))
             total += light * opacity * colour
             light *= 1 - opacity
         np.testing.assert_allclose(got, total, atol=1e-10)
         np.testing.assert_allclose(alpha, 1 - light, atol=1e-10)
+
+
+@pytest.mark.parametrize("edge", [3.0, 3.3, 3.5, 3.9])
+def test_negative_density_puts_an_edge_anywhere_between_voxel_centres(edge):
+    # A wall that ends at voxel coordinate `edge` along y, seen head on: a ray at y meets the same density all the way through.
+    count, pinhole = 8, Pinhole(400, 1, 400.0, 400.0, 200.0, 0.5)
+    beyond = np.arange(count) - edge
+    density = np.broadcast_to(50.0 * np.clip(-beyond, -1.0, 1.0)[None, :, None], (count,) * 3).copy()
+    wall = VoxelGridObject(
+        np.zeros((count,) * 3, np.int32), (1, 3), np.zeros((0, 3)), np.zeros(3), np.full(3, float(count)), np.eye(4),
+        density=density, step_units=0.5,
+    )  # fmt: skip
+    T = look_at([104.0, 4.0, 4.0], [0.0, 4.0, 4.0])
+    cast = cast_object(wall, T[None], pinhole, 1, np.float64)
+    # Columns show y = 4 m (camera) plus or minus; the wall is opaque up to its edge within a hundredth of a voxel.
+    columns = np.arange(400)
+    y = T[1, 3] + 100.0 * (columns + 0.5 - 200.0) / 400.0 * T[1, 0]
+    seen = np.zeros(400)
+    seen[cast.pixels] = cast.alpha
+    inside = (y > 0.3) & (y - 0.5 < edge - 0.3)
+    outside = y - 0.5 > edge + 0.05
+    assert inside.any()
+    assert outside.any()
+    assert seen[inside].min() > 0.999
+    assert seen[outside].max() == 0.0
 
 
 def trilinear(grid, g):

@@ -14,10 +14,10 @@ PINHOLE = Pinhole(30, 22, 26.0, 25.0, 15.0, 11.0)
 POSES = np.stack([look_at([1.6, 0.3, 0.6], [0.1, 0.0, 0.2]), look_at([0.4, -1.7, 0.5], [0.1, 0.0, 0.2])])
 
 
-def cloud(position_m=(0.1, 0.0, 0.2), thickness=8.0):
+def cloud(position_m=(0.1, 0.0, 0.2), thickness=8.0, least=0.0):
     count = 12
     i, j, k = (index / (count - 1) - 0.5 for index in np.indices((count,) * 3))
-    density = thickness * np.clip(3.0 * (0.3 - np.sqrt(i**2 + 2 * j**2 + 1.5 * k**2)), 0.0, 1.0)
+    density = thickness * np.clip(3.0 * (0.3 - np.sqrt(i**2 + 2 * j**2 + 1.5 * k**2)), least, 1.0)
     return VoxelGridObject(
         np.arange(count**3, dtype=np.int32).reshape((count,) * 3),
         (count**3, 3),
@@ -35,8 +35,9 @@ def colours_of(field, seed=0):
     return torch.randn(field.theta_shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
-def test_it_shows_what_the_sparse_cast_shows():
-    field = cloud()
+@pytest.mark.parametrize("least", [0.0, -1.0], ids=["positive", "signed"])
+def test_it_shows_what_the_sparse_cast_shows(least):
+    field = cloud(least=least)
     theta = colours_of(field)
     colour, alpha, depth_m = render_soft(field, placement_of(field), theta, POSES, PINHOLE, 2)
     cast = cast_object(dataclasses.replace(field, step_units=0.002), POSES, PINHOLE, 2, np.float64)
@@ -48,9 +49,10 @@ def test_it_shows_what_the_sparse_cast_shows():
     np.testing.assert_allclose(depth_m.reshape(-1)[cast.pixels[thick]], cast.depth_m[thick], atol=4e-3)
 
 
+@pytest.mark.parametrize("least", [0.0, -1.0], ids=["positive", "signed"])
 @pytest.mark.parametrize("axis", range(4), ids=["x", "y", "yaw", "scale"])
-def test_derivatives_with_respect_to_the_placement_are_finite_differences(axis):
-    field = cloud()
+def test_derivatives_with_respect_to_the_placement_are_finite_differences(axis, least):
+    field = cloud(least=least)
     theta, generator = colours_of(field), torch.Generator().manual_seed(1)
     probe = torch.randn(2, 22, 30, 4, dtype=torch.float64, generator=generator)
 
