@@ -24,7 +24,7 @@ from mcap.records import (
 from nodes.bags.metadata import Contents, rosbag2_metadata
 from nodes.bags.part import LIBRARY, PROFILE
 from nodes.bags.records import MAGIC, RECORD_HEAD
-from nodes.bags.scan import Piece, Scan
+from nodes.bags.scanned import Piece, Scan
 
 ENDS, REPAIRS = "advnerf_end", "advnerf_repair"
 

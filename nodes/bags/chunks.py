@@ -25,7 +25,7 @@ from nodes.bags.records import (
     records_of,
     unpack_chunk,
 )
-from nodes.bags.scan import Run
+from nodes.bags.scanned import Run
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError
 

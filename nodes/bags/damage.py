@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from nodes.bags.scan import Loss, Scan
+from nodes.bags.scanned import Loss, Scan
 from nodes.runtime.clock import NS_PER_S
 
 

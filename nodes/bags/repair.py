@@ -26,7 +26,8 @@ from nodes.bags.formats import require_mcap
 from nodes.bags.journal import RESERVE_BYTES, RESERVE_NAME, Entry, journal_of, read_journal
 from nodes.bags.metadata import rosbag2_metadata
 from nodes.bags.parts import METADATA_FILE, bag_parts
-from nodes.bags.scan import Piece, Scan, scan_file
+from nodes.bags.scan import scan_file
+from nodes.bags.scanned import Piece, Scan
 from nodes.runtime.errors import BagError
 from nodes.runtime.messages import type_definition, type_hash
 from nodes.runtime.topics import topic as topic_row

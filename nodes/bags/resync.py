@@ -1,4 +1,4 @@
-"""Finds the next valid records of an MCAP file after damage."""
+"""Finds the next valid records of an MCAP file after damage, and says whether the file ends in one."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Header, Metadata, Schema
 
 from nodes.bags.records import (
+    CHUNK_HEAD_BYTES,
     DATA_END_BYTES,
     MESSAGE_HEAD,
     RECORD_HEAD,
@@ -113,3 +114,41 @@ def _judge(buffer: Any, at: int, limit: int, channels: Collection[int], messages
     else:
         raise Damaged("not a record of the data section")
     return end, sure
+
+
+def runs_over(buffer: Any, at: int, limit: int) -> bool:
+    """Whether the record that begins here would end after the end of the file."""
+    if at + RECORD_HEAD.size > limit:
+        return True
+    opcode, length = RECORD_HEAD.unpack_from(buffer, at)
+    return 0 < opcode <= Opcode.DATA_END and length > limit - at - RECORD_HEAD.size
+
+
+def is_cut(buffer: Any, at: int, limit: int) -> bool:
+    """Whether the file certainly ends in this record: in its head, or in data whose two lengths agree."""
+    if not runs_over(buffer, at, limit):
+        return False
+    if at + RECORD_HEAD.size > limit:
+        return True
+    opcode, length = RECORD_HEAD.unpack_from(buffer, at)
+    if opcode == Opcode.CHUNK:
+        if limit - at < RECORD_HEAD.size + CHUNK_HEAD_BYTES:
+            return True
+        try:
+            chunk_head(buffer, at + RECORD_HEAD.size, length)
+        except Damaged:
+            return False
+        return True
+    return opcode == Opcode.ATTACHMENT and _attachment_agrees(buffer, at + RECORD_HEAD.size, length)
+
+
+def _attachment_agrees(buffer: Any, body: int, length: int) -> bool:
+    """Whether the length inside an attachment agrees with that of its record. The end of the attachment may be missing."""
+    at = body + 16
+    for _ in range(2):
+        if at + 4 > len(buffer):
+            return True
+        at += 4 + int.from_bytes(buffer[at : at + 4], "little")
+    if at + 8 > len(buffer):
+        return at < body + length
+    return at + 8 + int.from_bytes(buffer[at : at + 8], "little") + 4 == body + length

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import zlib
 from bisect import bisect_right
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +21,10 @@ from mcap.records import (
     MetadataIndex,
     Schema,
 )
-from mcap.summary import Summary
 
+from nodes.bags.against_summary import contradiction, restore_definitions
 from nodes.bags.file import mapped
 from nodes.bags.records import (
-    CHUNK_HEAD_BYTES,
     DATA_END_BYTES,
     MAGIC,
     MESSAGE_HEAD,
@@ -41,7 +39,8 @@ from nodes.bags.records import (
     records_of,
     unpack_chunk,
 )
-from nodes.bags.resync import makes_sense, next_record, only_zeros, plausible_end
+from nodes.bags.resync import is_cut, makes_sense, next_record, only_zeros, plausible_end, runs_over
+from nodes.bags.scanned import BAD, CUT, JUNK, ZEROS, Loss, Piece, Run, Scan
 from nodes.bags.summary import Ending, read_ending, read_summary_section
 from nodes.runtime.errors import BagError
 
@@ -49,153 +48,6 @@ from nodes.runtime.errors import BagError
 _RUN_BYTES = 1 << 20
 _CRC_BLOCK_BYTES = 1 << 22
 _SUMMARY_ONLY = (Opcode.FOOTER, Opcode.STATISTICS, Opcode.SUMMARY_OFFSET, Opcode.CHUNK_INDEX)  # fmt: skip
-# How a loss came about.
-BAD, CUT, ZEROS, JUNK = "bad", "cut", "zeros", "junk"
-
-
-@dataclass
-class Piece:
-    """Bytes of the file to keep, or their replacement.
-
-    Attributes:
-        offset: Offset in the file.
-        length: Number of bytes.
-        record: Entry in the summary, with the offsets of the file; None without an entry.
-        content: Bytes that replace them; ``record`` then refers to these bytes at ``offset``.
-    """
-
-    offset: int
-    length: int
-    record: ChunkIndex | AttachmentIndex | MetadataIndex | None = None
-    content: bytes | None = None
-
-
-@dataclass
-class Loss:
-    """Bytes that cannot be kept.
-
-    Attributes:
-        offset: Offset in the file.
-        length: Number of bytes.
-        what: Their description, as far as known.
-        reason: Why they cannot be kept.
-        kind: ``bad`` (a whole record with a wrong checksum), ``cut``, ``zeros``, or ``junk``.
-        span_ns: Log times of their first and last message, if known [ns since 1970].
-        counts: Number of their messages by channel, as far as known.
-        harmless: Whether they contained no message, attachment or metadata.
-    """
-
-    offset: int
-    length: int
-    what: str
-    reason: str
-    kind: str
-    span_ns: tuple[int, int] | None = None
-    counts: dict[int, int] = field(default_factory=dict)
-    harmless: bool = False
-
-
-@dataclass
-class Run:
-    """Consecutive messages outside chunks, with the fields of a `ChunkIndex` for reading."""
-
-    offset: int
-    length: int
-    start_ns: int
-    end_ns: int
-    channels: set[int]
-
-
-@dataclass
-class Scan:
-    """Contents and damage of a file.
-
-    Attributes:
-        size: Size of the file [bytes].
-        ending: The footer; None if it is missing.
-        known: The summary; None if it is missing or damaged.
-        summary_damage: Damage of the summary; empty if there is none.
-        data_end: Offset of the record that ends the data; None if it is missing.
-        data_crc: Checksum of all data; 0 means none.
-        data_crc_wrong: Whether this checksum is wrong.
-        pieces: Pieces to keep, in order.
-        losses: Bytes that are lost.
-        fixes: Repairs without a loss.
-        headers, schemas, channels: Records of the data section; schemas and channels by id.
-        counts: Number of messages by channel id.
-        gaps: Number of missing sequence numbers by channel id.
-        sequences: Last sequence number by channel id.
-        start_ns, end_ns: Log times of the first and the last message [ns since 1970].
-        unchecked_chunks: Number of chunks without a checksum.
-        unchecked_messages: Number of messages outside chunks, which have no checksum.
-        runs: Messages outside chunks.
-        insert_at: Index of the piece before which the lost definitions are inserted.
-        lost_definitions: Definitions that the file has lost.
-    """
-
-    size: int = 0
-    ending: Ending | None = None
-    known: Summary | None = None
-    summary_damage: str = ""
-    data_end: int | None = None
-    data_crc: int = 0
-    data_crc_wrong: bool = False
-    pieces: list[Piece] = field(default_factory=list)
-    losses: list[Loss] = field(default_factory=list)
-    fixes: list[str] = field(default_factory=list)
-    header: Header | None = None
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, Channel] = field(default_factory=dict)
-    counts: dict[int, int] = field(default_factory=dict)
-    gaps: dict[int, int] = field(default_factory=dict)
-    sequences: dict[int, int] = field(default_factory=dict)
-    start_ns: int = 0
-    end_ns: int = 0
-    unchecked_chunks: int = 0
-    unchecked_messages: int = 0
-    runs: list[Run] = field(default_factory=list)
-    insert_at: int | None = None
-    lost_definitions: list[Schema | Channel] = field(default_factory=list)
-
-    @property
-    def messages(self) -> int:
-        """Number of messages that are kept."""
-        return sum(self.counts.values())
-
-    @property
-    def complete(self) -> bool:
-        """Whether the file is complete: end of data, footer, magic."""
-        return self.data_end is not None and self.ending is not None
-
-    @property
-    def whole(self) -> bool:
-        """Whether the file is intact."""
-        wrong = (
-            self.losses or self.fixes or self.lost_definitions or self.summary_damage or self.data_crc_wrong
-        )
-        return self.complete and not wrong
-
-    @property
-    def unchecked(self) -> str:
-        """Why damage to messages may go unnoticed; empty if checksums cover them."""
-        if self.data_crc and not self.data_crc_wrong:
-            return ""
-        parts = []
-        if self.unchecked_messages:
-            parts.append(f"{self.unchecked_messages} of its messages are outside chunks")
-        if self.unchecked_chunks:
-            parts.append(f"{self.unchecked_chunks} of its chunks have no checksum")
-        return " and ".join(parts)
-
-    def loses_more_than_the_tail(self) -> list[Loss]:
-        """Losses before the end of the kept data, or in a finished file."""
-        last = max((piece.offset for piece in self.pieces if piece.length), default=0)
-        tail_is_fine = self.ending is None and self.data_end is None
-        return [
-            loss
-            for loss in self.losses
-            if not loss.harmless and (not tail_is_fine or loss.offset < last or loss.kind == JUNK)
-        ]
 
 
 def scan_file(path: Path) -> Scan:
@@ -246,9 +98,9 @@ class _Scanner:
         self._close_chunk(at_end=True)
         if self.found.data_end is None and self.found.ending is not None:
             self.found.fixes.append("the record that ends the data was missing")
-        self._name_what_was_lost()
+        restore_definitions(self.found)
         if self.found.known is not None and not self.found.summary_damage and not self.found.losses:
-            self.found.summary_damage = self._contradiction(self.found.known)
+            self.found.summary_damage = contradiction(self.found, self.found.known)
 
     def _begin(self) -> int:
         buffer, at = self._buffer, len(MAGIC)
@@ -487,7 +339,7 @@ class _Scanner:
         """Note a loss. Returns the offset of the next valid records, or the end of the file."""
         if (end := self._index_end(at)) is not None:
             return end
-        self._close_chunk(at_end=self._runs_over(at))
+        self._close_chunk(at_end=runs_over(self._buffer, at, self._limit))
         if (disguised := self._chunk_in_disguise(at)) is not None:
             end, head, records = disguised
             self._commit(at, end, head, records, *_contents(records))
@@ -503,14 +355,14 @@ class _Scanner:
             self._note_harmless(at, limit, "the end of the data is damaged")
             return limit
         bad, self._bad_chunk = self._bad_chunk, None
-        if self._is_cut(at):
+        if found.known is None and is_cut(buffer, at, limit):
             found.losses.append(
                 Loss(at, limit - at, _KINDS.get(opcode, "a record"), "the file ends in it", CUT)
             )
             return limit
         after = self._next(at, opcode)
         end = limit if after is None else after
-        if after is None and found.known is None and self._runs_over(at):
+        if after is None and found.known is None and runs_over(buffer, at, limit):
             kind, reason = CUT, "the file ends in it"
         elif after is None:
             kind = JUNK
@@ -545,30 +397,6 @@ class _Scanner:
         return min(index.message_start_time for index in inside), max(
             index.message_end_time for index in inside
         )
-
-    def _runs_over(self, at: int) -> bool:
-        """Whether the record that begins here would end after the end of the file."""
-        if at + RECORD_HEAD.size > self._limit:
-            return True
-        opcode, length = RECORD_HEAD.unpack_from(self._buffer, at)
-        return 0 < opcode <= Opcode.DATA_END and length > self._limit - at - RECORD_HEAD.size
-
-    def _is_cut(self, at: int) -> bool:
-        """Whether the file certainly ends in this record: in its head, or in data whose two lengths agree."""
-        if self.found.known is not None or not self._runs_over(at):
-            return False
-        if at + RECORD_HEAD.size > self._limit:
-            return True
-        opcode, length = RECORD_HEAD.unpack_from(self._buffer, at)
-        if opcode == Opcode.CHUNK:
-            if self._limit - at < RECORD_HEAD.size + CHUNK_HEAD_BYTES:
-                return True
-            try:
-                chunk_head(self._buffer, at + RECORD_HEAD.size, length)
-            except Damaged:
-                return False
-            return True
-        return opcode == Opcode.ATTACHMENT and _attachment_agrees(self._buffer, at + RECORD_HEAD.size, length)
 
     def _next(self, at: int, opcode: int) -> int | None:
         found = self.found
@@ -615,50 +443,6 @@ class _Scanner:
             found.gaps[channel_id] = found.gaps.get(channel_id, 0) + sequence - last - 1
         found.sequences[channel_id] = sequence
 
-    def _name_what_was_lost(self) -> None:
-        """Restore lost definitions of kept messages: from the summary, or else without a name."""
-        found = self.found
-        known = found.known if found.known is not None else Summary()
-        for channel_id in sorted(found.counts.keys() - found.channels.keys()):
-            channel = known.channels.get(channel_id) or Channel(
-                channel_id, f"/unnamed_channel_{channel_id}", "", {}, 0
-            )
-            found.channels[channel_id] = channel
-            found.lost_definitions.append(channel)
-        for channel in list(found.channels.values()):
-            if channel.schema_id and channel.schema_id not in found.schemas:
-                schema = known.schemas.get(channel.schema_id) or Schema(channel.schema_id, b"", "", "unknown")
-                found.schemas[schema.id] = schema
-                found.lost_definitions.append(schema)
-        if found.lost_definitions:
-            # A schema precedes its channels, and both precede their messages.
-            found.lost_definitions.sort(key=lambda record: isinstance(record, Channel))
-            first = min((loss.offset for loss in found.losses if not loss.harmless), default=0)
-            found.insert_at = next(
-                (i for i, piece in enumerate(found.pieces) if piece.offset >= max(first, len(MAGIC) + 1)),
-                len(found.pieces),
-            )
-
-    def _contradiction(self, known: Summary) -> str:
-        """Contradiction between summary and data; empty if there is none. A summary may be incomplete."""
-        found, statistics = self.found, known.statistics
-        counts = {channel_id: n for channel_id, n in found.counts.items() if n}
-        if statistics is not None:
-            listed = {channel_id: n for channel_id, n in statistics.channel_message_counts.items() if n}
-            if statistics.message_count != found.messages or (listed and listed != counts):
-                return f"its summary lists {statistics.message_count} messages, but it has {found.messages}"
-        chunks = {
-            (piece.record.chunk_start_offset, piece.record.chunk_length)
-            for piece in found.pieces
-            if isinstance(piece.record, ChunkIndex)
-        }
-        if (
-            known.chunk_indexes
-            and {(i.chunk_start_offset, i.chunk_length) for i in known.chunk_indexes} != chunks
-        ):
-            return "its summary lists other chunks than it has"
-        return ""
-
 
 _KINDS = {Opcode.CHUNK: "a chunk", Opcode.ATTACHMENT: "an attachment", Opcode.MESSAGE: "a message"}
 
@@ -681,15 +465,3 @@ def _record(record: Any) -> bytes:
     builder = RecordBuilder()
     record.write(builder)
     return bytes(builder.end())
-
-
-def _attachment_agrees(buffer: Any, body: int, length: int) -> bool:
-    """Whether the length inside an attachment agrees with that of its record. The end of the attachment may be missing."""
-    at = body + 16
-    for _ in range(2):
-        if at + 4 > len(buffer):
-            return True
-        at += 4 + int.from_bytes(buffer[at : at + 4], "little")
-    if at + 8 > len(buffer):
-        return at < body + length
-    return at + 8 + int.from_bytes(buffer[at : at + 8], "little") + 4 == body + length

@@ -12,7 +12,8 @@ from mcap.summary import Summary
 from nodes.bags.damage import describe
 from nodes.bags.file import mapped
 from nodes.bags.records import DATA_END_BYTES, MAGIC, RECORD_HEAD, Damaged, record_at
-from nodes.bags.scan import Run, Scan, scan_file
+from nodes.bags.scan import scan_file
+from nodes.bags.scanned import Run, Scan
 from nodes.bags.summary import Ending, read_ending, read_summary_section
 from nodes.runtime.errors import BagError
 

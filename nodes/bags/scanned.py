@@ -1,0 +1,158 @@
+"""What the scan of an MCAP file found: pieces to keep, losses, definitions and counts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from mcap.records import AttachmentIndex, Channel, ChunkIndex, Header, MetadataIndex, Schema
+from mcap.summary import Summary
+
+from nodes.bags.summary import Ending
+
+# How a loss came about.
+BAD, CUT, ZEROS, JUNK = "bad", "cut", "zeros", "junk"
+
+
+@dataclass
+class Piece:
+    """Bytes of the file to keep, or their replacement.
+
+    Attributes:
+        offset: Offset in the file.
+        length: Number of bytes.
+        record: Entry in the summary, with the offsets of the file; None without an entry.
+        content: Bytes that replace them; ``record`` then refers to these bytes at ``offset``.
+    """
+
+    offset: int
+    length: int
+    record: ChunkIndex | AttachmentIndex | MetadataIndex | None = None
+    content: bytes | None = None
+
+
+@dataclass
+class Loss:
+    """Bytes that cannot be kept.
+
+    Attributes:
+        offset: Offset in the file.
+        length: Number of bytes.
+        what: Their description, as far as known.
+        reason: Why they cannot be kept.
+        kind: ``bad`` (a whole record with a wrong checksum), ``cut``, ``zeros``, or ``junk``.
+        span_ns: Log times of their first and last message, if known [ns since 1970].
+        counts: Number of their messages by channel, as far as known.
+        harmless: Whether they contained no message, attachment or metadata.
+    """
+
+    offset: int
+    length: int
+    what: str
+    reason: str
+    kind: str
+    span_ns: tuple[int, int] | None = None
+    counts: dict[int, int] = field(default_factory=dict)
+    harmless: bool = False
+
+
+@dataclass
+class Run:
+    """Consecutive messages outside chunks, with the fields of a `ChunkIndex` for reading."""
+
+    offset: int
+    length: int
+    start_ns: int
+    end_ns: int
+    channels: set[int]
+
+
+@dataclass
+class Scan:
+    """Contents and damage of a file.
+
+    Attributes:
+        size: Size of the file [bytes].
+        ending: The footer; None if it is missing.
+        known: The summary; None if it is missing or damaged.
+        summary_damage: Damage of the summary; empty if there is none.
+        data_end: Offset of the record that ends the data; None if it is missing.
+        data_crc: Checksum of all data; 0 means none.
+        data_crc_wrong: Whether this checksum is wrong.
+        pieces: Pieces to keep, in order.
+        losses: Bytes that are lost.
+        fixes: Repairs without a loss.
+        headers, schemas, channels: Records of the data section; schemas and channels by id.
+        counts: Number of messages by channel id.
+        gaps: Number of missing sequence numbers by channel id.
+        sequences: Last sequence number by channel id.
+        start_ns, end_ns: Log times of the first and the last message [ns since 1970].
+        unchecked_chunks: Number of chunks without a checksum.
+        unchecked_messages: Number of messages outside chunks, which have no checksum.
+        runs: Messages outside chunks.
+        insert_at: Index of the piece before which the lost definitions are inserted.
+        lost_definitions: Definitions that the file has lost.
+    """
+
+    size: int = 0
+    ending: Ending | None = None
+    known: Summary | None = None
+    summary_damage: str = ""
+    data_end: int | None = None
+    data_crc: int = 0
+    data_crc_wrong: bool = False
+    pieces: list[Piece] = field(default_factory=list)
+    losses: list[Loss] = field(default_factory=list)
+    fixes: list[str] = field(default_factory=list)
+    header: Header | None = None
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    counts: dict[int, int] = field(default_factory=dict)
+    gaps: dict[int, int] = field(default_factory=dict)
+    sequences: dict[int, int] = field(default_factory=dict)
+    start_ns: int = 0
+    end_ns: int = 0
+    unchecked_chunks: int = 0
+    unchecked_messages: int = 0
+    runs: list[Run] = field(default_factory=list)
+    insert_at: int | None = None
+    lost_definitions: list[Schema | Channel] = field(default_factory=list)
+
+    @property
+    def messages(self) -> int:
+        """Number of messages that are kept."""
+        return sum(self.counts.values())
+
+    @property
+    def complete(self) -> bool:
+        """Whether the file is complete: end of data, footer, magic."""
+        return self.data_end is not None and self.ending is not None
+
+    @property
+    def whole(self) -> bool:
+        """Whether the file is intact."""
+        wrong = (
+            self.losses or self.fixes or self.lost_definitions or self.summary_damage or self.data_crc_wrong
+        )
+        return self.complete and not wrong
+
+    @property
+    def unchecked(self) -> str:
+        """Why damage to messages may go unnoticed; empty if checksums cover them."""
+        if self.data_crc and not self.data_crc_wrong:
+            return ""
+        parts = []
+        if self.unchecked_messages:
+            parts.append(f"{self.unchecked_messages} of its messages are outside chunks")
+        if self.unchecked_chunks:
+            parts.append(f"{self.unchecked_chunks} of its chunks have no checksum")
+        return " and ".join(parts)
+
+    def loses_more_than_the_tail(self) -> list[Loss]:
+        """Losses before the end of the kept data, or in a finished file."""
+        last = max((piece.offset for piece in self.pieces if piece.length), default=0)
+        tail_is_fine = self.ending is None and self.data_end is None
+        return [
+            loss
+            for loss in self.losses
+            if not loss.harmless and (not tail_is_fine or loss.offset < last or loss.kind == JUNK)
+        ]
