@@ -64,7 +64,7 @@ def _record_time(experiment: Experiment, minutes: float) -> None:
 
 def record(experiment: Experiment, cell: Path | None = None, victim_of: Path | None = None) -> None:
     """The rows of one road: three, or without drives two."""
-    folder = experiment.folder
+    folder, scene = experiment.folder, experiment.config.scene
     about = json.loads((folder / "capture" / "world.json").read_text())["description"]
     name = road_of(experiment.config.world)
     command = f"python -m benchmarks.learned_roads {folder}{f' --cell {cell}' if cell else ''}{f' --victim-of {victim_of}' if victim_of else ''}"
@@ -76,6 +76,7 @@ def record(experiment: Experiment, cell: Path | None = None, victim_of: Path | N
         f">= {_LEAST_DB:g} dB",
         psnr_db >= _LEAST_DB,
         command,
+        f"{scene.steps} steps, decay {scene.decay} from {scene.learning_rate:g}",
     )
     whose = ""
     if victim_of is None:

@@ -175,7 +175,11 @@ def _march(o: Any, d: Any, edges: Any, t_in: float, t_out: float, nearest: float
                     + (density[cx, ay, cz] * (1.0 - fz) + density[cx, ay, az] * fz) * fy)  # fmt: skip
             far = ((density[ax, cy, cz] * (1.0 - fz) + density[ax, cy, az] * fz) * (1.0 - fy)
                    + (density[ax, ay, cz] * (1.0 - fz) + density[ax, ay, az] * fz) * fy)  # fmt: skip
-            opacity = 1.0 - np.exp(-max(near * (1.0 - fx) + far * fx, 0.0) * dt * speed)
+            sigma = near * (1.0 - fx) + far * fx
+            if sigma <= 0.0:  # outside a surface between voxels
+                i += 1
+                continue
+            opacity = 1.0 - np.exp(-sigma * dt * speed)
             if transmittance * (1.0 - opacity) < LEAST_TRANSMITTANCE:
                 opacity = 1.0
         weight = transmittance * opacity * share
