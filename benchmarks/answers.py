@@ -10,11 +10,11 @@ from typing import Any
 
 from advnerf_core.report.conditions import style_of
 
-# Published sets from worlds that this project did not write, or did not draw.
+# Worlds that this project did not write, or did not draw, by what the names of their sets contain.
 _FOREIGN = {
-    "gap_metadrive": "MetaDrive, with its own renderer and its own car",
-    "gap_filament": "the room as MuJoCo 4's renderer Filament draws it",
-    "gap_duckietown": "Duckietown, with its own renderer and its own robot",
+    "metadrive": "in MetaDrive, with its own renderer and car",
+    "duckietown": "in Duckietown, with its own renderer and robot",
+    "filament": "in the lab's room as MuJoCo 4's renderer Filament draws it",
 }
 _HARDENED = "python -m benchmarks.hardening"
 
@@ -41,11 +41,11 @@ def answers(rows: Sequence[Mapping[str, Any]], published: Path) -> list[Answer]:
         rows: Of the ledger.
         published: Folder of the published sets.
     """
-    sets = [json.loads(file.read_text()) for file in sorted(published.glob("*/set/set.json"))]
+    sets = _sets(published)
     found = [
-        Answer("Does it transfer?", "results/transfer.md", _joined(_transfers, sets)),
+        Answer("Does it transfer?", "results/transfer.md", _transfers(sets)),
         Answer("Against which victims?", "results/hardened.md", _victims(rows)),
-        Answer("Better than what?", "results/transfer.md", _joined(_better, sets)),
+        Answer("Better than what?", "results/transfer.md", _better(sets)),
         Answer("How realistic is the learned copy?", "results/room.md", _realistic(rows)),
         Answer("In whose world?", "was_not_run.md", _worlds(sets)),
         Answer("How fast?", "performance.md", _fast(rows)),
@@ -59,8 +59,20 @@ def table(found: Sequence[Answer]) -> str:
     return "| question | answer |\n|---|---|\n" + "".join(lines)
 
 
-def _joined(answer: Any, sets: Sequence[Mapping[str, Any]]) -> str:
-    return " ".join(answer(each["name"], test, each["rows"]) for each in sets for test in _told(each))
+def sets_table(published: Path) -> str:
+    """One line for each test of the published sets, as Markdown; empty without any."""
+    lines = [_line(found, test) for found in _sets(published) for test in _told(found)]
+    if not lines:
+        return ""
+    head = (
+        "| registered set | victim | learned copy [m per tick] | deployed | 95 % | leaves the track | gradient - strongest random | p |\n"
+        "|---|---|---|---|---|---|---|---|\n"
+    )
+    return head + "".join(lines)
+
+
+def _sets(published: Path) -> list[dict[str, Any]]:
+    return [json.loads(file.read_text()) for file in sorted(published.glob("*/set/set.json"))]
 
 
 def _told(found: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
@@ -69,34 +81,53 @@ def _told(found: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
     return tests[-1:] if found.get("contrasts") else tests
 
 
-def _where(name: str, test: Mapping[str, Any]) -> str:
-    return f"{name}, {test['test']['scenario']}".replace("_", " ")
-
-
 def _row(rows: Sequence[Mapping[str, Any]], test: Mapping[str, Any], domain: str) -> Mapping[str, Any]:
     keys = ("scenario", "placement", "victim", "method")
     wanted = [test["test"][key] for key in keys]
     return next(r for r in rows if [r[key] for key in keys] == wanted and r["domain"] == domain)
 
 
-def _transfers(name: str, test: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
-    there, here = _row(rows, test, "deployed"), _row(rows, test, "surrogate")
-    band = (
-        "" if there["low_m"] is None else f" (95 % interval {there['low_m']:.2f} to {there['high_m']:.2f} m)"
-    )
+def _line(found: Mapping[str, Any], test: Mapping[str, Any]) -> str:
+    here, there = (_row(found["rows"], test, domain) for domain in ("surrogate", "deployed"))
+    band = "" if there["low_m"] is None else f"{there['low_m']:.3f} to {there['high_m']:.3f}"
+    cells = [
+        f"[{found['name']}](results/transfer.md#{found['name']}), {test['test']['scenario']}",
+        test["test"]["victim"],
+        f"{here['excess_m']:.3f}",
+        f"{there['excess_m']:.3f}",
+        band,
+        f"{there['off_track']} of {there['drives']}",
+        f"{test['difference_m']:+.3f} ({style_of(test['baseline']).title})",
+        "not tested" if test["p_holm"] is None else f"{test['p_holm']:.4f}",
+    ]
+    return f"| {' | '.join(cells)} |\n"
+
+
+def _transfers(sets: Sequence[Mapping[str, Any]]) -> str:
+    pairs = [
+        [_row(found["rows"], test, domain) for domain in ("surrogate", "deployed")]
+        for found in sets
+        for test in _told(found)
+    ]
+    if not pairs:
+        return ""
+    above = sum(there["low_m"] is not None and there["low_m"] > 0.0 for _, there in pairs)
+    kept = [there["excess_m"] / here["excess_m"] for here, there in pairs]
     return (
-        f"{_where(name, test)}: attacks move the car {there['excess_m']:.2f} m per tick further from its path where they are "
-        f"deployed{band}, {here['excess_m']:.2f} m in the learned copy; {there['off_track']} of {there['drives']} deployed drives leave the track."
+        f"In {above} of {len(pairs)} registered sets the attack moves the car where it is deployed (95 % interval above zero). "
+        f"It keeps {100 * min(kept):.0f} to {100 * max(kept):.0f} % of its excess in the learned copy. The next table has a line for each."
     )
 
 
-def _better(name: str, test: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
-    del rows
-    p = "no test is claimed" if test["p_holm"] is None else f"p = {test['p_holm']:.4f}"
-    others = "; ".join(style_of(each).title for each in test["test"]["against"])
+def _better(sets: Sequence[Mapping[str, Any]]) -> str:
+    tests = [test for found in sets for test in _told(found)]
+    if not tests:
+        return ""
+    added = [test["difference_m"] for test in tests]
+    shown = sum(test["p_holm"] is not None and test["p_holm"] < 0.05 for test in tests)
     return (
-        f"{_where(name, test)}: the gradient adds {test['difference_m']:.2f} m per tick to "
-        f"*{style_of(test['baseline']).title}* ({p}), the strongest of these in the learned copy: {others}."
+        f"Than the strongest family of random textures in the learned copy: the gradient adds {min(added):.2f} to {max(added):.2f} m per tick, "
+        f"with p < 0.05 in {shown} of {len(tests)} sets."
     )
 
 
@@ -127,8 +158,11 @@ def _worlds(sets: Sequence[Mapping[str, Any]]) -> str:
         return ""
     words = {"nodes": "by the live nodes, against emulated devices", "world": "in the simulator itself"}
     driven = " and ".join(words.get(each, each) for each in through)
-    foreign = [_FOREIGN[found["name"]] for found in sets if found["name"] in _FOREIGN]
-    elsewhere = f" Also in {' and in '.join(foreign)}." if foreign else ""
+    names = [str(found["name"]) for found in sets]
+    foreign = [each for key, each in _FOREIGN.items() if any(key in name for name in names)]
+    elsewhere = (
+        f" Also {'; '.join(foreign[:-1])}{'; and ' if foreign[1:] else ''}{foreign[-1]}." if foreign else ""
+    )
     return f"In this project's own simulated places, driven {driven}.{elsewhere} No real car was driven."
 
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.files import write_atomically
-from benchmarks.answers import Answer, answers, table
+from benchmarks.answers import Answer, answers, sets_table, table
 from benchmarks.questions import OTHER, QUESTIONS, Question, question_of
 from nodes.runtime.machine import memory_gib, processor_name
 
@@ -113,15 +113,18 @@ def write_pages(rows: list[dict[str, Any]], page: Path, published: Path = PAGE.p
     folder.mkdir(parents=True, exist_ok=True)
     for question, found in answered.items():
         write_atomically(folder / f"{question.slug}.md", _question_page(question, found))
-    write_atomically(page, _index_page(answered, answers(rows, published)))
+    write_atomically(page, _index_page(answered, answers(rows, published), sets_table(published)))
 
 
-def _index_page(answered: dict[Question, list[dict[str, Any]]], found: list[Answer]) -> str:
+def _index_page(answered: dict[Question, list[dict[str, Any]]], found: list[Answer], sets: str) -> str:
     head = (
         "# Measured results\n\nEvery figure was written by the command beside it, on the machine and day that its row names. A row that "
         "misses its target stays, with the reason. The rows are in `results.json`; `python -m benchmarks.results` makes these pages.\n\n"
-        "## In short\n\n" + table(found) + "\n"
-        "## All rows\n\n| question | rows | with a target | missed |\n|---|---|---|---|\n"
+        "## In short\n\n"
+        + table(found)
+        + "\n"
+        + (sets and f"{sets}\n")
+        + "## All rows\n\n| question | rows | with a target | missed |\n|---|---|---|---|\n"
     )
     lines = [
         f"| [{question.title}](results/{question.slug}.md) {question.answers} | {len(found)} "

@@ -1,7 +1,7 @@
 import json
 import shutil
 
-from benchmarks.answers import answers
+from benchmarks.answers import answers, sets_table
 from benchmarks.questions import OTHER, QUESTIONS, question_of
 from benchmarks.results import PAGE, read_rows, record_row, write_pages
 
@@ -36,19 +36,22 @@ def test_the_short_answers_are_those_of_sets_and_rows(tmp_path):
     file.write_text(json.dumps(data))
     rows = [{"line": "x", "command": "python -m benchmarks.hardening runs/full", "value": -0.0234}]
     found = {each.question: each.text for each in answers(rows, tmp_path)}
-    assert "adds 0.12 m per tick to *random, coarse* (no test is claimed)" in found["Better than what?"]
+    assert "adds 0.12 to 0.12 m per tick, with p < 0.05 in 0 of 1 sets" in found["Better than what?"]
+    assert "In 1 of 1 registered sets" in found["Does it transfer?"]
     assert (
         "Of 1 families of random textures none moves it by more than 0.023 m"
         in found["Against which victims?"]
     )
-    everywhere = answers([], published)[0].text
-    assert found["Does it transfer?"] in everywhere
+    (line,) = sets_table(tmp_path).splitlines()[2:]
+    assert "| +0.123 (random, coarse) | not tested |" in line
     # Of a set with contrasts that is told in which everything is the world's own.
-    assert "gap room, native own: attacks move" in everywhere
+    everywhere = sets_table(published)
+    assert "gap_room), native_own |" in everywhere
     assert "composed" not in everywhere
     # Nothing is claimed that was not measured.
     assert "How fast?" not in found
     assert answers([], tmp_path / "none") == []
+    assert sets_table(tmp_path / "none") == ""
 
 
 def test_an_absent_ledger_has_no_rows(tmp_path):
