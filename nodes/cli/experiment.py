@@ -420,10 +420,18 @@ def publish(
             "--build/--no-build", help="Keep the scenes and victims too, some 20 MB for each place."
         ),
     ] = True,
+    withdraw: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--withdraw",
+            metavar="SCENARIO=REASON",
+            help="Give a registered scenario up of which nothing was published; the page says so, and why.",
+        ),
+    ] = None,
     overrides: Overrides = None,
 ) -> None:
     """Copy the finished cells, and the scenes, victims and objects that they were run with, to where they are kept with the code."""
-    from advnerf_core.report.evidence.registration import FILE as REGISTERED
+    from advnerf_core.report.evidence import registration
     from advnerf_core.report.evidence.verify import write_page, write_set
     from nodes.experiment.campaign.plan import statuses
     from nodes.experiment.campaign.published import publish as copy_cells
@@ -434,7 +442,9 @@ def publish(
     found = copy_cells(campaign, statuses(campaign, cells), to, prune)
     for name in found.written:
         print(f"{to / campaign.name / name}.json")
-    if (to / campaign.name / REGISTERED).exists():
+    if withdraw:
+        registration.withdraw(to / campaign.name, dict(_scenario_and_reason(each) for each in withdraw))
+    if (to / campaign.name / registration.FILE).exists():
         print(write_set(to / campaign.name))
         if (film := write_film(campaign, to / campaign.name)) is not None:
             print(film)
@@ -448,6 +458,11 @@ def publish(
             "are removed" if prune else "stay, until --prune removes them"
         )
         print(f"{len(found.stale)} of those there {what}: {', '.join(found.stale)}")
+
+
+def _scenario_and_reason(text: str) -> tuple[str, str]:
+    scenario, _, reason = text.partition("=")
+    return scenario, reason
 
 
 def _say_build(build: PublishedBuild) -> None:

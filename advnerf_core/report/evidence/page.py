@@ -59,6 +59,7 @@ def _section(name: str, data: Mapping[str, Any]) -> str:
         ),
         f"![Excess of every drive, by method and domain]({picture_of(name)})\n",
         _where(data["deployed_through"]) + "\n",
+        *_withdrawn(data),
         *_tests(data),
         _table(registered),
     ]
@@ -68,6 +69,22 @@ def _section(name: str, data: Mapping[str, Any]) -> str:
         parts += ["### Exploration\n", "Run, and not registered before.\n", _table(explored)]
     parts += ["### How to run it\n", _commands(name, data["registered"])]
     return "\n".join(parts)
+
+
+def _withdrawn(data: Mapping[str, Any]) -> list[str]:
+    """Sentences about what was registered and given up."""
+    registered = data["registered"]
+    counts = {
+        scenario: [
+            sum(each["scenario"] == scenario for each in registered[of]) for of in ("cells", "primary")
+        ]
+        for scenario in data.get("withdrawn", {})
+    }
+    return [
+        f"**Registered, and not run:** {scenario.replace('_', ' ')}, with {counts[scenario][0]} cells and {counts[scenario][1]} of the primary "
+        f"tests, which count as p = 1 in Holm's adjustment. {reason}\n"
+        for scenario, reason in data.get("withdrawn", {}).items()
+    ]
 
 
 def _tests(data: Mapping[str, Any]) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path as FilePath
 from typing import Annotated, Any, Literal
 
@@ -12,10 +13,13 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.driving.path import Path
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.files import write_atomically
+from advnerf_core.report.cells import cell_name
 from advnerf_core.report.reference import Domain
 
 FORMAT: Literal["advnerf-registration-1"] = "advnerf-registration-1"
-FILE = "set/registration.json"  # in the folder of the published cells
+# In the folder of the published cells: what was registered, and which scenarios of it were given up later.
+FILE, WITHDRAWN = "set/registration.json", "set/withdrawn.json"
 Pose = tuple[float, float, float]
 Share = Annotated[float, Field(gt=0, lt=1)]
 
@@ -85,6 +89,11 @@ class RegisteredCell(_Part):
     victim: str
     method: str
     seed: int
+
+    @property
+    def name(self) -> str:
+        """Name of the cell, and of its file."""
+        return cell_name(self.scenario, self.victim, self.method, self.seed, self.placement)
 
 
 class PrimaryTest(_Part):
@@ -188,3 +197,53 @@ def read_registration(folder: FilePath) -> Registration | None:
         raise RegistrationError(
             f"{file}: expected a registration, got: {text}; restore it from git"
         ) from None
+
+
+def read_withdrawn(folder: FilePath) -> dict[str, str]:
+    """Registered scenarios of a set that were given up, each with the reason; empty without any.
+
+    Raises:
+        RegistrationError: The file does not say so.
+    """
+    file = folder / WITHDRAWN
+    if not file.exists():
+        return {}
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+        if not all(isinstance(each, str) and each for pair in found.items() for each in pair):
+            raise ValueError("expected a reason for each scenario")
+    except (OSError, ValueError, AttributeError) as error:
+        raise RegistrationError(
+            f"{file}: expected withdrawn scenarios with their reasons: {error}; restore it from git"
+        ) from None
+    return dict(found)
+
+
+def withdraw(folder: FilePath, scenarios: Mapping[str, str]) -> None:
+    """Give registered scenarios up, for reasons that the page of results tells.
+
+    Raises:
+        RegistrationError: One was not registered, has no reason, or has results already: these are published, whatever they say.
+    """
+    registration = read_registration(folder)
+    if registration is None:
+        raise RegistrationError(f"{folder}: expected {FILE}, which advnerf register writes, got none")
+    names = {cell.scenario for cell in registration.cells}
+    for scenario, reason in scenarios.items():
+        if scenario not in names:
+            raise RegistrationError(
+                f"expected a registered scenario to withdraw ({', '.join(sorted(names))}), got {scenario!r}"
+            )
+        if not reason.strip():
+            raise RegistrationError(f"expected a reason for withdrawing {scenario}; give {scenario}=REASON")
+        there = [
+            cell.name
+            for cell in registration.cells
+            if cell.scenario == scenario and (folder / f"{cell.name}.json").exists()
+        ]
+        if there:
+            raise RegistrationError(
+                f"{scenario} cannot be withdrawn, as {there[0]} was published; publish all of it"
+            )
+    text = json.dumps({**read_withdrawn(folder), **scenarios}, indent=1) + "\n"
+    write_atomically(folder / WITHDRAWN, text)

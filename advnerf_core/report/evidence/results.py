@@ -112,10 +112,7 @@ class Evidence:
             for cell in cells
             if cell.kept and registration.scenario(cell.scenario, cell.placement) is not None
         }
-        self._named = {
-            cell_name(cell.scenario, cell.victim, cell.method, cell.seed, cell.placement)
-            for cell in registration.cells
-        }
+        self._named = {cell.name for cell in registration.cells}
         self._paths = {name: each.reference_path() for name, each in registration.scenarios.items()}
         self._metrics: dict[tuple[str, Domain], list[DriveMetrics]] = {}
 
@@ -182,10 +179,12 @@ def rows(evidence: Evidence) -> list[Row]:
 
 
 def primary_tests(evidence: Evidence) -> list[TestResult]:
-    """The registered tests, adjusted by Holm over these alone."""
+    """The registered tests, adjusted by Holm over all that were registered: one that cannot be made counts as p = 1."""
     found = [test for each in evidence.registration.primary if (test := _test(evidence, each)) is not None]
     p_values = [test.p for test in found if test.p is not None]
-    adjusted = iter(holm(p_values) if p_values else ())  # too few searches for any: the intervals remain
+    absent = [1.0] * (len(evidence.registration.primary) - len(found))
+    # Too few searches for any: the intervals remain.
+    adjusted = iter(holm([*p_values, *absent]) if p_values else ())
     return [test if test.p is None else replace(test, p_holm=next(adjusted)) for test in found]
 
 

@@ -7,7 +7,7 @@ the published numbers. The digests of all sets are in one file beside their fold
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,16 +16,18 @@ import numpy as np
 
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import sha256_of, write_atomically
-from advnerf_core.report.cells import CellError, CellResult, cell_name, read_cell
+from advnerf_core.report.cells import CellError, CellResult, read_cell
 from advnerf_core.report.evidence.contrasts import contrast_data
 from advnerf_core.report.evidence.kept import KeptDrive
 from advnerf_core.report.evidence.page import film_of, picture_of, results_page
 from advnerf_core.report.evidence.registration import (
     FILE,
+    WITHDRAWN,
     RegisteredScenario,
     Registration,
     RegistrationError,
     read_registration,
+    read_withdrawn,
 )
 from advnerf_core.report.evidence.results import DOMAINS, Evidence, as_data
 from advnerf_core.report.reference import Domain
@@ -73,7 +75,8 @@ def write_set(folder: Path) -> Path:
     """
     registration, cells = _read(folder)
     evidence = Evidence(registration, cells)
-    problems = list(_against_registration(evidence, cells))
+    withdrawn = read_withdrawn(folder)
+    problems = list(_against_registration(evidence, cells, withdrawn))
     if problems:
         raise SetError(f"{folder}: cannot be published: {problems[0]} ({len(problems)} problems in all)")
     data = {
@@ -81,6 +84,7 @@ def write_set(folder: Path) -> Path:
         "name": registration.name,
         "registration": registration.digest,
         "files": digests_of(folder),
+        **({"withdrawn": withdrawn} if withdrawn else {}),
         **_published(evidence),
     }
     write_atomically(folder / SET, json.dumps(data, indent=1) + "\n")
@@ -111,12 +115,13 @@ def verify_set(folder: Path) -> Verified:
     """
     try:
         registration, cells = _read(folder)
+        withdrawn = read_withdrawn(folder)
     except (SetError, RegistrationError, CellError) as error:
         return Verified(folder.name, 0, 0, (str(error),))
     if not cells and not (folder / SET).exists() and folder.name not in _known_digests(folder.parent):
         return Verified(folder.name, 0, 0, (), awaits_results=True)
     evidence = Evidence(registration, cells)
-    problems = [*_files(folder), *_against_registration(evidence, cells)]
+    problems = [*_files(folder), *_against_registration(evidence, cells, withdrawn)]
     numbers = 0
     if not problems:  # numbers of damaged drives say nothing more
         numbers, wrong = _numbers(folder, evidence)
@@ -158,7 +163,7 @@ def _cell_files(folder: Path) -> list[Path]:
 
 
 def digests_of(folder: Path) -> dict[str, str]:
-    files = (folder / FILE, *_cell_files(folder))
+    files = (folder / FILE, *filter(Path.exists, [folder / WITHDRAWN]), *_cell_files(folder))
     return {file.relative_to(folder).as_posix(): sha256_of(file) for file in files}
 
 
@@ -191,12 +196,17 @@ def _files(folder: Path) -> Iterator[str]:
             yield f"{folder / name}: its digest is not the one in {SET}"
 
 
-def _against_registration(evidence: Evidence, cells: Sequence[CellResult]) -> Iterator[str]:
-    """Whether all that was registered is there, from the registered starts, and of one build."""
+def _against_registration(
+    evidence: Evidence, cells: Sequence[CellResult], withdrawn: Collection[str]
+) -> Iterator[str]:
+    """Whether all that was registered and not withdrawn is there, from the registered starts, and of one build."""
     there = {cell.name for cell in cells}
     for wanted in evidence.registration.cells:
-        name = cell_name(wanted.scenario, wanted.victim, wanted.method, wanted.seed, wanted.placement)
-        if name not in there:
+        name = wanted.name
+        if wanted.scenario in withdrawn:
+            if name in there:
+                yield f"{name}: is there, and its scenario was withdrawn"
+        elif name not in there:
             yield f"{name}: was registered, and is not there"
         elif name in evidence.cells and not evidence.is_registered(evidence.cells[name]):
             yield f"{name}: was registered, and was not run under this registration"
@@ -290,6 +300,8 @@ def _numbers(folder: Path, evidence: Evidence) -> tuple[int, list[str]]:
         wrong.append(
             f"{SET}: expected drives deployed through {found['deployed_through']}, got {published['deployed_through']}"
         )
+    if published.get("withdrawn", {}) != read_withdrawn(folder):
+        wrong.append(f"{SET}: expected what {WITHDRAWN} says was withdrawn, got {published.get('withdrawn')}")
     for part in ("rows", "primary", *(["contrasts"] if "contrasts" in found else [])):
         there = published.get(part, [])
         if len(there) != len(found[part]):

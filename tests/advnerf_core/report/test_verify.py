@@ -12,7 +12,14 @@ from scipy import stats
 from typer.testing import CliRunner
 
 from advnerf_core.report.cells import read_cells
-from advnerf_core.report.evidence.registration import FILE, RegistrationError, read_registration
+from advnerf_core.report.evidence.registration import (
+    FILE,
+    WITHDRAWN,
+    Registration,
+    RegistrationError,
+    read_registration,
+    withdraw,
+)
 from advnerf_core.report.evidence.results import Evidence, primary_tests, rows
 from advnerf_core.report.evidence.verify import DIGESTS, PAGE, SET, SetError, sets_in, verify_set, write_set
 from benchmarks.planted_changes import CHANGES, write_simulated_set
@@ -175,3 +182,58 @@ def test_verifying_needs_no_torch(original):
         f"assert verify_set(Path({str(original)!r})).problems == ()"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.fixture
+def half_run(copied):
+    """The simulated set, with a second scenario registered of which nothing was run."""
+    registration = read_registration(copied)
+    data = registration.model_dump(mode="json")
+    data["scenarios"]["other"] = data["scenarios"]["track"]
+    for part in ("cells", "primary"):
+        data[part] += [{**each, "scenario": "other"} for each in data[part]]
+    other = Registration.model_validate(data)
+    (copied / FILE).write_text(other.model_dump_json(indent=1))
+    for file in copied.glob("*.json"):
+        cell = json.loads(file.read_text())
+        file.write_text(json.dumps({**cell, "registration": other.digest}))
+    return copied
+
+
+def test_a_scenario_that_was_given_up_is_told_with_its_reason_and_counts_against_the_others(
+    half_run, original
+):
+    with pytest.raises(SetError, match="other_hardened_none_0: was registered, and is not there"):
+        write_set(half_run)
+    withdraw(half_run, {"other": "It would have taken two days."})
+    write_set(half_run)
+    assert verify_set(half_run).problems == ()
+    page = (half_run.parent / PAGE).read_text()
+    assert "**Registered, and not run:** other, with 13 cells and 1 of the primary tests" in page
+    assert "It would have taken two days." in page
+    (alone,), (beside,) = (primary_tests(evidence_of(folder)) for folder in (original, half_run))
+    assert beside.p == alone.p
+    assert beside.p_holm == pytest.approx(min(1.0, 2.0 * alone.p))
+    # The reason cannot be changed or dropped unnoticed.
+    (half_run / WITHDRAWN).write_text(json.dumps({"other": "No matter."}))
+    assert any(WITHDRAWN in each for each in verify_set(half_run).problems)
+    (half_run / WITHDRAWN).unlink()
+    assert any("is not there" in each for each in verify_set(half_run).problems)
+
+
+@pytest.mark.parametrize(
+    ("scenarios", "says"),
+    [
+        ({"third": "why not"}, "expected a registered scenario to withdraw (other, track), got 'third'"),
+        ({"other": " "}, "expected a reason for withdrawing other"),
+        (
+            {"track": "It did not come out well."},
+            "track cannot be withdrawn, as track_hardened_",
+        ),
+    ],
+)
+def test_results_and_strangers_cannot_be_withdrawn(half_run, scenarios, says):
+    with pytest.raises(RegistrationError) as error:
+        withdraw(half_run, scenarios)
+    assert says in str(error.value)
+    assert not (half_run / WITHDRAWN).exists()
