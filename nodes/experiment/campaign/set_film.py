@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from advnerf_core.files import write_atomically
-from advnerf_core.report.cells import cell_name, read_cell
+from advnerf_core.report.cells import read_cell
 from advnerf_core.report.clips import read_clip, webp
 from advnerf_core.report.conditions import NONE
 from advnerf_core.report.evidence.page import film_of
+from advnerf_core.report.evidence.registration import read_registration
 from advnerf_core.report.evidence.verify import SET
 from nodes.experiment.campaign.config import Campaign
 
@@ -41,10 +42,16 @@ def write_film(campaign: Campaign, published: Path) -> Path | None:
 
 
 def _clips(campaign: Campaign, published: Path, test: dict[str, Any]) -> list[Path]:
-    which = test["test"]
+    which, registration = test["test"], read_registration(published)
+    assert registration is not None, "a set was registered"
     clips = []
     for method in (NONE, test["baseline"], which["method"]):
-        name = cell_name(which["scenario"], which["victim"], method, 0, which["placement"])
+        of = (which["scenario"], which["placement"], which["victim"], method)
+        name = next(
+            each.name
+            for each in registration.cells
+            if (each.scenario, each.placement, each.victim, each.method) == of
+        )
         extra = read_cell(published / f"{name}.json").extra
         clips.append(campaign.folder / "cells" / str(extra.get("clip", "")))
     return clips
