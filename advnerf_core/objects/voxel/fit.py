@@ -22,7 +22,7 @@ from torch.nn.functional import grid_sample
 from advnerf_core.objects.voxel.pictures import FitError, PosedRgba, RayBatches, crossing
 from advnerf_core.objects.voxel.voxelise import OPAQUE_PER_VOXEL, ObjectGrids
 
-_LEARNING_RATE = 0.15
+LEARNING_RATE = 0.15
 _EDGE = 1e-3  # the logistic function of the density never reaches 0 or 1 at the start
 _SPARSITY = 1e-3
 _FAINT = 0.01
@@ -51,6 +51,7 @@ def fit_grids(
     seed: int = 0,
     progress: Callable[[float, str], None] | None = None,
     max_seconds: float | None = None,
+    learning_rate: float = LEARNING_RATE,
 ) -> Fit:
     """Density and colours that explain the pictures.
 
@@ -65,6 +66,7 @@ def fit_grids(
         progress: Called after each step with the finished fraction and a text.
         max_seconds: Stop after this much time, if sooner [s]. The learning rate falls with the finished fraction, so that a fit
             that is stopped by time ends as smoothly as one that is stopped by steps.
+        learning_rate: Of Adam, at the start.
 
     Raises:
         FitError: Too few pictures, none shows the object, or none looks at the box.
@@ -73,10 +75,10 @@ def fit_grids(
     batches = RayBatches(views, start.box_min, start.box_max, seed)
     torch_rng = torch.Generator().manual_seed(seed)
     field = _Field(start)
-    optimiser = torch.optim.Adam(field.parameters, lr=_LEARNING_RATE)
+    optimiser = torch.optim.Adam(field.parameters, lr=learning_rate)
     began, errors, fraction = time.monotonic(), list[float](), 0.0 if steps > 0 else 1.0
     while fraction < 1.0:
-        optimiser.param_groups[0]["lr"] = _learning_rate(fraction)
+        optimiser.param_groups[0]["lr"] = learning_rate * _cosine(fraction)
         errors.append(_step(field, optimiser, batches.draw(rays), torch_rng))
         by_time = 0.0 if max_seconds is None else (time.monotonic() - began) / max_seconds
         fraction = min(1.0, max(len(errors) / steps, by_time))
@@ -105,9 +107,9 @@ def _step(
     return float(error.detach())
 
 
-def _learning_rate(fraction: float) -> float:
-    """Half a cosine from the full rate to a tenth of it."""
-    return _LEARNING_RATE * (0.1 + 0.45 * (1.0 + math.cos(math.pi * fraction)))
+def _cosine(fraction: float) -> float:
+    """Half a cosine from 1 to a tenth."""
+    return 0.1 + 0.45 * (1.0 + math.cos(math.pi * fraction))
 
 
 def _psnr(errors: Sequence[float]) -> float:
