@@ -61,7 +61,7 @@ def table(found: Sequence[Answer]) -> str:
 
 def sets_table(published: Path) -> str:
     """One line for each test of the published sets, as Markdown; empty without any."""
-    lines = [_line(found, test) for found in _sets(published) for test in _told(found)]
+    lines = [_line(found, test) for found, test in _told(_sets(published))]
     if not lines:
         return ""
     head = (
@@ -75,10 +75,13 @@ def _sets(published: Path) -> list[dict[str, Any]]:
     return [json.loads(file.read_text()) for file in sorted(published.glob("*/set/set.json"))]
 
 
-def _told(found: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
-    """The tests that are told here: of a set with contrasts that under its last condition, in which everything is the world's own."""
-    tests: Sequence[Mapping[str, Any]] = found["primary"]
-    return tests[-1:] if found.get("contrasts") else tests
+def _told(sets: Sequence[Mapping[str, Any]]) -> list[tuple[Mapping[str, Any], Mapping[str, Any]]]:
+    """Sets with their tests that are told here: of one with contrasts that under its last condition, in which everything is the world's own."""
+    return [
+        (found, test)
+        for found in sets
+        for test in (found["primary"][-1:] if found.get("contrasts") else found["primary"])
+    ]
 
 
 def _row(rows: Sequence[Mapping[str, Any]], test: Mapping[str, Any], domain: str) -> Mapping[str, Any]:
@@ -106,8 +109,7 @@ def _line(found: Mapping[str, Any], test: Mapping[str, Any]) -> str:
 def _transfers(sets: Sequence[Mapping[str, Any]]) -> str:
     pairs = [
         [_row(found["rows"], test, domain) for domain in ("surrogate", "deployed")]
-        for found in sets
-        for test in _told(found)
+        for found, test in _told(sets)
     ]
     if not pairs:
         return ""
@@ -120,7 +122,7 @@ def _transfers(sets: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _better(sets: Sequence[Mapping[str, Any]]) -> str:
-    tests = [test for found in sets for test in _told(found)]
+    tests = [test for _, test in _told(sets)]
     if not tests:
         return ""
     added = [test["difference_m"] for test in tests]

@@ -73,18 +73,17 @@ def _section(name: str, data: Mapping[str, Any]) -> str:
 
 def _withdrawn(data: Mapping[str, Any]) -> list[str]:
     """Sentences about what was registered and given up."""
-    registered = data["registered"]
-    counts = {
-        scenario: [
-            sum(each["scenario"] == scenario for each in registered[of]) for of in ("cells", "primary")
-        ]
-        for scenario in data.get("withdrawn", {})
-    }
-    return [
-        f"**Registered, and not run:** {scenario.replace('_', ' ')}, with {counts[scenario][0]} cells and {counts[scenario][1]} of the primary "
-        f"tests, which count as p = 1 in Holm's adjustment. {reason}\n"
-        for scenario, reason in data.get("withdrawn", {}).items()
-    ]
+    sentences = []
+    for scenario, reason in data.get("withdrawn", {}).items():
+        cells, tests = (
+            sum(each["scenario"] == scenario for each in data["registered"][part])
+            for part in ("cells", "primary")
+        )
+        sentences.append(
+            f"**Registered, and not run:** {scenario.replace('_', ' ')}, with {cells} cells and {tests} of the primary tests, which count as "
+            f"p = 1 in Holm's adjustment. {reason}\n"
+        )
+    return sentences
 
 
 def _tests(data: Mapping[str, Any]) -> list[str]:

@@ -124,7 +124,7 @@ def verify_set(folder: Path) -> Verified:
     problems = [*_files(folder), *_against_registration(evidence, cells, withdrawn)]
     numbers = 0
     if not problems:  # numbers of damaged drives say nothing more
-        numbers, wrong = _numbers(folder, evidence)
+        numbers, wrong = _numbers(folder, evidence, withdrawn)
         problems += wrong
         if not wrong:  # it is made of these numbers
             problems += _page_problems(folder.parent)
@@ -291,7 +291,7 @@ def _published(evidence: Evidence) -> dict[str, Any]:
     return {**as_data(evidence), **contrast_data(evidence)}
 
 
-def _numbers(folder: Path, evidence: Evidence) -> tuple[int, list[str]]:
+def _numbers(folder: Path, evidence: Evidence, withdrawn: Mapping[str, str]) -> tuple[int, list[str]]:
     """How many published numbers there are, and those that are not what the drives give."""
     published = json.loads((folder / SET).read_text(encoding="utf-8"))
     found = json.loads(json.dumps(_published(evidence)))
@@ -300,7 +300,7 @@ def _numbers(folder: Path, evidence: Evidence) -> tuple[int, list[str]]:
         wrong.append(
             f"{SET}: expected drives deployed through {found['deployed_through']}, got {published['deployed_through']}"
         )
-    if published.get("withdrawn", {}) != read_withdrawn(folder):
+    if published.get("withdrawn", {}) != withdrawn:
         wrong.append(f"{SET}: expected what {WITHDRAWN} says was withdrawn, got {published.get('withdrawn')}")
     for part in ("rows", "primary", *(["contrasts"] if "contrasts" in found else [])):
         there = published.get(part, [])

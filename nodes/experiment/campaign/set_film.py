@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from advnerf_core.files import write_atomically
-from advnerf_core.report.cells import read_cell
+from advnerf_core.report.cells import read_cells
 from advnerf_core.report.clips import read_clip, webp
 from advnerf_core.report.conditions import NONE
 from advnerf_core.report.evidence.page import film_of
 from advnerf_core.report.evidence.registration import read_registration
+from advnerf_core.report.evidence.results import Evidence
 from advnerf_core.report.evidence.verify import SET
 from nodes.experiment.campaign.config import Campaign
 
@@ -44,17 +45,12 @@ def write_film(campaign: Campaign, published: Path) -> Path | None:
 def _clips(campaign: Campaign, published: Path, test: dict[str, Any]) -> list[Path]:
     which, registration = test["test"], read_registration(published)
     assert registration is not None, "a set was registered"
-    clips = []
-    for method in (NONE, test["baseline"], which["method"]):
-        of = (which["scenario"], which["placement"], which["victim"], method)
-        name = next(
-            each.name
-            for each in registration.cells
-            if (each.scenario, each.placement, each.victim, each.method) == of
-        )
-        extra = read_cell(published / f"{name}.json").extra
-        clips.append(campaign.folder / "cells" / str(extra.get("clip", "")))
-    return clips
+    evidence = Evidence(registration, read_cells(published))
+    searched = [
+        evidence.searches((which["scenario"], which["placement"], which["victim"], method))[0]
+        for method in (NONE, test["baseline"], which["method"])
+    ]
+    return [campaign.folder / "cells" / str(cell.extra.get("clip", "")) for cell in searched]
 
 
 def _side_by_side(clips: Sequence[NDArray[np.uint8]]) -> list[Image.Image]:

@@ -1,16 +1,20 @@
 """The fidelity gate of campaigns, and predictions, on pictures whose steering is known: a policy that reads it off a pixel."""
 
+import inspect
 import json
+from typing import get_type_hints
 
 import pytest
 import torch
 from typer.testing import CliRunner
 
+from advnerf_core.attack.transfer import DEFAULT_DRAWS, FEWEST_DRAWS
 from advnerf_core.driving.dynamics import Dubins
 from advnerf_core.driving.metrics import Horizon, drive_metrics
 from advnerf_core.driving.path import Line, Path
 from advnerf_core.driving.rollout import drive
 from advnerf_core.scene.gate_limits import GateLimits
+from nodes.cli.experiment import predict
 from nodes.cli.main import app
 from nodes.experiment.campaign.config import load_campaign
 from nodes.experiment.campaign.gate import judge_scene
@@ -171,3 +175,9 @@ def test_a_kind_without_pictures_has_no_gate(bench):
         judge_scene(
             load_kind(bench.kind, bench.folder), None, Cell("straight", "hardened", "none", 0), GateLimits()
         )
+
+
+def test_the_command_draws_as_often_as_the_library_by_default_and_as_it_must():
+    draws = inspect.signature(predict).parameters["draws"]
+    (option,) = get_type_hints(predict, include_extras=True)["draws"].__metadata__
+    assert (draws.default, option.min) == (DEFAULT_DRAWS, FEWEST_DRAWS)
