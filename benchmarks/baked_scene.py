@@ -124,7 +124,7 @@ def _ticks(code: Path, run: Path) -> dict[str, float]:
     environment = {**os.environ, "PYTHONPATH": str(code)}
     environment.pop("OMP_WAIT_POLICY", None)  # each code as its commands would have it
     done = subprocess.run(
-        [sys.executable, "-W", "ignore", code / "benchmarks" / "ticks.py", run],
+        [sys.executable, "-W", "ignore", "-m", "benchmarks.ticks", run],
         cwd=code,
         env=environment,
         check=True,
@@ -144,7 +144,8 @@ def _copy_as_of_before(run: Path, target: Path) -> None:
             ignore=shutil.ignore_patterns("photos", "frames", "*.checkpoint.*", "views"),
         )
     manifest = json.loads((run / "manifest.json").read_text())
-    manifest["config"].pop("reference")
+    for unknown in ("reference", "measure"):
+        del manifest["config"][unknown]
     (target / "manifest.json").write_text(json.dumps(manifest))
     file = target / "scene" / "scene.safetensors"
     with safe_open(file, framework="pt") as scene:
