@@ -14,8 +14,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from advnerf_core.fields.hash_grid_kernels import PRIME_Y, PRIME_Z, Array32, encode_level, scatter_level
-from advnerf_core.parallel import run_slots
+from advnerf_core.fields.hash_grid_kernels import (
+    PRIME_Y,
+    PRIME_Z,
+    Array32,
+    chunk_scratch,
+    encode_level,
+    rows_to_tiles,
+    scatter_level,
+)
+from advnerf_core.fields.mlp_kernels import TILE
+from advnerf_core.parallel import SLOTS, run_slots, slot_bounds
 
 
 @dataclass(frozen=True)
@@ -132,10 +141,18 @@ class _NumbaEncode(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[None, Tensor, None]:
         (points,) = ctx.saved_tensors
-        grad_table = torch.zeros(ctx.shape)
-        grad_out = grads[0].contiguous().numpy()[None]
-        scatter(points.detach().contiguous().numpy(), len(points), grad_out, ctx.levels, grad_table.numpy())
+        grad_table = torch.empty(ctx.shape)
+        grad_out = _in_tiles(grads[0].T.contiguous().numpy())
+        at = points.detach().contiguous().numpy()
+        scatter(at, len(points), grad_out, ctx.levels, grad_table.numpy(), from_zero=True)
         return None, grad_table, None
+
+
+def _in_tiles(values: Array32) -> Array32:
+    tiles = np.empty((-(-len(values) // TILE), values.shape[1], TILE), np.float32)
+    bounds = slot_bounds(len(tiles), SLOTS)
+    run_slots(lambda slot: rows_to_tiles(values, *bounds[slot], tiles), SLOTS)
+    return tiles
 
 
 def encode(points: Array32, count: int, table: Array32, levels: NDArray[np.int64], out: Array32) -> None:
@@ -145,14 +162,31 @@ def encode(points: Array32, count: int, table: Array32, levels: NDArray[np.int64
     """
     last = levels.shape[0] - 1
     # Finest first: those miss the cache most, and a slow level handed out last would leave the other threads waiting.
-    run_slots(lambda slot: encode_level(points, count, table, last - slot, levels, out), levels.shape[0])
+    run_slots(
+        lambda slot: encode_level(points, count, table, last - slot, levels, *chunk_scratch(), out),
+        levels.shape[0],
+    )
 
 
 def scatter(
-    points: Array32, count: int, grad_out: Array32, levels: NDArray[np.int64], grad_table: Array32
+    points: Array32,
+    count: int,
+    grad_out: Array32,
+    levels: NDArray[np.int64],
+    grad_table: Array32,
+    from_zero: bool = False,
 ) -> None:
-    """``scatter_level`` at all levels, in parallel over levels (no two write the same rows)."""
+    """``scatter_level`` at all levels, in parallel over levels (no two write the same rows).
+
+    ``from_zero`` overwrites what ``grad_table`` held: a level is cleared while it is in the cache anyway.
+    """
     last = levels.shape[0] - 1
-    run_slots(
-        lambda slot: scatter_level(points, count, grad_out, last - slot, levels, grad_table), levels.shape[0]
-    )
+    ends = [*levels[1:, 0].tolist(), len(grad_table)]
+
+    def work(slot: int) -> None:
+        level = last - slot
+        if from_zero:
+            grad_table[levels[level, 0] : ends[level]] = 0.0
+        scatter_level(points, count, grad_out, level, levels, *chunk_scratch(), grad_table)
+
+    run_slots(work, levels.shape[0])

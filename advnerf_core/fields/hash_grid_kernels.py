@@ -3,6 +3,9 @@
 A level is described by four numbers, kept in ``levels`` as int64 ``[L, 4]``: first row in the table, cells per axis, index mask
 (entries - 1), and 1 if the level is indexed densely, 0 if hashed. Encodings are tiled and feature-major, ``[tiles, L * F, T]``: one
 level writes contiguous rows, and the network after it reads contiguous rows.
+
+A few points at a time first find their table rows and weights, in loops that the compiler turns into vector instructions, and then
+read the table: reads that wait for memory then lie close together, and many wait at once.
 """
 
 from __future__ import annotations
@@ -14,58 +17,148 @@ from numpy.typing import NDArray
 from advnerf_core.parallel import KERNEL_OPTIONS
 
 Array32 = NDArray[np.float32]
+Array32u = NDArray[np.uint32]
 Array64i = NDArray[np.int64]
 
 PRIME_Y = 2654435761  # the spatial hash of Teschner et al. 2003, as used by Müller et al. 2022, equation 4
 PRIME_Z = 805459861
 
-# Rows are unsigned: numba wraps signed indices (a[-1]), and that check costs a third of the time here.
-_U = np.uint64
-_ONE = np.uint64(1)
-_PRIME_Y = np.uint64(PRIME_Y)
-_PRIME_Z = np.uint64(PRIME_Z)
+CHUNK = 128  # points that are placed together
+_ONE = np.uint32(1)
+# Products wrap at 32 bits; the mask of a level is shorter.
+_PRIME_Y, _PRIME_Z = np.uint32(PRIME_Y), np.uint32(PRIME_Z)
+_f = np.float32
+_NOT, _ALL = np.float32(0.0), np.float32(1.0)
 
 
 @njit(**KERNEL_OPTIONS)
-def _axis(x, cells):  # type: ignore[no-untyped-def]
-    """Cell index and fraction inside it of one coordinate in [0, 1]; outside it is clamped."""
-    position = min(max(x, np.float32(0.0)), np.float32(1.0)) * np.float32(cells)
-    index = min(np.int32(position), np.int32(cells) - np.int32(1))
-    return _U(index), position - np.float32(index)
+def chunk_scratch() -> tuple[Array32u, Array32]:
+    """What one thread needs to place a chunk: table rows and cells ``[11 * CHUNK]``, weights and fractions ``[11 * CHUNK]``."""
+    return np.empty(11 * CHUNK, np.uint32), np.empty(11 * CHUNK, np.float32)
 
 
 @njit(**KERNEL_OPTIONS)
-def _corners(ix, iy, iz, cells, mask, dense, first):  # type: ignore[no-untyped-def]
-    """Table rows of the eight vertices of a cell, x fastest."""
-    if dense:
-        side = cells + _ONE
-        a = ix + side * (iy + side * iz) + first
+def _find_cells(points, begin, count, cells, index, fraction):  # type: ignore[no-untyped-def]
+    """Cell of each point along x, y and z, and the fraction inside it; coordinates outside of [0, 1] are clamped."""
+    last, side = np.int32(cells) - np.int32(1), _f(cells)
+    for n in range(count):
+        x = min(max(points[begin + n, 0], _NOT), _ALL) * side
+        y = min(max(points[begin + n, 1], _NOT), _ALL) * side
+        z = min(max(points[begin + n, 2], _NOT), _ALL) * side
+        i, j, k = min(np.int32(x), last), min(np.int32(y), last), min(np.int32(z), last)
+        index[n], index[CHUNK + n], index[2 * CHUNK + n] = np.uint32(i), np.uint32(j), np.uint32(k)
+        fraction[n], fraction[CHUNK + n], fraction[2 * CHUNK + n] = x - _f(i), y - _f(j), z - _f(k)
+
+
+@njit(**KERNEL_OPTIONS)
+def _dense_rows(index, count, cells, first, rows):  # type: ignore[no-untyped-def]
+    side = np.uint32(cells) + _ONE
+    for n in range(count):
+        a = index[n] + side * (index[CHUNK + n] + side * index[2 * CHUNK + n]) + first
         b, c = a + side, a + side * side
         d = c + side
-        return a, a + _ONE, b, b + _ONE, c, c + _ONE, d, d + _ONE
-    x1 = ix + _ONE
-    y0, z0 = iy * _PRIME_Y, iz * _PRIME_Z
-    y1, z1 = y0 + _PRIME_Y, z0 + _PRIME_Z
-    a, b, c, d = y0 ^ z0, y1 ^ z0, y0 ^ z1, y1 ^ z1
-    return (
-        first + ((ix ^ a) & mask), first + ((x1 ^ a) & mask), first + ((ix ^ b) & mask), first + ((x1 ^ b) & mask),
-        first + ((ix ^ c) & mask), first + ((x1 ^ c) & mask), first + ((ix ^ d) & mask), first + ((x1 ^ d) & mask),
-    )  # fmt: skip
+        rows[n], rows[CHUNK + n], rows[2 * CHUNK + n], rows[3 * CHUNK + n] = a, a + _ONE, b, b + _ONE
+        rows[4 * CHUNK + n], rows[5 * CHUNK + n], rows[6 * CHUNK + n], rows[7 * CHUNK + n] = (
+            c,
+            c + _ONE,
+            d,
+            d + _ONE,
+        )
 
 
 @njit(**KERNEL_OPTIONS)
-def _weights(fx, fy, fz):  # type: ignore[no-untyped-def]
-    """Trilinear weights of the eight vertices, in the order of ``_corners``."""
-    one = np.float32(1.0)
-    gx, gy, gz = one - fx, one - fy, one - fz
-    a, b, c, d = gy * gz, fy * gz, gy * fz, fy * fz
-    return gx * a, fx * a, gx * b, fx * b, gx * c, fx * c, gx * d, fx * d
+def _hashed_rows(index, count, mask, first, rows):  # type: ignore[no-untyped-def]
+    for n in range(count):
+        x0, y0, z0 = index[n], index[CHUNK + n] * _PRIME_Y, index[2 * CHUNK + n] * _PRIME_Z
+        x1, y1, z1 = x0 + _ONE, y0 + _PRIME_Y, z0 + _PRIME_Z
+        a, b, c, d = y0 ^ z0, y1 ^ z0, y0 ^ z1, y1 ^ z1
+        rows[n], rows[CHUNK + n] = first + ((x0 ^ a) & mask), first + ((x1 ^ a) & mask)
+        rows[2 * CHUNK + n], rows[3 * CHUNK + n] = first + ((x0 ^ b) & mask), first + ((x1 ^ b) & mask)
+        rows[4 * CHUNK + n], rows[5 * CHUNK + n] = first + ((x0 ^ c) & mask), first + ((x1 ^ c) & mask)
+        rows[6 * CHUNK + n], rows[7 * CHUNK + n] = first + ((x0 ^ d) & mask), first + ((x1 ^ d) & mask)
+
+
+@njit(**KERNEL_OPTIONS)
+def _trilinear(fraction, count, weights):  # type: ignore[no-untyped-def]
+    for n in range(count):
+        fx, fy, fz = fraction[n], fraction[CHUNK + n], fraction[2 * CHUNK + n]
+        gx, gy, gz = _ALL - fx, _ALL - fy, _ALL - fz
+        a, b, c, d = gy * gz, fy * gz, gy * fz, fy * fz
+        weights[n], weights[CHUNK + n] = gx * a, fx * a
+        weights[2 * CHUNK + n], weights[3 * CHUNK + n] = gx * b, fx * b
+        weights[4 * CHUNK + n], weights[5 * CHUNK + n] = gx * c, fx * c
+        weights[6 * CHUNK + n], weights[7 * CHUNK + n] = gx * d, fx * d
+
+
+@njit(**KERNEL_OPTIONS)
+def _place(points, begin, count, level, rows, weights):  # type: ignore[no-untyped-def]
+    """Table rows and trilinear weights of the eight vertices around each of ``count`` points, x fastest; vertex ``k`` from ``k * CHUNK`` on."""
+    index, fraction = rows[8 * CHUNK :], weights[8 * CHUNK :]
+    first, cells = np.uint32(level[0]), level[1]
+    _find_cells(points, begin, count, cells, index, fraction)
+    if level[3] == 1:
+        _dense_rows(index, count, cells, first, rows)
+    else:
+        _hashed_rows(index, count, np.uint32(level[2]), first, rows)
+    _trilinear(fraction, count, weights)
+
+
+# Rows are unsigned: numba wraps signed indices (a[-1]), and that check costs a third of the time here. Features are moved as pairs or
+# fours, which the compiler packs into one instruction.
+
+
+@njit(**KERNEL_OPTIONS)
+def _gather_pairs(table, rows, weights, count, out):  # type: ignore[no-untyped-def]
+    for n in range(count):
+        u, v = _NOT, _NOT
+        for k in range(8):
+            row, weight = np.uint64(rows[k * CHUNK + n]), weights[k * CHUNK + n]
+            u += table[row, 0] * weight
+            v += table[row, 1] * weight
+        out[0, n], out[1, n] = u, v
+
+
+@njit(**KERNEL_OPTIONS)
+def _gather_fours(table, rows, weights, count, out):  # type: ignore[no-untyped-def]
+    for j in range(0, table.shape[1], 4):
+        for n in range(count):
+            s, t, u, v = _NOT, _NOT, _NOT, _NOT
+            for k in range(8):
+                row, weight = np.uint64(rows[k * CHUNK + n]), weights[k * CHUNK + n]
+                s += table[row, j] * weight
+                t += table[row, j + 1] * weight
+                u += table[row, j + 2] * weight
+                v += table[row, j + 3] * weight
+            out[j, n], out[j + 1, n], out[j + 2, n], out[j + 3, n] = s, t, u, v
+
+
+@njit(**KERNEL_OPTIONS)
+def _scatter_pairs(grad_out, rows, weights, count, grad_table):  # type: ignore[no-untyped-def]
+    for n in range(count):
+        u, v = grad_out[0, n], grad_out[1, n]
+        for k in range(8):
+            row, weight = np.uint64(rows[k * CHUNK + n]), weights[k * CHUNK + n]
+            grad_table[row, 0] += u * weight
+            grad_table[row, 1] += v * weight
+
+
+@njit(**KERNEL_OPTIONS)
+def _scatter_fours(grad_out, rows, weights, count, grad_table):  # type: ignore[no-untyped-def]
+    for j in range(0, grad_table.shape[1], 4):
+        for n in range(count):
+            s, t, u, v = grad_out[j, n], grad_out[j + 1, n], grad_out[j + 2, n], grad_out[j + 3, n]
+            for k in range(8):
+                row, weight = np.uint64(rows[k * CHUNK + n]), weights[k * CHUNK + n]
+                grad_table[row, j] += s * weight
+                grad_table[row, j + 1] += t * weight
+                grad_table[row, j + 2] += u * weight
+                grad_table[row, j + 3] += v * weight
 
 
 @njit(**KERNEL_OPTIONS)
 def encode_level(
-    points: Array32, count: int, table: Array32, level: int, levels: Array64i, out: Array32
-) -> None:
+    points: Array32, count: int, table: Array32, level: int, levels: Array64i, rows: Array32u, weights: Array32, out: Array32
+) -> None:  # fmt: skip
     """Encode the first ``count`` points at one level; levels may run in parallel.
 
     Args:
@@ -74,33 +167,29 @@ def encode_level(
         table: ``[entries, F]``, F even.
         level: Which level.
         levels: ``[L, 4]``.
+        rows: Of `chunk_scratch`, used by one thread at a time.
+        weights: The same.
         out: Tiles ``[tiles, L * F, T]``; only the rows of this level are written.
     """
-    first, cells, mask = _U(levels[level, 0]), _U(levels[level, 1]), _U(levels[level, 2])
-    dense = levels[level, 3] == 1
     features, tile = table.shape[1], out.shape[2]
-    row = level * features
-    for block in range((count + tile - 1) // tile):
-        start = block * tile
-        for n in range(min(tile, count - start)):
-            ix, fx = _axis(points[start + n, 0], cells)
-            iy, fy = _axis(points[start + n, 1], cells)
-            iz, fz = _axis(points[start + n, 2], cells)
-            a, b, c, d, e, f, g, h = _corners(ix, iy, iz, cells, mask, dense, first)
-            p0, p1, p2, p3, p4, p5, p6, p7 = _weights(fx, fy, fz)
-            for k in range(0, features, 2):  # pairs: the compiler then moves both with one instruction
-                u = table[a, k] * p0 + table[b, k] * p1 + table[c, k] * p2 + table[d, k] * p3
-                v = table[a, k + 1] * p0 + table[b, k + 1] * p1 + table[c, k + 1] * p2 + table[d, k + 1] * p3
-                u += table[e, k] * p4 + table[f, k] * p5 + table[g, k] * p6 + table[h, k] * p7
-                v += table[e, k + 1] * p4 + table[f, k + 1] * p5 + table[g, k + 1] * p6 + table[h, k + 1] * p7
-                out[block, row + k, n] = u
-                out[block, row + k + 1, n] = v
+    own = level * features
+    for begin in range(0, count, CHUNK):
+        here, n = min(CHUNK, count - begin), 0
+        _place(points, begin, here, levels[level], rows, weights)
+        while n < here:  # tiles, or the part of one
+            block, column = (begin + n) // tile, (begin + n) % tile
+            part = min(tile - column, here - n)
+            if features == 2:
+                _gather_pairs(table, rows[n:], weights[n:], part, out[block, own:, column:])
+            else:
+                _gather_fours(table, rows[n:], weights[n:], part, out[block, own:, column:])
+            n += part
 
 
 @njit(**KERNEL_OPTIONS)
 def scatter_level(
-    points: Array32, count: int, grad_out: Array32, level: int, levels: Array64i, grad_table: Array32
-) -> None:
+    points: Array32, count: int, grad_out: Array32, level: int, levels: Array64i, rows: Array32u, weights: Array32, grad_table: Array32
+) -> None:  # fmt: skip
     """Add the transpose of ``encode_level`` to ``grad_table``; levels may run in parallel.
 
     Args:
@@ -109,35 +198,30 @@ def scatter_level(
         grad_out: Tiles ``[tiles, L * F, T]``.
         level: Which level.
         levels: ``[L, 4]``.
+        rows: Of `chunk_scratch`, used by one thread at a time.
+        weights: The same.
         grad_table: ``[entries, F]``, accumulated into.
     """
-    first, cells, mask = _U(levels[level, 0]), _U(levels[level, 1]), _U(levels[level, 2])
-    dense = levels[level, 3] == 1
     features, tile = grad_table.shape[1], grad_out.shape[2]
-    row = level * features
-    for block in range((count + tile - 1) // tile):
-        start = block * tile
-        for n in range(min(tile, count - start)):
-            ix, fx = _axis(points[start + n, 0], cells)
-            iy, fy = _axis(points[start + n, 1], cells)
-            iz, fz = _axis(points[start + n, 2], cells)
-            a, b, c, d, e, f, g, h = _corners(ix, iy, iz, cells, mask, dense, first)
-            p0, p1, p2, p3, p4, p5, p6, p7 = _weights(fx, fy, fz)
-            for k in range(0, features, 2):
-                u, v = grad_out[block, row + k, n], grad_out[block, row + k + 1, n]
-                grad_table[a, k] += u * p0
-                grad_table[a, k + 1] += v * p0
-                grad_table[b, k] += u * p1
-                grad_table[b, k + 1] += v * p1
-                grad_table[c, k] += u * p2
-                grad_table[c, k + 1] += v * p2
-                grad_table[d, k] += u * p3
-                grad_table[d, k + 1] += v * p3
-                grad_table[e, k] += u * p4
-                grad_table[e, k + 1] += v * p4
-                grad_table[f, k] += u * p5
-                grad_table[f, k + 1] += v * p5
-                grad_table[g, k] += u * p6
-                grad_table[g, k + 1] += v * p6
-                grad_table[h, k] += u * p7
-                grad_table[h, k + 1] += v * p7
+    own = level * features
+    for begin in range(0, count, CHUNK):
+        here, n = min(CHUNK, count - begin), 0
+        _place(points, begin, here, levels[level], rows, weights)
+        while n < here:  # tiles, or the part of one
+            block, column = (begin + n) // tile, (begin + n) % tile
+            part = min(tile - column, here - n)
+            if features == 2:
+                _scatter_pairs(grad_out[block, own:, column:], rows[n:], weights[n:], part, grad_table)
+            else:
+                _scatter_fours(grad_out[block, own:, column:], rows[n:], weights[n:], part, grad_table)
+            n += part
+
+
+@njit(**KERNEL_OPTIONS)
+def rows_to_tiles(values: Array32, first: int, stop: int, tiles: Array32) -> None:
+    """Write values ``[N, K]`` of points to tiles ``first..stop`` of ``[tiles, K, T]``."""
+    width, tile = tiles.shape[1], tiles.shape[2]
+    for block in range(first, stop):
+        for n in range(min(tile, values.shape[0] - block * tile)):
+            for k in range(width):
+                tiles[block, k, n] = values[block * tile + n, k]

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from advnerf_core.fields.hash_grid_kernels import encode_level
+from advnerf_core.fields.hash_grid_kernels import chunk_scratch, encode_level
 from advnerf_core.fields.mlp_kernels import TILE, dense
 from advnerf_core.parallel import KERNEL_OPTIONS
 from advnerf_core.render.march_kernels import span_in_box, step_size
@@ -64,6 +64,7 @@ def bake_points(
     """
     channels = w2.shape[0] - 1
     encoded = np.zeros((1, w1.shape[1], TILE), np.float32)
+    rows, weights = chunk_scratch()
     hidden, field = np.empty((w1.shape[0], TILE), np.float32), np.empty((w2.shape[0], TILE), np.float32)
     inputs = np.zeros((c1.shape[1], TILE), np.float32)
     decoded, colours = np.empty((c1.shape[0], TILE), np.float32), np.empty((4, TILE), np.float32)
@@ -71,7 +72,7 @@ def bake_points(
     for begin in range(first, stop, TILE):
         count = min(TILE, stop - begin)
         for level in range(levels.shape[0]):
-            encode_level(points[begin:stop], count, table, level, levels, encoded)
+            encode_level(points[begin:stop], count, table, level, levels, rows, weights, encoded)
         dense(w1, b1, encoded[0], hidden, True)
         dense(w2, b2, hidden, field, False)
         squash_features(field)

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from advnerf_core.fields.hash_grid_kernels import encode_level
+from advnerf_core.fields.hash_grid_kernels import chunk_scratch, encode_level
 from advnerf_core.fields.mlp_kernels import TILE, dense
 from advnerf_core.fields.spherical_harmonics import write_spherical_harmonics
 from advnerf_core.parallel import KERNEL_OPTIONS
@@ -80,6 +80,7 @@ def render_tiles(
     points, owner = np.zeros((TILE, 3), np.float32), np.empty(TILE, np.int64)
     spans, middles = np.empty(TILE, np.float32), np.empty(TILE, np.float32)
     encoded = np.zeros((1, w1.shape[1], TILE), np.float32)
+    rows, weights = chunk_scratch()
     hidden, field = np.empty((w1.shape[0], TILE), np.float32), np.empty((w2.shape[0], TILE), np.float32)
     inputs = np.zeros((c1.shape[1], TILE), np.float32)
     decoded, colours = np.empty((c1.shape[0], TILE), np.float32), np.empty((4, TILE), np.float32)
@@ -126,7 +127,7 @@ def render_tiles(
             total += used
             if used > 0:
                 for level in range(levels.shape[0]):
-                    encode_level(points, used, table, level, levels, encoded)
+                    encode_level(points, used, table, level, levels, rows, weights, encoded)
                 dense(w1, b1, encoded[0], hidden, True)
                 dense(w2, b2, hidden, field, False)
                 squash_features(field)

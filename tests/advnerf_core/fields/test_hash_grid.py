@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from advnerf_core.fields.hash_grid import HashGrid, HashGridConfig, encode_reference
+from advnerf_core.fields.hash_grid import HashGrid, HashGridConfig, encode, encode_reference, scatter
 
 SMALL = HashGridConfig(levels=4, features=2, log2_entries=8, coarsest=3, finest=24)
 
@@ -33,7 +33,7 @@ def test_a_dense_level_interpolates_a_linear_function_exactly() -> None:
     )
 
 
-@pytest.mark.parametrize("features", [2, 4])
+@pytest.mark.parametrize("features", [2, 4, 8])
 def test_kernels_agree_with_plain_torch(features: int) -> None:
     grid = random_grid(HashGridConfig(levels=6, features=features, log2_entries=10, coarsest=4, finest=300))
     points = (
@@ -45,6 +45,20 @@ def test_kernels_agree_with_plain_torch(features: int) -> None:
     (reference,) = torch.autograd.grad((expected * weights).sum(), grid.table)
     (ours,) = torch.autograd.grad((grid(points) * weights).sum(), grid.table)
     assert (ours - reference).abs().max() <= 1e-6 * reference.abs().max()
+
+
+@pytest.mark.parametrize("tile", [32, 100, 1000])
+def test_values_do_not_depend_on_how_points_are_tiled(tile: int) -> None:
+    grid = random_grid(HashGridConfig(levels=5, features=2, log2_entries=10, coarsest=4, finest=300))
+    points, table = torch.rand(1000, 3).numpy(), grid.table.detach().numpy()
+    out = np.zeros((-(-1000 // tile), grid.config.width, tile), np.float32)
+    encode(points, 1000, table, grid.levels, out)
+    rows = out.transpose(0, 2, 1).reshape(-1, grid.config.width)[:1000]
+    np.testing.assert_array_equal(rows, grid(torch.from_numpy(points)).detach())
+    added, anew = np.ones_like(table), np.full_like(table, np.nan)
+    scatter(points, 1000, out, grid.levels, added)
+    scatter(points, 1000, out, grid.levels, anew, from_zero=True)
+    np.testing.assert_allclose(added - 1.0, anew, atol=1e-5)
 
 
 def test_the_plain_path_passes_gradcheck_in_double_precision() -> None:
