@@ -51,7 +51,7 @@ def _differentiable_images(frames: Frames, theta: Tensor) -> Tensor:
     assert isinstance(seen.field, VoxelGridObject)
     colours = seen.field.colours(theta)[torch.from_numpy(seen.rows)]
     flat = frames.background.reshape(-1, 3)
-    flat = flat.index_add(0, pixels, torch.as_tensor(W.toarray(), dtype=theta.dtype) @ colours)
+    flat = flat.index_add(0, pixels, torch.as_tensor(W.csr().toarray(), dtype=theta.dtype) @ colours)
     return flat.reshape(frames.background.shape).permute(0, 3, 1, 2)
 
 

@@ -6,16 +6,14 @@ are taken for these only.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 from numba import njit
 from numpy.typing import NDArray
-from scipy import sparse
 from torch import Tensor
 
 from advnerf_core.fields.coloured import ColouredObject
+from advnerf_core.fields.sparse_rows import SparseRows
 from advnerf_core.fields.voxel_grid import squash, squash_derivative
 from advnerf_core.parallel import KERNEL_OPTIONS, scratch
 
@@ -64,15 +62,11 @@ class SeenRows:
         return out
 
 
-def compact(
-    weights: sparse.csr_matrix, share: NDArray[Any], field: ColouredObject
-) -> tuple[sparse.csr_matrix, SeenRows]:
-    """Weights ``[P, slots]`` times each row's ``share [P]``, with only the columns that are used ``[P, V]``, and what these are."""
-    indices = np.empty_like(weights.indices)
-    rows = _pack(weights.indices, scratch("place", weights.shape[1], np.int32), indices)
-    data = weights.data * np.repeat(share.astype(weights.dtype), np.diff(weights.indptr))
-    packed = sparse.csr_matrix((data, indices, weights.indptr), (weights.shape[0], len(rows)))
-    return packed, SeenRows(field, rows)
+def compact(weights: SparseRows, field: ColouredObject) -> tuple[SparseRows, SeenRows]:
+    """Weights ``[P, slots]`` with only the columns that are used ``[P, V]``, and what these are."""
+    columns = np.empty_like(weights.columns)
+    rows = _pack(weights.columns, scratch("place", weights.width, np.int32), columns)
+    return SparseRows(weights.ends, columns, weights.values, len(rows)), SeenRows(field, rows)
 
 
 @njit(**KERNEL_OPTIONS)

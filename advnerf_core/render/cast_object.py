@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage, sparse
 
 from advnerf_core.fields.coloured import ColouredObject
+from advnerf_core.fields.sparse_rows import SparseRows
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.geometry import Array, Pinhole, invert_transform, transform_points
 from advnerf_core.parallel import run_slots, scratch
@@ -41,20 +42,23 @@ class ObjectCast:
         pixels: Flat indices into ``[B, H, W]`` of the pixels that the object covers at least in part, ``[P]`` int64, ascending.
         alpha: Coverage times opacity, ``[P]`` in 0..1.
         depth_m: Planar depth, averaged with the rendering weights, ``[P]`` [m].
-        weights: Rendering weights ``[P, slots]``, CSR; each row sums to alpha.
+        rows: Rendering weights ``[P, slots]``; each row sums to alpha.
     """
 
     pixels: NDArray[np.int64]
     alpha: Array
     depth_m: Array
-    weights: sparse.csr_matrix
+    rows: SparseRows
+
+    @property
+    def weights(self) -> sparse.csr_matrix:
+        """The rendering weights as a matrix of SciPy."""
+        return self.rows.csr()
 
     @property
     def nbytes(self) -> int:
         """Memory held by the arrays [bytes]."""
-        w = self.weights
-        parts = (self.pixels, self.alpha, self.depth_m, w.data, w.indices, w.indptr)
-        return int(sum(part.nbytes for part in parts))
+        return self.pixels.nbytes + self.alpha.nbytes + self.depth_m.nbytes + self.rows.nbytes
 
 
 @runtime_checkable
@@ -140,9 +144,10 @@ def _cast_grids(
 def made_opaque(cast: ObjectCast) -> ObjectCast:
     """The cast with each pixel either wholly covered or not at all; half covered counts as covered."""
     kept = np.flatnonzero(cast.alpha >= 0.5)
-    alpha, weights = cast.alpha[kept], cast.weights[kept]
-    weights.data /= np.repeat(alpha, np.diff(weights.indptr)).astype(weights.dtype)
-    return ObjectCast(cast.pixels[kept], np.ones(len(kept)), cast.depth_m[kept], weights)
+    rows = cast.rows.take(kept)
+    values = rows.values
+    values /= np.repeat(cast.alpha[kept], np.diff(rows.ends)).astype(values.dtype)
+    return ObjectCast(cast.pixels[kept], np.ones(len(kept)), cast.depth_m[kept], rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,10 +323,8 @@ def _joined(parts: Sequence[_Part], field: VoxelGridObject, dtype: Any) -> Objec
             ("indices", np.int32),
         )
     )
-    shape = (len(pixels), field.slot_count)
-    return ObjectCast(
-        pixels, alpha, depth_m, sparse.csr_matrix((values, indices, np.concatenate(starts)), shape)
-    )
+    rows = SparseRows(np.concatenate(starts).astype(np.int32), indices, values, field.slot_count)
+    return ObjectCast(pixels, alpha, depth_m, rows)
 
 
 def _bands(window: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from numba import njit
 from numpy.typing import NDArray
-from scipy import sparse
 from torch import Tensor
 
 from advnerf_core.geometry import Array
@@ -104,27 +103,6 @@ def sparse_shares(
     background, shares = np.ones(len(behind)), np.empty(len(where))
     _layer_shares(where, alpha, depth, behind, ends, np.empty(len(where), np.int64), background, shares)
     return background, np.split(shares, np.cumsum(lengths)[:-1]) if lengths else []
-
-
-def add_layer(
-    image: NDArray[Any], pixels: NDArray[np.int64], weights: sparse.csr_matrix, colours: NDArray[Any]
-) -> None:
-    """Add ``weights [P, V] @ colours [V, 3]`` to the ``pixels [P]`` of an image ``[N, 3]``, in place."""
-    _add_rows(image, pixels, weights.indptr, weights.indices, weights.data, colours)
-
-
-@njit(**KERNEL_OPTIONS)
-def _add_rows(image: Any, pixels: Any, ends: Any, indices: Any, values: Any, colours: Any) -> None:
-    for p in range(len(pixels)):
-        red = green = blue = values.dtype.type(0.0)
-        for k in range(ends[p], ends[p + 1]):
-            weight, row = values[k], indices[k]
-            red += weight * colours[row, 0]
-            green += weight * colours[row, 1]
-            blue += weight * colours[row, 2]
-        image[pixels[p], 0] += red
-        image[pixels[p], 1] += green
-        image[pixels[p], 2] += blue
 
 
 @njit(**KERNEL_OPTIONS)

@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from advnerf_core.geometry import Array
-from advnerf_core.render.composite import add_layer
 from advnerf_core.scene.surrogate import Frames, Rendered, Surrogate, split_theta
 
 
@@ -84,8 +83,8 @@ class ManyTextures:
                 ]
             )
             for seen, W, share, value in zip(frames.seen, frames.weights, shares, values[k], strict=True):
-                rows, pixels = W[share[k].rows], share[k].pixels.numpy()
-                add_layer(image.reshape(-1, 3), pixels, rows, seen.colours(value).numpy())
+                rows, pixels = W.take(share[k].rows), share[k].pixels.numpy()
+                rows.add_product(seen.colours(value).numpy(), pixels, image.reshape(-1, 3))
         images = torch.from_numpy(np.ascontiguousarray(image.transpose(0, 3, 1, 2)))
         kept = sum(value.nbytes for each in values for value in each) + sum(
             seen.nbytes for seen in frames.seen
@@ -113,7 +112,10 @@ def _vjp(
         gradient = []
         for k in range(shape[0]):
             rows = [
-                here.gradient(value, torch.from_numpy(W[share[k].rows].T @ flat[share[k].pixels].numpy()))
+                here.gradient(
+                    value,
+                    torch.from_numpy(W.take(share[k].rows).transposed_product(flat[share[k].pixels].numpy())),
+                )
                 for here, value, W, share in zip(seen, values[k], weights, shares, strict=True)
             ]
             gradient.append(torch.cat(rows).to(dtype) if rows else torch.zeros(0, 3, dtype=dtype))

@@ -15,15 +15,15 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
-from scipy import sparse
 from torch import Tensor
 
 from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.fields.seen_rows import SeenRows, compact
+from advnerf_core.fields.sparse_rows import SparseRows
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.geometry import Array, Pinhole, planar_poses
 from advnerf_core.render.cast_object import ObjectCast, cast_objects, made_opaque
-from advnerf_core.render.composite import add_layer, composite, sparse_shares
+from advnerf_core.render.composite import composite, sparse_shares
 from advnerf_core.render.soft_pose import render_soft
 from advnerf_core.scene.remembered import RememberedBackground
 
@@ -58,7 +58,7 @@ class Frames:
     """
 
     background: Tensor
-    weights: tuple[sparse.csr_matrix, ...]
+    weights: tuple[SparseRows, ...]
     pixels: tuple[Tensor, ...]
     seen: tuple[SeenRows, ...]
 
@@ -71,7 +71,7 @@ class Frames:
             rows.values(part.to(self.background.dtype)) for rows, part in zip(self.seen, parts, strict=True)
         ]
         for rows, W, pixels, value in zip(self.seen, self.weights, self.pixels, values, strict=True):
-            add_layer(image.reshape(-1, 3), pixels.numpy(), W, rows.colours(value).numpy())
+            W.add_product(rows.colours(value).numpy(), pixels.numpy(), image.reshape(-1, 3))
         images = torch.from_numpy(np.ascontiguousarray(image.transpose(0, 3, 1, 2)))
         own = sum(rows.nbytes for rows in self.seen) + sum(value.nbytes for value in values)
         return Rendered(images, self._vjp(theta, values), images.nbytes + self.weights_nbytes + own)
@@ -79,8 +79,7 @@ class Frames:
     @property
     def weights_nbytes(self) -> int:
         """Memory that weights and pixels hold [bytes]."""
-        matrices = sum(W.data.nbytes + W.indices.nbytes + W.indptr.nbytes for W in self.weights)
-        return int(matrices + sum(pixels.nbytes for pixels in self.pixels))
+        return sum(W.nbytes for W in self.weights) + sum(pixels.nbytes for pixels in self.pixels)
 
     def _vjp(self, theta: Tensor | None, values: Sequence[Tensor]) -> Callable[[Tensor], Tensor]:
         # Only these names are kept alive: the background is not, nor is theta.
@@ -92,7 +91,7 @@ class Frames:
                 return torch.zeros(0, 3)
             flat = grad_images.detach().permute(0, 2, 3, 1).reshape(-1, 3)
             rows = [
-                here.gradient(value, torch.from_numpy(W.T @ flat[index].numpy()))
+                here.gradient(value, torch.from_numpy(W.transposed_product(flat[index].numpy())))
                 for here, value, W, index in zip(seen, values, weights, pixels, strict=True)
             ]
             return (rows[0] if len(rows) == 1 else torch.cat(rows)).to(dtype).reshape(shape)
@@ -294,14 +293,10 @@ class Surrogate:
             raise ValueError(f"expected a background of shapes {(*size, 3)} and {size}, got {got}")
 
 
-def _seen(
-    cast: ObjectCast, share: Array, field: ColouredObject
-) -> tuple[Tensor, sparse.csr_matrix, SeenRows]:
+def _seen(cast: ObjectCast, share: Array, field: ColouredObject) -> tuple[Tensor, SparseRows, SeenRows]:
     """Pixels, weights and colours of what is seen of a cast whose pixels keep ``share [P]`` of their light."""
-    W, kept = cast.weights, share > 0.0
-    if not kept.all():
-        W, share = W[np.flatnonzero(kept)], share[kept]
-    return torch.from_numpy(cast.pixels[kept]), *compact(W, share, field)
+    kept = np.flatnonzero(share > 0.0)
+    return torch.from_numpy(cast.pixels[kept]), *compact(cast.rows.scaled(kept, share[kept]), field)
 
 
 def split_theta(objects: Sequence[ColouredObject], theta: Tensor | None) -> list[Tensor]:

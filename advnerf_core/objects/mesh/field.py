@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import sparse
 from torch import Tensor
 
+from advnerf_core.fields.sparse_rows import SparseRows
 from advnerf_core.fields.voxel_grid import inverse_squash, squash
 from advnerf_core.geometry import Array, Pinhole, invert_transform
 from advnerf_core.objects.mesh.ray_cast import Hits, RayCaster
@@ -170,15 +170,14 @@ class MeshField:
         """One row per pixel of what its rays hit; rays of a pixel follow one another."""
         pixels, first, counts = np.unique(pixel, return_index=True, return_counts=True)
         texel, weight = self._bilinear(hits)
-        indptr = np.concatenate([[0], np.cumsum(4 * counts)])
+        ends = np.concatenate([[0], np.cumsum(4 * counts)]).astype(np.int32)
         data = (weight / rays_per_pixel).astype(dtype).reshape(-1)
-        shape = (len(pixels), self.slot_count)
         depth = np.add.reduceat(hits.t, first) / counts if len(pixels) else np.zeros(0)
         return ObjectCast(
             pixels,
             counts / rays_per_pixel,
             depth,
-            sparse.csr_matrix((data, texel.reshape(-1), indptr), shape),
+            SparseRows(ends, texel.reshape(-1), data, self.slot_count),
         )
 
     def _bilinear(self, hits: Hits) -> tuple[NDArray[np.int32], Array]:

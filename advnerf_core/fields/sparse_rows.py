@@ -1,0 +1,109 @@
+"""Rows of which few entries are not zero: what a cast writes, a frame keeps, and a gradient reads.
+
+The arrays are those of SciPy's CSR matrix. SciPy examines them whenever a matrix is made or cut, which for one object's part of one
+frame takes longer than the product itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy import sparse
+
+from advnerf_core.parallel import KERNEL_OPTIONS
+
+# Not contracted: a gradient has the bits of SciPy's product, which knows no fused multiply-add.
+_ORDERED = {**KERNEL_OPTIONS, "fastmath": False}
+
+
+@dataclass(frozen=True, eq=False)
+class SparseRows:
+    """A sparse matrix ``[P, V]``, row by row.
+
+    Attributes:
+        ends: Row ``p`` has the entries ``ends[p]`` to ``ends[p + 1]``, ``[P + 1]`` int32.
+        columns: Column of each entry ``[N]`` int32.
+        values: Value of each entry ``[N]``.
+        width: Number of columns V.
+    """
+
+    ends: NDArray[np.int32]
+    columns: NDArray[np.int32]
+    values: NDArray[Any]
+    width: int
+
+    def __len__(self) -> int:
+        return len(self.ends) - 1
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held [bytes]."""
+        return self.ends.nbytes + self.columns.nbytes + self.values.nbytes
+
+    def csr(self) -> sparse.csr_matrix:
+        """The same as a matrix of SciPy, which shares the arrays where it can."""
+        return sparse.csr_matrix((self.values, self.columns, self.ends), (len(self), self.width))
+
+    def take(self, rows: NDArray[np.int64]) -> SparseRows:
+        """The ``rows [R]`` alone, in arrays of their own."""
+        return self.scaled(rows, np.ones(len(rows)))
+
+    def scaled(self, rows: NDArray[np.int64], factors: NDArray[Any]) -> SparseRows:
+        """The ``rows [R]`` alone, each times its factor ``[R]``."""
+        factors = np.ascontiguousarray(factors, self.values.dtype)
+        ends, columns, values = _scaled(
+            self.ends, self.columns, self.values, np.ascontiguousarray(rows), factors
+        )
+        return SparseRows(ends, columns, values, self.width)
+
+    def add_product(self, values: NDArray[Any], rows: NDArray[np.int64], out: NDArray[Any]) -> None:
+        """Add the product with ``values [V, 3]`` to the ``rows [P]`` of ``out [N, 3]``."""
+        _add_product(self.ends, self.columns, self.values, values, rows, out)
+
+    def transposed_product(self, values: NDArray[Any]) -> NDArray[Any]:
+        """The product ``[V, 3]`` of the transpose with ``values [P, 3]``."""
+        out = np.zeros((self.width, 3), np.result_type(self.values, values))
+        _add_transposed(self.ends, self.columns, self.values, np.ascontiguousarray(values), out)
+        return out
+
+
+@njit(**KERNEL_OPTIONS)
+def _scaled(ends: Any, columns: Any, values: Any, rows: Any, factors: Any) -> Any:
+    begins = np.zeros(len(rows) + 1, np.int32)
+    for r in range(len(rows)):
+        begins[r + 1] = begins[r] + ends[rows[r] + 1] - ends[rows[r]]
+    kept_columns, kept = np.empty(begins[-1], columns.dtype), np.empty(begins[-1], values.dtype)
+    for r in range(len(rows)):
+        first = ends[rows[r]]
+        for n in range(begins[r + 1] - begins[r]):
+            kept_columns[begins[r] + n] = columns[first + n]
+            kept[begins[r] + n] = values[first + n] * factors[r]
+    return begins, kept_columns, kept
+
+
+@njit(**KERNEL_OPTIONS)
+def _add_product(ends: Any, columns: Any, values: Any, factors: Any, rows: Any, out: Any) -> None:
+    for p in range(len(rows)):
+        red = green = blue = values.dtype.type(0.0)
+        for n in range(ends[p], ends[p + 1]):
+            value, column = values[n], columns[n]
+            red += value * factors[column, 0]
+            green += value * factors[column, 1]
+            blue += value * factors[column, 2]
+        out[rows[p], 0] += red
+        out[rows[p], 1] += green
+        out[rows[p], 2] += blue
+
+
+@njit(**_ORDERED)
+def _add_transposed(ends: Any, columns: Any, values: Any, factors: Any, out: Any) -> None:
+    for p in range(len(ends) - 1):
+        for n in range(ends[p], ends[p + 1]):
+            value, column = values[n], columns[n]
+            out[column, 0] += value * factors[p, 0]
+            out[column, 1] += value * factors[p, 1]
+            out[column, 2] += value * factors[p, 2]
