@@ -16,7 +16,7 @@ from torch import Tensor
 
 from advnerf_core.files import with_sorted_header, write_atomically
 from advnerf_core.geometry import Array, Pinhole
-from advnerf_core.parallel import run_slots, slot_bounds
+from advnerf_core.parallel import run_slots, slot_bounds, thread_count
 from advnerf_core.render.march import MarchConfig
 from advnerf_core.render.occupancy import Leaps, leap_distances
 from advnerf_core.render.rays import intrinsics_row, poses_in_box
@@ -25,6 +25,7 @@ from advnerf_core.scene.field import SceneFieldConfig, SceneFileError
 
 FORMAT = "advnerf-baked-1"
 _SLOTS = 16
+_NOTING = 4  # threads that note what is seen: an array of all cells is tens of MiB
 _NOTHING_NOTED = np.zeros((0, 0, 0), np.float32)
 
 
@@ -89,10 +90,17 @@ class BakedScene:
 
     def nearest_seen_m(self, T_world_from_camera: Array, pinhole: Pinhole) -> NDArray[np.float32]:
         """From how near each cell ``[X, Y, Z]`` is seen in views ``[N, 4, 4]`` [m]; infinite where it is not."""
-        nearest_m = np.full(self.leaps.distance.shape, np.inf, np.float32)
-        for pose in T_world_from_camera:
-            self._render(pose[None], pinhole, nearest_m)
-        return nearest_m
+        # Each thread notes in an array of its own, as two would write the same cells.
+        shape = (min(thread_count(), _NOTING), *self.leaps.distance.shape)
+        nearest_m = np.full(shape, np.inf, np.float32)
+
+        def work(slot: int) -> None:
+            for pose in T_world_from_camera[slot :: len(nearest_m)]:
+                self._render(pose[None], pinhole, nearest_m[slot])
+
+        run_slots(work, len(nearest_m))
+        found: NDArray[np.float32] = nearest_m.min(axis=0)
+        return found
 
     def _render(
         self, poses: Array, pinhole: Pinhole, nearest_m: NDArray[np.float32]
@@ -101,7 +109,6 @@ class BakedScene:
         rgb, depth_m = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32)
         alpha = np.empty(shape, np.float32)
         tiles = len(poses) * -(-pinhole.height // HIGH) * -(-pinhole.width // WIDE)
-        # What is seen is noted by one thread, as two would write the same cells.
         bounds = slot_bounds(tiles, 1 if nearest_m.size else _SLOTS)
         in_box = poses_in_box(poses, self.config.origin_m, self.config.extent_m)
 
