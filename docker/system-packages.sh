@@ -1,6 +1,7 @@
 #!/bin/sh
 # The Debian/Ubuntu packages that pip cannot bring: offscreen OpenGL for the simulated lab, and LLVM for the attacks on meshes.
 # Without root, or on another system, it says what is missing and goes on: nothing else needs them.
+#   system-packages.sh [demo]    demo: only what the demo needs, so no LLVM
 set -eu
 
 has() { ldconfig -p 2>/dev/null | grep -qE "$1"; }
@@ -11,7 +12,7 @@ if ! has 'libEGL_mesa.so.0' || ! has 'libOpenGL.so.0|libGL.so.1'; then
   packages="libegl1 libgl1-mesa-dri libegl-mesa0 libopengl0"
 fi
 # Mitsuba compiles its kernels with LLVM; 15 and 16 crash on processors with AVX-512. Older systems do not have it.
-if ! has 'libLLVM(-|\.so\.)(1[7-9]|2[0-9])'; then
+if [ "${1:-}" != demo ] && ! has 'libLLVM(-|\.so\.)(1[7-9]|2[0-9])'; then
   if ! command -v apt-cache >/dev/null 2>&1 || apt-cache show libllvm19 >/dev/null 2>&1 || [ "$(id -u)" -eq 0 ]; then
     packages="$packages libllvm19"
   fi
