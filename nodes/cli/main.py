@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 OUR_PACKAGES = ("advnerf_core", "hardware", "calibration", "nodes")
 ERROR_EXIT, FAILURE_EXIT = 2, 1
 # The extra that installs each package which a base installation, such as the car's, does not have.
-_EXTRA_OF = dict.fromkeys(("torch", "numba", "scipy", "matplotlib", "jinja2", "av"), "core") | {
+_EXTRA_OF = dict.fromkeys(("torch", "numba", "scipy", "matplotlib", "jinja2", "av", "joblib"), "core") | {
     "mujoco": "twin",
     "pycolmap": "sfm",
     "trimesh": "mesh",
@@ -52,7 +52,6 @@ _EXTRA_OF = dict.fromkeys(("torch", "numba", "scipy", "matplotlib", "jinja2", "a
     "onnx": "onnx",
     "mitsuba": "mesh",
     "drjit": "mesh",
-    "joblib": "cluster",
     "ray": "cluster",
     "carla": "carla",
     "starlette": "page",
