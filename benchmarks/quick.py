@@ -1,7 +1,8 @@
 """Did something get slower? ``make bench-quick`` compares the main rates with the recorded ones and fails where one is a fifth slower.
 
 A rate is the time of a calibration, which reads memory at random and multiplies matrices, over the time of the work: on a machine that
-is twice as fast both halve. All run in one process, in turns, equally often; medians count. ``--record`` writes what is measured now.
+is twice as fast both halve. Kinds of processors differ in what is fast, so each has rates of its own. All run in one process, in turns,
+equally often; medians count. ``--record`` writes what is measured now.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from llvmlite.binding import get_host_cpu_name
 
 from advnerf_core.attack.adjoint import AttackProblem, adjoint_gradient
 from advnerf_core.driving.dynamics import Dubins
@@ -103,23 +105,30 @@ def rates(repeats: int) -> dict[str, float]:
 
 
 def main() -> int:
-    """Measure and compare; the exit code is 1 if something is slower than it may be."""
+    """Measure and compare; the exit code is 1 if something is slower than it may be, 2 if nothing is recorded to compare with."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--repeats", type=int, default=25)
     parser.add_argument("--record", action="store_true", help="write what is measured now")
     options = parser.parse_args()
+    kind, kept = get_host_cpu_name(), json.loads(RECORDED.read_text())
+    if kind not in kept and not options.record:
+        print(
+            f"expected a processor whose rates are recorded ({', '.join(kept)}), got {kind}; "
+            "record them with the code of before your change: python -m benchmarks.quick --record"
+        )
+        return 2
     found = rates(options.repeats)
     if options.record:
-        kept = {
+        kept[kind] = {
             "machine": machine_description(),
             "rates": {name: round(rate, 4) for name, rate in found.items()},
         }
         write_atomically(RECORDED, json.dumps(kept, indent=1) + "\n")
-        print(f"wrote {RECORDED.name}")
+        print(f"wrote the rates of {kind} to {RECORDED.name}")
         return 0
-    recorded = json.loads(RECORDED.read_text())["rates"]
+    recorded = kept[kind]["rates"]
     slower = [name for name, rate in found.items() if rate < LEAST_SHARE * recorded[name]]
     for name, rate in found.items():
         print(
