@@ -105,7 +105,7 @@ def cast_objects(
     grids = {k: field for k, field in enumerate(fields) if isinstance(field, VoxelGridObject)}
     casts = _cast_grids(grids, poses, pinhole, supersample, dtype)
     for k, field in enumerate(fields):
-        if isinstance(field, CastsItself):
+        if k not in grids and isinstance(field, CastsItself):
             casts[k] = field.cast(poses, pinhole, supersample, dtype)
     return [casts[k] for k in range(len(fields))]
 
@@ -114,6 +114,7 @@ def _cast_grids(
     fields: Mapping[int, VoxelGridObject], poses: Array, pinhole: Pinhole, supersample: int, dtype: Any
 ) -> dict[int, ObjectCast]:
     bands = max(1, -(-_LEAST_PARTS // max(1, len(poses) * len(fields))))
+    T_camera_from_world = invert_transform(poses)
     jobs = [
         (
             k,
@@ -128,7 +129,9 @@ def _cast_grids(
             ),
         )
         for k, field in fields.items()
-        for b, T, whole in zip(range(len(poses)), poses, windows(field, poses, pinhole), strict=True)
+        for b, T, whole in zip(
+            range(len(poses)), poses, windows(field, T_camera_from_world, pinhole), strict=True
+        )
         if whole[0] < whole[1] and whole[2] < whole[3]
         for window in _bands(whole, bands)
     ]
@@ -311,6 +314,12 @@ class _Part:
 
 def _joined(parts: Sequence[_Part], field: VoxelGridObject, dtype: Any) -> ObjectCast:
     """One cast of all images from their parts in order."""
+    if len(parts) == 1:
+        (part,) = parts
+        ends = np.concatenate([np.zeros(1, np.int32), part.ends.astype(np.int32)])
+        # Copies, as the part's arrays have room for more.
+        rows = SparseRows(ends, part.indices.copy(), part.values.copy(), field.slot_count)
+        return ObjectCast(part.pixels, part.alpha.copy(), part.depth_m.copy(), rows)
     before = np.concatenate([[0], np.cumsum([len(part.values) for part in parts])])
     starts = [np.zeros(1, np.int64), *(part.ends + first for part, first in zip(parts, before, strict=False))]
     pixels, alpha, depth_m, values, indices = (
@@ -329,14 +338,16 @@ def _joined(parts: Sequence[_Part], field: VoxelGridObject, dtype: Any) -> Objec
 
 def _bands(window: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
     """A window cut into so many bands of rows."""
+    if count == 1:
+        return [window]
     edges = np.linspace(window[0], max(window[1], window[0]), count + 1).astype(np.int64)
     return [np.array([first, last, window[2], window[3]]) for first, last in itertools.pairwise(edges)]
 
 
-def windows(field: VoxelGridObject, poses: Array, pinhole: Pinhole) -> NDArray[np.int64]:
+def windows(field: VoxelGridObject, T_camera_from_world: Array, pinhole: Pinhole) -> NDArray[np.int64]:
     """Pixel out ``[B, 4]`` (first row, end row, first column, end column) that surely hold the object."""
     grids = prepared(field, np.float32)
-    T_camera_from_object = np.ascontiguousarray(invert_transform(poses) @ field.T_world_from_object)
+    T_camera_from_object = np.ascontiguousarray(T_camera_from_world @ field.T_world_from_object)
     intrinsics = np.array([pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy])
     box = field.scale * np.stack([grids.low, grids.high])
     return box_windows(T_camera_from_object, box, intrinsics, pinhole.width, pinhole.height)

@@ -295,7 +295,7 @@ class _Walk:
 def _window_pixels(field: VoxelGridObject, poses: Array, pinhole: Pinhole) -> NDArray[np.int64]:
     """Flat indices of the pixels that may show the object."""
     found = [np.zeros(0, np.int64)]
-    for b, window in enumerate(windows(field, poses, pinhole)):
+    for b, window in enumerate(windows(field, invert_transform(poses), pinhole)):
         v, u = np.mgrid[window[0] : window[1], window[2] : window[3]]
         found.append(((b * pinhole.height + v) * pinhole.width + u).ravel())
     return np.concatenate(found).astype(np.int64)
