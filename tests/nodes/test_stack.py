@@ -70,7 +70,7 @@ def test_a_process_that_hangs_stops_the_car_and_waking_up_does_not_move_it(stack
     stack.put_back()
     stack.drive()
     since_ns = stack.signal(victim, signal.SIGSTOP)
-    stack.watch(1.8)
+    stack.watch(2.4)
     assert_stopped(stack, since_ns)
     stack.signal(victim, signal.SIGCONT)
     stack.watch(1.0)
