@@ -33,7 +33,7 @@ $(VENV)/.installed-demo: pyproject.toml constraints.txt docker/system-packages.s
 	@$(PIP) -e '.[core,twin]'
 	@touch $@
 
-demo: $(VENV)/.installed-demo  ## The whole experiment, small setting, on the simulated lab (ten minutes on 2 cores)
+demo: $(VENV)/.installed-demo  ## The whole experiment, small setting, on the simulated lab (six to ten minutes on 2 cores)
 	@$(BIN)/advnerf experiment launch/room.experiment.yaml --setting demo --run-folder runs/demo --anew
 
 experiment: setup  ## The full experiment, 3 seeds (a quarter of an hour on 2 cores); writes its rows to docs/results.json
@@ -56,7 +56,7 @@ world: setup  ## A simulator of other people, from its installation to its table
 	$(BIN)/advnerf experiment launch/$(NAME).experiment.yaml --setting panel --run-folder runs/$(NAME) $(CHANGES) && \
 	$(BIN)/python -m benchmarks.learned_roads runs/$(NAME) --wall-s $$(( $$(date +%s) - began ))
 
-test: setup  ## The default tests (about five minutes on 2 cores)
+test: setup  ## The default tests (five to nine minutes on 2 cores)
 	@# Tests that measure time or start nodes run one after the other and mostly wait. Those that compute use what that leaves of the
 	@# processors and nothing else: the kernel gives an idle-class process no time that another one wants. Collecting only the files
 	@# that mark a test as live saves ten seconds of imports.

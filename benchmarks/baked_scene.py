@@ -124,6 +124,7 @@ def _ticks(code: Path, run: Path) -> dict[str, float]:
     environment = {**os.environ, "PYTHONPATH": str(code)}
     environment.pop("OMP_WAIT_POLICY", None)  # each code as its commands would have it
     done = subprocess.run(
+        # As a module: run by its path, it would find benchmarks/coverage.py where numba looks for coverage.
         [sys.executable, "-W", "ignore", "-m", "benchmarks.ticks", run],
         cwd=code,
         env=environment,

@@ -24,11 +24,11 @@ PRIME_Y = 2654435761  # the spatial hash of Teschner et al. 2003, as used by Mü
 PRIME_Z = 805459861
 
 CHUNK = 128  # points that are placed together
-_ONE = np.uint32(1)
+_NEXT = np.uint32(1)
 # Products wrap at 32 bits; the mask of a level is shorter.
 _PRIME_Y, _PRIME_Z = np.uint32(PRIME_Y), np.uint32(PRIME_Z)
 _f = np.float32
-_NOT, _ALL = np.float32(0.0), np.float32(1.0)
+_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 
 
 @njit(**KERNEL_OPTIONS)
@@ -42,9 +42,9 @@ def _find_cells(points, begin, count, cells, index, fraction):  # type: ignore[n
     """Cell of each point along x, y and z, and the fraction inside it; coordinates outside of [0, 1] are clamped."""
     last, side = np.int32(cells) - np.int32(1), _f(cells)
     for n in range(count):
-        x = min(max(points[begin + n, 0], _NOT), _ALL) * side
-        y = min(max(points[begin + n, 1], _NOT), _ALL) * side
-        z = min(max(points[begin + n, 2], _NOT), _ALL) * side
+        x = min(max(points[begin + n, 0], _ZERO), _ONE) * side
+        y = min(max(points[begin + n, 1], _ZERO), _ONE) * side
+        z = min(max(points[begin + n, 2], _ZERO), _ONE) * side
         i, j, k = min(np.int32(x), last), min(np.int32(y), last), min(np.int32(z), last)
         index[n], index[CHUNK + n], index[2 * CHUNK + n] = np.uint32(i), np.uint32(j), np.uint32(k)
         fraction[n], fraction[CHUNK + n], fraction[2 * CHUNK + n] = x - _f(i), y - _f(j), z - _f(k)
@@ -52,25 +52,22 @@ def _find_cells(points, begin, count, cells, index, fraction):  # type: ignore[n
 
 @njit(**KERNEL_OPTIONS)
 def _dense_rows(index, count, cells, first, rows):  # type: ignore[no-untyped-def]
-    side = np.uint32(cells) + _ONE
+    side = np.uint32(cells) + _NEXT
     for n in range(count):
         a = index[n] + side * (index[CHUNK + n] + side * index[2 * CHUNK + n]) + first
         b, c = a + side, a + side * side
         d = c + side
-        rows[n], rows[CHUNK + n], rows[2 * CHUNK + n], rows[3 * CHUNK + n] = a, a + _ONE, b, b + _ONE
-        rows[4 * CHUNK + n], rows[5 * CHUNK + n], rows[6 * CHUNK + n], rows[7 * CHUNK + n] = (
-            c,
-            c + _ONE,
-            d,
-            d + _ONE,
-        )
+        rows[n], rows[CHUNK + n] = a, a + _NEXT
+        rows[2 * CHUNK + n], rows[3 * CHUNK + n] = b, b + _NEXT
+        rows[4 * CHUNK + n], rows[5 * CHUNK + n] = c, c + _NEXT
+        rows[6 * CHUNK + n], rows[7 * CHUNK + n] = d, d + _NEXT
 
 
 @njit(**KERNEL_OPTIONS)
 def _hashed_rows(index, count, mask, first, rows):  # type: ignore[no-untyped-def]
     for n in range(count):
         x0, y0, z0 = index[n], index[CHUNK + n] * _PRIME_Y, index[2 * CHUNK + n] * _PRIME_Z
-        x1, y1, z1 = x0 + _ONE, y0 + _PRIME_Y, z0 + _PRIME_Z
+        x1, y1, z1 = x0 + _NEXT, y0 + _PRIME_Y, z0 + _PRIME_Z
         a, b, c, d = y0 ^ z0, y1 ^ z0, y0 ^ z1, y1 ^ z1
         rows[n], rows[CHUNK + n] = first + ((x0 ^ a) & mask), first + ((x1 ^ a) & mask)
         rows[2 * CHUNK + n], rows[3 * CHUNK + n] = first + ((x0 ^ b) & mask), first + ((x1 ^ b) & mask)
@@ -82,7 +79,7 @@ def _hashed_rows(index, count, mask, first, rows):  # type: ignore[no-untyped-de
 def _trilinear(fraction, count, weights):  # type: ignore[no-untyped-def]
     for n in range(count):
         fx, fy, fz = fraction[n], fraction[CHUNK + n], fraction[2 * CHUNK + n]
-        gx, gy, gz = _ALL - fx, _ALL - fy, _ALL - fz
+        gx, gy, gz = _ONE - fx, _ONE - fy, _ONE - fz
         a, b, c, d = gy * gz, fy * gz, gy * fz, fy * fz
         weights[n], weights[CHUNK + n] = gx * a, fx * a
         weights[2 * CHUNK + n], weights[3 * CHUNK + n] = gx * b, fx * b
@@ -110,7 +107,7 @@ def _place(points, begin, count, level, rows, weights):  # type: ignore[no-untyp
 @njit(**KERNEL_OPTIONS)
 def _gather_pairs(table, rows, weights, count, out):  # type: ignore[no-untyped-def]
     for n in range(count):
-        u, v = _NOT, _NOT
+        u, v = _ZERO, _ZERO
         for k in range(8):
             row, weight = np.uint64(rows[k * CHUNK + n]), weights[k * CHUNK + n]
             u += table[row, 0] * weight
@@ -122,7 +119,7 @@ def _gather_pairs(table, rows, weights, count, out):  # type: ignore[no-untyped-
 def _gather_fours(table, rows, weights, count, out):  # type: ignore[no-untyped-def]
     for j in range(0, table.shape[1], 4):
         for n in range(count):
-            s, t, u, v = _NOT, _NOT, _NOT, _NOT
+            s, t, u, v = _ZERO, _ZERO, _ZERO, _ZERO
             for k in range(8):
                 row, weight = np.uint64(rows[k * CHUNK + n]), weights[k * CHUNK + n]
                 s += table[row, j] * weight
