@@ -314,12 +314,6 @@ class _Part:
 
 def _joined(parts: Sequence[_Part], field: VoxelGridObject, dtype: Any) -> ObjectCast:
     """One cast of all images from their parts in order."""
-    if len(parts) == 1:
-        (part,) = parts
-        ends = np.concatenate([np.zeros(1, np.int32), part.ends.astype(np.int32)])
-        # Copies, as the part's arrays have room for more.
-        rows = SparseRows(ends, part.indices.copy(), part.values.copy(), field.slot_count)
-        return ObjectCast(part.pixels, part.alpha.copy(), part.depth_m.copy(), rows)
     before = np.concatenate([[0], np.cumsum([len(part.values) for part in parts])])
     starts = [np.zeros(1, np.int64), *(part.ends + first for part, first in zip(parts, before, strict=False))]
     pixels, alpha, depth_m, values, indices = (
