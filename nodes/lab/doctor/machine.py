@@ -31,7 +31,7 @@ _UNSYNCHRONISED = 0x0040
 _CHRONYC_S = 2.0
 _OFFSET_WAIT_S = 0.8
 _REQUIREMENT = re.compile(
-    r"^([A-Za-z0-9._-]+)\s*(?:\[[^\]]*\])?\s*([^;]*)(?:;.*extra == ['\"]([a-z]+)['\"])?"
+    r"^([A-Za-z0-9._-]+)\s*(?:\[[^\]]*\])?\s*([^;]*)(?:;.*extra == ['\"]([a-z0-9-]+)['\"])?"
 )
 _NOT_OURS = ("all", "dev")
 
