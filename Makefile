@@ -71,7 +71,8 @@ test: setup  ## The default tests (five to nine minutes on 2 cores)
 test-slow: setup  ## The tests that take minutes, the default ones excluded
 	@$(BIN)/pytest -q -m 'slow' --timeout 1200
 
-test-gpu: setup  ## The tests that need a CUDA device
+test-gpu: setup  ## The tests that need a CUDA device, or only the compiler for one
+	@$(PIP) -e '.[gpu]'
 	@$(BIN)/pytest -q -m 'gpu' --timeout 1200
 
 test-hardware: setup  ## The tests that need a real device; each says which, and skips without it

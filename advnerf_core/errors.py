@@ -8,3 +8,7 @@ class AdvnerfError(Exception):
 
     The command line prints it as one line, without a traceback. Anything else that escapes is a defect of ours.
     """
+
+
+class DeviceError(AdvnerfError, RuntimeError):
+    """A GPU was asked for, and there is none that can be used, or it cannot do what is asked."""

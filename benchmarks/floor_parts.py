@@ -119,7 +119,7 @@ def tick_parts(batch: Batch, resolution: int) -> list[Part]:
     thing = dense_object(make_transform(np.eye(3), [2.0, 0.0, 0.5]), resolution)
     surrogate, pose = Surrogate(baked, view, mount, [thing]), planar_poses(states[4:5]) @ mount
     theta, policy = surrogate.plain_theta(), PilotNet(0, 0.4).eval().requires_grad_(False)
-    rgb, depth_m = surrogate.coloured_background(pose)
+    rgb, depth_m = surrogate.scene_frames(pose)
     image = surrogate.render(pose, theta).images
     casts = cast_objects([thing], pose, view)
     weights = casts[0].weights
@@ -131,7 +131,7 @@ def tick_parts(batch: Batch, resolution: int) -> list[Part]:
     )
     density_bytes = 8 * resolution**3
     return [
-        Part("tick, background", lambda: surrogate.coloured_background(pose), background),
+        Part("tick, background", lambda: surrogate.scene_frames(pose), background),
         Part(
             "tick, casting one object",
             lambda: cast_objects([thing], pose, view),

@@ -45,7 +45,7 @@ def measured(
     space = PoseSpace(objects, [PoseBounds(x_m=(0.0, 3.0), y_m=(-3.0, 0.0))] * len(objects))
     unit = space.unit(space.nominal)
     poses = surrogate.camera_poses(state)
-    found = {"scene alone": cpu_ms(lambda: surrogate.coloured_background(poses), repeats)}
+    found = {"scene alone": cpu_ms(lambda: surrogate.scene_frames(poses), repeats)}
     for name, free in (("poses", False), ("poses and colours", True)):
         sensor = PlacedSensor(surrogate, space, free)
         theta = sensor.join(unit, surrogate.plain_theta(torch.float64))

@@ -35,6 +35,7 @@ QUESTIONS = (
             "baked_scene",
             "floors",
             "seeds_together",
+            "gpu",
             "closed_loop_cosine",
             "mesh_render",
             "black_box",

@@ -102,16 +102,14 @@ class Disturbances:
         generator = torch.Generator().manual_seed(
             int(self._generator(_FRAME, draw, tick).integers(2**63 - 1))
         )
-        return torch.randn((starts, *images.shape[1:]), generator=generator, dtype=torch.float32).to(
-            images.dtype
-        )
+        return torch.randn((starts, *images.shape[1:]), generator=generator, dtype=torch.float32).to(images)
 
     def _generator(self, stream: int, draw: int, tick: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, stream, draw, tick])
 
 
 def _as_images(values: NDArray[np.float64], images: Tensor, ticks: int) -> Tensor:
-    return torch.from_numpy(np.tile(values, ticks)).to(images.dtype)[:, None, None, None]
+    return torch.from_numpy(np.tile(values, ticks)).to(images)[:, None, None, None]
 
 
 class Smoothness:

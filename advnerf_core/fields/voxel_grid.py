@@ -147,7 +147,7 @@ class VoxelGridObject:
             places = torch.from_numpy(np.stack([entries.row, entries.col]).astype(np.int64))
             data = torch.from_numpy(entries.data).to(theta.dtype)
             matrix = torch.sparse_coo_tensor(places, data, entries.shape, check_invariants=True)
-            rows = matrix @ rows
+            rows = matrix.to(theta.device) @ rows
         return torch.cat([squash(rows), fixed])
 
     def neighbours(self) -> NDArray[np.int64]:

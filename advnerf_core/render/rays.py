@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
@@ -40,7 +42,7 @@ def write_ray(
     """Write origin and direction ``[6]`` of the ray through a pixel position; returns its planar depth per metre of ray."""
     f = np.float32
     x, y = (column - intrinsics[2]) / intrinsics[0], (row - intrinsics[3]) / intrinsics[1]
-    scale = f(1.0) / np.sqrt(x * x + y * y + f(1.0))
+    scale = f(1.0) / f(math.sqrt(x * x + y * y + f(1.0)))
     for axis in range(3):
         ray[axis] = pose[axis, 3]
         ray[3 + axis] = (pose[axis, 0] * x + pose[axis, 1] * y + pose[axis, 2]) * scale

@@ -26,14 +26,14 @@ LOWEST_LOG = -4.0
 LOG_STEP = (MAX_LOG_DENSITY - LOWEST_LOG) / 255.0
 # Pixels of a tile, samples that are taken together, and those of one ray among them.
 WIDE, HIGH, WAVE, AHEAD = 16, 16, 512, 2
-_INTO_CELL = np.float32(1e-4)  # m beyond an edge, so that rounding cannot trap a ray on it
-_TINY = np.float32(1e-9)  # cells a metre, of a ray along the other axes
+INTO_CELL = np.float32(1e-4)  # m beyond an edge, so that rounding cannot trap a ray on it
+TINY = np.float32(1e-9)  # cells a metre, of a ray along the other axes
 _SEEN = np.float32(0.2)  # of a pixel's light, for a cell to count as seen
 _f = np.float32
 _ONE = np.float32(1.0)
 _ZERO = np.float32(0.0)
-_BYTE = np.float32(1.0 / 255.0)
-_LOWEST, _STEP = np.float32(LOWEST_LOG), np.float32(LOG_STEP)
+BYTE = np.float32(1.0 / 255.0)
+LOWEST, STEP = np.float32(LOWEST_LOG), np.float32(LOG_STEP)
 
 
 @njit(**KERNEL_OPTIONS)
@@ -83,7 +83,7 @@ def bake_points(
         dense(c1, d1, inputs, decoded, True)
         dense(c2, d2, decoded, colours, False)
         for n in range(count):
-            level_of = (field[0, n] - _LOWEST) / _STEP
+            level_of = (field[0, n] - LOWEST) / STEP
             values[begin + n, 0] = np.uint8(min(max(level_of, _ZERO), _f(255.0)) + _f(0.5))
             for c in range(3):
                 straight[c] = (_ONE / (_ONE + np.exp(-colours[c, n]))) ** power
@@ -95,7 +95,7 @@ def bake_points(
 
 
 @njit(**KERNEL_OPTIONS)
-def _between(values, base, across, along, fx, fy, fz):  # type: ignore[no-untyped-def]
+def between(values, base, across, along, fx, fy, fz):  # type: ignore[no-untyped-def]
     """The value between the corners ``base`` and the next along x (``across`` rows on), y (``along`` rows on) and z."""
     gx, gy, gz = _ONE - fx, _ONE - fy, _ONE - fz
     a, b, c, d = gx * gy * gz, gx * gy * fz, gx * fy * gz, gx * fy * fz
@@ -132,7 +132,7 @@ def _leap_all(grids, t, end, distance, rays, count):  # type: ignore[no-untyped-
             u = (_f(i + reach if grid[3] > _ZERO else i - reach + 1) - x) * grid[6]
             v = (_f(j + reach if grid[4] > _ZERO else j - reach + 1) - y) * grid[7]
             w = (_f(k + reach if grid[5] > _ZERO else k - reach + 1) - z) * grid[8]
-            further = s + max(min(min(u, v), w), _ZERO) + _INTO_CELL
+            further = s + max(min(min(u, v), w), _ZERO) + INTO_CELL
             goes = reach > 0 and s < end[n]
             t[n] = further if goes else s
             rays[going] = n
@@ -210,7 +210,7 @@ def render_baked(
             units[n] = np.sqrt(ray[3] * ray[3] + ray[4] * ray[4] + ray[5] * ray[5])
             for axis in range(3):
                 grids[n, axis], step = ray[axis] * cells[axis], ray[3 + axis] * cells[axis]
-                step = step if abs(step) > _TINY else _TINY
+                step = step if abs(step) > TINY else TINY
                 grids[n, 3 + axis], grids[n, 6 + axis] = step, _ONE / step
             through[n], taken[n] = _ONE, 0
             found[n, 0], found[n, 1], found[n, 2], found[n, 3] = _ZERO, _ZERO, _ZERO, _ZERO
@@ -275,10 +275,10 @@ def render_baked(
                 n = owner[m]
                 if through[n] < least_through:
                     continue
-                log, red, green, blue = _between(
+                log, red, green, blue = between(
                     values, base[m], strides[m, 0], strides[m, 1], places[m, 0], places[m, 1], places[m, 2]
                 )
-                keep = np.exp(-np.exp(log * _STEP + _LOWEST) * places[m, 3] * units[n])
+                keep = np.exp(-np.exp(log * STEP + LOWEST) * places[m, 3] * units[n])
                 weight = through[n] * (_ONE - keep)
                 through[n] *= keep
                 found[n, 0] += weight * places[m, 4]
@@ -299,7 +299,7 @@ def render_baked(
             if row >= height or column >= width:
                 continue
             for c in range(3):
-                rgb[image, row, column, c] = found[n, 1 + c] * _BYTE + through[n] * behind[c]
+                rgb[image, row, column, c] = found[n, 1 + c] * BYTE + through[n] * behind[c]
             opacity = _ONE - through[n]
             alpha[image, row, column] = opacity
             depth_m[image, row, column] = (

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -24,6 +25,14 @@ class _Share:
 
     rows: NDArray[np.int64]
     pixels: Tensor
+
+
+@runtime_checkable
+class ShowsMany(Protocol):
+    """A sensor that can show several textures at once by itself."""
+
+    def many(self, count: int, starts: int) -> Any:
+        """The sensor for ``count`` textures at once, each from so many ``starts``; frames and theta as of `ManyTextures`."""
 
 
 class ManyTextures:

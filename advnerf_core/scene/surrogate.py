@@ -37,7 +37,7 @@ class Rendered:
 
     Attributes:
         images: ``[B, 3, H, W]`` RGB in 0..1, without autograd history.
-        vjp: Takes the gradient of a scalar with respect to ``images`` to its gradient with respect to ``theta``.
+        vjp: Takes the gradient of a scalar with respect to ``images``, on their device, to its gradient with respect to ``theta``, on theta's.
         nbytes: Memory that keeping this object holds [bytes].
     """
 
@@ -110,8 +110,6 @@ class Surrogate:
         depth_tolerance_m: An object is hidden only by a scene surface nearer than this much in front of it [m]. A learned
             scene's depth is not exact, and a face a centimetre in front of its board must win.
         supersample: Rays along each side of a pixel for the objects; 2 imitates the area filter of the policy's view.
-        background_colour: Optional map of background colours ``[B, H, W, 3]``, for a scene learned by another camera than the
-            one that drives.
         dtype: Type of images and weights.
         opaque: Compose as a deployment does that cannot blend: each pixel is wholly the object's or wholly the scene's, whichever
             is nearer; an object that covers less than half of a pixel is not there.
@@ -125,18 +123,16 @@ class Surrogate:
         objects: Sequence[ColouredObject] | ColouredObject | None = None,
         depth_tolerance_m: float = 0.15,
         supersample: int = 2,
-        background_colour: Callable[[Tensor], Tensor] | None = None,
         dtype: torch.dtype = torch.float32,
         opaque: bool = False,
     ) -> None:
-        self._background = background
+        self.background = background
         self.camera = camera
         self.T_car_from_camera = np.asarray(T_car_from_camera, dtype=np.float64)
         listed = () if objects is None else objects
         self.objects = tuple(listed) if isinstance(listed, Sequence) else (listed,)
         self.depth_tolerance_m = depth_tolerance_m
         self.supersample = supersample
-        self._background_colour = background_colour
         self.dtype = dtype
         self.opaque = opaque
 
@@ -149,7 +145,7 @@ class Surrogate:
     def with_background(self, background: BackgroundRenderer) -> Surrogate:
         """The same surrogate before another renderer of the scene."""
         other = copy.copy(self)
-        other._background = background
+        other.background = background
         return other
 
     def with_objects(self, objects: Sequence[ColouredObject], opaque: bool | None = None) -> Surrogate:
@@ -183,13 +179,13 @@ class Surrogate:
 
     def remembering(self, budget_bytes: int) -> Surrogate:
         """The same surrogate, which keeps as many of the last background frames as fit into a budget of memory."""
-        return self.with_background(RememberedBackground(self._background, budget_bytes))
+        return self.with_background(RememberedBackground(self.background, budget_bytes))
 
     @torch.no_grad()
     def prepare(self, T_world_from_camera: ArrayLike) -> Frames:
         """Render the background and cast the objects for camera poses ``[B, 4, 4]``."""
         poses = np.asarray(T_world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
-        return self._composed(poses, *self.coloured_background(poses))
+        return self._composed(poses, *self.scene_frames(poses))
 
     @torch.no_grad()
     def overlay(
@@ -259,7 +255,7 @@ class Surrogate:
                 "expected objects made of voxels, got a mesh: only voxels are differentiable in their pose"
             )
         poses = np.asarray(T_world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
-        rgb, depth_m = self.coloured_background(poses)
+        rgb, depth_m = self.scene_frames(poses)
         layers = [
             render_soft(field, placement, part, poses, self.camera, self.supersample)
             for field, placement, part in zip(grids, placements, split_theta(grids, theta), strict=True)
@@ -279,12 +275,12 @@ class Surrogate:
         return lambda states: self.sense(states, theta).images
 
     @torch.no_grad()
-    def coloured_background(self, poses: Array) -> tuple[Tensor, Tensor]:
+    def scene_frames(self, poses: Array) -> tuple[Tensor, Tensor]:
         """Colours ``[B, H, W, 3]`` and planar depth ``[B, H, W]`` of the scene without objects, from ``[B, 4, 4]``."""
-        rgb, depth_m = self._background(poses, self.camera)[:2]
+        rgb, depth_m = self.background(poses, self.camera)[:2]
         self._check_background(rgb, depth_m, len(poses))
         rgb, depth_m = (torch.as_tensor(part, device="cpu").to(self.dtype) for part in (rgb, depth_m))
-        return rgb if self._background_colour is None else self._background_colour(rgb), depth_m
+        return rgb, depth_m
 
     def _check_background(self, rgb: Any, depth_m: Any, count: int) -> None:
         size = (count, self.camera.height, self.camera.width)

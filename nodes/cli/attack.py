@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from nodes.runtime.terminal import Overrides, print_table, table
+from nodes.runtime.terminal import Device, Overrides, print_table, table
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -23,11 +23,14 @@ def attack_run(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Folder of the results.", show_default="runs/<name>")
     ] = None,
+    device: Device = None,
     overrides: Overrides = None,
 ) -> None:
     """Search as a request asks, for each of its seeds; ends in one attack file per seed."""
+    from advnerf_core.attack.on_device import use_device
     from nodes.experiment.request.request import load_request
 
+    use_device(device)
     request = load_request(file, overrides or [])
     _run(output or Path("runs") / request.name, request)
 
@@ -35,10 +38,13 @@ def attack_run(
 @app.command("resume")
 def attack_resume(
     folder: Annotated[Path, typer.Argument(help="Folder of 'advnerf attack run'.", exists=True)],
+    device: Device = None,
 ) -> None:
-    """Go on with a search that was stopped or killed; on a CPU to the bit."""
+    """Go on with a search that was stopped or killed; on the same device to the bit."""
+    from advnerf_core.attack.on_device import use_device
     from nodes.experiment.request.search import kept_request
 
+    use_device(device)
     _run(folder, kept_request(folder))
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from nodes.runtime.terminal import Overrides, print_table, say_error, table
+from nodes.runtime.terminal import Device, Overrides, print_table, say_error, table
 from nodes.runtime.termination import ends_in_order
 
 if TYPE_CHECKING:
@@ -118,6 +118,7 @@ def experiment(
             help="Run cells on the Ray cluster at host:port; auto: the one in RAY_ADDRESS, or one started here.",
         ),
     ] = None,
+    device: Device = None,
     retry: Annotated[bool, typer.Option("--retry", help="Also run cells that failed before.")] = False,
     gate: Annotated[
         bool,
@@ -150,10 +151,12 @@ def experiment(
 ) -> None:
     """Run an experiment, from the photographs to the report: every stage and every cell that is not there yet. It may be stopped at any time."""
     os.environ.setdefault("MUJOCO_GL", "egl")
+    from advnerf_core.attack.on_device import use_device
     from nodes.experiment.campaign.config import is_campaign
     from nodes.experiment.campaign.run import Options
     from nodes.runtime.errors import ConfigError
 
+    use_device(device)
     many = is_campaign(file)
     address = "" if cluster in (None, "auto") else str(cluster)
     backend: Literal["local", "ray"] = "local" if cluster is None else "ray"

@@ -16,6 +16,7 @@ from advnerf_core.attack.adjoint import AttackProblem, evaluate
 from advnerf_core.attack.artifact import AttackFile, load_attack, save_attack
 from advnerf_core.attack.clean import clean_drive
 from advnerf_core.attack.methods import Method, SearchRun, SearchSettings, load_method
+from advnerf_core.attack.on_device import on_chosen_device, said_of_device
 from advnerf_core.attack.search.search import SearchResult
 from advnerf_core.attack.spaces.space import Shown, Space
 from advnerf_core.files import write_atomically
@@ -286,7 +287,7 @@ def _search(
     settings = search_settings(experiment, method)
     told = telling(method.evaluations(problem, settings), report)
     run = SearchRun(cell.seed, folder / _STATE, told, settings_hash)
-    return space.search(cell.code, problem, settings, run)
+    return space.search(cell.code, on_chosen_device(problem), settings, run)
 
 
 @lru_cache(maxsize=4)
@@ -317,7 +318,12 @@ def _attack_file(
         seed=cell.seed,
         predicted_total_cte_m=result.best.predicted_total_cte_m,
         software_version=version("advnerf"),
-        extra={"victim": cell.victim, "scenario": cell.scenario, "horizon": experiment.searched_ticks},
+        extra={
+            "victim": cell.victim,
+            "scenario": cell.scenario,
+            "horizon": experiment.searched_ticks,
+            **said_of_device(),
+        },
         clean_drive=clean,
     )
     if not baked_file(experiment).exists() or over_the_world(experiment):

@@ -20,6 +20,7 @@ import torch
 from numpy.typing import NDArray
 
 from advnerf_core.attack.adjoint import evaluate
+from advnerf_core.attack.on_device import on_chosen_device
 from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.spaces.space import ColourSpace
 from advnerf_core.driving.path import Array
@@ -183,7 +184,7 @@ def _attack_again(
             )
 
         result = gradient_attack(
-            problem,
+            on_chosen_device(problem),
             attack.evaluations,
             attack.learning_rate,
             seed=attack.seeds[0],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -14,6 +14,14 @@ if TYPE_CHECKING:
 Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Override a value of the file. May be repeated."),
+]
+Device = Annotated[
+    Literal["cpu", "cuda"] | None,
+    typer.Option(
+        "--device",
+        help="Where searches compute; cuda is an NVIDIA GPU.",
+        show_default="ADVNERF_DEVICE, or cpu",
+    ),
 ]
 RunDir = Annotated[
     Path | None, typer.Option("--run-dir", help="Folder of the run.", show_default="the only running launch")

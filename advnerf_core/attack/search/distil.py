@@ -129,7 +129,7 @@ class Lessons:
 
 def to_bytes(images: Tensor) -> Tensor:
     """Images 0..1 as they are kept."""
-    return (images * 255.0).round().clamp(0, 255).to(torch.uint8)
+    return (images * 255.0).round().clamp(0, 255).to(torch.uint8).cpu()
 
 
 class Student:
@@ -170,9 +170,9 @@ class Student:
         self._adam = torch.optim.Adam(self.network.parameters(), lr=settings.learning_rate)
 
     def __call__(self, images: Tensor, goals: Tensor | None = None) -> Tensor:
-        """Steering ``[B]`` [rad]; differentiable with respect to the images."""
+        """Steering ``[B]`` [rad] of images on any device; differentiable with respect to them."""
         given = None if self.goal_size == 0 or goals is None else goals.to(self._dtype)
-        steering: Tensor = self.network(images.to(self._dtype), given)
+        steering: Tensor = self.network(images.cpu().to(self._dtype), given)
         return steering
 
     def begin(self, generator: torch.Generator) -> float:

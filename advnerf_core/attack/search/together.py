@@ -19,7 +19,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from advnerf_core.attack.adjoint import AttackProblem, Totals, adjoint_gradient
+from advnerf_core.attack.adjoint import AttackProblem, Sensor, Totals, adjoint_gradient
 from advnerf_core.attack.search.search import (
     Evaluation,
     SearchDivergedError,
@@ -30,7 +30,7 @@ from advnerf_core.attack.search.search import (
     search_fingerprint,
 )
 from advnerf_core.files import write_atomically
-from advnerf_core.scene.many_textures import ManyTextures
+from advnerf_core.scene.many_textures import ManyTextures, ShowsMany
 from advnerf_core.scene.surrogate import Surrogate
 
 _FORMAT = "advnerf-searches-1"
@@ -60,10 +60,6 @@ class _Batch:
             raise ValueError(
                 "expected problems that differ in seed and start poses only, got other numbers of starts or steps"
             )
-        if not isinstance(first.sensor, Surrogate):
-            raise TypeError(
-                f"expected problems with a Surrogate as sensor, got {type(first.sensor).__name__}"
-            )
         if not first.policy.stateless:
             raise ValueError(
                 "expected a stateless policy; search the seeds of one with memory one after the other"
@@ -71,12 +67,22 @@ class _Batch:
         goals = None if first.goals is None else torch.cat([p.goals for p in problems if p.goals is not None])
         together = replace(
             first,
-            sensor=ManyTextures(first.sensor, len(problems), starts),
+            sensor=_many(first.sensor, len(problems), starts),
             goals=goals,
             regulariser=None,
             start_states=torch.cat([p.start_states for p in problems]),
         )
         return cls(together, tuple(problems), starts)
+
+
+def _many(sensor: Sensor, count: int, starts: int) -> Sensor:
+    """The sensor for several textures at once."""
+    if isinstance(sensor, Surrogate):
+        return ManyTextures(sensor, count, starts)
+    if isinstance(sensor, ShowsMany):
+        shown: Sensor = sensor.many(count, starts)
+        return shown
+    raise TypeError(f"expected problems with a Surrogate as sensor, got {type(sensor).__name__}")
 
 
 def gradient_attacks(

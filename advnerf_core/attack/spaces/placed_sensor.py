@@ -128,7 +128,7 @@ class PlacedSensor:
     def render(self, T_world_from_camera: Array, theta: Tensor) -> Rendered:
         """Images at camera poses ``[B, 4, 4]`` with their vjp with respect to theta."""
         parts = self._parts(theta)
-        rgb, depth_m = self.surrogate.coloured_background(T_world_from_camera)
+        rgb, depth_m = self.surrogate.scene_frames(T_world_from_camera)
         lens, supersample = self.surrogate.camera, self.surrogate.supersample
         layers = [
             soft_layer(field, place, rows, T_world_from_camera, lens, supersample)

@@ -145,7 +145,7 @@ class ShapeSensor:
     def render(self, T_world_from_camera: ArrayLike, theta: Tensor) -> Rendered:
         """Images at camera poses ``[B, 4, 4]`` with their vjp with respect to ``theta``."""
         poses = np.asarray(T_world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
-        rgb, depth_m = self.surrogate.coloured_background(poses)
+        rgb, depth_m = self.surrogate.scene_frames(poses)
         fields, theta = self.shaped(theta), theta.detach().clone()
         images = self.surrogate.with_objects(fields).overlay(rgb, depth_m, poses, self.colours)
         seen = [

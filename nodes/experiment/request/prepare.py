@@ -24,6 +24,7 @@ from advnerf_core.attack.artifact import (
 )
 from advnerf_core.attack.clean import clean_drive
 from advnerf_core.attack.methods import method_digest
+from advnerf_core.attack.on_device import said_of_device
 from advnerf_core.attack.search.search import SearchResult, draw_start_states
 from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.driving.actuated import ActuatedAckermann
@@ -127,7 +128,7 @@ class Prepared:
             seed=self.seed,
             predicted_total_cte_m=predicted,
             software_version=version("advnerf"),
-            extra=extra,
+            extra={**extra, **said_of_device()},
             clean_drive=clean or self.clean_drive,
         )
 

@@ -16,6 +16,7 @@ from advnerf_core.attack.methods import (
     black_box_methods,
     load_method,
 )
+from advnerf_core.attack.on_device import all_on_chosen_device, on_chosen_device
 from advnerf_core.attack.search.search import Evaluation, OnEvaluation, SearchResult
 from advnerf_core.attack.search.together import gradient_attacks
 from advnerf_core.files import write_atomically
@@ -66,7 +67,7 @@ def search(
             f"{prepared.request.policy} has no gradient: use the method {alternatives(black_box_methods())}"
         )
     run = SearchRun(prepared.seed, state_path, on_evaluation, prepared.settings_hash)
-    return method.search(prepared.problem, settings, run)
+    return method.search(on_chosen_device(prepared.problem), settings, run)
 
 
 def planned_evaluations(prepared: Prepared) -> int:
@@ -187,7 +188,7 @@ def _run_together(
         for one in each
     ]
     results = gradient_attacks(
-        [one.problem for one in each],
+        all_on_chosen_device([one.problem for one in each]),
         seeds,
         request.search.evaluations,
         request.search.learning_rate or 0.1,

@@ -322,7 +322,7 @@ def test_an_attack_file_of_places_gives_what_a_deployment_shows():
     torch.testing.assert_close(*(each.protocol_cte_m for each in totals), rtol=1e-6, atol=1e-6)
     # Composed into a deployment's image: opaque objects at the found places, hidden by what is nearer.
     T = surrogate.camera_poses(problem.start_states)
-    rgb, depth_m = surrogate.coloured_background(T)
+    rgb, depth_m = surrogate.scene_frames(T)
     deployed = surrogate.with_objects(found.objects, opaque=True)
     shown = deployed.overlay(rgb, depth_m, T, found.colours)
     assert torch.equal(shown, deployed.render(T, found.colours).images)
@@ -352,7 +352,7 @@ def test_the_scene_of_a_drive_is_rendered_once_for_its_gradient_too():
         rendered.extend(poses)
         return background(poses, pinhole)
 
-    background, surrogate._background = surrogate._background, counted
+    background, surrogate.background = surrogate.background, counted
     found = {}
     for kept_bytes in (0, 2**20):
         rendered.clear()

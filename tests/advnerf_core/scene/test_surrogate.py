@@ -126,15 +126,6 @@ def test_frames_can_be_rendered_again_without_the_scene():
     assert calls == [2, 2, 2, 2]
 
 
-def test_background_colour_map_touches_the_background_only():
-    plain, mapped = surrogate(face(2.0)), surrogate(face(2.0), background_colour=lambda rgb: 0.5 * rgb)
-    theta = torch.randn(plain.theta_shape, dtype=torch.float64)
-    poses = plain.camera_poses(STATES)
-    a, b = plain.render(poses, theta).images, mapped.render(poses, theta).images
-    black = plain.render(poses, torch.full_like(theta, -60)).images
-    torch.testing.assert_close(a - b, 0.5 * black, atol=1e-12, rtol=0)
-
-
 def test_float32_agrees_with_float64():
     scene64, scene32 = surrogate(face(2.0)), Surrogate(wall, PINHOLE, MOUNT, face(2.0))
     theta = torch.randn(scene64.theta_shape, dtype=torch.float64)

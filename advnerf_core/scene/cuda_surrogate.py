@@ -1,0 +1,227 @@
+"""The surrogate on a GPU: background, objects, images and gradients are computed and stay there.
+
+A drop-in for `Surrogate`, and for `ManyTextures`, as the sensor of an attack. The processor keeps the car's states and theta; what crosses
+between the two in a tick are camera poses, and what the policy makes of the images.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from advnerf_core.errors import DeviceError
+from advnerf_core.fields.coloured import ColouredObject
+from advnerf_core.geometry import Array
+from advnerf_core.render.cast_cuda import CudaObjects
+from advnerf_core.render.cuda_launch import cuda_device
+from advnerf_core.scene.baked import BakedScene
+from advnerf_core.scene.baked_cuda import CudaBaked
+from advnerf_core.scene.surrogate import Rendered, Surrogate, split_theta
+
+
+@dataclass(frozen=True, eq=False)
+class _Textures:
+    """Theta as it was given, and the colours that it means.
+
+    Attributes:
+        given: As given, which keeps its memory from being used by another theta.
+        version: Torch's count of changes of ``given``.
+        leaf: The same on the device.
+        colours: All objects' colour vectors ``[N, V, 3]``, with history to ``leaf``.
+        shown: The same without.
+    """
+
+    given: Tensor
+    version: int
+    leaf: Tensor
+    colours: Tensor
+    shown: Tensor
+
+    def is_of(self, theta: Tensor) -> bool:
+        """Whether ``theta`` is what these were made of, unchanged."""
+        same = theta.data_ptr() == self.given.data_ptr() and theta.shape == self.given.shape
+        return same and theta.dtype == self.given.dtype and theta._version == self.version
+
+
+@dataclass(frozen=True, eq=False)
+class CudaFrames:
+    """A batch of camera poses with what does not depend on ``theta``.
+
+    Attributes:
+        surrogate: That renders them.
+        background: ``[B, 3, H, W]`` on the device.
+        depth_m: Its planar depth ``[B, H, W]`` [m].
+        places: Where the objects are, from `CudaObjects.placed`; None without objects.
+    """
+
+    surrogate: CudaSurrogate
+    background: Tensor
+    depth_m: Tensor
+    places: tuple[Tensor, Tensor] | None
+
+    @property
+    def weights_nbytes(self) -> int:
+        """Memory held beside the background [bytes]."""
+        return 0 if self.places is None else sum(each.nbytes for each in self.places)
+
+    @torch.no_grad()
+    def render(self, theta: Tensor | None) -> Rendered:
+        """Images for ``theta``, on the device, with their vjp, which takes slopes there and gives the gradient where ``theta`` is."""
+        image, objects, places = self.background.clone(), self.surrogate.drawn, self.places
+        if objects is None or places is None:
+            return Rendered(image, lambda _: torch.zeros(0, 3), image.nbytes)
+        if theta is None:
+            raise ValueError(f"expected theta for {len(objects.objects)} object(s), got None")
+        textures = self.surrogate.textures(theta)
+        texture_of = self.surrogate.texture_of(len(image))
+        shares = objects.draw(places, textures.shown, texture_of, self.depth_m, image)
+
+        def vjp(grad_images: Tensor) -> Tensor:
+            slopes = objects.pull(
+                places, textures.shown, texture_of, shares, grad_images.detach().to(objects.dtype)
+            )
+            (gradient,) = torch.autograd.grad(textures.colours, textures.leaf, slopes, retain_graph=True)
+            return gradient.to(textures.given)
+
+        return Rendered(image, vjp, image.nbytes + shares.nbytes + self.weights_nbytes)
+
+
+class CudaSurrogate:
+    """A surrogate on a GPU; the images of its renders are tensors there, theta may be anywhere.
+
+    A baked scene is copied to the device. Another background is rendered on the processor as before, and then copied.
+
+    Args:
+        surrogate: The scene with its objects, all voxel grids.
+
+    Raises:
+        DeviceError: No device; or the objects are not all voxel grids, too many, or composed opaque.
+    """
+
+    def __init__(self, surrogate: Surrogate) -> None:
+        if surrogate.opaque:
+            raise DeviceError(
+                "expected a surrogate that blends on a GPU, got one that composes opaque pixels as a deployment does"
+            )
+        self.surrogate = surrogate
+        self.count: int | None = (
+            None  # of textures at once; None is one, with theta of the surrogate's own shape
+        )
+        self.starts = 1
+        self.device = cuda_device()
+        self.drawn = None
+        if surrogate.objects:
+            self.drawn = CudaObjects(
+                surrogate.objects,
+                surrogate.camera,
+                surrogate.supersample,
+                surrogate.dtype,
+                surrogate.depth_tolerance_m,
+            )
+        baked = surrogate.background
+        self._baked = CudaBaked(baked) if isinstance(baked, BakedScene) else None
+        self._textures: _Textures | None = None
+
+    def many(self, count: int, starts: int) -> CudaSurrogate:
+        """The same for several textures at once, sharing what is on the device; frames and theta as of `ManyTextures`."""
+        if count < 1 or starts < 1:
+            raise ValueError(f"expected at least one texture and one start, got {count} and {starts}")
+        other = copy.copy(self)
+        other.count, other.starts, other._textures = count, starts, None
+        return other
+
+    @property
+    def objects(self) -> tuple[ColouredObject, ...]:
+        """Of the surrogate."""
+        return self.surrogate.objects
+
+    @property
+    def theta_shape(self) -> tuple[int, ...]:
+        """Of the surrogate; of several textures ``(count, *surrogate.theta_shape)``."""
+        own = self.surrogate.theta_shape
+        return own if self.count is None else (self.count, *own)
+
+    def plain_theta(self) -> Tensor:
+        """Of the surrogate."""
+        return self.surrogate.plain_theta()
+
+    def initial_theta(self, generator: torch.Generator) -> Tensor:
+        """Of the surrogate; of several textures one after the other from one generator."""
+        drawn = [self.surrogate.initial_theta(generator) for _ in range(self.count or 1)]
+        return drawn[0] if self.count is None else torch.stack(drawn)
+
+    def camera_poses(self, states: Tensor) -> Array:
+        """``T_world_from_camera [B, 4, 4]`` at car states ``[B, n]``, detached."""
+        return self.surrogate.camera_poses(states)
+
+    def sense(self, states: Tensor, theta: Tensor | None) -> Rendered:
+        """What the car's camera sees from states ``[B, n]``; poses are detached."""
+        return self.render(self.camera_poses(states), theta)
+
+    def render(self, T_world_from_camera: ArrayLike, theta: Tensor | None) -> Rendered:
+        """Images at camera poses ``[B, 4, 4]`` and their vjp; see `CudaFrames.render`."""
+        return self.prepare(T_world_from_camera).render(None if theta is None else theta.detach())
+
+    @torch.no_grad()
+    def prepare(self, T_world_from_camera: ArrayLike) -> CudaFrames:
+        """Render the background for camera poses ``[B, 4, 4]``, and find out where the objects are."""
+        poses = np.asarray(T_world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
+        if self.count is not None and len(poses) % (self.count * self.starts):
+            raise ValueError(f"expected poses in multiples of {self.count * self.starts}, got {len(poses)}")
+        background, depth_m = self._background(poses)
+        places = None if self.drawn is None else self.drawn.placed(poses)
+        return CudaFrames(self, background.contiguous(), depth_m.contiguous(), places)
+
+    def texture_of(self, images: int) -> Tensor:
+        """Which texture each of a batch of images shows ``[B]`` int32."""
+        return (torch.arange(images, device=self.device) // self.starts % (self.count or 1)).to(torch.int32)
+
+    def textures(self, theta: Tensor) -> _Textures:
+        """The colours of a theta; those of the last one are kept, as all ticks of a drive show the same."""
+        if self._textures is None or not self._textures.is_of(theta):
+            if theta.shape != self.theta_shape:
+                raise ValueError(f"expected theta {list(self.theta_shape)}, got {list(theta.shape)}")
+            self._textures = self._made(theta)
+        return self._textures
+
+    def _made(self, theta: Tensor) -> _Textures:
+        given = theta.detach()
+        leaf = given.to(self.device, self.surrogate.dtype, copy=True).requires_grad_()
+        with torch.enable_grad():
+            several = leaf[None] if self.count is None else leaf
+            colours = torch.stack([self._colours(each) for each in several])
+        return _Textures(given, given._version, leaf, colours, colours.detach())
+
+    def _colours(self, theta: Tensor) -> Tensor:
+        assert self.drawn is not None
+        grids = self.drawn.objects
+        return torch.cat(
+            [field.colours(part) for field, part in zip(grids, split_theta(grids, theta), strict=True)]
+        )
+
+    def _background(self, poses: Array) -> tuple[Tensor, Tensor]:
+        if self._baked is None:
+            rgb, depth_m = (each.to(self.device) for each in self.surrogate.scene_frames(poses))
+            return rgb.permute(0, 3, 1, 2), depth_m
+        rgb, depth_m = self._baked.render(poses, self.surrogate.camera)
+        return rgb.to(self.surrogate.dtype), depth_m.to(self.surrogate.dtype)
+
+
+def on_cuda(sensor: Any) -> CudaSurrogate:
+    """A sensor on a GPU.
+
+    Raises:
+        DeviceError: No device; or the sensor is no surrogate, or has objects that a GPU cannot draw.
+    """
+    if not isinstance(sensor, Surrogate):
+        raise DeviceError(
+            f"expected a search for colours of objects where they stand on a GPU, got the sensor {type(sensor).__name__}; "
+            "leave --device out to search on the processor"
+        )
+    return CudaSurrogate(sensor)

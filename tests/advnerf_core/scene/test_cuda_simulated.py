@@ -1,0 +1,25 @@
+"""The tests of what runs on a GPU, in numba's simulator: the same source, line by line, on a machine without a device."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+TESTS = Path(__file__).parents[1]
+FILES = (TESTS / "scene" / "test_cuda_surrogate.py", TESTS / "attack" / "test_on_device.py")
+
+
+def test_the_code_for_a_gpu_computes_in_the_simulator_what_the_processor_does():
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "gpu", *map(str, FILES)]
+    done = subprocess.run(
+        command,
+        env={**os.environ, "NUMBA_ENABLE_CUDASIM": "1", "CUDA_VISIBLE_DEVICES": ""},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=280,
+    )
+    assert done.returncode == 0, done.stdout
+    assert int(re.search(r"(\d+) passed", done.stdout)[1]) >= 15, done.stdout
+    assert "skipped" not in done.stdout
