@@ -250,7 +250,7 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--speed", action="store_true", help="compare with the code of a commit, instead")
     parser.add_argument("--before", default="fad839a", help="that commit")
-    parser.add_argument("--turns", type=int, default=3)
+    parser.add_argument("--turns", type=int, default=5)
     parser.add_argument(
         "--pairs", action="store_true", help="search and deploy attacks both ways, instead (minutes)"
     )

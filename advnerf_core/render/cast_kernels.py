@@ -159,8 +159,10 @@ def _march(o: Any, d: Any, edges: Any, t_in: float, t_out: float, nearest: float
     while i < samples:
         x, y, z = gx + i * sx, gy + i * sy, gz + i * sz
         cx, cy, cz = cell_of(x, nx), cell_of(y, ny), cell_of(z, nz)
-        if not solid and clear[cx, cy, cz] > 0:
-            reach = int(clear[cx, cy, cz])
+        # Unsigned, because numba asks of each signed index whether it counts from the end.
+        lx, ly, lz = np.uint64(cx), np.uint64(cy), np.uint64(cz)
+        if not solid and clear[lx, ly, lz] > 0:
+            reach = int(clear[lx, ly, lz])
             leap = min(
                 steps_to_leap(x, sx, cx, reach),
                 steps_to_leap(y, sy, cy, reach),
@@ -169,13 +171,17 @@ def _march(o: Any, d: Any, edges: Any, t_in: float, t_out: float, nearest: float
             i += max(leap, 1)
             continue
         fx, fy, fz = share_of(x, cx, nx), share_of(y, cy, ny), share_of(z, cz, nz)
-        ax, ay, az = min(cx + 1, nx - 1), min(cy + 1, ny - 1), min(cz + 1, nz - 1)
+        hx, hy, hz = (
+            np.uint64(min(cx + 1, nx - 1)),
+            np.uint64(min(cy + 1, ny - 1)),
+            np.uint64(min(cz + 1, nz - 1)),
+        )
         opacity = 1.0
         if not solid:
-            near = ((density[cx, cy, cz] * (1.0 - fz) + density[cx, cy, az] * fz) * (1.0 - fy)
-                    + (density[cx, ay, cz] * (1.0 - fz) + density[cx, ay, az] * fz) * fy)  # fmt: skip
-            far = ((density[ax, cy, cz] * (1.0 - fz) + density[ax, cy, az] * fz) * (1.0 - fy)
-                   + (density[ax, ay, cz] * (1.0 - fz) + density[ax, ay, az] * fz) * fy)  # fmt: skip
+            near = ((density[lx, ly, lz] * (1.0 - fz) + density[lx, ly, hz] * fz) * (1.0 - fy)
+                    + (density[lx, hy, lz] * (1.0 - fz) + density[lx, hy, hz] * fz) * fy)  # fmt: skip
+            far = ((density[hx, ly, lz] * (1.0 - fz) + density[hx, ly, hz] * fz) * (1.0 - fy)
+                   + (density[hx, hy, lz] * (1.0 - fz) + density[hx, hy, hz] * fz) * fy)  # fmt: skip
             sigma = near * (1.0 - fx) + far * fx
             if sigma <= 0.0:  # outside a surface between voxels
                 i += 1
@@ -195,9 +201,9 @@ def _march(o: Any, d: Any, edges: Any, t_in: float, t_out: float, nearest: float
                     * weight
                 )
                 if part > 0.0:
-                    slot = slots[ax if k & 1 else cx, ay if k & 2 else cy, az if k & 4 else cz]
+                    slot = np.uint64(slots[hx if k & 1 else lx, hy if k & 2 else ly, hz if k & 4 else lz])
                     if row[slot] == 0.0:
-                        touched[count] = slot
+                        touched[np.uint64(count)] = slot
                         count += 1
                     row[slot] += part
         transmittance *= 1.0 - opacity

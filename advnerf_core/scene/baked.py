@@ -46,6 +46,11 @@ class Voxels:
     behind: NDArray[np.float32]
 
     @property
+    def words(self) -> NDArray[np.int32]:
+        """The values ``[V]``, each as one word: the first of its four bytes is the lowest."""
+        return self.values.view("<i4").reshape(-1)
+
+    @property
     def nbytes(self) -> int:
         """Memory held [bytes]."""
         return self.values.nbytes + self.brick_of.nbytes + self.log_sides.nbytes
@@ -122,9 +127,9 @@ class BakedScene:
                 self.march.steps(),
                 self.leaps.distance,
                 self.leaps.cells,
-                self.voxels.brick_of,
-                self.voxels.log_sides,
-                self.voxels.values,
+                self.voxels.brick_of.reshape(-1),
+                self.voxels.log_sides.reshape(-1),
+                self.voxels.words,
                 self.voxels.behind,
                 np.float32(self.least_transmittance),
                 self.march.max_samples,

@@ -33,7 +33,7 @@ def _to_edge(place: Any, step: Any, cell: Any, reach: Any) -> Any:
 
 @cuda.jit
 def render_baked_cuda(poses: Any, intrinsics: Any, high: Any, near: Any, steps: Any, distance: Any, cells: Any, brick_of: Any, log_sides: Any,
-                      values: Any, behind: Any, least_through: Any, max_samples: int, rgb: Any, depth_m: Any) -> None:  # fmt: skip
+                      words: Any, behind: Any, least_through: Any, max_samples: int, rgb: Any, depth_m: Any) -> None:  # fmt: skip
     """Render a batch of images; arguments are those of ``render_baked``, but for the image ``rgb [B, 3, H, W]``."""
     n: int = cuda.grid(1)  # type: ignore[call-arg]
     height, width = depth_m.shape[1], depth_m.shape[2]
@@ -81,7 +81,13 @@ def render_baked_cuda(poses: Any, intrinsics: Any, high: Any, near: Any, steps: 
             i, j, k = min(np.int64(fx), side - 1), min(np.int64(fy), side - 1), min(np.int64(fz), side - 1)
             fx, fy, fz = fx - _f(i), fy - _f(j), fz - _f(k)
             line, plane = side + 1, (side + 1) * (side + 1)
-        log, r, g, b = _between(values, max(begin, 0) + i * plane + j * line + k, plane, line, fx, fy, fz)
+        at = max(begin, 0) + i * plane + j * line + k
+        on = at + plane
+        log, r, g, b = _between(
+            words[at], words[at + 1], words[at + line], words[at + line + 1],
+            words[on], words[on + 1], words[on + line], words[on + line + 1],
+            fx, fy, fz,
+        )  # fmt: skip
         keep = math.exp(-math.exp(log * STEP + LOWEST) * span * unit)
         weight = through * (_ONE - keep)
         through *= keep
@@ -115,7 +121,7 @@ class CudaBaked:
                 leaps.cells,
                 voxels.brick_of,
                 voxels.log_sides,
-                voxels.values,
+                voxels.words,
                 voxels.behind,
             )
         )

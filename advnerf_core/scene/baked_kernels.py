@@ -29,11 +29,12 @@ WIDE, HIGH, WAVE, AHEAD = 16, 16, 512, 2
 INTO_CELL = np.float32(1e-4)  # m beyond an edge, so that rounding cannot trap a ray on it
 TINY = np.float32(1e-9)  # cells a metre, of a ray along the other axes
 _SEEN = np.float32(0.2)  # of a pixel's light, for a cell to count as seen
-_f = np.float32
+_f, _i = np.float32, np.int32  # in 64 bits, the words would fill twice as many vectors
 _ONE = np.float32(1.0)
 _ZERO = np.float32(0.0)
 BYTE = np.float32(1.0 / 255.0)
 LOWEST, STEP = np.float32(LOWEST_LOG), np.float32(LOG_STEP)
+_IN_ORDER = {**KERNEL_OPTIONS, "fastmath": KERNEL_OPTIONS["fastmath"] - {"reassoc"}}
 
 
 @njit(**KERNEL_OPTIONS)
@@ -94,22 +95,46 @@ def bake_points(
                 values[begin + n, 1 + c] = np.uint8(min(max(mapped, _ZERO), _ONE) * _f(255.0) + _f(0.5))
 
 
-@njit(**KERNEL_OPTIONS)
-def between(values, base, across, along, fx, fy, fz):  # type: ignore[no-untyped-def]
-    """The value between the corners ``base`` and the next along x (``across`` rows on), y (``along`` rows on) and z."""
+# Loops that call a function are not turned into vector instructions, unless numba itself puts the function in its place.
+@njit(**_IN_ORDER, inline="always")
+def between(p000, p001, p010, p011, p100, p101, p110, p111, fx, fy, fz):  # type: ignore[no-untyped-def]
+    """The four parts of the value between corners, each a word of four bytes, at fractions of the way along x, y and z."""
     gx, gy, gz = _ONE - fx, _ONE - fy, _ONE - fz
     a, b, c, d = gx * gy * gz, gx * gy * fz, gx * fy * gz, gx * fy * fz
     e, f, g, h = fx * gy * gz, fx * gy * fz, fx * fy * gz, fx * fy * fz
-    i, j, k = base + along, base + across, base + across + along
-    v0 = (_f(values[base, 0]) * a + _f(values[base + 1, 0]) * b + _f(values[i, 0]) * c + _f(values[i + 1, 0]) * d
-          + _f(values[j, 0]) * e + _f(values[j + 1, 0]) * f + _f(values[k, 0]) * g + _f(values[k + 1, 0]) * h)  # fmt: skip
-    v1 = (_f(values[base, 1]) * a + _f(values[base + 1, 1]) * b + _f(values[i, 1]) * c + _f(values[i + 1, 1]) * d
-          + _f(values[j, 1]) * e + _f(values[j + 1, 1]) * f + _f(values[k, 1]) * g + _f(values[k + 1, 1]) * h)  # fmt: skip
-    v2 = (_f(values[base, 2]) * a + _f(values[base + 1, 2]) * b + _f(values[i, 2]) * c + _f(values[i + 1, 2]) * d
-          + _f(values[j, 2]) * e + _f(values[j + 1, 2]) * f + _f(values[k, 2]) * g + _f(values[k + 1, 2]) * h)  # fmt: skip
-    v3 = (_f(values[base, 3]) * a + _f(values[base + 1, 3]) * b + _f(values[i, 3]) * c + _f(values[i + 1, 3]) * d
-          + _f(values[j, 3]) * e + _f(values[j + 1, 3]) * f + _f(values[k, 3]) * g + _f(values[k + 1, 3]) * h)  # fmt: skip
+    v0 = (_f(_i(p001 & 255)) * b + _f(_i(p000 & 255)) * a + _f(_i(p010 & 255)) * c + _f(_i(p011 & 255)) * d
+          + _f(_i(p100 & 255)) * e + _f(_i(p101 & 255)) * f + _f(_i(p110 & 255)) * g + _f(_i(p111 & 255)) * h)  # fmt: skip
+    v1 = (_f(_i(p001 >> 8 & 255)) * b + _f(_i(p000 >> 8 & 255)) * a + _f(_i(p010 >> 8 & 255)) * c + _f(_i(p011 >> 8 & 255)) * d
+          + _f(_i(p100 >> 8 & 255)) * e + _f(_i(p101 >> 8 & 255)) * f + _f(_i(p110 >> 8 & 255)) * g + _f(_i(p111 >> 8 & 255)) * h)  # fmt: skip
+    v2 = (_f(_i(p001 >> 16 & 255)) * b + _f(_i(p000 >> 16 & 255)) * a + _f(_i(p010 >> 16 & 255)) * c + _f(_i(p011 >> 16 & 255)) * d
+          + _f(_i(p100 >> 16 & 255)) * e + _f(_i(p101 >> 16 & 255)) * f + _f(_i(p110 >> 16 & 255)) * g + _f(_i(p111 >> 16 & 255)) * h)  # fmt: skip
+    v3 = (_f(_i(p001 >> 24 & 255)) * b + _f(_i(p000 >> 24 & 255)) * a + _f(_i(p010 >> 24 & 255)) * c + _f(_i(p011 >> 24 & 255)) * d
+          + _f(_i(p100 >> 24 & 255)) * e + _f(_i(p101 >> 24 & 255)) * f + _f(_i(p110 >> 24 & 255)) * g + _f(_i(p111 >> 24 & 255)) * h)  # fmt: skip
     return v0, v1, v2, v3
+
+
+@njit(**KERNEL_OPTIONS)
+def _gather(words, base, strides, used, corners):  # type: ignore[no-untyped-def]
+    """Read the corners of samples ``[:used]`` into ``corners [8, WAVE]``: many reads wait for memory at once."""
+    for m in range(used):
+        # Unsigned, because numba asks of each signed index whether it counts from the end.
+        at, line, plane = np.uint64(base[m]), np.uint64(strides[1, m]), np.uint64(strides[0, m])
+        one = np.uint64(1)
+        corners[0, m], corners[1, m] = words[at], words[at + one]
+        corners[2, m], corners[3, m] = words[at + line], words[at + line + one]
+        corners[4, m], corners[5, m] = words[at + plane], words[at + plane + one]
+        corners[6, m], corners[7, m] = words[at + plane + line], words[at + plane + line + one]
+
+
+@njit(**_IN_ORDER)
+def _interpolate(corners, places, used, mixed):  # type: ignore[no-untyped-def]
+    """`between` for samples ``[:used]``, in vector instructions, to ``mixed [4, WAVE]``."""
+    for m in range(used):
+        mixed[0, m], mixed[1, m], mixed[2, m], mixed[3, m] = between(
+            corners[0, m], corners[1, m], corners[2, m], corners[3, m],
+            corners[4, m], corners[5, m], corners[6, m], corners[7, m],
+            places[0, m], places[1, m], places[2, m],
+        )  # fmt: skip
 
 
 @njit(**KERNEL_OPTIONS)
@@ -128,7 +153,7 @@ def _leap_all(grids, t, end, distance, rays, count):  # type: ignore[no-untyped-
             i = min(max(np.int64(x), 0), nx - 1)
             j = min(max(np.int64(y), 0), ny - 1)
             k = min(max(np.int64(z), 0), nz - 1)
-            reach = np.int64(distance[i, j, k])
+            reach = np.int64(distance[np.uint64(i), np.uint64(j), np.uint64(k)])
             u = (_f(i + reach if grid[3] > _ZERO else i - reach + 1) - x) * grid[6]
             v = (_f(j + reach if grid[4] > _ZERO else j - reach + 1) - y) * grid[7]
             w = (_f(k + reach if grid[5] > _ZERO else k - reach + 1) - z) * grid[8]
@@ -143,7 +168,7 @@ def _leap_all(grids, t, end, distance, rays, count):  # type: ignore[no-untyped-
 @njit(**KERNEL_OPTIONS)
 def render_baked(
     poses: Array32, intrinsics: Array32, first: int, stop: int, high: Array32, near: np.float32, steps: Array32, distance: Array8,
-    cells: Array32, brick_of: NDArray[np.int32], log_sides: Array8, values: Array8, behind: Array32, least_through: np.float32,
+    cells: Array32, brick_of: NDArray[np.int32], log_sides: Array8, words: NDArray[np.int32], behind: Array32, least_through: np.float32,
     max_samples: int, rgb: Array32, depth_m: Array32, alpha: Array32, nearest_m: Array32,
 ) -> None:  # fmt: skip
     """Render pixel tiles ``first..stop`` of a batch of images.
@@ -161,10 +186,10 @@ def render_baked(
         steps: Smallest and largest interval [m] and growth per metre ``[3]``.
         distance: Leap distances ``[X, Y, Z]``.
         cells: Cells per unit ``[3]``.
-        brick_of: First value of the brick of each cell ``[X, Y, Z]``; negative where it has none, and the corners of cells serve,
+        brick_of: First value of the brick of each cell ``[X * Y * Z]``; negative where it has none, and the corners of cells serve,
             which come first among the values.
-        log_sides: Logarithm to base 2 of the parts along each side of the bricks ``[X, Y, Z]``.
-        values: ``[V, 4]``.
+        log_sides: Logarithm to base 2 of the parts along each side of the bricks ``[X * Y * Z]``.
+        words: The values ``[V]``, four bytes each.
         behind: Colour ``[3]`` behind everything.
         least_through: Transmittance at which a ray stops.
         max_samples: Most samples on one ray.
@@ -173,7 +198,7 @@ def render_baked(
         alpha: ``[B, H, W]``, written.
         nearest_m: Per cell ``[X, Y, Z]``, the nearest distance from which it was seen, kept up; empty if nobody asks.
     """
-    nx, ny, nz = brick_of.shape
+    nx, ny, nz = distance.shape
     height, width = alpha.shape[1], alpha.shape[2]
     across_image, down = (width + WIDE - 1) // WIDE, (height + HIGH - 1) // HIGH
     row_stride, plane_stride = nz + 1, (ny + 1) * (nz + 1)
@@ -192,10 +217,11 @@ def render_baked(
     through, taken = np.empty(WIDE * HIGH, np.float32), np.empty(WIDE * HIGH, np.int64)
     found = np.empty((WIDE * HIGH, 4), np.float32)  # reach and colour
     owner, cell = np.empty(WAVE, np.int64), np.empty(WAVE, np.int64)
-    base, strides, places = (
-        np.empty(WAVE, np.int64),
-        np.empty((WAVE, 2), np.int64),
-        np.empty((WAVE, 5), np.float32),
+    base, strides = np.empty(WAVE, np.int64), np.empty((2, WAVE), np.int64)
+    places, corners, mixed = (
+        np.empty((5, WAVE), np.float32),
+        np.empty((8, WAVE), np.int32),
+        np.empty((4, WAVE), np.float32),
     )
     for tile in range(first, stop):
         image, rest = tile // (across_image * down), tile % (across_image * down)
@@ -235,59 +261,44 @@ def render_baked(
                     z = min(max(grid[2] + s * grid[5], _ZERO), _f(nz) - _f(1e-3))
                     i, j, k = np.int64(x), np.int64(y), np.int64(z)
                     owner[used], cell[used] = n, (i * ny + j) * nz + k
-                    places[used, 0], places[used, 1], places[used, 2] = x - _f(i), y - _f(j), z - _f(k)
-                    places[used, 3], places[used, 4] = span, s
+                    base[used] = i * plane_stride + j * row_stride + k
+                    strides[0, used], strides[1, used] = plane_stride, row_stride
+                    places[0, used], places[1, used], places[2, used] = x - _f(i), y - _f(j), z - _f(k)
+                    places[3, used], places[4, used] = span, s
                     t[n] += span
                     taken[n] += 1
                     used += 1
             for m in range(used):
-                at = cell[m]
-                brick = np.int64(brick_of.flat[at])
-                if brick < 0:
-                    k = at % nz
-                    j = at // nz % ny
-                    i = at // (nz * ny)
-                    base[m] = i * plane_stride + j * row_stride + k
-                    strides[m, 0], strides[m, 1] = plane_stride, row_stride
-                else:
-                    side = np.int64(1) << np.int64(log_sides.flat[at])
-                    x, y, z = places[m, 0] * _f(side), places[m, 1] * _f(side), places[m, 2] * _f(side)
+                at = np.uint64(cell[m])
+                brick = np.int64(brick_of[at])
+                if brick >= 0:
+                    side = np.int64(1) << np.int64(log_sides[at])
+                    x, y, z = places[0, m] * _f(side), places[1, m] * _f(side), places[2, m] * _f(side)
                     i, j, k = (
                         min(np.int64(x), side - 1),
                         min(np.int64(y), side - 1),
                         min(np.int64(z), side - 1),
                     )
                     along = side + 1
-                    strides[m, 0], strides[m, 1] = along * along, along
+                    strides[0, m], strides[1, m] = along * along, along
                     base[m] = brick + i * along * along + j * along + k
-                    places[m, 0], places[m, 1], places[m, 2] = x - _f(i), y - _f(j), z - _f(k)
-            touched = 0
-            for m in range(used):
-                at, plane, line = base[m], strides[m, 0], strides[m, 1]
-                touched += (
-                    values[at, 0]
-                    + values[at + line, 0]
-                    + values[at + plane, 0]
-                    + values[at + plane + line, 0]
-                )
-            owner[0] += touched >> 40  # never anything: keeps the reads
+                    places[0, m], places[1, m], places[2, m] = x - _f(i), y - _f(j), z - _f(k)
+            _gather(words, base, strides, used, corners)
+            _interpolate(corners, places, used, mixed)
             for m in range(used):
                 n = owner[m]
                 if through[n] < least_through:
                     continue
-                log, red, green, blue = between(
-                    values, base[m], strides[m, 0], strides[m, 1], places[m, 0], places[m, 1], places[m, 2]
-                )
-                keep = np.exp(-np.exp(log * STEP + LOWEST) * places[m, 3] * units[n])
+                keep = np.exp(-np.exp(mixed[0, m] * STEP + LOWEST) * places[3, m] * units[n])
                 weight = through[n] * (_ONE - keep)
                 through[n] *= keep
-                found[n, 0] += weight * places[m, 4]
-                found[n, 1] += weight * red
-                found[n, 2] += weight * green
-                found[n, 3] += weight * blue
+                found[n, 0] += weight * places[4, m]
+                found[n, 1] += weight * mixed[1, m]
+                found[n, 2] += weight * mixed[2, m]
+                found[n, 3] += weight * mixed[3, m]
                 if marked and weight > _SEEN:
                     at = cell[m]
-                    nearest_m.flat[at] = min(nearest_m.flat[at], places[m, 4])
+                    nearest_m.flat[at] = min(nearest_m.flat[at], places[4, m])
             for a in range(count):
                 n = active[a]
                 if through[n] >= least_through and t[n] < end[n]:

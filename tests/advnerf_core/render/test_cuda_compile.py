@@ -33,7 +33,7 @@ def pull(kind):
     return [*objects(kind), *arrays((kind, 4), (kind, 4), (F8, 1), (I8, 3))]
 
 
-BAKED = [*arrays((F4, 3), (F4, 1), (F4, 1)), F8, *arrays((F4, 1), (U1, 3), (F4, 1), (I4, 3), (U1, 3), (U1, 2), (F4, 1)), F8, I8,
+BAKED = [*arrays((F4, 3), (F4, 1), (F4, 1)), F8, *arrays((F4, 1), (U1, 3), (F4, 1), (I4, 3), (U1, 3), (I4, 1), (F4, 1)), F8, I8,
          *arrays((F4, 4), (F4, 3))]  # fmt: skip
 KERNELS = {
     "draw, float32": (cast_cuda_kernels.draw_objects, draw(F4)),
