@@ -20,7 +20,11 @@ NEAR_M = 0.02  # closer than this to the camera nothing is drawn
 LEAST_TRANSMITTANCE = 1e-3
 # Progress of a cast: next pixel of the window, covered pixels, weights written.
 NEXT, FOUND, FILLED = 0, 1, 2
+# Of a ray, after where its first sample lies and how far the next is (in voxels): object units a metre, metres between samples, and
+# the planar depth of the first.
+SPEED, DT, BEGIN = 6, 7, 8
 _PIXEL_ROUNDING = 1e-6
+_MANY = 1e9  # samples; more than any ray has
 _ROUNDING = 1e-9  # samples; a leap may not end beyond an occupied cell for the last bit of a float
 
 
@@ -141,34 +145,117 @@ def reach_of_bricks(
 
 
 @njit(**KERNEL_OPTIONS)
-def _march(o: Any, d: Any, edges: Any, t_in: float, t_out: float, nearest: float, furthest: float, slots: Any, density: Any, clear: Any, solid: bool,
-           step: float, share: float, row: Any, touched: Any, count: int) -> tuple[int, float, float]:  # fmt: skip
-    """Add one ray to the scratch ``row [slots]``; returns the touched count, the ray's alpha and alpha-weighted depth."""
+def _set_out(R: Any, o: Any, edges: Any, sizes: Any, aims: Any, count: int, solid: bool, one_sided: bool, step: float,
+             rays: Any, spans: Any) -> None:  # fmt: skip
+    """Where rays sample, in vector instructions: `span_in_box` without branches, and the samples between.
+
+    Args:
+        R: As in `cast_window`, like the following.
+        o: ``[3]``.
+        edges: ``[3]``.
+        sizes: Voxels along each axis.
+        aims: ``x`` and ``y`` of each ray at unit depth, and between which depths it may meet something ``[4, N]``.
+        count: Of rays.
+        solid: One sample where the ray enters.
+        one_sided: Only rays through the ``+x`` face count.
+        step: Object units between samples.
+        rays: ``[9, N]``, written.
+        spans: First sample worth a look, and one past the last, ``[2, N]``; written.
+    """
+    # By name, so that the loop need not read them again after each write.
+    xx, xy, xz = R[0, 0], R[0, 1], R[0, 2]
+    yx, yy, yz = R[1, 0], R[1, 1], R[1, 2]
+    zx, zy, zz = R[2, 0], R[2, 1], R[2, 2]
+    ox, oy, oz, ex, ey, ez = o[0], o[1], o[2], edges[0], edges[1], edges[2]
+    high_x, high_y, high_z = sizes[0] - 0.5, sizes[1] - 0.5, sizes[2] - 0.5
+    beside_x, beside_y, beside_z = (
+        ox < -0.5 or ox > high_x,
+        oy < -0.5 or oy > high_y,
+        oz < -0.5 or oz > high_z,
+    )
+    for n in range(count):
+        x, y, nearest, furthest = aims[0, n], aims[1, n], aims[2, n], aims[3, n]
+        dx, dy, dz = xx * x + xy * y + xz, yx * x + yy * y + yz, zx * x + zy * y + zz
+        along_x, along_y, along_z = abs(dx) < 1e-15, abs(dy) < 1e-15, abs(dz) < 1e-15
+        misses = (along_x & beside_x) | (along_y & beside_y) | (along_z & beside_z)
+        ax, bx = (-0.5 - ox) / dx, (high_x - ox) / dx
+        ay, by = (-0.5 - oy) / dy, (high_y - oy) / dy
+        az, bz = (-0.5 - oz) / dz, (high_z - oz) / dz
+        in_x = -np.inf if along_x else min(ax, bx)
+        in_y = -np.inf if along_y else min(ay, by)
+        in_z = -np.inf if along_z else min(az, bz)
+        out_x = np.inf if along_x else max(ax, bx)
+        out_y = np.inf if along_y else max(ay, by)
+        out_z = np.inf if along_z else max(az, bz)
+        by_face = (dx < 0.0) & (in_x > NEAR_M) & (in_x >= in_y) & (in_x >= in_z)
+        t_in, t_out = max(max(max(NEAR_M, in_x), in_y), in_z), min(min(out_x, out_y), out_z)
+        misses = misses | (t_out <= t_in) | (one_sided & (not by_face))
+        # Object units a metre of planar depth.
+        speed = np.sqrt((dx * ex) ** 2 + (dy * ey) ** 2 + (dz * ez) ** 2)
+        samples = 1.0 if solid else max(1.0, np.ceil((t_out - t_in) * speed / step))
+        dt = (t_out - t_in) / samples
+        begin = t_in if solid else t_in + 0.5 * dt
+        rays[0, n], rays[1, n], rays[2, n] = ox + begin * dx, oy + begin * dy, oz + begin * dz
+        rays[3, n], rays[4, n], rays[5, n] = dt * dx, dt * dy, dt * dz
+        rays[SPEED, n], rays[DT, n], rays[BEGIN, n] = speed, dt, begin
+        # With a sample to spare at both ends.
+        first = 0.0 if solid else min(max((nearest - begin) / dt - 1.0, 0.0), _MANY)
+        last = samples if solid else min(samples, min(max((furthest - begin) / dt, 0.0), _MANY) + 2.0)
+        spans[0, n], spans[1, n] = np.int32(first), np.int32(0.0 if misses else last)
+
+
+@njit(**KERNEL_OPTIONS)
+def _leap(rays: Any, n: int, i: int, clear: Any) -> int:
+    """The sample of ray ``n`` to look at after sample ``i``, which is ``i`` itself where its cell is not empty."""
+    nx, ny, nz = clear.shape[0] + 1, clear.shape[1] + 1, clear.shape[2] + 1
+    x, y, z = rays[0, n] + i * rays[3, n], rays[1, n] + i * rays[4, n], rays[2, n] + i * rays[5, n]
+    cx, cy, cz = cell_of(x, nx), cell_of(y, ny), cell_of(z, nz)
+    reach = int(clear[np.uint64(cx), np.uint64(cy), np.uint64(cz)])
+    leap = min(
+        steps_to_leap(x, rays[3, n], cx, reach),
+        steps_to_leap(y, rays[4, n], cy, reach),
+        steps_to_leap(z, rays[5, n], cz, reach),
+    )
+    return i + max(leap, 1) if reach > 0 else i
+
+
+@njit(**KERNEL_OPTIONS)
+def _leap_all(rays: Any, spans: Any, count: int, going: Any, clear: Any) -> None:
+    """Take ``count`` rays to their first samples in cells that are not empty, or to their ends.
+
+    One leap of every ray after the other: a leap waits for the one before, but not for those of other rays.
+    """
+    under_way = 0
+    for n in range(count):
+        going[under_way] = n
+        under_way += 1 if spans[0, n] < spans[1, n] else 0
+    while under_way > 0:
+        left = 0
+        for k in range(under_way):
+            n = going[k]
+            i = spans[0, n]
+            j = _leap(rays, n, i, clear)
+            spans[0, n], going[left] = j, n
+            left += 1 if i < j < spans[1, n] else 0
+        under_way = left
+
+
+@njit(**KERNEL_OPTIONS)
+def _march(rays: Any, n: int, spans: Any, slots: Any, density: Any, clear: Any, solid: bool, share: float, row: Any, touched: Any,
+           count: int) -> tuple[int, float, float]:  # fmt: skip
+    """Add ray ``n`` to the scratch ``row [slots]``; returns the touched count, the ray's alpha and alpha-weighted depth."""
     nx, ny, nz = slots.shape
-    # Object units a metre of planar depth.
-    speed = np.sqrt((d[0] * edges[0]) ** 2 + (d[1] * edges[1]) ** 2 + (d[2] * edges[2]) ** 2)
-    samples = 1 if solid else max(1, int(np.ceil((t_out - t_in) * speed / step)))
-    dt = (t_out - t_in) / samples
-    begin = t_in if solid else t_in + 0.5 * dt
-    gx, gy, gz = o[0] + begin * d[0], o[1] + begin * d[1], o[2] + begin * d[2]
-    sx, sy, sz = dt * d[0], dt * d[1], dt * d[2]
-    transmittance, alpha, alpha_depth, i = 1.0, 0.0, 0.0, 0
-    if not solid:  # with a sample to spare at both ends
-        i = max(int((nearest - begin) / dt) - 1, 0)
-        samples = min(samples, int(min((furthest - begin) / dt, 1e9)) + 2)
+    gx, gy, gz, sx, sy, sz = rays[0, n], rays[1, n], rays[2, n], rays[3, n], rays[4, n], rays[5, n]
+    speed, dt, begin = rays[SPEED, n], rays[DT, n], rays[BEGIN, n]
+    transmittance, alpha, alpha_depth = 1.0, 0.0, 0.0
+    i, samples = np.int64(spans[0, n]), np.int64(spans[1, n])
     while i < samples:
         x, y, z = gx + i * sx, gy + i * sy, gz + i * sz
         cx, cy, cz = cell_of(x, nx), cell_of(y, ny), cell_of(z, nz)
         # Unsigned, because numba asks of each signed index whether it counts from the end.
         lx, ly, lz = np.uint64(cx), np.uint64(cy), np.uint64(cz)
         if not solid and clear[lx, ly, lz] > 0:
-            reach = int(clear[lx, ly, lz])
-            leap = min(
-                steps_to_leap(x, sx, cx, reach),
-                steps_to_leap(y, sy, cy, reach),
-                steps_to_leap(z, sz, cz, reach),
-            )
-            i += max(leap, 1)
+            i = _leap(rays, n, i, clear)
             continue
         fx, fy, fz = share_of(x, cx, nx), share_of(y, cy, ny), share_of(z, cz, nz)
         hx, hy, hz = (
@@ -192,7 +279,7 @@ def _march(o: Any, d: Any, edges: Any, t_in: float, t_out: float, nearest: float
         weight = transmittance * opacity * share
         if weight > 0.0:
             alpha += weight
-            alpha_depth += weight * (t_in if solid else begin + i * dt)
+            alpha_depth += weight * (begin + i * dt)
             for k in range(8):
                 part = (
                     (fx if k & 1 else 1.0 - fx)
@@ -215,7 +302,7 @@ def _march(o: Any, d: Any, edges: Any, t_in: float, t_out: float, nearest: float
 
 @njit(**KERNEL_OPTIONS)
 def cast_window(R: Any, o: Any, edges: Any, window: Any, intrinsics: Any, nearest_m: Any, furthest_m: Any, width: int, supersample: int, slots: Any,
-                density: Any, clear: Any, solid: bool, one_sided: bool, step: float, row: Any, touched: Any, ray: Any,
+                density: Any, clear: Any, solid: bool, one_sided: bool, step: float, row: Any, touched: Any,
                 progress: Any, pixels: Any, alphas: Any, depths: Any, ends: Any, indices: Any, values: Any) -> bool:  # fmt: skip
     """Cast the rays of one window, from where ``progress`` says.
 
@@ -237,7 +324,6 @@ def cast_window(R: Any, o: Any, edges: Any, window: Any, intrinsics: Any, neares
         step: Object units between samples.
         row: Scratch ``[slots]``, zero before and after.
         touched: Scratch ``[slots]``.
-        ray: Scratch ``[3]``.
         progress: ``[NEXT, FOUND, FILLED]``, kept up.
         pixels: Flat indices ``[P]``, written.
         alphas: ``[P]``, written.
@@ -249,57 +335,49 @@ def cast_window(R: Any, o: Any, edges: Any, window: Any, intrinsics: Any, neares
     Returns:
         Whether the window is done; if not, there was no room left in ``indices`` and ``values``: give more and call again.
     """
-    share, across = 1.0 / (supersample * supersample), window[3] - window[2]
-    sizes = slots.shape
-    while progress[NEXT] < (window[1] - window[0]) * across:
-        v, u = window[0] + progress[NEXT] // across, window[2] + progress[NEXT] % across
-        alpha, alpha_depth, count = 0.0, 0.0, 0
-        nearest, furthest = nearest_m[v - window[0], u - window[2]], furthest_m[v - window[0], u - window[2]]
-        if nearest > furthest:
-            progress[NEXT] += 1
-            continue
-        for s in range(supersample * supersample):
-            x = (u + (s % supersample + 0.5) / supersample - intrinsics[2]) / intrinsics[0]
-            y = (v + (s // supersample + 0.5) / supersample - intrinsics[3]) / intrinsics[1]
-            for axis in range(3):
-                ray[axis] = R[axis, 0] * x + R[axis, 1] * y + R[axis, 2]
-            t_in, t_out, by_face = span_in_box(o, ray, sizes, NEAR_M)
-            if t_out <= t_in or (one_sided and not by_face):
+    share, sizes, per_pixel = 1.0 / (supersample * supersample), slots.shape, supersample * supersample
+    down, across = window[1] - window[0], window[3] - window[2]
+    most = across * per_pixel
+    aims, rays, spans = np.empty((4, most)), np.empty((9, most)), np.empty((2, most), np.int32)
+    columns, going = np.empty(across, np.int64), np.empty(most, np.int64)
+    while progress[NEXT] < down * across:
+        line, alive = progress[NEXT] // across, 0
+        for column in range(progress[NEXT] % across, across):
+            if nearest_m[line, column] > furthest_m[line, column]:
                 continue
-            count, a, ad = _march(
-                o,
-                ray,
-                edges,
-                t_in,
-                t_out,
-                nearest,
-                furthest,
-                slots,
-                density,
-                clear,
-                solid,
-                step,
-                share,
-                row,
-                touched,
-                count,
-            )
-            alpha += a
-            alpha_depth += ad
-        filled, found = progress[FILLED], progress[FOUND]
-        room = filled + count <= len(indices)
-        for k in range(count):
-            if room:
-                indices[filled + k] = touched[k]
-                values[filled + k] = row[touched[k]]
-            row[touched[k]] = 0.0
-        if not room:
-            return False
-        progress[NEXT] += 1
-        if alpha > 0.0:
-            pixels[found] = v * width + u
-            alphas[found] = min(alpha, 1.0)
-            depths[found] = alpha_depth / alpha
-            ends[found] = filled + count
-            progress[FOUND], progress[FILLED] = found + 1, filled + count
+            for r in range(per_pixel):
+                n, u, v = alive * per_pixel + r, window[2] + column, window[0] + line
+                aims[0, n] = (u + (r % supersample + 0.5) / supersample - intrinsics[2]) / intrinsics[0]
+                aims[1, n] = (v + (r // supersample + 0.5) / supersample - intrinsics[3]) / intrinsics[1]
+                aims[2, n], aims[3, n] = nearest_m[line, column], furthest_m[line, column]
+            columns[alive] = column
+            alive += 1
+        _set_out(R, o, edges, sizes, aims, alive * per_pixel, solid, one_sided, step, rays, spans)
+        if not solid:
+            _leap_all(rays, spans, alive * per_pixel, going, clear)
+        for pixel in range(alive):
+            alpha, alpha_depth, count = 0.0, 0.0, 0
+            for n in range(pixel * per_pixel, (pixel + 1) * per_pixel):
+                count, a, ad = _march(
+                    rays, n, spans, slots, density, clear, solid, share, row, touched, count
+                )
+                alpha += a
+                alpha_depth += ad
+            filled, found = progress[FILLED], progress[FOUND]
+            room = filled + count <= len(indices)
+            for k in range(count):
+                if room:
+                    indices[filled + k] = touched[k]
+                    values[filled + k] = row[touched[k]]
+                row[touched[k]] = 0.0
+            progress[NEXT] = line * across + columns[pixel]
+            if not room:
+                return False
+            if alpha > 0.0:
+                pixels[found] = (window[0] + line) * width + window[2] + columns[pixel]
+                alphas[found] = min(alpha, 1.0)
+                depths[found] = alpha_depth / alpha
+                ends[found] = filled + count
+                progress[FOUND], progress[FILLED] = found + 1, filled + count
+        progress[NEXT] = (line + 1) * across
     return True

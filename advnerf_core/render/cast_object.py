@@ -295,7 +295,6 @@ class _Part:
             float(field.step_units),
             row,
             touched,
-            np.empty(3),
             progress,
             pixels,
             alpha,
