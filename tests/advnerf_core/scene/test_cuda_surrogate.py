@@ -27,7 +27,11 @@ pytestmark = [
         reason="needs a CUDA device, or NUMBA_ENABLE_CUDASIM=1",
     ),
 ]
+# The simulator starts a thread of Python for every pixel: a quarter of the pixels see the same there.
 PINHOLE = Pinhole(20, 12, 13.0, 13.0, 10.0, 5.0)
+if config.ENABLE_CUDASIM:
+    PINHOLE = PINHOLE.resized(10, 6)
+HIGH, WIDE = PINHOLE.height, PINHOLE.width
 MOUNT = camera_mount(0.3, 0.0, 0.2, 0.17)
 STATES = torch.tensor([[0.0, 0.0, 0.0], [0.2, 0.1, 0.15]], dtype=torch.float64)
 
@@ -37,8 +41,8 @@ def wall(poses, pinhole):
     rows = torch.linspace(0.2, 0.7, pinhole.height, dtype=torch.float64)[None, :, None, None]
     rgb = rows.expand(len(poses), pinhole.height, pinhole.width, 3).clone()
     depth_m = torch.full(rgb.shape[:3], 5.0, dtype=torch.float64)
-    depth_m[:, :, :8] = 1.9
-    depth_m[:, :4, :4] = torch.nan
+    depth_m[:, :, : 2 * WIDE // 5] = 1.9
+    depth_m[:, : HIGH // 3, : WIDE // 5] = torch.nan
     return rgb, depth_m
 
 
@@ -86,7 +90,7 @@ def noise(shape, seed=0, dtype=torch.float64):
 def test_images_and_gradients_are_those_of_the_processor(scene, dtype, close):
     here = surrogate(SCENES[scene](), dtype=dtype)
     there, poses = CudaSurrogate(here), here.camera_poses(STATES)
-    theta, slopes = noise(here.theta_shape, dtype=dtype), noise((2, 3, 12, 20), 1, dtype)
+    theta, slopes = noise(here.theta_shape, dtype=dtype), noise((2, 3, HIGH, WIDE), 1, dtype)
     ours, theirs = here.render(poses, theta), there.render(poses, theta)
     assert float((ours.images - here.render(poses, theta + 1.0).images).abs().max()) > 0.05  # it is seen
     torch.testing.assert_close(theirs.images.cpu(), ours.images, atol=close, rtol=0)
@@ -98,7 +102,11 @@ def test_images_and_gradients_are_those_of_the_processor(scene, dtype, close):
 
 def test_the_gradient_is_that_of_finite_differences():
     there = CudaSurrogate(surrogate([cloud(1.6, 0.1), face()]))
-    theta, direction, slopes = noise(there.theta_shape), noise(there.theta_shape, 1), noise((2, 3, 12, 20), 2)
+    theta, direction, slopes = (
+        noise(there.theta_shape),
+        noise(there.theta_shape, 1),
+        noise((2, 3, HIGH, WIDE), 2),
+    )
     poses, h = there.camera_poses(STATES), 1e-5
     gradient = there.render(poses, theta).vjp(slopes.to(there.device))
     plus, minus = (there.render(poses, theta + sign * h * direction).images.cpu() for sign in (1, -1))
@@ -113,7 +121,7 @@ def test_several_textures_are_shown_at_once():
     assert there.theta_shape == many.theta_shape
     drawn, again = (each.initial_theta(torch.Generator().manual_seed(3)) for each in (many, there))
     assert torch.equal(drawn, again)
-    poses, slopes = here.camera_poses(STATES.repeat(2, 1)), noise((4, 3, 12, 20), 1)
+    poses, slopes = here.camera_poses(STATES.repeat(2, 1)), noise((4, 3, HIGH, WIDE), 1)
     ours, theirs = many.render(poses, drawn), there.render(poses, drawn)
     torch.testing.assert_close(theirs.images.cpu(), ours.images, atol=1e-11, rtol=0)
     torch.testing.assert_close(theirs.vjp(slopes.to(there.device)), ours.vjp(slopes), atol=1e-9, rtol=0)
@@ -137,9 +145,9 @@ def test_frames_serve_other_textures_and_a_theta_that_changed_in_place():
 def test_slopes_that_are_not_finite_make_the_gradient_so():
     there = CudaSurrogate(surrogate([face()]))
     rendered = there.render(there.camera_poses(STATES), noise(there.theta_shape))
-    slopes = torch.zeros(2, 3, 12, 20, dtype=torch.float64, device=there.device)
+    slopes = torch.zeros(2, 3, HIGH, WIDE, dtype=torch.float64, device=there.device)
     assert not rendered.vjp(slopes).any()
-    slopes[1, 2, 6, 10] = torch.inf
+    slopes[1, 2, HIGH // 2, WIDE // 2] = torch.inf
     assert torch.isnan(rendered.vjp(slopes)).all()
 
 

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -62,18 +63,27 @@ def test_a_simulator_is_opened_with_arrays_where_the_world_sends_some(tmp_path: 
     assert all(np.array_equal(answer.arrays[name], data) for name, data in sent.items())
 
 
+@pytest.fixture(scope="module")
+def faulty(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[FlatWorld, Path, object]]:
+    """A world for one fault after the other, the folder where they are planned, and a drive that had none."""
+    folder = tmp_path_factory.mktemp("faulty")
+    with faulty_world(folder) as world:
+        yield world, folder, drive(world)
+
+
 @pytest.mark.parametrize("kind", FAULTS)
-def test_a_fault_ends_as_its_named_error_and_the_next_drive_goes_on(kind: str, tmp_path: Path) -> None:
+def test_a_fault_ends_as_its_named_error_and_the_next_drive_goes_on(
+    kind: str, faulty: tuple[FlatWorld, Path, object]
+) -> None:
     calls, expected = FAULTS[kind]
-    with faulty_world(tmp_path) as world:
-        whole = drive(world)
-        error, gone = suffer(world, tmp_path, calls[-1], kind, 2)
-        assert type(error) is expected
-        assert str(error).startswith("world flat: ")
-        assert gone
-        with pytest.raises(ServerLost, match="call reset first"):
-            world.step(0.0, 1.2, 0.1)
-        assert drive(world) == whole
+    world, folder, whole = faulty
+    error, gone = suffer(world, folder, calls[-1], kind, 2)
+    assert type(error) is expected
+    assert str(error).startswith("world flat: ")
+    assert gone
+    with pytest.raises(ServerLost, match="call reset first"):
+        world.step(0.0, 1.2, 0.1)
+    assert drive(world) == whole
 
 
 @pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGTERM])
