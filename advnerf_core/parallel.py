@@ -10,9 +10,10 @@ from __future__ import annotations
 import itertools
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,9 @@ KERNEL_OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
     "boundscheck": False,
 }
+
+T = TypeVar("T")
+U = TypeVar("U")
 
 SLOTS = 8  # parts of the work; fixed, so that sums over slots do not depend on the number of threads
 
@@ -77,6 +81,29 @@ def run_slots(function: Callable[[int], object], slots: int) -> None:
     worker()
     for future in futures:
         future.result()
+
+
+@dataclass(frozen=True)
+class Work(Generic[T]):
+    """Something to compute, in parts that do not wait for each other.
+
+    Attributes:
+        parts: Do the work; each obeys the rules of a slot of `run_slots`.
+        result: Gives what was computed, once all parts have run.
+    """
+
+    parts: Sequence[Callable[[], object]]
+    result: Callable[[], T]
+
+    def run(self) -> T:
+        """Run the parts on all threads, those that come first in the sequence first."""
+        run_slots(lambda slot: self.parts[slot](), len(self.parts))
+        return self.result()
+
+
+def beside(first: Work[T], second: Work[U]) -> Work[tuple[T, U]]:
+    """Both works as one: threads that find no part of the first go on with the second."""
+    return Work([*first.parts, *second.parts], lambda: (first.result(), second.result()))
 
 
 def slot_bounds(count: int, slots: int, multiple: int = 1) -> list[tuple[int, int]]:

@@ -25,7 +25,7 @@ from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.fields.sparse_rows import SparseRows
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.geometry import Array, Pinhole, invert_transform, transform_points
-from advnerf_core.parallel import run_slots, scratch
+from advnerf_core.parallel import Work, scratch
 from advnerf_core.render.cast_kernels import FILLED, FOUND, box_windows, cast_window, reach_of_bricks
 from advnerf_core.render.occupancy import leap_distances
 
@@ -99,23 +99,44 @@ def cast_objects(
     Raises:
         ValueError: No rays.
     """
+    return cast_work(fields, T_world_from_camera, pinhole, supersample, dtype).run()
+
+
+def cast_work(
+    fields: Sequence[ColouredObject],
+    T_world_from_camera: ArrayLike,
+    pinhole: Pinhole,
+    supersample: int = 2,
+    dtype: Any = np.float32,
+) -> Work[list[ObjectCast]]:
+    """:func:`cast_objects`, not begun yet: its parts may run beside those of other work."""
     poses = np.asarray(T_world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
     if supersample < 1:
         raise ValueError(f"expected at least 1 ray along a pixel's side, got {supersample}")
     grids = {k: field for k, field in enumerate(fields) if isinstance(field, VoxelGridObject)}
-    casts = _cast_grids(grids, poses, pinhole, supersample, dtype)
-    for k, field in enumerate(fields):
-        if k not in grids and isinstance(field, CastsItself):
-            casts[k] = field.cast(poses, pinhole, supersample, dtype)
-    return [casts[k] for k in range(len(fields))]
+    jobs = _grid_parts(grids, poses, pinhole, supersample, dtype)
+
+    def result() -> list[ObjectCast]:
+        casts = {
+            k: _joined([part for owner, part in jobs if owner == k], field, dtype)
+            for k, field in grids.items()
+        }
+        for k, field in enumerate(fields):
+            if k not in grids and isinstance(field, CastsItself):
+                casts[k] = field.cast(poses, pinhole, supersample, dtype)
+        return [casts[k] for k in range(len(fields))]
+
+    # The longest first: threads end together.
+    parts = sorted((part for _, part in jobs), key=lambda part: -part.area)
+    return Work([part.cast for part in parts], result)
 
 
-def _cast_grids(
+def _grid_parts(
     fields: Mapping[int, VoxelGridObject], poses: Array, pinhole: Pinhole, supersample: int, dtype: Any
-) -> dict[int, ObjectCast]:
+) -> list[tuple[int, _Part]]:
     bands = max(1, -(-_LEAST_PARTS // max(1, len(poses) * len(fields))))
     T_camera_from_world = invert_transform(poses)
-    jobs = [
+    return [
         (
             k,
             _Part(
@@ -135,13 +156,6 @@ def _cast_grids(
         if whole[0] < whole[1] and whole[2] < whole[3]
         for window in _bands(whole, bands)
     ]
-    parts = sorted(
-        (part for _, part in jobs), key=lambda part: -part.area
-    )  # the longest first: threads end together
-    run_slots(lambda slot: parts[slot].cast(), len(parts))
-    return {
-        k: _joined([part for owner, part in jobs if owner == k], field, dtype) for k, field in fields.items()
-    }
 
 
 def made_opaque(cast: ObjectCast) -> ObjectCast:

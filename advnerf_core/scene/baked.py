@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from torch import Tensor
 
 from advnerf_core.files import with_sorted_header, write_atomically
 from advnerf_core.geometry import Array, Pinhole
-from advnerf_core.parallel import run_slots, slot_bounds, thread_count
+from advnerf_core.parallel import Work, run_slots, slot_bounds, thread_count
 from advnerf_core.render.march import MarchConfig
 from advnerf_core.render.occupancy import Leaps, leap_distances
 from advnerf_core.render.rays import intrinsics_row, poses_in_box
@@ -84,14 +85,20 @@ class BakedScene:
         self, T_world_from_camera: ArrayLike | Tensor, pinhole: Pinhole
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Render a batch of views; arguments and results are those of `FieldRenderer.render`."""
+        return self.work(T_world_from_camera, pinhole).run()
+
+    __call__ = render
+
+    def work(
+        self, T_world_from_camera: ArrayLike | Tensor, pinhole: Pinhole
+    ) -> Work[tuple[Tensor, Tensor, Tensor]]:
+        """`render`, not begun yet: its parts may run beside those of other work."""
         if isinstance(T_world_from_camera, Tensor):
             T_world_from_camera = T_world_from_camera.detach().cpu().numpy()
         poses = np.asarray(T_world_from_camera, np.float64)
         if poses.ndim != 3 or poses.shape[1:] != (4, 4):
             raise ValueError(f"expected poses [B, 4, 4], got {poses.shape}")
-        return self._render(poses, pinhole, _NOTHING_NOTED)
-
-    __call__ = render
+        return self._work(poses, pinhole, _NOTHING_NOTED)
 
     def nearest_seen_m(self, T_world_from_camera: Array, pinhole: Pinhole) -> NDArray[np.float32]:
         """From how near each cell ``[X, Y, Z]`` is seen in views ``[N, 4, 4]`` [m]; infinite where it is not."""
@@ -101,15 +108,15 @@ class BakedScene:
 
         def work(slot: int) -> None:
             for pose in T_world_from_camera[slot :: len(nearest_m)]:
-                self._render(pose[None], pinhole, nearest_m[slot])
+                self._work(pose[None], pinhole, nearest_m[slot]).run()
 
         run_slots(work, len(nearest_m))
         found: NDArray[np.float32] = nearest_m.min(axis=0)
         return found
 
-    def _render(
+    def _work(
         self, poses: Array, pinhole: Pinhole, nearest_m: NDArray[np.float32]
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    ) -> Work[tuple[Tensor, Tensor, Tensor]]:
         shape = (len(poses), pinhole.height, pinhole.width)
         rgb, depth_m = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32)
         alpha = np.empty(shape, np.float32)
@@ -139,8 +146,10 @@ class BakedScene:
                 nearest_m,
             )
 
-        run_slots(work, len(bounds))
-        return torch.from_numpy(rgb), torch.from_numpy(depth_m), torch.from_numpy(alpha)
+        return Work(
+            [partial(work, slot) for slot in range(len(bounds))],
+            lambda: (torch.from_numpy(rgb), torch.from_numpy(depth_m), torch.from_numpy(alpha)),
+        )
 
     def save(self, path: Path) -> None:
         """Write to one ``.safetensors`` file, atomically."""

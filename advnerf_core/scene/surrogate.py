@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -22,13 +22,22 @@ from advnerf_core.fields.seen_rows import SeenRows, compact
 from advnerf_core.fields.sparse_rows import SparseRows
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.geometry import Array, Pinhole, planar_poses
-from advnerf_core.render.cast_object import ObjectCast, cast_objects, made_opaque
+from advnerf_core.parallel import Work, beside
+from advnerf_core.render.cast_object import ObjectCast, cast_work, made_opaque
 from advnerf_core.render.composite import composite, sparse_shares
 from advnerf_core.render.soft_pose import render_soft
 from advnerf_core.scene.remembered import RememberedBackground
 
 BackgroundRenderer = Callable[[Array, Pinhole], Sequence[Any]]
 """``(T_world_from_camera [B, 4, 4], pinhole) -> (rgb [B, H, W, 3] in 0..1, planar depth [B, H, W] in metres, ...)``."""
+
+
+@runtime_checkable
+class RendersInParts(Protocol):
+    """A `BackgroundRenderer` whose work can be done beside the casting of objects: no thread waits for the end of either."""
+
+    def work(self, T_world_from_camera: Array, pinhole: Pinhole) -> Work[tuple[Tensor, Tensor, Tensor]]:
+        """What calling it does and returns, not begun yet."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +194,13 @@ class Surrogate:
     def prepare(self, T_world_from_camera: ArrayLike) -> Frames:
         """Render the background and cast the objects for camera poses ``[B, 4, 4]``."""
         poses = np.asarray(T_world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
-        return self._composed(poses, *self.scene_frames(poses))
+        casting = self._cast_work(poses)
+        if isinstance(self.background, RendersInParts):
+            casts, frames = beside(casting, self.background.work(poses, self.camera)).run()
+        else:
+            frames = self.background(poses, self.camera)
+            casts = casting.run()
+        return self._composed(casts, *self._checked(frames, len(poses)))
 
     @torch.no_grad()
     def overlay(
@@ -205,10 +220,14 @@ class Surrogate:
         poses = np.asarray(T_world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
         images, depths = (torch.as_tensor(part, device="cpu").to(self.dtype) for part in (rgb, depth_m))
         self._check_background(images, depths, len(poses))
-        return self._composed(poses, images, depths).render(None if theta is None else theta.detach()).images
+        frames = self._composed(self._cast_work(poses).run(), images, depths)
+        return frames.render(None if theta is None else theta.detach()).images
 
-    def _composed(self, poses: Array, rgb: Tensor, depth_m: Tensor) -> Frames:
-        casts = cast_objects(self.objects, poses, self.camera, self.supersample, rgb.numpy().dtype)
+    def _cast_work(self, poses: Array) -> Work[list[ObjectCast]]:
+        dtype = torch.empty(0, dtype=self.dtype).numpy().dtype
+        return cast_work(self.objects, poses, self.camera, self.supersample, dtype)
+
+    def _composed(self, casts: Sequence[ObjectCast], rgb: Tensor, depth_m: Tensor) -> Frames:
         if self.opaque:
             casts = [made_opaque(cast) for cast in casts]
         return self.composed(casts, rgb, depth_m)
@@ -277,8 +296,11 @@ class Surrogate:
     @torch.no_grad()
     def scene_frames(self, poses: Array) -> tuple[Tensor, Tensor]:
         """Colours ``[B, H, W, 3]`` and planar depth ``[B, H, W]`` of the scene without objects, from ``[B, 4, 4]``."""
-        rgb, depth_m = self.background(poses, self.camera)[:2]
-        self._check_background(rgb, depth_m, len(poses))
+        return self._checked(self.background(poses, self.camera), len(poses))
+
+    def _checked(self, frames: Sequence[Any], count: int) -> tuple[Tensor, Tensor]:
+        rgb, depth_m = frames[:2]
+        self._check_background(rgb, depth_m, count)
         rgb, depth_m = (torch.as_tensor(part, device="cpu").to(self.dtype) for part in (rgb, depth_m))
         return rgb, depth_m
 

@@ -1,6 +1,7 @@
 """Several objects in one scene, opaque composition, and parameters that are mixed before they are squashed."""
 
 import dataclasses
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from advnerf_core.fields.seen_rows import SeenRows
 from advnerf_core.fields.summed_levels import with_summed_levels
 from advnerf_core.fields.voxel_grid import VoxelGridObject, squash
 from advnerf_core.geometry import Pinhole, camera_mount, make_transform, rotation_z
-from advnerf_core.scene.surrogate import Surrogate
+from advnerf_core.parallel import Work
+from advnerf_core.scene.surrogate import RendersInParts, Surrogate
 
 PINHOLE = Pinhole(40, 26, 25.0, 25.0, 20.0, 11.0)
 MOUNT = camera_mount(0.3, 0.0, 0.2, 0.17)
@@ -20,6 +22,22 @@ STATES = torch.tensor([[0.0, 0.0, 0.0], [0.2, 0.1, 0.15]], dtype=torch.float64)
 def wall(poses, pinhole):
     rgb = torch.full((len(poses), pinhole.height, pinhole.width, 3), 0.4, dtype=torch.float64)
     return rgb, torch.full(rgb.shape[:3], 2.2, dtype=torch.float64)
+
+
+class WallInParts:
+    """The wall, each image of which is drawn by a part of its own; by no call."""
+
+    def __call__(self, poses, pinhole):
+        raise AssertionError("expected to be asked for its parts")
+
+    def work(self, poses, pinhole):
+        rgb, depth_m = (torch.full_like(each, torch.nan) for each in wall(poses, pinhole))
+
+        def draw(b):
+            drawn = wall(poses[b : b + 1], pinhole)
+            rgb[b], depth_m[b] = drawn[0][0], drawn[1][0]
+
+        return Work([partial(draw, b) for b in range(len(poses))], lambda: (rgb, depth_m, depth_m))
 
 
 def cloud(x_m, y_m, density=6.0, count=8):
@@ -55,6 +73,17 @@ def assert_vjp_is_the_derivative(scene, seed=0):
     torch.testing.assert_close(
         (gradient * direction).sum(), ((plus - minus) * probe).sum() / (2 * h), rtol=1e-7, atol=1e-9
     )
+
+
+def test_a_scene_drawn_beside_the_objects_gives_the_same_bits():
+    called = surrogate([cloud(1.5, 0.1), cloud(2.4, 0.2)])
+    beside = called.with_background(WallInParts())
+    assert isinstance(beside.background, RendersInParts)
+    theta = called.initial_theta(torch.Generator().manual_seed(0))
+    slopes = torch.randn(2, 3, 26, 40, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    ours, theirs = (each.render(each.camera_poses(STATES), theta) for each in (called, beside))
+    assert torch.equal(ours.images, theirs.images)
+    assert torch.equal(ours.vjp(slopes), theirs.vjp(slopes))
 
 
 def test_the_order_in_which_objects_are_named_does_not_matter():

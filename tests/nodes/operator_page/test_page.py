@@ -101,7 +101,9 @@ def test_a_browser_that_goes_stops_the_car(run, browser, how):
         run.car.pictures = True
         assert 0.8 < run.car.stop_after(since_ns) < 1.0 + STOP_S
         # The act comes from the page, the state from the safety node: either may be heard first.
-        run.wait(lambda: any(act.act == "let_go" for act in run.car.acts[before:]), "the reason for letting go")
+        run.wait(
+            lambda: any(act.act == "let_go" for act in run.car.acts[before:]), "the reason for letting go"
+        )
         let_go = next(act for act in run.car.acts[before:] if act.act == "let_go")
         assert let_go.detail.startswith("the picture on the page is 1.")
         return
