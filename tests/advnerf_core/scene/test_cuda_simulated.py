@@ -6,10 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 TESTS = Path(__file__).parents[1]
 FILES = (TESTS / "scene" / "test_cuda_surrogate.py", TESTS / "attack" / "test_on_device.py")
 
 
+@pytest.mark.timeout(300)  # the simulator's threads wait for each other, and longer where other tests run
 def test_the_code_for_a_gpu_computes_in_the_simulator_what_the_processor_does():
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "gpu", *map(str, FILES)]
     done = subprocess.run(
