@@ -194,13 +194,15 @@ class Surrogate:
     def prepare(self, T_world_from_camera: ArrayLike) -> Frames:
         """Render the background and cast the objects for camera poses ``[B, 4, 4]``."""
         poses = np.asarray(T_world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
+        casts, frames = self._casts_and_scene(poses)
+        return self._composed(casts, *self._checked(frames, len(poses)))
+
+    def _casts_and_scene(self, poses: Array) -> tuple[list[ObjectCast], Sequence[Any]]:
+        # In a method of its own, so that the parts of the cast are gone before frames are composed.
         casting = self._cast_work(poses)
         if isinstance(self.background, RendersInParts):
-            casts, frames = beside(casting, self.background.work(poses, self.camera)).run()
-        else:
-            frames = self.background(poses, self.camera)
-            casts = casting.run()
-        return self._composed(casts, *self._checked(frames, len(poses)))
+            return beside(casting, self.background.work(poses, self.camera)).run()
+        return casting.run(), self.background(poses, self.camera)
 
     @torch.no_grad()
     def overlay(
