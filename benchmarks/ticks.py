@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from advnerf_core.attack.adjoint import adjoint_gradient
+from advnerf_core.driving.rollout import drive
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.geometry import make_transform, planar_poses, rotation_z
 from advnerf_core.objects.voxel.build import build_from_mesh
@@ -49,22 +50,23 @@ def hydrants(count: int) -> list[VoxelGridObject]:
 
 
 def measured(folder: Path, repeats: int = 5) -> dict[str, float]:
-    """Milliseconds of a tick with one object and with five (scene, objects and policy, 200 x 66), and of an iteration on the face."""
+    """Milliseconds of a tick of a rollout with one object and with five (scene, objects, policy, car, 200 x 66), and of an iteration on the face."""
     experiment = _run_of(folder)
     scenario, background = experiment.config.scenarios[0], load_background(experiment)
     path, loaded = experiment.paths[scenario], load_policy(victim_file(experiment, HARDENED))
     states = np.array([path.pose_at(float(s)) for s in np.linspace(0.0, 3.0, 30)])
     poses, found = planar_poses(states) @ experiment.mount, {}
+    start = torch.zeros(1, experiment.dynamics.state_size)
     for count in OBJECTS:
         surrogate = Surrogate(background, experiment.view.pinhole, experiment.mount, hydrants(count))
         theta = surrogate.plain_theta()
 
-        def drive(surrogate: Surrogate = surrogate, theta: torch.Tensor = theta) -> None:
-            with torch.no_grad():
-                for pose in poses:
-                    loaded.policy(surrogate.render(pose[None], theta).images)
+        def along_the_path(surrogate: Surrogate = surrogate, theta: torch.Tensor = theta) -> None:
+            # The same views for both codes, wherever their policies would drive.
+            views = (surrogate.render(pose[None], theta).images for pose in poses)
+            drive(loaded.policy, lambda _: next(views), experiment.dynamics, start, len(poses))
 
-        found[f"tick, {count}"] = 1e3 * seconds_in_turns({"tick": drive}, repeats)["tick"] / len(poses)
+        found[f"tick, {count}"] = 1e3 * seconds_in_turns({"tick": along_the_path}, repeats)["tick"] / len(poses)
     space = face_space(experiment, background)
     problem = replace(attack_problem(experiment, space, loaded, scenario, 0), steps=STEPS)
     theta = space.surrogate.initial_theta(torch.Generator().manual_seed(0))

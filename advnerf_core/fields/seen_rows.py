@@ -76,17 +76,19 @@ def _pack(
     """The different ones of ``indices``, ascending; ``packed`` gets each index's number among them. ``place`` is and stays zeros."""
     count = 0
     for n in range(indices.shape[0]):
-        count += 1 - place[indices[n]]
-        place[indices[n]] = 1
-    rows, found, at = np.empty(count, np.int64), 0, 0
+        index = np.uint64(indices[n])  # numba asks of a signed one whether it counts from the end
+        count += 1 - place[index]
+        place[index] = 1
+    rows, found, at = np.empty(count + 1, np.int64), 0, 0
     while found < count:
-        if place[at] == 1:
-            rows[found] = at
-            found += 1
-            place[at] = found
+        # Without a branch, as no processor can foresee which ones are there.
+        is_there = place[np.uint64(at)]
+        rows[np.uint64(found)] = at
+        found += is_there
+        place[np.uint64(at)] = found * is_there
         at += 1
     for n in range(indices.shape[0]):
-        packed[n] = place[indices[n]] - 1
+        packed[n] = place[np.uint64(indices[n])] - 1
     for n in range(count):
-        place[rows[n]] = 0
-    return rows
+        place[np.uint64(rows[n])] = 0
+    return rows[:count]

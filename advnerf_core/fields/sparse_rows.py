@@ -16,7 +16,8 @@ from scipy import sparse
 
 from advnerf_core.parallel import KERNEL_OPTIONS
 
-# Not contracted: a gradient has the bits of SciPy's product, which knows no fused multiply-add.
+# Sums keep their order and are not contracted: images and gradients have the bits of SciPy's product on every machine, and each row
+# is too short to gain by vector instructions.
 _ORDERED = {**KERNEL_OPTIONS, "fastmath": False}
 
 
@@ -71,39 +72,42 @@ class SparseRows:
         return out
 
 
-@njit(**KERNEL_OPTIONS)
+# Indices are unsigned here, because numba asks of each signed one whether it counts from the end.
+@njit(**_ORDERED)
 def _scaled(ends: Any, columns: Any, values: Any, rows: Any, factors: Any) -> Any:
     begins = np.zeros(len(rows) + 1, np.int32)
     for r in range(len(rows)):
         begins[r + 1] = begins[r] + ends[rows[r] + 1] - ends[rows[r]]
     kept_columns, kept = np.empty(begins[-1], columns.dtype), np.empty(begins[-1], values.dtype)
     for r in range(len(rows)):
-        first = ends[rows[r]]
-        for n in range(begins[r + 1] - begins[r]):
-            kept_columns[begins[r] + n] = columns[first + n]
-            kept[begins[r] + n] = values[first + n] * factors[r]
+        first, begin, factor = np.uint64(ends[rows[r]]), np.uint64(begins[r]), factors[r]
+        for n in range(np.uint64(begins[r + 1] - begins[r])):
+            kept_columns[begin + n] = columns[first + n]
+            kept[begin + n] = values[first + n] * factor
     return begins, kept_columns, kept
 
 
-@njit(**KERNEL_OPTIONS)
+@njit(**_ORDERED)
 def _add_product(ends: Any, columns: Any, values: Any, factors: Any, rows: Any, out: Any) -> None:
     for p in range(len(rows)):
         red = green = blue = values.dtype.type(0.0)
-        for n in range(ends[p], ends[p + 1]):
-            value, column = values[n], columns[n]
+        for n in range(np.uint64(ends[p]), np.uint64(ends[p + 1])):
+            value, column = values[n], np.uint64(columns[n])
             red += value * factors[column, 0]
             green += value * factors[column, 1]
             blue += value * factors[column, 2]
-        out[rows[p], 0] += red
-        out[rows[p], 1] += green
-        out[rows[p], 2] += blue
+        row = np.uint64(rows[p])
+        out[row, 0] += red
+        out[row, 1] += green
+        out[row, 2] += blue
 
 
 @njit(**_ORDERED)
 def _add_transposed(ends: Any, columns: Any, values: Any, factors: Any, out: Any) -> None:
     for p in range(len(ends) - 1):
-        for n in range(ends[p], ends[p + 1]):
-            value, column = values[n], columns[n]
-            out[column, 0] += value * factors[p, 0]
-            out[column, 1] += value * factors[p, 1]
-            out[column, 2] += value * factors[p, 2]
+        red, green, blue = factors[p, 0], factors[p, 1], factors[p, 2]
+        for n in range(np.uint64(ends[p]), np.uint64(ends[p + 1])):
+            value, column = values[n], np.uint64(columns[n])
+            out[column, 0] += value * red
+            out[column, 1] += value * green
+            out[column, 2] += value * blue

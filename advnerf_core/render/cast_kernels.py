@@ -289,9 +289,9 @@ def _march(rays: Any, n: int, spans: Any, slots: Any, density: Any, clear: Any, 
                 )
                 if part > 0.0:
                     slot = np.uint64(slots[hx if k & 1 else lx, hy if k & 2 else ly, hz if k & 4 else lz])
-                    if row[slot] == 0.0:
-                        touched[np.uint64(count)] = slot
-                        count += 1
+                    # Written in any case: a processor cannot foresee whether a slot is new.
+                    touched[np.uint64(count)] = slot
+                    count += 1 if row[slot] == 0.0 else 0
                     row[slot] += part
         transmittance *= 1.0 - opacity
         if transmittance <= 0.0:
@@ -323,7 +323,7 @@ def cast_window(R: Any, o: Any, edges: Any, window: Any, intrinsics: Any, neares
         one_sided: Only rays through the ``+x`` face count.
         step: Object units between samples.
         row: Scratch ``[slots]``, zero before and after.
-        touched: Scratch ``[slots]``.
+        touched: Scratch ``[slots + 1]``.
         progress: ``[NEXT, FOUND, FILLED]``, kept up.
         pixels: Flat indices ``[P]``, written.
         alphas: ``[P]``, written.

@@ -289,7 +289,7 @@ class _Part:
         intrinsics = np.array([lens.fx, lens.fy, lens.cx, lens.cy])
         reach_of_bricks(np.linalg.inv(R), o, grids.bricks, window, intrinsics, nearest_m, furthest_m)
         row = scratch("row", field.slot_count, grids.density.dtype)
-        touched = scratch("touched", field.slot_count, np.int32)
+        touched = scratch("touched", field.slot_count + 1, np.int32)
         progress = np.zeros(3, np.int64)
         while not cast_window(
             R,
