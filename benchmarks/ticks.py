@@ -66,7 +66,9 @@ def measured(folder: Path, repeats: int = 5) -> dict[str, float]:
             views = (surrogate.render(pose[None], theta).images for pose in poses)
             drive(loaded.policy, lambda _: next(views), experiment.dynamics, start, len(poses))
 
-        found[f"tick, {count}"] = 1e3 * seconds_in_turns({"tick": along_the_path}, repeats)["tick"] / len(poses)
+        found[f"tick, {count}"] = (
+            1e3 * seconds_in_turns({"tick": along_the_path}, repeats)["tick"] / len(poses)
+        )
     space = face_space(experiment, background)
     problem = replace(attack_problem(experiment, space, loaded, scenario, 0), steps=STEPS)
     theta = space.surrogate.initial_theta(torch.Generator().manual_seed(0))
