@@ -28,6 +28,10 @@ def world_check(
     pictures: Annotated[
         Path | None, typer.Option("--pictures", help="Folder for what the cameras see: look at it.")
     ] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option("--only", metavar="PART", help="A part to look at alone; again for another."),
+    ] = None,
 ) -> None:
     """Hold a world against the contract: handedness, metric depth, colour order, lateness, determinism, its car and its paths.
 
@@ -40,7 +44,7 @@ def world_check(
     document = Document({"kind": world}, "command line")
     apply_overrides(document, overrides or [])
     with ends_in_order():
-        findings = check_world(read_world(document, Path.cwd()), pictures)
+        findings = check_world(read_world(document, Path.cwd()), pictures, only or [])
     rows = table("part", "state", "found")
     for finding in findings:
         state = "[green]met[/]" if finding.met else "[red]not met[/]"

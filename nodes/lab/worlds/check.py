@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Collection
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,7 @@ import numpy as np
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import planar_pose
+from advnerf_core.plugins import unknown
 from hardware.worlds.world import NativePanels, NotOpenError, World, WorldDescription, traits_of
 from nodes.lab.worlds.bench import Bench, Check, Finding, NotMet
 from nodes.lab.worlds.driving import (
@@ -23,6 +25,7 @@ from nodes.lab.worlds.geometry import box_holds_what_is_seen, ground_is_flat, ph
 from nodes.lab.worlds.named import NamedWorld
 from nodes.lab.worlds.panels import panels_are_native
 from nodes.lab.worlds.pictures import form, is_not_late, photographs_match, repeats, takes_no_time
+from nodes.runtime.errors import ConfigError
 
 _DESCRIPTION = "description"
 # Without the first of these nothing else can be looked at.
@@ -45,19 +48,25 @@ _CHECKS: tuple[tuple[str, Check], ...] = (
 _PANELS: tuple[str, Check] = ("panels", panels_are_native)
 
 
-def check_world(named: NamedWorld, pictures: Path | None = None) -> list[Finding]:
+def check_world(named: NamedWorld, pictures: Path | None = None, only: Collection[str] = ()) -> list[Finding]:
     """Look at everything that can be told of a world from the outside.
 
     Args:
         named: The world.
         pictures: Folder for what the driving camera and a photograph show, for a person to look at.
+        only: Parts of the contract to look at, beside the first ones; all of them if empty.
 
     Returns:
         A line for each part of the contract; fewer if a first one fails without which the others cannot be looked at.
 
     Raises:
         AdvnerfError: The world cannot be made or opened; its own message.
+        ConfigError: There is no part of such a name.
     """
+    names = (_DESCRIPTION, *(name for name, _ in (*_FIRST, *_CHECKS, _PANELS)))
+    for name in only:
+        if name not in names:
+            raise ConfigError(unknown(name, "part of the contract", names))
     closed = _described(named.make())
     findings: list[Finding] = []
     with named.make() as world:
@@ -77,7 +86,7 @@ def check_world(named: NamedWorld, pictures: Path | None = None) -> list[Finding
         if pictures is not None:
             _write_pictures(bench, pictures)
         wanted = (*_CHECKS, _PANELS) if isinstance(world, NativePanels) else _CHECKS
-        findings += [_look(name, check, bench) for name, check in wanted]
+        findings += [_look(name, check, bench) for name, check in wanted if not only or name in only]
     return findings
 
 

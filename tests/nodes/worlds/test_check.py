@@ -19,6 +19,7 @@ from hardware.worlds.world import Box, CarDescription, NotOpenError
 from nodes.lab.worlds.check import check_world
 from nodes.lab.worlds.named import NamedWorld, read_world
 from nodes.runtime.config import Document
+from nodes.runtime.errors import ConfigError
 from tests.support.warehouse import EXAMPLES, Warehouse, small
 
 PARTS = [
@@ -319,9 +320,16 @@ class Raises(Small):
     ],
 )
 def test_a_planted_fault_is_found_and_named(fault: Callable[..., Any], part: str, told: str) -> None:
-    (finding,) = [each for each in check_world(small(fault)) if each.name == part]
+    (finding,) = [each for each in check_world(small(fault), only=[part]) if each.name == part]
     assert not finding.met
     assert told in finding.text
+
+
+def test_parts_are_looked_at_alone_and_unknown_ones_are_refused() -> None:
+    alone = check_world(small(Small), only=["reset", "time"])
+    assert [finding.name for finding in alone] == ["description", "pictures", "time", "reset"]
+    with pytest.raises(ConfigError, match=r"part of the contract.*camera.*got 'cameras'"):
+        check_world(small(Small), only=["cameras"])
 
 
 def test_what_a_world_must_be_asked_for_is_asked_once_it_is_open() -> None:
