@@ -151,15 +151,10 @@ class Path:
         xy = np.asarray(xy_m, dtype=np.float64)
         if xy.ndim == 0 or xy.shape[-1] != 2:
             raise ValueError(f"expected positions of shape [..., 2], got {list(xy.shape)}")
-        best_square = np.full(xy.shape[:-1], np.inf)
-        best_s = np.zeros(xy.shape[:-1])
-        for index in range(len(self.segments)):
-            along = self._nearest_on(index, xy)
-            foot = _advance(self._poses[index], self._curvatures[index], along)
-            square = np.sum((xy - foot[..., :2]) ** 2, axis=-1)
-            nearer = square < best_square
-            best_square = np.where(nearer, square, best_square)
-            best_s = np.where(nearer, self._starts_s[index] + along, best_s)
+        along = self._nearest_on_each(xy)
+        feet = _advance(self._poses[:-1], self._curvatures, along)
+        nearest = np.sum((xy[..., None, :] - feet[..., :2]) ** 2, axis=-1).argmin(axis=-1)[..., None]
+        best_s = np.take_along_axis(self._starts_s[:-1] + along, nearest, axis=-1)[..., 0]
         return self._describe(xy, best_s)
 
     def to_dict(self) -> dict[str, Any]:
@@ -212,24 +207,31 @@ class Path:
     def _segment_of(self, s: Array) -> NDArray[np.intp]:
         return np.clip(np.searchsorted(self._starts_s, s, side="right") - 1, 0, len(self.segments) - 1)
 
-    def _nearest_on(self, index: int, xy: Array) -> Array:
-        """Distance along one segment of its point nearest to ``xy [..., 2]``."""
-        x, y, yaw = self._poses[index]
-        length, curvature = self._lengths[index], self._curvatures[index]
-        offset = xy - np.array([x, y])
-        if curvature == 0.0:
-            along = offset @ np.array([np.cos(yaw), np.sin(yaw)])
-            return np.asarray(np.clip(along, 0.0, length), dtype=np.float64)
-        turn = np.sign(curvature)
-        centre = np.array([-np.sin(yaw), np.cos(yaw)]) / curvature
-        from_centre = offset - centre
+    def _nearest_on_each(self, xy: Array) -> Array:
+        """Distance along each segment of its point nearest to ``xy [..., 2]``, ``[..., segments]``."""
+        along = np.empty((*xy.shape[:-1], len(self.segments)))
+        for bent in (False, True):
+            which = np.flatnonzero((self._curvatures != 0.0) == bent)
+            on = self._nearest_on_arcs if bent else self._nearest_on_lines
+            along[..., which] = on(
+                which, xy[..., :1] - self._poses[which, 0], xy[..., 1:] - self._poses[which, 1]
+            )
+        return along
+
+    def _nearest_on_lines(self, which: NDArray[np.intp], x: Array, y: Array) -> Array:
+        yaw = self._poses[which, 2]
+        return np.asarray(np.clip(x * np.cos(yaw) + y * np.sin(yaw), 0.0, self._lengths[which]), np.float64)
+
+    def _nearest_on_arcs(self, which: NDArray[np.intp], x: Array, y: Array) -> Array:
+        yaw, curvature = self._poses[which, 2], self._curvatures[which]
+        turn, centre_x, centre_y = np.sign(curvature), -np.sin(yaw) / curvature, np.cos(yaw) / curvature
         # Angle travelled from the start of the arc, measured symmetrically about its middle so that clamping
         # sends each point to the nearer end.
-        start_angle = np.arctan2(-centre[1], -centre[0])
-        middle = 0.5 * length * abs(curvature)
-        angle = turn * (np.arctan2(from_centre[..., 1], from_centre[..., 0]) - start_angle)
+        start_angle = np.arctan2(-centre_y, -centre_x)
+        middle = 0.5 * self._lengths[which] * np.abs(curvature)
+        angle = turn * (np.arctan2(y - centre_y, x - centre_x) - start_angle)
         travelled = middle + wrap_angle(angle - middle)
-        return np.clip(travelled, 0.0, 2.0 * middle) / abs(curvature)
+        return np.asarray(np.clip(travelled, 0.0, 2.0 * middle) / np.abs(curvature), np.float64)
 
     def _describe(self, xy: Array, s: Array) -> Projection:
         index = self._segment_of(s)
