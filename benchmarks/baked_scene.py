@@ -1,7 +1,8 @@
 """What does baking the scene gain, and what does it cost? ``python -m benchmarks.baked_scene RUN_FOLDER``.
 
 In the scene and against the victims of a run folder of the room (``make demo``), on the same views and starts through the field and through
-the baked scene. ``--pairs`` searches and deploys attacks both ways. ``--speed`` compares with the code before there were baked scenes.
+the baked scene. ``--pairs`` searches and deploys attacks both ways. ``--speed`` compares with the code before there were baked scenes;
+there the run folder may be the junction's.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ import shutil
 import subprocess
 import sys
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -42,17 +44,23 @@ from nodes.experiment.faces import PaintedScene, face_space
 from nodes.experiment.learned_scene import load_background, load_field
 from nodes.experiment.policy import HARDENED, NAIVE, victim_file
 
-COMMAND = "python -m benchmarks.baked_scene runs/demo"
+COMMAND = "python -m benchmarks.baked_scene"
 _VIEWS, _EXCESS_M, _MOST_EVALUATIONS, _SEEDS = 200, 0.15, 60, 3
 Backgrounds = dict[str, BackgroundRenderer]
 
 
 def record(
-    line: str, value: float, unit: str, target: str, met: bool | None, note: str = "", option: str = ""
+    line: str,
+    value: float,
+    unit: str,
+    target: str,
+    met: bool | None,
+    note: str = "",
+    options: str = "runs/demo",
 ) -> None:
     """A row of the ledger."""
     print(f"{line}: {value:.4g} {unit} ({target}); {note}", flush=True)
-    record_row(line, value, unit, target, met, f"{COMMAND}{option}", note)
+    record_row(line, value, unit, target, met, f"{COMMAND} {options}", note)
 
 
 def fidelity(experiment: Experiment, backgrounds: Backgrounds) -> None:
@@ -81,8 +89,9 @@ def fidelity(experiment: Experiment, backgrounds: Backgrounds) -> None:
     )  # fmt: skip
 
 
-def speed(run: Path, before: str, turns: int) -> None:
-    """Ticks and iterations of this code and of that of a commit, each in processes of its own, in turns."""
+@contextmanager
+def _code_of_before(run: Path, before: str) -> Iterator[tuple[Path, Path]]:
+    """The code of a commit, with our script of measurements, and the run folder as that code can read it."""
     with TemporaryDirectory() as work:
         old = Path(work) / "code"
         subprocess.run(
@@ -94,18 +103,47 @@ def speed(run: Path, before: str, turns: int) -> None:
         try:
             shutil.copy(REPOSITORY / "benchmarks" / "ticks.py", old / "benchmarks" / "ticks.py")
             _copy_as_of_before(run, Path(work) / "run")
-            found: dict[str, list[dict[str, float]]] = {"before": [], "now": []}
-            for _ in range(turns):
-                found["before"].append(_ticks(old, Path(work) / "run"))
-                found["now"].append(_ticks(REPOSITORY, run.resolve()))
+            yield old, Path(work) / "run"
         finally:
             subprocess.run(["git", "worktree", "remove", "--force", old], cwd=REPOSITORY, check=True)
+
+
+def totals(run: Path, before: str) -> None:
+    """What the same searches find with this code and with that of a commit."""
+    with _code_of_before(run, before) as (old, copy):
+        found_m = {"before": _measured(old, copy, "--totals"), "now": _measured(REPOSITORY, run, "--totals")}
+    before_m, now_m = (list(found_m[when].values()) for when in ("before", "now"))
+    spread_m = max(before_m) - min(before_m)
+    apart_m = abs(mean(now_m) - mean(before_m))
+    by_seed = "; ".join(
+        f"{when} {', '.join(f'{total:.3f}' for total in found_m[when].values())} m" for when in found_m
+    )
+    record(
+        "totals after 50 iterations, room, against the code before baked scenes",
+        apart_m,
+        "m apart in the mean",
+        f"<= the seeds' spread before, {spread_m:.3f} m",
+        apart_m <= spread_m,
+        f"{len(now_m)} seeds: {by_seed}",
+        f"runs/{run.resolve().name} --totals",
+    )
+
+
+def speed(run: Path, before: str, turns: int) -> None:
+    """Ticks and iterations of this code and of that of a commit, each in processes of its own, in turns."""
+    found: dict[str, list[dict[str, float]]] = {"before": [], "now": []}
+    with _code_of_before(run, before) as (old, copy):
+        for _ in range(turns):
+            found["before"].append(_measured(old, copy))
+            found["now"].append(_measured(REPOSITORY, run))
+    where = "room" if "tick, 1" in found["now"][0] else "junction"
     lines = {
         "tick, 1": ("surrogate tick, one 64^3 object", 3.0),
         "tick, 5": ("surrogate tick, five 64^3 objects", 3.0),
-        "iteration": ("attack iteration, room", 2.5),
+        "iteration": (f"attack iteration, {where}", 2.5),
     }
-    for name, (line, least) in lines.items():
+    for name in found["now"][0]:
+        line, least = lines[name]
         before_ms, now_ms = (median(each[name] for each in found[when]) for when in ("before", "now"))
         note = f"{now_ms:.1f} ms against {before_ms:.1f} ms; medians of {turns} processes each, in turns"
         ratio = before_ms / now_ms
@@ -116,16 +154,16 @@ def speed(run: Path, before: str, turns: int) -> None:
             f">= {least:g} x",
             ratio >= least,
             note,
-            " --speed",
+            f"runs/{run.resolve().name} --speed",
         )
 
 
-def _ticks(code: Path, run: Path) -> dict[str, float]:
+def _measured(code: Path, run: Path, *options: str) -> dict[str, float]:
     environment = {**os.environ, "PYTHONPATH": str(code)}
     environment.pop("OMP_WAIT_POLICY", None)  # each code as its commands would have it
     done = subprocess.run(
         # As a module: run by its path, it would find benchmarks/coverage.py where numba looks for coverage.
-        [sys.executable, "-W", "ignore", "-m", "benchmarks.ticks", run],
+        [sys.executable, "-W", "ignore", "-m", "benchmarks.ticks", run.resolve(), *options],
         cwd=code,
         env=environment,
         check=True,
@@ -138,7 +176,9 @@ def _ticks(code: Path, run: Path) -> dict[str, float]:
 
 def _copy_as_of_before(run: Path, target: Path) -> None:
     """A run folder that the code before can read: the scene in single precision, with the header that it knew."""
-    for stage in ("capture", "policy", "scene"):
+    for stage in ("capture", "policy", "scene", "object"):
+        if not (run / stage).exists():  # a panel is built when it is needed
+            continue
         shutil.copytree(
             run / stage,
             target / stage,
@@ -238,7 +278,7 @@ def pairs(experiment: Experiment, backgrounds: Backgrounds) -> None:
         "<= 10 %",
         difference <= 0.1,
         note,
-        " --pairs",
+        "runs/demo --pairs",
     )
 
 
@@ -250,6 +290,9 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--speed", action="store_true", help="compare with the code of a commit, instead")
     parser.add_argument("--before", default="fad839a", help="that commit")
+    parser.add_argument(
+        "--totals", action="store_true", help="compare what searches find with that of that code, instead"
+    )
     parser.add_argument("--turns", type=int, default=5)
     parser.add_argument(
         "--pairs", action="store_true", help="search and deploy attacks both ways, instead (minutes)"
@@ -260,6 +303,9 @@ def main() -> None:
     backgrounds: Backgrounds = {"field": load_field(experiment), "baked": load_background(experiment)}
     if options.pairs:
         pairs(experiment, backgrounds)
+        return
+    if options.totals:
+        totals(options.run, options.before)
         return
     if options.speed:
         speed(options.run, options.before, options.turns)
