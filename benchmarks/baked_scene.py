@@ -32,6 +32,7 @@ from advnerf_core.attack.methods import SearchRun, load_method
 from advnerf_core.attack.search.search import Evaluation
 from advnerf_core.geometry import planar_poses
 from advnerf_core.learning.imitation import recovery_states
+from advnerf_core.objects.voxel.model import load_object, save_object
 from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.scene.bake import bake
 from advnerf_core.scene.surrogate import BackgroundRenderer
@@ -188,6 +189,9 @@ def _copy_as_of_before(run: Path, target: Path) -> None:
     for unknown in ("reference", "measure"):
         del manifest["config"][unknown]
     (target / "manifest.json").write_text(json.dumps(manifest))
+    for file in target.glob("object/*.safetensors"):  # a surface between voxels was not known
+        model = load_object(file)
+        save_object(file, replace(model, grids=replace(model.grids, density=model.grids.density.clip(0.0))))
     file = target / "scene" / "scene.safetensors"
     with safe_open(file, framework="pt") as scene:
         header = scene.metadata()
