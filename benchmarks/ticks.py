@@ -1,6 +1,6 @@
 """How long a tick of the surrogate and an iteration of an attack take in a run folder: printed as JSON, for `benchmarks.baked_scene`.
 
-With ``--totals``, what searches of fifty evaluations find instead. It names nothing that the code of before baked scenes lacks, so that the same script measures both.
+It names nothing that the code of before baked scenes lacks, so that the same script measures both.
 """
 
 from __future__ import annotations
@@ -15,9 +15,7 @@ import advnerf_core as advnerf_core  # isort: skip  # before torch, as in the co
 import numpy as np
 import torch
 
-from advnerf_core.attack.adjoint import AttackProblem, adjoint_gradient, evaluate
-from advnerf_core.attack.methods import SearchRun, load_method
-from advnerf_core.attack.spaces.space import Space
+from advnerf_core.attack.adjoint import adjoint_gradient
 from advnerf_core.driving.rollout import drive
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.geometry import make_transform, planar_poses, rotation_z
@@ -27,7 +25,7 @@ from advnerf_core.objects.voxel.mesh import stand
 from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.scene.surrogate import Surrogate
 from benchmarks.timing import seconds_in_turns
-from nodes.experiment.attack import attack_problem, search_settings
+from nodes.experiment.attack import attack_problem
 from nodes.experiment.config import ExperimentConfig
 from nodes.experiment.context import Experiment
 from nodes.experiment.learned_scene import load_background
@@ -36,7 +34,6 @@ from nodes.experiment.space_config import FaceConfig
 from nodes.experiment.spaces import make_space
 
 STEPS, OBJECTS = 40, (1, 5)
-EVALUATIONS, SEEDS = 50, range(3)
 
 
 def _run_of(folder: Path) -> Experiment:
@@ -82,28 +79,11 @@ def _ticks(experiment: Experiment, repeats: int) -> dict[str, float]:
     return found
 
 
-def _problem(experiment: Experiment, space: Space, seed: int) -> AttackProblem:
-    loaded = load_policy(victim_file(experiment, HARDENED))
-    return attack_problem(experiment, space, loaded, experiment.config.scenarios[0], seed)
-
-
-def totals(folder: Path) -> dict[str, float]:
-    """Predicted total cross-track error [m] of what a search with the gradient finds, by seed."""
-    experiment = _run_of(folder)
-    space, settings = make_space(experiment, None), search_settings(experiment, load_method("gradient"))
-    settings = replace(settings, evaluations=EVALUATIONS)
-    found = {}
-    for seed in SEEDS:
-        problem = _problem(experiment, space, seed)
-        theta = space.search("gradient", problem, settings, SearchRun(seed)).theta
-        found[str(seed)] = float(evaluate(problem, theta)[1].protocol_cte_m.mean())
-    return found
-
-
 def _iteration(experiment: Experiment, repeats: int) -> float:
     """Of a rollout and its gradient."""
-    space = make_space(experiment, None)
-    problem = replace(_problem(experiment, space, 0), steps=STEPS)
+    scenario, space = experiment.config.scenarios[0], make_space(experiment, None)
+    loaded = load_policy(victim_file(experiment, HARDENED))
+    problem = replace(attack_problem(experiment, space, loaded, scenario, 0), steps=STEPS)
     theta = space.surrogate.initial_theta(torch.Generator().manual_seed(0))
     return (
         1e3 * seconds_in_turns({"iteration": lambda: adjoint_gradient(problem, theta)}, repeats)["iteration"]
@@ -112,5 +92,4 @@ def _iteration(experiment: Experiment, repeats: int) -> float:
 
 if __name__ == "__main__":
     os.environ.setdefault("MUJOCO_GL", "egl")
-    asked = totals if sys.argv[2:] == ["--totals"] else measured
-    print(json.dumps(asked(Path(sys.argv[1]))))
+    print(json.dumps(measured(Path(sys.argv[1]))))

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
 
 from advnerf_core.geometry import Array, make_transform, rotation_z
+from hardware.worlds.paths import ReferencePath
 from hardware.worlds.world import WorldDescription
 
 ObjectKind = Literal["small_car", "hydrant", "panel"]
@@ -137,13 +139,7 @@ def in_a_lane(objects: Sequence[PlacedObject], world: WorldDescription) -> tuple
     Returns:
         Its index, and what is wrong in words; None if all objects stand beside the lanes.
     """
-    middles = np.array(
-        [
-            lane.pose_at(float(s))[:2]
-            for lane in world.lanes
-            for s in np.linspace(0.0, lane.length_m, 2 + int(lane.length_m / _SPACING_M))
-        ]
-    )
+    middles = np.concatenate([_middle_of(lane) for lane in world.lanes])
     for index, thing in enumerate(objects):
         turned, half = (
             rotation_z(thing.yaw_rad)[:2, :2],
@@ -160,3 +156,10 @@ def in_a_lane(objects: Sequence[PlacedObject], world: WorldDescription) -> tuple
                 f"at ({x:.2f}, {y:.2f}); move it"
             )
     return None
+
+
+@lru_cache(maxsize=64)  # of a few lanes, many spots are tried
+def _middle_of(lane: ReferencePath) -> Array:
+    """Points ``[N, 2]`` along the middle of a lane."""
+    along_m = np.linspace(0.0, lane.length_m, 2 + int(lane.length_m / _SPACING_M))
+    return np.array([lane.pose_at(float(s))[:2] for s in along_m])

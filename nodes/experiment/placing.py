@@ -124,8 +124,12 @@ def _fits(
     for other in standing:
         if math.hypot(spot.x_m - other.x_m, spot.y_m - other.y_m) < 0.5 * (spot.side_m + other.side_m):
             return False
-    ticks = sum(_is_seen(experiment, spot, view, wanted.stands.least_px) for view in views)
-    return ticks * experiment.config.dt_s >= wanted.stands.seen_s - 1e-9
+    needed, ticks = math.ceil((wanted.stands.seen_s - 1e-9) / experiment.config.dt_s), 0
+    for passed, view in enumerate(views):
+        if ticks >= needed or ticks + len(views) - passed < needed:  # decided
+            break
+        ticks += _is_seen(experiment, spot, view, wanted.stands.least_px)
+    return ticks >= needed
 
 
 def seen_from(experiment: Experiment, world: World, panel: PlacedObject, least_px: float) -> list[Pose]:

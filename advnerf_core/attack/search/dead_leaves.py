@@ -50,6 +50,8 @@ def dead_leaves(places: Tensor, generator: torch.Generator) -> Tensor:
         leaves = _drawn(extent, generator)
         inside = torch.cdist(places[uncovered], leaves.centres) <= leaves.radii
         covered = inside.any(1)
+        if not covered.any():  # most leaves fall beside the last open places
+            continue
         rows, top = uncovered[covered], inside[covered].to(torch.uint8).argmax(1)
         values[rows] = _shown(leaves, top, places[rows])
         uncovered = uncovered[~covered]

@@ -90,10 +90,14 @@ class FlatSimulator:
         dx, dy, ox, oy = rays[..., 0], rays[..., 1], eye[0] - px, eye[1] - py
         a, b, c = dx * dx + dy * dy, dx * ox + dy * oy, ox * ox + oy * oy - radius * radius
         root = b * b - a * c
+        if not (root > 0.0).any():
+            return rgb, z
         with np.errstate(divide="ignore", invalid="ignore"):
             hit = np.where(root > 0.0, (-b - np.sqrt(np.maximum(root, 0.0))) / a, np.inf)
         height = eye[2] + np.where(np.isfinite(hit), hit, 0.0) * rays[..., 2]
         seen = (hit > 0.05) & (hit < z) & (height > 0.0) & (height < POST_HEIGHT_M)
+        if not seen.any():
+            return rgb, z
         return np.where(
             seen[..., None], colour * (0.6 + 0.4 * np.sin(9.0 * height[..., None]) ** 2), rgb
         ), np.where(seen, hit, z)
