@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -36,20 +37,29 @@ _PARTS = (
 )
 
 
-def live_sections(data: ReportData) -> list[tuple[str, Markup]]:
-    """Parts of the page about one experiment whose drives were live: headings and HTML; missing parts are named as such."""
-    module = _fragments(data)
-    return [(heading, Markup(getattr(module, name)())) for name, heading in _PARTS]
+@dataclass(frozen=True)
+class LiveParts:
+    """What an experiment whose drives were live adds to its page.
+
+    Attributes:
+        sections: Headings and HTML; missing parts are named as such.
+        lead: What the page opens with: what happened in words, and the key figures.
+        targets: The targets of the experiment, and whether they were met.
+    """
+
+    sections: list[tuple[str, Markup]]
+    lead: tuple[str | Markup, ...]
+    targets: Markup
 
 
-def live_lead(data: ReportData) -> tuple[str | Markup, ...]:
-    """What the page opens with: what happened in words, and the key figures."""
-    return (*opening(data), Markup(_fragments(data).key_figures_part()))
-
-
-def live_targets(data: ReportData) -> Markup:
-    """The targets of the experiment, and whether they were met."""
-    return Markup(_fragments(data).targets_part())
+def live_parts(data: ReportData) -> LiveParts:
+    """The parts of the page about one experiment whose drives were live."""
+    drawn = _fragments(data)
+    return LiveParts(
+        [(heading, Markup(getattr(drawn, name)())) for name, heading in _PARTS],
+        (*opening(data), Markup(drawn.key_figures_part())),
+        Markup(drawn.targets_part()),
+    )
 
 
 def _fragments(data: ReportData) -> Any:

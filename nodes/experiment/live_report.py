@@ -6,19 +6,17 @@ import json
 import os
 import platform
 from collections.abc import Iterator
-from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from markupsafe import Markup
 
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.report import data as rd
 from advnerf_core.report import tables, targets
-from advnerf_core.report.live_parts import live_lead, live_sections, live_targets
+from advnerf_core.report.live_parts import LiveParts, live_parts
 from advnerf_core.report.results import read_results, write_results
 from nodes.experiment import films, memory
 from nodes.experiment.attack import ATTACK, SEARCHED, cells, frozen_hashes
@@ -39,22 +37,7 @@ SHOWN_VIEWS = 6
 _PATH_POINTS = 400
 
 
-@dataclass(frozen=True)
-class Parts:
-    """What an experiment whose drives were live adds to its page.
-
-    Attributes:
-        sections: Headings and HTML.
-        lead: What the page opens with.
-        targets: The targets, and whether they were met.
-    """
-
-    sections: list[tuple[str, Markup]]
-    lead: tuple[str | Markup, ...]
-    targets: Markup
-
-
-def make_parts(experiment: Experiment, folder: Path, report: Report) -> Parts:
+def make_parts(experiment: Experiment, folder: Path, report: Report) -> LiveParts:
     """Measure memory, cut films, and keep everything in ``results.json``."""
     rows = memory.measure(experiment, folder, lambda part, text="": report(0.6 * part, text))
     report(0.6, "cutting clips")
@@ -62,7 +45,7 @@ def make_parts(experiment: Experiment, folder: Path, report: Report) -> Parts:
     report(0.9, "writing the page")
     data = _report_data(experiment, clips, rows)
     write_results(data, folder / "results.json")
-    return Parts(live_sections(data), live_lead(data), live_targets(data))
+    return live_parts(data)
 
 
 def target_rows(experiment: Experiment) -> tables.Table:

@@ -7,7 +7,7 @@ from pathlib import Path
 from advnerf_core.report import plots
 from advnerf_core.report.conditions import CONDITIONS, SPARE, order_of, style_of
 from advnerf_core.report.data import LossCurve, ReportData
-from advnerf_core.report.live_parts import live_sections
+from advnerf_core.report.live_parts import live_parts
 from advnerf_core.report.palette import DARK, LIGHT
 from advnerf_core.report.tables import transfer_rows
 
@@ -57,4 +57,4 @@ def test_a_stranger_appears_in_the_report(make):
         "Spiral: each texture, best so far",
         "no attack, surrogate",
     ]
-    assert any("Spiral" in body for _, body in live_sections(data))
+    assert any("Spiral" in body for _, body in live_parts(data).sections)

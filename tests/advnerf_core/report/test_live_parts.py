@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from advnerf_core.report.data import Clip, ReportData, Texture
-from advnerf_core.report.live_parts import live_lead, live_sections, live_targets
+from advnerf_core.report.live_parts import live_parts
 from advnerf_core.report.results import read_results, results_dict, write_results
 from advnerf_core.report.transfer import TransferTable
 from advnerf_core.report.transfer_page import render_transfer_page
@@ -53,7 +53,8 @@ def check(page):
 def render_page(data):
     """The one page, with the parts of an experiment whose drives were live."""
     table = TransferTable((), {}, "room")
-    return render_transfer_page(table, (), live_sections(data), live_lead(data), live_targets(data))
+    parts = live_parts(data)
+    return render_transfer_page(table, (), parts.sections, parts.lead, parts.targets)
 
 
 @pytest.fixture(scope="module")
