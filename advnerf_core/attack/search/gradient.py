@@ -14,12 +14,12 @@ from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem, Totals, adjoint_gradient
 from advnerf_core.attack.methods import SearchRun, SearchSettings
+from advnerf_core.attack.search.adam import Adam
 from advnerf_core.attack.search.population import Coarse
 from advnerf_core.attack.search.search import (
     OnEvaluation,
     SearchDivergedError,
     SearchResult,
-    SearchState,
     begin,
     gradient_step,
     search_fingerprint,
@@ -130,17 +130,16 @@ def climb(
     state = begin(
         run.state_path, fingerprint, lambda: {"theta": coarse.sampled(problem.sensor.initial_theta(start))}
     )
-    searched, adam = _adam(state, learning_rate)
+    adam = Adam(state.tensors, learning_rate)
     while len(state.history) < evaluations:
         began, number = time.perf_counter(), len(state.history)
-        theta = coarse.expand(searched.detach())
+        theta = coarse.expand(adam.theta)
         slope = slope_of(problem.at_draw(number), theta)
         _check_finite(slope, number)
         evaluated = theta.clone()  # before Adam changes it in place
-        searched.grad = coarse.gathered(slope.gradient)
-        adam.step()
+        adam.step(coarse.gathered(slope.gradient))
         evaluation = state.record(evaluated, slope.loss_m, slope.totals, time.perf_counter() - began)
-        state.tensors = _tensors(searched, adam)
+        state.tensors = adam.tensors
         if run.state_path is not None:
             state.save(run.state_path, fingerprint)
         if run.on_evaluation is not None:
@@ -154,19 +153,3 @@ def _check_finite(slope: Slope, number: int) -> None:
             f"expected a finite loss and gradient at iteration {number}, got loss {slope.loss_m}; "
             "check the policy and the scene for NaN"
         )
-
-
-def _adam(state: SearchState, learning_rate: float) -> tuple[Tensor, torch.optim.Adam]:
-    theta = state.tensors["theta"].clone().requires_grad_()
-    adam = torch.optim.Adam([theta], lr=learning_rate)
-    moments = {key: value.clone() for key, value in state.tensors.items() if key != "theta"}
-    if moments:
-        adam.state[theta] = moments
-    return theta, adam
-
-
-def _tensors(theta: Tensor, adam: torch.optim.Adam) -> dict[str, Tensor]:
-    return {
-        "theta": theta.detach().clone(),
-        **{key: value.clone() for key, value in adam.state[theta].items()},
-    }

@@ -20,6 +20,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem, Sensor, Totals, adjoint_gradient
+from advnerf_core.attack.search.adam import Adam
 from advnerf_core.attack.search.search import (
     Evaluation,
     SearchDivergedError,
@@ -124,17 +125,16 @@ def gradient_attacks(
         hash=settings_hash,
     )
     states, tensors = _begin(batch, seeds, state_path, fingerprint)
-    theta, adam = _adam(tensors, learning_rate)
+    adam = Adam(tensors, learning_rate)
     while len(states[0].history) < iterations:
         began, draw = time.perf_counter(), len(states[0].history)
-        loss, totals, gradient = _gradients(batch, theta.detach(), draw)
-        evaluated = theta.detach().clone()
-        theta.grad = gradient
-        adam.step()
+        loss, totals, gradient = _gradients(batch, adam.theta, draw)
+        evaluated = adam.theta.clone()  # before Adam changes it in place
+        adam.step(gradient)
         spent_s = (time.perf_counter() - began) / len(seeds)
         made = [state.record(evaluated[k], loss[k], totals[k], spent_s) for k, state in enumerate(states)]
         if state_path is not None:
-            _save(state_path, fingerprint, states, {"theta": theta.detach(), **adam.state[theta]})
+            _save(state_path, fingerprint, states, adam.tensors)
         if on_evaluation is not None:
             for k, evaluation in enumerate(made):
                 on_evaluation(k, evaluation)
@@ -170,14 +170,6 @@ def _begin(
     surrogate = batch.each[0].sensor
     theta = torch.stack([surrogate.initial_theta(torch.Generator().manual_seed(seed)) for seed in seeds])
     return [SearchState({}) for _ in seeds], {"theta": theta}
-
-
-def _adam(tensors: dict[str, Tensor], learning_rate: float) -> tuple[Tensor, torch.optim.Adam]:
-    theta = tensors["theta"].clone().requires_grad_()
-    adam = torch.optim.Adam([theta], lr=learning_rate)
-    if moments := {key: value.clone() for key, value in tensors.items() if key != "theta"}:
-        adam.state[theta] = moments
-    return theta, adam
 
 
 def _save(path: Path, fingerprint: str, states: Sequence[SearchState], tensors: dict[str, Tensor]) -> None:
