@@ -18,6 +18,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from advnerf_core.adam import Adam
 from advnerf_core.files import with_sorted_header, write_atomically
 from advnerf_core.learning.augment import AugmentConfig, augment
 from advnerf_core.learning.frames import FrameSet, FrameStoreError
@@ -74,14 +75,11 @@ def fit(
             "expected training frames, got none: collect frames, or lower the share that is held out"
         )
     policy.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    optimiser = torch.optim.AdamW(
-        policy.parameters(), config.learning_rate, weight_decay=config.weight_decay, fused=True
-    )
-    done = 0 if checkpoint is None else _resume(checkpoint, policy, optimiser, config)
+    done, moments = (0, {}) if checkpoint is None else _resume(checkpoint, policy, config)
+    optimiser = Adam(dict(policy.named_parameters()), moments, config.weight_decay, fused=True)
     policy.train()
     running = 0.0
     for step in range(done, config.steps):
-        optimiser.param_groups[0]["lr"] = _learning_rate(config, step)
         error = _train_step(policy, optimiser, frames, config, step)
         running = error if step == done else 0.95 * running + 0.05 * error
         finished = step + 1
@@ -104,9 +102,7 @@ def mean_absolute_error(policy: PilotNet, frames: FrameSet) -> float:
     return total / len(rows)
 
 
-def _train_step(
-    policy: PilotNet, optimiser: torch.optim.Optimizer, frames: FrameSet, config: FitConfig, step: int
-) -> float:
+def _train_step(policy: PilotNet, optimiser: Adam, frames: FrameSet, config: FitConfig, step: int) -> float:
     rng = np.random.default_rng([config.seed, step])
     rows = frames.training[rng.integers(0, len(frames.training), config.batch_size)]
     images, labels, goals = frames.batch(rows)
@@ -114,9 +110,8 @@ def _train_step(
     target = torch.from_numpy(labels)
     output: Tensor = policy(inputs, torch.from_numpy(goals) if policy.goal_size else None)
     loss = F.huber_loss(output, target, delta=config.huber_rad) / config.huber_rad**2
-    optimiser.zero_grad(set_to_none=True)
     loss.backward()
-    optimiser.step()
+    optimiser.step(_learning_rate(config, step))
     return float((output.detach() - target).square().mean())
 
 
@@ -127,22 +122,19 @@ def _learning_rate(config: FitConfig, step: int) -> float:
     return config.learning_rate * (0.01 + 0.99 * 0.5 * (1.0 + cos(pi * share)))
 
 
-def _write(
-    path: Path, policy: PilotNet, optimiser: torch.optim.Optimizer, step: int, config: FitConfig
-) -> None:
+def _write(path: Path, policy: PilotNet, optimiser: Adam, step: int, config: FitConfig) -> None:
     tensors = {f"weight.{name}": value.detach() for name, value in policy.state_dict().items()}
-    for name, parameter in policy.named_parameters():
-        moments = optimiser.state[parameter]
+    for name, moments in optimiser.moments.items():
         tensors[f"first.{name}"], tensors[f"second.{name}"] = moments["exp_avg"], moments["exp_avg_sq"]
     contiguous = {name: value.contiguous() for name, value in tensors.items()}
     header = {"step": str(step), "config": repr(asdict(config))}
     write_atomically(path, with_sorted_header(save(contiguous, header)))
 
 
-def _resume(path: Path, policy: PilotNet, optimiser: torch.optim.Optimizer, config: FitConfig) -> int:
-    """Load the checkpoint if there is one; returns the number of finished steps."""
+def _resume(path: Path, policy: PilotNet, config: FitConfig) -> tuple[int, dict[str, dict[str, Tensor]]]:
+    """Load the checkpoint if there is one; returns the number of finished steps, and Adam's moments after them."""
     if not path.is_file():
-        return 0
+        return 0, {}
     try:
         with safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
@@ -160,10 +152,12 @@ def _resume(path: Path, policy: PilotNet, optimiser: torch.optim.Optimizer, conf
     )
     policy.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     step = int(header["step"])
-    for name, parameter in policy.named_parameters():
-        optimiser.state[parameter] = {
+    moments = {
+        name: {
             "step": torch.tensor(float(step)),
-            "exp_avg": torch.empty_like(parameter).copy_(tensors[f"first.{name}"]),
-            "exp_avg_sq": torch.empty_like(parameter).copy_(tensors[f"second.{name}"]),
+            "exp_avg": tensors[f"first.{name}"],
+            "exp_avg_sq": tensors[f"second.{name}"],
         }
-    return step
+        for name, _ in policy.named_parameters()
+    }
+    return step, moments

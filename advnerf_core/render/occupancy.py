@@ -147,29 +147,38 @@ def leap_distances(occupied: NDArray[np.bool_], cells: Array32) -> Leaps:
 
 @njit(**KERNEL_OPTIONS)
 def _chamfer(distance: NDArray[np.uint8]) -> None:
-    """Two raster sweeps (Borgefors 1986) that turn 0 / MAX_REACH into chessboard distances."""
+    """Two raster sweeps (Borgefors 1986) that turn 0 / MAX_REACH into chessboard distances.
+
+    Of the thirteen neighbours that a sweep has already passed, the twelve of other rows are looked at a row at a time, in vectors of
+    bytes; only the one before in the same row waits for its value.
+    """
     nx, ny, nz = distance.shape
+    # The least of the rows already passed, with a border on both sides.
+    least = np.full(nz + 2, np.uint8(MAX_REACH), np.uint8)
+    inner, before, after = least[1:-1], least[:-2], least[2:]
     for sweep in range(2):
-        sign = 1 - 2 * sweep
+        step = 1 - 2 * sweep
         for a in range(nx):
             i = a if sweep == 0 else nx - 1 - a
             for b in range(ny):
                 j = b if sweep == 0 else ny - 1 - b
+                row = distance[i, j]
+                inner[:] = MAX_REACH
+                if a > 0:
+                    for passed in range(max(j - 1, 0), min(j + 2, ny)):
+                        _lower(inner, distance[i - step, passed])
+                if b > 0:
+                    _lower(inner, distance[i, j - step])
+                for k in range(nz):
+                    row[k] = min(row[k], np.uint8(min(before[k], inner[k], after[k]) + 1))
+                left = np.uint8(MAX_REACH)
                 for c in range(nz):
                     k = c if sweep == 0 else nz - 1 - c
-                    best = distance[i, j, k]
-                    if best == 0:
-                        continue
-                    # The thirteen neighbours that this sweep has already passed.
-                    ip, kp = i - sign, k - sign
-                    if 0 <= ip < nx:
-                        for jj in range(max(j - 1, 0), min(j + 2, ny)):
-                            for kk in range(max(k - 1, 0), min(k + 2, nz)):
-                                best = min(best, distance[ip, jj, kk] + 1)
-                    jp = j - sign
-                    if 0 <= jp < ny:
-                        for kk in range(max(k - 1, 0), min(k + 2, nz)):
-                            best = min(best, distance[i, jp, kk] + 1)
-                    if 0 <= kp < nz:
-                        best = min(best, distance[i, j, kp] + 1)
-                    distance[i, j, k] = best
+                    left = min(row[k], np.uint8(left + 1))
+                    row[k] = left
+
+
+@njit(**KERNEL_OPTIONS)
+def _lower(least: NDArray[np.uint8], row: NDArray[np.uint8]) -> None:
+    for k in range(len(least)):
+        least[k] = min(least[k], row[k])

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parents[2]
 RECORDED = ROOT / "tests" / "nodes" / "experiment" / "versions.json"
 TINY = (
-    "capture.photos=12", "capture.colour_pairs=2", "capture.held_out=3", "scene.steps=12", "scene.log2_entries=12",
+    "capture.photos=12", "capture.colour_pairs=2", "capture.held_out=3", "scene.steps=12", "scene.log2_entries=12", "scene.occupancy=32",
     "policy.deployed_stills=12", "policy.surrogate_stills=8", "policy.deployed_drives=1", "policy.surrogate_drives=2",
     "policy.drive_steps=3", "policy.first_steps=6", "policy.round_steps=3", "policy.naive_steps=0",
     "attack.horizon=6", "attack.evaluations=2", "space.resolution=8", "horizon=8", "deploy.through=world",

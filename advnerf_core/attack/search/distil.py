@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from advnerf_core.adam import Adam
 from advnerf_core.policies.pilotnet import IMAGE_HEIGHT, IMAGE_WIDTH, PilotNet
 
 StudentFactory = Callable[[tuple[int, ...], int, float], nn.Module]
@@ -167,7 +168,7 @@ class Student:
             self.network = factory(tuple(lessons.images.shape[2:]), self.goal_size, self.bound_rad).eval()
         self._names = [name for name, _ in self.network.named_parameters()]
         self._dtype = next(self.network.parameters()).dtype
-        self._adam = torch.optim.Adam(self.network.parameters(), lr=settings.learning_rate)
+        self._adam = Adam(dict(self.network.named_parameters()))
 
     def __call__(self, images: Tensor, goals: Tensor | None = None) -> Tensor:
         """Steering ``[B]`` [rad] of images on any device; differentiable with respect to them."""
@@ -199,9 +200,8 @@ class Student:
             error = self(images, goals).reshape(-1, 2) - self.lessons.answers[chosen].to(self._dtype)
             square = (error**2).mean()
             apart = ((error[:, 0] - error[:, 1]) ** 2).mean()
-            self._adam.zero_grad()
             (square + self.settings.difference_weight * apart).backward()
-            self._adam.step()
+            self._adam.step(self.settings.learning_rate)
             errors.append(float(square.detach()))
         self.network.eval().requires_grad_(False)
         last = errors[-max(1, len(errors) // 4) :]
@@ -213,7 +213,7 @@ class Student:
         kept["bound_rad"] = torch.tensor(self.bound_rad, dtype=torch.float64)
         for name, value in self.network.named_parameters():
             kept[f"weight.{name}"] = value.detach().clone()
-            for key, moment in self._adam.state[value].items():
+            for key, moment in self._adam.moments[name].items():
                 kept[f"{key}.{name}"] = moment.clone()
         return {f"student.{key}": value.contiguous() for key, value in kept.items()}
 
@@ -229,10 +229,11 @@ class Student:
         }
         lessons = Lessons(kept["images"], kept["goals"], kept["answers"])
         student = cls(lessons, settings, 0, factory, float(kept["bound_rad"]))
-        for name, value in student.network.named_parameters():
+        weights, moments = dict(student.network.named_parameters()), {}
+        for name, value in weights.items():
             with torch.no_grad():
                 value.copy_(kept[f"weight.{name}"])
-            moments = ("step", "exp_avg", "exp_avg_sq")
-            student._adam.state[value] = {key: kept[f"{key}.{name}"].clone() for key in moments}
+            moments[name] = {key: kept[f"{key}.{name}"] for key in ("step", "exp_avg", "exp_avg_sq")}
+        student._adam = Adam(weights, moments)
         student.network.requires_grad_(False)
         return student

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem, Totals, adjoint_gradient
 from advnerf_core.attack.methods import SearchRun, SearchSettings
-from advnerf_core.attack.search.adam import Adam
+from advnerf_core.attack.search.descent import Descent
 from advnerf_core.attack.search.population import Coarse
 from advnerf_core.attack.search.search import (
     OnEvaluation,
@@ -130,16 +130,16 @@ def climb(
     state = begin(
         run.state_path, fingerprint, lambda: {"theta": coarse.sampled(problem.sensor.initial_theta(start))}
     )
-    adam = Adam(state.tensors, learning_rate)
+    descent = Descent(state.tensors, learning_rate)
     while len(state.history) < evaluations:
         began, number = time.perf_counter(), len(state.history)
-        theta = coarse.expand(adam.theta)
+        theta = coarse.expand(descent.theta)
         slope = slope_of(problem.at_draw(number), theta)
         _check_finite(slope, number)
         evaluated = theta.clone()  # before Adam changes it in place
-        adam.step(coarse.gathered(slope.gradient))
+        descent.step(coarse.gathered(slope.gradient))
         evaluation = state.record(evaluated, slope.loss_m, slope.totals, time.perf_counter() - began)
-        state.tensors = adam.tensors
+        state.tensors = descent.tensors
         if run.state_path is not None:
             state.save(run.state_path, fingerprint)
         if run.on_evaluation is not None:

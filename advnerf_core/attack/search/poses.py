@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from advnerf_core.adam import Adam
 from advnerf_core.attack.adjoint import (
     AdjointResult,
     AttackProblem,
@@ -215,13 +216,18 @@ def _gradient(problem: AttackProblem, theta: Tensor) -> AdjointResult:
 class _Climb:
     """One drawn pose on its way: coordinates and colours with their Adam, which has no other state."""
 
-    def __init__(self, sensor: PlacedSensor, budget: MultiStart, unit: Tensor, colours: Tensor) -> None:
+    def __init__(
+        self,
+        sensor: PlacedSensor,
+        budget: MultiStart,
+        unit: Tensor,
+        colours: Tensor,
+        moments: Mapping[str, Mapping[str, Tensor]] | None = None,
+    ) -> None:
         self._sensor = sensor
-        self._parts = {"unit": unit.clone().requires_grad_(), "colours": colours.clone().requires_grad_()}
-        rates = {"unit": budget.pose_rate, "colours": budget.colour_rate}
-        self._adam = torch.optim.Adam(
-            [{"params": [part], "lr": rates[name]} for name, part in self._parts.items()]
-        )
+        self._parts = {"unit": unit.clone(), "colours": colours.clone()}
+        self._rates = {"unit": budget.pose_rate, "colours": budget.colour_rate}
+        self._adams = {name: Adam({name: part}, moments) for name, part in self._parts.items()}
 
     @classmethod
     def fresh(cls, sensor: PlacedSensor, budget: MultiStart, generator: torch.Generator) -> _Climb:
@@ -234,37 +240,35 @@ class _Climb:
         """Where ``tensors`` left it; of no meaning if they hold none."""
         if "unit" not in tensors:
             return cls(sensor, budget, torch.zeros(0, 4), torch.zeros(0))
-        climb = cls(sensor, budget, tensors["unit"], tensors["colours"])
-        for name, part in climb._parts.items():
-            moments = {
-                key.partition(".")[2]: value.clone()
-                for key, value in tensors.items()
-                if key.startswith(name + ".")
-            }
-            if moments:
-                climb._adam.state[part] = moments
-        return climb
+        moments: dict[str, dict[str, Tensor]] = {}
+        for key, value in tensors.items():
+            name, _, moment = key.partition(".")
+            if moment:
+                moments.setdefault(name, {})[moment] = value
+        return cls(sensor, budget, tensors["unit"], tensors["colours"], moments)
 
     @property
     def theta(self) -> Tensor:
         """Where it is."""
-        return self._sensor.join(self._parts["unit"].detach(), self._parts["colours"].detach())
+        return self._sensor.join(self._parts["unit"], self._parts["colours"])
 
     def step(self, gradient: Tensor) -> None:
         """One step downhill; the pose stays within what is allowed."""
-        unit, before = self._parts["unit"], self._parts["unit"].detach().clone()
-        unit.grad = self._sensor.unit(gradient)
-        self._parts["colours"].grad = gradient[self._sensor.pose_count :]
-        self._adam.step()
-        with torch.no_grad():
-            unit.copy_(self._sensor.space.project(unit.detach(), before))
+        unit, before = self._parts["unit"], self._parts["unit"].clone()
+        slopes = {
+            "unit": self._sensor.unit(gradient),
+            "colours": gradient[self._sensor.pose_count :],
+        }
+        for name, adam in self._adams.items():
+            adam.step(self._rates[name], {name: slopes[name]})
+        unit.copy_(self._sensor.space.project(unit, before))
 
     def tensors(self) -> dict[str, Tensor]:
         """Everything it needs to go on."""
         out: dict[str, Tensor] = {}
         for name, part in self._parts.items():
-            out[name] = part.detach().clone()
-            moments: dict[str, Any] = self._adam.state.get(part, {})
+            out[name] = part.clone()
+            moments = self._adams[name].moments[name]
             out |= {f"{name}.{key}": value.clone() for key, value in moments.items()}
         return out
 

@@ -20,7 +20,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem, Sensor, Totals, adjoint_gradient
-from advnerf_core.attack.search.adam import Adam
+from advnerf_core.attack.search.descent import Descent
 from advnerf_core.attack.search.search import (
     Evaluation,
     SearchDivergedError,
@@ -125,16 +125,16 @@ def gradient_attacks(
         hash=settings_hash,
     )
     states, tensors = _begin(batch, seeds, state_path, fingerprint)
-    adam = Adam(tensors, learning_rate)
+    descent = Descent(tensors, learning_rate)
     while len(states[0].history) < iterations:
         began, draw = time.perf_counter(), len(states[0].history)
-        loss, totals, gradient = _gradients(batch, adam.theta, draw)
-        evaluated = adam.theta.clone()  # before Adam changes it in place
-        adam.step(gradient)
+        loss, totals, gradient = _gradients(batch, descent.theta, draw)
+        evaluated = descent.theta.clone()  # before Adam changes it in place
+        descent.step(gradient)
         spent_s = (time.perf_counter() - began) / len(seeds)
         made = [state.record(evaluated[k], loss[k], totals[k], spent_s) for k, state in enumerate(states)]
         if state_path is not None:
-            _save(state_path, fingerprint, states, adam.tensors)
+            _save(state_path, fingerprint, states, descent.tensors)
         if on_evaluation is not None:
             for k, evaluation in enumerate(made):
                 on_evaluation(k, evaluation)

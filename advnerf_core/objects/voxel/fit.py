@@ -19,6 +19,7 @@ from scipy import ndimage
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
+from advnerf_core.adam import Adam
 from advnerf_core.objects.voxel.pictures import FitError, PosedRgba, RayBatches, crossing
 from advnerf_core.objects.voxel.voxelise import OPAQUE_PER_VOXEL, ObjectGrids
 
@@ -75,11 +76,11 @@ def fit_grids(
     batches = RayBatches(views, start.box_min, start.box_max, seed)
     torch_rng = torch.Generator().manual_seed(seed)
     field = _Field(start)
-    optimiser = torch.optim.Adam(field.parameters, lr=learning_rate)
+    optimiser = Adam(field.parameters)
     began, errors, fraction = time.monotonic(), list[float](), 0.0 if steps > 0 else 1.0
     while fraction < 1.0:
-        optimiser.param_groups[0]["lr"] = learning_rate * _cosine(fraction)
-        errors.append(_step(field, optimiser, batches.draw(rays), torch_rng))
+        errors.append(_error(field, batches.draw(rays), torch_rng))
+        optimiser.step(learning_rate * _cosine(fraction))
         by_time = 0.0 if max_seconds is None else (time.monotonic() - began) / max_seconds
         fraction = min(1.0, max(len(errors) / steps, by_time))
         if progress is not None:
@@ -87,13 +88,8 @@ def fit_grids(
     return Fit(field.grids(), len(errors), _gain_db(errors))
 
 
-def _step(
-    field: _Field,
-    optimiser: torch.optim.Optimizer,
-    batch: tuple[Tensor, Tensor, Tensor],
-    torch_rng: torch.Generator,
-) -> float:
-    """One step on a batch of rays; returns the mean squared error before it."""
+def _error(field: _Field, batch: tuple[Tensor, Tensor, Tensor], torch_rng: torch.Generator) -> float:
+    """Mean squared error on a batch of rays; leaves the gradients in the parameters."""
     target, origins, directions = batch
     count = len(target)
     background = torch.rand(count, 3, generator=torch_rng)
@@ -101,9 +97,7 @@ def _step(
     got = colour + (1.0 - alpha) * background
     wanted = target[:, :3] + (1.0 - target[:, 3:]) * background
     error = (got - wanted).square().mean()
-    optimiser.zero_grad(set_to_none=True)
     (error + _SPARSITY * field.opacity_between()).backward()
-    optimiser.step()
     return float(error.detach())
 
 
@@ -137,7 +131,7 @@ class _Field:
         self._low = torch.tensor(start.box_min, dtype=torch.float32)
         self._high = torch.tensor(start.box_max, dtype=torch.float32)
         self._step = start.voxel / 2.0
-        self.parameters = [self._raw, self._theta]
+        self.parameters = {"raw": self._raw, "theta": self._theta}
 
     def _share(self) -> Tensor:
         """Density as a share of the largest, from -1 to 1."""

@@ -27,7 +27,7 @@ from tests.support.stage_versions import measured
 LAUNCH = Path(__file__).parents[3] / "launch" / "junction.experiment.yaml"
 TINY: dict[str, Any] = {
     "capture": {"photos": 9, "held_out": 3},
-    "scene": {"steps": 20, "log2_entries": 10, "finest": 32},
+    "scene": {"steps": 20, "log2_entries": 10, "finest": 32, "occupancy": 32},
     "object": {"car_resolution": 12, "hydrant_resolution": 10, "fit_steps": 0},
     "policy": {
         "deployed_stills": 4, "surrogate_stills": 4, "deployed_drives": 1, "surrogate_drives": 1, "drive_steps": 2,
