@@ -17,7 +17,8 @@ import numpy as np
 import torch
 
 from advnerf_core.attack.adjoint import adjoint_gradient
-from advnerf_core.attack.on_device import on_chosen_device, use_device
+from advnerf_core.attack.device import use_device
+from advnerf_core.attack.on_device import on_chosen_device
 from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.scene.surrogate import Surrogate

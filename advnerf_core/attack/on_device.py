@@ -1,13 +1,8 @@
-"""Searches on a GPU: the sensor and the policy of a problem go there, everything else stays on the processor.
-
-Which device a search uses is a matter of the machine, not of the experiment: it is no key of a configuration, and no hash has it. Results
-differ in their last bits between a processor and a GPU, and so does what a chaotic drive makes of them.
-"""
+"""Searches on a GPU: the sensor and the policy of a problem go there, everything else stays on the processor."""
 
 from __future__ import annotations
 
 import copy
-import os
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -15,24 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from advnerf_core.attack.device import searches_on_gpu
 from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.attack.spaces.displayed import DisplayedSensor
-from advnerf_core.errors import DeviceError
-
-VARIABLE = "ADVNERF_DEVICE"
-_CPU, _CUDA = "cpu", "cuda"
-
-
-def searches_on_gpu() -> bool:
-    """Whether the environment variable ``ADVNERF_DEVICE`` asks for a GPU; without it the processor searches.
-
-    Raises:
-        DeviceError: It names something else than cpu or cuda.
-    """
-    named = os.environ.get(VARIABLE) or _CPU
-    if named not in (_CPU, _CUDA):
-        raise DeviceError(f"expected cpu or cuda in {VARIABLE}, got {named!r}")
-    return named == _CUDA
 
 
 def on_chosen_device(problem: AttackProblem) -> AttackProblem:
@@ -56,20 +36,6 @@ def all_on_chosen_device(problems: Sequence[AttackProblem]) -> list[AttackProble
     """Problems that differ in starts, goals and draws only, on the chosen device, where they share one sensor and one policy."""
     first = on_chosen_device(problems[0])
     return [replace(each, sensor=first.sensor, policy=first.policy) for each in problems]
-
-
-def use_device(device: str | None) -> None:
-    """Search on ``cpu`` or ``cuda`` from now on, also in processes that are started from here; None leaves it as it is.
-
-    Raises:
-        DeviceError: There is no such device.
-    """
-    if device is not None:
-        os.environ[VARIABLE] = device
-    if searches_on_gpu():
-        from advnerf_core.render.cuda_launch import cuda_device
-
-        cuda_device()
 
 
 def said_of_device() -> dict[str, str]:

@@ -6,17 +6,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from markupsafe import Markup
-from matplotlib.figure import Figure
-from scipy.stats import spearmanr
 
 from advnerf_core.report.conditions import order_of, style_of
 from advnerf_core.report.palette import LIGHT
-from advnerf_core.report.plots import new_axes, svg
 from advnerf_core.report.tables import Table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # An attack that makes the car stray by this ratio counts as one that works.
 WORKS_FROM = 1.5
@@ -83,6 +83,8 @@ class Skill:
 
 def skill_of(pairs: Sequence[Predicted]) -> Skill:
     """Sum predictions up."""
+    from scipy.stats import spearmanr  # half a second, and most tables have no predictions
+
     if not pairs:
         return Skill(0, None, None, None, 0)
     ratios, measured = (np.array([getattr(pair, name) for pair in pairs]) for name in ("ratio", "measured"))
@@ -153,6 +155,8 @@ def skill_text(pairs: Sequence[Predicted]) -> str:
 
 def prediction_plot(pairs: Sequence[Predicted]) -> Figure:
     """Measured over expected ratio, both logarithmic; on the diagonal the prediction was right."""
+    from advnerf_core.report.plots import new_axes  # matplotlib
+
     with new_axes(5.4, 4.4) as ax:
         values = [value for pair in pairs for value in (pair.ratio, pair.measured)]
         low, high = min([0.5, *values]) / 1.3, max([4.0, *values]) * 1.3
@@ -181,6 +185,8 @@ def prediction_plot(pairs: Sequence[Predicted]) -> Figure:
 
 def prediction_section(pairs: Sequence[Predicted]) -> Markup:
     """Sentence, plot and table for the page."""
+    from advnerf_core.report.plots import svg  # matplotlib
+
     parts = [Markup("<p>{}</p>").format(skill_text(pairs))]
     if pairs:
         picture = Markup(

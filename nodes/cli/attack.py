@@ -27,7 +27,7 @@ def attack_run(
     overrides: Overrides = None,
 ) -> None:
     """Search as a request asks, for each of its seeds; ends in one attack file per seed."""
-    from advnerf_core.attack.on_device import use_device
+    from advnerf_core.attack.device import use_device
     from nodes.experiment.request.request import load_request
 
     use_device(device)
@@ -41,7 +41,7 @@ def attack_resume(
     device: Device = None,
 ) -> None:
     """Go on with a search that was stopped or killed; on the same device to the bit."""
-    from advnerf_core.attack.on_device import use_device
+    from advnerf_core.attack.device import use_device
     from nodes.experiment.request.search import kept_request
 
     use_device(device)

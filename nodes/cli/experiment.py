@@ -151,7 +151,7 @@ def experiment(
 ) -> None:
     """Run an experiment, from the photographs to the report: every stage and every cell that is not there yet. It may be stopped at any time."""
     os.environ.setdefault("MUJOCO_GL", "egl")
-    from advnerf_core.attack.on_device import use_device
+    from advnerf_core.attack.device import use_device
     from nodes.experiment.campaign.config import is_campaign
     from nodes.experiment.campaign.run import Options
     from nodes.runtime.errors import ConfigError

@@ -1,13 +1,11 @@
-import os
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from typer.testing import CliRunner
 
 from advnerf_core.data.posed_images import write_posed_images
 from advnerf_core.driving.expert import Expert
@@ -22,6 +20,7 @@ from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.field import SceneField, SceneFieldConfig, save_scene
 from calibration.schema import CameraCalibration, RoomCalibration, load_calibration, save_calibration
 from nodes.bags.writer import BagWriter
+from nodes.cli.main import app
 from nodes.lab.policy_reference import from_bag, from_run, from_scene, from_twin, judged_by_drives
 from nodes.runtime.errors import BagError, ConfigError
 from nodes.runtime.messages import encode, image_message, pose_message
@@ -167,25 +166,21 @@ def test_a_scene_gives_views_of_the_policys_own_size_and_drives(tmp_path):
     assert not reference.drives(circling(-0.1, narrow), ()).drives
 
 
-def test_the_command_fails_for_a_policy_that_does_not_drive_where_it_was_asked_to(tmp_path):
+def test_the_command_fails_for_a_policy_that_does_not_drive_where_it_was_asked_to(tmp_path, monkeypatch):
     circle = ReferencePath.from_segments((0.0, -2.0, 0.0), [Arc(2.0, np.pi / 2)] * 4)
     folder = run_folder(tmp_path / "run", circle)
     for name, steering_rad in (("good", 0.1244), ("bad", -0.1)):
         source = f"from test_policy_reference import circling\n\n\ndef factory():\n    return circling({steering_rad})\n"
-        (tmp_path / f"{name}.py").write_text(source)
-    for name, place, code in (
-        ("bad", ["--run-folder", str(folder)], 1),
-        ("good", ["--run-folder", str(folder)], 0),
-    ):
-        done = subprocess.run(
-            [sys.executable, "-m", "nodes.cli", "policy", "check", f"{name}:factory", *place],
-            cwd=tmp_path,
-            text=True,
-            capture_output=True,
-            env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{Path(__file__).parent}", "COLUMNS": "300"},
+        (tmp_path / f"circling_{name}.py").write_text(source)
+    monkeypatch.setenv("COLUMNS", "300")
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for name, code in (("bad", 1), ("good", 0)):
+        done = CliRunner().invoke(
+            app, ["policy", "check", f"circling_{name}:factory", "--run-folder", str(folder)]
         )
-        assert done.returncode == code, done.stdout + done.stderr
-        assert ("NO DRIVE" in done.stdout) == (code == 1)
+        assert done.exit_code == code, done.output
+        assert ("NO DRIVE" in done.output) == (code == 1)
 
 
 def test_the_twin_gives_left_and_right(monkeypatch):

@@ -8,31 +8,41 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from advnerf_core.attack.transfer import DEFAULT_DRAWS
 from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import CellResult
 from advnerf_core.report.conditions import CONTROLS
 from advnerf_core.report.transfer_prediction import Predicted
 from nodes.experiment.campaign.config import Campaign
-from nodes.experiment.campaign.gate import CleanDrive, predict_cell
 from nodes.experiment.campaign.plan import plan_cells
 from nodes.experiment.campaign.store import store_of
 from nodes.experiment.cell import Cell
 from nodes.experiment.kinds import load_kind
 
+if TYPE_CHECKING:
+    from nodes.experiment.campaign.gate import CleanDrive
+
 _KEYS = {"ratio", "ratio_low", "ratio_high", "retained", "total_cte_m", "clean_drive"}
 
 
 def predict_campaign(
-    campaign: Campaign, cells: Sequence[Cell], say: Callable[[str], None], draws: int = DEFAULT_DRAWS
+    campaign: Campaign, cells: Sequence[Cell], say: Callable[[str], None], draws: int | None = None
 ) -> int:
     """Predict every attacked cell that has been searched and is not predicted yet; returns how many were.
 
     A prediction needs the finished search (``advnerf experiment --search-only`` makes no more than that) and the drive without attack. It reads
     no drive with the attack, so it is the same before and after that drive.
+
+    Args:
+        campaign: The campaign.
+        cells: Of it.
+        say: Told what was predicted, and what was not and why.
+        draws: Drives per prediction, `DEFAULT_DRAWS` unless told.
     """
+    from nodes.experiment.campaign.gate import DEFAULT_DRAWS, predict_cell  # loads torch
+
+    draws = DEFAULT_DRAWS if draws is None else draws
     store, made = store_of(campaign), 0
     experiments: dict[tuple[str, str], Any] = {}
     clean: dict[tuple[str, str, str, int], CleanDrive] = {}

@@ -33,7 +33,7 @@ def random_texture(level: int, generator: torch.Generator) -> Tensor:
     )
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_the_gradient_beats_as_many_random_textures_of_every_coarseness(
     problem: AttackProblem, seed: int
 ) -> None:

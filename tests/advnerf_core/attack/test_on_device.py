@@ -7,12 +7,12 @@ import torch
 from numba import config
 
 from advnerf_core.attack.adjoint import adjoint_gradient
+from advnerf_core.attack.device import use_device
 from advnerf_core.attack.on_device import (
     PolicyThere,
     all_on_chosen_device,
     on_chosen_device,
     said_of_device,
-    use_device,
 )
 from advnerf_core.attack.robustness import Disturbances
 from advnerf_core.attack.search.gradient import gradient_attack

@@ -24,8 +24,8 @@ def whole(*shape):
 
 def shell():
     """The seen voxels of a ball."""
-    distance = np.linalg.norm(np.indices((20, 16, 24)).T - [9.5, 7.5, 11.5], axis=-1).T
-    return ColourGrid((20, 16, 24), torch.from_numpy(np.argwhere(np.abs(distance - 6.5) < 1.0)))
+    distance = np.linalg.norm(np.indices((14, 12, 16)).T - [6.5, 5.5, 7.5], axis=-1).T
+    return ColourGrid((14, 12, 16), torch.from_numpy(np.argwhere(np.abs(distance - 4.5) < 1.0)))
 
 
 FACE = whole(EDGE, EDGE)

@@ -27,10 +27,10 @@ pytestmark = [
         reason="needs a CUDA device, or NUMBA_ENABLE_CUDASIM=1",
     ),
 ]
-# The simulator starts a thread of Python for every pixel: a quarter of the pixels see the same there.
+# The simulator starts a thread of Python for every pixel: a tenth of the pixels see the same there.
 PINHOLE = Pinhole(20, 12, 13.0, 13.0, 10.0, 5.0)
 if config.ENABLE_CUDASIM:
-    PINHOLE = PINHOLE.resized(10, 6)
+    PINHOLE = PINHOLE.resized(6, 4)
 HIGH, WIDE = PINHOLE.height, PINHOLE.width
 MOUNT = camera_mount(0.3, 0.0, 0.2, 0.17)
 STATES = torch.tensor([[0.0, 0.0, 0.0], [0.2, 0.1, 0.15]], dtype=torch.float64)

@@ -43,7 +43,7 @@ def searching(here):
     here.code.write_text(here.code.read_text() + SEARCHES)
     here.kind = "toy_cells.py:Searching"
     write_spiral(here.folder)
-    here.write("seeds: [1]\nmethods: [spiral.py:Spiral, gradient, none]\nvictims: [hardened]\n")
+    here.write("seeds: [1]\nmethods: [spiral.py:Spiral, none]\nvictims: [hardened]\n")
     return here
 
 
@@ -61,23 +61,23 @@ def test_a_method_of_a_file_runs_in_worker_processes_and_appears_in_the_table(
     searching, monkeypatch, tmp_path
 ):
     campaign = load_campaign(searching.file)
-    names = [f"straight_hardened_{method}_1" for method in ("none", "gradient", "Spiral")]
+    names = [f"straight_hardened_{method}_1" for method in ("none", "Spiral")]
     assert [cell.name for cell in campaign.cells] == names
-    assert [cell.name for cell in select(campaign.cells, "method=Spiral")] == names[2:]
+    assert [cell.name for cell in select(campaign.cells, "method=Spiral")] == names[1:]
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     monkeypatch.chdir(elsewhere)  # references are relative to the campaign file
     ended, _ = run(searching, jobs=2)
     assert {end.how for end in ended} == {"done"}
     assert f"begin straight_hardened_{searching.folder / 'spiral.py'}:Spiral_1" in searching.calls
-    result = json.loads((searching.cells / f"{names[2]}.json").read_text())
+    result = json.loads((searching.cells / f"{names[1]}.json").read_text())
     assert result["method"] == "Spiral"
     shape = toy_problem(2).sensor.theta_shape
     thetas = [spiral_theta(shape, number, seed=1).flatten() for number in range(3)]
     found = torch.tensor(result["extra"]["theta"])
     assert min(float((found - theta).abs().max()) for theta in thetas) < 1e-5
     table = text_table(campaign_table(campaign, statuses(campaign, campaign.cells)))
-    assert [row[2] for row in table.rows if row[2]] == ["no attack", "gradient", "Spiral"]
+    assert [row[2] for row in table.rows if row[2]] == ["no attack", "Spiral"]
 
 
 def test_its_cells_run_again_when_its_code_changes_and_no_others(searching):
