@@ -58,9 +58,9 @@ world: setup  ## A simulator of other people, from its installation to its table
 
 test: setup  ## The default tests (five to nine minutes on 2 cores)
 	@# Tests that measure time or start nodes run one after the other and mostly wait. Those that compute use what that leaves of the
-	@# processors and nothing else: the kernel gives an idle-class process no time that another one wants. Collecting only the files
-	@# that mark a test as live saves ten seconds of imports.
-	@OMP_NUM_THREADS=1 chrt --idle 0 $(BIN)/pytest -q -n auto --maxprocesses 4 --dist worksteal -p no:cacheprovider \
+	@# processors and nothing else: the kernel gives an idle-class process no time that another one wants. They are one more than the
+	@# processors, as some wait for a process of theirs. Collecting only the files that mark a test as live saves ten seconds of imports.
+	@OMP_NUM_THREADS=1 chrt --idle 0 $(BIN)/pytest -q -n $$(( $$(nproc) + 1 )) --maxprocesses 4 --dist worksteal -p no:cacheprovider \
 		-m '$(DEFAULT_TESTS) and not live' >$(VENV)/computing-tests.log 2>&1 & computing=$$!; \
 	trap "kill $$computing; exit 130" INT TERM; \
 	$(BIN)/pytest -q -m '$(DEFAULT_TESTS) and live' $$(grep -rl --include='*.py' 'mark\.live' tests); live=$$?; \

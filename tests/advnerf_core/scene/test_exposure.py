@@ -25,7 +25,7 @@ GRID = HashGridConfig(levels=6, features=4, log2_entries=12, coarsest=8, finest=
 FIELD = SceneFieldConfig((-1.05, -1.05, -0.55), (1.05, 1.05, 0.55), grid=GRID, hidden=16, features=7)
 MARCH = MarchConfig(near_m=0.05, smallest_step_m=0.01, largest_step_m=0.05, step_growth=0.02, max_samples=128)
 TRAIN = TrainConfig(
-    steps=500,
+    steps=400,
     samples_per_step=1 << 13,
     max_rays=1024,
     occupancy_resolution=32,

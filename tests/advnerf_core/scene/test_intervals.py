@@ -108,7 +108,7 @@ def test_an_interval_of_no_pixels_is_refused():
 
 
 def test_rendering_has_the_intervals_of_the_training_unless_told_otherwise(standing_back, tmp_path):
-    trainer = Trainer(standing_back[0], FIELD, dataclasses.replace(TRAIN, steps=2))
+    trainer = Trainer(standing_back[0], FIELD, dataclasses.replace(TRAIN, steps=2, occupancy_resolution=16))
     assert trainer.march == trainer._marcher.config == pixel_intervals([LENS], OUTSIDE, FIELD, 0.05)
     with torch.no_grad():
         trained = trainer.run()
@@ -127,7 +127,7 @@ def test_rendering_has_the_intervals_of_the_training_unless_told_otherwise(stand
 
 
 def test_a_checkpoint_of_other_intervals_is_refused(standing_back, tmp_path):
-    config = dataclasses.replace(TRAIN, steps=1)
+    config = dataclasses.replace(TRAIN, steps=1, occupancy_resolution=16)
     path = tmp_path / "checkpoint.safetensors"
     train_scene(standing_back[0], FIELD, config, path)
     march = pixel_intervals([LENS], OUTSIDE, FIELD, 0.05)

@@ -32,7 +32,9 @@ def named(kind: str) -> NamedWorld:
     return read_world(Document({"kind": kind}, "test"), EXAMPLES)
 
 
-@pytest.mark.parametrize("kind", ["lab", "junction", "world_warehouse.py:Warehouse"])
+@pytest.mark.parametrize(
+    "kind", ["lab", "junction", pytest.param("world_warehouse.py:Warehouse", marks=pytest.mark.slow)]
+)
 def test_good_worlds_pass(kind: str, tmp_path: Any) -> None:
     findings = check_world(named(kind), tmp_path / "look")
     shows_panels = ["panels"] if kind == "lab" else []  # the only one of them with native panels
