@@ -167,6 +167,7 @@ def test_known_gains_are_recovered_and_held_out_views_are_better() -> None:
     assert held_out_db(trained) > held_out_db(without) + 3.0
 
 
+@pytest.mark.slow
 def test_photographs_of_one_exposure_get_gains_of_one() -> None:
     trained = Trainer(room_images(), FIELD, TRAIN).run()
     assert trained.gains is not None

@@ -43,7 +43,7 @@ def searching(here):
     here.code.write_text(here.code.read_text() + SEARCHES)
     here.kind = "toy_cells.py:Searching"
     write_spiral(here.folder)
-    here.write("seeds: [1]\nmethods: [spiral.py:Spiral, none]\nvictims: [hardened]\n")
+    here.write("seeds: [1]\nmethods: [spiral.py:Spiral, spiral, none]\nvictims: [hardened]\n")
     return here
 
 
@@ -57,13 +57,14 @@ def states(bench):
     return {each.cell.name: each.state for each in statuses(campaign, campaign.cells)}
 
 
-def test_a_method_of_a_file_runs_in_worker_processes_and_appears_in_the_table(
+def test_methods_of_a_file_and_of_a_package_run_in_worker_processes_and_appear_in_the_table(
     searching, monkeypatch, tmp_path
 ):
+    install_method(searching.folder, monkeypatch, spiral_code())
     campaign = load_campaign(searching.file)
-    names = [f"straight_hardened_{method}_1" for method in ("none", "Spiral")]
+    names = [f"straight_hardened_{method}_1" for method in ("none", "Spiral", "spiral")]
     assert [cell.name for cell in campaign.cells] == names
-    assert [cell.name for cell in select(campaign.cells, "method=Spiral")] == names[1:]
+    assert [cell.name for cell in select(campaign.cells, "method=Spiral")] == [names[1]]
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     monkeypatch.chdir(elsewhere)  # references are relative to the campaign file
@@ -77,7 +78,7 @@ def test_a_method_of_a_file_runs_in_worker_processes_and_appears_in_the_table(
     found = torch.tensor(result["extra"]["theta"])
     assert min(float((found - theta).abs().max()) for theta in thetas) < 1e-5
     table = text_table(campaign_table(campaign, statuses(campaign, campaign.cells)))
-    assert [row[2] for row in table.rows if row[2]] == ["no attack", "Spiral"]
+    assert [row[2] for row in table.rows if row[2]] == ["no attack", "Spiral", "spiral"]
 
 
 def test_its_cells_run_again_when_its_code_changes_and_no_others(searching):
@@ -103,15 +104,6 @@ def test_a_broken_method_fails_alone_and_in_one_line(searching):
     assert "cannot be loaded: ZeroDivisionError: division by zero" in text
     assert "\n" not in text
     assert {state for state, _ in how.values()} == {"done"}
-
-
-def test_a_method_of_an_installed_package_runs_in_worker_processes(here, monkeypatch):
-    here.code.write_text(here.code.read_text() + SEARCHES)
-    here.kind = "toy_cells.py:Searching"
-    install_method(here.folder, monkeypatch, spiral_code())
-    here.write("seeds: [0]\nmethods: [spiral]\nvictims: [hardened]\n")
-    ended, _ = run(here, jobs=1)
-    assert [(end.name, end.how) for end in ended] == [("straight_hardened_spiral_0", "done")]
 
 
 @pytest.mark.parametrize(

@@ -60,6 +60,20 @@ def served(tmp_path):
         yield folder, record, port_of(page)
 
 
+@pytest.fixture(scope="module")
+def at_rest(tmp_path_factory):
+    """The port of a page whose run folder stays as it is: a picture, and secrets beside it."""
+    folder = tmp_path_factory.mktemp("at_rest") / "run"
+    record_of(folder)
+    (folder.parent / "secret.png").write_bytes(b"secret")
+    (folder / "policy").mkdir()
+    (folder / "policy" / "a.png").write_bytes(b"a picture")
+    (folder / "policy" / "policy.safetensors").write_bytes(b"secret")
+    (folder / "policy" / "link.png").symlink_to(folder.parent / "secret.png")
+    with ExperimentPage(folder, 0) as page:
+        yield port_of(page)
+
+
 def test_the_state_follows_the_experiment(served):
     folder, record, port = served
     record.finish("capture", 3.0, cached=False)
@@ -117,11 +131,10 @@ def test_cells_that_other_processes_run_are_seen_by_their_files(served):
     assert parts[GRADIENT]["measured"] == {"surrogate": [5.0, 1.0]}
 
 
-def test_an_unchanged_state_is_not_sent_again(served):
-    _, _, port = served
-    _, headers, body = request(port, "/state.json")
+def test_an_unchanged_state_is_not_sent_again(at_rest):
+    _, headers, body = request(at_rest, "/state.json")
     assert body
-    status, again, body = request(port, "/state.json", headers={"if-none-match": headers["etag"]})
+    status, again, body = request(at_rest, "/state.json", headers={"if-none-match": headers["etag"]})
     assert (status, again["etag"], body) == (304, headers["etag"], b"")
 
 
@@ -145,33 +158,27 @@ def test_the_report_takes_over_once_it_is_made(served):
 
 
 @pytest.mark.parametrize("path", OTHER_PATHS)
-def test_only_the_files_of_the_page_are_served(served, path):
-    folder, _, port = served
-    (folder.parent / "secret.png").write_bytes(b"secret")
-    (folder / "policy").mkdir()
-    (folder / "policy" / "a.png").write_bytes(b"a picture")
-    (folder / "policy" / "policy.safetensors").write_bytes(b"secret")
-    (folder / "policy" / "link.png").symlink_to(folder.parent / "secret.png")
-    assert request(port, "/policy/a.png")[2] == b"a picture"
-    status, _, body = request(port, path)
+def test_only_the_files_of_the_page_are_served(at_rest, path):
+    assert request(at_rest, "/policy/a.png")[2] == b"a picture"
+    status, _, body = request(at_rest, path)
     assert status == 404
     assert b"secret" not in body
 
 
 @pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "PATCH", "OPTIONS"])
 @pytest.mark.parametrize("path", ["/", "/state.json", "/web/main.js", "/policy/a.png"])
-def test_it_only_reads(served, method, path):
-    assert request(served[2], path, method=method)[0] == 405
+def test_it_only_reads(at_rest, method, path):
+    assert request(at_rest, path, method=method)[0] == 405
 
 
-def test_a_stranger_with_a_name_for_this_computer_gets_nothing(served):
-    status, _, body = request(served[2], "/state.json", headers={"host": "evil.example:80"})
+def test_a_stranger_with_a_name_for_this_computer_gets_nothing(at_rest):
+    status, _, body = request(at_rest, "/state.json", headers={"host": "evil.example:80"})
     assert (status, b"room" in body) == (421, False)
 
 
-def test_all_answers_forbid_what_is_not_ours(served):
+def test_all_answers_forbid_what_is_not_ours(at_rest):
     for path in ("/run", "/web/main.js", "/web/look.css", "/favicon.ico", "/state.json"):
-        status, headers, _ = request(served[2], path)
+        status, headers, _ = request(at_rest, path)
         assert status == 200
         assert "default-src 'none'" in headers["content-security-policy"]
         assert headers["x-content-type-options"] == "nosniff"
@@ -211,11 +218,15 @@ def test_clients_that_never_read_do_not_reach_the_experiment(served):
     assert state_of(port)["parts"][1]["state"] == "done"
 
 
+def children():
+    return set(Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split())
+
+
 def test_an_experiment_outlives_its_page(tmp_path):
-    said = []
+    said, others = [], children()
 
     def run(record):
-        (server,) = Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split()
+        (server,) = children() - others
         os.kill(int(server), signal.SIGKILL)
         time.sleep(0.5)
         record.start("scene")(0.5, "goes on")
