@@ -10,6 +10,7 @@ import contextlib
 import fcntl
 import os
 import shutil
+import time
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -34,6 +35,7 @@ from nodes.runtime.topics import topic as topic_row
 
 KEPT_SUFFIX = ".damaged"
 _BLOCK_BYTES = 1 << 24
+_LOADED_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -187,15 +189,21 @@ def _messages_before(scan: Scan) -> dict[str, int]:
 
 def being_written(path: Path) -> bool:
     """Whether a process has the file open for writing. The system grants a read lease only if no process has."""
+    # A process that was started while a file was open has it too until its own program is loaded: that is no writer.
+    until_s = time.monotonic() + _LOADED_S
     with open(path, "rb") as file:
-        try:
-            fcntl.fcntl(file, fcntl.F_SETLEASE, fcntl.F_RDLCK)
-            fcntl.fcntl(file, fcntl.F_SETLEASE, fcntl.F_UNLCK)
-        except BlockingIOError:
-            return True
-        except OSError:
-            return False  # a file system without leases, or a file of another user
-    return False
+        while True:
+            try:
+                fcntl.fcntl(file, fcntl.F_SETLEASE, fcntl.F_RDLCK)
+                fcntl.fcntl(file, fcntl.F_SETLEASE, fcntl.F_UNLCK)
+            except BlockingIOError:
+                if time.monotonic() > until_s:
+                    return True
+                time.sleep(0.01)
+            except OSError:
+                return False  # a file system without leases, or a file of another user
+            else:
+                return False
 
 
 def _swap(path: Path, layout: Layout, scan: Scan, before: os.stat_result, keep_original: bool) -> Path | None:

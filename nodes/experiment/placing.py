@@ -24,7 +24,9 @@ from nodes.runtime.errors import ConfigError
 _ALONG, _AWAY, _FARTHEST = 0.25, 0.25, 6.0
 # Share of a panel's points that must be seen, what the scene's depth may be off by, and the steepest view [cos].
 _SEEN, _DEPTH_SHARE, _FACING = 0.9, 0.03, 0.3
-_POINTS = 7
+_FACE = np.stack(np.meshgrid(*[np.linspace(-0.95, 0.95, 7)] * 2), axis=-1).reshape(
+    -1, 2
+)  # across and up, in half sides
 
 
 @dataclass(frozen=True)
@@ -145,12 +147,14 @@ def seen_from(experiment: Experiment, world: World, panel: PlacedObject, least_p
 def _is_seen(experiment: Experiment, spot: PlacedObject, view: _View, least_px: float) -> bool:
     """Whether nearly all of a panel is in the policy's window, in front of the scene, facing the camera and large enough."""
     T_camera_from_face = view.T_camera_from_world @ spot.T_world_from_face
-    ends = 0.5 * spot.side_m * np.linspace(-0.95, 0.95, _POINTS)
-    across, up = (each.ravel() for each in np.meshgrid(ends, ends))
-    face = np.stack([np.zeros_like(across), across, up, np.ones_like(across)])
-    points = (T_camera_from_face @ face)[:3].T
-    middle = T_camera_from_face[:3, 3]
-    if points[:, 2].min() <= 0.0 or -(middle @ T_camera_from_face[:3, 0]) < _FACING * np.linalg.norm(middle):
+    middle, normal = T_camera_from_face[:3, 3], T_camera_from_face[:3, 0]
+    # Its middle alone decides for most spots.
+    if middle[2] <= 0.0 or spot.side_m * experiment.view.pinhole.fy < least_px * middle[2]:
+        return False
+    if -(middle @ normal) < _FACING * math.sqrt(middle @ middle):
+        return False
+    points = middle + 0.5 * spot.side_m * _FACE @ T_camera_from_face[:3, 1:3].T
+    if points[:, 2].min() <= 0.0:
         return False
     pinhole, window = experiment.camera, experiment.view.window
     columns, rows = (pinhole.project(points) - 0.5).round().astype(int).T
@@ -160,8 +164,7 @@ def _is_seen(experiment: Experiment, spot: PlacedObject, view: _View, least_px: 
         & (columns >= window[1].start)
         & (columns < window[1].stop)
     )
-    policy_px = spot.side_m * experiment.view.pinhole.fy / middle[2]
-    if policy_px < least_px or inside.mean() < _SEEN:
+    if inside.mean() < _SEEN:
         return False
     depth_m = view.depth_m[rows[inside], columns[inside]]
     free = depth_m >= points[inside, 2] * (1.0 - _DEPTH_SHARE)

@@ -6,6 +6,7 @@ import signal
 import struct
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
@@ -339,6 +340,15 @@ def test_a_file_that_is_being_written_is_left_alone(tmp_path):
         with pytest.raises(BagError, match="is being written at this moment"):
             read_info(writer.path)
     assert repair(tmp_path / "bag").was_whole
+
+
+def test_a_copy_of_the_file_that_a_starting_process_has_for_a_moment_is_no_writer(tmp_path):
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.write("/vicon/car", b"x" * 100, START_NS, START_NS, 0)
+    inherited = writer.path.open("ab")
+    threading.Timer(0.1, inherited.close).start()
+    assert repair(tmp_path / "bag").was_whole
+    assert inherited.closed
 
 
 def test_zeros_behind_the_last_record_are_left_out(bags, write):

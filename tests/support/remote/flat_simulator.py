@@ -75,9 +75,9 @@ class FlatSimulator:
         tile = np.floor(at[..., :2]).astype(int) % 64
         sky = 150.0 + 60.0 * rays[..., 2:] / np.linalg.norm(rays, axis=-1, keepdims=True)
         rgb = np.where(np.isfinite(floor)[..., None], self._tiles[tile[..., 0], tile[..., 1]], sky)
-        z = floor
+        z, steep = floor, rays[..., 0] ** 2 + rays[..., 1] ** 2
         for (px, py, radius), colour in zip(self._posts, self._colours, strict=True):
-            rgb, z = self._post(rgb, z, eye, rays, px, py, radius, colour)
+            self._post(rgb, z, eye, rays, steep, px, py, radius, colour)
         for T_face, size, texture in self._panels.values():
             rgb, z = self._panel(rgb, z, eye, rays, T_face, size, texture)
         found = {"rgb": np.rint(np.clip(rgb, 0.0, 255.0)).astype(np.uint8), "T_world_from_camera": T}
@@ -85,22 +85,18 @@ class FlatSimulator:
             found["depth"] = np.where(z < FAR_M, z, np.inf).astype("<f4")
         return {}, found
 
-    def _post(self, rgb, z, eye, rays, px, py, radius, colour):
+    def _post(self, rgb, z, eye, rays, steep, px, py, radius, colour):
         """A round post: the nearer crossing of a vertical cylinder."""
-        dx, dy, ox, oy = rays[..., 0], rays[..., 1], eye[0] - px, eye[1] - py
-        a, b, c = dx * dx + dy * dy, dx * ox + dy * oy, ox * ox + oy * oy - radius * radius
-        root = b * b - a * c
-        if not (root > 0.0).any():
-            return rgb, z
-        with np.errstate(divide="ignore", invalid="ignore"):
-            hit = np.where(root > 0.0, (-b - np.sqrt(np.maximum(root, 0.0))) / a, np.inf)
-        height = eye[2] + np.where(np.isfinite(hit), hit, 0.0) * rays[..., 2]
-        seen = (hit > 0.05) & (hit < z) & (height > 0.0) & (height < POST_HEIGHT_M)
-        if not seen.any():
-            return rgb, z
-        return np.where(
-            seen[..., None], colour * (0.6 + 0.4 * np.sin(9.0 * height[..., None]) ** 2), rgb
-        ), np.where(seen, hit, z)
+        ox, oy = eye[0] - px, eye[1] - py
+        b = rays[..., 0] * ox + rays[..., 1] * oy
+        root = b * b - steep * (ox * ox + oy * oy - radius * radius)
+        met = (root > 0.0) & (b < 0.0)  # what lies behind is not seen
+        hit = (-b[met] - np.sqrt(root[met])) / steep[met]
+        height = eye[2] + hit * rays[met][:, 2]
+        seen = (hit > 0.05) & (hit < z[met]) & (height > 0.0) & (height < POST_HEIGHT_M)
+        met[met] = seen
+        rgb[met] = colour * (0.6 + 0.4 * np.sin(9.0 * height[seen, None]) ** 2)
+        z[met] = hit[seen]
 
     def _panel(self, rgb, z, eye, rays, T_face, size, texture):
         """A rectangle in the plane x = 0 of its frame, seen from x > 0; for a viewer its right is the frame's +y."""
