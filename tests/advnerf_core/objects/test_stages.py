@@ -54,12 +54,12 @@ def test_an_object_is_learned_from_pictures_in_stages() -> None:
         mesh_views(mesh, 16, 48),
         "hydrant",
         64,
-        60,
+        30,
         progress=lambda fraction, text: told.append(fraction),
         held_out=mesh_views(mesh, 3, 48, 0.37),
         coarse_to_fine=True,
     )
-    assert model.about["steps"] == 60
+    assert model.about["steps"] == 30
     assert max(model.grids.density.shape) <= 70
     assert model.about["held_out_psnr_db"] > 20.0
     assert told == sorted(told)
