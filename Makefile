@@ -7,7 +7,7 @@ export MUJOCO_GL ?= egl
 export PYTHONDONTWRITEBYTECODE :=
 DEFAULT_TESTS := not slow and not gpu and not hardware and not data and not browser and not ros2
 
-.PHONY: help setup demo experiment evidence world test test-slow test-gpu test-hardware test-browser setup-ros2 test-ros2 check bench bench-quick campaign rooms api docs fmt clean
+.PHONY: help setup demo experiment evidence world test computing-tests test-slow test-gpu test-hardware test-browser setup-ros2 test-ros2 check bench bench-quick campaign rooms api docs fmt clean
 
 help:  ## Show this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -56,17 +56,26 @@ world: setup  ## A simulator of other people, from its installation to its table
 	$(BIN)/advnerf experiment launch/$(NAME).experiment.yaml --setting panel --run-folder runs/$(NAME) $(CHANGES) && \
 	$(BIN)/python -m benchmarks.learned_roads runs/$(NAME) --wall-s $$(( $$(date +%s) - began ))
 
-test: setup  ## The default tests (five to nine minutes on 2 cores)
+test: setup  ## The default tests (five to seven minutes on 2 cores)
 	@# Tests that measure time or start nodes run one after the other and mostly wait. Those that compute use what that leaves of the
-	@# processors and nothing else: the kernel gives an idle-class process no time that another one wants. They are one more than the
-	@# processors, as some wait for a process of theirs. Collecting only the files that mark a test as live saves ten seconds of imports.
-	@OMP_NUM_THREADS=1 chrt --idle 0 $(BIN)/pytest -q -n $$(( $$(nproc) + 1 )) --maxprocesses 4 --dist worksteal -p no:cacheprovider \
-		-m '$(DEFAULT_TESTS) and not live' >$(VENV)/computing-tests.log 2>&1 & computing=$$!; \
+	@# processors and nothing else: the kernel gives an idle-class process no time that another one wants. Collecting only the files
+	@# that mark a test as live saves ten seconds of imports.
+	@chrt --idle 0 $(MAKE) -s computing-tests >$(VENV)/computing-tests.log 2>&1 & computing=$$!; \
 	trap "kill $$computing; exit 130" INT TERM; \
 	$(BIN)/pytest -q -m '$(DEFAULT_TESTS) and live' $$(grep -rl --include='*.py' 'mark\.live' tests); live=$$?; \
 	echo "waiting for the tests that compute ($(VENV)/computing-tests.log)"; \
 	wait $$computing; computing=$$?; cat $(VENV)/computing-tests.log; \
 	test $$live -eq 0 -a $$computing -eq 0
+
+# One worker more than processors, as some wait for a process of theirs.
+computing-tests: $(VENV)/.kernels
+	@OMP_NUM_THREADS=1 $(BIN)/pytest -q -n $$(( $$(nproc) + 1 )) --maxprocesses 4 --dist worksteal -p no:cacheprovider \
+		-m '$(DEFAULT_TESTS) and not live'
+
+# The tiny experiment needs most kernels. Compiled by it, they are compiled once; otherwise each worker of the tests would do so.
+$(VENV)/.kernels: $(VENV)/.installed $(shell grep -rl --include='*.py' njit advnerf_core)
+	@OMP_NUM_THREADS=1 $(BIN)/pytest -q -p no:cacheprovider tests/nodes/experiment/test_versions.py
+	@touch $@
 
 test-slow: setup  ## The tests that take minutes, the default ones excluded
 	@$(BIN)/pytest -q -m 'slow' --timeout 1200
