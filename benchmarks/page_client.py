@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import http.client
 import json
@@ -9,10 +10,11 @@ import ssl
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from typing import Any
 
+from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
 from websockets.typing import Origin
 
 
@@ -67,20 +69,14 @@ class Browser:
         answers: bool = True,
     ) -> None:
         scheme = "https" if tls else "http"
-        context = None
-        if tls:
-            context = unchecked()
-        headers = {"Cookie": cookie_of(port) if cookie is None else cookie}
-        self._stack = contextlib.ExitStack()
         opening = connect(
             f"{'wss' if tls else 'ws'}://127.0.0.1:{port}/live",
             origin=Origin(f"{scheme}://127.0.0.1:{port}" if origin is None else origin),
-            additional_headers=headers,
-            ssl=context,
+            additional_headers={"Cookie": cookie_of(port) if cookie is None else cookie},
+            ssl=unchecked() if tls else None,
             compression=None,
             max_size=2**22,
         )
-        self.socket = self._stack.enter_context(opening)
         self.welcome: dict[str, Any] = {}
         self.state: dict[str, Any] = {}
         self.answers: list[dict[str, Any]] = []
@@ -88,21 +84,47 @@ class Browser:
         self.beats: list[int] = []
         self.press, self.held, self.responsive = 0, False, answers
         self.frame, self.closed, self._n, self._lock = "0", False, 0, threading.Lock()
-        self._thread = threading.Thread(target=self._listen, daemon=True)
+        self._loop: asyncio.AbstractEventLoop
+        self._outbox: asyncio.Queue[str | None]
+        self._transport: Any
+        # One thread reads and writes: a TLS socket that two threads use loses a message now and then.
+        opened: Future[None] = Future()
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._live(opening, opened)), daemon=True)
         self._thread.start()
+        opened.result()
         self.wait(lambda: self.welcome and self.state, "the welcome")
         self.tell({"t": "wants", "c": [0, 1]})
 
-    def _listen(self) -> None:
+    async def _live(self, opening: connect, opened: Future[None]) -> None:
         try:
-            for data in self.socket:
+            socket = await opening
+        except BaseException as refusal:  # raised in the thread that opens
+            opened.set_exception(refusal)
+            return
+        self._loop, self._outbox, self._transport = (
+            asyncio.get_running_loop(),
+            asyncio.Queue(),
+            socket.transport,
+        )
+        sending = asyncio.create_task(self._send(socket))
+        opened.set_result(None)
+        try:
+            async for data in socket:
                 if isinstance(data, bytes):
                     self._draw(data)
                 else:
                     self._hear(json.loads(data))
         except ConnectionClosed:
             pass
-        self.closed = True
+        finally:
+            self.closed = True
+            sending.cancel()
+
+    async def _send(self, socket: ClientConnection) -> None:
+        with contextlib.suppress(ConnectionClosed):
+            while (text := await self._outbox.get()) is not None:
+                await socket.send(text)
+            await socket.close()
 
     def _draw(self, data: bytes) -> None:
         stamp = str(int.from_bytes(data[1:9], "big"))
@@ -125,8 +147,19 @@ class Browser:
             self.answers.append(message)
 
     def tell(self, message: dict[str, Any]) -> None:
-        with contextlib.suppress(ConnectionClosed):
-            self.socket.send(json.dumps(message))
+        self.send_text(json.dumps(message))
+
+    def send_text(self, text: str | None) -> None:
+        """Send ``text``, well-formed or not; None closes the connection after what was sent before."""
+        self._soon(self._outbox.put_nowait, text)
+
+    def cut(self) -> None:
+        """End the connection without a word, as a browser that crashed."""
+        self._soon(self._transport.abort)
+
+    def _soon(self, run: Callable[..., object], *arguments: object) -> None:
+        with contextlib.suppress(RuntimeError):  # the connection has ended, and its loop with it
+            self._loop.call_soon_threadsafe(run, *arguments)
 
     def act(self, kind: str, **more: Any) -> int:
         with self._lock:
@@ -159,5 +192,5 @@ class Browser:
             time.sleep(0.005)
 
     def close(self) -> None:
-        self._stack.close()
+        self.send_text(None)
         self._thread.join()

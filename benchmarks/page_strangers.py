@@ -8,6 +8,7 @@ granted to a stranger, and whether the operator still drives and the page still 
 from __future__ import annotations
 
 import argparse
+import asyncio
 import json
 import math
 import random
@@ -16,8 +17,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import connect
 from websockets.typing import Origin
 
 from benchmarks.operator import LiveOperator
@@ -132,16 +133,18 @@ def malformed(operator: LiveOperator, port: int, count: int) -> int:
     """Send messages that no page sends, in as many connections as it takes. Returns how many were sent."""
     cookie = enter(operator, port)
     with ThreadPoolExecutor(_AT_ONCE) as pool:
-        sent = pool.map(lambda seed: _pester(port, cookie, seed), range(math.ceil(count / _EACH)))
+        sent = pool.map(
+            lambda seed: asyncio.run(_pester(port, cookie, seed)), range(math.ceil(count / _EACH))
+        )
         return sum(sent)
 
 
-def _pester(port: int, cookie: str, seed: int) -> int:
+async def _pester(port: int, cookie: str, seed: int) -> int:
     """Send nonsense until the node closes the connection. Returns how many messages were sent."""
     rng, sent = random.Random(seed), 0
     while sent < _EACH:
         try:
-            with connect(
+            async with connect(
                 f"wss://127.0.0.1:{port}/live",
                 origin=Origin(f"https://127.0.0.1:{port}"),
                 additional_headers={"Cookie": cookie},
@@ -150,7 +153,7 @@ def _pester(port: int, cookie: str, seed: int) -> int:
                 close_timeout=0.2,
             ) as socket:
                 while sent < _EACH:
-                    socket.send(_nonsense(rng))
+                    await socket.send(_nonsense(rng))
                     sent += 1
         except (ConnectionClosed, InvalidStatus, OSError, TimeoutError):
             continue  # thrown out, as it should be, or not let in while others are

@@ -92,7 +92,7 @@ def test_a_browser_that_goes_stops_the_car(run, browser, how):
     if how == "closed":
         ann.close()
     elif how == "killed":
-        ann.socket.socket.shutdown(2)
+        ann.cut()
     elif how == "silent":
         ann.responsive = False  # frozen: it neither answers beats nor draws
     else:
@@ -288,7 +288,7 @@ def test_a_replayed_or_malformed_message_is_no_act(run, browser):
     eve.tell({**message, "n": number + 1})  # in another connection
     eve.tell({**message, "n": number + 1, "frame": "1"})
     for text in ("{}", "nonsense", json.dumps({"t": "arm"})):
-        eve.socket.send(text)
+        eve.send_text(text)
     eve.wait(lambda: len([a for a in eve.answers if a["t"] == "refused"]) == 5, "five refusals")
     for _ in range(100):
         eve.tell({"t": "arm"})
