@@ -356,7 +356,11 @@ def cast_window(R: Any, o: Any, edges: Any, window: Any, intrinsics: Any, neares
         if not solid:
             _leap_all(rays, spans, alive * per_pixel, going, clear)
         for pixel in range(alive):
-            alpha, alpha_depth, count = 0.0, 0.0, 0
+            alpha, alpha_depth, count = (
+                0.0,
+                0.0,
+                np.int64(0),
+            )  # for a literal, `_march` would be compiled twice
             for n in range(pixel * per_pixel, (pixel + 1) * per_pixel):
                 count, a, ad = _march(
                     rays, n, spans, slots, density, clear, solid, share, row, touched, count

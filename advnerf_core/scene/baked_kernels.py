@@ -226,7 +226,7 @@ def render_baked(
     for tile in range(first, stop):
         image, rest = tile // (across_image * down), tile % (across_image * down)
         top, left = HIGH * (rest // across_image), WIDE * (rest % across_image)
-        count = 0
+        count = np.int64(0)  # for literals, what they are handed to would be compiled twice
         for n in range(WIDE * HIGH):
             row, column = top + n // WIDE, left + n % WIDE
             if row >= height or column >= width:
@@ -243,7 +243,7 @@ def render_baked(
             active[count] = n
             count += 1
         while count > 0:
-            used, left_over = 0, 0
+            used, left_over = np.int64(0), 0
             for _ in range(AHEAD if count * AHEAD <= WAVE else 1):
                 for a in range(count):
                     going[a] = active[a]

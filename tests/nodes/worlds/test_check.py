@@ -33,7 +33,12 @@ def named(kind: str) -> NamedWorld:
 
 
 @pytest.mark.parametrize(
-    "kind", ["lab", "junction", pytest.param("world_warehouse.py:Warehouse", marks=pytest.mark.slow)]
+    "kind",
+    [
+        "lab",
+        pytest.param("junction", marks=pytest.mark.slow),
+        pytest.param("world_warehouse.py:Warehouse", marks=pytest.mark.slow),
+    ],
 )
 def test_good_worlds_pass(kind: str, tmp_path: Any) -> None:
     findings = check_world(named(kind), tmp_path / "look")
