@@ -243,7 +243,7 @@ def render_baked(
             active[count] = n
             count += 1
         while count > 0:
-            used, left_over = np.int64(0), 0
+            used, left_over = np.int64(0), np.int64(0)
             for _ in range(AHEAD if count * AHEAD <= WAVE else 1):
                 for a in range(count):
                     going[a] = active[a]
