@@ -10,7 +10,6 @@ import hashlib
 import importlib
 import os
 import re
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 
 from advnerf_core.policies.contract import PolicyContract, PolicyContractError
 from advnerf_core.policies.view import PolicyView
+from advnerf_core.run_module import search_working_folder_last
 
 if TYPE_CHECKING:
     from advnerf_core.policies.adapter import AdaptedPolicy
@@ -90,8 +90,7 @@ def _from_factory(spec: str) -> tuple[AdaptedPolicy, str]:
     from advnerf_core.policies.adapter import AdaptedPolicy
 
     module_name, _, name = spec.partition(":")
-    if str(Path.cwd()) not in sys.path:
-        sys.path.insert(0, str(Path.cwd()))  # as `python -m` does; the command line's own folder is elsewhere
+    search_working_folder_last()
     try:
         module = importlib.import_module(module_name)
         factory = getattr(module, name)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import re
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
+from advnerf_core.run_module import search_working_folder_last
 from nodes.launching.launch_hosts import HostEntry, choose_host
 from nodes.runtime.config import Document, apply_overrides, read_yaml, validate
 from nodes.runtime.errors import ConfigError, TopicError
@@ -327,9 +327,7 @@ def _check(name: str, entry: NodeEntry, document: Document) -> None:
         )
     if entry.required and entry.respawn is not None:
         raise ConfigError(f"{place}: node {name} has respawn, so it must also have required: false")
-    # The node's process is started by `python -m` in this folder, and finds its modules there.
-    if (folder := str(Path.cwd())) not in sys.path:
-        sys.path.append(folder)
+    search_working_folder_last()  # as the node's process does
     try:
         found = importlib.util.find_spec(entry.module) is not None
     except ModuleNotFoundError:

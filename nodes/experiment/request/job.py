@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from advnerf_core.run_module import module_command
 from nodes.runtime.inbox import Inbox, ReaderThread
 
 # As nodes.experiment.request.search calls it, which the node does not import: it would bring torch.
@@ -55,19 +56,10 @@ class Job:
         if threads:
             environment |= {"OMP_NUM_THREADS": str(threads), "NUMBA_NUM_THREADS": str(threads)}
         # It dies with the node, which then finds its state and goes on.
-        command = [
-            sys.executable,
-            "-I",
-            "-S",
-            str(_SHIM),
-            str(os.getpid()),
-            sys.executable,
-            "-m",
-            "nodes.experiment.request.worker",
-        ]
+        shim = [sys.executable, "-I", "-S", str(_SHIM), str(os.getpid())]
         with open(self.log, "ab") as log:
             self._process = subprocess.Popen(
-                [*command, str(folder)],
+                [*shim, *module_command("nodes.experiment.request.worker", str(folder))],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=log,

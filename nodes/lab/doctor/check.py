@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -12,6 +11,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.run_module import module_command
 
 OK, ABSENT, WARNING, FAILURE = "ok", "absent", "warning", "failure"
 STATES = (OK, ABSENT, WARNING, FAILURE)
@@ -97,7 +97,7 @@ def in_child(probe: str, *arguments: Any, timeout_s: float = CHILD_S) -> Answer:
         arguments: Arguments of the probe, as plain data.
         timeout_s: Time after which the process is killed [s].
     """
-    command = [sys.executable, "-m", "nodes.lab.doctor.probes", probe, json.dumps(arguments)]
+    command = module_command("nodes.lab.doctor.probes", probe, json.dumps(arguments))
     try:
         done = subprocess.run(
             command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout_s, check=False
