@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.places import expanded
 
 T = TypeVar("T")
 
@@ -103,7 +104,7 @@ def absolute_reference(name: str, folder: Path) -> str:
     if not is_file_reference(name):
         return name
     file, _, attribute = name.rpartition(":")
-    return f"{(folder / Path(file).expanduser()).resolve()}:{attribute}"
+    return f"{(folder / expanded(file)).resolve()}:{attribute}"
 
 
 def load_from_file(reference: str, what: str, folder: Path | None = None) -> Any:

@@ -11,6 +11,7 @@ from typing import Any
 from rich.console import Console
 
 from advnerf_core.attack.methods import method_digest, method_name
+from advnerf_core.places import require_utf8
 from advnerf_core.plugins import unknown
 from nodes.experiment import bake, capture, live, objects, policy, retrain, scene
 from nodes.experiment.config import ExperimentConfig
@@ -58,6 +59,7 @@ def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: 
     Raises:
         ConfigError: With file, line and the valid keys.
     """
+    require_utf8(folder.absolute())
     document = read_setting(file, setting, overrides)
     config = validate(ExperimentConfig, document, file.parent)
     read_world(document.part(("world",)), file.resolve().parent)

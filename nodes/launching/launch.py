@@ -19,13 +19,14 @@ from typing import Any, TextIO
 import yaml
 
 from advnerf_core.files import write_atomically
+from advnerf_core.places import private_folder, require_utf8
 from nodes.launching.child import Child
 from nodes.launching.launch_file import Plan, load_launch
 from nodes.runtime.bus import Bus
 from nodes.runtime.config import node_document
 from nodes.runtime.errors import LaunchError
 from nodes.runtime.locks import HeldError, hold
-from nodes.runtime.paths import RESOLVED_NAME, private_folder, user_folder
+from nodes.runtime.paths import RESOLVED_NAME, user_folder
 from nodes.runtime.topics import status_topic
 
 _POLL_S = 0.05
@@ -55,6 +56,7 @@ class Launch:
         host: str | None = None,
     ) -> None:
         self.run_dir = Path(run_dir).resolve()
+        require_utf8(self.run_dir)
         self.plan: Plan = load_launch(Path(file), overrides, self.run_dir, host)
         self.failure = ""
         self._report = report or (lambda line: None)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import os
-import stat
-import tempfile
 from pathlib import Path
 
+from advnerf_core.places import private_folder, temporary_folder
 from nodes.runtime.errors import BusError
 
 # sizeof(sockaddr_un.sun_path) is 108 on Linux, including the final zero.
@@ -18,25 +17,12 @@ _LONGEST_NAME = 31
 RESOLVED_NAME = "launch.resolved.yaml"
 
 
-def private_folder(path: Path) -> Path:
-    """Create a folder that only this user may enter. A folder of another user is refused."""
-    path.mkdir(mode=0o700, parents=True, exist_ok=True)
-    found = path.lstat()
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid():
-        raise BusError(
-            f"expected {path} to belong to user {os.getuid()}, but it belongs to user {found.st_uid}; remove it"
-        )
-    if stat.S_IMODE(found.st_mode) & 0o077:
-        path.chmod(0o700)
-    return path
-
-
 def user_folder() -> Path:
     """Short path of this user for files that live as long as a run, under XDG_RUNTIME_DIR or the temporary folder."""
     base = os.environ.get("XDG_RUNTIME_DIR")
     if base and os.path.isdir(base) and os.access(base, os.W_OK):
         return private_folder(Path(base) / "advnerf")
-    return private_folder(Path(tempfile.gettempdir()) / f"advnerf-{os.getuid()}")
+    return temporary_folder()
 
 
 def bus_folder(run_dir: Path) -> Path:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import save
 from torch import Tensor
 
@@ -26,6 +26,7 @@ from advnerf_core.attack.methods import SearchRun, SearchSettings
 from advnerf_core.attack.problem import ScaledSensor, SearchDivergedError
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
+from advnerf_core.places import open_tensors
 
 __all__ = [
     "Evaluation", "OnEvaluation", "SearchDivergedError", "SearchResult", "SearchState", "SearchStateError", "begin",
@@ -131,7 +132,7 @@ class SearchState:
 def load_state(path: Path, fingerprint: str) -> SearchState:
     """Read a state file that a search with the same settings wrote."""
     try:
-        with safe_open(path, framework="pt") as handle:
+        with open_tensors(path, "pt") as handle:
             header = handle.metadata() or {}
             tensors = {name: handle.get_tensor(name) for name in handle.keys()}  # noqa: SIM118 - not a mapping
         if header.get("format") != _FORMAT:

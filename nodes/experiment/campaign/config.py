@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
 from advnerf_core.attack.methods import method_name
+from advnerf_core.places import require_utf8
 from advnerf_core.report.conditions import CONTROLS, NONE, order_of
 from advnerf_core.report.evidence.registration import Contrast
 from advnerf_core.report.reference import Reference
@@ -187,6 +188,7 @@ def load_campaign(file: Path, folder: Path | None = None, overrides: tuple[str, 
     """
     config = load_config(CampaignConfig, file, overrides)
     where = (folder or config.folder or Path("runs/campaigns") / config.name).resolve()
+    require_utf8(where)
     against = load_config(Reference, file.parent / config.reference) if config.reference else Reference()
     campaign = Campaign(
         config.name,

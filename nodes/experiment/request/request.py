@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from advnerf_core.attack.methods import METHODS, alternatives, method_name
 from advnerf_core.geometry import Array, make_transform, rotation_z
+from advnerf_core.places import expanded
 from advnerf_core.policies.load import is_factory
 from nodes.experiment.method_names import MethodReference
 from nodes.experiment.request.mesh_request import MeshRequest, ShapeRequest
@@ -309,7 +310,7 @@ def _resolve(document: Document, folder: Path, overrides: Sequence[str]) -> Atta
     def absolute(path: Path | None) -> Path | None:
         if path is None or is_factory(str(path)):
             return path
-        return (folder / path.expanduser()).resolve()
+        return (folder / expanded(path)).resolve()
 
     changes: dict[str, Any] = {name: absolute(getattr(request, name)) for name in _PATHS}
     changes["objects"] = tuple(

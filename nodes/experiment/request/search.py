@@ -20,6 +20,7 @@ from advnerf_core.attack.on_device import all_on_chosen_device, on_chosen_device
 from advnerf_core.attack.search.search import Evaluation, OnEvaluation, SearchResult
 from advnerf_core.attack.search.together import gradient_attacks
 from advnerf_core.files import write_atomically
+from advnerf_core.places import require_utf8
 from nodes.experiment.request.prepare import Prepared, prepare
 from nodes.experiment.request.request import SHAPE_METHODS, AttackRequest, load_request, request_text
 from nodes.experiment.request.telling import telling
@@ -108,6 +109,7 @@ def run_attack(
         PluginError: The method's code cannot be loaded.
     """
     chosen_method(request)  # before anything is loaded or written
+    require_utf8(folder.absolute())
     keep_request(request, folder)
     if request.search.together:
         return _run_together(request, folder, display, on_evaluation, on_prepared)

@@ -68,10 +68,16 @@ class Answer:
     Attributes:
         data: The result; None if the probe failed.
         trouble: Why the probe failed.
+        late: Whether it gave no answer in time, which says nothing about what is installed.
     """
 
     data: Any
     trouble: str = ""
+    late: bool = False
+
+    def cure(self, of_failure: str) -> str:
+        """What to do: that of a failure, or wait where the computer is only slow."""
+        return "run advnerf doctor again when this computer has less to do" if self.late else of_failure
 
 
 def examine(checks: Sequence[Check]) -> Iterator[Finding]:
@@ -103,7 +109,7 @@ def in_child(probe: str, *arguments: Any, timeout_s: float = CHILD_S) -> Answer:
             command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout_s, check=False
         )
     except subprocess.TimeoutExpired:
-        return Answer(None, f"no answer within {timeout_s:g} s")
+        return Answer(None, f"no answer within {timeout_s:g} s", late=True)
     if done.returncode < 0:
         return Answer(None, f"its process was ended by signal {-done.returncode}")
     lines = (done.stderr if done.returncode else done.stdout).strip().splitlines()

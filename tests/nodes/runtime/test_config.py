@@ -6,9 +6,10 @@ import pytest
 import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
+from advnerf_core.places import PlaceError, private_folder
 from nodes.runtime.config import apply_overrides, load_config, load_node_config, node_document, parse_yaml
 from nodes.runtime.errors import BusError, ConfigError
-from nodes.runtime.paths import bus_folder, private_folder, user_folder
+from nodes.runtime.paths import bus_folder, user_folder
 
 pytestmark = pytest.mark.live
 
@@ -148,5 +149,5 @@ def test_socket_folder_is_private_and_short(tmp_path, monkeypatch):
 
 def test_folder_of_somebody_else_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "getuid", lambda: 12345)
-    with pytest.raises(BusError, match=r"expected .* to belong to user 12345"):
+    with pytest.raises(PlaceError, match=r"expected .* to belong to user 12345"):
         private_folder(tmp_path / "bus")
