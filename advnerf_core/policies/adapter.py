@@ -33,6 +33,10 @@ class AdaptedPolicy(nn.Module):
                 "expected a network that is not stateless to have initial_memory(batch), got one without; add it, or declare "
                 "stateless = True if the output depends on the present image only"
             )
+        if (contract.input_name or contract.output_name) and not hasattr(network, "tensors"):
+            raise PolicyContractError(
+                "expected input_name and output_name for an .onnx or .pt2 file only; remove them, and return what steers"
+            )
         self.network = network
         self.contract = contract
         self.stateless = contract.stateless
@@ -54,6 +58,27 @@ class AdaptedPolicy(nn.Module):
             return self.contract.to_steering_rad(raw, len(images)), memory
         raw = self.network(given) if self.goal_size == 0 else self.network(given, goals)
         return self.contract.to_steering_rad(raw, len(images))
+
+    def described_tensors(self) -> list[tuple[str, str]]:
+        """Each input and output in words, with its shape and what it is used for: those of the file, else those of the contract."""
+        contract, tensors = self.contract, getattr(self.network, "tensors", None)
+        if tensors is not None:
+            column = contract.output_column
+            rows = [("input", each) for each in tensors.inputs] + [
+                ("output", each) for each in tensors.outputs
+            ]
+            return [(what, f"{each}: {tensors.use_of(each, column)}") for what, each in rows]
+        channels, size = (contract.channels,), contract.size
+        image = (*channels, *size) if contract.layout == "NCHW" else (*size, *channels)
+        goals = [("input", f"goals [B, {self.goal_size}]")] if self.goal_size else []
+        columns = (
+            "[B] or [B, 1]" if contract.output_column is None else f"[B, N], column {contract.output_column}"
+        )
+        return [
+            ("input", f"images [B, {', '.join(map(str, image))}]"),
+            *goals,
+            ("output", f"steering {columns}"),
+        ]
 
     def _check_goals(self, goals: Tensor | None, batch: int) -> None:
         shape = None if goals is None else tuple(goals.shape)

@@ -146,12 +146,14 @@ def policy_export(
 
 @app.command("info")
 def policy_info(policy: Spec) -> None:
-    """Show a policy's declaration and its hash."""
+    """Show a policy's inputs and outputs, its declaration and its hash."""
     from advnerf_core.policies.load import load_adapted
 
     adapted, sha256 = load_adapted(policy)
     contract = adapted.contract
     rows = table("what", "value")
+    for name, value in adapted.described_tensors():
+        rows.add_row(name, value.replace("[", r"\["))
     for name, value in contract.to_dict().items():
         if name != "view":
             rows.add_row(name, str(value).replace("[", r"\["))
