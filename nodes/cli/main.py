@@ -32,13 +32,14 @@ from nodes.cli import policy as cli_policy
 from nodes.cli import replay as cli_replay
 from nodes.cli import room as cli_room
 from nodes.cli import scene as cli_scene
+from nodes.cli import start as cli_start
 from nodes.cli import teleop as cli_teleop
 from nodes.cli import topic as cli_topic
 from nodes.cli import trial as cli_trial
 from nodes.cli import verify as cli_verify
 from nodes.cli import world as cli_world
 from nodes.runtime.extras import installs
-from nodes.runtime.terminal import Overrides, RunDir, print_table, say_error, table
+from nodes.runtime.terminal import LaunchFile, Overrides, RunDir, print_table, say_error, table
 
 if TYPE_CHECKING:
     from nodes.launching.launch import Launch
@@ -70,6 +71,7 @@ app.add_typer(cli_scene.app, name="scene")
 app.add_typer(cli_room.app, name="room")
 app.add_typer(cli_carla.app, name="carla")
 app.add_typer(cli_world.app, name="world")
+cli_start.add_to(app)
 cli_doctor.add_to(app)
 cli_experiment.add_to(app)
 cli_verify.add_to(app)
@@ -102,7 +104,7 @@ def options(
 
 @app.command()
 def launch(
-    file: Annotated[Path, typer.Argument(help="A *.launch.yaml file.", exists=True, dir_okay=False)],
+    file: LaunchFile,
     overrides: Overrides = None,
     run_dir: Annotated[
         Path | None,

@@ -8,11 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from nodes.cli import policy_train as cli_policy_train
+from nodes.runtime.paths import shipped
 from nodes.runtime.terminal import print_table, table
 
 if TYPE_CHECKING:
     from advnerf_core.policies.view import PolicyView
     from nodes.lab.policy_reference import Reference
+
+_TWIN_ROOM = shipped("calibration/twin/room.yaml")
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -56,8 +59,12 @@ def policy_check(
     ] = None,
     room: Annotated[
         Path,
-        typer.Option("--room", help="Room calibration with the path that the expert follows in the bag."),
-    ] = Path("calibration/twin/room.yaml"),
+        typer.Option(
+            "--room",
+            help="Room calibration with the path that the expert follows in the bag.",
+            show_default="the simulated lab's",
+        ),
+    ] = _TWIN_ROOM,
     goal: Annotated[
         list[float] | None,
         typer.Option("--goal", help="One number of the goal vector. Repeat for each number."),

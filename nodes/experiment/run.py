@@ -270,7 +270,8 @@ def stages_of(experiment: Experiment) -> list[Stage]:
         after = ("scene", "object", "policy")
         stages.append(stage("retrain", retrain, settings, after, fewer, reads_bulk_of=("policy",)))
     if config.deploy.live and (config.deploy.laps or config.deploy.empty_scene):
-        graph = load_launch(experiment.launch_file).resolved
+        # The same on every machine, wherever it is installed.
+        graph = load_launch(experiment.launch_file, twin_calibration="calibration/twin").resolved
         stages.append(
             stage(
                 "live",

@@ -1,4 +1,4 @@
-"""Paths of the sockets and logs of a run."""
+"""Paths of the sockets and logs of a run, and of the files that come with advnerf."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import hashlib
 import os
 from pathlib import Path
 
-from advnerf_core.places import private_folder, temporary_folder
+from advnerf_core.places import PlaceError, private_folder, temporary_folder
 from nodes.runtime.errors import BusError
 
 # sizeof(sockaddr_un.sun_path) is 108 on Linux, including the final zero.
@@ -15,6 +15,48 @@ UNIX_PATH_LIMIT = 107
 _LONGEST_NAME = 31
 # The resolved launch file in the run folder, which recorders attach to their bag.
 RESOLVED_NAME = "launch.resolved.yaml"
+
+
+def shipped(name: str) -> Path:
+    """File or folder that comes with advnerf, such as ``launch`` or ``calibration/twin``; read-only.
+
+    A checkout has it beside its packages, a wheel in ``nodes/shipped`` (setup.py).
+    """
+    package = Path(__file__).parents[1]
+    inside = package / "shipped" / name
+    return inside if inside.exists() else package.parent / name
+
+
+def named_file(name: str | Path, *kinds: str) -> Path:
+    """File that a command was given: a path, or a name like ``green_screen`` of one in ``launch`` here, or of one that is shipped.
+
+    Args:
+        name: Path or name.
+        kinds: Endings without ``.yaml``, such as ``launch``, in the order in which they are tried.
+
+    Raises:
+        PlaceError: There is none; the message lists the names.
+    """
+    path = Path(name)
+    if path.is_file():
+        return path
+    folders = Path("launch"), shipped("launch")
+    if path.name == str(name):
+        for file in (folder / f"{name}.{kind}.yaml" for folder in folders for kind in kinds):
+            if file.is_file():
+                return file
+    known = sorted(
+        {
+            file.name.split(".")[0]
+            for folder in folders
+            for kind in kinds
+            for file in folder.glob(f"*.{kind}.yaml")
+        }
+    )
+    raise PlaceError(
+        f"expected a file {' or '.join(f'*.{kind}.yaml' for kind in kinds)}, found none at {name}; correct the path, or give one of the names "
+        f"{', '.join(known)} (advnerf init copies these files to edit)"
+    )
 
 
 def user_folder() -> Path:

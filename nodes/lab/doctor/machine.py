@@ -23,7 +23,6 @@ from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, Finding
 from nodes.launching.launch import active_launches
 from nodes.linking.keys import DRIVE, KeyFolder, default_folder
 from nodes.runtime.bus import Bus
-from nodes.runtime.errors import SecurityError
 from nodes.runtime.machine import memory_gib
 from nodes.runtime.paths import user_folder
 from nodes.safety import SafetyConfig
@@ -183,14 +182,14 @@ def sockets() -> list[Finding]:
 
 def keys(folder: Path | None = None) -> list[Finding]:
     """Check the keys for a second host."""
-    folder = folder or default_folder()
-    store = KeyFolder(folder)
     try:
+        folder = folder or default_folder()
+        store = KeyFolder(folder)
         rows = store.rows()
         for row in rows:
             if row.ours:
                 store.secret(row.name)
-    except (SecurityError, OSError) as error:
+    except (AdvnerfError, OSError) as error:
         return [Finding("keys", WARNING, str(error))]
     ours = ", ".join(row.name for row in rows if row.ours)
     drivers = ", ".join(row.name for row in rows if DRIVE in row.rights) or "no key"
