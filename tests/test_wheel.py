@@ -66,15 +66,15 @@ def test_every_file_of_the_packages_and_what_is_beside_them_rides_in_it(unpacked
 
 
 LOOK = """
-import json, sys
-from pathlib import Path
+import json
+import advnerf_core, calibration, hardware, nodes
 from nodes.experiment.reference import REFERENCE
 from nodes.launching.launch_file import load_launch
 from nodes.runtime.paths import named_file, shipped
 launches = [file.name.split(".")[0] for file in shipped("launch").glob("*.launch.yaml")]
 plan = load_launch(named_file("green_screen", "launch"))
 print(json.dumps({
-    "packages": [sys.modules[name].__file__ for name in ("nodes", "advnerf_core", "hardware")],
+    "packages": [each.__file__ for each in (advnerf_core, calibration, hardware, nodes)],
     "launches": {name: str(named_file(name, "launch")) for name in launches},
     "room": str(named_file("room", "experiment", "campaign")),
     "paper": str(named_file("paper", "experiment", "campaign")),
