@@ -62,9 +62,14 @@ def private_folder(path: Path) -> Path:
     return path
 
 
+def temporary_path() -> Path:
+    """Path of this user's folder among the temporary files; it need not exist."""
+    return Path(tempfile.gettempdir()) / f"advnerf-{os.getuid()}"
+
+
 def temporary_folder() -> Path:
     """Private folder of this user among the temporary files."""
-    return private_folder(Path(tempfile.gettempdir()) / f"advnerf-{os.getuid()}")
+    return private_folder(temporary_path())
 
 
 def use_writable_cache() -> Path:

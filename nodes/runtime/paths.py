@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import os
+import stat
 from pathlib import Path
 
-from advnerf_core.places import PlaceError, private_folder, temporary_folder
+from advnerf_core.places import PlaceError, private_folder, temporary_folder, temporary_path
 from nodes.runtime.errors import BusError
 
 # sizeof(sockaddr_un.sun_path) is 108 on Linux, including the final zero.
@@ -65,6 +66,21 @@ def user_folder() -> Path:
     if base and os.path.isdir(base) and os.access(base, os.W_OK):
         return private_folder(Path(base) / "advnerf")
     return temporary_folder()
+
+
+def user_folders() -> list[Path]:
+    """All folders that `user_folder` may have returned to other processes of this user, whose environment may be another one."""
+    base = os.environ.get("XDG_RUNTIME_DIR") or f"/run/user/{os.getuid()}"
+    candidates = (Path(base) / "advnerf", temporary_path())
+    return [folder for folder in candidates if _is_ours(folder)]
+
+
+def _is_ours(folder: Path) -> bool:
+    try:
+        found = folder.lstat()
+    except OSError:
+        return False
+    return stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid()
 
 
 def bus_folder(run_dir: Path) -> Path:
