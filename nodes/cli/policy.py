@@ -170,4 +170,6 @@ def policy_info(policy: Spec) -> None:
     crop = f"rows {kept_rows.start} to {kept_rows.stop - 1}, columns {kept_columns.start} to {kept_columns.stop - 1}"
     rows.add_row("view", f"{crop} of {view.camera.width} x {view.camera.height}")
     rows.add_row("sha256", sha256)
+    if adapted.identity:
+        rows.add_row("not fixed", f"asks another program, which may change: {adapted.identity}")
     print_table(rows)
