@@ -9,8 +9,10 @@ import difflib
 import hashlib
 import importlib.util
 import sys
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
@@ -145,6 +147,21 @@ def load_from_file(reference: str, what: str, folder: Path | None = None) -> Any
     return getattr(module, attribute)
 
 
+class _Beside(MetaPathFinder):
+    """Finds some modules in a folder, and nothing else: the folder may hold a `hardware.py` that has nothing to do with ours."""
+
+    def __init__(self, folder: Path, names: Container[str]) -> None:
+        self._folder, self._names = folder, names
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """The module, if it is one of these."""
+        if path is not None or fullname not in self._names:
+            return None
+        return PathFinder.find_spec(fullname, [str(self._folder)], target)
+
+
 @contextmanager
 def _imports_from(folder: Path, files: Iterable[Path]) -> Iterator[None]:
     """Imports find some files of a folder, as they are now, and other modules of their names do not meet them: before and after."""
@@ -159,12 +176,13 @@ def _imports_from(folder: Path, files: Iterable[Path]) -> Iterator[None]:
         if not Path(getattr(each, "__file__", None) or "/").is_relative_to(folder):
             del sys.modules[name]
     writes_none, sys.dont_write_bytecode = sys.dont_write_bytecode, True
-    sys.path.insert(0, str(folder))
+    finder = _Beside(folder, names)
+    sys.meta_path.insert(0, finder)
     importlib.invalidate_caches()
     try:
         yield
     finally:
-        sys.path.remove(str(folder))
+        sys.meta_path.remove(finder)
         sys.dont_write_bytecode = writes_none
         for name in loaded():
             del sys.modules[name]

@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
-from nodes.experiment.request.job import REQUEST, Job, Said
+from nodes.experiment.request.job import REQUEST, Job, Said, is_begun
 from nodes.experiment.request.request import parse_request, request_text
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.messages import header, image_message, types
@@ -172,7 +172,8 @@ class AttackNode(Node):
             raise AdvnerfError(f"busy with {self._request_id}; wait for it, or cancel it")
         folder = self._folder / request_id
         kept = folder / REQUEST
-        if kept.exists() and kept.read_text(encoding="utf-8") != kept_text:
+        other = kept.exists() and kept.read_text(encoding="utf-8") != kept_text
+        if other and (self._job is not None or is_begun(folder)):
             raise AdvnerfError(f"{request_id} is another request already; give this one another id")
         if self._job is not None:
             return  # the very same request again

@@ -56,25 +56,26 @@ def test_a_file_that_imports_nothing_beside_it_is_named_by_its_bytes(tmp_path: P
 
 
 def test_a_file_imports_what_is_beside_it_as_it_is_now(tmp_path: Path) -> None:
-    a = write(tmp_path / "a", mine="import helper\nMine = helper.x\n", helper="x = 'a1'\n")
+    a = write(tmp_path / "a", mine="import helper, hardware\nMine = helper.x\n", helper="x = 'a1'\n")
+    write(a, hardware="1 / 0\n")  # ours is meant
     b = write(tmp_path / "b", mine="from helper import x as Mine\n", helper="x = 'b1'\n")
-    path, modules = [*sys.path], {*sys.modules}
+    finders, modules = [*sys.meta_path], {*sys.modules}
     assert load_from_file(f"{a}/mine.py:Mine", "thing") == "a1"
     assert load_from_file(f"{b}/mine.py:Mine", "thing") == "b1"
     write(a, helper="x = 'a2'\n")  # as long as before, within the same second
     assert load_from_file(f"{a}/mine.py:Mine", "thing") == "a2"
     assert load_from_file(f"{b}/mine.py:Mine", "thing") == "b1"
-    assert sys.path == path
+    assert sys.meta_path == finders
     assert "helper" not in {*sys.modules} - modules
     assert not list(tmp_path.rglob("*.pyc"))
 
 
 def test_a_helper_that_fails_is_one_line_and_leaves_nothing_behind(tmp_path: Path) -> None:
     write(tmp_path, mine="import helper\nMine = 1\n", helper="1 / 0\n")
-    path = [*sys.path]
+    finders = [*sys.meta_path]
     with pytest.raises(PluginError, match=r"mine\.py cannot be loaded: ZeroDivisionError: division by zero"):
         load_from_file(f"{tmp_path}/mine.py:Mine", "thing")
-    assert sys.path == path
+    assert sys.meta_path == finders
     assert "helper" not in sys.modules
 
 

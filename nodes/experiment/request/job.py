@@ -16,12 +16,17 @@ from typing import Any
 from advnerf_core.run_module import module_command
 from nodes.runtime.inbox import Inbox, ReaderThread
 
-# As nodes.experiment.request.search calls it, which the node does not import: it would bring torch.
-REQUEST = "request.attack.yaml"
+# Names that nodes.experiment.request.search shares; the node does not import that, because it would bring torch.
+REQUEST, TOGETHER_STATE = "request.attack.yaml", "together.state.safetensors"
 _SHIM = Path(__file__).parents[2] / "launching" / "shim.py"
 _READ_S = 0.2
 _PIECE = 1 << 16
 _END_S = 2.0
+
+
+def is_begun(folder: Path) -> bool:
+    """Whether a search has written a state or a result into a folder. Until then another request may take its place."""
+    return (folder / TOGETHER_STATE).exists() or any(folder.glob("seed_*.safetensors"))
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,8 +21,9 @@ from advnerf_core.attack.search.search import Evaluation
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.places import open_tensors
 from advnerf_core.scene.surrogate import split_theta
+from nodes.experiment.request.job import TOGETHER_STATE
 from nodes.experiment.request.prepare import Prepared
-from nodes.experiment.request.search import TOGETHER_STATE, kept_request, planned_evaluations, run_attack
+from nodes.experiment.request.search import kept_request, planned_evaluations, run_attack
 from nodes.runtime.progress import MeasuringReport
 
 TEXTURE, PREVIEW = "texture", "preview"
