@@ -19,12 +19,10 @@ def test_a_lock_names_its_owner_and_ends_with_its_file(tmp_path):
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can act as another user")
-def test_a_file_that_another_user_made_can_be_locked(tmp_path):
-    file = tmp_path / "lock"
+def test_a_file_that_another_user_made_can_be_locked(open_folder):
+    file = open_folder / "lock"
     hold(file).close()
     os.chmod(file, 0o644)
-    for folder in (tmp_path, tmp_path.parent, tmp_path.parent.parent):
-        os.chmod(folder, 0o755)
     pid = os.fork()
     if pid == 0:  # the stranger
         code = 9
