@@ -15,11 +15,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
+from advnerf_core.strict import StrictModel
 from nodes.experiment.request.job import REQUEST, Job, Said, is_begun
 from nodes.experiment.request.request import parse_request, request_text
 from nodes.runtime.clock import NS_PER_S
@@ -39,7 +40,7 @@ _INBOX = 1000
 RUNNING = ("preparing", "searching")
 
 
-class AttackConfig(BaseModel):
+class AttackConfig(StrictModel):
     """Configuration of the attack node.
 
     Attributes:
@@ -48,8 +49,6 @@ class AttackConfig(BaseModel):
         repeat_s: Pause between [s].
         threads: Threads of the search; 0 leaves it to the libraries.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     folder: Path = Path("attack")
     sends: int = Field(default=3, ge=1)

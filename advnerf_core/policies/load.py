@@ -10,6 +10,7 @@ import hashlib
 import importlib
 import os
 import re
+import sys
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Protocol

@@ -11,8 +11,10 @@ from typing import Any
 from rich.console import Console
 
 from advnerf_core.attack.methods import method_digest, method_name
+from advnerf_core.documents import Document, Key, read_yaml
 from advnerf_core.places import require_utf8
 from advnerf_core.plugins import unknown
+from advnerf_core.strict import validate
 from nodes.experiment import bake, capture, live, objects, policy, retrain, scene
 from nodes.experiment.config import ExperimentConfig
 from nodes.experiment.context import Experiment
@@ -25,7 +27,7 @@ from nodes.experiment.stage_record import Stage, StageRecord
 from nodes.experiment.stages import begun_with
 from nodes.lab.worlds.named import read_world
 from nodes.launching.launch_file import load_launch
-from nodes.runtime.config import Document, Key, apply_overrides, read_yaml, validate
+from nodes.runtime.config import apply_overrides
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import Display, MeasuringReport
 

@@ -9,11 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import ConfigDict, Field, field_validator
 
+from advnerf_core.documents import Document, read_yaml
 from advnerf_core.run_module import search_working_folder_last
+from advnerf_core.strict import StrictModel, validate
 from nodes.launching.launch_hosts import HostEntry, choose_host
-from nodes.runtime.config import Document, apply_overrides, read_yaml, validate
+from nodes.runtime.config import apply_overrides
 from nodes.runtime.errors import ConfigError, TopicError
 from nodes.runtime.paths import bus_folder, shipped
 from nodes.runtime.topics import status_topic
@@ -22,8 +24,8 @@ RECORDER = "recorder"
 _REFERENCE = re.compile(r"\$\{([A-Za-z_][A-Za-z0-9_]*)\}")
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
+class _Strict(StrictModel):
+    model_config = ConfigDict(populate_by_name=True)
 
 
 class Respawn(_Strict):

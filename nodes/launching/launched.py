@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from nodes.runtime.config import parse_yaml
+from advnerf_core.documents import parse_yaml
 from nodes.runtime.paths import RESOLVED_NAME
 
 

@@ -18,12 +18,13 @@ from typing import Any
 import yaml
 from pydantic import BaseModel
 
+from advnerf_core.documents import Document, parse_yaml
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.run_module import search_working_folder_last
+from advnerf_core.strict import validate
 from nodes.bags.reader import plain_name, read_attachments
 from nodes.launching.launch_file import NodeEntry, Plan, load_launch
 from nodes.runtime.clock import Clock
-from nodes.runtime.config import Document, parse_yaml, validate
 from nodes.runtime.errors import BagError, ConfigError
 from nodes.runtime.node import Node, NodeContext
 from nodes.runtime.paths import RESOLVED_NAME

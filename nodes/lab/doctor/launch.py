@@ -12,6 +12,7 @@ from pydantic import BaseModel
 
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.policies.load import is_factory
+from advnerf_core.strict import validate
 from calibration.schema import CameraCalibration, load_calibration
 from hardware.mocap.vicon import ViconConfig
 from hardware.motor.vesc_settings import TimeoutSettings
@@ -27,7 +28,6 @@ from nodes.monitor import MonitorConfig, ScreenConfig
 from nodes.motor import MotorConfig
 from nodes.policy import PolicyConfig
 from nodes.recorder import RecorderConfig
-from nodes.runtime.config import validate
 from nodes.runtime.errors import ConfigError
 from nodes.safety import SafetyConfig
 from nodes.vicon import ViconNodeConfig

@@ -11,10 +11,11 @@ from typing import Any, cast
 
 from pydantic import BaseModel, TypeAdapter
 
+from advnerf_core.documents import Document
 from advnerf_core.plugins import PluginError, absolute_reference, code_sha256, is_file_reference, resolve
+from advnerf_core.strict import validate
 from hardware.worlds import ENTRY_POINTS, WORLDS
 from hardware.worlds.world import World, WorldClass, members_of_a_world
-from nodes.runtime.config import Document, validate
 from nodes.runtime.errors import ConfigError
 
 _PAGE = "docs/worlds.md"

@@ -6,9 +6,10 @@ import pytest
 import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
+from advnerf_core.documents import parse_yaml
 from advnerf_core.places import PlaceError, private_folder
 from nodes.launching.launch_file import load_launch
-from nodes.runtime.config import apply_overrides, load_config, load_node_config, node_document, parse_yaml
+from nodes.runtime.config import apply_overrides, load_config, load_node_config, node_document
 from nodes.runtime.errors import BusError, ConfigError
 from nodes.runtime.paths import bus_folder, named_file, shipped, user_folder
 

@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from advnerf_core.documents import parse_yaml
 from hardware.worlds import WORLDS
 from nodes.cli.main import app
 from nodes.lab.worlds.named import NamedWorld, read_world, without
-from nodes.runtime.config import parse_yaml
 from nodes.runtime.errors import ConfigError
 from tests.support.warehouse import EXAMPLES
 
