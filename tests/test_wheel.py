@@ -141,7 +141,8 @@ class Installed:
 
     def __init__(self, wheel, folder):
         self.environment, self.folder = folder / "venv", folder / "empty"
-        self.as_stranger = ["setpriv", f"--reuid={STRANGER}", f"--regid={STRANGER}", "--clear-groups"]
+        # setpriv itself may still execute anything, so that it executes env, which may not.
+        self.as_stranger = ["setpriv", f"--reuid={STRANGER}", f"--regid={STRANGER}", "--clear-groups", "env"]
         if os.getuid() != 0:
             self.as_stranger = []
         python = self._python()
