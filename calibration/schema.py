@@ -12,12 +12,13 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, Pinhole
+from advnerf_core.strict import StrictModel
 from hardware.motor.limits import DriveLimits, VehicleGains
 
 Row4 = tuple[float, float, float, float]
@@ -32,7 +33,7 @@ class CalibrationError(AdvnerfError, ValueError):
     """A calibration file is missing or wrong."""
 
 
-class Calibration(BaseModel):
+class Calibration(StrictModel):
     """Fields that all calibration files have.
 
     Attributes:
@@ -44,14 +45,12 @@ class Calibration(BaseModel):
         residuals: What the fit left, by name with its unit; empty where nothing was fitted.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
     kind: str
     date: datetime.date
     method: str = Field(min_length=1)
     notes: str = ""
     views: int | None = Field(default=None, ge=0)
-    residuals: dict[str, float] = {}
+    residuals: dict[str, float] = Field(default_factory=dict)
 
 
 def require_rigid(rows: tuple[Row4, ...]) -> tuple[Row4, ...]:
@@ -110,10 +109,8 @@ class CameraCalibration(Calibration):
         return np.array(self.T_car_from_camera)
 
 
-class GainsSection(BaseModel):
+class GainsSection(StrictModel):
     """See `hardware.motor.limits.VehicleGains`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     erpm_per_mps: float
     erpm_offset: float
@@ -123,10 +120,8 @@ class GainsSection(BaseModel):
     servo_max: float
 
 
-class LimitsSection(BaseModel):
+class LimitsSection(StrictModel):
     """See `hardware.motor.limits.DriveLimits`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     speed_min_mps: float
     speed_max_mps: float
@@ -137,7 +132,7 @@ class LimitsSection(BaseModel):
     current_max_a: float = Field(default=60.0, gt=0.0)
 
 
-class ResponseSection(BaseModel):
+class ResponseSection(StrictModel):
     """Delay and lag of the car.
 
     Attributes:
@@ -148,8 +143,6 @@ class ResponseSection(BaseModel):
         speed_delay_s: From the written command until the speed begins to change [s].
         speed_lag_s: Time constant of the speed [s].
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     pipeline_delay_s: float = Field(ge=0.0)
     steering_delay_s: float = Field(ge=0.0)

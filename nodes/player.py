@@ -13,8 +13,9 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from advnerf_core.strict import StrictModel
 from nodes.bags.keys import Keys
 from nodes.bags.play import PAUSE, RATE, RESUME, STEP, STOP, TOGGLE, Command, Playhead
 from nodes.bags.reader import BagMessage, read_info, read_messages, require_readable
@@ -35,7 +36,7 @@ _FASTER = 1.25
 _FAREWELL_NS = NS_PER_S // 4
 
 
-class PlayerConfig(BaseModel):
+class PlayerConfig(StrictModel):
     """Configuration of the player.
 
     Attributes:
@@ -51,8 +52,6 @@ class PlayerConfig(BaseModel):
         wait_for: Topics, by their played names, that must have a subscriber before the first message. None waits for a subscriber of
             any topic. An empty list does not wait; messages without a subscriber are lost.
     """
-
-    model_config = ConfigDict(extra="forbid")
 
     bag: Path
     rate: float = Field(default=1.0, gt=0)

@@ -23,7 +23,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.plugins import (
     PluginError,
-    code_digest,
+    code_sha256,
     is_file_reference,
     known_names,
     require_known,
@@ -245,8 +245,8 @@ def method_name(reference: str) -> str:
 
 
 def method_digest(reference: str) -> str:
-    """Names the code of a user's method: it changes with the file, or with the version of the package. Empty for a built-in one."""
-    return "" if reference in METHODS else code_digest(reference, GROUP)
+    """Names the code of a user's method in 16 characters: it changes with the files of the code. Empty for a built-in one."""
+    return code_sha256(reference, METHODS, GROUP)[:16]
 
 
 def method_names() -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from advnerf_core.documents import Document
 from advnerf_core.driving.dynamics import Ackermann, Dubins
 from advnerf_core.driving.expert import Expert, ExpertConfig
 from advnerf_core.driving.metrics import Horizon
@@ -30,7 +31,7 @@ from nodes.experiment.placed import PlacedObject, in_a_lane
 from nodes.experiment.run_folder import RunFolder
 from nodes.lab.worlds.expert_drive import as_path
 from nodes.lab.worlds.named import NamedWorld, read_world, without
-from nodes.runtime.config import Document, load_config
+from nodes.runtime.config import load_config
 from nodes.runtime.errors import ConfigError
 
 WORLD, PLACED, CALIBRATION, CELLS = "world.json", "objects.json", "calibration", "cells"

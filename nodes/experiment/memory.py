@@ -19,6 +19,7 @@ from advnerf_core.files import write_atomically
 from advnerf_core.memory import RETURNS_WHAT_IS_FREED, peak_mib, restart_peak
 from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.report.data import MemoryRow
+from advnerf_core.run_module import module_command
 from nodes.experiment.attack import attack_problem
 from nodes.experiment.context import Experiment
 from nodes.experiment.faces import face_space
@@ -35,7 +36,7 @@ def measure(experiment: Experiment, folder: Path, report: Report) -> tuple[Memor
     for index, ticks in enumerate(HORIZONS):
         report(index / len(HORIZONS), f"memory of the adjoint at T = {ticks}")
         if str(ticks) not in rows:
-            command = [sys.executable, "-m", "nodes.experiment.memory", str(experiment.folder), str(ticks)]
+            command = module_command("nodes.experiment.memory", str(experiment.folder), str(ticks))
             environment = {**os.environ, **RETURNS_WHAT_IS_FREED}
             done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=environment)
             rows[str(ticks)] = float(done.stdout.split()[-1])

@@ -19,13 +19,14 @@ from typing import Any, TextIO
 import yaml
 
 from advnerf_core.files import write_atomically
+from advnerf_core.places import private_folder, require_utf8
 from nodes.launching.child import Child
 from nodes.launching.launch_file import Plan, load_launch
 from nodes.runtime.bus import Bus
 from nodes.runtime.config import node_document
 from nodes.runtime.errors import LaunchError
 from nodes.runtime.locks import HeldError, hold
-from nodes.runtime.paths import RESOLVED_NAME, private_folder, user_folder
+from nodes.runtime.paths import RESOLVED_NAME, user_folder, user_folders
 from nodes.runtime.topics import status_topic
 
 _POLL_S = 0.05
@@ -55,8 +56,10 @@ class Launch:
         host: str | None = None,
     ) -> None:
         self.run_dir = Path(run_dir).resolve()
+        require_utf8(self.run_dir)
         self.plan: Plan = load_launch(Path(file), overrides, self.run_dir, host)
         self.failure = ""
+        self.timed_out = False  # whether a node was too slow, instead of ended by an error of its own
         self._report = report or (lambda line: None)
         self._children = {name: Child(name, entry, self.run_dir) for name, entry in self.plan.nodes.items()}
         # Plain flags: an Event takes a lock, and a signal handler that sets it could deadlock with itself.
@@ -107,6 +110,7 @@ class Launch:
             if self._done.is_set():
                 raise LaunchError(self.failure or "the launch was stopped before it was ready")
             if time.monotonic() > deadline:
+                self.timed_out = True
                 raise LaunchError(
                     f"expected the launch to be ready within {timeout_s:g} s: {self._what_is_missing()}"
                 )
@@ -172,6 +176,7 @@ class Launch:
                 self._report(f"{child.name}: restarted, process {child.pid}")
         elif child.running:
             if trouble := _silence(child, now):
+                self.timed_out |= child.entry.required and not self.failure
                 child.signal(signal.SIGKILL)
                 self._died(child, f"{trouble} and was killed (log: {child.log})", now)
         elif not child.given_up:
@@ -267,9 +272,9 @@ class Launch:
 
 
 def active_launches() -> list[dict[str, Any]]:
-    """Running launches of this user on this host: name, run_dir, pid."""
+    """Running launches of this user on this host: name, run_dir, pid, and cwd, the folder in which it was started."""
     found = []
-    for card in sorted((user_folder() / "active").glob("*.json")):
+    for card in sorted(card for folder in user_folders() for card in (folder / "active").glob("*.json")):
         try:
             launch = json.loads(card.read_text(encoding="utf-8"))
             if is_running(Path(launch["run_dir"])):
@@ -310,5 +315,7 @@ def is_running(run_dir: Path) -> bool:
 
 def _leave_card(name: str, run_dir: Path) -> Path:
     card = private_folder(user_folder() / "active") / f"{os.getpid()}-{run_dir.name}.json"
-    write_atomically(card, json.dumps({"name": name, "run_dir": str(run_dir), "pid": os.getpid()}))
+    write_atomically(
+        card, json.dumps({"name": name, "run_dir": str(run_dir), "pid": os.getpid(), "cwd": os.getcwd()})
+    )
     return card

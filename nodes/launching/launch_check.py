@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,6 +10,7 @@ from pathlib import Path
 
 import yaml
 
+from advnerf_core.run_module import module_command
 from nodes.launching.launch_file import Plan
 from nodes.runtime.config import node_document
 
@@ -51,7 +51,7 @@ def _processes(plan: Plan, folder: Path) -> Iterator[dict[str, subprocess.Popen[
             config.write_text(
                 yaml.safe_dump(node_document(plan.documents[name]), sort_keys=False), encoding="utf-8"
             )
-            command = [sys.executable, "-m", entry.module, "--check", "--config", str(config)]
+            command = module_command(entry.module, "--check", "--config", str(config))
             processes[name] = subprocess.Popen(
                 [*command, "--run-dir", str(folder), "--name", name],
                 stdin=subprocess.DEVNULL,

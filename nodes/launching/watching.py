@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from advnerf_core.documents import parse_yaml
 from nodes.launching.launch import active_launches, is_running
 from nodes.runtime.bus import Bus, Received
 from nodes.runtime.clock import NS_PER_S
-from nodes.runtime.config import parse_yaml
 from nodes.runtime.errors import LaunchError, MessageError
 from nodes.runtime.messages import stamp_ns
 from nodes.runtime.paths import RESOLVED_NAME, bus_folder

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib
 import inspect
-import sys
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,11 +18,13 @@ from typing import Any
 import yaml
 from pydantic import BaseModel
 
+from advnerf_core.documents import Document, parse_yaml
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.run_module import search_working_folder_last
+from advnerf_core.strict import validate
 from nodes.bags.reader import plain_name, read_attachments
 from nodes.launching.launch_file import NodeEntry, Plan, load_launch
 from nodes.runtime.clock import Clock
-from nodes.runtime.config import Document, parse_yaml, validate
 from nodes.runtime.errors import BagError, ConfigError
 from nodes.runtime.node import Node, NodeContext
 from nodes.runtime.paths import RESOLVED_NAME
@@ -91,8 +92,8 @@ def close_nodes(nodes: Mapping[str, Node]) -> None:
 def _plan(bag: Path, choice: Choice, folder: Path) -> Plan:
     modules = [f"{name}.module={spec.partition(':')[0]}" for name, spec in choice.replacements.items()]
     file = choice.launch or _launch_of_bag(bag, choice, folder)
-    if (choice.replacements or choice.launch) and str(Path.cwd()) not in sys.path:
-        sys.path.append(str(Path.cwd()))  # like `python -m`, with which a launch starts its modules
+    if choice.replacements or choice.launch:
+        search_working_folder_last()  # as the processes of a launch do
     plan = load_launch(file, [*modules, *choice.overrides], folder)
     if missing := [name for name in choice.nodes if name not in plan.nodes]:
         raise BagError(f"{file} has no node {', '.join(missing)}; it has {', '.join(plan.nodes)}")

@@ -26,7 +26,9 @@ class Topic:
         queue: Number of messages that a receiver keeps. 1 keeps only the newest; older ones are dropped and counted.
         max_age_s: Age since publication beyond which a receiver must not use a message [s]; None if age does not matter.
         publisher: Role of the node that publishes the topic.
-        senders: Number of processes per host that may publish the topic at the same time. A request to stop must not have to wait for another sender.
+        senders: Number of processes per host that may publish the topic at the same time.
+        receivers: Number of processes per host that may receive the topic at the same time, for a topic that any number of processes
+            may send; 0 for all other topics. A request to stop the car must not have to wait for a free endpoint.
         replay: Whether a recording of the topic may be published: ``never`` for what moves or arms a car, selects its driver, shows an
             attack, or feeds a clock, and for reports that decide about these.
     """
@@ -38,6 +40,7 @@ class Topic:
     max_age_s: float | None
     publisher: str
     senders: int = 1
+    receivers: int = 0
     replay: Replay = FREE
 
     @property
@@ -67,7 +70,7 @@ _ROWS = (
     Topic("/safety/drive", _ACKERMANN, 10.0, 1, 0.25, "safety", replay=NEVER),
     Topic("/safety/state", "advnerf_msgs/msg/SafetyState", 10.0, 20, 0.5, "safety", replay=NEVER),
     Topic("/clock/offset", "advnerf_msgs/msg/ClockOffset", 5.0, 20, 1.0, "gateway", replay=NEVER),
-    Topic("/arm", "advnerf_msgs/msg/Arm", None, 20, None, "operator", senders=4, replay=NEVER),
+    Topic("/arm", "advnerf_msgs/msg/Arm", None, 20, None, "operator", receivers=8, replay=NEVER),
     Topic("/operator/act", "advnerf_msgs/msg/OperatorAct", None, 50, None, "page", replay=NEVER),
     Topic("/twin/reset", "geometry_msgs/msg/PoseStamped", None, 5, None, "operator", senders=2, replay=NEVER),
     Topic("/attack/request", "advnerf_msgs/msg/AttackRequest", None, 5, None, "operator", replay=NEVER),

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path as FilePath
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.driving.path import Path
@@ -16,6 +16,7 @@ from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import cell_name
 from advnerf_core.report.reference import Domain
+from advnerf_core.strict import StrictModel
 
 FORMAT: Literal["advnerf-registration-1"] = "advnerf-registration-1"
 # In the folder of the published cells: what was registered, and which scenarios of it were given up later.
@@ -28,11 +29,7 @@ class RegistrationError(AdvnerfError, ValueError):
     """A registration is not usable, or would come too late."""
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class RegisteredScenario(_Part):
+class RegisteredScenario(StrictModel):
     """One scenario, or one placement of its objects.
 
     Attributes:
@@ -73,7 +70,7 @@ class RegisteredScenario(_Part):
         return Path.from_dict(self.path)
 
 
-class RegisteredCell(_Part):
+class RegisteredCell(StrictModel):
     """One cell.
 
     Attributes:
@@ -96,7 +93,7 @@ class RegisteredCell(_Part):
         return cell_name(self.scenario, self.victim, self.method, self.seed, self.placement)
 
 
-class PrimaryTest(_Part):
+class PrimaryTest(StrictModel):
     """A test that is claimed: the method's deployed excess against that of the baseline that is strongest in the surrogate.
 
     Attributes:
@@ -114,7 +111,7 @@ class PrimaryTest(_Part):
     against: tuple[str, ...] = Field(min_length=1)
 
 
-class Contrast(_Part):
+class Contrast(StrictModel):
     """Two conditions that the same attacks are driven under, and what differs between them.
 
     Attributes:
@@ -132,7 +129,7 @@ class Contrast(_Part):
     after_in: Domain = "deployed"
 
 
-class Registration(_Part):
+class Registration(StrictModel):
     """What will be run.
 
     Attributes:

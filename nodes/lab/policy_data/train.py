@@ -17,6 +17,7 @@ from advnerf_core.files import write_atomically
 from advnerf_core.learning.fit import FitConfig, fit, mean_absolute_error
 from advnerf_core.learning.frames import FrameSet, FrameStore
 from advnerf_core.learning.imitation import ImitationConfig, Progress, SourcePlan, train_policy
+from advnerf_core.places import require_utf8
 from advnerf_core.policies.pilotnet import PilotNet, save_policy
 from advnerf_core.policies.view import PolicyView
 from nodes.lab.policy_data.frames import Recording
@@ -85,6 +86,7 @@ def train_from_recordings(
     Frames and checkpoints are in ``out/work/<digest of all inputs>``. The same call resumes, or returns at once if finished. Other
     recordings or settings start a new training, and remove the earlier work when they are finished.
     """
+    require_utf8(out.absolute())
     claim = {
         "parts": {part.name: part.digest for part in parts},
         "view": view.to_dict(),

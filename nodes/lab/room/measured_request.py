@@ -6,8 +6,8 @@ from pathlib import Path
 
 import yaml
 
+from advnerf_core.documents import read_yaml
 from advnerf_core.files import write_atomically
-from nodes.runtime.config import read_yaml
 from nodes.runtime.errors import ConfigError
 
 _POSE_KEYS = ("T_world_from_object", "x_m", "y_m", "z_m", "yaw_rad")
