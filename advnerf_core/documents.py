@@ -42,7 +42,12 @@ _REAL = re.compile(
     r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)"
 )
 _SPECIAL = re.compile(r"\.(inf|nan)", re.IGNORECASE)
-_TYPES = {"null": (type(None),), "bool": (bool,), "int": (int,), "float": (int, float)}
+_TYPES: dict[str, tuple[type, ...]] = {
+    "null": (type(None),),
+    "bool": (bool,),
+    "int": (int,),
+    "float": (int, float),
+}
 _JSON_TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|[{}\[\]:,]', re.DOTALL)
 
 
@@ -285,6 +290,23 @@ class _Composer:
 
 def _short(tag: str) -> str:
     return tag.replace(_TAG, "!!", 1)
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes text that `parse_yaml` would not take as text: PyYAML writes version 1.1, in which ``1e0`` is text."""
+
+
+def _write_text(dumper: Any, text: str) -> Any:
+    number = any(form.fullmatch(text) for form in (_INTEGER, _OTHER_BASE, _REAL))
+    return dumper.represent_scalar(_TAG + "str", text, style="'" if number else None)
+
+
+_Dumper.add_representer(str, _write_text)
+
+
+def dump_yaml(data: Any, **style: Any) -> str:
+    """YAML text from which `parse_yaml` reads the same plain data; keys keep their order."""
+    return str(yaml.dump(data, Dumper=_Dumper, sort_keys=False, **style))
 
 
 def _is_real(text: str) -> bool:

@@ -115,7 +115,12 @@ def validate(model: type[M], document: Document, folder: Path | None = None) -> 
         )
     raise_problems(list(_unknown_keys(model, document, ())))
     try:
-        return typing.cast(M, _validator(model).validate_python(document.data, context={"folder": folder}))
+        return typing.cast(
+            M,
+            strict_validator(typing.cast(Any, model)).validate_python(
+                document.data, context={"folder": folder}
+            ),
+        )
     except ValidationError as error:
         raise_problems(_explain(model, document, error))
         raise
@@ -124,14 +129,15 @@ def validate(model: type[M], document: Document, folder: Path | None = None) -> 
 def parse_value(annotation: Any, document: Document) -> Any:
     """Typed value of a document that is one value of a bigger one, such as a section; errors as in `validate`."""
     try:
-        return _validator(annotation).validate_python(document.data)
+        return strict_validator(annotation).validate_python(document.data)
     except ValidationError as error:
         raise_problems(_explain(annotation, document, error))
         raise
 
 
 @lru_cache(maxsize=64)
-def _validator(model: Any) -> SchemaValidator:
+def strict_validator(model: Any) -> SchemaValidator:
+    """Validator of a model or type whose numbers and booleans are strict."""
     # Prebuilt validators are those of classes that do not derive from StrictModel, such as a plug-in's: they are not strict.
     return SchemaValidator(TypeAdapter(Annotated[model, Strict()]).core_schema, _use_prebuilt=False)
 

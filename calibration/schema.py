@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import numpy as np
-import yaml
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
+from advnerf_core.documents import dump_yaml, parse_yaml, read_yaml
 from advnerf_core.driving.path import Path as DrivingPath
-from advnerf_core.errors import AdvnerfError
+from advnerf_core.errors import AdvnerfError, ConfigError, MissingFileError
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, Pinhole
-from advnerf_core.strict import StrictModel
+from advnerf_core.strict import StrictModel, validate
 from hardware.motor.limits import DriveLimits, VehicleGains
 
 Row4 = tuple[float, float, float, float]
@@ -270,23 +270,21 @@ C = TypeVar("C", bound=Calibration)
 
 
 def load_calibration(model: type[C], path: Path | str) -> C:
-    """Read a calibration file. Errors are one `CalibrationError` that names the file and the key."""
-    path = Path(path)
+    """Read a calibration file. Everything wrong in it is one `CalibrationError` that names the file, the lines and the keys."""
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+        return validate(model, read_yaml(Path(path)))
+    except MissingFileError:
         raise CalibrationError(f"{path}: no such calibration file") from None
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise CalibrationError(f"{path}: cannot be read as YAML: {' '.join(str(error).split())}") from error
+    except ConfigError as error:
+        raise CalibrationError(str(error)) from None
+
+
+def parse_calibration(model: type[C], text: str, source: str) -> C:
+    """The same from text; messages call it ``source``."""
     try:
-        return model.model_validate(data)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        key = ".".join(map(str, first["loc"])) or "the whole file"
-        known = f"; known keys: {', '.join(model.model_fields)}" if first["type"] == "extra_forbidden" else ""
-        raise CalibrationError(
-            f"{path}: {key}: {first['msg'].removeprefix('Value error, ')}{known}"
-        ) from None
+        return validate(model, parse_yaml(text, source))
+    except ConfigError as error:
+        raise CalibrationError(str(error)) from None
 
 
 def save_calibration(calibration: Calibration, path: Path | str) -> None:
@@ -295,7 +293,7 @@ def save_calibration(calibration: Calibration, path: Path | str) -> None:
     values = calibration.model_dump(mode="python")
     # Files that measured nothing stay as short as they were.
     kept = {key: value for key, value in values.items() if key not in _OPTIONAL or value not in (None, {})}
-    text = yaml.safe_dump(kept, sort_keys=False, default_flow_style=None, width=120)
+    text = dump_yaml(kept, default_flow_style=None, width=120)
     try:
         write_atomically(path, text)
     except OSError as error:

@@ -18,6 +18,7 @@ import numpy as np
 from pydantic import Field
 
 from advnerf_core.attack.artifact import load_attack
+from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
 from advnerf_core.strict import StrictModel
@@ -205,7 +206,7 @@ class AttackNode(Node):
     def _resume(self) -> None:
         """Go on with a search that was cut off, and send again what was finished."""
         try:
-            current = json.loads((self._folder / _CURRENT).read_text(encoding="utf-8"))
+            current = read_json(self._folder / _CURRENT)
         except FileNotFoundError:
             return
         if current["state"] == "running":

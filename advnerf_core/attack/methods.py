@@ -18,7 +18,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic import BaseModel, ValidationError
 
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.plugins import (
@@ -31,6 +31,7 @@ from advnerf_core.plugins import (
     unknown,
 )
 from advnerf_core.report.conditions import CONDITIONS
+from advnerf_core.strict import strict_validator
 
 if TYPE_CHECKING:
     from advnerf_core.attack.problem import AttackProblem
@@ -147,7 +148,7 @@ class Method:
         if self.Options is None:
             return None
         try:
-            return TypeAdapter(self.Options).validate_python(dict(written))
+            return strict_validator(self.Options).validate_python(dict(written))
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
             place, message = (

@@ -10,13 +10,14 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from math import pi
+from numbers import Real
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-import yaml
 
-from advnerf_core.errors import AdvnerfError
+from advnerf_core.documents import parse_json, read_yaml
+from advnerf_core.errors import AdvnerfError, ConfigError
 from advnerf_core.policies.view import PolicyView
 
 ColourSpace = Literal["RGB", "BGR", "YUV", "GRAY"]
@@ -99,10 +100,22 @@ class PolicyContract:
                 raise PolicyContractError(
                     f"{name}: expected {' or '.join(choices)}, got {getattr(self, name)!r}"
                 )
+        self._check_types()
         self._check_input()
         self._check_output()
-        if not isinstance(self.goal_size, int) or self.goal_size < 0:
+        if not isinstance(self.goal_size, int) or isinstance(self.goal_size, bool) or self.goal_size < 0:
             raise PolicyContractError(f"expected a goal size >= 0, got {self.goal_size!r}")
+
+    def _check_types(self) -> None:
+        for name in ("value_max", "full_steering_rad", "wheelbase_m", "steering_ratio", "mean", "std"):
+            value = getattr(self, name)
+            for number in value if isinstance(value, tuple) else (value,):
+                # A boolean counts as a number in Python.
+                if number is not None and (isinstance(number, bool) or not isinstance(number, Real)):
+                    raise PolicyContractError(f"{name}: expected a number, got {number!r}")
+        for name in ("stateless", "differentiable"):
+            if not isinstance(getattr(self, name), bool):
+                raise PolicyContractError(f"{name}: expected true or false, got {getattr(self, name)!r}")
 
     def _check_input(self) -> None:
         for name in ("mean", "std"):
@@ -232,9 +245,7 @@ class PolicyContract:
             for name in ("mean", "std"):
                 if name in values:
                     given = values[name]
-                    values[name] = tuple(
-                        float(v) for v in ([given] if isinstance(given, int | float) else given)
-                    )
+                    values[name] = tuple(given) if isinstance(given, list | tuple) else (given,)
             return cls(**values)
         except (TypeError, ValueError) as error:
             raise PolicyContractError(f"{source}: {error}") from error
@@ -251,14 +262,13 @@ def declaration_beside(path: Path, embedded: str | None, **implied: Any) -> Poli
     beside = path.with_name(path.name + ".policy.yaml")
     try:
         if beside.is_file():
-            declared = yaml.safe_load(beside.read_text(encoding="utf-8"))
-            return PolicyContract.from_dict(declared, str(beside), **implied)
+            return PolicyContract.from_dict(read_yaml(beside).data, str(beside), **implied)
         if embedded:
-            return PolicyContract.from_dict(json.loads(embedded), str(path))
-    except (yaml.YAMLError, json.JSONDecodeError) as error:
-        raise PolicyContractError(
-            f"cannot read the declaration of {path}: {' '.join(str(error).split())}"
-        ) from error
+            return PolicyContract.from_dict(parse_json(embedded, str(path)), str(path), **implied)
+    except PolicyContractError:
+        raise
+    except ConfigError as error:
+        raise PolicyContractError(f"cannot read the declaration of {path}: {error}") from error
     raise PolicyContractError(
         f"{path} says nothing about its colours, range and unit; write {beside.name} beside it (see docs/policies.md)"
     )

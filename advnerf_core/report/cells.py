@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 
+from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.report.evidence.kept import KeptDrive
 from advnerf_core.report.reference import Domain
@@ -138,8 +138,8 @@ def read_cell(path: Path) -> CellResult:
         CellError: It is not there, not JSON, or not a cell's.
     """
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        data = read_json(path)
+    except (OSError, ValueError) as error:
         raise CellError(f"{path}: cannot be read: {error}; remove it to run the cell again") from None
     return cell_from(data, str(path))
 

@@ -15,6 +15,7 @@ from pathlib import Path
 import torch
 
 from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
+from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.memory import RETURNS_WHAT_IS_FREED, peak_mib, restart_peak
 from advnerf_core.policies.pilotnet import load_policy
@@ -32,7 +33,7 @@ HORIZONS = (50, 200, 400)
 def measure(experiment: Experiment, folder: Path, report: Report) -> tuple[MemoryRow, ...]:
     """Measure the horizons that are not measured yet; kept in ``memory.json`` so that a stopped report goes on."""
     kept = folder / "memory.json"
-    rows: dict[str, float] = json.loads(kept.read_text()) if kept.exists() else {}
+    rows: dict[str, float] = read_json(kept) if kept.exists() else {}
     for index, ticks in enumerate(HORIZONS):
         report(index / len(HORIZONS), f"memory of the adjoint at T = {ticks}")
         if str(ticks) not in rows:

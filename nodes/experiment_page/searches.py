@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 
 from advnerf_core.attack.artifact import COLOURS, MESH_TEXTURE, AttackFileError, face_texture, load_attack
+from advnerf_core.documents import read_json
 from advnerf_core.places import open_tensors
 
 ATTACK, SEARCHED, STATE = "attack.safetensors", "surrogate.json", "state.safetensors"
@@ -64,7 +65,7 @@ def read_search(folder: Path, state: str = STATE) -> Search | None:
 @lru_cache(maxsize=512)
 def _finished(file: Path, changed_ns: int) -> tuple[float, ...]:
     del changed_ns  # a changed file is another entry of the cache
-    return tuple(round(float(each), 3) for each in json.loads(file.read_text())["curve_total_cte_m"])
+    return tuple(round(float(each), 3) for each in read_json(file)["curve_total_cte_m"])
 
 
 @lru_cache(maxsize=64)

@@ -16,8 +16,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
-import yaml
-
+from advnerf_core.documents import dump_yaml, read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.places import private_folder, require_utf8
 from nodes.launching.child import Child
@@ -132,11 +131,11 @@ class Launch:
         self._impatient = self._impatient or kill
 
     def _write_configuration(self) -> None:
-        resolved = yaml.safe_dump(self.plan.resolved, sort_keys=False)
+        resolved = dump_yaml(self.plan.resolved)
         write_atomically(self.run_dir / RESOLVED_NAME, resolved)
         for name, child in self._children.items():
             document = node_document(self.plan.documents[name])
-            write_atomically(child.config, yaml.safe_dump(document, sort_keys=False))
+            write_atomically(child.config, dump_yaml(document))
 
     def _supervise(self) -> None:
         try:
@@ -276,7 +275,7 @@ def active_launches() -> list[dict[str, Any]]:
     found = []
     for card in sorted(card for folder in user_folders() for card in (folder / "active").glob("*.json")):
         try:
-            launch = json.loads(card.read_text(encoding="utf-8"))
+            launch = read_json(card)
             if is_running(Path(launch["run_dir"])):
                 found.append(launch)
         except (OSError, ValueError, KeyError):

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from advnerf_core.documents import parse_yaml
+from advnerf_core.documents import read_yaml
 from nodes.launching.launch import active_launches, is_running
 from nodes.runtime.bus import Bus, Received
 from nodes.runtime.clock import NS_PER_S
@@ -77,7 +77,7 @@ def _launched(run_dir: Path) -> list[str]:
     try:
         if not is_running(run_dir):
             return []
-        resolved = parse_yaml((run_dir / RESOLVED_NAME).read_text(encoding="utf-8"), RESOLVED_NAME).data
+        resolved = read_yaml(run_dir / RESOLVED_NAME).data
         return [name for name, entry in resolved["nodes"].items() if entry.get("if", True)]
     except FileNotFoundError:
         return []

@@ -15,10 +15,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import yaml
 from pydantic import BaseModel
 
-from advnerf_core.documents import Document, parse_yaml
+from advnerf_core.documents import Document, decode_text, dump_yaml, parse_yaml
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.run_module import search_working_folder_last
 from advnerf_core.strict import validate
@@ -108,7 +107,7 @@ def _launch_of_bag(bag: Path, choice: Choice, folder: Path) -> Path:
             f"expected {RESOLVED_NAME} attached to {bag}, found none; give the launch file with --launch FILE"
         )
     source = f"{bag}:{RESOLVED_NAME}"
-    data = parse_yaml(attachments[RESOLVED_NAME].decode("utf-8", "replace"), source).data
+    data = parse_yaml(decode_text(attachments[RESOLVED_NAME], source), source).data
     nodes = data.get("nodes") if isinstance(data, dict) else None
     if not isinstance(nodes, dict):
         raise ConfigError(f"{source}: expected a launch file with keys name and nodes")
@@ -122,7 +121,7 @@ def _launch_of_bag(bag: Path, choice: Choice, folder: Path) -> Path:
             )
     files = _put_down(bag, attachments, folder / "attachments")
     kept = {name: _found_again(nodes[name], files) for name in choice.nodes}
-    text = yaml.safe_dump({"name": str(data.get("name", "replay")), "nodes": kept}, sort_keys=False)
+    text = dump_yaml({"name": str(data.get("name", "replay")), "nodes": kept})
     file = folder / RESOLVED_NAME
     file.write_text(text, encoding="utf-8")
     return file

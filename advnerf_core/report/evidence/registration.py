@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError
 
+from advnerf_core.documents import read_json
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.driving.path import Path
 from advnerf_core.errors import AdvnerfError
@@ -188,7 +189,7 @@ def read_registration(folder: FilePath) -> Registration | None:
     if not file.exists():
         return None
     try:
-        return Registration.model_validate_json(file.read_text(encoding="utf-8"))
+        return Registration.model_validate(read_json(file))
     except (OSError, UnicodeDecodeError, ValidationError) as error:
         text = error.errors(include_url=False)[0]["msg"] if isinstance(error, ValidationError) else str(error)
         raise RegistrationError(
@@ -206,7 +207,7 @@ def read_withdrawn(folder: FilePath) -> dict[str, str]:
     if not file.exists():
         return {}
     try:
-        found = json.loads(file.read_text(encoding="utf-8"))
+        found = read_json(file)
         if not all(isinstance(each, str) and each for pair in found.items() for each in pair):
             raise ValueError("expected a reason for each scenario")
     except (OSError, ValueError, AttributeError) as error:

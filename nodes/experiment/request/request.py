@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from advnerf_core.attack.methods import METHODS, alternatives, method_name
-from advnerf_core.documents import Document, parse_yaml, read_yaml
+from advnerf_core.documents import Document, dump_yaml, parse_yaml, read_yaml
 from advnerf_core.geometry import Array, make_transform, rotation_z
 from advnerf_core.places import expanded
 from advnerf_core.policies.load import is_factory
@@ -294,11 +294,7 @@ def parse_request(
 
 def request_text(request: AttackRequest) -> str:
     """YAML text from which `parse_request` makes the same request on the same machine."""
-    import yaml
-
-    return yaml.safe_dump(
-        request.model_dump(mode="json"), sort_keys=False, default_flow_style=None, width=120
-    )
+    return dump_yaml(request.model_dump(mode="json"), default_flow_style=None, width=120)
 
 
 def _resolve(document: Document, folder: Path, overrides: Sequence[str]) -> AttackRequest:

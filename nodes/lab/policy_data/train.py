@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 
+from advnerf_core.documents import read_json
 from advnerf_core.driving.expert import Expert
 from advnerf_core.files import write_atomically
 from advnerf_core.learning.fit import FitConfig, fit, mean_absolute_error
@@ -128,7 +129,7 @@ def _cut(part: Part, store: FrameStore, work: Path, report: Report) -> dict[str,
         recording = part.cut()
         write_atomically(record, json.dumps(recording.counts) + "\n")
         store.append(_shard(part), recording.frames)
-    return {reason: int(count) for reason, count in json.loads(record.read_text()).items()}
+    return {reason: int(count) for reason, count in read_json(record).items()}
 
 
 def _clone(
