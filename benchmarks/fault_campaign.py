@@ -31,7 +31,7 @@ from benchmarks.operator import LiveOperator
 from benchmarks.processes import end
 from benchmarks.results import REPOSITORY, record_row
 from hardware.emulators.vesc_emulator import read_wire_log
-from nodes.runtime.messages import encode, pose_message
+from nodes.runtime.messages import pose_message
 
 COMMAND = "python -m benchmarks.fault_campaign"
 FOLDER = REPOSITORY / "runs" / "fault_campaign"
@@ -121,11 +121,11 @@ class Graph:
 
     def put_back(self, start: tuple[float, float, float] = START) -> None:
         """Lift the car to a start pose (x [m], y [m], yaw [rad]), once it stands."""
-        pose = encode(pose_message(planar_pose(*start), time.time_ns()))
         offset, operator = self.wire_size(), self.operator
 
         def placed() -> bool:
-            operator.bus.publish("/twin/reset", pose)
+            # Stamped anew each time: the twin refuses an old request.
+            operator.bus.publish("/twin/reset", pose_message(planar_pose(*start), time.time_ns()))
             operator.watch(0.2)
             return any(row[0].name == "PLACED" for row in self.wire(offset))
 

@@ -17,6 +17,7 @@ from hardware.emulators.vicon_emulator import ViconEmulator
 from nodes.runtime.node import NodeContext
 from nodes.runtime.paths import bus_folder
 from nodes.runtime.process import run_node_main
+from nodes.runtime.twin_port import claim_twins_port
 from nodes.twin import TwinConfig, TwinNode
 
 # To the side, and inside the fence of the track's straights: the pose check must stop the car, not the fence.
@@ -78,9 +79,10 @@ def _listen(lab: FaultyLab) -> None:
 
 def build(config: TwinConfig, context: NodeContext) -> TwinNode:
     """The twin node, with a thread that obeys standard input."""
+    claim = claim_twins_port(context.run_dir)
     lab = LiveLab(config, context.run_dir, bus_folder(context.run_dir))
     threading.Thread(target=_listen, args=(FaultyLab(lab),), daemon=True).start()
-    return TwinNode(lab)
+    return TwinNode(lab, claim)
 
 
 if __name__ == "__main__":

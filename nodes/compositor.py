@@ -171,7 +171,7 @@ class CompositorNode(Node):
             self._interlock.heard(message, info)
             return []
         if topic == ATTACK_SWITCH:
-            self._switch.heard(message)
+            self._switch.heard(message, now.real_ns)
             return []
         if topic != self._image_topic:
             self._poses[topic].add(stamp_ns(message), pose_matrix(message))

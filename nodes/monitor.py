@@ -188,7 +188,7 @@ class MonitorNode(Node):
             self._armed, self._safety_reason = bool(message.armed), str(message.reason)
             self._state_ns = info.publish_mono_ns
         elif topic == ATTACK_SWITCH:
-            self._switch.heard(message)
+            self._switch.heard(message, now.real_ns)
         elif self._attack is None or message.sha256 != self._attack_sha256 or self._assembler.receiving:
             received, trouble = self._assembler.add(message, info.instance_id)
             if trouble:

@@ -1,8 +1,9 @@
 """The motor node: sends drive commands to the VESC, and stops the car unless it keeps receiving fresh commands.
 
 It obeys only commands younger than a limit. If commands stop, are not finite, or come from a restarted safety node, it brakes and
-latches: it then ignores every command to move until it receives an explicit stop, which the safety node sends only while disarmed. So
-a process that dies, hangs or resumes cannot make the car move without a new arming.
+latches: it then ignores every command to move until it receives a stop while the safety node reports that the car is disarmed. So a
+process that dies, hangs or resumes cannot make the car move without a new arming. The same holds after a suspend of the computer, a
+step of its clock, or a pause of this process.
 
 The node is not ready, and the car cannot be armed, until the controller has sent telemetry and reported a short enough time-out (if
 its firmware can), and the front wheels were confirmed to turn.
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -27,11 +29,13 @@ from hardware.motor.vesc_settings import TimeoutSettings
 from nodes.control.command_gate import Brake, CommandGate, Drive, GateSettings, GateState
 from nodes.control.motor_reports import diagnostics_message
 from nodes.control.motor_watch import ControllerWatch
+from nodes.control.stamps import COMMAND_AGE_S, REQUEST_AGE_S, ClockWatch, stamp_age_s, stamp_problem
 from nodes.control.steering_check import CheckSettings
 from nodes.runtime.clock import NS_PER_S
-from nodes.runtime.messages import header, ns_from_stamp, types
+from nodes.runtime.messages import header, stamp_ns, types
 from nodes.runtime.node import ACTIVE, FAULT, READY, STARTING, MessageInfo, Node, NodeContext, Now, Out
 from nodes.runtime.process import run_node_main
+from nodes.runtime.twin_port import is_twins_port
 
 _TICK_RATE_HZ = 50.0
 _RETRY_S = 0.5
@@ -45,7 +49,8 @@ class MotorConfig(StrictModel):
     Attributes:
         port: Serial device; ``<run_dir>/vesc`` for the twin.
         calibration: Vehicle calibration file: gains and limits.
-        command_age_limit_s: Largest age of a command since its publication [s].
+        command_age_limit_s: Largest age of a command since its publication, and longest pause of this process [s].
+        stamp_age_limit_s: Largest age of the image or the pose that a command to move is based on [s].
         brake_current_a: Brake current of a stop [A].
         brake_ramp_s: Time over which the brake current rises from a third to its full value [s].
         brake_hold_s: Duration of braking, after which the motor is released [s].
@@ -62,6 +67,7 @@ class MotorConfig(StrictModel):
     port: str
     calibration: Path
     command_age_limit_s: float = Field(default=0.22, gt=0.0, le=0.25)
+    stamp_age_limit_s: float = Field(default=COMMAND_AGE_S, gt=0.0, le=0.55)
     brake_current_a: float = Field(default=20.0, gt=0.0, le=60.0)
     brake_ramp_s: float = Field(default=0.1, ge=0.0, le=0.5)
     brake_hold_s: float = Field(default=1.0, gt=0.0)
@@ -83,23 +89,34 @@ class MotorNode(Node):
         make_vesc: Makes a driver that is not open yet.
         wheelbase_m: Distance between the axles, for odometry [m].
         mono_ns: Monotonic time at the start [ns].
+        on_twins_port: Returns whether the port is the one that the twin of this run has made.
     """
 
-    subscriptions = ("/safety/drive", "/motor/check", "/vicon/car")
+    subscriptions = ("/safety/drive", "/safety/state", "/motor/check", "/vicon/car")
     publications = ("/motor/sent", "/motor/state", "/odom", "/diagnostics")
     tick_rate_hz = _TICK_RATE_HZ
 
     def __init__(
-        self, config: MotorConfig, make_vesc: Callable[[], Vesc], wheelbase_m: float, mono_ns: int
+        self,
+        config: MotorConfig,
+        make_vesc: Callable[[], Vesc],
+        wheelbase_m: float,
+        mono_ns: int,
+        on_twins_port: Callable[[], bool],
     ) -> None:
-        self._config = config
+        self._config, self._on_twins_port = config, on_twins_port
+        self._clock_watch = ClockWatch()
         self._vesc = make_vesc()
         wanted = TimeoutSettings(config.controller_timeout_ms, config.controller_brake_current_a)
         shown = CheckSettings(wheelbase_m, config.steering_angle_rad, config.steering_hold_s)
         self._watch = ControllerWatch(wanted, config.steering_check, shown)
         self._diagnosed_ns = 0
         settings = GateSettings(
-            config.command_age_limit_s, config.brake_current_a, config.brake_ramp_s, config.brake_hold_s
+            config.command_age_limit_s,
+            config.brake_current_a,
+            config.brake_ramp_s,
+            config.brake_hold_s,
+            config.stamp_age_limit_s,
         )
         self._gate = CommandGate(settings, mono_ns)
         self._link_error = "not connected yet"
@@ -118,29 +135,32 @@ class MotorNode(Node):
         def make() -> Vesc:
             return Vesc(config.port, car.vehicle_gains, limits, config.brake_current_a)
 
-        return cls(config, make, car.wheelbase_m, context.clock.now().mono_ns)
+        on_twins_port = partial(is_twins_port, context.run_dir, config.port)
+        return cls(config, make, car.wheelbase_m, context.clock.now().mono_ns, on_twins_port)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """Execute or refuse a command, or note a pose during the steering check."""
+        """Execute or refuse a command, or note a report of the safety node, or a pose during the steering check."""
+        self._watch_clocks(now)
+        age_s = stamp_age_s(stamp_ns(message), now.real_ns)
+        if topic == "/safety/state":
+            self._gate.heard_safety(bool(message.armed), info)
+            return []
         if topic == "/vicon/car":
-            self._watch.see(message, now.mono_ns)
+            if not stamp_problem(age_s, self._config.stamp_age_limit_s):
+                self._watch.see(message, now.mono_ns)
             return []
         if topic == "/motor/check":
-            busy = "the car drives; disarm first" if self._gate.state is GateState.DRIVING else ""
-            self._watch.obey(
-                message,
-                busy or ("" if self._vesc.is_open else f"no controller: {self._link_error}"),
-                now.mono_ns,
-            )
+            self._watch.obey(message, self._refusal(age_s), now.mono_ns)
             return self._diagnostics(now, at_once=True)
         drive = message.drive
-        action = self._gate.command(float(drive.speed), float(drive.steering_angle), info, now.mono_ns)
+        action = self._gate.command(float(drive.speed), float(drive.steering_angle), info, now.mono_ns, age_s)
         if isinstance(action, Drive):
-            self._origin_stamp_ns = ns_from_stamp(message.header.stamp)
+            self._origin_stamp_ns = stamp_ns(message)
         return self._act(action, now, first=True)
 
     def tick(self, now: Now) -> list[Out]:
         """Continue the last command, stop if it is stale, read telemetry, and reconnect if needed."""
+        self._watch_clocks(now)
         if not self._vesc.is_open:
             self._connect(now)
         self._watch.check.tick(now.mono_ns)
@@ -174,6 +194,19 @@ class MotorNode(Node):
         """Brake until the car stands, then release the motor and close the port."""
         self._vesc.close()
 
+    def _watch_clocks(self, now: Now) -> None:
+        if problem := self._clock_watch.problem(now):
+            self._gate.latch(problem, now.mono_ns)
+
+    def _refusal(self, age_s: float) -> str:
+        """Why no request about the steering check can be executed; empty if it can."""
+        if self._gate.state is GateState.DRIVING:
+            return "the car drives; disarm first"
+        if not self._vesc.is_open:
+            return f"no controller: {self._link_error}"
+        problem = stamp_problem(age_s, REQUEST_AGE_S)
+        return f"the request does not count: {problem}" if problem else ""
+
     def _show_wheels(self, now: Now) -> None:
         steering_rad = self._watch.check.steering_rad(now.mono_ns)
         if steering_rad is None or self._link_error or self._gate.state is GateState.DRIVING:
@@ -195,7 +228,7 @@ class MotorNode(Node):
             self._link_error = str(error)
             return
         self._link_error, self._linked_once = "", True
-        self._watch.connected(firmware)
+        self._watch.connected(firmware, self._on_twins_port())
         # After a connection, the car is stopped first, whatever it did before.
         self._gate.brake_again(now.mono_ns)
 
@@ -228,9 +261,9 @@ class MotorNode(Node):
 
     def _report(self, sent: Sent) -> Out:
         driving = self._gate.state is GateState.DRIVING
-        stamp_ns = self._origin_stamp_ns if driving else sent.write_real_ns
+        origin_ns = self._origin_stamp_ns if driving else sent.write_real_ns
         message = types.MotorSent(
-            header=header(stamp_ns, "car"),
+            header=header(origin_ns, "car"),
             serial_write_mono_ns=sent.write_mono_ns,
             serial_write_real_ns=sent.write_real_ns,
             speed_mps=sent.speed_mps,
@@ -240,7 +273,7 @@ class MotorNode(Node):
             brake_current_a=sent.brake_current_a or 0.0,
             braking=not driving,
             reason=self._gate.reason,
-            peer=str(self._vesc.firmware),
+            peer=self._watch.peer,
         )
         return Out("/motor/sent", message)
 

@@ -1,7 +1,7 @@
 """The player node: publishes the messages of a bag on the bus, at the recorded speed or another.
 
-Bytes and capture stamps are those of the recording. Publish times are new, so that receivers see fresh messages. Status messages and
-requests (to arm, for an attack) are played only if requested, because a recording must not arm a car.
+Bytes and capture stamps are those of the recording. Publish times are new, so that receivers see fresh messages. Topics that the topic
+table marks ``replay: never`` are not played, under no name: a recording must not move or arm a car.
 
 The player can pause, resume, step message by message, change its speed and stop, controlled by keys in a terminal and by requests on
 ``/player/control``, which it answers on ``/player/state``. ``/clock`` has the position in the recording.
@@ -9,7 +9,7 @@ The player can pause, resume, step message by message, change its speed and stop
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +26,10 @@ from nodes.runtime.messages import header, stamp_from_ns, types
 from nodes.runtime.node import ACTIVE, READY, Inbox, MessageInfo, Node, NodeContext, Now, Out, ReaderThread
 from nodes.runtime.process import run_node_main
 from nodes.runtime.requests import Answer, Answers
-from nodes.runtime.topics import STATUS_PREFIX, type_of_topic
+from nodes.runtime.topics import may_replay, type_of_topic
 from nodes.runtime.topics import topic as topic_row
 
 _CONTROL, _STATE, _CLOCK = "/player/control", "/player/state", "/clock"
-_STAYS = ("/arm", "/attack/request", "/attack/cancel", _CONTROL, _STATE, _CLOCK)
 # Messages are published at the first tick after they are due, on average up to 2.5 ms late.
 _TICK_HZ = 200.0
 _FASTER = 1.25
@@ -47,7 +46,7 @@ class PlayerConfig(StrictModel):
         loop: Start over at the end.
         start_offset_s: Time to skip at the beginning [s].
         duration_s: Time to play from there [s].
-        topics: Topics to play; none means all except statuses and requests.
+        topics: Topics to play; none means all that may be played.
         remap: New names of topics, by recorded name.
         paused: Start paused.
         clock_hz: Rate of ``/clock`` [Hz]; none for never.
@@ -89,6 +88,7 @@ class PlayerNode(Node):
         self._names = _renamed(config, self._topics)
         unknown = [topic.name for topic in self._info.topics if type_of_topic(topic.name) is None]
         self._left_out = [] if config.topics else [name for name in unknown if name not in self._topics]
+        self._kept = [] if config.topics else [t.name for t in self._info.topics if not may_replay(t.name)]
         self._types = {recorded: topic_row(played).type for recorded, played in self._names.items()}
         require_readable(config.bag, self._types)
         self._played_names = tuple(self._names[topic] for topic in self._topics)
@@ -176,6 +176,8 @@ class PlayerNode(Node):
         words = [f"{self._played} messages played"]
         if self._left_out:
             words.append(f"not in the topic table: {', '.join(self._left_out)}")
+        if self._kept:
+            words.append(f"never played: {', '.join(self._kept)}")
         if self._head is not None and self._head.paused:
             words.append("paused")
         return ACTIVE, "; ".join([*words, *filter(None, [self._trouble])])
@@ -279,6 +281,7 @@ def _renamed(config: PlayerConfig, topics: list[str]) -> dict[str, str]:
                 f"cannot play {old} as {new}, because {old} is not played; played are {', '.join(topics)}"
             )
     names = {topic: config.remap.get(topic, topic) for topic in topics}
+    _require_free(names.values())
     for name in names.values():
         topic_row(name)  # only topics of the table can be published
         if len(sources := [topic for topic, played in names.items() if played == name]) > 1:
@@ -290,20 +293,31 @@ def _renamed(config: PlayerConfig, topics: list[str]) -> dict[str, str]:
 
 def _choose_topics(config: PlayerConfig, recorded: list[str]) -> list[str]:
     if config.topics is None:
-        stays = [name for name in recorded if name in _STAYS or name.startswith(STATUS_PREFIX)]
+        _require_free(name for name in recorded if name in config.remap)
         chosen = [
-            name for name in recorded if name not in stays and (type_of_topic(name) or name in config.remap)
+            name
+            for name in recorded
+            if may_replay(name) and (type_of_topic(name) is not None or name in config.remap)
         ]
     else:
         chosen = list(dict.fromkeys(config.topics))
         if unknown := [name for name in chosen if name not in recorded]:
             raise BagError(f"{config.bag} has no topic {', '.join(unknown)}; it has {', '.join(recorded)}")
+        _require_free(chosen)
     if not chosen:
         raise BagError(
             f"{config.bag} has nothing to play; it has {', '.join(recorded) or 'no message'}. Only topics of the topic table can be "
             "played; rename others with --remap OLD:=NEW"
         )
     return chosen
+
+
+def _require_free(names: Iterable[str]) -> None:
+    if never := [name for name in names if not may_replay(name)]:
+        raise BagError(
+            f"expected topics that a recording may publish, got {', '.join(never)}: a recording must not move or arm a car, under no name."
+            " Run nodes over these messages with advnerf replay, which has no bus"
+        )
 
 
 def main() -> int:

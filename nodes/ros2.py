@@ -16,6 +16,7 @@ from pydantic import Field, model_validator
 
 from advnerf_core.strict import StrictModel
 from calibration.schema import VehicleCalibration, load_calibration
+from nodes.control.stamps import COMMAND_AGE_S, stamp_age_s, stamp_problem
 from nodes.linking.link import on_our_clock
 from nodes.linking.ros2.answers import stamp_of_cdr
 from nodes.linking.ros2.carried import Rate, Sent, Taken
@@ -24,7 +25,7 @@ from nodes.linking.ros2.routes import SAFETY_DRIVE, SendRoute, TakeRoute, check_
 from nodes.linking.ros2.samples import Heard
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError, MessageError, SecurityError
-from nodes.runtime.messages import decode, drive_message, encode
+from nodes.runtime.messages import decode, drive_message, encode, stamp_ns
 from nodes.runtime.node import ACTIVE, FAULT, READY, Inbox, MessageInfo, Node, NodeContext, Now, Out
 from nodes.runtime.process import run_node_main
 from nodes.runtime.topics import topic as topic_row
@@ -267,7 +268,11 @@ class Ros2Node(Node):
             if taken.answers is not None and taken.route.answers == topic:
                 taken.answers.sent(stamp_of_cdr(info.raw), info.publish_mono_ns)
         if topic == SAFETY_DRIVE:
-            moves = float(decode(sent.route.table_type, info.raw).drive.speed) != 0.0
+            drive = decode(sent.route.table_type, info.raw)
+            moves = float(drive.drive.speed) != 0.0
+            if moves and stamp_problem(stamp_age_s(stamp_ns(drive), self._now_real_ns), COMMAND_AGE_S):
+                self._counts[f"stale {topic}"] += 1
+                return
             self._driven_ns, self._stops_left = (info.publish_mono_ns if moves else None), 0
         if self._side.write(number, sent.cdr(info.raw)):
             self._counts[f"sent {topic}"] += 1

@@ -17,9 +17,18 @@ from nodes.control.arming_gates import ClockGate, HandGate, inside, require_simp
 from nodes.control.arming_requests import ArmRequests
 from nodes.control.pose_check import MotionBounds, PoseCheck, PoseGate
 from nodes.control.stall_check import StallGate, StallLimits
+from nodes.control.stamps import (
+    AHEAD_LIMIT_S,
+    REQUEST_AGE_S,
+    ClockWatch,
+    captured_mono_ns,
+    stamp_age_s,
+    stamp_problem,
+)
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError, MessageError
-from nodes.runtime.messages import drive_message, header, ns_from_stamp, pose_matrix, types
+from nodes.runtime.messages import drive_message, header, pose_matrix, types
+from nodes.runtime.messages import stamp_ns as stamp_of
 from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out
 from nodes.runtime.process import run_node_main
 from nodes.runtime.requests import asked_mono_ns
@@ -161,6 +170,7 @@ class SafetyNode(Node):
     ) -> None:
         self._arming = Arming(limits, hand or HandGate(), clocks or ClockGate(), (poses, stall))
         self._requests = ArmRequests(self._arming)
+        self._clock_watch = ClockWatch()
         self._poses, self._stall = poses, stall
         self._topic_of = {f"/{driver}/drive": driver for driver in limits.drivers}
         self._stopped_ns = 0
@@ -192,6 +202,7 @@ class SafetyNode(Node):
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Note a message. A command is forwarded if it may pass."""
         arming = self._arming
+        self._watch_clocks(now)
         if topic in self._topic_of:
             return self._pass_on(self._topic_of[topic], message, info, now)
         if topic == "/teleop/state":
@@ -199,7 +210,8 @@ class SafetyNode(Node):
         if topic == "/arm":
             return self._obey(message, info, now)
         if topic == "/clock/offset":
-            arming.clocks.heard(str(message.peer), float(message.offset_s), float(message.error_s), info)
+            if not stamp_problem(stamp_age_s(stamp_of(message), now.real_ns), REQUEST_AGE_S):
+                arming.clocks.heard(str(message.peer), float(message.offset_s), float(message.error_s), info)
         elif topic == "/camera/camera_info":
             arming.heard_camera(info)
         elif topic == "/vicon/car":
@@ -207,6 +219,7 @@ class SafetyNode(Node):
         elif topic == "/motor/sent":
             arming.peer = str(message.peer)
         elif topic == "/motor/state":
+            arming.heard_motor(info)
             self._stall.motor(float(message.speed_mps), now.mono_ns)
         elif topic.startswith(STATUS_PREFIX):
             arming.heard_status(
@@ -217,6 +230,7 @@ class SafetyNode(Node):
 
     def tick(self, now: Now) -> list[Out]:
         """Run the checks, and send a stop at every tick while disarmed."""
+        self._watch_clocks(now)
         self._arming.check(now.mono_ns)
         outs = self._news(now)
         if not self._arming.armed and now.mono_ns - self._stopped_ns >= _STOP_PERIOD_S * NS_PER_S:
@@ -236,24 +250,34 @@ class SafetyNode(Node):
         """Report how often it stopped the car."""
         return {"disarmed": self._stops, "impossible_poses": self._poses.count}
 
+    def _watch_clocks(self, now: Now) -> None:
+        if problem := self._clock_watch.problem(now):
+            # Also while disarmed: requests from before are void.
+            self._arming.disarm(problem, now.mono_ns)
+
     def _see_car(self, message: Any, info: MessageInfo, now: Now) -> None:
+        limit_s = self._arming.limits.pose_age_s + AHEAD_LIMIT_S
+        age_s, ahead_s = stamp_age_s(stamp_of(message), now.real_ns), self._arming.clocks.ahead_s(now.mono_ns)
+        if problem := stamp_problem(age_s, limit_s, ahead_s):
+            self._poses.refuse(f"the car's pose does not count: {problem}", info)
+            return
         x_m, y_m = float(message.pose.position.x), float(message.pose.position.y)
         self._arming.heard_car(x_m, y_m, info)
         self._stall.pose(x_m, y_m, now.mono_ns)
         try:
-            self._poses.heard(ns_from_stamp(message.header.stamp), pose_matrix(message), info)
+            self._poses.heard(stamp_of(message), pose_matrix(message), info)
         except MessageError as error:
             self._poses.refuse(str(error), info)
 
     def _hand(self, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         speed, steering = float(message.speed_mps), float(message.steering_rad)
         passes = self._arming.heard_hand(
-            str(message.mode), bool(message.estop), speed, steering, info, now.mono_ns
+            str(message.mode), bool(message.estop), speed, steering, info, stamp_of(message), now
         )
         return self._news(now) + ([self._go(speed, steering, now.real_ns, now)] if passes else [])
 
     def _pass_on(self, driver: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        drive, capture_ns = message.drive, ns_from_stamp(message.header.stamp)
+        drive, capture_ns = message.drive, stamp_of(message)
         speed, steering = float(drive.speed), float(drive.steering_angle)
         if self._arming.heard_drive(speed, steering, capture_ns, info, now.mono_ns, now.real_ns, driver):
             return [self._go(speed, steering, capture_ns, now)]
@@ -265,13 +289,15 @@ class SafetyNode(Node):
 
     def _obey(self, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Execute a request to arm or disarm, and answer every repeat of it."""
-        ask_id, source, asked_ns = (
-            str(message.ask_id),
-            str(message.source),
-            min(asked_mono_ns(message, info), now.mono_ns),
-        )
+        ask_id, source, stamp_ns = str(message.ask_id), str(message.source), stamp_of(message)
+        asked_ns = min(asked_mono_ns(message, info), captured_mono_ns(stamp_ns, now), now.mono_ns)
         if message.arm:
-            self._requests.arm(ask_id, source, asked_ns, now.mono_ns)
+            age_s = min(
+                0.0, stamp_age_s(stamp_ns, now.real_ns)
+            )  # the age itself is judged with the other conditions
+            problem = stamp_problem(age_s, 0.0, self._arming.clocks.ahead_s(now.mono_ns))
+            refusal = f"the request does not count: {problem}" if problem else ""
+            self._requests.arm(ask_id, source, asked_ns, now.mono_ns, refusal)
         else:
             self._requests.disarm(ask_id, f"disarmed by {source}: {message.reason}", asked_ns, now.mono_ns)
         self._arming.check(now.mono_ns)

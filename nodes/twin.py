@@ -6,16 +6,18 @@ with which experiments move the car to a start pose. It is refused while the car
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TextIO
 
 from advnerf_core.geometry import yaw_of
 from hardware.emulators.live import LiveLab, LiveLabConfig
 from hardware.errors import HardwareError
+from nodes.control.stamps import REQUEST_AGE_S, stamp_age_s, stamp_problem
 from nodes.runtime.errors import MessageError
-from nodes.runtime.messages import pose_matrix
+from nodes.runtime.messages import pose_matrix, stamp_ns
 from nodes.runtime.node import ACTIVE, MessageInfo, Node, NodeContext, Now, Out
 from nodes.runtime.paths import bus_folder
 from nodes.runtime.process import run_node_main
+from nodes.runtime.twin_port import claim_twins_port
 
 RESET_TOPIC = "/twin/reset"
 
@@ -30,19 +32,23 @@ class TwinNode(Node):
     subscriptions = (RESET_TOPIC,)
     tick_rate_hz = 10.0
 
-    def __init__(self, lab: LiveLab) -> None:
-        self._lab = lab
+    def __init__(self, lab: LiveLab, claim: TextIO) -> None:
+        self._lab, self._claim = lab, claim
         self._text = ""
         self._resets = self._refused = 0
 
     @classmethod
     def build(cls, config: TwinConfig, context: NodeContext) -> TwinNode:
         """Build the lab. Returns when its devices are available."""
-        return cls(LiveLab(config, context.run_dir, bus_folder(context.run_dir)))
+        # Before the serial port exists: a motor node may open it at once, and must see whose it is.
+        claim = claim_twins_port(context.run_dir)
+        return cls(LiveLab(config, context.run_dir, bus_folder(context.run_dir)), claim)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """Move the car to the pose of a ``PoseStamped``."""
+        """Move the car to the pose of a ``PoseStamped``, if it was asked for a moment ago."""
         try:
+            if problem := stamp_problem(stamp_age_s(stamp_ns(message), now.real_ns), REQUEST_AGE_S):
+                raise MessageError(problem)
             T = pose_matrix(message)
             self._lab.place(float(T[0, 3]), float(T[1, 3]), yaw_of(T))
             self._resets += 1
@@ -69,6 +75,7 @@ class TwinNode(Node):
     def close(self) -> None:
         """Stop the lab."""
         self._lab.close()
+        self._claim.close()
 
 
 def main() -> int:

@@ -194,7 +194,7 @@ def bag_play(
     ] = False,
     run_dir: RunDir = None,
 ) -> None:
-    """Play a bag to the nodes of a run folder. Status and request topics are played only if --topics names them.
+    """Play a bag to the nodes of a run folder. What moves or arms a car is never played.
 
     Keys in the terminal: space pauses and resumes, right arrow or s steps, + and - change the speed, q quits.
     From another terminal: advnerf bag control pause|resume|toggle|step [N]|rate X|stop.

@@ -11,12 +11,13 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from nodes.control.arming_gates import ClockGate, HandGate, edge_distance_m, inside
-from nodes.runtime.clock import NS_PER_S
+from nodes.control.stamps import captured_mono_ns, stamp_age_s, stamp_problem
+from nodes.runtime.clock import NS_PER_S, Now
 from nodes.runtime.requests import ESTOP_LATCHED
+from nodes.runtime.twin_port import is_twin
 from nodes.runtime.wire import MessageInfo
 
 OPERATOR = "operator"
-TWIN_PEER = "TWIN"
 _ALIVE_STATES = ("ready", "active")
 
 
@@ -32,6 +33,7 @@ class ArmingLimits:
         drive_age_s: Largest age of the active driver's newest command since publication [s].
         image_age_s: Largest age of the newest camera image since publication, and of the image that a command is based on [s].
         pose_age_s: Largest age of the car's newest pose since publication [s].
+        motor_age_s: Largest age of the motor node's newest telemetry since publication [s].
         status_age_s: Largest age of a node's newest status [s].
         held_up_s: Longest pause of this process; a longer one disarms the car [s].
         speed_mps: Largest magnitude of a commanded speed [m/s].
@@ -46,6 +48,7 @@ class ArmingLimits:
     drive_age_s: float = 0.22
     image_age_s: float = 0.25
     pose_age_s: float = 0.2
+    motor_age_s: float = 0.2
     status_age_s: float = 1.0
     held_up_s: float = 0.2
     speed_mps: float = 1.0
@@ -71,7 +74,7 @@ class _Source:
 
     def heard(self, info: MessageInfo) -> None:
         self.restarted |= self.instance_id is not None and info.instance_id != self.instance_id
-        self.publish_ns, self.instance_id = info.publish_mono_ns, info.instance_id
+        self.publish_ns, self.instance_id = info.fresh_mono_ns, info.instance_id
 
     def age_s(self, mono_ns: int) -> float:
         return math.inf if self.publish_ns is None else (mono_ns - self.publish_ns) / NS_PER_S
@@ -80,6 +83,7 @@ class _Source:
 @dataclass
 class _Driver(_Source):
     capture_ns: int = 0
+    refused: str = ""
 
 
 @dataclass
@@ -121,6 +125,7 @@ class Arming:
     _last_ns: int | None = None
     _camera: _Source = field(default_factory=_Source)
     _car: _Source = field(default_factory=_Source)
+    _motor: _Source = field(default_factory=_Source)
     _drivers: dict[str, _Driver] = field(default_factory=dict)
     _nodes: dict[str, _NodeStatus] = field(default_factory=dict)
 
@@ -137,6 +142,10 @@ class Arming:
         """Note a measured position of the car [m]."""
         self._car.heard(info)
         self._position_m = (x_m, y_m)
+
+    def heard_motor(self, info: MessageInfo) -> None:
+        """Note telemetry of the motor node."""
+        self._motor.heard(info)
 
     def heard_status(self, name: str, state: str, text: str, info: MessageInfo) -> None:
         """Note the status of a node."""
@@ -157,23 +166,27 @@ class Arming:
     ) -> bool:
         """Note a command of a driver. Returns whether the command may pass."""
         self._check_held_up(mono_ns)
-        fault = self._command_fault(speed_mps, steering_rad) or self._capture_fault(capture_real_ns, real_ns)
-        source = self._drivers[driver]
-        if capture_real_ns > source.capture_ns:
+        source, now = self._drivers[driver], Now(mono_ns, real_ns)
+        source.refused = (
+            self._command_fault(speed_mps, steering_rad)
+            or self._capture_fault(capture_real_ns, now)
+            or self._order_fault(source, driver, capture_real_ns)
+        )
+        if source.refused:
+            if self.armed and driver == self.driver and not self.hand.drives:
+                self.disarm(source.refused, mono_ns)
+            return False
+        if capture_real_ns == source.capture_ns:
             # A command based on an image that was already used does not count as fresh: with a frozen camera, the policy
             # repeats its command.
-            source.heard(info)
-            source.capture_ns = capture_real_ns
-        elif not fault:
             return False
+        # Only a command that is accepted moves the comparison: a stamp of a wrong clock must not lock out the right ones.
+        source.heard(info)
+        source.capture_ns = capture_real_ns
         order = self.limits.drivers
-        if not fault and (not self.armed or order.index(driver) < order.index(self.driver)):
+        if not self.armed or order.index(driver) < order.index(self.driver):
             self._give_way(driver, mono_ns)
-        if driver != self.driver or self.hand.drives:
-            return False
-        if fault and self.armed:
-            self.disarm(fault, mono_ns)
-        return not fault and self.check(mono_ns)
+        return driver == self.driver and not self.hand.drives and self.check(mono_ns)
 
     def heard_hand(
         self,
@@ -182,20 +195,31 @@ class Arming:
         speed_mps: float,
         steering_rad: float,
         info: MessageInfo,
-        mono_ns: int,
+        stamp_ns: int,
+        now: Now,
     ) -> bool:
         """Note a message of the teleop node. Returns whether its own command may pass.
 
         Pressing the button arms the car. After it is released, or after any other disarming, it must be pressed again. Only an
-        explicit request of the operator clears an e-stop.
+        explicit request of the operator clears an e-stop. A message whose stamp is not of a moment ago can only stop the car.
         """
+        mono_ns = now.mono_ns
         self._check_held_up(mono_ns)
-        began = self.hand.heard(mode, pressed_stop, info)
+        since_ns = min(captured_mono_ns(stamp_ns, now), info.fresh_mono_ns)
+        age_s = stamp_age_s(stamp_ns, now.real_ns)
+        began = False
+        if refused := stamp_problem(age_s, self.hand.age_limit_s, self.clocks.ahead_s(mono_ns)):
+            self.hand.refuse(f"the teleop node's message does not count: {refused}")
+        else:
+            began = self.hand.heard(mode, pressed_stop, info, since_ns)
         if pressed_stop:
             self._estop = ESTOP_LATCHED
             self.disarm(self._estop, mono_ns)
         elif began and self.hand.required:
-            self.arm(OPERATOR, info.publish_mono_ns, mono_ns, explicit=False)
+            self.arm(OPERATOR, since_ns, mono_ns, explicit=False)
+        if refused:
+            self.check(mono_ns)
+            return False
         if self.hand.drives and self.armed and (fault := self._command_fault(speed_mps, steering_rad)):
             self.disarm(fault, mono_ns)
         return self.check(mono_ns) and self.hand.drives
@@ -233,7 +257,7 @@ class Arming:
         if explicit and source == OPERATOR and not self.hand.pressed_stop:
             self._estop = ""
         self.driver = self._first_fresh(mono_ns)
-        if source != OPERATOR and TWIN_PEER not in self.peer.upper():
+        if source != OPERATOR and not is_twin(self.peer):
             refusal = (
                 f"expected source {OPERATOR!r} for a real car, got {source!r}; the motor's peer is {self.peer or 'unknown'},"
                 " not the twin. Arm with advnerf arm"
@@ -278,7 +302,8 @@ class Arming:
                 return problem
         for what, source, limit_s in self._sources():
             if (age_s := source.age_s(mono_ns)) > limit_s:
-                return f"{what} yet" if math.isinf(age_s) else f"{what} for {age_s:.2f} s"
+                why = f" ({source.refused})" if isinstance(source, _Driver) and source.refused else ""
+                return f"{what} yet{why}" if math.isinf(age_s) else f"{what} for {age_s:.2f} s{why}"
         return next(filter(None, (gate.problem(mono_ns) for gate in self.gates)), "") or self._fence_problem()
 
     def _sources(self) -> list[tuple[str, _Source, float]]:
@@ -286,6 +311,8 @@ class Arming:
         sources: list[tuple[str, _Source, float]] = [("no pose of the car", self._car, limits.pose_age_s)]
         if "camera" in limits.nodes:
             sources.insert(0, ("no camera image", self._camera, limits.image_age_s))
+        if "motor" in limits.nodes:
+            sources.append(("no telemetry from the motor node", self._motor, limits.motor_age_s))
         if not self.hand.drives:
             sources.append(
                 (f"no command from the {self.driver}", self._drivers[self.driver], limits.drive_age_s)
@@ -315,7 +342,7 @@ class Arming:
         return ""
 
     def _watched(self) -> list[_Source]:
-        return [self._camera, self._car, *self._drivers.values(), *self._nodes.values()]
+        return [self._camera, self._car, self._motor, *self._drivers.values(), *self._nodes.values()]
 
     def _first_fresh(self, mono_ns: int) -> str:
         fresh = [name for name, d in self._drivers.items() if d.age_s(mono_ns) <= self.limits.drive_age_s]
@@ -356,10 +383,18 @@ class Arming:
             return f"a command of {steering_rad:.2f} rad, the limit is {self.limits.steering_rad:.2f} rad"
         return ""
 
-    def _capture_fault(self, capture_real_ns: int, real_ns: int) -> str:
-        age_s = (real_ns - capture_real_ns) / NS_PER_S
+    def _capture_fault(self, capture_real_ns: int, now: Now) -> str:
+        age_s = stamp_age_s(capture_real_ns, now.real_ns)
+        problem = stamp_problem(age_s, self.limits.image_age_s, self.clocks.ahead_s(now.mono_ns))
+        return f"a command that does not count: {problem}" if problem else ""
+
+    def _order_fault(self, source: _Driver, driver: str, capture_real_ns: int) -> str:
+        """Name a stamp that goes back, which shows a wrong clock. While disarmed, the comparison starts again with it."""
+        back_s = (source.capture_ns - capture_real_ns) / NS_PER_S
         return (
-            "" if -0.05 <= age_s <= self.limits.image_age_s else f"a command from an image {age_s:.2f} s old"
+            f"the stamps of the {driver}'s commands went back by {back_s:.2f} s"
+            if self.armed and back_s > 0.0
+            else ""
         )
 
     def _check_held_up(self, mono_ns: int) -> None:

@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from nodes.control.stamps import AHEAD_LIMIT_S
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.wire import MessageInfo
@@ -16,6 +17,8 @@ from nodes.runtime.wire import MessageInfo
 IDLE, HUMAN, AUTONOMY = "idle", "human", "autonomy"
 Point = tuple[float, float]
 _MOST_DOUBT_S = 3600.0
+# Error of a driver that converts a device's clock to real time [s].
+_ONE_HOST_S = 0.005
 
 
 @dataclass
@@ -33,13 +36,24 @@ class HandGate:
     age_limit_s: float = 0.2
     mode: str = IDLE
     pressed_stop: bool = False
-    _publish_ns: int | None = None
+    _since_ns: int | None = None
     _instance_id: int | None = None
+    _refused: str = ""
 
-    def heard(self, mode: str, pressed_stop: bool, info: MessageInfo) -> bool:
+    def refuse(self, why: str) -> None:
+        """Note that a message did not count. The button stays as it was, so that the next message is not a new press."""
+        self._refused = why
+
+    def heard(self, mode: str, pressed_stop: bool, info: MessageInfo, since_ns: int | None = None) -> bool:
         """Note a message. Returns whether the button was just pressed.
 
         After a restart of the teleop node, the button must be seen released before a press counts.
+
+        Args:
+            mode: What the button does.
+            pressed_stop: Whether the e-stop is pressed.
+            info: Transport data of the message.
+            since_ns: Time of the report on this host's monotonic clock, if it is earlier than its publication [ns].
         """
         known = info.instance_id == self._instance_id
         began = known and self.mode == IDLE and mode in (HUMAN, AUTONOMY)
@@ -48,7 +62,9 @@ class HandGate:
         elif known and self.mode not in (IDLE, HUMAN, AUTONOMY) and mode != IDLE:
             mode = self.mode  # still the earlier press
         self.mode, self.pressed_stop = mode, pressed_stop
-        self._publish_ns, self._instance_id = info.publish_mono_ns, info.instance_id
+        since_ns = info.publish_mono_ns if since_ns is None else since_ns
+        self._since_ns, self._instance_id = min(since_ns, info.fresh_mono_ns), info.instance_id
+        self._refused = ""
         return began
 
     def problem(self, mono_ns: int) -> str:
@@ -57,10 +73,10 @@ class HandGate:
             return "the e-stop is pressed"
         if not self.required:
             return ""
-        if self._publish_ns is None:
-            return "no message from the teleop node yet; start it: advnerf teleop"
-        if (age_s := (mono_ns - self._publish_ns) / NS_PER_S) > self.age_limit_s:
-            return f"no message from the teleop node for {age_s:.2f} s"
+        if self._since_ns is None:
+            return self._refused or "no message from the teleop node yet; start it: advnerf teleop"
+        if (age_s := (mono_ns - self._since_ns) / NS_PER_S) > self.age_limit_s:
+            return self._refused or f"no message from the teleop node for {age_s:.2f} s"
         if self.mode == IDLE:
             return "the button is not held"
         return (
@@ -92,7 +108,7 @@ class ClockGate:
 
     def heard(self, peer: str, offset_s: float, error_s: float, info: MessageInfo) -> None:
         """Note a measurement."""
-        self._heard[peer] = (offset_s, error_s, info.publish_mono_ns)
+        self._heard[peer] = (offset_s, error_s, info.fresh_mono_ns)
 
     def doubt_ns(self, mono_ns: int) -> int:
         """Largest error of a time from another host, by the newest measurements [ns]; 0 without other hosts."""
@@ -103,6 +119,10 @@ class ClockGate:
                 # Not finite, or too large: the age of a request cannot be known.
                 worst_s = max(worst_s, doubt_s) if doubt_s <= _MOST_DOUBT_S else _MOST_DOUBT_S
         return round(worst_s * NS_PER_S)
+
+    def ahead_s(self, mono_ns: int) -> float:
+        """Largest accepted lead of a capture stamp over this host's clock [s]: the error of the clocks, within a fixed limit."""
+        return min(_ONE_HOST_S + self.doubt_ns(mono_ns) / NS_PER_S, AHEAD_LIMIT_S)
 
     def problem(self, mono_ns: int) -> str:
         """Return why the car may not move; empty if it may."""

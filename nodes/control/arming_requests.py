@@ -27,7 +27,7 @@ class ArmRequests:
         """The answer to the newest request."""
         return self._answers.last
 
-    def arm(self, ask_id: str, source: str, asked_ns: int, mono_ns: int) -> None:
+    def arm(self, ask_id: str, source: str, asked_ns: int, mono_ns: int, refusal: str = "") -> None:
         """Decide a request to arm. A repeat gets the same answer.
 
         Args:
@@ -35,6 +35,7 @@ class ArmRequests:
             source: Source of the request.
             asked_ns: Time of the first repeat, on this host's monotonic clock [ns].
             mono_ns: Current time [ns].
+            refusal: Why the request does not count; empty if it does.
         """
         if self._answers.repeat(ask_id):
             return
@@ -42,7 +43,7 @@ class ArmRequests:
             refusal = f"expected an ask_id of 1 to 64 characters, got {len(ask_id)}; use advnerf arm"
         elif asked_ns <= self._forgotten_ns:
             refusal = "the request is older than one that was already decided and forgotten; arm again"
-        else:
+        elif not refusal:
             refusal = self._arming.arm(source, asked_ns, mono_ns)
         self._keep(Answer(ask_id, not refusal, refusal or "armed"), asked_ns)
 

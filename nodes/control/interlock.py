@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from nodes.control.stamps import REQUEST_AGE_S, stamp_age_s, stamp_problem
 from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.messages import stamp_ns
 from nodes.runtime.wire import MessageInfo
 
 SAFETY_STATE, ATTACK_SWITCH = "/safety/state", "/attack/switch"
@@ -31,7 +33,7 @@ class Interlock:
         self._armed, self._reason, self._publish_ns = (
             bool(message.armed),
             str(message.reason),
-            info.publish_mono_ns,
+            info.fresh_mono_ns,
         )
 
     def refusal(self, mono_ns: int) -> str:
@@ -47,8 +49,10 @@ class AttackSwitch:
     def __init__(self) -> None:
         self._off_by = ""
 
-    def heard(self, message: Any) -> None:
-        """Note an ``AttackSwitch`` message."""
+    def heard(self, message: Any, real_ns: int) -> None:
+        """Note an ``AttackSwitch`` message. To show the attack, it must be of a moment ago on this host's clock [ns]."""
+        if message.show and stamp_problem(stamp_age_s(stamp_ns(message), real_ns), REQUEST_AGE_S):
+            return
         self._off_by = "" if message.show else str(message.source) or "the operator"
 
     def refusal(self) -> str:

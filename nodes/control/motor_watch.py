@@ -16,10 +16,10 @@ from nodes.runtime.errors import MessageError
 from nodes.runtime.messages import pose_matrix
 from nodes.runtime.node import Out
 from nodes.runtime.requests import Answer, Answers
+from nodes.runtime.twin_port import is_twin, peer_text
 
 # Number of requests for the settings before the controller counts as one that does not report them.
 _SETTINGS_ASKS = 3
-_TWIN = "TWIN"
 
 
 class ControllerWatch:
@@ -35,6 +35,7 @@ class ControllerWatch:
         values: Last telemetry; None before the first.
         timeout: Time-out as read back; None if the controller does not report it.
         answers: Answers to requests about the check.
+        peer: Identity of the controller; `is_twin` tells whether it is the twin of this run.
     """
 
     def __init__(self, wanted: TimeoutSettings, steering_check: str, shown: CheckSettings) -> None:
@@ -45,13 +46,20 @@ class ControllerWatch:
         self._wanted = wanted
         self._policy = steering_check
         self._odometry = Odometry(shown.wheelbase_m)
+        self.peer = ""
         self._firmware: FirmwareVersion | None = None
         self._checked_with: FirmwareVersion | None = None
         self._asks_left = _SETTINGS_ASKS
 
-    def connected(self, firmware: FirmwareVersion) -> None:
-        """Note that a controller answered. Earlier reports are discarded until it repeats them."""
+    def connected(self, firmware: FirmwareVersion, on_twins_port: bool) -> None:
+        """Note that a controller answered. Earlier reports are discarded until it repeats them.
+
+        Args:
+            firmware: Its answer.
+            on_twins_port: Whether the port is the one that the twin of this run has made.
+        """
         self.values = self.timeout = None
+        self.peer = peer_text(str(firmware), firmware.hardware_name, on_twins_port)
         self._firmware, self._asks_left = firmware, _SETTINGS_ASKS
         if self._checked_with not in (None, firmware):
             self.check.forget(f"{self._checked_with} was replaced by {firmware}")
@@ -117,8 +125,7 @@ class ControllerWatch:
     @property
     def steering_good(self) -> bool:
         """Whether the steering check allows arming."""
-        twin = _TWIN in str(self._firmware).upper()
-        exempt = self._policy == "never" or (self._policy == "unless_twin" and twin)
+        exempt = self._policy == "never" or (self._policy == "unless_twin" and is_twin(self.peer))
         # A check that is running or has failed prevents arming on every car.
         return self.check.passed or (exempt and self._checked_with is None)
 

@@ -187,7 +187,7 @@ class PoseGate:
 
     def refuse(self, text: str, info: MessageInfo) -> None:
         """Note a message that is not a valid pose."""
-        self._text, self._seen_ns = text, info.publish_mono_ns
+        self._text, self._seen_ns = text, info.fresh_mono_ns
         self.count += 1
 
     def problem(self, mono_ns: int) -> str:

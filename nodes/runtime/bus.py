@@ -290,7 +290,8 @@ class Bus:
         in_two = len(parts) == 2 and subscription.topic.type == IMAGE_TYPE
         raw = b"" if in_two else parts[0] if len(parts) == 1 else b"".join(parts)
         info = MessageInfo(
-            publish_mono_ns=meta.publish_mono_ns,
+            # All processes of a host read the same clock, so a publication in the future is an error. It must not stay fresh for ever.
+            publish_mono_ns=min(meta.publish_mono_ns, now.mono_ns),
             receive_mono_ns=now.mono_ns,
             sequence=meta.sequence,
             raw=raw,

@@ -1,28 +1,35 @@
-"""The two clocks of a node. They are passed to the node, so that tests and replays can pass other ones.
+"""The clocks of a node. They are passed to the node, so that tests and replays can pass other ones.
 
-Monotonic time is for durations, ages and deadlines on one host. Real time (CLOCK_REALTIME) is for capture stamps.
+Monotonic time is for durations, ages and deadlines on one host. Real time (CLOCK_REALTIME) is for capture stamps. Monotonic time
+stands still while the computer is suspended, and CLOCK_BOOTTIME does not: their difference shows a suspend.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
 NS_PER_S = 1_000_000_000
+# A process that was held up between two readings of a clock cannot tell their difference.
+_LONGEST_READ_NS = 1_000_000
 
 
 @dataclass(frozen=True)
 class Now:
-    """One instant read from both clocks.
+    """One instant read from all clocks.
 
     Attributes:
         mono_ns: CLOCK_MONOTONIC [ns], the same for all processes of one host.
         real_ns: CLOCK_REALTIME [ns since 1970].
+        asleep_ns: CLOCK_BOOTTIME minus CLOCK_MONOTONIC: the time for which the computer was suspended so far, plus a constant [ns].
+            None if the clocks could not be read within a millisecond of each other, or if there is no such clock.
     """
 
     mono_ns: int
     real_ns: int
+    asleep_ns: int | None = None
 
     @property
     def mono_s(self) -> float:
@@ -39,16 +46,37 @@ class Clock(Protocol):
     """Interface of a clock."""
 
     def now(self) -> Now:
-        """Read both clocks."""
+        """Read all clocks."""
         ...
 
 
+def _boot_ns() -> int:
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+
+
 class SystemClock:
-    """The clocks of this computer."""
+    """The clocks of this computer. Each can be replaced, for tests.
+
+    Args:
+        mono: Reads CLOCK_MONOTONIC [ns].
+        boot: Reads CLOCK_BOOTTIME [ns].
+        real: Reads CLOCK_REALTIME [ns].
+    """
+
+    def __init__(
+        self,
+        mono: Callable[[], int] = time.monotonic_ns,
+        boot: Callable[[], int] = _boot_ns,
+        real: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self._mono, self._boot, self._real = mono, boot, real
 
     def now(self) -> Now:
-        """Read both clocks."""
-        return Now(time.monotonic_ns(), time.time_ns())
+        """Read all clocks: the others between two readings of monotonic time, which must lie close together."""
+        before_ns, boot_ns, real_ns, mono_ns = self._mono(), self._boot(), self._real(), self._mono()
+        read_ns = mono_ns - before_ns
+        asleep_ns = boot_ns - before_ns - read_ns // 2 if read_ns <= _LONGEST_READ_NS else None
+        return Now(mono_ns, real_ns, asleep_ns)
 
 
 class ManualClock:
@@ -58,7 +86,7 @@ class ManualClock:
         self._now = Now(mono_ns, real_ns)
 
     def now(self) -> Now:
-        """Read both clocks."""
+        """Read all clocks."""
         return self._now
 
     def advance(self, duration_s: float) -> Now:

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from typing import Literal
 
 from nodes.runtime.errors import TopicError
 
 STATUS_PREFIX = "/status/"
 STATUS_RATE_HZ = 5.0
+Replay = Literal["free", "never"]
+FREE: Replay = "free"
+NEVER: Replay = "never"
 
 
 @dataclass(frozen=True)
@@ -25,6 +29,8 @@ class Topic:
         senders: Number of processes per host that may publish the topic at the same time.
         receivers: Number of processes per host that may receive the topic at the same time, for a topic that any number of processes
             may send; 0 for all other topics. A request to stop the car must not have to wait for a free endpoint.
+        replay: Whether a recording of the topic may be published: ``never`` for what moves or arms a car, selects its driver, shows an
+            attack, or feeds a clock, and for reports that decide about these.
     """
 
     name: str
@@ -35,6 +41,7 @@ class Topic:
     publisher: str
     senders: int = 1
     receivers: int = 0
+    replay: Replay = FREE
 
     @property
     def latest(self) -> bool:
@@ -55,32 +62,32 @@ _ROWS = (
     Topic("/compositor/attack", "advnerf_msgs/msg/AttackStamp", 10.0, 50, None, "compositor"),
     Topic("/monitor/attack", "advnerf_msgs/msg/AttackStamp", 5.0, 50, None, "monitor"),
     Topic("/monitor/shown", "advnerf_msgs/msg/DisplayShown", 5.0, 50, None, "monitor"),
-    Topic("/policy/drive", _ACKERMANN, 10.0, 1, 0.25, "policy"),
+    Topic("/policy/drive", _ACKERMANN, 10.0, 1, 0.25, "policy", replay=NEVER),
     Topic("/policy/counterfactual", "advnerf_msgs/msg/Counterfactual", 10.0, 20, None, "counterfactual"),
-    Topic("/expert/drive", _ACKERMANN, 20.0, 1, 0.25, "expert"),
+    Topic("/expert/drive", _ACKERMANN, 20.0, 1, 0.25, "expert", replay=NEVER),
     Topic("/expert/state", "advnerf_msgs/msg/ExpertState", 20.0, 20, None, "expert"),
-    Topic("/teleop/state", "advnerf_msgs/msg/Teleop", 20.0, 1, 0.2, "teleop"),
-    Topic("/safety/drive", _ACKERMANN, 10.0, 1, 0.25, "safety"),
-    Topic("/safety/state", "advnerf_msgs/msg/SafetyState", 10.0, 20, 0.5, "safety"),
-    Topic("/clock/offset", "advnerf_msgs/msg/ClockOffset", 5.0, 20, 1.0, "gateway"),
-    Topic("/arm", "advnerf_msgs/msg/Arm", None, 20, None, "operator", receivers=8),
-    Topic("/operator/act", "advnerf_msgs/msg/OperatorAct", None, 50, None, "page"),
-    Topic("/twin/reset", "geometry_msgs/msg/PoseStamped", None, 5, None, "operator", senders=2),
-    Topic("/attack/request", "advnerf_msgs/msg/AttackRequest", None, 5, None, "operator"),
-    Topic("/attack/cancel", "advnerf_msgs/msg/AttackCancel", None, 5, None, "operator"),
+    Topic("/teleop/state", "advnerf_msgs/msg/Teleop", 20.0, 1, 0.2, "teleop", replay=NEVER),
+    Topic("/safety/drive", _ACKERMANN, 10.0, 1, 0.25, "safety", replay=NEVER),
+    Topic("/safety/state", "advnerf_msgs/msg/SafetyState", 10.0, 20, 0.5, "safety", replay=NEVER),
+    Topic("/clock/offset", "advnerf_msgs/msg/ClockOffset", 5.0, 20, 1.0, "gateway", replay=NEVER),
+    Topic("/arm", "advnerf_msgs/msg/Arm", None, 20, None, "operator", receivers=8, replay=NEVER),
+    Topic("/operator/act", "advnerf_msgs/msg/OperatorAct", None, 50, None, "page", replay=NEVER),
+    Topic("/twin/reset", "geometry_msgs/msg/PoseStamped", None, 5, None, "operator", senders=2, replay=NEVER),
+    Topic("/attack/request", "advnerf_msgs/msg/AttackRequest", None, 5, None, "operator", replay=NEVER),
+    Topic("/attack/cancel", "advnerf_msgs/msg/AttackCancel", None, 5, None, "operator", replay=NEVER),
     Topic("/attack/progress", "advnerf_msgs/msg/AttackProgress", 1.0, 50, None, "attack"),
     Topic("/attack/texture", "sensor_msgs/msg/Image", None, 1, None, "attack"),
     Topic("/attack/preview", "sensor_msgs/msg/Image", None, 1, None, "attack"),
-    Topic("/attack/file", "advnerf_msgs/msg/FileChunk", None, 300, None, "attack", senders=2),
-    Topic("/attack/switch", "advnerf_msgs/msg/AttackSwitch", 2.0, 1, None, "page"),
-    Topic("/motor/sent", "advnerf_msgs/msg/MotorSent", 20.0, 200, None, "motor"),
-    Topic("/motor/check", "advnerf_msgs/msg/SteeringCheck", None, 5, None, "operator"),
+    Topic("/attack/file", "advnerf_msgs/msg/FileChunk", None, 300, None, "attack", senders=2, replay=NEVER),
+    Topic("/attack/switch", "advnerf_msgs/msg/AttackSwitch", 2.0, 1, None, "page", replay=NEVER),
+    Topic("/motor/sent", "advnerf_msgs/msg/MotorSent", 20.0, 200, None, "motor", replay=NEVER),
+    Topic("/motor/check", "advnerf_msgs/msg/SteeringCheck", None, 5, None, "operator", replay=NEVER),
     Topic("/odom", "nav_msgs/msg/Odometry", 20.0, 50, 0.5, "motor"),
     Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", 1.0, 20, None, "motor"),
     Topic("/motor/state", "advnerf_msgs/msg/VescState", 20.0, 50, 0.5, "motor"),
-    Topic("/clock", "rosgraph_msgs/msg/Clock", 40.0, 1, None, "player"),
-    Topic("/player/control", "advnerf_msgs/msg/PlayerControl", None, 20, None, "operator"),
-    Topic("/player/state", "advnerf_msgs/msg/PlayerState", None, 20, None, "player"),
+    Topic("/clock", "rosgraph_msgs/msg/Clock", 40.0, 1, None, "player", replay=NEVER),
+    Topic("/player/control", "advnerf_msgs/msg/PlayerControl", None, 20, None, "operator", replay=NEVER),
+    Topic("/player/state", "advnerf_msgs/msg/PlayerState", None, 20, None, "player", replay=NEVER),
 )
 TOPICS: dict[str, Topic] = {row.name: row for row in _ROWS}
 """The rows of the table by name; every node also has a status topic, ``/status/<node>``."""
@@ -102,11 +109,21 @@ def type_of_topic(name: str) -> str | None:
         return None
 
 
+def may_replay(name: str) -> bool:
+    """Whether a recording of a topic may be published. A topic that is not in the table decides nothing here."""
+    try:
+        return topic(name).replay == FREE
+    except TopicError:
+        return True
+
+
 def topic(name: str) -> Topic:
     """Row of a topic. Every node also has a status topic, which is not in the table."""
     if row := TOPICS.get(name):
         return row
     if name.startswith(STATUS_PREFIX):
         node = name.removeprefix(STATUS_PREFIX)
-        return Topic(status_topic(node), "advnerf_msgs/msg/NodeStatus", STATUS_RATE_HZ, 1, 1.0, node)
+        return Topic(
+            status_topic(node), "advnerf_msgs/msg/NodeStatus", STATUS_RATE_HZ, 1, 1.0, node, replay=NEVER
+        )
     raise TopicError(f"unknown topic {name!r}; known are {', '.join(TOPICS)}, {STATUS_PREFIX}<node>")

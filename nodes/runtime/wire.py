@@ -39,6 +39,11 @@ class MessageInfo:
     instance_id: int = 0
     lost: int = 0
 
+    @property
+    def fresh_mono_ns(self) -> int:
+        """Time from which the age of the message counts [ns]: its publication, or its receipt if that claims to be in the future."""
+        return min(self.publish_mono_ns, self.receive_mono_ns)
+
 
 @dataclass(frozen=True)
 class Meta:

@@ -107,7 +107,7 @@ def sent(speed_mps, stamp_ns):
         brake_current_a=0.0,
         braking=speed_mps == 0.0,
         reason="",
-        peer="TWIN",
+        peer="TWIN firmware 5.02",
     )
 
 

@@ -28,7 +28,7 @@ class Car:
 
     def restart(self):
         self.arming = Arming(ArmingLimits(nodes=("motor",), fence_m=FENCE))
-        self.arming.peer = "TWIN"
+        self.arming.peer = "TWIN firmware 5.02"
         self.requests = ArmRequests(self.arming)
         self.run(20)
 
@@ -36,6 +36,7 @@ class Car:
         for _ in range(duration_ms // 10):
             self.ms += 10
             now, info = self.ms * MS, MessageInfo(self.ms * MS, self.ms * MS, instance_id=1)
+            self.arming.heard_motor(info)
             self.arming.heard_status("motor", "ready" if self.well else "fault", "", info)
             self.arming.heard_car(0.0, 0.0, info)
             self.arming.heard_drive(0.5, 0.0, REAL_NS + now, info, now, REAL_NS + now)

@@ -8,6 +8,7 @@ import pytest
 
 from nodes.control.arming import Arming, ArmingLimits
 from nodes.control.arming_gates import ClockGate, HandGate, edge_distance_m, inside, require_simple
+from nodes.runtime.clock import Now
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.wire import MessageInfo
 
@@ -53,7 +54,13 @@ class World:
                 self.ms % 50 == 20
                 and "teleop" in self.talking
                 and arming.heard_hand(
-                    self.mode, self.estop, self.hand_speed, 0.1, self.info("teleop"), mono_ns
+                    self.mode,
+                    self.estop,
+                    self.hand_speed,
+                    0.1,
+                    self.info("teleop"),
+                    real_ns,
+                    Now(mono_ns, real_ns),
                 )
             ):
                 self.passed.append("hand")
@@ -139,7 +146,7 @@ def test_the_estop_latches_until_a_person_re_arms(held):
     held.hold("idle")
     assert not held.hold("autonomy")  # holding is not enough
     assert "e-stop" in held.arming.reason
-    held.arming.peer = "TWIN"
+    held.arming.peer = "TWIN firmware 5.02"
     assert not held.arm("trial")  # nor is a program, not even on the twin
     assert held.arm("operator")
     assert held.run(500)

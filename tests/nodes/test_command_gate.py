@@ -23,9 +23,16 @@ class World:
         self.gate = CommandGate(SETTINGS, self.ms * MS)
         self.instance = 7
 
-    def send(self, command, age_ms=0):
+    def send(self, command, age_ms=0, stamp_age_s=0.0):
+        """A command of a safety node that reports at the same time: disarmed with a stop, armed with any other."""
+        self.report(command != STOP)
         info = MessageInfo((self.ms - age_ms) * MS, self.ms * MS, instance_id=self.instance)
-        return self.gate.command(*command, info, self.ms * MS)
+        return self.gate.command(*command, info, self.ms * MS, stamp_age_s)
+
+    def report(self, armed, instance=None):
+        self.armed = armed
+        info = MessageInfo(self.ms * MS, self.ms * MS, instance_id=instance or self.instance)
+        self.gate.heard_safety(armed, info)
 
     def tick(self, after_ms=20):
         self.ms += after_ms
@@ -59,6 +66,52 @@ def test_an_explicit_stop_opens_it(world):
     assert world.gate.state is GateState.STOPPED
     assert world.send(GO) == Drive(0.8, 0.1)
     assert world.gate.state is GateState.DRIVING
+
+
+@pytest.mark.parametrize("what", ["armed", "silent", "old", "another process"])
+def test_a_stop_opens_it_only_while_the_safety_node_reports_disarmed(world, what):
+    """A policy that commands zero speed while the car is armed must not open the latch."""
+    if what == "old":
+        world.report(armed=False)
+        world.ms += 501
+    elif what != "silent":
+        world.report(armed=what == "armed", instance=8 if what == "another process" else None)
+    info = MessageInfo(world.ms * MS, world.ms * MS, instance_id=world.instance)
+    assert world.gate.command(*STOP, info, world.ms * MS) is None
+    assert (world.gate.state, world.gate.refused) == (GateState.LATCHED, 1)
+    assert world.send(GO) is None
+    world.send(STOP)
+    assert world.send(GO) == Drive(*GO)
+
+
+def test_zero_speed_while_armed_stops_a_car_that_drives_and_does_not_latch(driving):
+    info = MessageInfo(driving.ms * MS, driving.ms * MS, instance_id=driving.instance)
+    assert isinstance(driving.gate.command(*STOP, info, driving.ms * MS), Brake)
+    assert driving.gate.state is GateState.STOPPED
+    assert driving.send(GO) == Drive(*GO)
+
+
+@pytest.mark.parametrize("stamp_age_s", [0.51, 3600.0, -0.06, -3600.0])
+def test_a_command_with_a_stamp_of_another_time_does_not_drive(driving, stamp_age_s):
+    assert driving.send(GO, stamp_age_s=stamp_age_s) is None
+    for _ in range(12):
+        driving.ms += 20
+        assert driving.send(GO, stamp_age_s=stamp_age_s) is None
+    assert driving.gate.state is GateState.LATCHED
+    assert isinstance(driving.send(STOP, stamp_age_s=stamp_age_s), Brake | None)
+    assert driving.gate.state is GateState.STOPPED  # a stop of any time counts
+
+
+def test_a_command_from_the_future_is_not_fresh_for_ever(driving):
+    driving.send(GO, age_ms=-3_600_000)
+    driving.let_pass(240)
+    assert driving.gate.state is GateState.LATCHED
+
+
+def test_a_pause_of_the_loop_latches(driving):
+    driving.tick(230)
+    assert driving.gate.reason == "the motor node was held up for 0.23 s"
+    assert driving.send(GO) is None
 
 
 def test_silence_brakes_in_time_then_lets_go_and_latches(driving):

@@ -64,7 +64,7 @@ def test_nothing_is_drawn_unless_armed_and_fresh():
 
 def switch(bench, show_it):
     now = bench.clock.now()
-    message = types.AttackSwitch(header=header(0), show=show_it, source="ann")
+    message = types.AttackSwitch(header=header(now.real_ns), show=show_it, source="ann")
     bench.node.handle("/attack/switch", message, MessageInfo(now.mono_ns, now.mono_ns, instance_id=1), now)
 
 

@@ -164,7 +164,10 @@ def test_the_operator_switches_the_attack_off_and_on(screen):
     bench.hear("/attack/switch", types.AttackSwitch(header=header(0), show=False, source="ann"))
     assert bench.said["/monitor/attack"].reason == "switched off by ann"
     assert not bench.said["/monitor/attack"].drawn
-    bench.hear("/attack/switch", types.AttackSwitch(header=header(0), show=True, source="ann"))
+    bench.hear(
+        "/attack/switch",
+        types.AttackSwitch(header=header(bench.clock.now().real_ns), show=True, source="ann"),
+    )
     assert bench.said["/monitor/attack"].drawn
 
 

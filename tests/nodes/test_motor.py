@@ -18,6 +18,8 @@ from nodes.motor import MotorConfig, MotorNode, drive_limits
 from nodes.runtime.clock import SystemClock
 from nodes.runtime.messages import drive_message, ns_from_stamp
 from nodes.runtime.node import MessageInfo
+from nodes.runtime.twin_port import claim_twins_port
+from tests.support.safety_reports import state_message
 
 pytestmark = pytest.mark.live
 
@@ -29,18 +31,18 @@ class Drives:
     """A motor node on an emulator, and the safety node's commands to it."""
 
     def __init__(self, tmp_path, node_context):
+        self.claim = claim_twins_port(node_context.run_dir)
         self.emulator = VescEmulator(VescEmulatorConfig(), TwinVehicle(CarConfig()), tmp_path / "vesc")
         self.config = MotorConfig(port=str(tmp_path / "vesc"), calibration=TWIN / "vehicle.yaml")
         self.node = MotorNode.build(self.config, node_context)
 
-    def send(self, speed, steering, stamp_ns=12_345):
+    def send(self, speed, steering, stamp_ns=None):
+        """A command of a safety node that reports at the same time: disarmed with a stop, armed with any other."""
         now = CLOCK.now()
-        return self.node.handle(
-            "/safety/drive",
-            drive_message(speed, steering, stamp_ns),
-            MessageInfo(now.mono_ns, now.mono_ns, instance_id=1),
-            now,
-        )
+        info = MessageInfo(now.mono_ns, now.mono_ns, instance_id=1)
+        self.node.handle("/safety/state", state_message(now.real_ns, armed=speed != 0.0), info, now)
+        command = drive_message(speed, steering, now.real_ns if stamp_ns is None else stamp_ns)
+        return self.node.handle("/safety/drive", command, info, now)
 
     def run(self, duration_s):
         outs, deadline = [], time.monotonic() + duration_s
@@ -63,6 +65,7 @@ def drives(tmp_path, node_context):
     yield drives
     drives.node.close()
     drives.emulator.close()
+    drives.claim.close()
 
 
 def test_motor_connects_stops_and_waits_for_the_safety_node(drives):
@@ -84,9 +87,10 @@ def test_motor_connects_stops_and_waits_for_the_safety_node(drives):
 def test_motor_obeys_and_reports_the_origin(drives):
     drives.run(0.1)
     drives.send(0.0, 0.0)
-    (out,) = drives.send(0.3, 0.1, stamp_ns=777)
+    stamp_ns = time.time_ns() - 77_777_777
+    (out,) = drives.send(0.3, 0.1, stamp_ns)
     message = out.message
-    assert ns_from_stamp(message.header.stamp) == 777
+    assert ns_from_stamp(message.header.stamp) == stamp_ns
     assert not message.braking
     assert message.speed_mps == pytest.approx(0.3, abs=1e-3)
     assert abs(int(message.serial_write_mono_ns) - time.monotonic_ns()) < 1e9

@@ -21,6 +21,8 @@ from nodes.motor import MotorConfig, MotorNode
 from nodes.runtime.clock import Now, SystemClock
 from nodes.runtime.messages import decode, encode, header, pose_message, types
 from nodes.runtime.node import MessageInfo, NodeContext
+from nodes.runtime.twin_port import claim_twins_port, is_twin, is_twins_port
+from tests.support.safety_reports import state_message
 
 pytestmark = pytest.mark.live
 
@@ -31,7 +33,8 @@ VEHICLE = Path(__file__).parents[2] / "calibration" / "twin" / "vehicle.yaml"
 class Car:
     """A motor node on an emulator over a real pty, in time that the test gives out."""
 
-    def __init__(self, tmp_path, config=None, **vesc):
+    def __init__(self, tmp_path, config=None, twins_port=True, **vesc):
+        self.claim = claim_twins_port(tmp_path) if twins_port else None
         self.emulator = VescEmulator(
             VescEmulatorConfig(**{"hardware_name": "60", **vesc}), TwinVehicle(CarConfig()), tmp_path / "vesc"
         )
@@ -52,7 +55,9 @@ class Car:
             time.sleep(0.005)
 
     def say(self, action):
-        message = types.SteeringCheck(header=header(0), action=action, source="operator", ask_id="")
+        message = types.SteeringCheck(
+            header=header(CLOCK.now().real_ns), action=action, source="operator", ask_id=""
+        )
         self.node.handle("/motor/check", message, MessageInfo(0, 0, instance_id=1), CLOCK.now())
 
     def rows(self):
@@ -63,14 +68,16 @@ class Car:
     def close(self):
         self.node.close()
         self.emulator.close()
+        if self.claim is not None:
+            self.claim.close()
 
 
 @pytest.fixture
 def make(tmp_path):
     cars = []
 
-    def build(config=None, **vesc):
-        cars.append(Car(tmp_path, config, **vesc))
+    def build(config=None, **options):
+        cars.append(Car(tmp_path, config, **options))
         return cars[-1]
 
     yield build
@@ -96,6 +103,30 @@ def test_who_is_exempt(make, config, vesc):
     car.settle(lambda: car.node.status()[1] == "latched: waiting for the safety node")
     strict = SteeringCheck(CheckSettings(0.25))
     assert not strict.passed
+
+
+@pytest.mark.parametrize(
+    ("name", "twins_port", "is_the_twin"),
+    [("TWIN", True, True), ("TWIN", False, False), ("TWINKLE", True, False), ("TWIN firmware", True, False)],
+)
+def test_the_twin_is_its_firmware_name_at_the_port_that_the_twin_made(make, name, twins_port, is_the_twin):
+    car = make(hardware_name=name, twins_port=twins_port)
+    settled = "latched: waiting for the safety node" if is_the_twin else "steering was not checked"
+    car.settle(lambda: settled in car.node.status()[1])
+    peers = {o.message.peer for o in car.outs if o.topic == "/motor/sent"}
+    assert peers
+    assert {is_twin(peer) for peer in peers} == {is_the_twin}
+
+
+def test_a_twin_at_another_port_of_its_run_is_not_the_twin(make, tmp_path):
+    """As a launch with two controllers would have it, or a link that leads elsewhere."""
+    car = make()
+    with VescEmulator(VescEmulatorConfig(), TwinVehicle(CarConfig()), tmp_path / "other"):
+        assert not is_twins_port(tmp_path, str(tmp_path / "other"))
+    assert is_twins_port(tmp_path, str(tmp_path / "vesc"))
+    assert is_twins_port(tmp_path, car.emulator.port)
+    assert not is_twins_port(tmp_path, "/dev/null")
+    assert not is_twins_port(tmp_path, str(tmp_path / "nothing"))
 
 
 def test_a_time_out_that_is_too_long_keeps_it_from_arming(make):
@@ -139,9 +170,9 @@ def drive(car, speed):
             steering_angle=0.0, steering_angle_velocity=0.0, speed=speed, acceleration=0.0, jerk=0.0
         ),
     )
-    return car.node.handle(
-        "/safety/drive", message, MessageInfo(now.mono_ns, now.mono_ns, instance_id=1), now
-    )
+    info = MessageInfo(now.mono_ns, now.mono_ns, instance_id=1)
+    car.node.handle("/safety/state", state_message(now.real_ns, armed=speed != 0.0), info, now)
+    return car.node.handle("/safety/drive", message, info, now)
 
 
 def test_diagnostics_and_odometry_are_standard_messages(make):
@@ -225,9 +256,14 @@ def test_the_node_turns_the_wheels_and_listens_to_the_person(make):
         now = Now(later.mono_ns + second * 10**9, later.real_ns)
         car.node._watch.check.tick(now.mono_ns)
         car.node.handle(
-            "/vicon/car", pose_message(planar_pose(0.0, 0.0, 0.0), 0), MessageInfo(0, 0, instance_id=1), now
+            "/vicon/car",
+            pose_message(planar_pose(0.0, 0.0, 0.0), now.real_ns),
+            MessageInfo(0, 0, instance_id=1),
+            now,
         )
-    message = types.SteeringCheck(header=header(0), action="confirm", source="operator", ask_id="")
+    message = types.SteeringCheck(
+        header=header(CLOCK.now().real_ns), action="confirm", source="operator", ask_id=""
+    )
     car.node.handle("/motor/check", message, MessageInfo(0, 0, instance_id=1), now)
     assert "steering" not in car.node._watch.missing()
 
@@ -237,7 +273,9 @@ def test_a_repeated_request_for_the_check_is_obeyed_once_and_answered_every_time
     car.settle(lambda: "steering was not checked" in car.node.status()[1])
 
     def ask(action, ask_id):
-        message = types.SteeringCheck(header=header(0), action=action, source="operator", ask_id=ask_id)
+        message = types.SteeringCheck(
+            header=header(CLOCK.now().real_ns), action=action, source="operator", ask_id=ask_id
+        )
         car.outs += car.node.handle("/motor/check", message, MessageInfo(0, 0, instance_id=1), CLOCK.now())
         values = {pair.key: pair.value for pair in car.rows()["motor: steering"].values}
         return values["answered"], values["granted"], values["answer"]

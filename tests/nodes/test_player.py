@@ -113,11 +113,19 @@ def test_a_recording_does_not_ask_for_an_attack(tmp_path):
     )
 
 
-def test_requests_to_arm_are_played_only_when_asked_for(bag):
-    assert PlayerNode(PlayerConfig(bag=bag, topics=["/arm"]), lambda topic: 0).publications == (
-        "/arm",
-        "/player/state",
-    )
+@pytest.mark.parametrize(
+    "options", [{"topics": ["/arm"]}, {"remap": {"/arm": "/arm"}}, {"remap": {"/vicon/car": "/twin/reset"}}]
+)
+def test_a_recording_asks_for_nothing_under_no_name(bag, options):
+    with pytest.raises(
+        BagError, match=r"expected topics that a recording may publish, got /(arm|twin/reset)"
+    ):
+        PlayerNode(PlayerConfig(bag=bag, **options), lambda topic: 0)
+
+
+def test_what_is_never_played_is_named(bag):
+    node = PlayerNode(PlayerConfig(bag=bag, wait_for=[]), lambda topic: 0)
+    assert node.status() == ("active", "0 messages played; never played: /arm")
 
 
 def test_topics_that_nobody_here_knows_are_left_out_and_named(tmp_path):

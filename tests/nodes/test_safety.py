@@ -31,7 +31,7 @@ class Guard:
         config = SafetyConfig(room=TWIN / "room.yaml", vehicle=TWIN / "vehicle.yaml")
         car = load_calibration(VehicleCalibration, config.vehicle)
         self.node = SafetyNode(limits, config.poses(car), config.stall())
-        self.ms = 1000
+        self.ms, self.wheels = 1000, 0.0
 
     @property
     def now(self):
@@ -45,7 +45,7 @@ class Guard:
             self.now,
         )
 
-    def everything(self, peer="TWIN", speed=0.8):
+    def everything(self, peer="TWIN firmware 5.02", speed=0.8):
         stamp = self.now.real_ns
         for name in ("camera", "motor"):
             status = types.NodeStatus(
@@ -75,6 +75,7 @@ class Guard:
             peer=peer,
         )
         self.say("/motor/sent", sent)
+        self.say("/motor/state", self.telemetry())
         info = types.CameraInfo(
             header=header(stamp),
             height=1,
@@ -91,6 +92,20 @@ class Guard:
         self.say("/camera/camera_info", info)
         self.see_car()
         return self.say("/policy/drive", drive_message(speed, 0.1, stamp))
+
+    def telemetry(self):
+        return types.VescState(
+            header=header(self.now.real_ns),
+            speed_mps=self.wheels,
+            erpm=0.0,
+            duty=0.0,
+            input_voltage_v=15.0,
+            motor_current_a=0.0,
+            input_current_a=0.0,
+            mosfet_temperature_c=30.0,
+            fault=0,
+            fault_text="",
+        )
 
     def see_car(self, x=0.1, y=0.2, yaw=0.0):
         return self.say("/vicon/car", pose_message(planar_pose(x, y, yaw), self.now.real_ns))
@@ -170,7 +185,7 @@ class Drive(Guard):
 
     def __init__(self):
         super().__init__()
-        self.x, self.speed, self.wheels = -0.5, 0.0, 0.0
+        self.x, self.speed = -0.5, 0.0
         self.offset = (0.0, 0.0, 0.0)
 
     def run(self, seconds, command=0.5):
@@ -184,20 +199,6 @@ class Drive(Guard):
                 self.everything_but_the_car(command)
                 self.node.tick(self.now)
         return self
-
-    def telemetry(self):
-        return types.VescState(
-            header=header(self.now.real_ns),
-            speed_mps=self.wheels,
-            erpm=0.0,
-            duty=0.0,
-            input_voltage_v=15.0,
-            motor_current_a=0.0,
-            input_current_a=0.0,
-            mosfet_temperature_c=30.0,
-            fault=0,
-            fault_text="",
-        )
 
     def everything_but_the_car(self, command):
         self.see_car = lambda *pose: None

@@ -16,7 +16,7 @@ START = (-1.1, -2.0, 0.0)
 class Stage:
     """A trial node, its clock, and a car that does what the operator asks for."""
 
-    def __init__(self, peer="TWIN v1", moves=True, **plan):
+    def __init__(self, peer="TWIN firmware 5.02", moves=True, **plan):
         self.node = TrialNode(TrialPlan(START, 1.0, ("camera", "motor"), **plan))
         self.t_s, self.pose, self.armed, self.reason, self.sent = (
             0.0,
@@ -109,7 +109,7 @@ def test_a_trial_places_arms_drives_for_its_time_and_disarms():
     stage.nodes_are_ready()
     stage.run_until(Phase.DONE)
     outcome = stage.node.outcome
-    assert outcome.peer == "TWIN v1"
+    assert outcome.peer == "TWIN firmware 5.02"
     assert outcome.stopped_early == ""
     assert (outcome.end_real_ns - outcome.start_real_ns) / 1e9 == pytest.approx(1.0, abs=0.11)
     assert not stage.armed

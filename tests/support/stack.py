@@ -15,7 +15,7 @@ import yaml
 
 from advnerf_core.geometry import planar_pose
 from benchmarks.operator import LiveOperator
-from nodes.runtime.messages import encode, pose_message
+from nodes.runtime.messages import pose_message
 from nodes.runtime.paths import bus_folder
 
 REPOSITORY = Path(__file__).parents[2]
@@ -81,11 +81,11 @@ class Stack(LiveOperator):
 
     def put_back(self) -> None:
         """Wait until the car stands and lift it to the start."""
-        pose = encode(pose_message(planar_pose(*START), time.time_ns()))
         resets = sum(event.name == "PLACED" for event, *_ in self.wire())
 
         def placed():
-            self.bus.publish("/twin/reset", pose)
+            # Stamped anew each time: the twin refuses an old request.
+            self.bus.publish("/twin/reset", pose_message(planar_pose(*START), time.time_ns()))
             self.watch(0.3)
             return sum(event.name == "PLACED" for event, *_ in self.wire()) > resets
 

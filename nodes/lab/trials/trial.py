@@ -22,8 +22,8 @@ from nodes.runtime.messages import ns_from_stamp, pose_matrix, pose_message
 from nodes.runtime.node import MessageInfo, Node, Out
 from nodes.runtime.requests import Asked
 from nodes.runtime.topics import status_topic
+from nodes.runtime.twin_port import is_twin
 
-TWIN_PEER = "TWIN"
 _REPEAT_S = 0.5
 _SETTLE_S = 0.5
 MOVED_M = 0.01
@@ -199,7 +199,7 @@ class TrialNode(Node):
     def _gather(self, now: Now) -> list[Out]:
         seen = self._seen
         if set(self.plan.nodes) <= seen.ready and seen.T_world_from_car is not None and seen.peer:
-            self._by_hand = TWIN_PEER not in seen.peer.upper()
+            self._by_hand = not is_twin(seen.peer)
             if self._by_hand and not self.plan.by_hand:
                 raise TrialError(
                     f"expected the motor's peer to be the twin, got {seen.peer!r}; only the operator may arm a real car"

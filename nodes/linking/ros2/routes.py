@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 from advnerf_core.strict import StrictModel
 from nodes.linking.ros2.conversions import ACKERMANN, COMPRESSED, IMAGE, POSE, convertible
 from nodes.runtime.errors import TopicError
+from nodes.runtime.topics import may_replay
 from nodes.runtime.topics import topic as topic_row
 
 Reliability = Literal["best_effort", "reliable"]
@@ -176,6 +177,11 @@ class TakeRoute(_Route):
             raise ValueError(
                 f"expected one of {', '.join((*COMMANDS, *SENSORS))} to take from ROS 2, got {self.topic};"
                 " nothing else may come in, because ROS 2 has no keys"
+            )
+        if not may_replay(self.ros_name) and self.ros_name != self.topic:
+            raise ValueError(
+                f"expected a ROS name that is no topic of ours with 'replay: never', got {self.ros_name} for {self.topic};"
+                " what is played there must not come in under another name"
             )
         if (self.answers is None) == self.commands:
             wanted = "'answers', for example /compositor/image" if self.commands else "no 'answers'"

@@ -250,7 +250,7 @@ def drives(side, since):
 
 
 def test_a_car_in_ros_is_stopped_when_the_safety_node_falls_silent(node, side):
-    send(node, "/safety/drive", drive_message(0.5, 0.1, REAL), S)
+    send(node, "/safety/drive", drive_message(0.5, 0.1, REAL + S), S)
     node.tick(now(S + 200 * MS))
     assert drives(side, 0) == pytest.approx([0.5])
     node.tick(now(S + 300 * MS))
@@ -262,15 +262,15 @@ def test_a_car_in_ros_is_stopped_when_the_safety_node_falls_silent(node, side):
 
 
 def test_a_car_in_ros_is_stopped_when_the_node_ends(node, side):
-    send(node, "/safety/drive", drive_message(0.5, 0.1, REAL), S)
+    send(node, "/safety/drive", drive_message(0.5, 0.1, REAL + S), S)
     node.close()
     assert drives(side, 0) == pytest.approx([0.5, 0.0])
     assert side.closed
 
 
 def test_a_stopped_car_is_left_alone(node, side):
-    send(node, "/safety/drive", drive_message(0.5, 0.1, REAL), S)
-    send(node, "/safety/drive", drive_message(0.0, 0.0, REAL), S + MS)
+    send(node, "/safety/drive", drive_message(0.5, 0.1, REAL + S), S)
+    send(node, "/safety/drive", drive_message(0.0, 0.0, REAL + S + MS), S + MS)
     node.tick(now(5 * S))
     node.close()
     assert drives(side, 0) == pytest.approx([0.5, 0.0])

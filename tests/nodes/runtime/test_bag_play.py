@@ -173,8 +173,8 @@ def test_names_that_cannot_be_are_refused(bag):
     for remap, words in [
         ({"/arm": "/vicon/car"}, "/arm is not played; played are /vicon/car"),
         (
-            {"/vicon/car": "/policy/drive"},
-            "/vicon/car is geometry_msgs/msg/PoseStamped, expected ackermann_msgs",
+            {"/vicon/car": "/odom"},
+            "/vicon/car is geometry_msgs/msg/PoseStamped, expected nav_msgs",
         ),
     ]:
         with pytest.raises(BagError, match=words):

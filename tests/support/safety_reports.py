@@ -1,0 +1,23 @@
+"""Reports of the safety node, as tests of its readers need them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from nodes.runtime.messages import header, types
+
+
+def state_message(stamp_ns: int, armed: bool, reason: str = "") -> Any:
+    """A ``SafetyState`` that answers no request."""
+    return types.SafetyState(
+        header=header(stamp_ns),
+        armed=armed,
+        stopping=not armed,
+        reason=reason,
+        source="",
+        command_age_s=0.0,
+        pose_age_s=0.0,
+        answered_id="",
+        granted=False,
+        answer="",
+    )
