@@ -66,6 +66,8 @@ class CellResult(BaseModel):
         date: When, ISO.
         surrogate: Drives in the learned scene; of an attack over the deployment scene's own frames (meshes) those of the ideal car there.
         deployed: Drives where it is deployed; None as long as they were not driven.
+        not_driven_live: Why live nodes could not drive it, because load or a fault of the stack spoiled all tries; empty otherwise. Such
+            a cell is never evidence.
         registration: Digest of the registration that the cell was run under; empty if there was none.
         policy_sha256: Content hash of the victim; empty in cells from before it was kept.
         kept: The drives of each domain, for whoever computes the numbers again; empty in cells from before they were kept.
@@ -87,10 +89,17 @@ class CellResult(BaseModel):
     date: str
     surrogate: Drives
     deployed: Drives | None = None
+    not_driven_live: str = ""
     registration: str = ""
     policy_sha256: str = ""
     kept: dict[Domain, tuple[KeptDrive, ...]] = Field(default_factory=dict)
     extra: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _driven_or_not(self) -> CellResult:
+        if self.not_driven_live and (self.deployed is not None or "deployed" in self.kept):
+            raise ValueError("expected no deployed drives in a cell that was not driven live, got some")
+        return self
 
     @property
     def name(self) -> str:

@@ -57,6 +57,8 @@ def film_scenario(
     frames = [as_uint8(whole.render(pose[None], shown.colours).images[0]) for pose in poses]
     tracks = [_track(experiment, attacked, "learned scene, attacked", frames, learned)]
     for cell in (attacked.clean, attacked):
+        if not (driven_folder(experiment, cell) / DRIVES).exists():
+            continue  # not driven live
         title = "deployed, no attack" if cell.method == NONE else "deployed, attacked"
         tracks.append(_deployed_track(experiment, scene, space, cell, title, driven_folder(experiment, cell)))
     return write_clip(folder / f"{scenario}.mp4", tracks, rate_hz, experiment.world.off_track_m)

@@ -72,6 +72,8 @@ def print_summary(experiment: Experiment, console: Console) -> None:
     wide.print(text_table(table_of(experiment)).rich())
     if experiment.config.deploy.live:
         wide.print(live_report.target_rows(experiment).rich())
+        if text := live_report.not_driven(experiment):
+            console.print(text, highlight=False, markup=False, soft_wrap=True)
     console.print(f"report: {experiment.stage_folder('report') / PAGE}", highlight=False, soft_wrap=True)
 
 

@@ -13,6 +13,7 @@ from nodes.experiment.attack import cells
 from nodes.experiment.campaign.config import Campaign, campaign_of
 from nodes.experiment.campaign.plan import statuses
 from nodes.experiment.campaign.run import Options, run_campaign
+from nodes.experiment.campaign.store import FINISHED, NOT_DRIVEN
 from nodes.experiment.campaign.worker import Ended
 from nodes.experiment.cell import Cell, select
 from nodes.experiment.context import Experiment
@@ -103,7 +104,7 @@ def _record_cells_there(
 ) -> None:
     """Cells that will not be run again: done, or failed before."""
     for each in statuses(campaign, chosen):
-        if each.state == "done":
+        if each.state in FINISHED and not (each.state == NOT_DRIVEN and options.retry):
             record.finish(each.cell.name, 0.0, cached=True)
         elif each.state == "failed" and not options.retry:
             record.fail(each.cell.name, each.text)
@@ -115,7 +116,9 @@ def _write_report(
     """The report, once every cell of these settings is here and deployed; what it was made of is part of its key."""
     files = {cell.name: experiment.cell_result(cell) for cell in campaign.cells}
     found = statuses(campaign, campaign.cells)
-    missing = [each.cell.name for each in found if each.state != "done" or not files[each.cell.name].exists()]
+    missing = [
+        each.cell.name for each in found if each.state not in FINISHED or not files[each.cell.name].exists()
+    ]
     if experiment.config.deploy.through == "nothing":
         return
     if missing:

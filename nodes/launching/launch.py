@@ -57,6 +57,7 @@ class Launch:
         self.run_dir = Path(run_dir).resolve()
         self.plan: Plan = load_launch(Path(file), overrides, self.run_dir, host)
         self.failure = ""
+        self.timed_out = False  # whether a node was too slow, instead of ended by an error of its own
         self._report = report or (lambda line: None)
         self._children = {name: Child(name, entry, self.run_dir) for name, entry in self.plan.nodes.items()}
         # Plain flags: an Event takes a lock, and a signal handler that sets it could deadlock with itself.
@@ -107,6 +108,7 @@ class Launch:
             if self._done.is_set():
                 raise LaunchError(self.failure or "the launch was stopped before it was ready")
             if time.monotonic() > deadline:
+                self.timed_out = True
                 raise LaunchError(
                     f"expected the launch to be ready within {timeout_s:g} s: {self._what_is_missing()}"
                 )
@@ -172,6 +174,7 @@ class Launch:
                 self._report(f"{child.name}: restarted, process {child.pid}")
         elif child.running:
             if trouble := _silence(child, now):
+                self.timed_out |= child.entry.required and not self.failure
                 child.signal(signal.SIGKILL)
                 self._died(child, f"{trouble} and was killed (log: {child.log})", now)
         elif not child.given_up:

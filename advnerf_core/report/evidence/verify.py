@@ -211,7 +211,9 @@ def _against_registration(
         elif name in evidence.cells and not evidence.is_registered(evidence.cells[name]):
             yield f"{name}: was registered, and was not run under this registration"
     for cell in cells:
-        if cell.name not in evidence.cells:
+        if cell.not_driven_live:
+            yield f"{cell.name}: was not driven live and is no evidence: {cell.not_driven_live}"
+        elif cell.name not in evidence.cells:
             yield f"{cell.name}: expected a cell of a registered scenario with its drives kept"
         elif not evidence.is_registered(cell) and cell.registration:
             yield f"{cell.name}: says that it was registered, and was not"
