@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.view import PolicyView
 from calibration.schema import RoomCalibration, load_calibration
+from nodes.launching.launched import read_launched
 from nodes.operator_page import board as topics
 from nodes.operator_page.board import Board
 from nodes.operator_page.catalogue import read_catalogue
@@ -25,7 +26,6 @@ from nodes.operator_page.client import Asked, Gone
 from nodes.operator_page.desk import Desk, DeskLimits
 from nodes.operator_page.diary import Diary
 from nodes.operator_page.disk import DiskWriter
-from nodes.operator_page.launched import read_launched
 from nodes.operator_page.operation import ACT, FILE, RESET, SWITCH, TELEOP, Operation, Parts
 from nodes.operator_page.pictures import ATTACKED, CAMERA, POLICY, Picture, jpeg_of, view_of_policy
 from nodes.operator_page.recording import RECORDER, Recording

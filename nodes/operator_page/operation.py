@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from advnerf_core.geometry import planar_pose
+from nodes.launching.launched import Launched
 from nodes.operator_page.board import Board
 from nodes.operator_page.catalogue import Entry, Sender
 from nodes.operator_page.client import Asked
 from nodes.operator_page.desk import Desk
 from nodes.operator_page.diary import Diary
-from nodes.operator_page.launched import Launched
 from nodes.operator_page.recording import Recording
 from nodes.operator_page.said import ChooseAttack, Hold, Label, Release, Stop, Take
 from nodes.operator_page.trial import Trial

@@ -42,11 +42,6 @@ class ArmAsker:
         if self._pending is None or self._pending.arm:
             self._pending = _Pending(Asked.at(now), True, reason)
 
-    def withdraw(self) -> None:
-        """Forget a request to arm. A request to disarm is never withdrawn."""
-        if self._pending is not None and self._pending.arm:
-            self._pending = None
-
     def disarm(self, now: Now, reason: str) -> Out:
         """Ask to disarm. Returns the first message."""
         self._pending = _Pending(Asked.at(now), False, reason)

@@ -371,12 +371,19 @@ def socket_paths(run_dir: Path, topic: Topic) -> list[Path]:
 
 
 def _connect(socket: zmq.Socket[Any], run_dir: Path, topic: Topic) -> None:
-    """Connect to all endpoints of a topic, whether a process has bound them yet or not."""
-    # A process that binds later must be found within its first period, without the growing default delay.
-    socket.setsockopt(zmq.RECONNECT_IVL, 20)
-    socket.setsockopt(zmq.RECONNECT_IVL_MAX, 100)
-    for path in socket_paths(run_dir, topic):
-        socket.connect(f"ipc://{path}")
+    """Connect to all endpoints of a topic, whether a process has bound them yet or not. An error closes the socket.
+
+    An open socket would keep the bus from closing for ever.
+    """
+    try:
+        # A process that binds later must be found within its first period, without the growing default delay.
+        socket.setsockopt(zmq.RECONNECT_IVL, 20)
+        socket.setsockopt(zmq.RECONNECT_IVL_MAX, 100)
+        for path in socket_paths(run_dir, topic):
+            socket.connect(f"ipc://{path}")
+    except BaseException:
+        socket.close()
+        raise
 
 
 def _bind(socket: zmq.Socket[Any], run_dir: Path, topic: Topic) -> TextIO:

@@ -246,6 +246,14 @@ def test_wait_for_subscribers_says_what_to_do(tmp_path):
         bus.wait_for_subscribers(["/arm"], 0.05)
 
 
+@pytest.mark.parametrize("topic_name", ["/arm", "/camera/image_raw", "/status/x"])
+def test_a_bus_whose_folder_cannot_be_used_closes(tmp_path, topic_name):
+    (tmp_path / "bus").write_text("no folder")
+    for open_it in (Bus.subscribe, Bus.publisher):
+        with Bus(tmp_path) as bus, pytest.raises(OSError):
+            open_it(bus, topic_name)
+
+
 def test_long_run_folder_still_has_sockets(tmp_path):
     deep = tmp_path / ("d" * 60) / ("e" * 60)
     with Bus(deep) as sender, Bus(deep) as receiver:
