@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hashlib
+import math
 import socket
 import threading
 import time
@@ -250,10 +251,18 @@ class PageServer:
         ours = origin_is_ours(
             request.headers.get("origin"), request.headers.get("host", ""), self.tls is not None
         )
-        token = ""
+        token, host = "", request.client.host
         if ours and code:
             with self._door_lock:
-                token = self.doors.enter(code, request.client.host, time.monotonic_ns())
+                wait_s = self.doors.wait_s(host, time.monotonic_ns())
+                turn_s = 0.0 if wait_s else self.doors.turn_s(host, time.monotonic_ns())
+            if wait_s:
+                self.counts.refused += 1
+                headers = {"Retry-After": str(math.ceil(wait_s))}
+                return JSONResponse({"open": False, "wait_s": math.ceil(wait_s)}, 429, headers)
+            await asyncio.sleep(turn_s)
+            with self._door_lock:
+                token = self.doors.enter(code, host, time.monotonic_ns())
         if not token:
             self.counts.refused += 1
             await asyncio.sleep(_WRONG_CODE_S)

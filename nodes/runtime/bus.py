@@ -23,6 +23,7 @@ from typing import Any, TextIO
 import zmq
 
 from nodes.runtime.clock import NS_PER_S, Clock, SystemClock
+from nodes.runtime.descriptors import require_free
 from nodes.runtime.errors import BusError, MessageError
 from nodes.runtime.image_parts import IMAGE_TYPE, PartedInfo, join_image, split_image, with_parts
 from nodes.runtime.locks import HeldError, hold
@@ -181,6 +182,7 @@ class Bus:
     def __init__(self, run_dir: Path, clock: Clock | None = None) -> None:
         self._run_dir = Path(run_dir)
         self._clock = clock or SystemClock()
+        require_free()
         self._context: zmq.Context[Any] = zmq.Context()
         self._poller = zmq.Poller()
         self._publishers: dict[str, Publisher] = {}

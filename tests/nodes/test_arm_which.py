@@ -161,7 +161,7 @@ def test_in_a_terminal_the_person_decides(desk, names, typed, armed):
     os.write(terminal, typed.encode())
     output, _ = asking.communicate(timeout=60)
     os.close(terminal)
-    assert (asking.returncode == 0) == bool(armed)
+    assert (asking.returncode == 0) == bool(armed), output
     assert ("armed by operator" in output) == bool(armed)
     for name, lab in labs.items():
         wait_for(lambda lab=lab: not lab.recorded or lab.recorded[-1].arm, "what was asked of each launch")
