@@ -299,7 +299,7 @@ class SafetyNode(Node):
             header=header(now.real_ns),
             armed=arming.armed,
             stopping=not arming.armed,
-            reason=arming.reason,
+            reason=arming.stopped_by,
             source=arming.source if arming.armed else "",
             answered_id=answer.ask_id,
             granted=answer.granted,

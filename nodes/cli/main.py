@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from advnerf_core.errors import AdvnerfError
+from nodes.cli import arm as cli_arm
 from nodes.cli import attack as cli_attack
 from nodes.cli import attack_node as cli_attack_node
 from nodes.cli import attack_poses as cli_attack_poses
@@ -35,7 +36,7 @@ from nodes.cli import topic as cli_topic
 from nodes.cli import trial as cli_trial
 from nodes.cli import verify as cli_verify
 from nodes.cli import world as cli_world
-from nodes.runtime.terminal import Overrides, RunDir, print_table, say_error, table
+from nodes.runtime.terminal import Overrides, print_table, say_error, table
 
 if TYPE_CHECKING:
     from nodes.launching.launch import Launch
@@ -83,6 +84,7 @@ app.add_typer(cli_scene.app, name="scene")
 app.add_typer(cli_room.app, name="room")
 app.add_typer(cli_carla.app, name="carla")
 app.add_typer(cli_world.app, name="world")
+cli_arm.add_to(app)
 cli_doctor.add_to(app)
 cli_experiment.add_to(app)
 cli_verify.add_to(app)
@@ -189,49 +191,6 @@ def _say_problems(plan: Any) -> None:
         say_error(problem)
     if problems:
         raise typer.Exit(ERROR_EXIT)
-
-
-@app.command()
-def arm(
-    run_dir: RunDir = None, reason: Annotated[str, typer.Option("--reason", help="Reason to record.")] = ""
-) -> None:
-    """Ask the safety node of a running launch to arm the car."""
-    from nodes.launching.watching import find_run_dir
-    from nodes.runtime.arm_requests import ask_to_arm
-
-    answer = ask_to_arm(find_run_dir(run_dir), reason)
-    if answer.granted and answer.armed:
-        print(f"armed by {answer.text}")
-        return
-    print(f"armed, but stopped again since: {answer.text}" if answer.granted else f"not armed: {answer.text}")
-    raise typer.Exit(FAILURE_EXIT)
-
-
-@app.command()
-def disarm(
-    run_dir: RunDir = None, reason: Annotated[str, typer.Option("--reason", help="Reason to record.")] = ""
-) -> None:
-    """Stop the car of a running launch and keep it stopped."""
-    from nodes.launching.watching import find_run_dir
-    from nodes.runtime.arm_requests import BRAKE_WAIT_S, ask_to_disarm
-
-    def silent(waited_s: float) -> None:
-        say_error(
-            f"NOT CONFIRMED: no answer from the safety node for {waited_s:.1f} s, and the car may be driving. Use the e-stop or"
-            " cut the power. Still asking (Ctrl-C gives up)"
-        )
-
-    answer = ask_to_disarm(find_run_dir(run_dir), reason, silent)
-    if answer.armed:
-        say_error("disarmed, but another request has armed the car again since")
-        raise typer.Exit(FAILURE_EXIT)
-    print(f"not armed: {answer.text}")
-    if not answer.braked:
-        say_error(
-            f"NOT CONFIRMED: disarmed, but the motor node did not report within {BRAKE_WAIT_S:g} s that it brakes. Watch the"
-            " car. If the motor node is down, the motor controller brakes after its own timeout"
-        )
-        raise typer.Exit(FAILURE_EXIT)
 
 
 def _is_for_people(error: Exception) -> bool:

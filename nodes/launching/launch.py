@@ -25,7 +25,7 @@ from nodes.runtime.bus import Bus
 from nodes.runtime.config import node_document
 from nodes.runtime.errors import LaunchError
 from nodes.runtime.locks import HeldError, hold
-from nodes.runtime.paths import RESOLVED_NAME, private_folder, user_folder
+from nodes.runtime.paths import RESOLVED_NAME, private_folder, user_folder, user_folders
 from nodes.runtime.topics import status_topic
 
 _POLL_S = 0.05
@@ -270,9 +270,9 @@ class Launch:
 
 
 def active_launches() -> list[dict[str, Any]]:
-    """Running launches of this user on this host: name, run_dir, pid."""
+    """Running launches of this user on this host: name, run_dir, pid, and cwd, the folder in which it was started."""
     found = []
-    for card in sorted((user_folder() / "active").glob("*.json")):
+    for card in sorted(card for folder in user_folders() for card in (folder / "active").glob("*.json")):
         try:
             launch = json.loads(card.read_text(encoding="utf-8"))
             if is_running(Path(launch["run_dir"])):
@@ -313,5 +313,7 @@ def is_running(run_dir: Path) -> bool:
 
 def _leave_card(name: str, run_dir: Path) -> Path:
     card = private_folder(user_folder() / "active") / f"{os.getpid()}-{run_dir.name}.json"
-    write_atomically(card, json.dumps({"name": name, "run_dir": str(run_dir), "pid": os.getpid()}))
+    write_atomically(
+        card, json.dumps({"name": name, "run_dir": str(run_dir), "pid": os.getpid(), "cwd": os.getcwd()})
+    )
     return card

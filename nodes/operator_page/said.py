@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, TypeAdapter, ValidationError
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    StringConstraints,
+    TypeAdapter,
+    ValidationError,
+)
 
 from nodes.runtime.errors import MessageError
 
@@ -19,6 +27,19 @@ _Text = Annotated[
 _Count = Annotated[int, Field(ge=0, lt=2**53, strict=True)]
 # A capture stamp in nanoseconds needs more digits than a number of JavaScript has, so it is sent as text.
 _Stamp = Annotated[str, StringConstraints(pattern=r"^(0|[1-9][0-9]{0,18})$")]
+
+
+STOPS = ("estop", "disarm")
+
+
+def _count_or_zero(value: Any) -> int:
+    return value if type(value) is int and 0 <= value < 2**53 else 0
+
+
+def _stamp_or_zero(value: Any) -> str:
+    return (
+        value if isinstance(value, str) and value.isascii() and value.isdigit() and len(value) < 20 else "0"
+    )
 
 
 class _Said(BaseModel):
@@ -70,12 +91,20 @@ class Take(_Act):
     name: _Name
 
 
+class Stop(_Said):
+    """Stop the car. Only the kind matters: a wrong or missing number, picture or key refuses no stop."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    t: Literal["estop", "disarm"]
+    n: Annotated[int, BeforeValidator(_count_or_zero)] = 0
+    frame: Annotated[str, BeforeValidator(_stamp_or_zero)] = "0"
+
+
 class Plain(_Act):
     """An act without arguments."""
 
-    t: Literal[
-        "leave", "estop", "reset_estop", "disarm", "trial", "trial_end", "attack_off", "record", "record_stop"
-    ]
+    t: Literal["leave", "reset_estop", "trial", "trial_end", "attack_off", "record", "record_stop"]
 
 
 class ChooseAttack(_Act):
@@ -92,7 +121,7 @@ class Label(_Act):
     text: _Text
 
 
-Act = Hold | Release | Take | Plain | ChooseAttack | Label
+Act = Hold | Release | Take | Plain | Stop | ChooseAttack | Label
 Said = Seen | Wants | Act
 _ADAPTER: TypeAdapter[Said] = TypeAdapter(Annotated[Said, Field(discriminator="t")])
 

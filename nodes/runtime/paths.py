@@ -39,6 +39,21 @@ def user_folder() -> Path:
     return private_folder(Path(tempfile.gettempdir()) / f"advnerf-{os.getuid()}")
 
 
+def user_folders() -> list[Path]:
+    """All folders that `user_folder` may have returned to other processes of this user, whose environment may be another one."""
+    base = os.environ.get("XDG_RUNTIME_DIR") or f"/run/user/{os.getuid()}"
+    candidates = (Path(base) / "advnerf", Path(tempfile.gettempdir()) / f"advnerf-{os.getuid()}")
+    return [folder for folder in candidates if _is_ours(folder)]
+
+
+def _is_ours(folder: Path) -> bool:
+    try:
+        found = folder.lstat()
+    except OSError:
+        return False
+    return stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid()
+
+
 def bus_folder(run_dir: Path) -> Path:
     """Folder of a run's sockets: ``<run_dir>/bus``, or a short link if that path is too long for a socket."""
     run_dir = Path(run_dir).resolve()

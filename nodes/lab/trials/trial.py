@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from advnerf_core.geometry import planar_pose, wrap_angle, yaw_of
-from nodes.runtime.arm_requests import arm_message
+from nodes.runtime.arm_requests import BRAKE_WAIT_S, arm_message
 from nodes.runtime.clock import NS_PER_S, Now
 from nodes.runtime.errors import NodeFinished, RuntimeFault
 from nodes.runtime.messages import ns_from_stamp, pose_matrix, pose_message
@@ -258,6 +258,8 @@ class TrialNode(Node):
             self._enter(Phase.DONE, now)
             return []
         answered = self._asked is not None and self._seen.answered_id == self._asked.ask_id
+        if not answered and self._phase_s(now) > BRAKE_WAIT_S:
+            self._tell("NOT CONFIRMED: no answer from the safety node. Use the hardware stop", now)
         return [] if answered and not self._seen.armed else [self._arm_message(False, now)]
 
     def _enter(self, phase: Phase, now: Now) -> None:
