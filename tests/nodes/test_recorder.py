@@ -115,7 +115,7 @@ def test_killed_process_loses_at_most_what_came_in_its_last_moment(tmp_path):
 def test_killed_process_that_splits_its_bag_loses_at_most_what_came_in_its_last_moment(tmp_path, seed):
     rng = np.random.default_rng(seed)
     with Bus(tmp_path) as bus:
-        process = start_recorder(tmp_path, bus, "max_bag_size_mb=1", "max_bag_duration_s=0.3")
+        process = start_recorder(tmp_path, bus, "max_bag_size_mb=1", "max_bag_duration_s=0.1")
         sent = drive(bus, 0.6 + rng.uniform(0.0, 0.4))
         os.kill(process.pid, signal.SIGKILL)
         process.communicate(timeout=10)

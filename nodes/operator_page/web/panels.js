@@ -20,7 +20,7 @@ export function showState(state, me) {
   showPlace(state);
   showSteering(state.steering);
   showAttack(state);
-  showRecording(state.recording);
+  showRecording(state.recording, state.nodes);
   showHealth(state);
   showTrial(state.trial);
   showActs(state.acts);
@@ -76,8 +76,9 @@ function showAttack({ attack, chosen, search }) {
   }
 }
 
-function showRecording(recording) {
-  let state = "Not recording from here.";
+function showRecording(recording, nodes) {
+  const launch = nodes.find((node) => node.name === "recorder" && node.state === "active" && fresh(node));
+  let state = launch ? "The launch records." : "Nothing is recorded.";
   if (recording.stopping) state = `Finishing ${recording.folder}.`;
   else if (recording.records) state = `Recording to ${recording.folder}.`;
   else if (recording.on) state = "Starting a recorder. Nothing is recorded yet.";
