@@ -32,8 +32,8 @@ class RecorderConfig(BaseModel):
         attachments: Files to attach, such as calibration and attack files.
         queue: Messages per topic that may wait while the disk is busy.
         max_bag_duration_s: Time after which a new file starts [s]. The default keeps the index of a quiet recording small.
-        max_bag_size_mb: Size at which a new file starts [MiB]. The default is 20 s of camera and compositor images. The index of a
-            file takes about 700 bytes of memory per image, or per 64 KiB of small messages.
+        max_bag_size_mb: Size at which a new file starts [MiB], after compression. The index of a file takes about 700 bytes of memory
+            per image, or per 64 KiB of small messages.
     """
 
     model_config = ConfigDict(extra="forbid")

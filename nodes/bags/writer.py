@@ -1,8 +1,8 @@
 """Writes bags that rosbag2, Foxglove, ``mcap`` and ``rosbags`` can open. Messages are stored as the received bytes.
 
-A bag is a folder with one ``.mcap`` file, or with numbered parts, and ``metadata.yaml``. Chunks of 64 KiB are written to the file at
-once and reach the disk once a second. A journal next to the file has the messages of the unfinished chunk, so that a killed recorder
-loses no message that it had received (`nodes.bags.repair` adds them to the bag).
+A bag is a folder with one ``.mcap`` file, or with numbered parts, and ``metadata.yaml``. Chunks of 64 KiB are compressed with zstd,
+written to the file at once, and reach the disk once a second. A journal next to the file has the messages of the unfinished chunk, so
+that a killed recorder loses no message that it had received (`nodes.bags.repair` adds them to the bag).
 
 The index of a file is kept in memory until the file is finished, about 700 bytes per chunk. So the recorder starts a new part from
 time to time, and another thread finishes the old one.

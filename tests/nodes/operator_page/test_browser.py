@@ -117,7 +117,7 @@ def test_arm_drive_attack_on_disarm_while_another_watches(lab, phones, options):
     put_back(page)
     drive(ann.page, ann.hold, ann.let_go)
     says(watcher, "#armed", "ARMED")
-    says(page, "#hold", "Driving")
+    says(page, "#hold", "Let go to stop")
     page.wait_for_timeout(500)
     page.keyboard.press("Tab")  # the focus leaves the button, and with it the hand
     says(page, "#armed", "disarmed")
