@@ -73,7 +73,8 @@ class RecorderNode(Node):
         attachments = _read_attachments([context.run_dir / RESOLVED_NAME], must_exist=False)
         attachments |= _read_attachments(config.attachments, must_exist=True)
         limits = SplitLimits(config.max_bag_duration_s, config.max_bag_size_mb)
-        writer = BagWriter(context.run_dir / config.output, attachments, provenance(), limits=limits)
+        folder = context.run_dir / config.output
+        writer = BagWriter(folder, attachments, provenance(), limits=limits, compressed=True)
         return cls(writer, topics, config.queue)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
