@@ -47,7 +47,7 @@ class Recording:
         """Note a status of the recorder. Only a recorder that received something from this page also receives labels."""
         if self._child is not None and int(status.pid) == self._child.pid:
             received = dict(zip(status.counter_names, status.counter_values, strict=True))
-            self._connected |= received.get(f"received {TELEOP}", 0.0) > 0.0
+            self._connected |= bool(received.get(f"received {TELEOP}", 0.0) > 0.0)  # the counters are numpy's
 
     def start(self) -> str:
         """Start a recorder into a new folder. Returns why not; empty if it was started."""
