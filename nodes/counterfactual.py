@@ -17,9 +17,10 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
 from advnerf_core.policies.load import Driver, load_driver
+from advnerf_core.strict import StrictModel
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError, MessageError
 from nodes.runtime.messages import header, stamp_ns, types
@@ -37,7 +38,7 @@ _OPEN = 12
 _QUEUE = 12
 
 
-class CounterfactualConfig(BaseModel):
+class CounterfactualConfig(StrictModel):
     """Configuration of the counterfactual node.
 
     Attributes:
@@ -48,8 +49,6 @@ class CounterfactualConfig(BaseModel):
         goal: Goal vector of a goal-conditioned policy.
         max_age_s: Largest age of a pair since publication. Older pairs are skipped, so that a busy computer can catch up [s].
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     policy: str = Field(min_length=1)
     sha256: str = ""

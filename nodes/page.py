@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import cv2
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.view import PolicyView
+from advnerf_core.strict import StrictModel
 from calibration.schema import RoomCalibration, load_calibration
 from nodes.launching.launched import read_launched
 from nodes.operator_page import board as topics
@@ -48,7 +49,7 @@ _OFF_TRACK_M = 0.4
 FOLDER, DOOR, LOG = "page", "page/door.json", "page/acts.jsonl"
 
 
-class PageConfig(BaseModel):
+class PageConfig(StrictModel):
     """Configuration of the page node.
 
     Attributes:
@@ -70,8 +71,6 @@ class PageConfig(BaseModel):
         code_s: Time for which a one-time code is valid [s].
         trial_ticks: Length of a trial in control ticks of 0.1 s.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     host: str = "127.0.0.1"
     port: int = Field(default=8090, ge=0, le=65535)

@@ -13,8 +13,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from advnerf_core.strict import StrictModel
 from hardware.operator.gamepad import EVENT_LAYOUT, JS_LAYOUT, Gamepad, Layout
 from hardware.operator.hands import Hands
 from hardware.operator.keyboard import Keyboard
@@ -38,7 +39,7 @@ from nodes.runtime.process import run_node_main
 _STALE_S = 0.15
 
 
-class TeleopConfig(BaseModel):
+class TeleopConfig(StrictModel):
     """Configuration of the teleop node.
 
     Attributes:
@@ -47,8 +48,6 @@ class TeleopConfig(BaseModel):
         speed_mps: Speed at full throttle [m/s].
         steering_rad: Steering at full deflection [rad].
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     device: Path | Literal["keyboard"] = "keyboard"
     axes: tuple[int, int] | None = None

@@ -6,7 +6,6 @@ a file is one `DatasetError` that names the file, the frame and the field.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable
 from pathlib import Path
@@ -14,10 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from advnerf_core.data.errors import DatasetError
+from advnerf_core.data.errors import DatasetError, raise_all
 from advnerf_core.data.image_files import SUFFIXES, image_size
 from advnerf_core.data.lens import Lens
 from advnerf_core.data.views import HELD_OUT_SPLITS, NGP_OFFSET, NGP_SCALE, TRAIN, PosedImage, PosedImages
+from advnerf_core.documents import read_json
+from advnerf_core.errors import ConfigError, MissingFileError
 from advnerf_core.geometry import OPENGL_FROM_OPENCV, Array, Pinhole
 
 _LENSES = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
@@ -67,7 +68,8 @@ def _read_set(path: Path, split: str | None, require_all: bool) -> PosedImages:
     listed = content.get("frames")
     if not isinstance(listed, list) or not listed:
         raise DatasetError(f"expected a list 'frames' in {path}, got {type(listed).__name__} without entries")
-    split_of, frames, missing = _listed_splits(path, content), [], []
+    split_of, frames, missing = _listed_splits(path, content), list[PosedImage](), list[Path]()
+    wrong = list[DatasetError]()
     for number, entry in enumerate(listed):
         try:
             name = _name_of(entry)
@@ -80,7 +82,8 @@ def _read_set(path: Path, split: str | None, require_all: bool) -> PosedImages:
             )
         except ValueError as error:
             label = f" ({entry['file_path']})" if isinstance(entry, dict) and "file_path" in entry else ""
-            raise DatasetError(f"{path}: frame {number}{label}: {error}") from error
+            wrong.append(DatasetError(f"{path}: frame {number}{label}: {error}"))
+    raise_all(wrong, len(listed), "frames")
     if missing and (require_all or not frames):
         raise DatasetError(
             f"expected {len(listed)} images listed in {path}, {len(missing)} are missing, the first is {missing[0]}; "
@@ -92,11 +95,11 @@ def _read_set(path: Path, split: str | None, require_all: bool) -> PosedImages:
 
 def _read_json(path: Path) -> _Values:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DatasetError(f"expected a transforms.json at {path}, got: {error.strerror}") from error
-    except ValueError as error:
-        raise DatasetError(f"expected JSON in {path}, got: {error}") from error
+        content = read_json(path)
+    except MissingFileError as error:
+        raise DatasetError(f"expected a transforms.json at {path}, found none; correct the path") from error
+    except ConfigError as error:
+        raise DatasetError(str(error)) from error
     if not isinstance(content, dict):
         raise DatasetError(f"expected a JSON object in {path}, got {type(content).__name__}")
     return content
@@ -264,6 +267,8 @@ def _focal_length(values: _Values, axis: str, size: int) -> float | None:
 def _number(values: _Values, key: str, default: float, positive: bool = False) -> float:
     raw = values.get(key)
     try:
+        if isinstance(raw, bool):  # in Python, a number
+            raise TypeError
         value = default if raw is None else float(raw)
     except (TypeError, ValueError):
         raise _FieldError(f"{key}: expected a number, got {raw!r:.60}") from None

@@ -9,16 +9,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from advnerf_core.data.errors import DatasetError
-from advnerf_core.data.image_files import Rgb
+from advnerf_core.data.image_files import Rgb, write_image
 from advnerf_core.data.keyframes import Candidate, KeyframeConfig, KeyframeSelector
+from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
-JPEG_QUALITY = 95
 _RECORD = "keyframes.json"
 
 
@@ -94,12 +93,7 @@ def keep_keyframes(
 
 def _write(folder: Path, frame: Candidate) -> dict[str, Any]:
     name = f"{frame.number:06d}.jpg"
-    encoded, data = cv2.imencode(
-        ".jpg", np.ascontiguousarray(frame.rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
-    )
-    if not encoded:
-        raise ValueError(f"expected an image that can be written as JPEG, got shape {frame.rgb.shape}")
-    write_atomically(folder / name, data.tobytes())
+    write_image(folder / name, frame.rgb)
     return {"file": name, "time_s": round(frame.time_s, 4), "sharpness": round(frame.sharpness, 2)}
 
 
@@ -127,7 +121,7 @@ def _key(path: Path, config: KeyframeConfig, most: int) -> str:
 
 def _finished(folder: Path, key: str) -> list[Path] | None:
     try:
-        record = json.loads((folder / _RECORD).read_text())
+        record = read_json(folder / _RECORD)
         files = [folder / row["file"] for row in record["frames"]]
         return files if record["key"] == key and all(file.exists() for file in files) else None
     except (OSError, ValueError, KeyError, TypeError):

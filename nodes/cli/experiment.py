@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from nodes.runtime.terminal import Device, Overrides, print_table, say_error, table
+from nodes.runtime.terminal import Device, Overrides, experiment_argument, print_table, say_error, table
 from nodes.runtime.termination import ends_in_order
 
 if TYPE_CHECKING:
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 File = Annotated[
     Path,
     typer.Argument(
-        help="A *.experiment.yaml file, or a *.campaign.yaml file that lists several.",
-        exists=True,
-        dir_okay=False,
+        metavar="FILE|NAME",
+        help="A *.experiment.yaml file, or a *.campaign.yaml file that lists several, or the name of one.",
+        parser=experiment_argument,
     ),
 ]
 Setting = Annotated[

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import signal
 import time
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.places import use_writable_cache
 from nodes.cli import arm as cli_arm
 from nodes.cli import attack as cli_attack
 from nodes.cli import attack_node as cli_attack_node
@@ -31,34 +33,20 @@ from nodes.cli import policy as cli_policy
 from nodes.cli import replay as cli_replay
 from nodes.cli import room as cli_room
 from nodes.cli import scene as cli_scene
+from nodes.cli import start as cli_start
 from nodes.cli import teleop as cli_teleop
 from nodes.cli import topic as cli_topic
 from nodes.cli import trial as cli_trial
 from nodes.cli import verify as cli_verify
 from nodes.cli import world as cli_world
-from nodes.runtime.terminal import Overrides, print_table, say_error, table
+from nodes.runtime.extras import installs
+from nodes.runtime.terminal import LaunchFile, Overrides, print_table, say_error, table
 
 if TYPE_CHECKING:
     from nodes.launching.launch import Launch
 
 OUR_PACKAGES = ("advnerf_core", "hardware", "calibration", "nodes")
 ERROR_EXIT, FAILURE_EXIT = 2, 1
-# The extra that installs each package which a base installation, such as the car's, does not have.
-_EXTRA_OF = dict.fromkeys(("torch", "numba", "scipy", "matplotlib", "jinja2", "av", "joblib"), "core") | {
-    "mujoco": "twin",
-    "pycolmap": "sfm",
-    "trimesh": "mesh",
-    "viser": "view",
-    "onnxruntime": "onnx",
-    "onnx": "onnx",
-    "mitsuba": "mesh",
-    "drjit": "mesh",
-    "ray": "cluster",
-    "carla": "carla",
-    "starlette": "page",
-    "uvicorn": "page",
-    "cryptography": "page",
-}
 
 app = typer.Typer(
     name="advnerf",
@@ -84,6 +72,7 @@ app.add_typer(cli_scene.app, name="scene")
 app.add_typer(cli_room.app, name="room")
 app.add_typer(cli_carla.app, name="carla")
 app.add_typer(cli_world.app, name="world")
+cli_start.add_to(app)
 cli_arm.add_to(app)
 cli_doctor.add_to(app)
 cli_experiment.add_to(app)
@@ -117,7 +106,7 @@ def options(
 
 @app.command()
 def launch(
-    file: Annotated[Path, typer.Argument(help="A *.launch.yaml file.", exists=True, dir_okay=False)],
+    file: LaunchFile,
     overrides: Overrides = None,
     run_dir: Annotated[
         Path | None,
@@ -200,17 +189,19 @@ def _is_for_people(error: Exception) -> bool:
 
 def main() -> None:
     """Run the command line. An error that the user can fix is printed as one line, with exit code 2 and no traceback."""
+    with contextlib.suppress(
+        AdvnerfError, OSError
+    ):  # only what needs a cache fails without one; stopping the car does not
+        use_writable_cache()
     try:
         app()
     except KeyboardInterrupt:
         raise SystemExit(130) from None
     except ModuleNotFoundError as error:
         missing = (error.name or "").split(".")[0]
-        if _debug or missing in OUR_PACKAGES or missing not in _EXTRA_OF:
+        if _debug or missing in OUR_PACKAGES or (command := installs(missing)) is None:
             raise
-        say_error(
-            f"this command needs {missing}, which is not installed: pip install 'advnerf[{_EXTRA_OF[missing]}]'"
-        )
+        say_error(f"this command needs {missing}, which is not installed: {command}")
         raise SystemExit(ERROR_EXIT) from None
     except Exception as error:  # any other exception is a bug and keeps its traceback
         if _debug or not _is_for_people(error):

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import torch
 
 from advnerf_core.attack.spaces.space import Space
+from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.report.conditions import NONE
@@ -127,7 +128,7 @@ def cell_data(
         Attack id, seconds; for ``surrogate`` and ``deployed`` the total CTE [m] and whether the car left the track, per start, and the total
         CTE without attack; see `advnerf_core.report.cells`. A cell that was not driven live has no ``deployed``, and says why.
     """
-    learned, undisturbed = (json.loads((at / SEARCHED).read_text()) for at in (folder, clean))
+    learned, undisturbed = (read_json(at / SEARCHED) for at in (folder, clean))
     data = {
         "scenario": cell.scenario,
         "victim": cell.victim,
@@ -191,7 +192,7 @@ def deployed_part(
     """Deployed drives of a searched cell from its starts, kept in ``drives.json``; what is there already is read."""
     kept = folder / DRIVES
     if kept.exists():
-        found: dict[str, Any] = json.loads(kept.read_text())
+        found: dict[str, Any] = read_json(kept)
         return found
     deployed = deployer.drive(space, cell, folder, tell)
     data = {

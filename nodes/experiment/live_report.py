@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 from collections.abc import Iterator
@@ -14,6 +13,7 @@ import cv2
 import numpy as np
 
 from advnerf_core.attack.artifact import load_attack
+from advnerf_core.documents import read_json
 from advnerf_core.report import data as rd
 from advnerf_core.report import summary, tables, targets
 from advnerf_core.report.cells import read_cell
@@ -68,7 +68,7 @@ def _report_data(
 ) -> rd.ReportData:
     extras = experiment.stage_folder("live")
     driven = {
-        name: json.loads(file.read_text())
+        name: read_json(file)
         for name, run in extra_runs(experiment).items()
         if (file := extras / f"{run.name}.json").exists()
     }
@@ -186,7 +186,7 @@ def _surrogate_runs(experiment: Experiment) -> Iterator[rd.Run]:
 
 
 def _searched(experiment: Experiment, cell: Cell) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((driven_folder(experiment, cell) / SEARCHED).read_text())
+    found: dict[str, Any] = read_json(driven_folder(experiment, cell) / SEARCHED)
     return found
 
 
@@ -194,7 +194,7 @@ def _live_results(experiment: Experiment, cell: Cell) -> list[dict[str, Any]]:
     file = driven_folder(experiment, cell) / DRIVES
     if read_cell(experiment.cell_result(cell)).not_driven_live:
         return []  # of an arm that was driven, when the one that it is compared with was not
-    found: list[dict[str, Any]] = json.loads(file.read_text())["live"]
+    found: list[dict[str, Any]] = read_json(file)["live"]
     return found
 
 
@@ -258,10 +258,8 @@ def _attacked(experiment: Experiment) -> list[Cell]:
 
 
 def _fidelity(experiment: Experiment) -> rd.Fidelity:
-    scene = json.loads((experiment.stage_folder("scene") / FIDELITY).read_text())
-    steering = json.loads((experiment.stage_folder("policy") / "policy.json").read_text())[
-        "on_held_out_views"
-    ]
+    scene = read_json(experiment.stage_folder("scene") / FIDELITY)
+    steering = read_json(experiment.stage_folder("policy") / "policy.json")["on_held_out_views"]
     shown = {int(i) for i in np.linspace(0, len(scene["views"]) - 1, SHOWN_VIEWS).round()}
     views = []
     for index, (view, angles) in enumerate(zip(scene["views"], steering, strict=True)):
@@ -302,11 +300,11 @@ def _timings(experiment: Experiment) -> Iterator[rd.StageTiming]:
         if record is not None:
             yield rd.StageTiming(name, record.seconds)
     results = [experiment.cell_result(cell) for cell in cells(experiment)]
-    yield rd.StageTiming("cells", sum(json.loads(file.read_text())["seconds"] for file in results))
+    yield rd.StageTiming("cells", sum(read_json(file)["seconds"] for file in results))
 
 
 def _manifest(experiment: Experiment) -> rd.Manifest:
-    manifest = json.loads((experiment.folder / "manifest.json").read_text())
+    manifest = read_json(experiment.folder / "manifest.json")
     machine = {
         "processor": processor_name(),
         "cores": str(len(os.sched_getaffinity(0))),

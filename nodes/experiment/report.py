@@ -33,11 +33,18 @@ _TABLE_WIDTH = 160
 _SEEN_AT_M = (9.0, 14.0)
 
 
-def run(experiment: Experiment, folder: Path, report: Report) -> None:
-    """Write ``report.html``, ``table.json``, ``table.csv``, ``table.md`` and a film of each drive; of live drives also what their bags tell."""
+def run(experiment: Experiment, folder: Path, report: Report, notes: Sequence[str] = ()) -> None:
+    """Write ``report.html``, ``table.json``, ``table.csv``, ``table.md`` and a film of each drive; of live drives also what their bags tell.
+
+    Args:
+        experiment: With all stages before finished, and all cells of its methods.
+        folder: Where to write.
+        report: Progress callback.
+        notes: Paragraphs at the top of the page, such as what is left out.
+    """
     if experiment.config.deploy.live:
         parts = live_report.make_parts(experiment, folder, report)
-        _write(experiment, folder, parts.sections, parts.lead, parts.targets)
+        _write(experiment, folder, parts.sections, (*notes, *parts.lead), parts.targets)
         return
     films_of: list[Path] = []
     with experiment.open_deployed_world() as scene:
@@ -51,7 +58,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         }
     report(0.95, "writing the page")
     sections = page.sections(experiment, overview, films_of, seen)
-    _write(experiment, folder, sections, (page.opening(experiment),))
+    _write(experiment, folder, sections, (*notes, page.opening(experiment)))
 
 
 def _write(

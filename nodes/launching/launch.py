@@ -16,16 +16,16 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
-import yaml
-
+from advnerf_core.documents import dump_yaml, read_json
 from advnerf_core.files import write_atomically
+from advnerf_core.places import private_folder, require_utf8
 from nodes.launching.child import Child
 from nodes.launching.launch_file import Plan, load_launch
 from nodes.runtime.bus import Bus
 from nodes.runtime.config import node_document
 from nodes.runtime.errors import LaunchError
 from nodes.runtime.locks import HeldError, hold
-from nodes.runtime.paths import RESOLVED_NAME, private_folder, user_folder, user_folders
+from nodes.runtime.paths import RESOLVED_NAME, user_folder, user_folders
 from nodes.runtime.topics import status_topic
 
 _POLL_S = 0.05
@@ -55,6 +55,7 @@ class Launch:
         host: str | None = None,
     ) -> None:
         self.run_dir = Path(run_dir).resolve()
+        require_utf8(self.run_dir)
         self.plan: Plan = load_launch(Path(file), overrides, self.run_dir, host)
         self.failure = ""
         self.timed_out = False  # whether a node was too slow, instead of ended by an error of its own
@@ -130,11 +131,11 @@ class Launch:
         self._impatient = self._impatient or kill
 
     def _write_configuration(self) -> None:
-        resolved = yaml.safe_dump(self.plan.resolved, sort_keys=False)
+        resolved = dump_yaml(self.plan.resolved)
         write_atomically(self.run_dir / RESOLVED_NAME, resolved)
         for name, child in self._children.items():
             document = node_document(self.plan.documents[name])
-            write_atomically(child.config, yaml.safe_dump(document, sort_keys=False))
+            write_atomically(child.config, dump_yaml(document))
 
     def _supervise(self) -> None:
         try:
@@ -274,7 +275,7 @@ def active_launches() -> list[dict[str, Any]]:
     found = []
     for card in sorted(card for folder in user_folders() for card in (folder / "active").glob("*.json")):
         try:
-            launch = json.loads(card.read_text(encoding="utf-8"))
+            launch = read_json(card)
             if is_running(Path(launch["run_dir"])):
                 found.append(launch)
         except (OSError, ValueError, KeyError):

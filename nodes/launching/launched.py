@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from nodes.runtime.config import parse_yaml
+from advnerf_core.documents import read_yaml
 from nodes.runtime.paths import RESOLVED_NAME
 
 
@@ -41,10 +41,9 @@ class Launched:
 def read_launched(run_dir: Path) -> Launched:
     """Read the resolved launch file of a run, if there is one."""
     try:
-        text = (run_dir / RESOLVED_NAME).read_text(encoding="utf-8")
+        entries = read_yaml(run_dir / RESOLVED_NAME).data.get("nodes") or {}
     except FileNotFoundError:
         return Launched()
-    entries = parse_yaml(text, RESOLVED_NAME).data.get("nodes") or {}
     enabled = {name: entry for name, entry in entries.items() if entry.get("if", True)}
     of_module = {entry.get("module"): entry.get("config") or {} for entry in enabled.values()}
     safety = of_module.get("nodes.safety")

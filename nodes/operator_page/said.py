@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 from pydantic import (
-    BaseModel,
     BeforeValidator,
     ConfigDict,
     Field,
@@ -14,6 +13,7 @@ from pydantic import (
     ValidationError,
 )
 
+from advnerf_core.strict import StrictModel
 from nodes.runtime.errors import MessageError
 
 LONGEST_BYTES = 2048
@@ -42,11 +42,7 @@ def _stamp_or_zero(value: Any) -> str:
     )
 
 
-class _Said(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Seen(_Said):
+class Seen(StrictModel):
     """A picture was drawn on the screen, or could not be decoded."""
 
     t: Literal["seen"]
@@ -54,14 +50,14 @@ class Seen(_Said):
     s: _Stamp
 
 
-class Wants(_Said):
+class Wants(StrictModel):
     """The pictures that the page shows."""
 
     t: Literal["wants"]
     c: Annotated[list[Annotated[int, Field(ge=0, le=2, strict=True)]], Field(max_length=3)]
 
 
-class _Act(_Said):
+class _Act(StrictModel):
     """An act carries the key of its connection, a number that grows, and the newest picture that its operator saw."""
 
     key: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{32}$")]
@@ -91,7 +87,7 @@ class Take(_Act):
     name: _Name
 
 
-class Stop(_Said):
+class Stop(StrictModel):
     """Stop the car. Only the kind matters: a wrong or missing number, picture or key refuses no stop."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)

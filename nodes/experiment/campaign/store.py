@@ -10,6 +10,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Literal
 
+from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import CellError, CellResult, cell_from, read_cell
 from nodes.experiment.campaign.config import Campaign
@@ -76,7 +77,7 @@ class Store:
     def error(self, name: str, settings_hash: str) -> str:
         """Why the cell failed with these settings; empty if it did not."""
         try:
-            data = json.loads((self.work(name) / _ERROR).read_text(encoding="utf-8"))
+            data = read_json(self.work(name) / _ERROR)
             return str(data["error"]) if data["settings_hash"] == settings_hash else ""
         except (OSError, ValueError, KeyError, TypeError):
             return ""

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, Literal, TextIO
 
 from advnerf_core.files import write_atomically
+from advnerf_core.run_module import module_command
 from nodes.experiment.campaign.store import LOG, Store
 from nodes.experiment.cell import Cell
 from nodes.experiment.cell_kind import CellKind, settings_hash
@@ -123,7 +124,7 @@ def run_in_process(job: Job) -> Ended:
     }
     environment.setdefault("MUJOCO_GL", "egl")
     process = subprocess.Popen(
-        [sys.executable, "-m", "nodes.experiment.campaign.worker", str(os.getpid())],
+        module_command("nodes.experiment.campaign.worker", str(os.getpid())),
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,

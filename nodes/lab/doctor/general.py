@@ -28,6 +28,7 @@ def checks(folder: Path, vicon_port: int, vesc_port: str | None = None) -> list[
     return [
         Check("versions", machine.versions),
         Check("machine", machine.machine),
+        Check("places", machine.places),
         Check("priority", priority.shares, priority.DEADLINE_S),
         Check("torch", graphics.torch, _CHILD_DEADLINE_S),
         Check("EGL", graphics.egl, _CHILD_DEADLINE_S),

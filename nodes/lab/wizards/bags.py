@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from advnerf_core.data.errors import DatasetError
+from advnerf_core.data.image_files import read_stored
 from advnerf_core.data.similarity import rotation_angles
+from advnerf_core.documents import read_csv
+from advnerf_core.errors import ConfigError, MissingFileError
 from advnerf_core.geometry import Array, make_transform
 from calibration.camera_to_car import MountView
 from calibration.charuco import BoardDetector, Detection
@@ -91,15 +93,11 @@ def read_pictures(source: Path) -> Iterator[tuple[str, Rgb]]:
 
 
 def read_picture(file: Path) -> Rgb:
-    """Read an image file as RGB ``[H, W, 3]``."""
+    """Read an image file as RGB ``[H, W, 3]``, as stored: a lens is calibrated on the pixels that the camera gives."""
     try:
-        data = np.frombuffer(file.read_bytes(), np.uint8)
-    except OSError as error:
-        raise CalibrationError(f"expected a picture at {file}: {error.strerror or error}") from error
-    bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
-    if bgr is None:
-        raise CalibrationError(f"expected a picture at {file}, cannot decode its {data.size} bytes")
-    return np.ascontiguousarray(bgr[..., ::-1], np.uint8)
+        return read_stored(file)[0]
+    except DatasetError as error:
+        raise CalibrationError(str(error)) from error
 
 
 def read_drive(bag: Path) -> Drive:
@@ -185,23 +183,19 @@ def read_shown(folder: Path) -> tuple[Array, Array, Array]:
     """
     table = folder / "shown.csv"
     try:
-        with table.open(newline="", encoding="utf-8") as stream:
-            rows = list(csv.DictReader(stream))
         keyed = [
             (
-                (float(r["red"]), float(r["green"]), float(r["blue"]), float(r.get("cos_angle") or 1.0)),
-                folder / r["file"],
+                (row.number("red"), row.number("green"), row.number("blue"), row.number("cos_angle", 1.0)),
+                folder / row.values["file"],
             )
-            for r in rows
+            for row in read_csv(table, ("file", "red", "green", "blue"))
         ]
-    except FileNotFoundError:
+    except MissingFileError:
         raise CalibrationError(
             f"expected {table} with columns file, red, green, blue, found none; write one row per image"
         ) from None
-    except (KeyError, TypeError, ValueError) as error:
-        raise CalibrationError(
-            f"{table}: expected columns file, red, green, blue in 0..255, got {error}"
-        ) from error
+    except ConfigError as error:
+        raise CalibrationError(str(error)) from error
     regions = {angle: _region(keyed, angle) for angle in {key[3] for key, _ in keyed}}
     shown, seen, angles = [], [], []
     for key, group in groupby(keyed, key=lambda row: row[0]):

@@ -12,7 +12,7 @@ import os, time
 from pathlib import Path
 from types import SimpleNamespace
 from nodes.experiment.cell_kind import CellKind
-from nodes.runtime.config import read_yaml
+from advnerf_core.documents import read_yaml
 
 def _note(folder, text):
     with open(folder.parent.parent / "calls.txt", "a") as file:
