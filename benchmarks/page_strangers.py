@@ -49,7 +49,7 @@ def main() -> None:
         ann.hold()
         operator.wait_until(lambda: operator.armed, 5.0, "to arm")
         strange = strange_acts(operator.run_dir)
-        still = ann.do("label", text="still here") == "" and request(port, tls=True)[0] == 200
+        still = ann.do("attack_off") == "" and request(port, tls=True)[0] == 200
         ann.close()
     print(
         f"{sum(tried.values())} attempts ({tried}), {sent} malformed messages: {strange} acts of strangers; up: {still}"

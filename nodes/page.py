@@ -29,7 +29,7 @@ from nodes.operator_page.diary import Diary
 from nodes.operator_page.disk import DiskWriter
 from nodes.operator_page.operation import ACT, FILE, RESET, SWITCH, TELEOP, Operation, Parts
 from nodes.operator_page.pictures import ATTACKED, CAMERA, POLICY, Picture, jpeg_of, view_of_policy
-from nodes.operator_page.recording import RECORDER, Recording
+from nodes.operator_page.recording import LAUNCH_RECORDER, RECORDER, Recording
 from nodes.operator_page.server import PageServer, ServerSettings
 from nodes.operator_page.trial import Trial
 from nodes.runtime.arm_requests import ARM
@@ -131,7 +131,8 @@ class PageNode(Node):
         )
         self.inbox: Inbox[Asked | Gone] = Inbox(_INBOX)
         self._operation = Operation(parts, self._answer)
-        statuses = tuple(map(status_topic, (*nodes, *((RECORDER,) if self._operates else ()))))
+        recorders = [name for name in (RECORDER, LAUNCH_RECORDER) if self._operates and name not in nodes]
+        statuses = tuple(map(status_topic, (*nodes, *recorders)))
         self.subscriptions = (config.camera_topic, _COMPOSITOR, *topics.TOPICS, *statuses)
         self.publications = self._publications(launched.twin)
         self._beat_ns = self._state_ns = self._door_ns = 0
@@ -158,6 +159,8 @@ class PageNode(Node):
             self._show(topic, message, info, now)
             return []
         self._board.hear(topic, message, info)
+        if topic == status_topic(RECORDER):
+            self._recording.heard(message)
         if topic == topics.SAFETY:
             self._operation.heard_safety(message, info)
         elif topic == topics.SENT:

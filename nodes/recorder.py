@@ -33,8 +33,8 @@ class RecorderConfig(StrictModel):
         attachments: Files to attach, such as calibration and attack files.
         queue: Messages per topic that may wait while the disk is busy.
         max_bag_duration_s: Time after which a new file starts [s]. The default keeps the index of a quiet recording small.
-        max_bag_size_mb: Size at which a new file starts [MiB]. The default is 20 s of camera and compositor images. The index of a
-            file takes about 700 bytes of memory per image, or per 64 KiB of small messages.
+        max_bag_size_mb: Size at which a new file starts [MiB], after compression. The index of a file takes about 700 bytes of memory
+            per image, or per 64 KiB of small messages.
     """
 
     output: Path = Path("bag")
@@ -72,7 +72,8 @@ class RecorderNode(Node):
         attachments = _read_attachments([context.run_dir / RESOLVED_NAME], must_exist=False)
         attachments |= _read_attachments(config.attachments, must_exist=True)
         limits = SplitLimits(config.max_bag_duration_s, config.max_bag_size_mb)
-        writer = BagWriter(context.run_dir / config.output, attachments, provenance(), limits=limits)
+        folder = context.run_dir / config.output
+        writer = BagWriter(folder, attachments, provenance(), limits=limits, compressed=True)
         return cls(writer, topics, config.queue)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:

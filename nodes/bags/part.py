@@ -34,6 +34,7 @@ class PartWriter:
         attachments: Content of the attachments, by name.
         metadata: Facts to store: versions, git hash.
         attached_ns: Time at which the files were attached [ns since 1970]; None means now.
+        compressed: Whether chunks are compressed with zstd.
 
     Attributes:
         contents: Contents written so far.
@@ -46,6 +47,7 @@ class PartWriter:
         attachments: Mapping[str, bytes],
         metadata: Mapping[str, str],
         attached_ns: int | None = None,
+        compressed: bool = False,
     ) -> None:
         self.path = path
         self.contents = Contents()
@@ -54,7 +56,8 @@ class PartWriter:
         self._schemas: dict[str, int] = {}
         self._stream = _WriteThrough(opening_name(path))
         try:
-            self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)  # type: ignore[arg-type]
+            compression = CompressionType.ZSTD if compressed else CompressionType.NONE
+            self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=compression)  # type: ignore[arg-type]
             self._writer.start(profile=PROFILE, library=LIBRARY)
             if metadata:
                 self._writer.add_metadata("advnerf", dict(metadata))

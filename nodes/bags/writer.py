@@ -1,8 +1,8 @@
 """Writes bags that rosbag2, Foxglove, ``mcap`` and ``rosbags`` can open. Messages are stored as the received bytes.
 
-A bag is a folder with one ``.mcap`` file, or with numbered parts, and ``metadata.yaml``. Chunks of 64 KiB are written to the file at
-once and reach the disk once a second. A journal next to the file has the messages of the unfinished chunk, so that a killed recorder
-loses no message that it had received (`nodes.bags.repair` adds them to the bag).
+A bag is a folder with one ``.mcap`` file, or with numbered parts, and ``metadata.yaml``. Chunks of 64 KiB are written to
+the file at once, and reach the disk once a second. A journal next to the file has the messages of the unfinished chunk, so
+that a killed recorder loses no message that it had received (`nodes.bags.repair` adds them to the bag).
 
 The index of a file is kept in memory until the file is finished, about 700 bytes per chunk. So the recorder starts a new part from
 time to time, and another thread finishes the old one.
@@ -60,6 +60,8 @@ class BagWriter:
         metadata: Facts to store in every part: versions, git hash.
         attached_ns: Time at which the files were attached [ns since 1970]; None means now.
         limits: Limits of a part. None writes a single file without a number, whose index stays in memory.
+        compressed: Whether chunks are compressed with zstd, without loss. Raw pictures of the simulated room shrink to a sixth for one
+            per cent of a core. The bytes then depend on the version of zstd, so a replay, which promises equal bytes, does without.
     """
 
     def __init__(
@@ -69,10 +71,11 @@ class BagWriter:
         metadata: Mapping[str, str] | None = None,
         attached_ns: int | None = None,
         limits: SplitLimits | None = None,
+        compressed: bool = False,
     ) -> None:
         self.folder = Path(folder)
         self.messages = 0
-        self._limits, self._metadata = limits, dict(metadata or {})
+        self._limits, self._metadata, self._compressed = limits, dict(metadata or {}), compressed
         self._total, self._files = Contents(), list[FileEntry]()
         self._open = False
         if self.folder.exists() and any(self.folder.iterdir()):
@@ -81,7 +84,9 @@ class BagWriter:
             self.folder.mkdir(parents=True, exist_ok=True)
             self._hold_reserve()
             name = f"{self.folder.name}.mcap" if limits is None else part_name(self.folder.name, 0)
-            self._part = PartWriter(self.folder / name, attachments or {}, self._metadata, attached_ns)
+            self._part = PartWriter(
+                self.folder / name, attachments or {}, self._metadata, attached_ns, compressed
+            )
         except OSError as error:
             shutil.rmtree(self.folder, ignore_errors=True)
             raise BagError(
@@ -157,7 +162,8 @@ class BagWriter:
         old = self._part
         old.flush()
         number = len(self._files) + 1
-        self._part = PartWriter(self.folder / part_name(self.folder.name, number), {}, self._metadata)
+        path = self.folder / part_name(self.folder.name, number)
+        self._part = PartWriter(path, {}, self._metadata, compressed=self._compressed)
         self._finishing = True
         self._full.put(old)
 

@@ -183,6 +183,7 @@ def _print_summary(results: list[dict[str, Any]]) -> None:
         "ratio",
         "off track",
         "stopped early",
+        "spoiled tries",
         "capture to serial p50",
         "checksums",
     )
@@ -195,6 +196,7 @@ def _print_summary(results: list[dict[str, Any]]) -> None:
             "" if row["ratio"] is None else f"{row['ratio']:.2f}",
             f"{row['off_track']} of {row['runs']}",
             str(row["stopped_early"]),
+            str(row["spoiled_tries"]),
             "" if row["latency_p50_ms"] is None else f"{row['latency_p50_ms']:.1f} ms",
             f"unchecked in {row['unchecked']}" if row["unchecked"] else "agree",
         )

@@ -32,6 +32,7 @@ _TRAIL_POINTS, _TRAIL_STEP_M = 1500, 0.03
 _LATENCIES = 50
 _LIVE_NS = 60 * NS_PER_S
 _PATH_POINTS = 241
+_SILENT_S = 1.5
 _LEVELS = {0: "ok", 1: "warning", 2: "error", 3: "stale"}
 
 
@@ -73,6 +74,17 @@ class Board:
     def armed(self) -> bool:
         """Whether the safety node says that the car is armed."""
         return bool(getattr(self._message(SAFETY), "armed", False))
+
+    @property
+    def stop_reason(self) -> str:
+        """Why the car is not armed, as the safety node said last; empty if it is armed."""
+        return "" if self.armed else str(getattr(self._message(SAFETY), "reason", ""))
+
+    def hears(self, node: str, now: Now) -> bool:
+        """Whether a node has reported a moment ago that it is active."""
+        topic = STATUS_PREFIX + node
+        age_s = self._age_s(topic, now)
+        return age_s is not None and age_s < _SILENT_S and str(self._message(topic).state) == "active"
 
     @property
     def position_m(self) -> tuple[float, float] | None:
@@ -118,10 +130,18 @@ class Board:
             "attack": self._attack(now),
             "search": self._search(),
             "nodes": [self._node(name, now) for name in self.nodes],
-            "latency": {"motor_ms": _median(self._latency_ms), "page_ms": _median(self._shown_ms)},
+            "latency": {
+                "motor_ms": self._while_fresh(SENT, self._latency_ms, now),
+                "page_ms": _median(self._shown_ms),
+            },
             "motor": self._motor(now),
             "rows": self._rows(),
         }
+
+    def _while_fresh(self, topic: str, values: deque[float], now: Now) -> float | None:
+        """Median of what was measured from a topic; None once the topic is silent."""
+        age_s = self._age_s(topic, now)
+        return _median(values) if age_s is not None and age_s < _SILENT_S else None
 
     def _message(self, topic: str) -> Any:
         return self._newest.get(topic, (None, 0))[0]
@@ -192,7 +212,13 @@ class Board:
         label = self.label
         if label is None:
             return None
-        return {"id": str(label.attack_id), "drawn": bool(label.drawn), "reason": str(label.reason)}
+        age_s = min(age for topic in LABELS if (age := self._age_s(topic, now)) is not None)
+        return {
+            "id": str(label.attack_id),
+            "drawn": bool(label.drawn),
+            "reason": str(label.reason),
+            "age_s": age_s,
+        }
 
     def _search(self) -> str:
         progress = self._message(PROGRESS)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from nodes.runtime.clock import NS_PER_S
 
 _BEATS_KEPT = 64
-_STOPPED = "the e-stop is latched; reset it first"
+_STOPPED = "the emergency stop is latched; release it first"
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ class Desk:
         if refusal := self.refusal(client):
             return refusal
         if not self.estop:
-            return "the e-stop is not latched"
+            return "the emergency stop is not latched"
         self.estop = False
         return ""
 

@@ -16,7 +16,7 @@ from nodes.operator_page.catalogue import Entry, Sender
 from nodes.operator_page.client import Asked
 from nodes.operator_page.desk import Desk
 from nodes.operator_page.diary import Diary
-from nodes.operator_page.recording import Recording
+from nodes.operator_page.recording import LAUNCH_RECORDER, TELEOP, Recording
 from nodes.operator_page.said import ChooseAttack, Hold, Label, Release, Stop, Take
 from nodes.operator_page.trial import Trial
 from nodes.runtime.arm_asker import ArmAsker
@@ -26,8 +26,7 @@ from nodes.runtime.node import Out
 from nodes.runtime.requests import ESTOP_LATCHED
 from nodes.runtime.wire import MessageInfo
 
-TELEOP, ACT, RESET, SWITCH, FILE = (
-    "/teleop/state",
+ACT, RESET, SWITCH, FILE = (
     "/operator/act",
     "/twin/reset",
     "/attack/switch",
@@ -141,7 +140,9 @@ class Operation:
         lease = parts.desk.lease
         if ended := parts.desk.check(now.mono_ns):
             outs += self._ended(ended, lease.name if lease else "", now)
-        if parts.trial.step(parts.board.armed, parts.board.position_m, parts.board.drawn_attack, now.mono_ns):
+        board = parts.board
+        reason = self._why_ended or board.stop_reason
+        if parts.trial.step(board.armed, board.position_m, board.drawn_attack, now.mono_ns, reason):
             outs += self._end_trial("the trial is over", now)
         if self._rearm_ns is not None and now.mono_ns >= self._rearm_ns:
             self._rearm_ns = None
@@ -209,7 +210,7 @@ class Operation:
         if isinstance(act, ChooseAttack):
             return self._choose(act.id, asked.client, now), act.id, []
         if isinstance(act, Label):
-            return "", act.text, []
+            return self._label_refusal(now), act.text, []
         do = {
             "leave": self._leave,
             "reset_estop": self._reset,
@@ -295,6 +296,14 @@ class Operation:
 
     def _record_stop(self, asked: Asked, now: Now) -> tuple[str, list[Out]]:
         return self._parts.recording.stop(), []
+
+    def _label_refusal(self, now: Now) -> str:
+        """Return why a label would be lost; empty if a recorder keeps it."""
+        if self._parts.recording.records or self._parts.board.hears(LAUNCH_RECORDER, now):
+            return ""
+        if self._parts.recording.starting:
+            return "the recorder is still starting; label again in a second"
+        return "nothing is being recorded, so the label would be lost; start recording first"
 
     def _ended(self, why: str, name: str, now: Now) -> list[Out]:
         """A hold ended by itself: report it before anything else."""

@@ -7,12 +7,13 @@ import shutil
 import signal
 import time
 from pathlib import Path
+from typing import Any
 
 from advnerf_core.files import write_atomically
 from nodes.launching.child import Child
 from nodes.launching.launch_file import NodeEntry
 
-RECORDER = "page_recorder"
+RECORDER, LAUNCH_RECORDER, TELEOP = "page_recorder", "recorder", "/teleop/state"
 _KILL_AFTER_S = 10.0
 
 
@@ -30,6 +31,23 @@ class Recording:
         self._folder = ""
         self._asked_s: float | None = None
         self._trouble = ""
+        self._connected = False
+
+    @property
+    def records(self) -> bool:
+        """Whether a recorder runs and has received messages of this page."""
+        return self._connected and self._child is not None and self._asked_s is None
+
+    @property
+    def starting(self) -> bool:
+        """Whether a recorder was started that does not record yet."""
+        return self._child is not None and self._asked_s is None and not self._connected
+
+    def heard(self, status: Any) -> None:
+        """Note a status of the recorder. Only a recorder that received something from this page also receives labels."""
+        if self._child is not None and int(status.pid) == self._child.pid:
+            received = dict(zip(status.counter_names, status.counter_values, strict=True))
+            self._connected |= bool(received.get(f"received {TELEOP}", 0.0) > 0.0)  # the counters are numpy's
 
     def start(self) -> str:
         """Start a recorder into a new folder. Returns why not; empty if it was started."""
@@ -45,7 +63,7 @@ class Recording:
             child.start()
         except OSError as error:  # a full disk must not end the page
             return f"cannot start a recorder: {error.strerror or error}"
-        self._child, self._asked_s, self._trouble = child, None, ""
+        self._child, self._asked_s, self._trouble, self._connected = child, None, "", False
         return ""
 
     def stop(self) -> str:
@@ -73,6 +91,7 @@ class Recording:
         """Describe the recording and the space left on its disk, for the page."""
         return {
             "on": self._child is not None,
+            "records": self.records,
             "stopping": self._child is not None and self._asked_s is not None,
             "folder": self._folder,
             "trouble": self._trouble,

@@ -1,6 +1,7 @@
 """A trial on the page: one drive from the start pose over a fixed time, and how far it left the path. Pure.
 
-The trial runs from the moment the car is armed. Its metrics are those of ``advnerf trial`` and ``advnerf evaluate``.
+The trial runs from the moment the car is armed. Its metrics are those of ``advnerf trial`` and ``advnerf evaluate``. A trial that a
+fault of the stack ended has no metrics, by the rule for stops that those commands have too.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import numpy as np
 
 from advnerf_core.driving.metrics import Horizon, drive_metrics
 from advnerf_core.driving.path import Path as DrivingPath
+from nodes.control.stop_causes import is_result
 from nodes.runtime.clock import NS_PER_S
 
 IDLE, WAITING, RUNNING, DONE = "idle", "waiting", "running", "done"
@@ -35,13 +37,21 @@ class Trial:
         self._began_ns = 0
         self._states: list[tuple[float, float]] = []
         self._result: dict[str, Any] = {}
+        self._stopped = ""
 
     def start(self) -> None:
         """Begin a new trial, which waits for the car to be armed."""
         self.phase, self.number = WAITING, self.number + 1
-        self._states, self._result, self.attack_id = [], {}, ""
+        self._states, self._result, self.attack_id, self._stopped = [], {}, "", ""
 
-    def step(self, armed: bool, position_m: tuple[float, float] | None, attack_id: str, mono_ns: int) -> bool:
+    def step(
+        self,
+        armed: bool,
+        position_m: tuple[float, float] | None,
+        attack_id: str,
+        mono_ns: int,
+        reason: str = "",
+    ) -> bool:
         """Continue the trial. Returns whether it has just ended.
 
         Args:
@@ -49,6 +59,7 @@ class Trial:
             position_m: Position of the rear axle [m]; None while unknown.
             attack_id: The attack that is drawn now; empty for none.
             mono_ns: Current time [ns].
+            reason: Why the car is not armed.
         """
         if self.phase == WAITING and armed and position_m is not None:
             self.phase, self._began_ns = RUNNING, mono_ns
@@ -62,6 +73,7 @@ class Trial:
                 self._states.append(position_m)
         if armed and tick < self._horizon.ticks:
             return False
+        self._stopped = "" if armed else reason
         self.end()
         return True
 
@@ -70,7 +82,7 @@ class Trial:
         if self.phase not in (WAITING, RUNNING):
             return False
         ran, self.phase = self.phase == RUNNING, DONE
-        if ran and self._path is not None and len(self._states) > 1:
+        if ran and is_result(self._stopped) and self._path is not None and len(self._states) > 1:
             found = drive_metrics(self._path, np.array(self._states), self._horizon)
             self._result = {
                 "total_cte_m": found.total_cte_m,
@@ -88,5 +100,7 @@ class Trial:
             "attack_id": self.attack_id,
             "ticks": max(0, len(self._states) - 1),
             "of_ticks": self._horizon.ticks,
+            "stopped": self._stopped,
+            "counts": is_result(self._stopped),
             **self._result,
         }

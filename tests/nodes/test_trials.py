@@ -171,7 +171,8 @@ def test_a_host_from_which_no_trial_can_be_driven_is_refused(tmp_path, host, ove
 
 def test_the_table_divides_by_no_attack():
     def result(condition, total):
-        return {"condition": condition, "total_cte_m": total, "off_track": total > 9, "stopped_early": ""}
+        found = {"condition": condition, "total_cte_m": total, "off_track": total > 9, "stopped_early": ""}
+        return {**found, "spoiled": ["late"] * (total > 11)}
 
     rows = summarise(
         [result("gradient", 10.0), result("none", 2.0), result("gradient", 14.0), result("none", 4.0)]
@@ -180,6 +181,7 @@ def test_the_table_divides_by_no_attack():
     assert rows[1]["mean_m"] == 12.0
     assert rows[1]["std_m"] == pytest.approx(np.sqrt(8.0))
     assert (rows[1]["ratio"], rows[1]["off_track"]) == (4.0, 2)
+    assert [row["spoiled_tries"] for row in rows] == [0, 1]
     assert summarise([result("gradient", 10.0)])[0]["ratio"] is None
 
 

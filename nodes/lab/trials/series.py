@@ -160,7 +160,7 @@ def _drive_once(
 
 def summarise(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Summarise the results in one row per condition: runs, mean and standard deviation of the total CTE [m], ratio to no attack,
-    number of runs off the track, number of runs without checksums.
+    number of runs off the track, spoiled tries before these runs, number of runs without checksums.
 
     The standard deviation is that of a sample (n - 1), and None for a single run. The ratio is that of the means.
     """
@@ -182,6 +182,7 @@ def summarise(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
                 "off_track": sum(bool(each["off_track"]) for each in groups[condition]),
                 "stopped_early": sum(bool(each["stopped_early"]) for each in groups[condition]),
                 "latency_p50_ms": float(np.median(latencies)) if latencies else None,
+                "spoiled_tries": sum(len(each.get("spoiled", [])) for each in groups[condition]),
                 "unchecked": sum(bool(each.get("unchecked")) for each in groups[condition]),
             }
         )

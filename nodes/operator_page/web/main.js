@@ -5,9 +5,12 @@ import { Link } from "./link.js";
 import { showAttacks, showState, text } from "./panels.js";
 import { CHANNELS, Pictures } from "./pictures.js";
 import { PlaceMap, SteeringPlot } from "./plots.js";
+import { wordsOf } from "./words.js";
 
 const element = (id) => document.getElementById(id);
 const DRAW_MS = 100;
+const SAID_MS = 10000; // an answer about the past does not stay under what is shown now
+const saidMs = new Map();
 
 let welcome = null;
 let state = null;
@@ -25,6 +28,20 @@ const link = new Link({
 });
 const hold = new HoldButton(element("hold"), link, showHold);
 
+/** Say something that is true for a moment. */
+function say(id, value) {
+  text(id, value);
+  saidMs.set(id, performance.now());
+}
+
+function forgetOldAnswers() {
+  for (const [id, since] of saidMs) {
+    if (performance.now() - since < SAID_MS) continue;
+    text(id, "");
+    saidMs.delete(id);
+  }
+}
+
 function opened() {
   pictures.reset();
   element("enter").hidden = true;
@@ -39,7 +56,8 @@ function closed() {
   element("hold").disabled = true;
   text("armed", "no connection");
   element("armed").classList.remove("armed");
-  text("reason", "");
+  document.body.classList.remove("stopped");
+  text("reason", "The page shows the last state that it received.");
   text("link", "connecting again");
 }
 
@@ -56,7 +74,7 @@ function hear(message) {
   else if (message.t === "state") update(message);
   else if (message.t === "answer") answer(message);
   else if (message.t === "welcome") begin(message);
-  else if (message.t === "refused") text("answer", `Refused: ${message.text}`);
+  else if (message.t === "refused") say("answer", `Refused: ${message.text}`);
 }
 
 function begin(message) {
@@ -89,25 +107,29 @@ function showHold() {
   if (!state) return;
   if (held && heldPress === hold.press && state.press !== hold.press) {
     hold.release();
-    text("hold-answer", `Released: ${state.ended}. Hold the button again.`);
+    say("hold-answer", `Released: ${state.ended}. Hold the button again.`);
   }
   heldPress = hold.held && state.press === hold.press ? hold.press : 0;
   const armed = state.safety?.armed;
-  text("hold", !hold.held ? "Hold to drive" : armed ? "Driving: let go to stop" : state.held ? "Held, not armed" : "Asking");
+  text("hold", !hold.held ? "Hold to drive" : armed ? "Let go to stop" : state.held ? "Held, not armed" : "Asking");
 }
 
 function answer(message) {
-  const words = message.act.replaceAll("_", " ");
+  const words = wordsOf(message.act);
   if (message.act === "hold") {
     if (message.refused) hold.release();
-    text("hold-answer", message.refused ? `Not held: ${message.refused}.` : "");
+    say("hold-answer", message.refused ? `Not held: ${message.refused}.` : "");
     return;
   }
   if (message.act === "release") return;
-  text("answer", message.refused ? `Not done: ${words}: ${message.refused}.` : `Done: ${words}.`);
+  // The node starts a recorder, and says when it records.
+  const done = message.act === "record" ? "Asked to start recording." : `Done: ${words}.`;
+  say("answer", message.refused ? `Not done: ${words}: ${message.refused}.` : done);
 }
 
 function drawPlots() {
+  pictures.showAges();
+  forgetOldAnswers();
   if (!document.hidden && welcome) {
     map.draw();
     plot.draw();
@@ -160,5 +182,9 @@ element("enter-form").addEventListener("submit", async (event) => {
   text("enter-answer", "This code is wrong, was used, or has expired. Run advnerf page on the robot for a new one.");
 });
 
+// What sticks below the header, and what is scrolled to, must know how high it is.
+new ResizeObserver(([entry]) => {
+  document.documentElement.style.setProperty("--head", `${entry.target.offsetHeight}px`);
+}).observe(document.querySelector("header"));
 setInterval(drawPlots, DRAW_MS);
 link.connect();

@@ -1,5 +1,7 @@
 // The texts of the page, from the state that the node sends.
 
+import { wordsOf } from "./words.js";
+
 const element = (id) => document.getElementById(id);
 const SILENT_S = 1.5;
 
@@ -10,6 +12,7 @@ export function text(id, value) {
 
 const number = (value, digits, unit) => (value === null || value === undefined ? "-" : `${value.toFixed(digits)} ${unit}`);
 const degrees = (value) => (value === null || value === undefined ? "-" : `${(value * 180 / Math.PI).toFixed(1)}°`);
+const fresh = (part) => Boolean(part) && part.age_s !== null && part.age_s < SILENT_S;
 const show = (id, visible) => { element(id).hidden = !visible; };
 
 export function showState(state, me) {
@@ -17,7 +20,7 @@ export function showState(state, me) {
   showPlace(state);
   showSteering(state.steering);
   showAttack(state);
-  showRecording(state.recording);
+  showRecording(state.recording, state.nodes);
   showHealth(state);
   showTrial(state.trial);
   showActs(state.acts);
@@ -26,36 +29,42 @@ export function showState(state, me) {
   text("hint", state.hint);
 }
 
-function showSafety({ safety, not_confirmed: notConfirmed }) {
+function showSafety({ safety, estop, not_confirmed: notConfirmed }) {
   const pill = element("armed");
-  const known = safety && safety.age_s < SILENT_S;
+  const known = fresh(safety);
   const armed = known && safety.armed;
-  text("armed", !safety ? "no safety node" : !known ? "safety node is silent" : armed ? "ARMED" : "disarmed");
+  // A latched stop is the state of everything: nothing else on the page may look as if the car could drive.
+  const stopped = !armed && (estop || (known && safety.reason.startsWith("e-stop")));
+  text("armed", !safety ? "no safety node" : !known ? "safety node is silent" : armed ? "ARMED" : stopped ? "EMERGENCY STOP" : "disarmed");
   pill.classList.toggle("armed", Boolean(armed));
+  document.body.classList.toggle("stopped", Boolean(stopped));
   const late = notConfirmed ? `${notConfirmed}. ` : "";
   text("reason", late + (safety ? (armed ? `by ${safety.source}` : safety.reason) : ""));
   element("reason").classList.toggle("bad", late !== "");
 }
 
 function showPlace({ car, motor, latency }) {
-  text("cte", car ? number(car.cte_m, 3, "m") : "-");
-  text("speed", number(motor?.speed_mps, 2, "m/s"));
+  text("cte", fresh(car) ? number(car.cte_m, 3, "m") : "-");
+  text("speed", fresh(motor) ? number(motor.speed_mps, 2, "m/s") : "-");
   text("motor-ms", number(latency.motor_ms, 0, "ms"));
   text("page-ms", number(latency.page_ms, 0, "ms"));
-  const where = car ? `Car at ${car.x_m.toFixed(2)}, ${car.y_m.toFixed(2)} m` : "No pose of the car";
+  const where = fresh(car) ? `Car at ${car.x_m.toFixed(2)}, ${car.y_m.toFixed(2)} m` : "No pose of the car";
   element("map").setAttribute("aria-label", `${where}. Path, fence and trail from above.`);
 }
 
 function showSteering(steering) {
-  text("clean", degrees(steering?.clean_rad));
-  text("attacked", degrees(steering?.attacked_rad));
-  const compared = steering && steering.clean_rad !== null && steering.attacked_rad !== null;
-  text("delta", compared ? degrees(steering.attacked_rad - steering.clean_rad) : "no counterfactual node");
+  const now = fresh(steering) ? steering : null;
+  text("clean", degrees(now?.clean_rad));
+  text("attacked", degrees(now?.attacked_rad));
+  const compared = now && steering.clean_rad !== null && steering.attacked_rad !== null;
+  const why = now || !steering ? "no counterfactual node" : "-";
+  text("delta", compared ? degrees(steering.attacked_rad - steering.clean_rad) : why);
 }
 
 function showAttack({ attack, chosen, search }) {
   const parts = [];
   if (!attack) parts.push("No node shows attacks.");
+  else if (!fresh(attack)) parts.push(`Unknown: the node that shows attacks has been silent for ${attack.age_s.toFixed(1)} s.`);
   else if (attack.drawn) parts.push(`Attack ${attack.id} is shown.${attack.reason ? ` ${attack.reason}.` : ""}`);
   else parts.push(`Not shown: ${attack.reason || "no attack"}.`);
   if (chosen.trouble) parts.push(`${chosen.id}: ${chosen.trouble}.`);
@@ -67,8 +76,12 @@ function showAttack({ attack, chosen, search }) {
   }
 }
 
-function showRecording(recording) {
-  const state = recording.stopping ? `Finishing ${recording.folder}.` : recording.on ? `Recording to ${recording.folder}.` : "Not recording from here.";
+function showRecording(recording, nodes) {
+  const launch = nodes.find((node) => node.name === "recorder" && node.state === "active" && fresh(node));
+  let state = launch ? "The launch records." : "Nothing is recorded.";
+  if (recording.stopping) state = `Finishing ${recording.folder}.`;
+  else if (recording.records) state = `Recording to ${recording.folder}.`;
+  else if (recording.on) state = "Starting a recorder. Nothing is recorded yet.";
   text("record-text", `${state} ${recording.disk_left_gb.toFixed(1)} GB left.${recording.trouble ? ` ${recording.trouble}` : ""}`);
   show("record", !recording.on);
   show("record_stop", recording.on && !recording.stopping);
@@ -77,7 +90,7 @@ function showRecording(recording) {
 function showHealth({ nodes, motor, rows }) {
   const battery = rows.find((row) => row.name.endsWith("battery"));
   text("battery", battery ? battery.text || number(motor?.voltage_v, 1, "V") : number(motor?.voltage_v, 1, "V"));
-  text("motor", motor ? (motor.braking ? `brakes: ${motor.reason || "stopped"}` : "drives") : "-");
+  text("motor", !motor ? "-" : !fresh(motor) ? "silent" : motor.braking ? `brakes: ${motor.reason || "stopped"}` : "drives");
   const faults = rows.filter((row) => row.level !== "ok" && row !== battery).map((row) => `${row.name}: ${row.text}`);
   if (motor?.fault) faults.unshift(motor.fault);
   text("faults", faults.join("; ") || "none");
@@ -110,11 +123,12 @@ function showTrial(trial) {
   if (trial.phase === "idle") text("trial-text", "");
   else if (trial.phase === "waiting") text("trial-text", `${begin}: hold the button to begin.`);
   else if (trial.phase === "running") text("trial-text", `${begin}: ${trial.ticks} of ${trial.of_ticks} ticks.`);
+  else if (!trial.counts) text("trial-text", `${begin} is no result: the stack stopped the car after ${trial.ticks} of ${trial.of_ticks} ticks (${trial.stopped}).`);
   else if (trial.total_cte_m === undefined) text("trial-text", `${begin} has ended.`);
   else {
     const off = trial.off_track ? ", off the track" : "";
     const shown = trial.attack_id ? `attack ${trial.attack_id}` : "no attack";
-    const driven = `${trial.ticks} of ${trial.of_ticks} ticks`;
+    const driven = `${trial.ticks} of ${trial.of_ticks} ticks${trial.stopped ? `, stopped: ${trial.stopped}` : ""}`;
     text("trial-text", `${begin} (${shown}, ${driven}): total cross-track error ${trial.total_cte_m.toFixed(2)} m, largest ${trial.max_cte_m.toFixed(2)} m${off}.`);
   }
 }
@@ -124,7 +138,7 @@ function showActs(acts) {
   const rows = acts.map((act) => {
     const time = new Date(act.real_ms).toLocaleTimeString();
     const refused = act.refused ? ` (refused: ${act.refused})` : "";
-    return `${time} ${act.operator || "-"}: ${act.act.replaceAll("_", " ")} ${act.detail}${refused}`;
+    return `${time} ${act.operator || "-"}: ${wordsOf(act.act)} ${act.detail}${refused}`;
   });
   while (list.children.length > rows.length) list.lastElementChild.remove();
   rows.forEach((row, index) => {
@@ -143,8 +157,8 @@ function showLease({ lease, viewers, estop }, { operates, stops, mine, session }
   show("leave", mine);
   show("reset_estop", operates && estop);
   element("estop").classList.toggle("latched", estop);
-  text("estop", estop ? "E-stop is latched" : "E-stop");
-  for (const id of ["hold", "reset_estop", "trial", "trial_end", "attack_off", "record", "record_stop"]) element(id).disabled = !mine;
+  text("estop", estop ? "Stopped" : "Emergency stop");
+  for (const id of ["hold", "reset_estop", "trial", "trial_end", "attack_off", "record", "record_stop"]) element(id).disabled = !mine || (estop && (id === "hold" || id === "trial"));
   for (const id of ["estop", "disarm"]) element(id).disabled = !stops;
   for (const button of document.querySelectorAll("#attacks button, #label-form button")) button.disabled = !mine;
 }

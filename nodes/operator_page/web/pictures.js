@@ -3,18 +3,35 @@
 export const CHANNELS = [0, 1, 2];
 const HEAD_BYTES = 9;
 const LIVE_MS = 60000;
+const OLD_MS = 1000; // age from which a picture no longer shows what the car sees; the node lets go of the button then
 
 export class Pictures {
   #waiting = new Map();
   #frame = 0;
   #stamp = 0n;
   #clockMs = null;
+  #drawn = new Map(); // per channel: when it was drawn, and how old it was then; null for a recording
 
   /** @param {(channel: number, stamp: string) => void} onDrawn */
   constructor(onDrawn) {
     this.onDrawn = onDrawn;
     this.canvases = CHANNELS.map((channel) => document.getElementById(`picture-${channel}`));
     this.ages = CHANNELS.map((channel) => document.getElementById(`age-${channel}`));
+  }
+
+  /** Show how old each picture is now, also while no new one comes; an old one turns grey. */
+  showAges() {
+    const now = performance.now();
+    for (const [channel, { drawnMs, ageMs }] of this.#drawn) {
+      const since = now - drawnMs;
+      const age = ageMs === null ? since : ageMs + since;
+      const old = age > OLD_MS;
+      this.canvases[channel].classList.toggle("old", old);
+      this.ages[channel].classList.toggle("bad", old);
+      const seconds = (age / 1000).toFixed(1);
+      if (old) this.ages[channel].textContent = ageMs === null ? `no new picture for ${seconds} s` : `${seconds} s old`;
+      else this.ages[channel].textContent = ageMs === null ? "recorded" : `${Math.round(age)} ms`;
+    }
   }
 
   /** Capture stamp of the newest picture on the screen, in nanoseconds, as text. */
@@ -67,12 +84,11 @@ export class Pictures {
       bitmap.close();
       canvas.dataset.stamp = String(stamp);
       if (stamp > this.#stamp) this.#stamp = stamp;
-      if (this.#clockMs !== null) {
-        const age = Date.now() - this.#clockMs - Number(stamp / 1000000n);
-        this.ages[channel].textContent = age < LIVE_MS ? `${Math.max(0, Math.round(age))} ms` : "recorded";
-      }
+      const age = this.#clockMs === null ? 0 : Math.max(0, Date.now() - this.#clockMs - Number(stamp / 1000000n));
+      this.#drawn.set(channel, { drawnMs: performance.now(), ageMs: age < LIVE_MS ? age : null });
       this.onDrawn(channel, String(stamp));
     }
     this.#waiting.clear();
+    this.showAges();
   }
 }

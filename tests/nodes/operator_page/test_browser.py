@@ -117,7 +117,7 @@ def test_arm_drive_attack_on_disarm_while_another_watches(lab, phones, options):
     put_back(page)
     drive(ann.page, ann.hold, ann.let_go)
     says(watcher, "#armed", "ARMED")
-    says(page, "#hold", "Driving")
+    says(page, "#hold", "Let go to stop")
     page.wait_for_timeout(500)
     page.keyboard.press("Tab")  # the focus leaves the button, and with it the hand
     says(page, "#armed", "disarmed")
@@ -152,11 +152,15 @@ def test_a_trial_is_driven_to_its_end_and_measured(lab, phones):
         # The car was just put to the start, which the safety node must have seen.
         ann.page.wait_for_timeout(500)
         drive(ann.page, ann.hold, ann.let_go)
-        says(ann.page, "#trial-text", "total cross-track error")
+        # A busy computer may stop it before its end, and then it is no result.
+        ann.page.wait_for_function(
+            "() => /total cross-track error|is no result/.test(document.querySelector('#trial-text').innerText)",
+            timeout=20000,
+        )
         says(ann.page, "#armed", "disarmed")
         ann.let_go()
         if "20 of 20" in (ended := ann.page.inner_text("#trial-text")):
-            break  # it was not stopped before its end by a busy computer
+            break
     assert "total cross-track error" in ended
     rows = [json.loads(line) for line in (lab.run_dir / "page" / "acts.jsonl").read_text().splitlines()]
     held = [row for row in rows if row["act"] == "hold"][-1]
@@ -176,13 +180,11 @@ def test_with_the_keyboard_alone(lab, phones):
     space = (lambda: page.keyboard.down(" "), lambda: page.keyboard.up(" "))
     drive(page, *space)
     page.keyboard.press("Escape")
-    says(page, "#armed", "disarmed")
+    says(page, "#armed", "EMERGENCY STOP")
     page.keyboard.up(" ")
-    says(page, "#estop", "E-stop is latched")
+    says(page, "#estop", "Stopped")
     says(page, "#reason", "e-stop")
-    page.keyboard.down(" ")
-    says(page, "#hold-answer", "the e-stop is latched")
-    page.keyboard.up(" ")
+    assert page.is_disabled("#hold")
     page.focus("#reset_estop")
     page.keyboard.press("Enter")
     page.wait_for_selector("#reset_estop", state="hidden")
@@ -220,7 +222,7 @@ def test_screen_readers_find_names_roles_and_live_regions(phones):
     )
     assert unnamed == []
     assert page.get_by_role("button", name="Hold to drive").count() == 1
-    assert page.get_by_role("button", name="E-stop").count() == 1
+    assert page.get_by_role("button", name="Emergency stop").count() == 1
     assert page.get_by_role("heading", level=1).count() == 1
     assert page.get_by_role("status").count() >= 4
     # Nothing is wider than the phone.

@@ -123,7 +123,7 @@ def test_the_e_stop_latches():
     bench = Bench()
     assert bench.hold(bench.beat()) == ""
     assert bench.desk.stop()
-    assert bench.hold(bench.beat(), press=2) == "the e-stop is latched; reset it first"
+    assert bench.hold(bench.beat(), press=2) == "the emergency stop is latched; release it first"
     assert bench.desk.reset(2) == "Ann operates; one operator at a time"
     assert bench.desk.estop
     assert bench.desk.reset(1) == ""

@@ -195,19 +195,22 @@ def test_a_label_is_in_the_bag_with_the_picture_that_its_author_saw(run, browser
 
     ann = browser()
     ann.take()
+    lost = "nothing is being recorded, so the label would be lost; start recording first"
+    assert ann.do("label", text="too early") == lost
     assert ann.do("record") == ""
     assert ann.do("record").startswith("already recording")
-    ann.wait(lambda: (run.folder / "bus" / "status.page_recorder").exists(), "the recorder")
-    ann.wait(lambda: ann.state["recording"]["on"], "the page to say so")
-    time.sleep(1.0)
+    # The process has just been started, and takes longer than this to connect.
+    assert (
+        ann.do("label", text="still too early") == "the recorder is still starting; label again in a second"
+    )
+    ann.wait(lambda: ann.state["recording"]["records"], "the recorder to receive messages of the page", 60.0)
     assert ann.do("label", text="a person crossed") == ""
-    time.sleep(0.3)
     assert ann.do("record_stop") == ""
     ann.wait(lambda: not ann.state["recording"]["on"], "the recorder to end", 15.0)
     assert ann.state["recording"]["trouble"] == ""
     bag = run.folder / ann.state["recording"]["folder"]
     acts = [decode("advnerf_msgs/msg/OperatorAct", m.cdr) for m in read_messages(bag, ["/operator/act"])]
-    label = next(act for act in acts if act.act == "label")
+    (label,) = [act for act in acts if act.act == "label"]
     assert (label.operator, label.detail, label.granted) == ("Ann", "a person crossed", True)
     assert label.seen.sec > 0
 
@@ -273,13 +276,13 @@ def test_strangers_do_nothing_and_the_page_stays_up(run, browser):
     assert request(run.port, "/attack/000000000000")[0] == 404
     time.sleep(0.3)
     assert len(run.car.acts) == before
-    assert ann.do("label", text="still here") == ""
+    assert ann.do("attack_off") == "", "the page is still here"
 
 
 def test_a_replayed_or_malformed_message_is_no_act(run, browser):
     ann, eve = browser(), browser()
     ann.take()
-    number = ann.act("label", text="once")
+    number = ann.act("label", text="once")  # it is refused, because nothing is recorded
     ann.wait(lambda: any(a.get("n") == number for a in ann.answers), "the answer")
     time.sleep(0.3)
     message = {"t": "label", "key": ann.welcome["key"], "n": number, "frame": ann.frame, "text": "once"}
@@ -294,7 +297,7 @@ def test_a_replayed_or_malformed_message_is_no_act(run, browser):
         eve.tell({"t": "arm"})
     eve.wait(lambda: eve.closed, "the connection to be closed")
     assert len(run.car.acts) == before
-    assert ann.do("label", text="still here") == ""
+    assert ann.do("attack_off") == "", "the page is still here"
 
 
 def test_the_headers_keep_foreign_code_out(run):

@@ -45,6 +45,29 @@ def test_a_car_that_stops_is_charged_for_the_rest():
     )
 
 
+@pytest.mark.parametrize(
+    ("reason", "counts"),
+    [
+        ("no pose of the car for 0.21 s", False),
+        ("the page has not answered for 0.31 s", False),
+        ("node camera has been silent for 1.1 s", False),
+        ("the car is outside the fence, at (3.60, 0.00) m", True),
+        ("stalled for 1.0 s: commanded 0.80 m/s, the car does not move", True),
+        ("disarmed by operator: on the page by Ann", True),
+        ("the button is not held", True),
+    ],
+)
+def test_a_trial_that_a_fault_of_the_stack_ended_is_no_result(reason, counts):
+    trial = Trial(Path.rounded_square(4.0, 1.0), 0.4, ticks=60)
+    trial.start()
+    for ms in range(0, 250, 20):
+        assert not trial.step(True, (0.0, -2.3), "", ms * MS)
+    assert trial.step(False, (0.0, -2.3), "", 250 * MS, reason)
+    state = trial.state()
+    assert (state["phase"], state["ticks"], state["stopped"], state["counts"]) == (DONE, 2, reason, counts)
+    assert ("total_cte_m" in state) is counts
+
+
 def test_without_a_path_it_only_counts():
     trial = Trial(None, 0.4, ticks=3)
     trial.start()

@@ -38,9 +38,11 @@ def fill(writer, count=400, first=0):
         )
 
 
-@pytest.mark.parametrize("limits", [SplitLimits(duration_s=0.5), SplitLimits(size_mib=0.03)])
+@pytest.mark.parametrize("limits", [SplitLimits(duration_s=0.5), SplitLimits(size_mib=0.01)])
 def test_every_part_opens_alone_and_independent_readers_find_every_message_once(tmp_path, limits):
-    with BagWriter(tmp_path / "drive", {"launch.yaml": b"x"}, {"git": "abc"}, limits=limits) as writer:
+    with BagWriter(
+        tmp_path / "drive", {"launch.yaml": b"x"}, {"git": "abc"}, limits=limits, compressed=True
+    ) as writer:
         for i in range(8):
             fill(writer, 50, i * 50)
             while writer._finishing:
@@ -234,12 +236,12 @@ def test_wherever_a_recorder_is_killed_around_a_split_nothing_is_lost_or_doubled
 
 # Chunks as many as pictures of a camera and a compositor come, 60 a second, in parts with as many as 256 MiB of pictures have.
 STREAM = """
-import os, sys
+import os, random, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from nodes.bags.writer import BagWriter, SplitLimits
-writer = BagWriter(Path(sys.argv[1]), limits=SplitLimits(size_mib=0.5))
-message, page = bytes([0, 1, 0, 0]) + bytes(200), os.sysconf("SC_PAGE_SIZE")
+writer = BagWriter(Path(sys.argv[1]), limits=SplitLimits(size_mib=0.5), compressed=True)
+message, page = bytes([0, 1, 0, 0]) + random.Random(0).randbytes(200), os.sysconf("SC_PAGE_SIZE")
 for i in range(int(sys.argv[3])):
     writer.write("/vicon/car", message, 1_800_000_000_000_000_000 + i * 30_000_000, 0, i)
     writer.flush()
