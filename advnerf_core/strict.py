@@ -117,9 +117,7 @@ def validate(model: type[M], document: Document, folder: Path | None = None) -> 
     try:
         return typing.cast(
             M,
-            strict_validator(typing.cast(Any, model)).validate_python(
-                document.data, context={"folder": folder}
-            ),
+            strict_validator(model).validate_python(document.data, context={"folder": folder}),
         )
     except ValidationError as error:
         raise_problems(_explain(model, document, error))
@@ -135,9 +133,13 @@ def parse_value(annotation: Any, document: Document) -> Any:
         raise
 
 
-@lru_cache(maxsize=64)
 def strict_validator(model: Any) -> SchemaValidator:
     """Validator of a model or type whose numbers and booleans are strict."""
+    return _validator(model)
+
+
+@lru_cache(maxsize=64)
+def _validator(model: Any) -> SchemaValidator:
     # Prebuilt validators are those of classes that do not derive from StrictModel, such as a plug-in's: they are not strict.
     return SchemaValidator(TypeAdapter(Annotated[model, Strict()]).core_schema, _use_prebuilt=False)
 

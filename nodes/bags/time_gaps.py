@@ -14,7 +14,7 @@ from nodes.runtime.clock import NS_PER_S
 
 # A running stack sends statuses every second. No recording is silent for an hour.
 LONGEST_SILENCE_S = 3600.0
-_UNITS = (("years", 365.25 * 86400.0), ("days", 86400.0), ("hours", 3600.0))
+_UNITS = (("year", 365.25 * 86400.0), ("day", 86400.0), ("hour", 3600.0))
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,8 @@ class TimeGap:
     def __str__(self) -> str:
         span_s = (self.after_ns - self.before_ns) / NS_PER_S
         unit, length_s = next(each for each in _UNITS if span_s >= each[1] or each is _UNITS[-1])
-        return f"log time jumps by {span_s / length_s:.0f} {unit} after message {self.messages}"
+        count = round(span_s / length_s)
+        return f"log time jumps by {count} {unit}{'s' * (count > 1)} after message {self.messages}"
 
 
 def find_gaps(times_ns: Sequence[int]) -> tuple[TimeGap, ...]:
