@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import zlib
 from bisect import bisect_right
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,7 @@ from nodes.bags.records import (
     unpack_chunk,
 )
 from nodes.bags.resync import is_cut, makes_sense, next_record, only_zeros, plausible_end, runs_over
+from nodes.bags.salvage import good_records
 from nodes.bags.scanned import BAD, CUT, JUNK, ZEROS, Loss, Piece, Run, Scan
 from nodes.bags.summary import Ending, read_ending, read_summary_section
 from nodes.runtime.errors import BagError
@@ -125,8 +127,8 @@ class _Scanner:
         self._close_chunk()
         self._bad_chunk = None
         if opcode == Opcode.CHUNK:
-            self._take_chunk(at, body, end)
-        elif opcode == Opcode.MESSAGE:
+            return self._take_chunk(at, body, end)
+        if opcode == Opcode.MESSAGE:
             self._take_message(at, body, end)
         elif opcode == Opcode.ATTACHMENT:
             a, _ = checked_attachment(self._buffer[body:end])
@@ -193,7 +195,7 @@ class _Scanner:
         else:
             runs.append(Run(at, end - at, log_ns, log_ns, {channel_id}))
 
-    def _take_chunk(self, at: int, body: int, end: int) -> None:
+    def _take_chunk(self, at: int, body: int, end: int) -> int:
         head = chunk_head(self._buffer, body, end - body)
         try:
             records = unpack_chunk(head, self._buffer[head.data_at : end])
@@ -201,7 +203,8 @@ class _Scanner:
         except Damaged as error:
             if not plausible_end(self._buffer, end, self._limit):
                 raise
-            self._lose_chunk(at, end, head, str(error))
+            return self._lose_chunk(at, end, head, str(error))
+        return end
 
     def _commit(
         self,
@@ -212,15 +215,7 @@ class _Scanner:
         definitions: list[Schema | Channel],
         messages: list[tuple[int, int, int, int]],
     ) -> None:
-        for definition in definitions:
-            if isinstance(definition, Schema):
-                self.found.schemas[definition.id] = definition
-            else:
-                self._add_channel(definition)
-        entries: dict[int, list[tuple[int, int]]] = {}
-        for channel_id, sequence, log_ns, place in messages:
-            entries.setdefault(channel_id, []).append((log_ns, place))
-            self._count(channel_id, sequence, log_ns)
+        entries = self._count_all(definitions, messages)
         self.found.unchecked_chunks += head.crc == 0 and bool(messages)
         times = [log_ns for _, _, log_ns, _ in messages] or [head.start_ns, head.end_ns]
         index = ChunkIndex(
@@ -251,6 +246,21 @@ class _Scanner:
                 Chunk(head.compression, data, max(times), min(times), head.crc, len(records))
             )
 
+    def _count_all(
+        self, definitions: list[Schema | Channel], messages: list[tuple[int, int, int, int]]
+    ) -> dict[int, list[tuple[int, int]]]:
+        """Add the records of a chunk to the scan. Returns log time and offset of its messages, by channel."""
+        for definition in definitions:
+            if isinstance(definition, Schema):
+                self.found.schemas[definition.id] = definition
+            else:
+                self._add_channel(definition)
+        entries: dict[int, list[tuple[int, int]]] = {}
+        for channel_id, sequence, log_ns, place in messages:
+            entries.setdefault(channel_id, []).append((log_ns, place))
+            self._count(channel_id, sequence, log_ns)
+        return entries
+
     def _chunk_in_disguise(self, at: int) -> tuple[int, ChunkHead, bytes] | None:
         """End, head and records of a chunk that certainly begins here, even if opcode and length of its record are damaged."""
         try:
@@ -262,13 +272,57 @@ class _Scanner:
         except (Damaged, BagError):
             return None
 
-    def _lose_chunk(self, at: int, end: int, head: ChunkHead, reason: str) -> None:
+    def _lose_chunk(self, at: int, end: int, head: ChunkHead, reason: str) -> int:
+        """Note the loss of a damaged chunk, and keep its good records. Returns the offset of the next record."""
         indexed = self._index_of(at)
         span = (head.start_ns, head.end_ns)
         if indexed is not None:
             span = indexed.message_start_time, indexed.message_end_time
         self._bad_chunk = Loss(at, end - at, "a chunk", reason, BAD, span)
         self.found.losses.append(self._bad_chunk)
+        indexed_messages, after = self._message_indexes(end)
+        data = bytes(self._buffer[head.data_at : end])
+        records, proven = good_records(head, data, indexed_messages, self.found.channels.keys())
+        if not records:
+            return end
+        definitions, messages = _contents(records)
+        lost = Counter(channel_id for channel_id, _ in indexed_messages.values())
+        lost.subtract(channel_id for channel_id, *_ in messages if channel_id in lost)
+        loss, self._bad_chunk = self._bad_chunk, None
+        loss.length, loss.counts = after - at, {channel_id: n for channel_id, n in lost.items() if n > 0}
+        loss.reason = f"{reason}; {len(messages)} of its messages are kept"
+        self.found.unchecked_chunks += bool(messages) and not proven
+        times = [log_ns for _, _, log_ns, _ in messages] or [head.start_ns, head.end_ns]
+        crc = zlib.crc32(records) if proven else 0
+        content = _record(Chunk("", records, max(times), min(times), crc, len(records)))
+        index = ChunkIndex(
+            chunk_length=len(content),
+            chunk_start_offset=at,
+            compression="",
+            compressed_size=len(records),
+            message_end_time=max(times),
+            message_index_length=0,
+            message_index_offsets={},
+            message_start_time=min(times),
+            uncompressed_size=len(records),
+        )
+        piece = Piece(at, after - at, index)
+        _index_anew(piece, index, content, self._count_all(definitions, messages))
+        self.found.pieces.append(piece)
+        return after
+
+    def _message_indexes(self, at: int) -> tuple[dict[int, tuple[int, int]], int]:
+        """Channel and log time of the messages of a chunk by their offset, from the indexes that follow it, and where these end."""
+        found: dict[int, tuple[int, int]] = {}
+        with contextlib.suppress(Damaged):
+            while True:
+                opcode, body, end = record_at(self._buffer, at, self._limit)
+                if opcode != Opcode.MESSAGE_INDEX:
+                    break
+                channel_id, entries = index_entries(self._buffer[body:end])
+                found |= {place: (channel_id, log_ns) for log_ns, place in entries}
+                at = end
+        return found, at
 
     def _index_of(self, at: int) -> ChunkIndex | None:
         return self._listed.get(at)
@@ -309,12 +363,7 @@ class _Scanner:
                     f"the message index of the chunk at byte {piece.offset} was wrong or incomplete"
                 )
             chunk = piece.content or self._buffer[piece.offset : piece.offset + index.chunk_length]
-            index.message_index_offsets.clear()
-            rows = bytearray()
-            for channel_id, entries in self._entries.items():
-                index.message_index_offsets[channel_id] = piece.offset + len(chunk) + len(rows)
-                rows += _record(MessageIndex(channel_id, entries))
-            piece.content, index.message_index_length = chunk + bytes(rows), len(rows)
+            _index_anew(piece, index, chunk, self._entries)
         else:
             index.message_index_offsets.update(self._indexed)
             index.message_index_length = piece.length - index.chunk_length
@@ -459,6 +508,18 @@ def _contents(records: bytes) -> tuple[list[Schema | Channel], list[tuple[int, i
         elif opcode == Opcode.CHANNEL:
             definitions.append(parse(Channel, records[body:end]))
     return definitions, messages
+
+
+def _index_anew(
+    piece: Piece, index: ChunkIndex, chunk: bytes, by_channel: dict[int, list[tuple[int, int]]]
+) -> None:
+    """Make a piece of a chunk record and new message indexes."""
+    index.message_index_offsets.clear()
+    rows = bytearray()
+    for channel_id, entries in by_channel.items():
+        index.message_index_offsets[channel_id] = piece.offset + len(chunk) + len(rows)
+        rows += _record(MessageIndex(channel_id, entries))
+    piece.content, index.message_index_length = chunk + bytes(rows), len(rows)
 
 
 def _record(record: Any) -> bytes:
