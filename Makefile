@@ -7,7 +7,7 @@ export MUJOCO_GL ?= egl
 export PYTHONDONTWRITEBYTECODE :=
 DEFAULT_TESTS := not slow and not gpu and not hardware and not data and not browser and not ros2
 
-.PHONY: help setup demo experiment evidence world test computing-tests test-slow test-gpu test-hardware test-browser setup-ros2 test-ros2 check bench bench-quick campaign rooms api docs fmt clean
+.PHONY: help setup demo experiment evidence world test computing-tests test-slow test-gpu test-hardware test-browser setup-ros2 test-ros2 check bench bench-quick campaign rooms api docs fmt clean clean-runs
 
 help:  ## Show this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -131,5 +131,18 @@ fmt: setup  ## Format and fix what can be fixed
 	@$(BIN)/ruff check --fix .
 	@$(BIN)/ruff format .
 
-clean:  ## Remove the environment and every run
-	rm -rf $(VENV) $(ROS2_VENV) runs
+# What can be made again, and nothing else. Bags, trained policies and reports lie in runs/.
+clean:  ## Remove the environments, caches and the built site; runs/ is kept
+	rm -rf $(VENV) $(ROS2_VENV) site build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	@find . -name __pycache__ -type d -not -path './runs/*' -prune -exec rm -rf {} +
+	@test ! -e runs || echo "kept runs/ ($$(du -sh runs | cut -f1)): bags, policies and reports; 'make clean-runs' removes it"
+
+clean-runs:  ## Remove runs/ with every bag, policy and report in it (asks; YES=1 does not)
+	@test -e runs || { echo "there is no runs/"; exit 0; }; \
+	du -sh runs; find runs -mindepth 1 -maxdepth 1 | sort; \
+	if [ "$(YES)" != 1 ]; then \
+		test -t 0 || { echo "expected a terminal to ask, got none; nothing is removed: give YES=1"; exit 1; }; \
+		printf "Remove all of this? Type yes: "; read answer; \
+		test "$$answer" = yes || { echo "nothing is removed"; exit 1; }; \
+	fi; \
+	rm -rf runs
