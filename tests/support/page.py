@@ -16,7 +16,7 @@ import numpy as np
 import yaml
 
 from nodes.runtime.bus import Bus
-from nodes.runtime.messages import drive_message, image_message, pose_message
+from nodes.runtime.messages import drive_message, header, image_message, pose_message, types
 
 REPOSITORY = Path(__file__).parents[2]
 TWIN = REPOSITORY / "calibration" / "twin"
@@ -30,7 +30,7 @@ class Car(threading.Thread):
         super().__init__(daemon=True)
         self.folder, self.stopping = folder, False
         self.newest, self.acts, self.moves, self.heard = {}, [], [], {}
-        self.pictures = True
+        self.pictures = self.motor = True
 
     def run(self):
         heard = (
@@ -67,6 +67,8 @@ class Car(threading.Thread):
         now_ns = time.time_ns()
         bus.publish("/vicon/car", pose_message(np.eye(4), now_ns))
         bus.publish("/policy/drive", drive_message(0.5, 0.0, now_ns))
+        if self.motor and self.moves:
+            bus.publish("/motor/sent", motor_sent(self.moves[-1][1], now_ns))
         if tick % 5 == 0 and self.pictures:
             rgb = np.full((188, 336, 3), tick % 255, np.uint8)
             for topic in ("/camera/image_raw", "/compositor/image"):
@@ -86,6 +88,23 @@ class Car(threading.Thread):
         stops = [t for t, speed in list(self.moves) if speed == 0.0 and t > (moving[-1] if moving else 0)]
         assert stops, "the car was not stopped"
         return (stops[0] - since_ns) / 1e9
+
+
+def motor_sent(speed_mps, stamp_ns):
+    """What a motor node reports that does what it is told."""
+    return types.MotorSent(
+        header=header(stamp_ns),
+        serial_write_mono_ns=0,
+        serial_write_real_ns=stamp_ns,
+        speed_mps=speed_mps,
+        steering_rad=0.0,
+        erpm=0.0,
+        servo=0.5,
+        brake_current_a=0.0,
+        braking=speed_mps == 0.0,
+        reason="",
+        peer="TWIN",
+    )
 
 
 class Run:
