@@ -166,6 +166,7 @@ element("enter-form").addEventListener("submit", async (event) => {
   event.preventDefault();
   const code = element("code").value;
   text("enter-answer", "");
+  let wrong = "This code is wrong, was used, or has expired. Run advnerf page on the robot for a new one.";
   try {
     const response = await fetch("/enter", {
       method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify({ code }),
@@ -175,11 +176,12 @@ element("enter-form").addEventListener("submit", async (event) => {
       link.connect();
       return;
     }
+    if (response.status === 429) wrong = `Too many wrong codes. Try again in ${(await response.json()).wait_s} s.`;
   } catch {
     text("enter-answer", "No answer from the robot.");
     return;
   }
-  text("enter-answer", "This code is wrong, was used, or has expired. Run advnerf page on the robot for a new one.");
+  text("enter-answer", wrong);
 });
 
 // What sticks below the header, and what is scrolled to, must know how high it is.
