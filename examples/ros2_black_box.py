@@ -15,11 +15,13 @@ import torch
 
 from advnerf_core.policies.adapter import AdaptedPolicy
 from nodes.lab.ros2_policy import ros2_policy
+from nodes.runtime.paths import shipped
 
 
 def factory() -> AdaptedPolicy:
     """The program on domain 0 that drives the simulated lab's car."""
-    return ros2_policy("calibration/twin/camera.yaml", "calibration/twin/vehicle.yaml", domain_id=0)
+    twin = shipped("calibration/twin")
+    return ros2_policy(twin / "camera.yaml", twin / "vehicle.yaml", domain_id=0)
 
 
 if __name__ == "__main__":

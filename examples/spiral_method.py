@@ -11,23 +11,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
+from torch import Tensor
 
+import advnerf_core as adv
 from advnerf_core.attack.methods import Method, SearchRun, SearchSettings, load_method
 from advnerf_core.attack.search.search import SearchResult, begin, evaluate_theta, search_fingerprint
-from benchmarks.attack_toy import toy_problem
 
-EVALUATIONS = 10
+CAMERA, EVALUATIONS = adv.Pinhole(width=48, height=24, fx=30.0, fy=30.0, cx=24.0, cy=12.0), 10
 
 
 @dataclass(frozen=True)
 class Options:
-    """What only this method knows.
-
-    Attributes:
-        turns: Turns of the spiral per evaluation.
-        growth: How far theta grows per evaluation.
-    """
+    """What only this method knows: turns, and growth of theta, per evaluation."""
 
     turns: float = 0.1
     growth: float = 0.4
@@ -51,13 +48,32 @@ def search(problem: Any, settings: SearchSettings, run: SearchRun) -> SearchResu
 Spiral = Method(search, Options=Options)
 
 
+def steer(images: Tensor) -> Tensor:
+    """Wheel angles ``[B]`` [rad] towards the brighter half of images ``[B, 3, H, W]``."""
+    left, right = images.mean((1, 2)).chunk(2, dim=1)
+    return 0.3 * torch.tanh(4.0 * (left.mean(1) - right.mean(1)))
+
+
+def grey_room(poses: Any, pinhole: adv.Pinhole) -> tuple[Tensor, Tensor]:
+    """Colours ``[B, H, W, 3]`` and depth ``[B, H, W]`` [m] around the car."""
+    size = (len(poses), pinhole.height, pinhole.width)
+    return torch.full((*size, 3), 0.5, dtype=torch.float64), torch.full(size, 8.0, dtype=torch.float64)
+
+
 if __name__ == "__main__":
-    problem = toy_problem(steps=10, resolution=8, dtype=torch.float32)
+    view = adv.PolicyView(CAMERA, crop_top_px=0, crop_height_px=24, width=48, height=24)
+    T_world_from_board = adv.make_transform(np.diag([-1.0, -1.0, 1.0]), [3.0, 0.5, 0.2])
+    board = adv.cube_face_object(0.8, 8, T_world_from_object=T_world_from_board)
+    problem = adv.AttackProblem(
+        adv.adapt(steer, adv.PolicyContract(view)),
+        adv.Surrogate(grey_room, view.pinhole, adv.camera_mount(0.0, 0.0, 0.2, 0.0), board),
+        adv.Ackermann(wheelbase_m=0.25, speed_mps=0.8, dt_s=0.1),
+        adv.Path.from_segments((0.0, 0.0, 0.0), [adv.Line(10.0)], closed=False),
+        torch.zeros(1, 3, dtype=torch.float64),
+        steps=20,
+    )
     print(f"total cross-track error after {EVALUATIONS} evaluations of each method:")
     for reference in (f"{__file__}:Spiral", "random", "gradient"):
         method = load_method(reference)
-        settings = SearchSettings(EVALUATIONS, learning_rate=0.5, options=method.options({}))
-        if reference == "random":
-            settings = SearchSettings(EVALUATIONS)
-        found = method.search(problem, settings, SearchRun(seed=0))
+        found = method.search(problem, SearchSettings(EVALUATIONS, options=method.options({})), SearchRun())
         print(f"  {reference.rpartition(':')[2]:9} {found.best.predicted_total_cte_m:.3f} m")

@@ -4,8 +4,10 @@ import ast
 import os
 import re
 import runpy
+import shutil
 import subprocess
 import sys
+from importlib.metadata import packages_distributions, requires
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +67,39 @@ def test_an_example_says_what_it_shows_and_is_listed(file):
     (row,) = [line for line in listing.splitlines() if f"[{file.name}]({file.name})" in line]
     assert f"`{commands[0]}`" in row
     assert len(text.splitlines()) < (250 if file.stem.startswith("world_") else 80)
+
+
+def imported(file):
+    """Top-level modules that a file imports."""
+    names = set()
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom):
+            assert node.level == 0
+            names.add(node.module.partition(".")[0])
+        elif isinstance(node, ast.Import):
+            names |= {alias.name.partition(".")[0] for alias in node.names}
+    return names
+
+
+@pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.py")), ids=lambda file: file.stem)
+def test_an_example_imports_only_what_is_installed(file):
+    ours = {"advnerf_core", "calibration", "hardware", "nodes"}
+    ros2 = {"rclpy", "geometry_msgs", "sensor_msgs"} if file.stem == "ros2_policy" else set()
+    declared = {re.match(r"[\w-]+", line)[0].lower() for line in requires("advnerf") if "dev" not in line}
+    packages = packages_distributions()
+    for name in imported(file) - ours - ros2 - sys.stdlib_module_names:
+        assert {package.lower() for package in packages[name]} & declared, name
+
+
+def test_a_copied_example_runs_in_an_empty_folder(tmp_path):
+    """Its imports, and all that it makes itself: nothing of this repository lies beside it."""
+    copy = shutil.copy(EXAMPLES / "spiral_method.py", tmp_path)
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run(
+        [sys.executable, copy], capture_output=True, text=True, cwd=tmp_path, env=environment, timeout=110
+    )
+    assert done.returncode == 0, done.stderr
+    assert figures(done.stdout)[2] > 0.0
 
 
 def test_the_attack_on_the_line_follower_beats_chance_and_paints_the_board_yellow(capsys):

@@ -42,6 +42,8 @@ _RGB_IN_YUV = (
 
 # Where an ONNX file carries its declaration.
 ONNX_METADATA_KEY = "advnerf_policy"
+# What a declaration beside a file adds to the file's name.
+DECLARATION_SUFFIX = ".policy.yaml"
 
 
 class PolicyContractError(AdvnerfError, ValueError):
@@ -259,7 +261,7 @@ def declaration_beside(path: Path, embedded: str | None, **implied: Any) -> Poli
         embedded: JSON that the file carries; None or empty if it carries none.
         **implied: What the file itself says about keys that the declaration leaves out.
     """
-    beside = path.with_name(path.name + ".policy.yaml")
+    beside = path.with_name(path.name + DECLARATION_SUFFIX)
     try:
         if beside.is_file():
             return PolicyContract.from_dict(read_yaml(beside).data, str(beside), **implied)

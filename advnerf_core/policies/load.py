@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.code_files import module_sha256
-from advnerf_core.policies.contract import PolicyContract, PolicyContractError
+from advnerf_core.inputs import InputFiles
+from advnerf_core.policies.contract import DECLARATION_SUFFIX, PolicyContract, PolicyContractError
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.run_module import search_working_folder_last
 
@@ -137,6 +138,19 @@ def _factory_sha256(spec: str, policy: AdaptedPolicy, code: str) -> str:
     if policy.identity:
         digest.update(f"{policy.identity}\0{policy.answers_mrad()}".encode())
     return digest.hexdigest()
+
+
+def policy_file_sha256(path: Path) -> str:
+    """Hash of a policy file as it lies on disk, with the files that it keeps weights in and the declaration beside it; nothing is loaded.
+
+    Raises:
+        PolicyContractError: One of them is missing, or lies elsewhere.
+    """
+    from advnerf_core.policies.onnx_policy import read_onnx
+
+    beside = path.with_name(path.name + DECLARATION_SUFFIX)
+    declared = beside.read_text(encoding="utf-8") if beside.is_file() else ""
+    return (read_onnx(path) if path.suffix == ".onnx" else InputFiles(path)).sha256(declared)
 
 
 class Driver(Protocol):

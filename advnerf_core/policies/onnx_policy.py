@@ -194,12 +194,11 @@ def _external_files(content: bytes) -> list[str]:
     if b"location" not in content:  # the key that names them; most models need no second reading
         return []
     import onnx
-    from google.protobuf.message import DecodeError
 
     try:
         model = onnx.load_model_from_string(content)
-    except DecodeError:
-        return []  # ONNX Runtime says what is wrong with it
+    except Exception:  # protobuf's own; ONNX Runtime says what is wrong with the file
+        return []
     return sorted(
         {
             entry.value

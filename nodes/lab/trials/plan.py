@@ -15,7 +15,7 @@ from typing import Any
 
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.documents import read_json
-from advnerf_core.files import sha256_of, write_atomically
+from advnerf_core.files import write_atomically
 from nodes.runtime.errors import RuntimeFault
 
 PLAN_NAME = "plan.json"
@@ -147,11 +147,6 @@ def finished(folder: Path, plan: TrialsPlan) -> dict[str, dict[str, Any]]:
         for run in plan.runs
         if (folder / f"{run.name}.json").exists()
     }
-
-
-def sha256_if_any(file: Path | None) -> str:
-    """Hash of a file; empty for None."""
-    return "" if file is None else sha256_of(file)
 
 
 def _read(file: Path) -> dict[str, Any]:

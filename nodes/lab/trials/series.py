@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from advnerf_core.files import sha256_of
+from advnerf_core.policies.load import policy_file_sha256
 from calibration.schema import RoomCalibration, load_calibration
 from nodes.lab.trials.bags import measure_drives
 from nodes.lab.trials.plan import (
@@ -23,7 +25,6 @@ from nodes.lab.trials.plan import (
     finished,
     keep_plan,
     make_runs,
-    sha256_if_any,
 )
 from nodes.lab.trials.trial import TrialPlan
 from nodes.lab.trials.trial_runner import TICK_S, run_trial
@@ -100,8 +101,8 @@ def prepare_series(
         seed,
         ticks,
         start_pose or room.start_pose,
-        sha256_if_any(room_file),
-        sha256_if_any(policy_file),
+        sha256_of(room_file),
+        "" if policy_file is None else policy_file_sha256(policy_file),
         make_runs(attacks, repeats, seed),
         host,
     )

@@ -11,7 +11,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from advnerf_core.policies.load import load_any_policy, load_driver
+from advnerf_core.files import sha256_of
+from advnerf_core.policies.load import load_any_policy, load_driver, policy_file_sha256
 from advnerf_core.policies.onnx_policy import OnnxNetwork
 from tests.support.onnx_models import mean_model, save_beside, steering
 
@@ -178,3 +179,14 @@ def test_a_policy_in_another_program_is_named_by_its_answers_and_is_not_fixed(tm
 def test_a_policy_that_runs_here_is_fixed(tmp_path):
     file = save_beside(mean_model({"steering": 0.25}), tmp_path / "policy.onnx")
     assert "not_fixed" not in load_any_policy(file).metadata
+
+
+def test_the_hash_of_a_policy_that_is_not_loaded_covers_weights_and_declaration(tmp_path):
+    def found(first, mean):
+        return policy_file_sha256(write_onnx(tmp_path, first, 0.5, mean, "", "unrelated"))
+
+    assert found(0.25, 0.0) == found(0.25, 0.0)
+    assert len({found(0.25, 0.0), found(0.5, 0.0), found(0.25, 0.5)}) == 3
+    other = tmp_path / "policy.safetensors"
+    other.write_bytes(b"weights")
+    assert policy_file_sha256(other) == sha256_of(other)
