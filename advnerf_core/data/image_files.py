@@ -1,92 +1,91 @@
-"""Image files: read whole or not at all, with their transparency."""
+"""Image files: read whole or not at all, with their transparency; as they are stored, or upright."""
 
 from __future__ import annotations
 
 import struct
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.data.errors import DatasetError
+from advnerf_core.data.image_bytes import (
+    JPEG,
+    PNG,
+    exif_segment,
+    is_damaged,
+    is_heif,
+    is_tiff,
+    orientation,
+    plain_tiff,
+    turned,
+)
 from advnerf_core.files import write_atomically
 
 Rgb = NDArray[np.uint8]
 Grey = NDArray[np.uint8]
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+HEIF_SUFFIXES = (".heic", ".heif")
 OPAQUE = 255
-_ORIENTATION_TAG = 0x0112
-_JPEG, _PNG = b"\xff\xd8", b"\x89PNG\r\n\x1a\n"
+JPEG_QUALITY = 95
 
 
 def write_image(path: Path, rgb: Rgb) -> None:
     """Write ``[H, W, 3]``, whole or not at all: photographs (``.jpg``) as JPEG of quality 95, anything else without loss."""
-    options = [cv2.IMWRITE_JPEG_QUALITY, 95] if path.suffix == ".jpg" else []
-    encoded, data = cv2.imencode(path.suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)
-    if not encoded:
-        raise ValueError(f"expected an image that can be written as {path.suffix}, got shape {rgb.shape}")
-    write_atomically(path, data.tobytes())
+    write_atomically(path, encoded(rgb, path.suffix))
 
 
-def read_image(path: Path) -> tuple[Rgb, Grey | None]:
-    """Colours ``[H, W, 3]`` and, if the file has it, opacity ``[H, W]``; turned upright as its EXIF data says.
+def encoded(rgb: Rgb, suffix: str, alpha: Grey | None = None) -> bytes:
+    """The file that `write_image` writes for such a name; with opacity ``[H, W]`` where the format has it."""
+    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if suffix in (".jpg", ".jpeg") else []
+    planes = [rgb[..., ::-1]] if alpha is None or suffix in (".jpg", ".jpeg") else [rgb[..., ::-1], alpha]
+    done, data = cv2.imencode(suffix, np.ascontiguousarray(np.dstack(planes)), options)
+    if not done:
+        raise ValueError(f"expected an image that can be written as {suffix}, got shape {rgb.shape}")
+    return data.tobytes()
+
+
+def read_stored(path: Path) -> tuple[Rgb, Grey | None]:
+    """Colours ``[H, W, 3]`` and, if the file has it, opacity ``[H, W]``, of the pixels as the file stores them.
+
+    This is how images with poses, masks, logs and calibration pictures are read: their numbers are about the stored pixels, whatever
+    EXIF says of the way up.
 
     Raises:
-        DatasetError: The file cannot be read, is cut off, or is no image.
+        DatasetError: The file cannot be read, is damaged, or is no image.
     """
+    return _decoded(path, read_bytes(path))
+
+
+def read_upright(path: Path) -> tuple[Rgb, Grey | None]:
+    """The same of a picture for people, or one whose pose is still to be found: turned upright as its EXIF data says."""
     data = read_bytes(path)
-    # With transparency OpenCV leaves pictures as they lie; only photographs, which have none, are ever turned.
-    flags = cv2.IMREAD_COLOR if data.startswith(_JPEG) else cv2.IMREAD_UNCHANGED
-    pixels = None if is_cut_off(data) else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    if pixels is None:
-        raise DatasetError(
-            f"expected a readable image, got {path}: it is damaged or no image, so copy it again"
-        )
-    if pixels.dtype == np.uint16:
-        pixels = np.round(pixels / 257.0).astype(np.uint8)
-    if pixels.dtype != np.uint8:
-        raise DatasetError(
-            f"expected an image of 8 or 16 bit, got {path} of {pixels.dtype}; convert it to PNG"
-        )
-    if pixels.ndim == 2:
-        pixels = np.repeat(pixels[..., None], 3, axis=-1)
-    rgb = np.ascontiguousarray(pixels[..., 2::-1], dtype=np.uint8)
-    return rgb, np.ascontiguousarray(pixels[..., 3], dtype=np.uint8) if pixels.shape[2] == 4 else None
+    rgb, alpha = _decoded(path, data)
+    turn = 1 if is_heif(data) else orientation(data)  # the decoder of HEIF has turned it
+    return turned(rgb, turn), None if alpha is None else turned(alpha, turn)
 
 
 def read_mask(path: Path) -> Grey:
-    """A mask ``[H, W]``; what is not black is kept."""
-    data = read_bytes(path)
-    pixels = None if is_cut_off(data) else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    if pixels is None:
-        raise DatasetError(
-            f"expected a readable mask, got {path}: it is damaged or no image, so make it again"
-        )
-    return np.asarray(pixels, np.uint8)
+    """A mask ``[H, W]`` of stored pixels; what is not black is kept."""
+    try:
+        rgb, _ = read_stored(path)
+    except DatasetError as error:
+        raise DatasetError(f"mask: {error}") from error
+    return np.asarray(rgb.max(axis=-1), np.uint8)
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height [px] as `read_image` would return them; of a PNG without decoding it."""
+    """Width and height [px] as `read_stored` would return them; of a PNG without decoding it."""
     with _open(path) as stream:
         head = stream.read(24)
-    if head.startswith(_PNG) and len(head) == 24:
+    if head.startswith(PNG) and len(head) == 24:
         width, height = struct.unpack(">II", head[16:24])
         return int(width), int(height)
-    rgb, _ = read_image(path)
+    rgb, _ = read_stored(path)
     return rgb.shape[1], rgb.shape[0]
-
-
-def is_cut_off(data: bytes) -> bool:
-    """Whether a JPEG or PNG lacks its end: decoders would fill up the rest of the picture with grey."""
-    if data.startswith(_JPEG):
-        scan = _first_scan(data)
-        return scan is None or data.find(b"\xff\xd9", scan) < 0
-    if data.startswith(_PNG):
-        return b"IEND" not in data
-    return False
 
 
 def read_bytes(path: Path) -> bytes:
@@ -95,42 +94,84 @@ def read_bytes(path: Path) -> bytes:
         return stream.read()
 
 
-def upright_exif(data: bytes) -> bytes:
-    """The EXIF segment of a JPEG file for a copy whose pixels were turned upright: the orientation in it is 1; empty without EXIF."""
-    at = 2
-    while data.startswith(_JPEG) and at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
-        end = at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-        if data[at + 1] == 0xE1 and data[at + 4 : at + 10] == b"Exif\0\0":
-            return data[at : at + 10] + _with_orientation_1(data[at + 10 : end])
-        at = end
-    return b""
+def _decoded(path: Path, data: bytes) -> tuple[Rgb, Grey | None]:
+    if is_heif(data):
+        return _decoded_heif(path, data), None
+    meaning = "unassociated"
+    whole = bool(data) and not is_damaged(data)
+    if is_tiff(data):
+        data, meaning = plain_tiff(data)
+    pixels = _opencv_pixels(data) if whole else None
+    if pixels is None:
+        raise DatasetError(
+            f"expected a readable image, got {path} ({len(data)} bytes): it is damaged or no image, so copy it again"
+        )
+    if pixels.dtype == np.uint16:
+        pixels = np.round(np.asarray(pixels, np.float64) / 257.0).astype(np.uint8)
+    if pixels.dtype != np.uint8:
+        raise DatasetError(
+            f"expected an image of 8 or 16 bit, got {path} of {pixels.dtype}; convert it to PNG"
+        )
+    if pixels.ndim == 2:
+        pixels = np.repeat(pixels[..., None], 3, axis=-1)
+    rgb = np.ascontiguousarray(pixels[..., 2::-1], dtype=np.uint8)
+    if pixels.shape[2] != 4 or meaning == "none":
+        return rgb, None
+    alpha = np.ascontiguousarray(pixels[..., 3], dtype=np.uint8)
+    return (unpremultiplied(rgb, alpha) if meaning == "associated" else rgb), alpha
 
 
-def _with_orientation_1(tiff: bytes) -> bytes:
-    order, changed = "<" if tiff[:2] == b"II" else ">", bytearray(tiff)
+def _opencv_pixels(data: bytes) -> NDArray[Any] | None:
+    # Colours of a JPEG may be CMYK, which only the first flag converts; the second reads whatever there is, alpha and 16 bit.
+    flags = (
+        cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION if data.startswith(JPEG) else cv2.IMREAD_UNCHANGED
+    )
     try:
-        (directory,) = struct.unpack_from(f"{order}I", tiff, 4)
-        (entries,) = struct.unpack_from(f"{order}H", tiff, directory)
-        for at in range(directory + 2, directory + 2 + 12 * entries, 12):
-            if struct.unpack_from(f"{order}H", tiff, at)[0] == _ORIENTATION_TAG:
-                struct.pack_into(f"{order}H", changed, at + 8, 1)
-    except struct.error:
-        return tiff  # damaged: readers ignore it
-    return bytes(changed)
+        return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:
+        return None
 
 
-def _first_scan(data: bytes) -> int | None:
-    """Where the picture's own data begins; a thumbnail with an end of its own may lie before it."""
-    at = 2
-    while at + 4 <= len(data) and data[at] == 0xFF:
-        marker = data[at + 1]
-        if marker == 0xDA:
-            return at
-        if marker == 0xFF:  # fill byte
-            at += 1
-            continue
-        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    return None
+def heif_exif(path: Path, data: bytes) -> bytes:
+    """The EXIF data of a HEIC picture as a segment for an upright JPEG copy; empty without any."""
+    return exif_segment(_heif_image(path, data).getexif().tobytes().removeprefix(b"Exif\0\0"))
+
+
+def _decoded_heif(path: Path, data: bytes) -> Rgb:
+    return np.ascontiguousarray(np.asarray(_heif_image(path, data).convert("RGB")), dtype=np.uint8)
+
+
+def heif_reader(path: Path) -> Any:
+    """The library that reads HEIC pictures.
+
+    Raises:
+        DatasetError: It is not installed.
+    """
+    try:
+        import pillow_heif
+    except ImportError:
+        raise DatasetError(
+            f"expected pillow-heif to read {path} (HEIC, as iPhones take pictures), it is not installed; run: "
+            "pip install pillow-heif, or convert the pictures to JPEG"
+        ) from None
+    return pillow_heif
+
+
+def _heif_image(path: Path, data: bytes) -> Any:
+    """A HEIC picture as an upright PIL image."""
+    reader = heif_reader(path)
+    try:
+        return reader.open_heif(data, convert_hdr_to_8bit=True).to_pillow()
+    except (ValueError, OSError, EOFError, RuntimeError) as error:
+        raise DatasetError(
+            f"expected a readable image, got {path} ({len(data)} bytes): it is damaged or no image ({error}), so copy it again"
+        ) from error
+
+
+def unpremultiplied(rgb: Rgb, alpha: Grey) -> Rgb:
+    """Colours that were multiplied by opacity, without it."""
+    weight = np.maximum(alpha[..., None], 1) / np.float32(OPAQUE)
+    return np.minimum(np.rint(rgb / weight), OPAQUE).astype(np.uint8)
 
 
 def _open(path: Path) -> BinaryIO:

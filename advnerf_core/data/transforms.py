@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from advnerf_core.data.errors import DatasetError
+from advnerf_core.data.errors import DatasetError, raise_all
 from advnerf_core.data.image_files import SUFFIXES, image_size
 from advnerf_core.data.lens import Lens
 from advnerf_core.data.views import HELD_OUT_SPLITS, NGP_OFFSET, NGP_SCALE, TRAIN, PosedImage, PosedImages
@@ -67,7 +67,8 @@ def _read_set(path: Path, split: str | None, require_all: bool) -> PosedImages:
     listed = content.get("frames")
     if not isinstance(listed, list) or not listed:
         raise DatasetError(f"expected a list 'frames' in {path}, got {type(listed).__name__} without entries")
-    split_of, frames, missing = _listed_splits(path, content), [], []
+    split_of, frames, missing = _listed_splits(path, content), list[PosedImage](), list[Path]()
+    wrong = list[DatasetError]()
     for number, entry in enumerate(listed):
         try:
             name = _name_of(entry)
@@ -80,7 +81,8 @@ def _read_set(path: Path, split: str | None, require_all: bool) -> PosedImages:
             )
         except ValueError as error:
             label = f" ({entry['file_path']})" if isinstance(entry, dict) and "file_path" in entry else ""
-            raise DatasetError(f"{path}: frame {number}{label}: {error}") from error
+            wrong.append(DatasetError(f"{path}: frame {number}{label}: {error}"))
+    raise_all(wrong, len(listed), "frames")
     if missing and (require_all or not frames):
         raise DatasetError(
             f"expected {len(listed)} images listed in {path}, {len(missing)} are missing, the first is {missing[0]}; "

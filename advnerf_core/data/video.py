@@ -9,16 +9,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from advnerf_core.data.errors import DatasetError
-from advnerf_core.data.image_files import Rgb
+from advnerf_core.data.image_files import Rgb, write_image
 from advnerf_core.data.keyframes import Candidate, KeyframeConfig, KeyframeSelector
 from advnerf_core.files import write_atomically
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
-JPEG_QUALITY = 95
 _RECORD = "keyframes.json"
 
 
@@ -94,12 +92,7 @@ def keep_keyframes(
 
 def _write(folder: Path, frame: Candidate) -> dict[str, Any]:
     name = f"{frame.number:06d}.jpg"
-    encoded, data = cv2.imencode(
-        ".jpg", np.ascontiguousarray(frame.rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
-    )
-    if not encoded:
-        raise ValueError(f"expected an image that can be written as JPEG, got shape {frame.rgb.shape}")
-    write_atomically(folder / name, data.tobytes())
+    write_image(folder / name, frame.rgb)
     return {"file": name, "time_s": round(frame.time_s, 4), "sharpness": round(frame.sharpness, 2)}
 
 

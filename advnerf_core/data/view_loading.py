@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.data.errors import DatasetError
-from advnerf_core.data.image_files import OPAQUE, Grey, Rgb, read_image, read_mask
+from advnerf_core.data.image_files import OPAQUE, Grey, Rgb, read_mask, read_stored, unpremultiplied
 from advnerf_core.data.lens import straightening
 from advnerf_core.geometry import Pinhole
 
@@ -51,7 +51,7 @@ def load_view(frame: PosedImage, size: tuple[int, int] | None = None, keep_all: 
     Undistortion keeps the largest window without missing pixels, so intrinsics change a little with it; or with ``keep_all``
     everything, and ``valid`` says where there is nothing.
     """
-    rgb, alpha = read_image(frame.path)
+    rgb, alpha = read_stored(frame.path)
     height, width = rgb.shape[:2]
     pinhole = _pinhole_of_file(frame, width, height)
     valid = None if frame.mask is None else _read_valid(frame, frame.mask, width, height)
@@ -71,7 +71,7 @@ def _pinhole_of_file(frame: PosedImage, width: int, height: int) -> Pinhole:
     if abs(listed.width * height / (listed.height * width) - 1.0) > _ASPECT_TOLERANCE:
         raise DatasetError(
             f"expected an image of the shape {listed.width} x {listed.height} (w x h) that is listed for it, got {frame.path} of "
-            f"{width} x {height}; it was turned or cropped after the poses were found"
+            f"{width} x {height}; the stored pixels were turned, cropped or stretched after the poses were found"
         )
     return listed.resized(width, height)
 
@@ -104,7 +104,8 @@ def _straightened(
         camera = f" (camera {frame.camera_id})" if frame.camera_id else ""
         raise DatasetError(f"{frame.path}{camera}: {error}") from error
     if alpha is not None:
-        rgb, alpha = _unpremultiplied(*(lens.apply(plane) for plane in _premultiplied(rgb, alpha)))
+        rgb, alpha = (lens.apply(plane) for plane in _premultiplied(rgb, alpha))
+        rgb = unpremultiplied(rgb, alpha)
     else:
         rgb = lens.apply(rgb)
     if valid is not None:
@@ -117,7 +118,8 @@ def _straightened(
 def _resized(rgb: Rgb, alpha: Grey | None, size: tuple[int, int]) -> tuple[Rgb, Grey | None]:
     if alpha is None:
         return _resize(rgb, size), None
-    return _unpremultiplied(*(_resize(plane, size) for plane in _premultiplied(rgb, alpha)))
+    rgb, alpha = (_resize(plane, size) for plane in _premultiplied(rgb, alpha))
+    return unpremultiplied(rgb, alpha), alpha
 
 
 def _resize(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
@@ -130,8 +132,3 @@ def _resize(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8
 def _premultiplied(rgb: Rgb, alpha: Grey) -> tuple[Rgb, Grey]:
     """Colours weighted by opacity: only those may be averaged, or what is behind the glass bleeds into the edges."""
     return np.rint(rgb * (alpha[..., None] / np.float32(OPAQUE))).astype(np.uint8), alpha
-
-
-def _unpremultiplied(rgb: Rgb, alpha: Grey) -> tuple[Rgb, Grey]:
-    weight = np.maximum(alpha[..., None], 1) / np.float32(OPAQUE)
-    return np.minimum(np.rint(rgb / weight), OPAQUE).astype(np.uint8), alpha

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from advnerf_core.data.errors import DatasetError
+from advnerf_core.data.errors import DatasetError, raise_all
 from advnerf_core.data.image_files import OPAQUE, Grey, Rgb
 from advnerf_core.data.lens import Lens
-from advnerf_core.data.view_loading import load_view
+from advnerf_core.data.view_loading import View, load_view
 from advnerf_core.geometry import Array, Pinhole
 
 # Instant-NGP maps the file's coordinates into its unit cube by 0.33 x + 0.5, unless the file says otherwise.
@@ -172,7 +172,9 @@ class PosedImages:
         if not self.frames:
             raise DatasetError(f"expected at least one image in {self._name} to load, got none")
         with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-            views = list(pool.map(lambda frame: load_view(frame, size, keep_all), self.frames))
+            found = list(pool.map(lambda frame: _view_or_error(frame, size, keep_all), self.frames))
+        views = [each for each in found if isinstance(each, View)]
+        raise_all([each for each in found if isinstance(each, DatasetError)], len(found), "images")
         sizes = {(view.pinhole.width, view.pinhole.height) for view in views}
         if len(sizes) > 1:
             raise DatasetError(
@@ -208,3 +210,10 @@ class PosedImages:
     @property
     def _name(self) -> str:
         return str(self.file) if self.file is not None else "the data set"
+
+
+def _view_or_error(frame: PosedImage, size: tuple[int, int] | None, keep_all: bool) -> View | DatasetError:
+    try:
+        return load_view(frame, size, keep_all)
+    except DatasetError as error:
+        return error

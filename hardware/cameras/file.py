@@ -56,7 +56,7 @@ class FileCamera(Camera):
                 f"all {len(self._files)} images of {self.folder} were played; set loop to repeat them"
             )
         path = self._files[self._sequence % len(self._files)]
-        bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        bgr = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if bgr is None:
             raise LinkLost(f"expected an image, cannot decode {path}; remove or replace it")
         rgb = np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8)

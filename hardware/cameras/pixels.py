@@ -73,7 +73,7 @@ def _nv12(data: Bytes, layout: Layout) -> Bytes:
 
 
 def _jpeg(data: Bytes, layout: Layout) -> Bytes:
-    bgr = cv2.imdecode(data, cv2.IMREAD_COLOR)
+    bgr = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if bgr is None:
         raise ValueError("the JPEG data of a frame are damaged")
     if bgr.shape[:2] != (layout.height, layout.width):

@@ -238,12 +238,10 @@ def _parts(
 
 def _own_view(read: Any, log: Path, view: PolicyView, columns: tuple[str, str], scale: float) -> Any:
     """The policy's view for another camera: images of another size are cropped at the same fraction of the image."""
-    import cv2
-
+    from advnerf_core.data.image_files import image_size
     from nodes.lab.policy_data.frames import first_image
 
-    picture = cv2.imread(str(first_image(log, columns[0])))
-    same = picture is not None and picture.shape[:2] == (view.camera.height, view.camera.width)
+    same = image_size(first_image(log, columns[0])) == (view.camera.width, view.camera.height)
     return read(log, view if same else None, *columns, scale)[0]
 
 

@@ -1,6 +1,6 @@
 import numpy as np
 
-from advnerf_core.data.image_files import read_image
+from advnerf_core.data.image_files import read_stored
 from advnerf_core.geometry import planar_pose, wrap_angle
 from benchmarks.lab_recordings import FRAME_PERIOD_S, START_NS, car_state, lab_with_phone, record_drive
 from hardware.worlds.lab.config import LabConfig
@@ -31,6 +31,6 @@ def test_a_recorded_drive_has_frames_and_poses_at_their_stamps(tmp_path):
     for stamp, T in zip(taken.stamps_ns, taken.T_world_from_camera, strict=True):
         true = planar_pose(*car_state(config, (stamp - START_NS) / 1e9)) @ config.camera.T_car_from_camera
         assert np.abs(T - true).max() < 0.004, "within the noise of the motion capture"
-    assert (read_image(taken.files[3])[0] == rgb).all(), (
+    assert (read_stored(taken.files[3])[0] == rgb).all(), (
         "frames are stored without loss, each at its own stamp"
     )

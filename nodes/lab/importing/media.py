@@ -5,14 +5,15 @@ from __future__ import annotations
 import os
 import re
 import shutil
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
 
-from advnerf_core.data import image_files, video
+from advnerf_core.data import image_bytes, image_files, video
+from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.keyframes import KeyframeConfig
 from advnerf_core.files import write_atomically
 from calibration.structure_from_motion import Source
@@ -20,6 +21,7 @@ from nodes.lab.importing.errors import ImportRecordingError
 from nodes.runtime.progress import Report
 
 IMAGES = "images"
+_SUFFIXES = (*image_files.SUFFIXES, *image_files.HEIF_SUFFIXES)
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ def gather(media: Sequence[Path], output: Path, config: MediaConfig, report: Rep
     Returns:
         One source for each video or folder, with paths relative to ``output``.
     """
-    singles = [path for path in media if path.is_file() and path.suffix.lower() in image_files.SUFFIXES]
+    singles = [path for path in media if path.is_file() and _is_photograph(path)]
     entries: list[tuple[str, list[Path], bool]] = [("photos", singles, False)] if singles else []
     for path in media:
         if path in singles:
@@ -84,18 +86,28 @@ def _part_of(report: Report, index: int, parts: int) -> Report:
 
 
 def photographs_in(folder: Path) -> list[Path]:
-    """Image files of a folder, sorted by name. Numbers in names are sorted by value."""
-    files = [
-        path for path in folder.iterdir() if path.suffix.lower() in image_files.SUFFIXES and path.is_file()
-    ]
+    """Image files of a folder, sorted by name. Numbers in names are sorted by value. Files of other kinds are told."""
+    files, others = list[Path](), Counter[str]()
+    for path in folder.iterdir():
+        if path.is_file() and _is_photograph(path):
+            files.append(path)
+        elif path.is_file() and not path.name.startswith("."):
+            others[path.suffix.lower() or "(no suffix)"] += 1
     if not files:
         raise ImportRecordingError(
-            f"expected photographs ({', '.join(image_files.SUFFIXES)}) in {folder}, got none; give the folder that holds them"
+            f"expected photographs ({', '.join(_SUFFIXES)}) in {folder}, got none; give the folder that holds them"
         )
+    if others:
+        kinds = ", ".join(f"{count} {suffix}" for suffix, count in sorted(others.items()))
+        print(f"{folder}: {len(files)} photographs; left out, as they are of other kinds: {kinds}")
     return sorted(
         files,
         key=lambda path: [(int(p), "") if p.isdigit() else (-1, p) for p in re.split(r"(\d+)", path.name)],
     )
+
+
+def _is_photograph(path: Path) -> bool:
+    return path.suffix.lower() in _SUFFIXES
 
 
 def _unique(label: str, taken: set[str]) -> str:
@@ -115,34 +127,45 @@ def _thinned(files: list[Path], most: int) -> list[Path]:
 
 
 def _copy_photographs(files: Sequence[Path], folder: Path, report: Report) -> list[Path]:
+    """Copy what can be read; what cannot is left out, and told."""
     folder.mkdir(parents=True, exist_ok=True)
-    copies, names = [], set[str]()
+    copies, names, damaged = [], set[str](), []
+    for file in files:
+        if file.suffix.lower() in image_files.HEIF_SUFFIXES:
+            image_files.heif_reader(file)  # without it most of a phone's pictures would be left out
     for index, file in enumerate(files):
-        suffix = file.suffix.lower()
-        copy = folder / f"{_unique(file.stem, names)}{suffix}"
-        if not (copy.exists() and copy.stat().st_mtime_ns >= file.stat().st_mtime_ns):
-            _copy(file, copy)
-        copies.append(copy)
+        heif = file.suffix.lower() in image_files.HEIF_SUFFIXES
+        copy = folder / f"{_unique(file.stem, names)}{'.jpg' if heif else file.suffix.lower()}"
+        try:
+            if not (copy.exists() and copy.stat().st_mtime_ns >= file.stat().st_mtime_ns):
+                _copy(file, copy)
+            copies.append(copy)
+        except DatasetError as error:
+            damaged.append((file, error))
         report((index + 1) / len(files), f"{index + 1} of {len(files)} photographs copied")
     for stranger in set(folder.iterdir()) - set(copies):  # from an earlier run with other photographs
         stranger.unlink() if stranger.is_file() else shutil.rmtree(stranger)
+    if damaged and not copies:
+        raise ImportRecordingError(f"not one of {len(files)} photographs can be read; {damaged[0][1]}")
+    if damaged:
+        listed = ", ".join(str(file) for file, _ in damaged)
+        print(
+            f"left out, {len(damaged)} of {len(files)} photographs cannot be read: {listed}; {damaged[0][1]}"
+        )
     return copies
 
 
 def _copy(file: Path, copy: Path) -> None:
     """Make a complete, readable copy that is also upright for readers that ignore EXIF."""
     data = image_files.read_bytes(file)
-    image_files.read_image(file)  # raises an error that names a damaged file
-    if data.startswith(b"\xff\xd8") and b"Exif" in data[:65536]:
-        raw = np.frombuffer(data, np.uint8)
-        as_stored = cv2.imdecode(raw, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        upright = cv2.imdecode(raw, cv2.IMREAD_COLOR)
-        if as_stored is not None and upright is not None and not np.array_equal(as_stored, upright):
-            turned = cv2.imencode(".jpg", upright, [cv2.IMWRITE_JPEG_QUALITY, video.JPEG_QUALITY])[
-                1
-            ].tobytes()
-            # Keep the camera and focal length in the EXIF data for structure from motion.
-            data = turned[:2] + image_files.upright_exif(data) + turned[2:]
+    turn = image_bytes.orientation(data)
+    heif = image_bytes.is_heif(data)
+    rgb, alpha = image_files.read_upright(file)  # raises an error that names a damaged file
+    if heif or turn != 1:
+        # Keep the camera and focal length in the EXIF data for structure from motion.
+        exif = image_files.heif_exif(file, data) if heif else image_bytes.upright_exif(data)
+        data = image_files.encoded(rgb, copy.suffix, alpha)
+        data = data[:2] + exif + data[2:] if copy.suffix in (".jpg", ".jpeg") else data
     write_atomically(copy, data)
     now = file.stat()
     os.utime(copy, ns=(now.st_atime_ns, max(now.st_mtime_ns, copy.stat().st_mtime_ns)))

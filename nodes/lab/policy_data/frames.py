@@ -15,9 +15,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 
+from advnerf_core.data.errors import DatasetError
+from advnerf_core.data.image_files import read_stored
 from advnerf_core.driving.expert import Expert
 from advnerf_core.geometry import Pinhole, yaw_of
 from advnerf_core.learning.frames import Frames
@@ -142,11 +143,10 @@ def frames_of_log(
     """
     images, steering = [], []
     for number, row in enumerate(_rows(log, (image_column, steering_column)), start=2):
-        picture = cv2.imread(str(log.parent / row[image_column].strip()), cv2.IMREAD_COLOR)
-        if picture is None:
-            raise ConfigError(
-                f"{log}:{number}: expected a readable image, got {row[image_column]!r}; correct or remove the row"
-            )
+        try:
+            rgb, _ = read_stored(log.parent / row[image_column].strip())
+        except DatasetError as error:
+            raise ConfigError(f"{log}:{number}: {error}, or remove the row") from error
         try:
             angle_rad = float(row[steering_column]) * rad_per_unit
         except ValueError:
@@ -156,7 +156,6 @@ def frames_of_log(
                 f"{log}:{number}: expected a steering angle below 1 rad, got {row[steering_column]!r} times {rad_per_unit:g};"
                 " give the factor from the log's unit to radians with --log-scale"
             )
-        rgb = np.ascontiguousarray(picture[..., ::-1], dtype=np.uint8)
         view = view or view_for_size(rgb.shape[1], rgb.shape[0])
         _require_size(rgb, view, str(log))
         images.append(view.image(rgb))

@@ -9,10 +9,11 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from advnerf_core.data.errors import DatasetError
+from advnerf_core.data.image_files import read_stored
 from advnerf_core.data.similarity import rotation_angles
 from advnerf_core.geometry import Array, make_transform
 from calibration.camera_to_car import MountView
@@ -91,15 +92,11 @@ def read_pictures(source: Path) -> Iterator[tuple[str, Rgb]]:
 
 
 def read_picture(file: Path) -> Rgb:
-    """Read an image file as RGB ``[H, W, 3]``."""
+    """Read an image file as RGB ``[H, W, 3]``, as stored: a lens is calibrated on the pixels that the camera gives."""
     try:
-        data = np.frombuffer(file.read_bytes(), np.uint8)
-    except OSError as error:
-        raise CalibrationError(f"expected a picture at {file}: {error.strerror or error}") from error
-    bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
-    if bgr is None:
-        raise CalibrationError(f"expected a picture at {file}, cannot decode its {data.size} bytes")
-    return np.ascontiguousarray(bgr[..., ::-1], np.uint8)
+        return read_stored(file)[0]
+    except DatasetError as error:
+        raise CalibrationError(str(error)) from error
 
 
 def read_drive(bag: Path) -> Drive:

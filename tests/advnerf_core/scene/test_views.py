@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from advnerf_core.data.dataset import DatasetError, load_transforms
-from advnerf_core.data.image_files import image_size, is_cut_off, read_image
+from advnerf_core.data.image_bytes import is_damaged
+from advnerf_core.data.image_files import image_size, read_stored
 
 EYE = np.eye(4).tolist()
 
@@ -82,7 +83,9 @@ def test_an_image_of_another_shape_than_listed_is_refused_but_a_smaller_copy_is_
     assert load_transforms(write(tmp_path, w=80, h=60, fl_x=70.0)).load().pinholes[0].fx == pytest.approx(
         35.0
     )
-    with pytest.raises(DatasetError, match=r"shape 60 x 80 .*0\.png of 40 x 30; it was turned"):
+    with pytest.raises(
+        DatasetError, match=r"shape 60 x 80 .*0\.png of 40 x 30; the stored pixels were turned"
+    ):
         load_transforms(write(tmp_path, w=60, h=80)).load()
 
 
@@ -90,11 +93,11 @@ def test_an_image_of_another_shape_than_listed_is_refused_but_a_smaller_copy_is_
 def test_a_file_that_was_cut_off_is_refused(tmp_path, suffix):
     path = tmp_path / f"0{suffix}"
     save(path, np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8))
-    assert not is_cut_off(path.read_bytes())
+    assert not is_damaged(path.read_bytes())
     assert image_size(path) == (60, 40)
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(DatasetError, match=r"expected a readable image, got .*damaged"):
-        read_image(path)
+        read_stored(path)
 
 
 def test_the_end_of_a_thumbnail_is_not_the_end_of_the_photograph(tmp_path):
@@ -102,16 +105,16 @@ def test_the_end_of_a_thumbnail_is_not_the_end_of_the_photograph(tmp_path):
     save(path, np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8))
     data, thumbnail = path.read_bytes(), b"Exif\0\0" + b"\xff\xd8 small picture \xff\xd9"
     with_thumbnail = data[:2] + b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail + data[2:]
-    assert not is_cut_off(with_thumbnail)
-    assert is_cut_off(with_thumbnail[:-200])
-    assert not is_cut_off(with_thumbnail + b"a film that the phone hangs on")
+    assert not is_damaged(with_thumbnail)
+    assert is_damaged(with_thumbnail[:-200])
+    assert not is_damaged(with_thumbnail + b"a film that the phone hangs on")
 
 
 def test_grey_and_16_bit_images_are_read_as_colours(tmp_path):
     save(tmp_path / "grey.png", np.full((5, 6), 70, np.uint8))
     save(tmp_path / "deep.png", np.full((5, 6, 3), 257 * 70, np.uint16))
     for name in ("grey.png", "deep.png"):
-        rgb, alpha = read_image(tmp_path / name)
+        rgb, alpha = read_stored(tmp_path / name)
         assert (rgb == 70).all()
         assert (rgb.shape, alpha) == ((5, 6, 3), None)
 

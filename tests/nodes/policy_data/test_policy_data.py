@@ -40,7 +40,10 @@ def test_a_foreign_log_becomes_frames_with_its_own_view(tmp_path):
     ("change", "reason"),
     [
         (lambda t: t.replace("angle", "wheel"), "expected columns frame, angle .* got frame, wheel"),
-        (lambda t: t.replace("3.png", "no.png"), r"csv:5: expected a readable image, got 'no\.png'"),
+        (
+            lambda t: t.replace("3.png", "no.png"),
+            r"csv:5: expected a readable image, got .*no\.png: No such file",
+        ),
         (lambda t: t.replace("2.png, -0.25", "2.png, left"), r"csv:4: expected a steering angle"),
         (lambda t: t.replace("2.png, -0.25", "2.png, 25"), "--log-scale"),
         (lambda t: "\n".join(t.split("\n")[:3]), "at least 4 rows"),

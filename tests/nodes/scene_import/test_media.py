@@ -1,9 +1,11 @@
+import sys
+
 import cv2
 import numpy as np
 import pytest
 
 from advnerf_core.data.dataset import DatasetError
-from advnerf_core.data.image_files import read_image
+from advnerf_core.data.image_files import read_stored
 from nodes.lab.importing.errors import ImportRecordingError
 from nodes.lab.importing.media import MediaConfig, gather, photographs_in
 
@@ -49,7 +51,7 @@ def test_each_folder_is_a_camera_and_names_sort_as_people_count(tmp_path):
 @pytest.mark.parametrize(("orientation", "turns"), [(1, 0), (3, 2), (6, 3), (8, 1)])
 def test_photographs_are_turned_upright_for_readers_without_exif(tmp_path, orientation, turns):
     file = photo(tmp_path / "phone" / "a.jpg")
-    before = read_image(file)[0]
+    before = read_stored(file)[0]
     turned(file, orientation)
     gather([tmp_path / "phone"], tmp_path / "out", MediaConfig(), quiet)
     raw = cv2.imread(
@@ -81,10 +83,57 @@ def test_at_most_so_many_are_taken_evenly(tmp_path):
 def test_damaged_and_missing_media_are_named(tmp_path):
     damaged = photo(tmp_path / "phone" / "a.jpg")
     damaged.write_bytes(damaged.read_bytes()[:-100])
-    with pytest.raises(DatasetError, match=r"a\.jpg: it is damaged"):
+    with pytest.raises(ImportRecordingError, match=r"not one of 1 .*a\.jpg \(\d+ bytes\): it is damaged"):
         gather([tmp_path / "phone"], tmp_path / "out", MediaConfig(), quiet)
     (tmp_path / "empty").mkdir()
     with pytest.raises(ImportRecordingError, match=r"expected photographs .* in .*empty, got none"):
         photographs_in(tmp_path / "empty")
     with pytest.raises(ImportRecordingError, match="found none"):
         gather([tmp_path / "nothing.mp4"], tmp_path / "out", MediaConfig(), quiet)
+
+
+def test_damaged_photographs_are_left_out_and_all_named(tmp_path, capsys):
+    for name in ("a.jpg", "b.jpg", "c.png", "d.jpg"):
+        photo(tmp_path / "phone" / name, 600, 400)
+    (tmp_path / "phone/b.jpg").write_bytes(b"")
+    data = (tmp_path / "phone/d.jpg").read_bytes()
+    (tmp_path / "phone/d.jpg").write_bytes(data[: len(data) // 2])
+    (tmp_path / "phone/raw.dng").write_bytes(b"II*\0")
+    (source,) = gather([tmp_path / "phone"], tmp_path / "out", MediaConfig(), quiet)
+    assert [name.rsplit("/", 1)[1] for name in source.images] == ["a.jpg", "c.png"]
+    said = capsys.readouterr().out
+    assert "2 of 4 photographs cannot be read" in said
+    assert "b.jpg" in said
+    assert "d.jpg" in said
+    assert "1 .dng" in said
+
+
+@pytest.mark.parametrize("orientation", [1, 6])
+def test_heic_photographs_become_upright_jpegs_with_their_focal_length(tmp_path, orientation):
+    heif = pytest.importorskip("pillow_heif")
+    image = pytest.importorskip("PIL.Image")
+    pixels = cv2.resize(RNG.integers(0, 255, (4, 6, 3), np.uint8), (96, 64), interpolation=cv2.INTER_NEAREST)
+    (tmp_path / "phone").mkdir()
+    heif.register_heif_opener()
+    exif = image.Exif()
+    exif[0x0112] = orientation
+    exif.get_ifd(0x8769)[0xA405] = 26  # focal length as of 35 mm film
+    picture = image.fromarray(pixels)
+    picture.info["exif"] = exif.tobytes()  # from here the library takes how the decoder is to turn it
+    picture.save(tmp_path / "phone/IMG_1.HEIC", quality=95)
+    (source,) = gather([tmp_path / "phone"], tmp_path / "out", MediaConfig(), quiet)
+    assert source.images == ("images/phone/IMG_1.jpg",)
+    with image.open(tmp_path / "out" / source.images[0]) as copy:
+        expected = np.rot90(pixels, {1: 0, 6: 3}[orientation])
+        assert copy.size == expected.shape[1::-1]
+        assert np.abs(np.asarray(copy).astype(int) - expected).mean() < 12.0
+        assert copy.getexif().get(0x0112, 1) == 1
+        assert copy.getexif().get_ifd(0x8769)[0xA405] == 26
+
+
+def test_heic_without_its_reader_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    (tmp_path / "phone").mkdir()
+    (tmp_path / "phone/IMG_1.heic").write_bytes(b"\0\0\0\x18ftypheic" + bytes(100))
+    with pytest.raises(DatasetError, match=r"IMG_1\.heic.*pip install pillow-heif"):
+        gather([tmp_path / "phone"], tmp_path / "out", MediaConfig(), quiet)
