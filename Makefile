@@ -34,7 +34,7 @@ $(VENV)/.installed-demo: pyproject.toml constraints.txt docker/system-packages.s
 	@touch $@
 
 demo: $(VENV)/.installed-demo  ## The whole experiment, small setting, on the simulated lab (six to ten minutes on 2 cores)
-	@$(BIN)/advnerf experiment launch/room.experiment.yaml --setting demo --run-folder runs/demo --anew
+	@$(BIN)/advnerf demo
 
 experiment: setup  ## The full experiment, 3 seeds (a quarter of an hour on 2 cores); writes its rows to docs/results.json
 	@began=$$(date +%s) && \

@@ -12,3 +12,15 @@ class AdvnerfError(Exception):
 
 class DeviceError(AdvnerfError, RuntimeError):
     """A GPU was asked for, and there is none that can be used, or it cannot do what is asked."""
+
+
+class ConfigError(AdvnerfError, ValueError):
+    """A file that a person wrote, or an override of it, is wrong."""
+
+
+class MissingFileError(ConfigError, FileNotFoundError):
+    """A file does not exist."""
+
+
+class UnreadableFileError(ConfigError, OSError):
+    """A file exists, and cannot be read."""

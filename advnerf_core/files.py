@@ -7,9 +7,12 @@ import json
 import os
 from pathlib import Path
 
+from advnerf_core.places import require_utf8
+
 
 def write_atomically(path: Path, data: str | bytes) -> None:
     """Write a whole file or none: under another name first, synced, then renamed over ``path``."""
+    require_utf8(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(path.name + ".part")
     try:

@@ -12,6 +12,8 @@ import shutil
 import sys
 from pathlib import Path
 
+from advnerf_core.places import PlaceError, is_writable, use_writable_cache
+
 _PACKAGE = Path(__file__).parent
 _PREFIX = "advnerf-"
 _VARIABLE = "NUMBA_CACHE_DIR"
@@ -21,19 +23,27 @@ _KEPT = 3  # folders of earlier sources that stay, as other checkouts may share 
 def use_own_folder(package: Path = _PACKAGE) -> Path:
     """Tell numba, in this process and in those it starts, to keep compiled kernels in the folder of their present sources.
 
-    It lies below ``NUMBA_CACHE_DIR``, or in the package's ``__pycache__``, or in the user's cache where that cannot be written. Call it
-    before a kernel is decorated.
+    It lies below ``NUMBA_CACHE_DIR``, or in the package's ``__pycache__``, or in the user's cache where that cannot be written, or in a
+    private temporary folder where that cannot either. Call it before a kernel is decorated.
 
     Args:
         package: Folder with the kernels' sources.
 
     Returns:
         The folder.
+
+    Raises:
+        PlaceError: The folder cannot be written.
     """
     folder = _base(package) / f"{_PREFIX}{sources_digest(package)}"
-    if not folder.is_dir():
-        folder.mkdir(parents=True, exist_ok=True)
-        _remove_old(folder)
+    try:
+        if not folder.is_dir():
+            folder.mkdir(parents=True, exist_ok=True)
+            _remove_old(folder)
+    except OSError as error:
+        raise PlaceError(
+            f"expected to keep compiled kernels in {folder}: {error}; set {_VARIABLE} to a folder of this user"
+        ) from error
     os.environ[_VARIABLE] = str(folder)
     if "numba" in sys.modules:
         sys.modules["numba"].config.CACHE_DIR = str(folder)
@@ -55,8 +65,7 @@ def _base(package: Path) -> Path:
         # A process that we started has our folder there already.
         return Path(chosen).parent if Path(chosen).name.startswith(_PREFIX) else Path(chosen)
     own = package / "__pycache__"
-    writable = os.access(own if own.is_dir() else package, os.W_OK)
-    return own if writable else Path.home() / ".cache" / "advnerf" / "kernels"
+    return own if is_writable(own if own.is_dir() else package) else use_writable_cache() / "kernels"
 
 
 def _remove_old(folder: Path) -> None:

@@ -9,12 +9,18 @@ import difflib
 import hashlib
 import importlib.util
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from types import ModuleType
 from typing import Any, TypeVar
 
+from advnerf_core.code_files import entry_point_sha256, file_sha256, modules_beside
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.places import expanded
 
 T = TypeVar("T")
 
@@ -69,21 +75,24 @@ def require_known(
         raise PluginError(_stands_for_nothing(name, what, built_in, group))
 
 
-def code_digest(name: str, group: str, folder: Path | None = None) -> str:
-    """Names the code behind a user's name: it changes with the content of the file, or with the version of the package.
+def code_sha256(name: str, built_in: Container[str], group: str, folder: Path | None = None) -> str:
+    """Hash of the code behind a user's name: it changes with the files that the code consists of (`advnerf_core.code_files`).
+
+    Args:
+        name: As of `resolve`, like the other arguments.
+        built_in: Names of what this project brings.
+        group: Entry point group.
+        folder: Folder that a relative ``file.py`` is relative to; the working folder if it is not given.
 
     Returns:
-        16 characters, the same on every machine; empty for a name that is neither a file's nor an entry point's.
+        SHA-256, the same on every machine; empty for a built-in name, and for one that stands for nothing.
     """
+    if name in built_in:
+        return ""
     if is_file_reference(name):
-        code = Path(absolute_reference(name, folder or Path.cwd()).rpartition(":")[0]).read_bytes()
-    else:
-        entry = next((each for each in entry_points(group=group) if each.name == name), None)
-        if entry is None:
-            return ""
-        version = f"{entry.dist.name} {entry.dist.version}" if entry.dist is not None else ""
-        code = f"{entry.value} {version}".encode()
-    return hashlib.sha256(code).hexdigest()[:16]
+        return file_sha256(Path(absolute_reference(name, folder or Path.cwd()).rpartition(":")[0]))
+    entry = next((each for each in entry_points(group=group) if each.name == name), None)
+    return "" if entry is None else entry_point_sha256(entry)
 
 
 def known_names(built_in: Iterable[str], group: str) -> tuple[str, ...]:
@@ -103,19 +112,20 @@ def absolute_reference(name: str, folder: Path) -> str:
     if not is_file_reference(name):
         return name
     file, _, attribute = name.rpartition(":")
-    return f"{(folder / Path(file).expanduser()).resolve()}:{attribute}"
+    return f"{(folder / expanded(file)).resolve()}:{attribute}"
 
 
 def load_from_file(reference: str, what: str, folder: Path | None = None) -> Any:
     """The attribute that ``file.py:Name`` names.
 
-    A file is loaded once per process and content, under a name of its own: two files of one name do not meet.
+    A file is loaded once per process and content, under a name of its own: two files of one name do not meet. While it is loaded, it
+    may import the modules beside it.
 
     Raises:
         PluginError: There is no such file or attribute, or the file raises an error.
     """
     file, attribute = _file_of(reference, what, folder)
-    digest = hashlib.sha256(str(file).encode() + b"\0" + file.read_bytes()).hexdigest()[:16]
+    digest = hashlib.sha256(f"{file}\0{file_sha256(file)}".encode()).hexdigest()[:16]
     module = sys.modules.get(name := f"advnerf_plugin_{file.stem}_{digest}")
     if module is None:
         spec = importlib.util.spec_from_file_location(name, file)
@@ -124,7 +134,8 @@ def load_from_file(reference: str, what: str, folder: Path | None = None) -> Any
         sys.modules[name] = module  # dataclasses look their module up while it is being loaded
         try:
             # Not by the loader: its byte code is as old as the file to the second, and a file may be saved twice in one.
-            exec(compile(file.read_bytes(), file, "exec"), module.__dict__)
+            with _imports_from(file.parent, modules_beside(file)):
+                exec(compile(file.read_bytes(), file, "exec"), module.__dict__)
         except Exception as error:
             del sys.modules[name]
             raise PluginError(
@@ -134,6 +145,48 @@ def load_from_file(reference: str, what: str, folder: Path | None = None) -> Any
         public = [each for each in vars(module) if not each.startswith("_")]
         raise PluginError(f"{what} {reference}: " + unknown(attribute, f"name in {file.name}", public))
     return getattr(module, attribute)
+
+
+class _Beside(MetaPathFinder):
+    """Finds some modules in a folder, and nothing else: the folder may hold a `hardware.py` that has nothing to do with ours."""
+
+    def __init__(self, folder: Path, names: Container[str]) -> None:
+        self._folder, self._names = folder, names
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """The module, if it is one of these."""
+        if path is not None or fullname not in self._names:
+            return None
+        return PathFinder.find_spec(fullname, [str(self._folder)], target)
+
+
+@contextmanager
+def _imports_from(folder: Path, files: Iterable[Path]) -> Iterator[None]:
+    """Imports find some files of a folder, as they are now, and other modules of their names do not meet them: before and after."""
+    names = {file.relative_to(folder).parts[0].removesuffix(".py") for file in files}
+
+    def loaded() -> dict[str, ModuleType]:
+        return {name: each for name, each in sys.modules.items() if name.partition(".")[0] in names}
+
+    others = loaded()
+    for name, each in others.items():
+        # What the user's own program imported from this folder is the same module, also to the plug-in.
+        if not Path(getattr(each, "__file__", None) or "/").is_relative_to(folder):
+            del sys.modules[name]
+    writes_none, sys.dont_write_bytecode = sys.dont_write_bytecode, True
+    finder = _Beside(folder, names)
+    sys.meta_path.insert(0, finder)
+    importlib.invalidate_caches()
+    try:
+        yield
+    finally:
+        sys.meta_path.remove(finder)
+        sys.dont_write_bytecode = writes_none
+        for name in loaded():
+            del sys.modules[name]
+        sys.modules.update(others)
 
 
 def _file_of(reference: str, what: str, folder: Path | None) -> tuple[Path, str]:

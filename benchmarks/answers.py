@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from advnerf_core.documents import read_json
 from advnerf_core.report.conditions import style_of
 
 # Worlds that this project did not write, or did not draw, by what the names of their sets contain.
@@ -72,7 +72,7 @@ def sets_table(published: Path) -> str:
 
 
 def _sets(published: Path) -> list[dict[str, Any]]:
-    return [json.loads(file.read_text()) for file in sorted(published.glob("*/set/set.json"))]
+    return [read_json(file) for file in sorted(published.glob("*/set/set.json"))]
 
 
 def _told(sets: Sequence[Mapping[str, Any]]) -> list[tuple[Mapping[str, Any], Mapping[str, Any]]]:

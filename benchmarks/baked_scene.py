@@ -30,6 +30,7 @@ from safetensors.torch import save_file
 from advnerf_core.attack.adjoint import AttackProblem, evaluate
 from advnerf_core.attack.methods import SearchRun, load_method
 from advnerf_core.attack.search.search import Evaluation
+from advnerf_core.documents import read_json
 from advnerf_core.geometry import planar_poses
 from advnerf_core.learning.imitation import recovery_states
 from advnerf_core.objects.voxel.model import load_object, save_object
@@ -66,7 +67,7 @@ def record(
 
 def fidelity(experiment: Experiment, backgrounds: Backgrounds) -> None:
     """PSNR of the held-out views as the bake stage found it, and the victim's steering on views that bricks were not made for."""
-    found = json.loads((experiment.stage_folder("bake") / "baked.json").read_text())
+    found = read_json(experiment.stage_folder("bake") / "baked.json")
     lost_db = found["psnr_field_db"] - found["psnr_baked_db"]
     note = f"{found['psnr_baked_db']:.2f} dB of {found['psnr_field_db']:.2f} dB through the field; {found['mib']:.0f} MiB of voxels"
     record("baked scene: PSNR that held-out views lose", lost_db, "dB", "<= 0.3 dB", lost_db <= 0.3, note)
@@ -164,7 +165,7 @@ def _copy_as_of_before(run: Path, target: Path) -> None:
             target / stage,
             ignore=shutil.ignore_patterns("photos", "frames", "*.checkpoint.*", "views"),
         )
-    manifest = json.loads((run / "manifest.json").read_text())
+    manifest = read_json(run / "manifest.json")
     for unknown in ("reference", "measure"):
         del manifest["config"][unknown]
     (target / "manifest.json").write_text(json.dumps(manifest))

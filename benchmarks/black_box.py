@@ -35,6 +35,7 @@ from advnerf_core.attack.search.distil import Distillation
 from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.search.query_count import CountedPolicy, calls_per_evaluation
 from advnerf_core.attack.search.search import Evaluation, OnEvaluation, draw_start_states
+from advnerf_core.documents import read_json
 from advnerf_core.fields.voxel_grid import cube_face_object
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.contract import PolicyContract
@@ -61,7 +62,7 @@ class OutOfTimeError(Exception):
 def make_problem(folder: Path, steps: int) -> AttackProblem:
     """The experiment's own attack: its face where its attack files have it, its starts of seed 0, over fewer ticks."""
     attack = load_attack(folder / "cells" / "track_hardened_gradient_0" / "attack.safetensors")
-    plain = json.loads((folder / "manifest.json").read_text())["config"]["space"]["plain_rgb"]
+    plain = read_json(folder / "manifest.json")["config"]["space"]["plain_rgb"]
     shown, carrier = attack.required_face(), attack.face_object
     face = cube_face_object(
         shown.size_m[0], carrier.theta.shape[0], tuple(plain), carrier.T_world_from_object
@@ -86,9 +87,7 @@ class Search:
     def __init__(self, name: str, out: Path, per_evaluation: int) -> None:
         self.name, self.state_path = name, out / f"{name}.state.safetensors"
         self._curve_path, self._per_evaluation = out / f"{name}.json", per_evaluation
-        self.curve: list[list[float]] = (
-            json.loads(self._curve_path.read_text()) if self._curve_path.exists() else []
-        )
+        self.curve: list[list[float]] = read_json(self._curve_path) if self._curve_path.exists() else []
 
     def listen(self, first_calls: int, step_calls: int, end_s: float) -> OnEvaluation:
         """What writes the curve: of evaluation k, ``first + k * step + one drive`` calls had been made when its total was known."""

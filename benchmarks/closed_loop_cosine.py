@@ -21,6 +21,7 @@ import torch
 from advnerf_core.attack.adjoint import adjoint_gradient
 from advnerf_core.attack.closed_loop import closed_loop_cosine
 from advnerf_core.attack.health import closed_loss
+from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from benchmarks.results import REPOSITORY, record_row
 from nodes.experiment.request.check import in_double
@@ -62,7 +63,7 @@ def kept_or_measured(prepared: Prepared, directions: int, folder: Path) -> dict[
     file = folder / f"{prepared.settings_hash[:16]}_{directions}.json"
     if not file.exists():
         write_atomically(file, json.dumps(measured(prepared, directions), indent=1) + "\n")
-    found: dict[str, Any] = json.loads(file.read_text())
+    found: dict[str, Any] = read_json(file)
     return found
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
+from advnerf_core.documents import read_json
 from advnerf_core.driving.metrics import drives
 from advnerf_core.report.data import ReportData
 from advnerf_core.report.results import read_results
@@ -186,7 +186,7 @@ def main() -> None:
 def record_time(folder: Path, record: Record, wall_s: float) -> None:
     """Minutes of a run that made everything; nothing if stages of it were there before."""
     stages = sorted(folder.glob("*/stage.json"))
-    seconds = {path.parent.name: json.loads(path.read_text())["seconds"] for path in stages}
+    seconds = {path.parent.name: read_json(path)["seconds"] for path in stages}
     if wall_s < sum(seconds.values()):
         print(f"make experiment: no row for its time, as stages in {folder} were there before")
         return

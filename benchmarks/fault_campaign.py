@@ -23,6 +23,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import planar_pose
 from benchmarks.fault_stops import CONFIGURED, LAUNCH_FILE, NODES, BrokenPromise
@@ -217,7 +218,7 @@ def run(folder: Path, count: int) -> list[dict[str, Any]]:
     try:
         for number, (fault, drive_s) in enumerate(plan(count)):
             file = folder / f"{number:03d}.json"
-            if file.exists() and json.loads(file.read_text())["fault"] == fault:
+            if file.exists() and read_json(file)["fault"] == fault:
                 continue  # done; a file of another plan is not
             if graph is None:
                 graph = Graph(Path(tempfile.mkdtemp(prefix="advnerf-")))
@@ -236,7 +237,7 @@ def run(folder: Path, count: int) -> list[dict[str, Any]]:
     finally:
         if graph is not None:
             graph.close()
-    return [json.loads((folder / f"{number:03d}.json").read_text()) for number in range(count)]
+    return [read_json(folder / f"{number:03d}.json") for number in range(count)]
 
 
 def report(results: list[dict[str, Any]], record: bool) -> None:

@@ -13,10 +13,11 @@ from pathlib import Path
 import numpy as np
 import psutil
 
+from advnerf_core.documents import Document
 from benchmarks.results import record_row
 from hardware.worlds.remote_world import RemoteWorld
 from nodes.lab.worlds.named import read_world
-from nodes.runtime.config import Document, apply_overrides
+from nodes.runtime.config import apply_overrides
 
 STEPS, WARM_UP, LIMIT_MS = 60, 8, 100.0
 VARIANTS: dict[str, dict[str, tuple[str, ...]]] = {

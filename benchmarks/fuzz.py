@@ -21,7 +21,9 @@ from types import FrameType
 
 import numpy as np
 
+from advnerf_core.documents import parse_yaml
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.strict import validate
 from benchmarks.results import record_row
 from hardware.mocap.vicon_codec import decode_block, encode_blocks, object_pose
 from hardware.motor.vesc_codec import FrameDecoder, decode_command, encode_frame
@@ -29,7 +31,6 @@ from hardware.motor.vesc_replies import decode_firmware_version, decode_values
 from nodes.bags.reader import read_info, read_messages
 from nodes.bags.writer import BagWriter
 from nodes.launching.launch_file import LaunchFile
-from nodes.runtime.config import parse_yaml, validate
 from nodes.runtime.image_parts import join_image, split_image
 from nodes.runtime.messages import (
     decode,

@@ -7,9 +7,9 @@ surrogate, past a panel that the world's own renderer shows, driven by the world
 from __future__ import annotations
 
 import argparse
-import json
 from typing import Any
 
+from advnerf_core.documents import read_json
 from advnerf_core.report.conditions import style_of
 from advnerf_core.report.evidence.registration import read_registration
 from benchmarks.results import REPOSITORY, record_row
@@ -28,7 +28,7 @@ def main() -> None:
         registration = read_registration(PUBLISHED / name)
         if registration is None:
             raise SystemExit(f"expected a published set in {PUBLISHED / name}, got none; run advnerf publish")
-        data = json.loads((PUBLISHED / name / "set" / "set.json").read_text())
+        data = read_json(PUBLISHED / name / "set" / "set.json")
         test = data["primary"][-1]
         scenario = registration.scenario(test["test"]["scenario"])
         assert scenario is not None, "a primary test is of a registered scenario"

@@ -9,11 +9,11 @@ with ``--victim-of``.
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 import numpy as np
 
+from advnerf_core.documents import read_json
 from advnerf_core.driving.metrics import drives as drives_well
 from advnerf_core.driving.metrics import mean_cte_limit_m
 from advnerf_core.policies.pilotnet import load_policy
@@ -65,10 +65,10 @@ def _record_time(experiment: Experiment, minutes: float) -> None:
 def record(experiment: Experiment, cell: Path | None = None, victim_of: Path | None = None) -> None:
     """The rows of one road: three, or without drives two."""
     folder, scene = experiment.folder, experiment.config.scene
-    about = json.loads((folder / "capture" / "world.json").read_text())["description"]
+    about = read_json(folder / "capture" / "world.json")["description"]
     name = road_of(experiment.config.world)
     command = f"python -m benchmarks.learned_roads {folder}{f' --cell {cell}' if cell else ''}{f' --victim-of {victim_of}' if victim_of else ''}"
-    psnr_db = json.loads((folder / "scene" / "fidelity.json").read_text())["mean"]["psnr_policy_db"]
+    psnr_db = read_json(folder / "scene" / "fidelity.json")["mean"]["psnr_policy_db"]
     record_row(
         f"{name}: held-out driving views, 200x66",
         psnr_db,
@@ -80,7 +80,7 @@ def record(experiment: Experiment, cell: Path | None = None, victim_of: Path | N
     )
     whose = ""
     if victim_of is None:
-        views = json.loads((folder / "policy" / "policy.json").read_text())["on_held_out_views"]
+        views = read_json(folder / "policy" / "policy.json")["on_held_out_views"]
     else:
         other = Experiment.resolved_in(victim_of)
         victim, whose = victim_file(other, HARDENED), f"; by the victim of {road_of(other.config.world)}"

@@ -18,9 +18,9 @@ import time
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from advnerf_core.attack.artifact import AttackFile, face_texture, save_attack
+from advnerf_core.documents import dump_yaml
 from advnerf_core.geometry import make_transform, planar_pose, rotation_z
 from benchmarks.results import REPOSITORY, record_row
 from calibration.schema import CameraCalibration, TargetCalibration, load_calibration
@@ -69,7 +69,7 @@ def make_bag(folder: Path, seconds: int) -> Path:
         "policy": {"module": "nodes.policy", "config": {"policy": "none"}},
     }
     attachments = {
-        "launch.resolved.yaml": yaml.safe_dump({"name": "bench", "nodes": nodes}).encode(),
+        "launch.resolved.yaml": dump_yaml({"name": "bench", "nodes": nodes}).encode(),
         "camera.yaml": (CALIBRATION / "camera.yaml").read_bytes(),
         "board.yaml": (CALIBRATION / "board.yaml").read_bytes(),
         "face.attack.safetensors": (folder / "face.attack.safetensors").read_bytes(),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import signal
 import subprocess
@@ -14,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from advnerf_core.documents import read_json
 from benchmarks.operator import LiveOperator
 from benchmarks.processes import end
 from benchmarks.results import REPOSITORY
@@ -89,7 +89,7 @@ def door_of(run_dir: Path, other_than: str = "") -> dict[str, Any]:
     deadline = time.monotonic() + 20.0
     while True:
         with contextlib.suppress(FileNotFoundError):
-            door: dict[str, Any] = json.loads((run_dir / "page" / "door.json").read_text())
+            door: dict[str, Any] = read_json(run_dir / "page" / "door.json")
             if door["url"].startswith("http:") or door["code"] != other_than:
                 return door
         if time.monotonic() > deadline:

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from advnerf_core.documents import read_json
 from advnerf_core.driving.metrics import drive_metrics
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.files import sha256_of
@@ -144,7 +145,7 @@ def swap_the_victim(folder: Path, rng: random.Random) -> None:
 def pick_a_start(folder: Path, rng: random.Random) -> None:
     """A drive from another start, moved by a decimetre or more, with consistent totals."""
     file, data, domain, number = _some_drive(folder, rng)
-    registration = Registration.model_validate_json((folder / FILE).read_text())
+    registration = Registration.model_validate(read_json(folder / FILE))
     scenario = registration.scenarios[data["scenario"]]
     drive = KeptDrive.model_validate(data["kept"][domain][number])
     poses, turned = drive.poses(), rng.uniform(-np.pi, np.pi)
@@ -276,7 +277,7 @@ def _write_cell(
 
 def _some_drive(folder: Path, rng: random.Random) -> tuple[Path, dict[str, Any], str, int]:
     file = rng.choice(sorted(folder.glob("*.json")))
-    data: dict[str, Any] = json.loads(file.read_text())
+    data: dict[str, Any] = read_json(file)
     domain = rng.choice(sorted(data["kept"]))
     return file, data, domain, rng.randrange(len(data["kept"][domain]))
 
@@ -285,13 +286,13 @@ def _put(folder: Path, file: Path, data: dict[str, Any]) -> None:
     """Write a cell, and renew the manifest and the digest of the set."""
     file.write_text(json.dumps(data, indent=1) + "\n")
     _renew_manifest(folder)
-    known = json.loads((folder.parent / DIGESTS).read_text())
+    known = read_json(folder.parent / DIGESTS)
     known[folder.name] = sha256_of(folder / SET)
     (folder.parent / DIGESTS).write_text(json.dumps(known, indent=1, sort_keys=True) + "\n")
 
 
 def _renew_manifest(folder: Path) -> None:
-    manifest = json.loads((folder / SET).read_text())
+    manifest = read_json(folder / SET)
     manifest["files"] = digests_of(folder)
     (folder / SET).write_text(json.dumps(manifest, indent=1) + "\n")
 

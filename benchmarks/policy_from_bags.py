@@ -16,6 +16,7 @@ import socket
 from functools import partial
 from pathlib import Path
 
+from advnerf_core.documents import read_json
 from advnerf_core.driving.expert import Expert, ExpertConfig
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.files import write_atomically
@@ -84,7 +85,7 @@ def drive(policy: Path, run_dir: Path, laps: float) -> TrialOutcome:
             f"safety.nodes={json.dumps([n for n in _NODES if n != 'safety'])}",
         ]
         run_trial(_LAUNCH, overrides, run_dir, TrialPlan(room.start_pose, duration_s + 0.2, _NODES), _READY_S)
-    return TrialOutcome(**json.loads((run_dir / "trial.json").read_text()))
+    return TrialOutcome(**read_json(run_dir / "trial.json"))
 
 
 def mean_abs_cte_m(run_dir: Path, outcome: TrialOutcome, laps: float) -> tuple[float, float]:

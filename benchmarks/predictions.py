@@ -8,11 +8,11 @@ with the spread between surrogate and deployment that earlier sets had".
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 import numpy as np
 
+from advnerf_core.documents import read_json
 from advnerf_core.report.cells import read_cells
 from advnerf_core.report.evidence.prediction_score import ScoredCell, score_cells
 from advnerf_core.report.evidence.registration import read_registration
@@ -59,7 +59,7 @@ def evidence_of(name: str) -> Evidence:
 
 def predictions_in(folder: Path) -> dict[str, dict[str, float]]:
     """Predictions by cell."""
-    return {file.stem: json.loads(file.read_text()) for file in folder.glob("*.json")}
+    return {file.stem: read_json(file) for file in folder.glob("*.json")}
 
 
 def record(name: str, found: list[ScoredCell], command: str, afterwards: bool) -> None:

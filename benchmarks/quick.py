@@ -18,6 +18,7 @@ import torch
 from llvmlite.binding import get_host_cpu_name
 
 from advnerf_core.attack.adjoint import AttackProblem, adjoint_gradient
+from advnerf_core.documents import read_json
 from advnerf_core.driving.dynamics import Dubins
 from advnerf_core.driving.path import Line
 from advnerf_core.driving.path import Path as ReferencePath
@@ -112,7 +113,7 @@ def main() -> int:
     parser.add_argument("--repeats", type=int, default=25)
     parser.add_argument("--record", action="store_true", help="write what is measured now")
     options = parser.parse_args()
-    kind, kept = get_host_cpu_name(), json.loads(RECORDED.read_text())
+    kind, kept = get_host_cpu_name(), read_json(RECORDED)
     if kind not in kept and not options.record:
         print(
             f"expected a processor whose rates are recorded ({', '.join(kept)}), got {kind}; "

@@ -24,8 +24,9 @@ from benchmarks.fault_campaign import START, Graph
 from benchmarks.processes import end
 from benchmarks.results import REPOSITORY, record_row
 from hardware.emulators.vesc_firmware import WireEvent
-from nodes.runtime.arm_requests import ask_to_arm, ask_to_disarm
+from nodes.runtime.arm_requests import ask_to_arm
 from nodes.runtime.errors import LaunchError
+from nodes.runtime.stopping import ask_to_disarm
 
 COMMAND = "python -m benchmarks.requests"
 COUNT, SEED, BRAKE_LIMIT_MS, RETURN_LIMIT_MS = 1000, 20261122, 300.0, 300.0

@@ -18,6 +18,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from benchmarks.answers import Answer, answers, sets_table, table
 from benchmarks.questions import OTHER, QUESTIONS, Question, question_of
@@ -93,7 +94,7 @@ def read_rows(ledger: Path = LEDGER) -> list[dict[str, Any]]:
     """All rows of the ledger; an absent ledger has none."""
     if not ledger.exists():
         return []
-    rows: list[dict[str, Any]] = json.loads(ledger.read_text())
+    rows: list[dict[str, Any]] = read_json(ledger)
     return rows
 
 

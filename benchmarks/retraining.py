@@ -11,6 +11,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from benchmarks.results import REPOSITORY, record_row
 from nodes.experiment import retrain_plot
@@ -73,7 +74,7 @@ def main() -> None:
         REPOSITORY / "launch" / "junction.experiment.yaml", "retrain", [], options.folder
     )
     found = experiment.stage_folder("retrain")
-    summary = json.loads((found / "retrain.json").read_text())
+    summary = read_json(found / "retrain.json")
     allowed = experiment.config.retrain.rounds if experiment.config.retrain else 0
     for line, value, unit, target, met, note in rows_of(summary, allowed):
         print(f"{line}: {value:.2f} {unit} (target {target or '-'}): {met}")

@@ -12,7 +12,6 @@ CTE over the starts and its bootstrap interval.
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +19,7 @@ import torch
 
 from advnerf_core.attack.artifact import AttackFile, load_attack
 from advnerf_core.attack.search.search import draw_start_states
+from advnerf_core.documents import read_json
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.fields.voxel_grid import cube_face_object
 from advnerf_core.policies.adapter import AdaptedPolicy
@@ -41,7 +41,7 @@ def drive_starts(
     """Total CTE [m] of each start, without and with the attack."""
     calibration = folder / "capture" / "calibration"
     room = load_calibration(RoomCalibration, calibration / "room.yaml")
-    plain_rgb = tuple(json.loads((folder / "manifest.json").read_text())["config"]["space"]["plain_rgb"])
+    plain_rgb = tuple(read_json(folder / "manifest.json")["config"]["space"]["plain_rgb"])
     carrier, size_m = attack.face_object, attack.required_face().size_m[0]
     face = cube_face_object(size_m, carrier.theta.shape[0], plain_rgb, carrier.T_world_from_object)
     x_m, y_m, yaw_rad = room.start_pose

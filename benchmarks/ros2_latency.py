@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
+from advnerf_core.documents import dump_yaml
 from advnerf_core.geometry import planar_pose
 from benchmarks.rclpy_peer import PEERS, RclpyPeer, rclpy_python
 from benchmarks.results import REPOSITORY, record_row
@@ -104,7 +104,7 @@ def run(seconds: float, domain: int) -> tuple[Tally, list[dict[str, Any]]]:
     tally, topics = Tally(), [route["topic"] for route in CONFIG["send"]]  # type: ignore[index]
     with tempfile.TemporaryDirectory(prefix="advnerf-") as name, Bus(Path(name)) as bus:
         config = Path(name) / "ros2.yaml"
-        config.write_text(yaml.safe_dump({**CONFIG, "domain_id": domain}), encoding="utf-8")
+        config.write_text(dump_yaml({**CONFIG, "domain_id": domain}), encoding="utf-8")
         for topic in topics:
             bus.publisher(topic)
         bus.subscribe("/policy/drive", queue=1000)

@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from advnerf_core.data.dataset import ImageSet
+from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Pinhole
 from advnerf_core.scene.field import SceneFieldConfig
@@ -105,7 +106,7 @@ def finished(folder: Path, images: Path, steps: int) -> tuple[float, float]:
         began = time.monotonic()
         if process.wait() != 0:
             raise RuntimeError(f"expected the training in {folder} to end well; see what it printed above")
-    return float(json.loads((folder / RESULT).read_text())["psnr_db"]), time.monotonic() - began
+    return float(read_json(folder / RESULT)["psnr_db"]), time.monotonic() - began
 
 
 def killed_and_resumed(folder: Path, images: Path, steps: int, after_s: float) -> tuple[float, bool]:

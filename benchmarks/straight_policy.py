@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import ConfigDict
 
+from advnerf_core.strict import StrictModel
 from nodes.runtime.messages import drive_message, ns_from_stamp
 from nodes.runtime.node import MessageInfo, Node, NodeContext, Now, Out
 from nodes.runtime.process import run_node_main
 
 
-class StraightConfig(BaseModel):
+class StraightConfig(StrictModel):
     """Configuration.
 
     Attributes:
@@ -20,7 +21,7 @@ class StraightConfig(BaseModel):
         steering_rad: Steering [rad].
     """
 
-    model_config = ConfigDict(extra="ignore", frozen=True)
+    model_config = ConfigDict(extra="ignore")
 
     policy: Any = None
     speed_mps: float = 0.8

@@ -11,6 +11,8 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+from advnerf_core.documents import read_json
+
 import advnerf_core as advnerf_core  # isort: skip  # before torch, as in the commands
 import numpy as np
 import torch
@@ -38,7 +40,7 @@ STEPS, OBJECTS = 40, (1, 5)
 
 def _run_of(folder: Path) -> Experiment:
     """The experiment of a run folder, as it was run."""
-    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest = read_json(folder / "manifest.json")
     config = ExperimentConfig.model_validate(manifest["config"])
     return Experiment(config, Path(manifest["file"]), folder.resolve(), manifest["setting"])
 

@@ -7,13 +7,13 @@ with the verdicts of the fidelity gate and the predictions of transfer.
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TypedDict
 
 import numpy as np
 
+from advnerf_core.documents import read_json
 from advnerf_core.report.cells import CellResult, Drives
 from advnerf_core.report.conditions import style_of
 from advnerf_core.report.transfer import DOMAINS, Domain, TableRow, TransferTable, drives_in
@@ -190,7 +190,7 @@ def gate_rows(
         for drive, of in ((False, "held-out views"), (True, "drive without attack")):
             if not (file := gate_file(folder, key, drive)).exists():
                 continue
-            verdict = json.loads(file.read_text(encoding="utf-8"))
+            verdict = read_json(file)
             n = verdict["numbers"]
             note = (
                 f"{n['views']} views, SSIM {n['ssim']:.3f}, steering differs by {n['steering']:.4f} on average and {n['steering_worst']:.4f} at worst "
@@ -209,7 +209,7 @@ def skill_rows(
     if not (pairs := predicted(folder, cells)):
         return []
     skill, command = skill_of(pairs), f"advnerf predict {campaign}"
-    clean = [json.loads(prediction_file(folder, pair.name).read_text())["clean_drive"] for pair in pairs]
+    clean = [read_json(prediction_file(folder, pair.name))["clean_drive"] for pair in pairs]
     views = (
         f"along the drives without attack PSNR {min(c['psnr_db'] for c in clean):.1f} to {max(c['psnr_db'] for c in clean):.1f} dB, "
         f"steering differs by at most {max(c['steering'] for c in clean):.4f} on average"

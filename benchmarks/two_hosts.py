@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from benchmarks.fault_stops import BrokenPromise
 from benchmarks.host_pair import HostPair, Person, skewed_clock, stop_of
@@ -178,7 +179,7 @@ def run(folder: Path, policy: Path, names: list[str]) -> dict[str, Result]:
         file = folder / f"{name}.json"
         if not file.exists():
             write_atomically(file, json.dumps(measure(name, policy), indent=1))
-        found[name] = json.loads(file.read_text(encoding="utf-8"))
+        found[name] = read_json(file)
         print(f"{name}: {found[name]}", flush=True)
     return found
 

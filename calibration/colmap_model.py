@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array
 from calibration import colmap_database as database
@@ -134,7 +135,7 @@ def _read_finished(work: Path, sources: Sequence[Source], cameras: Mapping[int, 
 
     if not (work / _FINISHED).exists():
         return None
-    record = json.loads((work / _FINISHED).read_text())
+    record = read_json(work / _FINISHED)
     choices = {int(number): Choice(**choice) for number, choice in record["choices"].items()}
     reconstruction = pycolmap.Reconstruction(work / "sparse" / "chosen")
     return _model(reconstruction, sources, cameras, record["parts"], choices, record["why"])

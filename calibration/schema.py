@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import numpy as np
-import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
+from advnerf_core.documents import dump_yaml, parse_yaml, read_yaml
 from advnerf_core.driving.path import Path as DrivingPath
-from advnerf_core.errors import AdvnerfError
+from advnerf_core.errors import AdvnerfError, ConfigError, MissingFileError
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, Pinhole
+from advnerf_core.strict import StrictModel, validate
 from hardware.motor.limits import DriveLimits, VehicleGains
 
 Row4 = tuple[float, float, float, float]
@@ -32,7 +33,7 @@ class CalibrationError(AdvnerfError, ValueError):
     """A calibration file is missing or wrong."""
 
 
-class Calibration(BaseModel):
+class Calibration(StrictModel):
     """Fields that all calibration files have.
 
     Attributes:
@@ -44,14 +45,12 @@ class Calibration(BaseModel):
         residuals: What the fit left, by name with its unit; empty where nothing was fitted.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
     kind: str
     date: datetime.date
     method: str = Field(min_length=1)
     notes: str = ""
     views: int | None = Field(default=None, ge=0)
-    residuals: dict[str, float] = {}
+    residuals: dict[str, float] = Field(default_factory=dict)
 
 
 def require_rigid(rows: tuple[Row4, ...]) -> tuple[Row4, ...]:
@@ -110,10 +109,8 @@ class CameraCalibration(Calibration):
         return np.array(self.T_car_from_camera)
 
 
-class GainsSection(BaseModel):
+class GainsSection(StrictModel):
     """See `hardware.motor.limits.VehicleGains`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     erpm_per_mps: float
     erpm_offset: float
@@ -123,10 +120,8 @@ class GainsSection(BaseModel):
     servo_max: float
 
 
-class LimitsSection(BaseModel):
+class LimitsSection(StrictModel):
     """See `hardware.motor.limits.DriveLimits`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     speed_min_mps: float
     speed_max_mps: float
@@ -137,7 +132,7 @@ class LimitsSection(BaseModel):
     current_max_a: float = Field(default=60.0, gt=0.0)
 
 
-class ResponseSection(BaseModel):
+class ResponseSection(StrictModel):
     """Delay and lag of the car.
 
     Attributes:
@@ -148,8 +143,6 @@ class ResponseSection(BaseModel):
         speed_delay_s: From the written command until the speed begins to change [s].
         speed_lag_s: Time constant of the speed [s].
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     pipeline_delay_s: float = Field(ge=0.0)
     steering_delay_s: float = Field(ge=0.0)
@@ -277,23 +270,21 @@ C = TypeVar("C", bound=Calibration)
 
 
 def load_calibration(model: type[C], path: Path | str) -> C:
-    """Read a calibration file. Errors are one `CalibrationError` that names the file and the key."""
-    path = Path(path)
+    """Read a calibration file. Everything wrong in it is one `CalibrationError` that names the file, the lines and the keys."""
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+        return validate(model, read_yaml(Path(path)))
+    except MissingFileError:
         raise CalibrationError(f"{path}: no such calibration file") from None
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise CalibrationError(f"{path}: cannot be read as YAML: {' '.join(str(error).split())}") from error
+    except ConfigError as error:
+        raise CalibrationError(str(error)) from None
+
+
+def parse_calibration(model: type[C], text: str, source: str) -> C:
+    """The same from text; messages call it ``source``."""
     try:
-        return model.model_validate(data)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        key = ".".join(map(str, first["loc"])) or "the whole file"
-        known = f"; known keys: {', '.join(model.model_fields)}" if first["type"] == "extra_forbidden" else ""
-        raise CalibrationError(
-            f"{path}: {key}: {first['msg'].removeprefix('Value error, ')}{known}"
-        ) from None
+        return validate(model, parse_yaml(text, source))
+    except ConfigError as error:
+        raise CalibrationError(str(error)) from None
 
 
 def save_calibration(calibration: Calibration, path: Path | str) -> None:
@@ -302,7 +293,7 @@ def save_calibration(calibration: Calibration, path: Path | str) -> None:
     values = calibration.model_dump(mode="python")
     # Files that measured nothing stay as short as they were.
     kept = {key: value for key, value in values.items() if key not in _OPTIONAL or value not in (None, {})}
-    text = yaml.safe_dump(kept, sort_keys=False, default_flow_style=None, width=120)
+    text = dump_yaml(kept, default_flow_style=None, width=120)
     try:
         write_atomically(path, text)
     except OSError as error:

@@ -10,10 +10,10 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from advnerf_core.run_module import module_command
 from calibration.colmap_messages import pack_job, unpack_answer
 from calibration.photo_model import (
     MIN_IMAGES,
@@ -63,7 +63,7 @@ def reconstruct(
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("wb") as stream:
         process = subprocess.Popen(
-            [sys.executable, "-m", "calibration.colmap_process", str(os.getpid())],
+            module_command("calibration.colmap_process", str(os.getpid())),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=stream,

@@ -11,8 +11,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from advnerf_core.strict import StrictModel
 from nodes.runtime import (
     MessageInfo,
     Node,
@@ -28,15 +29,13 @@ from nodes.runtime import (
 IMAGES, COMMANDS = "/camera/image_raw", "/policy/drive"
 
 
-class LightConfig(BaseModel):
+class LightConfig(StrictModel):
     """Configuration; an unknown key or a wrong value is one line with the file, the line and the valid keys.
 
     Attributes:
         gain_rad: Wheel angle at a difference of one, from black to white [rad].
         speed_mps: Speed [m/s].
     """
-
-    model_config = ConfigDict(extra="forbid")
 
     gain_rad: float = Field(default=0.5, ge=0.0)
     speed_mps: float = Field(default=0.8, ge=0.0)

@@ -15,12 +15,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from advnerf_core.attack.artifact import load_attack
+from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
-from nodes.experiment.request.job import REQUEST, Job, Said
+from advnerf_core.strict import StrictModel
+from nodes.experiment.request.job import REQUEST, Job, Said, is_begun
 from nodes.experiment.request.request import parse_request, request_text
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.messages import header, image_message, types
@@ -39,7 +41,7 @@ _INBOX = 1000
 RUNNING = ("preparing", "searching")
 
 
-class AttackConfig(BaseModel):
+class AttackConfig(StrictModel):
     """Configuration of the attack node.
 
     Attributes:
@@ -48,8 +50,6 @@ class AttackConfig(BaseModel):
         repeat_s: Pause between [s].
         threads: Threads of the search; 0 leaves it to the libraries.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     folder: Path = Path("attack")
     sends: int = Field(default=3, ge=1)
@@ -172,7 +172,8 @@ class AttackNode(Node):
             raise AdvnerfError(f"busy with {self._request_id}; wait for it, or cancel it")
         folder = self._folder / request_id
         kept = folder / REQUEST
-        if kept.exists() and kept.read_text(encoding="utf-8") != kept_text:
+        other = kept.exists() and kept.read_text(encoding="utf-8") != kept_text
+        if other and (self._job is not None or is_begun(folder)):
             raise AdvnerfError(f"{request_id} is another request already; give this one another id")
         if self._job is not None:
             return  # the very same request again
@@ -205,7 +206,7 @@ class AttackNode(Node):
     def _resume(self) -> None:
         """Go on with a search that was cut off, and send again what was finished."""
         try:
-            current = json.loads((self._folder / _CURRENT).read_text(encoding="utf-8"))
+            current = read_json(self._folder / _CURRENT)
         except FileNotFoundError:
             return
         if current["state"] == "running":

@@ -12,8 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
+from advnerf_core.strict import StrictModel
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.messages import drive_message, stamp_ns
 from nodes.runtime.node import MessageInfo, Node, NodeContext, Now, Out
@@ -39,7 +40,7 @@ class Part:
     speed_mps: float
 
 
-class CalibrationDriveConfig(BaseModel):
+class CalibrationDriveConfig(StrictModel):
     """Configuration of the calibration drive. Other keys of the policy node are ignored, so that this node can replace it.
 
     Attributes:
@@ -50,7 +51,7 @@ class CalibrationDriveConfig(BaseModel):
         wheelbase_m: Distance between the axles, for the length of a half circle [m].
     """
 
-    model_config = ConfigDict(extra="ignore", frozen=True)
+    model_config = ConfigDict(extra="ignore")
 
     slow_mps: float = Field(default=0.5, gt=0.0)
     fast_mps: float = Field(default=0.9, gt=0.0)

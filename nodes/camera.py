@@ -8,9 +8,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from advnerf_core.geometry import Pinhole
+from advnerf_core.strict import StrictModel
 from calibration.schema import CameraCalibration, load_calibration
 from hardware.cameras.interface import Frame
 from hardware.cameras.sources import CameraSource
@@ -40,7 +41,7 @@ _FACTORY_TOLERANCE = 0.05
 FRAME_ID = "camera"
 
 
-class CompressedConfig(BaseModel):
+class CompressedConfig(StrictModel):
     """JPEG images for a wireless link.
 
     Attributes:
@@ -48,13 +49,11 @@ class CompressedConfig(BaseModel):
         quality: JPEG quality, 1 to 100.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
     rate_hz: float = Field(default=10.0, gt=0.0)
     quality: int = Field(default=80, ge=1, le=100)
 
 
-class CameraConfig(BaseModel):
+class CameraConfig(StrictModel):
     """Configuration of the camera node.
 
     Attributes:
@@ -64,8 +63,6 @@ class CameraConfig(BaseModel):
         silence_s: Time without a frame after which the node reports a fault [s].
         compressed: Also publish JPEG images on ``/camera/image_raw/compressed`` while the topic has subscribers.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     source: CameraSource
     calibration: Path

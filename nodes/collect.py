@@ -10,9 +10,10 @@ import math
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from advnerf_core.driving.path import Path as DrivingPath
+from advnerf_core.strict import StrictModel
 from calibration.schema import RoomCalibration, load_calibration
 from nodes.lab.trials.trial import TrialNode, TrialPlan
 from nodes.runtime.errors import NodeFinished
@@ -20,7 +21,7 @@ from nodes.runtime.node import MessageInfo, Node, NodeContext, Now, Out
 from nodes.runtime.process import run_node_main
 
 
-class Start(BaseModel):
+class Start(StrictModel):
     """Start of a drive.
 
     Attributes:
@@ -28,8 +29,6 @@ class Start(BaseModel):
         lateral_m: Offset from the path, left positive [m].
         heading_rad: Angle from the heading of the path, left positive [rad].
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     s_m: float = 0.0
     lateral_m: float = Field(default=0.0, ge=-1.0, le=1.0)
@@ -42,7 +41,7 @@ class Start(BaseModel):
         return x_m + self.lateral_m * left[0], y_m + self.lateral_m * left[1], yaw_rad + self.heading_rad
 
 
-class CollectConfig(BaseModel):
+class CollectConfig(StrictModel):
     """Configuration of the collector.
 
     Attributes:
@@ -53,8 +52,6 @@ class CollectConfig(BaseModel):
         nodes: Nodes that must be ready before anything moves.
         patience_s: Longest time for each of getting ready, placing, arming and stopping [s].
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     room: Path
     starts: tuple[Start, ...] = Field(default=(Start(),), min_length=1)

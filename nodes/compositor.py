@@ -18,12 +18,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
 from advnerf_core.attack.artifact import AttackFile, attack_from_bytes, load_attack
 from advnerf_core.attack.projection import FaceOverlay
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Array, invert_transform
+from advnerf_core.strict import StrictModel
 from calibration.schema import CameraCalibration, TargetCalibration, load_calibration
 from nodes.control.interlock import ATTACK_SWITCH, SAFETY_STATE, AttackSwitch, Interlock
 from nodes.control.pose_buffer import PoseBuffer
@@ -40,7 +41,7 @@ _ACTIVE_S = 1.0
 _SIZE_TOLERANCE = 0.05
 
 
-class CompositorConfig(BaseModel):
+class CompositorConfig(StrictModel):
     """Configuration of the compositor node.
 
     Attributes:
@@ -54,8 +55,6 @@ class CompositorConfig(BaseModel):
         supersample: Samples along each side of a pixel.
         interlock: Draw the attack only while the safety node reports that the car is armed, so inside the fence with fresh poses.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     attack: Path | None = None
     camera: Path

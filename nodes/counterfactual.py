@@ -17,14 +17,16 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
 from advnerf_core.policies.load import Driver, load_driver
+from advnerf_core.strict import StrictModel
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError, MessageError
 from nodes.runtime.messages import header, stamp_ns, types
 from nodes.runtime.node import ACTIVE, FAULT, READY, MessageInfo, Node, NodeContext, Now, Out
 from nodes.runtime.pictures import RAW_TOPIC, rgb_image
+from nodes.runtime.priority import HELPER, take_share
 from nodes.runtime.process import run_node_main
 
 COUNTERFACTUAL_TOPIC = "/policy/counterfactual"
@@ -34,10 +36,9 @@ _WARM_UP_RUNS = 3
 # Largest number of incomplete pairs. The images of a pair arrive within the compositor's waiting time for poses.
 _OPEN = 12
 _QUEUE = 12
-_NICE = 15
 
 
-class CounterfactualConfig(BaseModel):
+class CounterfactualConfig(StrictModel):
     """Configuration of the counterfactual node.
 
     Attributes:
@@ -48,8 +49,6 @@ class CounterfactualConfig(BaseModel):
         goal: Goal vector of a goal-conditioned policy.
         max_age_s: Largest age of a pair since publication. Older pairs are skipped, so that a busy computer can catch up [s].
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     policy: str = Field(min_length=1)
     sha256: str = ""
@@ -212,7 +211,7 @@ class CounterfactualNode(Node):
 def build_to_give_way(config: CounterfactualConfig, context: NodeContext) -> CounterfactualNode:
     """Build the node, then set its process to idle priority."""
     # The policy is loaded before, because loading at idle priority could take for ever on a busy computer.
-    os.nice(_NICE)
+    take_share(HELPER)
     node = CounterfactualNode.build(config, context)
     with contextlib.suppress(OSError):  # a container may forbid it; then only nice applies
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))

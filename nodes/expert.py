@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from advnerf_core.driving.expert import Expert, ExpertConfig
 from advnerf_core.geometry import wrap_angle, yaw_of
+from advnerf_core.strict import StrictModel
 from calibration.schema import RoomCalibration, VehicleCalibration, load_calibration
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.messages import drive_message, header, pose_matrix, stamp_ns, types
@@ -31,7 +32,7 @@ _JUMP_M = 0.5
 _ARMED_AGE_S = 0.5
 
 
-class Disturbance(BaseModel):
+class Disturbance(StrictModel):
     """Disturbances that the expert adds to its steering.
 
     Attributes:
@@ -41,8 +42,6 @@ class Disturbance(BaseModel):
         within_m: Distance from the path beyond which no disturbance starts, and a running one ends [m].
         seed: Random seed.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     every_m: tuple[float, float] = (1.5, 3.0)
     over_m: tuple[float, float] = (0.3, 0.6)
@@ -59,7 +58,7 @@ class Disturbance(BaseModel):
         return self
 
 
-class ExpertNodeConfig(BaseModel):
+class ExpertNodeConfig(StrictModel):
     """Configuration of the expert node.
 
     Attributes:
@@ -76,8 +75,6 @@ class ExpertNodeConfig(BaseModel):
         max_age_s: Largest age of a pose since its capture [s].
         disturb: Disturbances; None drives without them.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     room: Path
     vehicle: Path

@@ -11,8 +11,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from advnerf_core.strict import StrictModel
 from nodes.linking.keys import KeyFolder
 from nodes.linking.link import Inbound, Link, LinkConfig, Offset
 from nodes.runtime.clock import NS_PER_S
@@ -29,7 +30,7 @@ _INBOX = 400
 _SILENCE_S = 0.8
 
 
-class GatewayConfig(BaseModel):
+class GatewayConfig(StrictModel):
     """Configuration of the gateway.
 
     Attributes:
@@ -43,8 +44,6 @@ class GatewayConfig(BaseModel):
         exports: Topics of this host that are sent to the other host.
         imports: Topics of the other host that are published here.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     listen: str | None = None
     connect: str | None = None

@@ -16,10 +16,11 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
 from advnerf_core.attack.artifact import AttackFile, attack_from_bytes, load_attack
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.strict import StrictModel
 from calibration.panel import Panel, make_panel, require_fits
 from calibration.schema import TargetCalibration, load_calibration
 from hardware.errors import HardwareError
@@ -38,11 +39,7 @@ _PLAIN_PX = 8
 Colour = tuple[float, float, float]
 
 
-class _Config(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class ScreenConfig(_Config):
+class ScreenConfig(StrictModel):
     """A real screen.
 
     Attributes:
@@ -55,7 +52,7 @@ class ScreenConfig(_Config):
     connector: str | None = None
 
 
-class TwinScreenConfig(_Config):
+class TwinScreenConfig(StrictModel):
     """The monitor of the simulated lab.
 
     Attributes:
@@ -68,7 +65,7 @@ class TwinScreenConfig(_Config):
     wait_s: float = Field(default=30.0, ge=0.0)
 
 
-class MonitorConfig(_Config):
+class MonitorConfig(StrictModel):
     """Configuration of the monitor node.
 
     Attributes:

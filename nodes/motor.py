@@ -15,8 +15,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from advnerf_core.strict import StrictModel
 from calibration.schema import VehicleCalibration, load_calibration
 from hardware.errors import HardwareError, ProtocolError
 from hardware.motor.limits import DriveLimits, Sent
@@ -38,7 +39,7 @@ _POLL_S = 0.04
 _DIAGNOSTICS_S = 1.0
 
 
-class MotorConfig(BaseModel):
+class MotorConfig(StrictModel):
     """Configuration of the motor node.
 
     Attributes:
@@ -57,8 +58,6 @@ class MotorConfig(BaseModel):
         steering_hold_s: Time for which each side is held in the check [s].
         battery_warning_v: Supply voltage below which the diagnostics warn [V].
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     port: str
     calibration: Path

@@ -7,23 +7,26 @@ computer only, unless ``host`` says otherwise; then it needs TLS and a one-time 
 
 from __future__ import annotations
 
+import contextlib
 import json
 from pathlib import Path
 from typing import Any, Literal
 
 import cv2
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.view import PolicyView
+from advnerf_core.strict import StrictModel
 from calibration.schema import RoomCalibration, load_calibration
+from nodes.launching.launched import read_launched
 from nodes.operator_page import board as topics
 from nodes.operator_page.board import Board
 from nodes.operator_page.catalogue import read_catalogue
 from nodes.operator_page.client import Asked, Gone
 from nodes.operator_page.desk import Desk, DeskLimits
 from nodes.operator_page.diary import Diary
-from nodes.operator_page.launched import read_launched
+from nodes.operator_page.disk import DiskWriter
 from nodes.operator_page.operation import ACT, FILE, RESET, SWITCH, TELEOP, Operation, Parts
 from nodes.operator_page.pictures import ATTACKED, CAMERA, POLICY, Picture, jpeg_of, view_of_policy
 from nodes.operator_page.recording import RECORDER, Recording
@@ -46,7 +49,7 @@ _OFF_TRACK_M = 0.4
 FOLDER, DOOR, LOG = "page", "page/door.json", "page/acts.jsonl"
 
 
-class PageConfig(BaseModel):
+class PageConfig(StrictModel):
     """Configuration of the page node.
 
     Attributes:
@@ -54,7 +57,7 @@ class PageConfig(BaseModel):
             ``advnerf page`` shows on this computer.
         port: TCP port; 0 selects a free one.
         names: Further names of this computer by which browsers may call it.
-        role: ``operate``, or ``watch`` for a page that only shows.
+        role: ``operate``, or ``watch`` for a page that only shows the launch and can stop the car.
         room: Room calibration file with path, fence and start; empty for none.
         policy: The policy that drives, for the picture of what it sees. ``.safetensors`` and ``.onnx`` files tell.
         attacks: Attack files, and folders with attack files, to choose from.
@@ -68,8 +71,6 @@ class PageConfig(BaseModel):
         code_s: Time for which a one-time code is valid [s].
         trial_ticks: Length of a trial in control ticks of 0.1 s.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     host: str = "127.0.0.1"
     port: int = Field(default=8090, ge=0, le=65535)
@@ -108,10 +109,12 @@ class PageNode(Node):
         self._board = Board(room, nodes)
         self._view: PolicyView | None = view_of_policy(config.policy)
         self._operates = config.role == "operate"
+        self._stops = self._operates or launched.known
         self._holds = launched.holds
         limits = DeskLimits(config.hold_age_limit_s, config.picture_age_limit_s, config.lease_s)
         self._desk = Desk(limits)
-        self._diary = Diary(run_dir / LOG)
+        self._disk = DiskWriter()
+        self._diary = Diary(run_dir / LOG, self._disk)
         self._recording = Recording(run_dir, nodes)
         path = None if room is None else room.reference_path
         off_track_m = _OFF_TRACK_M if room is None else room.off_track_m
@@ -135,7 +138,7 @@ class PageNode(Node):
         self._door_is_new = True
         self._pictures = self._trouble_count = 0
         settings = ServerSettings(config.host, config.port, config.names, config.code_s)
-        self._server = PageServer(settings, self.inbox, self._png_of, self._welcome)
+        self._server = PageServer(settings, self.inbox, self._png_of, self._welcome, self._operation.stops)
         self._server.start()
 
     @classmethod
@@ -156,7 +159,9 @@ class PageNode(Node):
             return []
         self._board.hear(topic, message, info)
         if topic == topics.SAFETY:
-            self._operation.heard_safety(message)
+            self._operation.heard_safety(message, info)
+        elif topic == topics.SENT:
+            self._operation.heard_motor(message, info)
         return []
 
     def receive(self, item: Asked | Gone, now: Now) -> list[Out]:
@@ -184,7 +189,8 @@ class PageNode(Node):
         """Report active while somebody operates."""
         lease = self._desk.lease
         who = f"{lease.name} operates" if lease else "nobody operates"
-        words = [f"{self.url}, {self._server.viewers} open, {who}", self._hint(), *self._left_out[:1]]
+        log = self._disk.trouble and f"the log of acts is not written: {self._disk.trouble}"
+        words = [f"{self.url}, {self._server.viewers} open, {who}", self._hint(), log, *self._left_out[:1]]
         return (ACTIVE if lease else READY), "; ".join(filter(None, words))
 
     def counters(self) -> dict[str, float]:
@@ -198,18 +204,21 @@ class PageNode(Node):
             "requests_refused": counts.refused,
             "messages_malformed": counts.malformed,
             "connections_closed": counts.closed,
+            "log_lines_lost": self._disk.lost,
         }
 
     def close(self) -> None:
         """Stop the server and finish a recording."""
         self._server.close()
         self._recording.close()
+        self._disk.close()
         self._diary.close()
-        (self._run_dir / DOOR).unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            (self._run_dir / DOOR).unlink(missing_ok=True)
 
     def _publications(self, twin: bool) -> tuple[str, ...]:
         if not self._operates:
-            return ()
+            return (ARM,) if self._stops else ()
         attack = (SWITCH, *((FILE,) if self._catalogue else ()))
         return (TELEOP, ARM, ACT, *attack, *((RESET,) if twin else ()))
 
@@ -240,6 +249,7 @@ class PageNode(Node):
             "real_ms": now.real_ns // 1_000_000,
             "viewers": self._server.viewers,
             "hint": self._hint(),
+            "log_trouble": self._disk.trouble,
             **self._board.state(now),
             **self._operation.state(now),
         }
@@ -248,6 +258,7 @@ class PageNode(Node):
         """What a new browser is told. Called by the server's thread, and reads only what that thread may."""
         return {
             "operates": self._operates,
+            "stops": self._stops,
             "attacks": [entry.facts for entry in self._catalogue.values()],
             "policy_view": self._view is not None,
             **self._board.place(),
@@ -268,7 +279,7 @@ class PageNode(Node):
     def _write_door(self, now: Now) -> None:
         """Write address and code to a file that only this user can read. Nothing secret goes on the bus, which is recorded.
 
-        A slow disk must not stop the car, so nothing is written while the button is held.
+        Nothing changes while the button is held, so that the operator's phone keeps the code that it shows.
         """
         if self._desk.held or not (self._server.renew_code(now.mono_ns) or self._door_is_new):
             return
@@ -280,7 +291,13 @@ class PageNode(Node):
             "valid_until_s": round(now.real_s + self._config.code_s),
             "fingerprint": tls.fingerprint if tls else "",
         }
-        write_atomically(self._run_dir / DOOR, json.dumps(door) + "\n")
+        text = json.dumps(door) + "\n"
+        self._disk.submit(lambda: _write_door(self._run_dir / DOOR, text))
+
+
+def _write_door(file: Path, text: str) -> None:
+    file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    write_atomically(file, text)
 
 
 def main() -> int:

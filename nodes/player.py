@@ -13,11 +13,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from advnerf_core.strict import StrictModel
 from nodes.bags.keys import Keys
 from nodes.bags.play import PAUSE, RATE, RESUME, STEP, STOP, TOGGLE, Command, Playhead
 from nodes.bags.reader import BagMessage, read_info, read_messages, require_readable
+from nodes.bags.time_gaps import skipped_gaps
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError, MessageError, NodeFinished
 from nodes.runtime.messages import header, stamp_from_ns, types
@@ -36,7 +38,7 @@ _FASTER = 1.25
 _FAREWELL_NS = NS_PER_S // 4
 
 
-class PlayerConfig(BaseModel):
+class PlayerConfig(StrictModel):
     """Configuration of the player.
 
     Attributes:
@@ -52,8 +54,6 @@ class PlayerConfig(BaseModel):
         wait_for: Topics, by their played names, that must have a subscriber before the first message. None waits for a subscriber of
             any topic. An empty list does not wait; messages without a subscriber are lost.
     """
-
-    model_config = ConfigDict(extra="forbid")
 
     bag: Path
     rate: float = Field(default=1.0, gt=0)
@@ -102,6 +102,7 @@ class PlayerNode(Node):
         self._end_ns = self._info.end_ns
         if config.duration_s is not None:
             self._end_ns = min(self._end_ns, self._begin_ns + round(config.duration_s * NS_PER_S))
+        self._gaps = skipped_gaps(config.bag)
         self._messages: Iterator[BagMessage] = iter(())
         self._next: BagMessage | None = None
         self._head: Playhead | None = None
@@ -153,6 +154,7 @@ class PlayerNode(Node):
             if self._missing():
                 return []
             self._head = Playhead(self._begin_ns, now.mono_ns, self._config.rate, self._config.paused)
+        self._head.skip(self._gaps, now.mono_ns)
         due: list[Out] = []
         while (
             not self._head.paused

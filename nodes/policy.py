@@ -13,9 +13,10 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from advnerf_core.policies.load import Driver, load_driver
+from advnerf_core.strict import StrictModel
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError, MessageError
 from nodes.runtime.messages import drive_message, stamp_ns
@@ -30,7 +31,7 @@ _ACTIVE_S = 1.0
 _CLOCK_TOLERANCE_S = 0.02
 
 
-class PolicyConfig(BaseModel):
+class PolicyConfig(StrictModel):
     """Configuration of the policy node.
 
     Attributes:
@@ -41,8 +42,6 @@ class PolicyConfig(BaseModel):
         max_age_s: Largest age of an image since capture and since publication [s].
         goal: Goal vector of a goal-conditioned policy.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     policy: str = Field(min_length=1)
     sha256: str = ""

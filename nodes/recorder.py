@@ -8,8 +8,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from advnerf_core.strict import StrictModel
 from nodes.bags.writer import BagWriter, SplitLimits
 from nodes.runtime.errors import BagError
 from nodes.runtime.node import MessageInfo, Node, NodeContext, Now, Out
@@ -22,7 +23,7 @@ from nodes.runtime.topics import topic as topic_row
 _FLUSH_HZ = 1.0
 
 
-class RecorderConfig(BaseModel):
+class RecorderConfig(StrictModel):
     """Configuration of the recorder.
 
     Attributes:
@@ -35,8 +36,6 @@ class RecorderConfig(BaseModel):
         max_bag_size_mb: Size at which a new file starts [MiB]. The default is 20 s of camera and compositor images. The index of a
             file takes about 700 bytes of memory per image, or per 64 KiB of small messages.
     """
-
-    model_config = ConfigDict(extra="forbid")
 
     output: Path = Path("bag")
     topics: list[str] | None = None

@@ -12,8 +12,9 @@ from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any, Protocol
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from advnerf_core.strict import StrictModel
 from calibration.schema import VehicleCalibration, load_calibration
 from nodes.linking.link import on_our_clock
 from nodes.linking.ros2.answers import stamp_of_cdr
@@ -37,7 +38,7 @@ _TICK_HZ = 20.0
 _STOPS = 20  # for a second
 
 
-class Ros2Config(BaseModel):
+class Ros2Config(StrictModel):
     """Configuration of the ROS 2 node.
 
     Attributes:
@@ -48,8 +49,6 @@ class Ros2Config(BaseModel):
         send: Topics that ROS 2 gets.
         take: Topics that ROS 2 supplies.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     domain_id: int = Field(default=0, ge=0, le=232)
     interface: str = Field(default="lo", pattern=r"^[A-Za-z0-9_.\-]{1,15}$")

@@ -8,8 +8,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from advnerf_core.strict import StrictModel
 from calibration.schema import RoomCalibration, VehicleCalibration, load_calibration
 from nodes.control.arming import Arming, ArmingLimits
 from nodes.control.arming_gates import ClockGate, HandGate, inside, require_simple
@@ -29,7 +30,7 @@ _STOP_PERIOD_S = 0.04
 _STATE_PERIOD_S = 0.1
 
 
-class SafetyConfig(BaseModel):
+class SafetyConfig(StrictModel):
     """Configuration of the safety node.
 
     Attributes:
@@ -65,8 +66,6 @@ class SafetyConfig(BaseModel):
         stall_sources: Measurements of the motion: motion capture, the motor controller's rpm. Either at rest is a stall. On a test
             stand, where the wheels turn and the car does not move, use only ``erpm``.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     room: Path
     vehicle: Path
@@ -299,7 +298,7 @@ class SafetyNode(Node):
             header=header(now.real_ns),
             armed=arming.armed,
             stopping=not arming.armed,
-            reason=arming.reason,
+            reason=arming.stopped_by,
             source=arming.source if arming.armed else "",
             answered_id=answer.ask_id,
             granted=answer.granted,

@@ -13,12 +13,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from advnerf_core.strict import StrictModel
 from hardware.operator.gamepad import EVENT_LAYOUT, JS_LAYOUT, Gamepad, Layout
 from hardware.operator.hands import Hands
 from hardware.operator.keyboard import Keyboard
-from nodes.runtime.arm_requests import OPERATOR, arm_message
+from nodes.runtime.arm_asker import ArmAsker
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.messages import header, types
 from nodes.runtime.node import (
@@ -34,13 +35,11 @@ from nodes.runtime.node import (
     ReaderThread,
 )
 from nodes.runtime.process import run_node_main
-from nodes.runtime.requests import Asked
 
 _STALE_S = 0.15
-_ARM_NS = NS_PER_S
 
 
-class TeleopConfig(BaseModel):
+class TeleopConfig(StrictModel):
     """Configuration of the teleop node.
 
     Attributes:
@@ -49,8 +48,6 @@ class TeleopConfig(BaseModel):
         speed_mps: Speed at full throttle [m/s].
         steering_rad: Steering at full deflection [rad].
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     device: Path | Literal["keyboard"] = "keyboard"
     axes: tuple[int, int] | None = None
@@ -67,7 +64,7 @@ class TeleopNode(Node):
         release: Releases the device.
     """
 
-    subscriptions = ("/safety/state",)
+    subscriptions = ("/safety/state", "/motor/sent")
     publications = ("/teleop/state", "/arm")
     tick_rate_hz = 20.0
 
@@ -80,7 +77,7 @@ class TeleopNode(Node):
         self._stops = self._rearms = 0
         self._estop = False
         self._arm_in_ticks = 0
-        self._asked: Asked | None = None
+        self._asker, self._late = ArmAsker(), ""
         self._mode = "idle"
         self._reader = ReaderThread(read, self.inbox, "hands")
         self._reader.start()
@@ -98,42 +95,42 @@ class TeleopNode(Node):
         return cls(config, device.read, device.close)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """Check whether the safety node has answered the request to re-arm."""
-        if self._asked is not None and message.answered_id == self._asked.ask_id:
-            self._asked = None
+        """Check whether the safety node has answered a request, and whether the car brakes."""
+        if topic == "/motor/sent":
+            self._asker.heard_motor(message, info)
+        else:
+            self._asker.heard(message, info)
         return []
 
     def receive(self, item: Hands, now: Now) -> list[Out]:
-        """Note the operator's input. A change is published at once."""
+        """Note the operator's input. A change is published at once. An e-stop also disarms, and is repeated until it is confirmed."""
         self._hands, self._heard_ns, before = item, now.mono_ns, (self._mode, self._estop)
         if item.rearms > self._rearms:
             self._estop, self._arm_in_ticks = False, 2
+        outs = []
         if item.stops > self._stops:
-            self._estop, self._arm_in_ticks, self._asked = True, 0, None  # if both are pressed, the stop wins
+            self._estop, self._arm_in_ticks = True, 0  # if both are pressed, the stop wins
+            outs.append(self._asker.disarm(now, "e-stop of the teleop node"))
         self._stops, self._rearms = item.stops, item.rearms
         state = self._state(now)
-        return [state] if (self._mode, self._estop) != before else []
+        return [state, *outs] if (self._mode, self._estop) != before else outs
 
     def tick(self, now: Now) -> list[Out]:
         """Publish the state again. Re-arm a moment after the e-stop was reported as released, because they use different topics.
 
-        The request to re-arm is repeated until the safety node has answered, or until it is too old.
+        A request is repeated until the safety node has answered. A request to re-arm also ends when it is too old.
         """
-        outs = [self._state(now)]
+        self._say_late(now)
         if self._arm_in_ticks:
             self._arm_in_ticks -= 1
             if not self._arm_in_ticks:
-                self._asked = Asked.at(now)
-        if self._asked is not None and self._asked.age_ns(now) > _ARM_NS:
-            self._asked = None
-        if self._asked is not None:
-            outs.append(
-                Out("/arm", arm_message(self._asked, now, True, OPERATOR, "re-armed by the operator"))
-            )
-        return outs
+                self._asker.arm(now, "re-armed by the operator")
+        return [self._state(now), *self._asker.tick(now)]
 
     def status(self) -> tuple[str, str]:
         """Report active while a button is held."""
+        if self._late:
+            return FAULT, self._late
         if not self._hands.connected:
             return FAULT, self._hands.text
         if self._estop:
@@ -144,6 +141,12 @@ class TeleopNode(Node):
         """Release the device."""
         self._reader.stop()
         self._release()
+
+    def _say_late(self, now: Now) -> None:
+        """Say in the terminal or the log when a stop is not confirmed, and when it is."""
+        before, self._late = self._late, self._asker.not_confirmed(now)
+        if bool(before) != bool(self._late):
+            print(f"teleop: {self._late or 'the car is stopped'}", file=sys.stderr, flush=True)
 
     def _state(self, now: Now) -> Out:
         hands, config = self._hands, self._config

@@ -5,8 +5,9 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
+from advnerf_core.strict import StrictModel
 from hardware.mocap.library import LibraryConfig, LibraryReceiver
 from hardware.mocap.vicon import DEFAULT_PORT, SubjectPose, ViconConfig, ViconReceiver
 from nodes.runtime.clock import NS_PER_S
@@ -31,7 +32,7 @@ _READ_TIMEOUT_S = 0.2
 _TOPIC_PREFIX = "/vicon/"
 
 
-class ViconNodeConfig(BaseModel):
+class ViconNodeConfig(StrictModel):
     """Configuration of the VICON node.
 
     Attributes:
@@ -47,8 +48,6 @@ class ViconNodeConfig(BaseModel):
         max_age_s: Largest age of a pose at its publication; older poses are dropped [s].
         silence_s: Time without any pose of the first subject after which the node reports a fault [s].
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     host: str = "127.0.0.1"
     port: int = Field(default=DEFAULT_PORT, ge=0, le=65535)

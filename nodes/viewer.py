@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from advnerf_core.strict import StrictModel
 from nodes.linking.keys import is_loopback
 from nodes.runtime.errors import BusError, SecurityError
 from nodes.runtime.messages import type_definition
@@ -22,7 +23,7 @@ from nodes.runtime.topics import topic as topic_row
 _BACKLOG = 64
 
 
-class ViewerConfig(BaseModel):
+class ViewerConfig(StrictModel):
     """Configuration of the viewer.
 
     Attributes:
@@ -32,8 +33,6 @@ class ViewerConfig(BaseModel):
         topics: Topics to show; none means the whole topic table.
         statuses_of: Nodes whose status is also shown.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     host: str = "127.0.0.1"
     port: int = Field(default=8765, ge=0, le=65535)

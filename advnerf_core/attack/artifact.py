@@ -17,13 +17,14 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from advnerf_core.driving.clean_drive import CleanDrive
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import with_sorted_header, write_atomically
 from advnerf_core.geometry import Array, Pinhole, yaw_of
+from advnerf_core.places import open_tensors
 
 FILE_FORMAT = "advnerf-attack-2"
 TEXTURE_PX = 512
@@ -311,7 +312,7 @@ def load_attack(path: str | os.PathLike[str]) -> AttackFile:
             f"expected an attack file at {source}, found none; run the attack, or correct the path"
         )
     try:
-        with safe_open(source, framework="numpy") as handle:
+        with open_tensors(source, "numpy") as handle:
             header = handle.metadata() or {}
             tensors = {name: handle.get_tensor(name) for name in handle.keys()}  # noqa: SIM118 - not a mapping
     except (SafetensorError, OSError, ValueError) as error:

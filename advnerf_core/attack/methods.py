@@ -18,12 +18,12 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic import BaseModel, ValidationError
 
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.plugins import (
     PluginError,
-    code_digest,
+    code_sha256,
     is_file_reference,
     known_names,
     require_known,
@@ -31,6 +31,7 @@ from advnerf_core.plugins import (
     unknown,
 )
 from advnerf_core.report.conditions import CONDITIONS
+from advnerf_core.strict import strict_validator
 
 if TYPE_CHECKING:
     from advnerf_core.attack.problem import AttackProblem
@@ -147,7 +148,7 @@ class Method:
         if self.Options is None:
             return None
         try:
-            return TypeAdapter(self.Options).validate_python(dict(written))
+            return strict_validator(self.Options).validate_python(dict(written))
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
             place, message = (
@@ -245,8 +246,8 @@ def method_name(reference: str) -> str:
 
 
 def method_digest(reference: str) -> str:
-    """Names the code of a user's method: it changes with the file, or with the version of the package. Empty for a built-in one."""
-    return "" if reference in METHODS else code_digest(reference, GROUP)
+    """Names the code of a user's method in 16 characters: it changes with the files of the code. Empty for a built-in one."""
+    return code_sha256(reference, METHODS, GROUP)[:16]
 
 
 def method_names() -> tuple[str, ...]:

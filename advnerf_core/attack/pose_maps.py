@@ -20,6 +20,7 @@ from torch import Tensor
 from advnerf_core.attack.adjoint import AttackProblem, evaluate
 from advnerf_core.attack.spaces.placed_sensor import PlacedSensor
 from advnerf_core.attack.spaces.placement import PoseSpace, placed
+from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array
@@ -225,7 +226,7 @@ def _cells(
 
 def _kept(file: Path, fingerprint: str) -> dict[int, Any]:
     try:
-        content = json.loads(file.read_text())
+        content = read_json(file)
         cells = {int(index): cell for index, cell in content["cells"].items()}
         made_of = (content["format"], content["fingerprint"])
     except (OSError, UnicodeDecodeError, ValueError, KeyError, TypeError, AttributeError) as error:

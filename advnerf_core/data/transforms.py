@@ -6,7 +6,6 @@ a file is one `DatasetError` that names the file, the frame and the field.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable
 from pathlib import Path
@@ -18,6 +17,8 @@ from advnerf_core.data.errors import DatasetError, raise_all
 from advnerf_core.data.image_files import SUFFIXES, image_size
 from advnerf_core.data.lens import Lens
 from advnerf_core.data.views import HELD_OUT_SPLITS, NGP_OFFSET, NGP_SCALE, TRAIN, PosedImage, PosedImages
+from advnerf_core.documents import read_json
+from advnerf_core.errors import ConfigError, MissingFileError
 from advnerf_core.geometry import OPENGL_FROM_OPENCV, Array, Pinhole
 
 _LENSES = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
@@ -94,11 +95,11 @@ def _read_set(path: Path, split: str | None, require_all: bool) -> PosedImages:
 
 def _read_json(path: Path) -> _Values:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DatasetError(f"expected a transforms.json at {path}, got: {error.strerror}") from error
-    except ValueError as error:
-        raise DatasetError(f"expected JSON in {path}, got: {error}") from error
+        content = read_json(path)
+    except MissingFileError as error:
+        raise DatasetError(f"expected a transforms.json at {path}, found none; correct the path") from error
+    except ConfigError as error:
+        raise DatasetError(str(error)) from error
     if not isinstance(content, dict):
         raise DatasetError(f"expected a JSON object in {path}, got {type(content).__name__}")
     return content
@@ -266,6 +267,8 @@ def _focal_length(values: _Values, axis: str, size: int) -> float | None:
 def _number(values: _Values, key: str, default: float, positive: bool = False) -> float:
     raw = values.get(key)
     try:
+        if isinstance(raw, bool):  # in Python, a number
+            raise TypeError
         value = default if raw is None else float(raw)
     except (TypeError, ValueError):
         raise _FieldError(f"{key}: expected a number, got {raw!r:.60}") from None

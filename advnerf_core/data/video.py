@@ -14,6 +14,7 @@ import numpy as np
 from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.image_files import Rgb, write_image
 from advnerf_core.data.keyframes import Candidate, KeyframeConfig, KeyframeSelector
+from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
@@ -120,7 +121,7 @@ def _key(path: Path, config: KeyframeConfig, most: int) -> str:
 
 def _finished(folder: Path, key: str) -> list[Path] | None:
     try:
-        record = json.loads((folder / _RECORD).read_text())
+        record = read_json(folder / _RECORD)
         files = [folder / row["file"] for row in record["frames"]]
         return files if record["key"] == key and all(file.exists() for file in files) else None
     except (OSError, ValueError, KeyError, TypeError):

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.nn.functional as F
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import save
 from torch import Tensor
 
@@ -22,6 +22,7 @@ from advnerf_core.adam import Adam
 from advnerf_core.files import with_sorted_header, write_atomically
 from advnerf_core.learning.augment import AugmentConfig, augment
 from advnerf_core.learning.frames import FrameSet, FrameStoreError
+from advnerf_core.places import open_tensors
 from advnerf_core.policies.pilotnet import PilotNet, images_to_tensor
 
 EVALUATION_BATCH = 128
@@ -136,7 +137,7 @@ def _resume(path: Path, policy: PilotNet, config: FitConfig) -> tuple[int, dict[
     if not path.is_file():
         return 0, {}
     try:
-        with safe_open(path, framework="pt") as file:
+        with open_tensors(path, "pt") as file:
             header = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
     except (SafetensorError, OSError) as error:

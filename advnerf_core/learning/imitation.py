@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from advnerf_core.documents import read_json
 from advnerf_core.driving.expert import Expert
 from advnerf_core.driving.path import Array, Path
 from advnerf_core.files import write_atomically
@@ -255,7 +256,7 @@ class _Recipe:
     def _claim_shards(self, stage: str) -> list[str]:
         record = self.out_dir / f"{stage}.shards.json"
         if record.is_file():
-            return list(json.loads(record.read_text()))
+            return list(read_json(record))
         names = self.store.names()
         write_atomically(record, json.dumps(names))
         return names

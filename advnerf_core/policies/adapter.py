@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from advnerf_core.policies.contract import PolicyContract, PolicyContractError
@@ -17,13 +18,15 @@ class AdaptedPolicy(nn.Module):
 
     Args:
         network: Called as ``network(images)``, with goals as ``network(images, goals)``, and if it is not stateless as
-            ``network(images, goals, memory) -> (output, memory)``; then it also has ``initial_memory(batch)``.
+            ``network(images, goals, memory) -> (output, memory)``; then it also has ``initial_memory(batch)``. A network that asks another
+            program has an attribute ``identity``, a text that names that program.
         contract: Its declaration.
 
     Attributes:
         stateless: As declared.
         differentiable: As declared.
         goal_size: As declared.
+        identity: The program that is asked; empty for a network that runs here. Such a policy is not fixed: the program may change.
     """
 
     def __init__(self, network: Callable[..., Any], contract: PolicyContract) -> None:
@@ -33,11 +36,16 @@ class AdaptedPolicy(nn.Module):
                 "expected a network that is not stateless to have initial_memory(batch), got one without; add it, or declare "
                 "stateless = True if the output depends on the present image only"
             )
+        if (contract.input_name or contract.output_name) and not hasattr(network, "tensors"):
+            raise PolicyContractError(
+                "expected input_name and output_name for an .onnx or .pt2 file only; remove them, and return what steers"
+            )
         self.network = network
         self.contract = contract
         self.stateless = contract.stateless
         self.differentiable = contract.differentiable
         self.goal_size = contract.goal_size
+        self.identity = str(getattr(network, "identity", ""))
         self.training = bool(getattr(network, "training", False))
 
     def initial_memory(self, batch: int) -> Tensor:
@@ -54,6 +62,40 @@ class AdaptedPolicy(nn.Module):
             return self.contract.to_steering_rad(raw, len(images)), memory
         raw = self.network(given) if self.goal_size == 0 else self.network(given, goals)
         return self.contract.to_steering_rad(raw, len(images))
+
+    def answers_mrad(self) -> list[int]:
+        """Steering for three fixed pictures [mrad, whole]: by which a program that is asked is told from another."""
+        generator = torch.Generator().manual_seed(0)
+        pictures = torch.rand(3, 3, *self.contract.size, generator=generator)
+        pictures[0] = 0.5
+        goals = torch.eye(3, self.goal_size) if self.goal_size else None
+        with torch.no_grad():
+            if self.stateless:
+                steering = self(pictures, goals)
+            else:
+                steering, _ = self(pictures, goals, self.initial_memory(3))
+        return [round(1000.0 * float(each)) for each in steering]
+
+    def described_tensors(self) -> list[tuple[str, str]]:
+        """Each input and output in words, with its shape and what it is used for: those of the file, else those of the contract."""
+        contract, tensors = self.contract, getattr(self.network, "tensors", None)
+        if tensors is not None:
+            column = contract.output_column
+            rows = [("input", each) for each in tensors.inputs] + [
+                ("output", each) for each in tensors.outputs
+            ]
+            return [(what, f"{each}: {tensors.use_of(each, column)}") for what, each in rows]
+        channels, size = (contract.channels,), contract.size
+        image = (*channels, *size) if contract.layout == "NCHW" else (*size, *channels)
+        goals = [("input", f"goals [B, {self.goal_size}]")] if self.goal_size else []
+        columns = (
+            "[B] or [B, 1]" if contract.output_column is None else f"[B, N], column {contract.output_column}"
+        )
+        return [
+            ("input", f"images [B, {', '.join(map(str, image))}]"),
+            *goals,
+            ("output", f"steering {columns}"),
+        ]
 
     def _check_goals(self, goals: Tensor | None, batch: int) -> None:
         shape = None if goals is None else tuple(goals.shape)

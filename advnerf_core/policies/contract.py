@@ -10,13 +10,14 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from math import pi
+from numbers import Real
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-import yaml
 
-from advnerf_core.errors import AdvnerfError
+from advnerf_core.documents import parse_json, read_yaml
+from advnerf_core.errors import AdvnerfError, ConfigError
 from advnerf_core.policies.view import PolicyView
 
 ColourSpace = Literal["RGB", "BGR", "YUV", "GRAY"]
@@ -27,6 +28,8 @@ _CHOICES: dict[str, tuple[str, ...]] = {
     "colour_space": get_args(ColourSpace), "output_unit": get_args(Unit), "positive": get_args(Side),
     "layout": get_args(Layout),
 }  # fmt: skip
+# Keys for files with more than one reading. Without them, declarations have the text, and policies the hash, that they always had.
+_NAMED = ("input_name", "output_name", "output_column")
 RAD_PER_DEG = pi / 180.0
 # Full-range YUV of BT.601 with U and V about one half, and grey, both as OpenCV's COLOR_RGB2YUV and COLOR_RGB2GRAY.
 _LUMA = (0.299, 0.587, 0.114)
@@ -64,6 +67,9 @@ class PolicyContract:
         full_steering_rad: Angle of the front wheels at a normalised output of 1 [rad]; with ``normalised`` only.
         wheelbase_m: Wheelbase that turns an inverse radius into an angle, ``atan(wheelbase / radius)`` [m]; with ``1/m`` only.
         steering_ratio: Turn of the steering wheel over that of the front wheels, for an output that is the steering wheel's.
+        input_name: The file's input that takes the images; None where its shapes allow one reading only.
+        output_name: The file's output that steers; None where it has one output.
+        output_column: The column of an output ``[B, N]`` that steers; None for ``[B]`` and ``[B, 1]``.
         positive: To which side a positive output steers.
         stateless: Whether the output depends on the present image and goal only.
         differentiable: Whether gradients reach the image; a black box declares False.
@@ -84,6 +90,9 @@ class PolicyContract:
     full_steering_rad: float | None = None
     wheelbase_m: float | None = None
     steering_ratio: float = 1.0
+    input_name: str | None = None
+    output_name: str | None = None
+    output_column: int | None = None
 
     def __post_init__(self) -> None:
         for name, choices in _CHOICES.items():
@@ -91,10 +100,22 @@ class PolicyContract:
                 raise PolicyContractError(
                     f"{name}: expected {' or '.join(choices)}, got {getattr(self, name)!r}"
                 )
+        self._check_types()
         self._check_input()
         self._check_output()
-        if not isinstance(self.goal_size, int) or self.goal_size < 0:
+        if not isinstance(self.goal_size, int) or isinstance(self.goal_size, bool) or self.goal_size < 0:
             raise PolicyContractError(f"expected a goal size >= 0, got {self.goal_size!r}")
+
+    def _check_types(self) -> None:
+        for name in ("value_max", "full_steering_rad", "wheelbase_m", "steering_ratio", "mean", "std"):
+            value = getattr(self, name)
+            for number in value if isinstance(value, tuple) else (value,):
+                # A boolean counts as a number in Python.
+                if number is not None and (isinstance(number, bool) or not isinstance(number, Real)):
+                    raise PolicyContractError(f"{name}: expected a number, got {number!r}")
+        for name in ("stateless", "differentiable"):
+            if not isinstance(getattr(self, name), bool):
+                raise PolicyContractError(f"{name}: expected true or false, got {getattr(self, name)!r}")
 
     def _check_input(self) -> None:
         for name in ("mean", "std"):
@@ -110,6 +131,12 @@ class PolicyContract:
             )
 
     def _check_output(self) -> None:
+        for name in ("input_name", "output_name"):
+            if not isinstance(given := getattr(self, name), str | None):
+                raise PolicyContractError(f"{name}: expected text, got {given!r}; put it in quotes")
+        column = self.output_column
+        if column is not None and (type(column) is not int or column < 0):
+            raise PolicyContractError(f"output_column: expected a whole number >= 0, got {column!r}")
         if not (np.isfinite(self.steering_ratio) and self.steering_ratio > 0.0):
             raise PolicyContractError(f"steering_ratio: expected a number > 0, got {self.steering_ratio}")
         for name, unit in (("full_steering_rad", "normalised"), ("wheelbase_m", "1/m")):
@@ -167,15 +194,8 @@ class PolicyContract:
         return (parts[0] + parts[1] + parts[2] + _channels(images, (0.0, 0.5, 0.5))).clip(0.0, 1.0)
 
     def to_steering_rad(self, raw: Any, batch: int) -> Any:
-        """Steering ``[B]`` [rad], left positive, of the network's output ``[B]`` or ``[B, 1]`` (numpy or torch)."""
-        shape = tuple(getattr(raw, "shape", ()))
-        if shape == (batch, 1):
-            raw = raw[:, 0]
-        elif shape != (batch,):
-            raise PolicyContractError(
-                f"expected the network's output to be [B] or [B, 1] steering angles, got {list(shape) or type(raw).__name__} "
-                f"for B = {batch}; return the column that steers"
-            )
+        """Steering ``[B]`` [rad], left positive, of the network's output ``[B]``, ``[B, 1]`` or ``[B, N]`` (numpy or torch)."""
+        raw = self._steering_column(raw, batch)
         side = 1.0 if self.positive == "left" else -1.0
         if self.output_unit == "1/m":
             bend = raw * (side * float(self.wheelbase_m or 0.0))
@@ -184,9 +204,22 @@ class PolicyContract:
         scale = side * unit / self.steering_ratio
         return raw if scale == 1.0 else raw * scale
 
+    def _steering_column(self, raw: Any, batch: int) -> Any:
+        shape, column = tuple(getattr(raw, "shape", ())), self.output_column
+        if column is None and shape == (batch,):
+            return raw
+        if len(shape) == 2 and shape[0] == batch and (shape[1] == 1 if column is None else column < shape[1]):
+            return raw[:, column or 0]
+        wanted = "[B] or [B, 1]" if column is None else f"[B, N] with the column {column}"
+        raise PolicyContractError(
+            f"expected the network's output to be {wanted} steering angles, got {list(shape) or type(raw).__name__} "
+            f"for B = {batch}; return the column that steers, or declare it as output_column"
+        )
+
     def to_dict(self) -> dict[str, Any]:
-        """Plain data from which `from_dict` makes the same declaration."""
+        """Plain data from which `from_dict` makes the same declaration; names that are not declared are left out."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
+        values = {name: value for name, value in values.items() if value is not None or name not in _NAMED}
         return {**values, "view": self.view.to_dict(), "mean": list(self.mean), "std": list(self.std)}
 
     def to_json(self) -> str:
@@ -194,43 +227,48 @@ class PolicyContract:
         return json.dumps(self.to_dict(), sort_keys=True, separators=(",", ":"), allow_nan=False)
 
     @classmethod
-    def from_dict(cls, data: Any, source: str = "declaration") -> PolicyContract:
-        """Rebuild a declaration; an unknown or missing key is one error that names it."""
+    def from_dict(cls, data: Any, source: str = "declaration", **implied: Any) -> PolicyContract:
+        """Rebuild a declaration; an unknown or missing key is one error that names it.
+
+        Args:
+            data: The declaration's keys and values.
+            source: What errors call it.
+            **implied: Values of keys that the declaration leaves out.
+        """
         if not isinstance(data, Mapping) or "view" not in data:
             raise PolicyContractError(f"{source}: expected keys and values with a 'view', got {data!r:.80}")
         known = [field.name for field in fields(cls)]
         if unknown := sorted(set(data) - set(known)):
             raise PolicyContractError(f"{source}: unknown key {unknown[0]}; valid keys: {', '.join(known)}")
         try:
-            values = {**data, "view": PolicyView.from_dict(data["view"])}
+            values = {**implied, **data, "view": PolicyView.from_dict(data["view"])}
             for name in ("mean", "std"):
                 if name in values:
                     given = values[name]
-                    values[name] = tuple(
-                        float(v) for v in ([given] if isinstance(given, int | float) else given)
-                    )
+                    values[name] = tuple(given) if isinstance(given, list | tuple) else (given,)
             return cls(**values)
         except (TypeError, ValueError) as error:
             raise PolicyContractError(f"{source}: {error}") from error
 
 
-def declaration_beside(path: Path, embedded: str | None) -> PolicyContract:
+def declaration_beside(path: Path, embedded: str | None, **implied: Any) -> PolicyContract:
     """The declaration of a file: the YAML file ``<path>.policy.yaml`` if there is one, else what the file carries.
 
     Args:
         path: The policy file.
         embedded: JSON that the file carries; None or empty if it carries none.
+        **implied: What the file itself says about keys that the declaration leaves out.
     """
     beside = path.with_name(path.name + ".policy.yaml")
     try:
         if beside.is_file():
-            return PolicyContract.from_dict(yaml.safe_load(beside.read_text(encoding="utf-8")), str(beside))
+            return PolicyContract.from_dict(read_yaml(beside).data, str(beside), **implied)
         if embedded:
-            return PolicyContract.from_dict(json.loads(embedded), str(path))
-    except (yaml.YAMLError, json.JSONDecodeError) as error:
-        raise PolicyContractError(
-            f"cannot read the declaration of {path}: {' '.join(str(error).split())}"
-        ) from error
+            return PolicyContract.from_dict(parse_json(embedded, str(path)), str(path), **implied)
+    except PolicyContractError:
+        raise
+    except ConfigError as error:
+        raise PolicyContractError(f"cannot read the declaration of {path}: {error}") from error
     raise PolicyContractError(
         f"{path} says nothing about its colours, range and unit; write {beside.name} beside it (see docs/policies.md)"
     )

@@ -2,52 +2,105 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import zipfile
-from collections.abc import Callable
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils._pytree import tree_leaves
 
+from advnerf_core.inputs import InputFiles
 from advnerf_core.policies.contract import PolicyContract, PolicyContractError, declaration_beside
 from advnerf_core.policies.onnx_policy import example_inputs
+from advnerf_core.policies.tensors import UINT8, TensorInfo, Tensors, chosen_tensors
 
 METADATA_FILE = "advnerf_policy.json"
 _LARGEST_BATCH = 65536
 
 
-def load_program(path: Path) -> tuple[Callable[..., Tensor], PolicyContract, str]:
+class ProgramNetwork:
+    """An exported program as a function of tensors.
+
+    Args:
+        program: What ``torch.export.load`` returned.
+        tensors: Its inputs and outputs, and what each is used for.
+    """
+
+    training = False
+
+    def __init__(self, program: Any, tensors: Tensors) -> None:
+        self.tensors = tensors
+        self._module = program.module()
+        self._dtypes = {each.name: getattr(torch, each.kind) for each in tensors.inputs}
+        self._steering = tensors.outputs.index(tensors.steering)
+        for parameter in self._module.parameters():
+            parameter.requires_grad_(False)
+
+    def __call__(self, images: Tensor, goals: Tensor | None = None) -> Tensor:
+        """Raw output of the program, in the type of the images."""
+        given = {self.tensors.image.name: images}
+        if self.tensors.goal is not None and goals is not None:
+            given[self.tensors.goal.name] = goals
+        arguments = [_as_dtype(given[name], dtype) for name, dtype in self._dtypes.items()]
+        try:
+            output: Tensor = tree_leaves(self._module(*arguments))[self._steering]
+        except (RuntimeError, AssertionError) as error:  # the program's own checks of sizes
+            reason = " ".join(str(error).split())
+            raise PolicyContractError(
+                f"expected the program to take {[list(each.shape) for each in arguments]}, but it wants "
+                f"{', '.join(map(str, self.tensors.inputs))}; correct size and layout in the declaration ({reason:.120})"
+            ) from error
+        return output.to(images.dtype)
+
+
+def load_program(path: Path) -> tuple[ProgramNetwork, PolicyContract, str]:
     """Network, declaration and hash of an exported program.
 
     Raises:
-        PolicyContractError: It is missing, no exported program, carries pickled objects, or has no declaration.
+        PolicyContractError: It is missing, no exported program, carries pickled objects, has no declaration, or one that does not fit.
     """
-    content = _checked_content(path)
+    files = _checked_file(path)
     extra = {METADATA_FILE: ""}
     try:
-        program = torch.export.load(path, extra_files=extra)
-        module = program.module()
+        program = torch.export.load(BytesIO(files.content), extra_files=extra)
+        inputs, outputs = _tensors(program)
     except Exception as error:  # a damaged archive ends in any of a dozen exceptions
         reason = " ".join(str(error).split())
         raise PolicyContractError(
             f"expected an exported program in {path}, got {reason:.200}; export it again"
         ) from error
-    contract = declaration_beside(path, _text(extra[METADATA_FILE]))
+    implied = {"value_max": 255.0} if any(each.kind == UINT8 for each in inputs) else {}
+    contract = declaration_beside(path, _text(extra[METADATA_FILE]), **implied)
     if not contract.stateless:
         raise PolicyContractError(f"expected a stateless policy in {path}, got one declared otherwise")
-    for parameter in module.parameters():
-        parameter.requires_grad_(False)
+    tensors = chosen_tensors(inputs, outputs, contract, path)
+    if tensors.image.kind == UINT8:
+        contract = replace(contract, differentiable=False)  # no gradient passes through whole numbers
+    network = ProgramNetwork(program, tensors)
+    return network, contract, files.sha256(contract.to_json())
 
-    def network(images: Tensor, goals: Tensor | None = None) -> Tensor:
-        output: Tensor = module(images) if goals is None else module(images, goals)
-        return output
 
-    return network, contract, hashlib.sha256(content + contract.to_json().encode()).hexdigest()
+def _as_dtype(given: Tensor, dtype: torch.dtype) -> Tensor:
+    return (given.round().clamp(0, 255) if dtype == torch.uint8 else given).to(dtype)
+
+
+def _tensors(program: Any) -> tuple[list[TensorInfo], list[TensorInfo]]:
+    """Inputs and outputs of a program."""
+    nodes, signature = {node.name: node for node in program.graph.nodes}, program.graph_signature
+
+    def info(name: Any) -> TensorInfo:
+        value = nodes[name].meta["val"] if name in nodes else None
+        if not isinstance(value, Tensor):
+            return TensorInfo(str(name), None, type(value).__name__)
+        shape = tuple(int(size) if isinstance(size, int) else str(size) for size in value.shape)
+        return TensorInfo(name, shape, str(value.dtype).removeprefix("torch."))
+
+    return [info(name) for name in signature.user_inputs], [info(name) for name in signature.user_outputs]
 
 
 def export_program(network: Any, contract: PolicyContract, path: Path) -> None:
@@ -74,14 +127,15 @@ def export_program(network: Any, contract: PolicyContract, path: Path) -> None:
         partial.unlink(missing_ok=True)
 
 
-def _checked_content(path: Path) -> bytes:
-    """The file's bytes, after a look for pickled objects: torch would unpickle them, which runs what a stranger wrote."""
+def _checked_file(path: Path) -> InputFiles:
+    """The file's content, after a look for pickled objects: torch would unpickle them, which runs what a stranger wrote."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        files = InputFiles(path)
+        with zipfile.ZipFile(BytesIO(files.content)) as archive:
             for name in archive.namelist():
                 if problem := _unsafe(name, archive.read(name)):
                     raise PolicyContractError(f"{path} carries {problem}, which can run code: refused")
-        return path.read_bytes()
+        return files
     except (OSError, zipfile.BadZipFile, ValueError, AttributeError) as error:
         if isinstance(error, PolicyContractError):
             raise

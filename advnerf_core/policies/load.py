@@ -12,13 +12,17 @@ import os
 import re
 import sys
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, Protocol
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
+from advnerf_core.code_files import module_sha256
 from advnerf_core.policies.contract import PolicyContract, PolicyContractError
 from advnerf_core.policies.view import PolicyView
+from advnerf_core.run_module import search_working_folder_last
 
 if TYPE_CHECKING:
     from advnerf_core.policies.adapter import AdaptedPolicy
@@ -26,6 +30,7 @@ if TYPE_CHECKING:
 
 _FACTORY = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 _SUFFIXES = (".safetensors", ".onnx", ".pt2")
+_CODE_OF_MODULES: WeakKeyDictionary[ModuleType, str] = WeakKeyDictionary()
 
 
 def is_factory(spec: str | os.PathLike[str]) -> bool:
@@ -54,7 +59,8 @@ def load_any_policy(spec: str | os.PathLike[str], expected_sha256: str | None = 
             f"expected the policy {expected_sha256}, got {sha256} from {spec}; correct the hash"
         )
     policy.requires_grad_(False)
-    return LoadedPolicy(policy, policy.contract.view, {"origin": str(spec)}, sha256)
+    known = {"origin": str(spec), **({"not_fixed": policy.identity} if policy.identity else {})}
+    return LoadedPolicy(policy, policy.contract.view, known, sha256)
 
 
 def load_adapted(spec: str | os.PathLike[str]) -> tuple[AdaptedPolicy, str]:
@@ -90,10 +96,9 @@ def _from_factory(spec: str) -> tuple[AdaptedPolicy, str]:
     from advnerf_core.policies.adapter import AdaptedPolicy
 
     module_name, _, name = spec.partition(":")
-    if str(Path.cwd()) not in sys.path:
-        sys.path.insert(0, str(Path.cwd()))  # as `python -m` does; the command line's own folder is elsewhere
+    search_working_folder_last()
     try:
-        module = importlib.import_module(module_name)
+        module, code = _imported(module_name)
         factory = getattr(module, name)
     except (ImportError, AttributeError) as error:
         raise PolicyContractError(
@@ -109,18 +114,28 @@ def _from_factory(spec: str) -> tuple[AdaptedPolicy, str]:
         raise PolicyContractError(
             f"expected {spec}() to return adapt(network, PolicyContract(...)), got {type(policy).__name__}"
         )
-    return policy, _factory_sha256(spec, policy, module)
+    return policy, _factory_sha256(spec, policy, code)
 
 
-def _factory_sha256(spec: str, policy: AdaptedPolicy, module: Any) -> str:
-    """Names weights, declaration and the module's source; what that module imports is not looked at."""
-    digest = hashlib.sha256(f"{spec}\0{policy.contract.to_json()}".encode())
-    if source := getattr(module, "__file__", None):
-        digest.update(Path(source).read_bytes())
+def _imported(name: str) -> tuple[ModuleType, str]:
+    """A module, and the hash of its code when it was first imported: a file that is edited later changes nothing in this process."""
+    if (module := sys.modules.get(name)) is None or module not in _CODE_OF_MODULES:
+        importlib.invalidate_caches()
+        code = module_sha256(name)
+        module = importlib.import_module(name)
+        _CODE_OF_MODULES[module] = code
+    return module, _CODE_OF_MODULES[module]
+
+
+def _factory_sha256(spec: str, policy: AdaptedPolicy, code: str) -> str:
+    """Names weights, declaration and code; of a program that is asked also its identity and its answers to fixed pictures."""
+    digest = hashlib.sha256(f"{spec}\0{policy.contract.to_json()}\0{code}".encode())
     for name, tensor in sorted(policy.state_dict().items()):
         array = tensor.detach().cpu().contiguous().numpy()
         digest.update(f"{name}\0{array.dtype.str}\0{array.shape}\0".encode())
         digest.update(array.tobytes())
+    if policy.identity:
+        digest.update(f"{policy.identity}\0{policy.answers_mrad()}".encode())
     return digest.hexdigest()
 
 

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-import hashlib
 import warnings
+from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.files import write_atomically
+from advnerf_core.inputs import InputFileError, InputFiles
 from advnerf_core.policies.contract import (
     ONNX_METADATA_KEY,
     PolicyContract,
     PolicyContractError,
     declaration_beside,
 )
+from advnerf_core.policies.tensors import UINT8, TensorInfo, Tensors, chosen_tensors
 
-_TYPES = {"tensor(float)": np.float32, "tensor(double)": np.float64, "tensor(float16)": np.float16}
+_KINDS = {"tensor(float)": "float32", "tensor(double)": "float64"}
 _OPSET = 17
 
 
@@ -32,7 +35,8 @@ class OnnxNetwork:
 
     Attributes:
         contract: Its declaration, with ``differentiable`` False whatever it says.
-        sha256: Hash of file and declaration.
+        sha256: Hash of the file, of files that it keeps weights in, and of the declaration.
+        tensors: Its inputs and outputs, and what each is used for.
     """
 
     training = False
@@ -40,29 +44,28 @@ class OnnxNetwork:
     def __init__(self, path: Path, threads: int = 1) -> None:
         import onnxruntime
 
-        content = _read(path)
+        files = read_onnx(path)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = threads
         options.log_severity_level = 3
         try:
-            self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+            self._session = _session(files, options)
         except Exception as error:  # its exceptions share no base of their own
             reason = " ".join(str(error).split())
             raise PolicyContractError(
                 f"expected an ONNX model in {path}, got {reason:.200}; export it again"
             ) from error
-        declared = declaration_beside(
-            path, self._session.get_modelmeta().custom_metadata_map.get(ONNX_METADATA_KEY)
+        inputs, outputs = (
+            [_info(each) for each in some]
+            for some in (self._session.get_inputs(), self._session.get_outputs())
         )
-        self.contract = _black_box(declared, path)
-        self.sha256 = hashlib.sha256(content + self.contract.to_json().encode()).hexdigest()
-        self._inputs = self._session.get_inputs()
-        wanted = 1 + (self.contract.goal_size > 0)
-        if len(self._inputs) != wanted:
-            raise PolicyContractError(
-                f"expected {wanted} inputs (images, goals) in {path}, got {self._inputs_text()}"
-            )
-        self._one_by_one = self._inputs[0].shape[:1] == [1]
+        embedded = self._session.get_modelmeta().custom_metadata_map.get(ONNX_METADATA_KEY)
+        # Elements of eight bits leave one range.
+        implied = {"value_max": 255.0} if any(each.kind == UINT8 for each in inputs) else {}
+        self.contract = _black_box(declaration_beside(path, embedded, **implied), path)
+        self.sha256 = files.sha256(self.contract.to_json())
+        self.tensors: Tensors = chosen_tensors(inputs, outputs, self.contract, path)
+        self._one_by_one = (self.tensors.image.shape or ())[:1] == (1,)
 
     def __call__(self, images: NDArray[Any], goals: NDArray[Any] | None = None) -> NDArray[Any]:
         """Raw output of the network for its own kind of images ``[B, ...]``."""
@@ -79,20 +82,16 @@ class OnnxNetwork:
         return np.asarray(self.contract.to_steering_rad(raw, len(images)))
 
     def _run(self, feeds: list[NDArray[Any]]) -> NDArray[Any]:
-        arrays = {
-            each.name: _as_type(feed, each.type) for each, feed in zip(self._inputs, feeds, strict=True)
-        }
+        wanted = [each for each in (self.tensors.image, self.tensors.goal) if each is not None]
+        arrays = {each.name: _as_kind(feed, each.kind) for each, feed in zip(wanted, feeds, strict=True)}
         try:
-            return np.asarray(self._session.run(None, arrays)[0])
+            return np.asarray(self._session.run([self.tensors.steering.name], arrays)[0])
         except Exception as error:
             reason = " ".join(str(error).split())
             raise PolicyContractError(
                 f"expected the ONNX model to take {[list(array.shape) for array in arrays.values()]}, but it wants "
-                f"{self._inputs_text()}; correct size and layout in the declaration ({reason:.120})"
+                f"{', '.join(map(str, wanted))}; correct size and layout in the declaration ({reason:.120})"
             ) from error
-
-    def _inputs_text(self) -> str:
-        return ", ".join(f"{each.name} {each.shape} {each.type}" for each in self._inputs)
 
 
 class TensorNetwork:
@@ -102,6 +101,7 @@ class TensorNetwork:
 
     def __init__(self, network: OnnxNetwork) -> None:
         self._network = network
+        self.tensors = network.tensors
 
     def __call__(self, images: Any, goals: Any = None) -> Any:
         """Raw output of the network for tensors."""
@@ -172,16 +172,77 @@ def _black_box(contract: PolicyContract, path: Path) -> PolicyContract:
     return PolicyContract(**{**vars(contract), "differentiable": False})
 
 
-def _read(path: Path) -> bytes:
+def read_onnx(path: Path) -> InputFiles:
+    """An ONNX file and the files that it keeps weights in, which must lie beside it.
+
+    Raises:
+        PolicyContractError: One of them is missing, or lies elsewhere.
+    """
     try:
-        return path.read_bytes()
+        files = InputFiles(path)
+        for name in _external_files(files.content):
+            files.read(name)
     except OSError as error:
         raise PolicyContractError(f"expected an ONNX policy at {path}, got: {error.strerror}") from error
+    except InputFileError as error:
+        raise PolicyContractError(str(error)) from error
+    return files
 
 
-def _as_type(array: NDArray[Any], kind: str) -> NDArray[Any]:
-    if kind == "tensor(uint8)":
-        return np.clip(np.rint(array), 0, 255).astype(np.uint8)
-    if kind not in _TYPES:
-        raise PolicyContractError(f"expected an input of {', '.join(_TYPES)} or tensor(uint8), got {kind}")
-    return np.ascontiguousarray(array, dtype=_TYPES[kind])
+def _external_files(content: bytes) -> list[str]:
+    """Names of the files in which tensors of an ONNX model lie."""
+    if b"location" not in content:  # the key that names them; most models need no second reading
+        return []
+    import onnx
+    from google.protobuf.message import DecodeError
+
+    try:
+        model = onnx.load_model_from_string(content)
+    except DecodeError:
+        return []  # ONNX Runtime says what is wrong with it
+    return sorted(
+        {
+            entry.value
+            for tensor in _tensors(model)
+            for entry in tensor.external_data
+            if entry.key == "location"
+        }
+    )
+
+
+def _tensors(message: Any) -> Iterator[Any]:
+    """All tensors in a model: weights, constants of nodes, and those of subgraphs and functions."""
+    if message.DESCRIPTOR.name == "TensorProto":
+        yield message
+        return
+    for field, value in message.ListFields():
+        if field.message_type is not None:
+            for each in value if hasattr(value, "__len__") else [value]:
+                yield from _tensors(each)
+
+
+def _session(files: InputFiles, options: Any) -> Any:
+    """An inference session of what was read; the files themselves are not opened again."""
+    import onnxruntime
+
+    providers = ["CPUExecutionProvider"]
+    if not files.others:
+        return onnxruntime.InferenceSession(files.content, options, providers=providers)
+    with TemporaryDirectory(prefix="advnerf_onnx_") as folder:
+        model = files.path.resolve().name
+        for name, content in {**files.others, model: files.content}.items():
+            copy = Path(folder, name)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_bytes(content)
+        return onnxruntime.InferenceSession(Path(folder, model), options, providers=providers)
+
+
+def _info(tensor: Any) -> TensorInfo:
+    kind = tensor.type.removeprefix("tensor(").removesuffix(")")
+    return TensorInfo(tensor.name, tuple(tensor.shape), _KINDS.get(tensor.type, kind))
+
+
+def _as_kind(array: NDArray[Any], kind: str) -> NDArray[Any]:
+    if kind == UINT8:
+        array = np.clip(np.rint(array), 0, 255)
+    return np.ascontiguousarray(array, dtype=kind)

@@ -18,12 +18,13 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import save
 from torch import Tensor, nn
 
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import with_sorted_header, write_atomically
+from advnerf_core.places import open_tensors
 from advnerf_core.policies.view import PolicyView
 
 IMAGE_HEIGHT, IMAGE_WIDTH = 66, 200
@@ -195,7 +196,7 @@ def load_policy(path: str | os.PathLike[str], expected_sha256: str | None = None
 
 def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
     try:
-        with safe_open(path, framework="pt") as file:
+        with open_tensors(path, "pt") as file:
             header = dict(file.metadata() or {})
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
     except FileNotFoundError as error:

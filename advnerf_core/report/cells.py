@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import ConfigDict, Field, ValidationError, model_validator
 
+from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.report.evidence.kept import KeptDrive
 from advnerf_core.report.reference import Domain
+from advnerf_core.strict import StrictModel
 
 Metres = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 
@@ -19,7 +20,7 @@ class CellError(AdvnerfError, ValueError):
     """A cell's file is not what a cell's file is."""
 
 
-class Drives(BaseModel):
+class Drives(StrictModel):
     """The drives of one cell in one domain, one entry per start pose.
 
     Attributes:
@@ -28,7 +29,7 @@ class Drives(BaseModel):
         none_total_cte_m: Total CTE of each start without attack, in the same domain [m].
     """
 
-    model_config = ConfigDict(extra="allow", frozen=True)
+    model_config = ConfigDict(extra="allow")
 
     total_cte_m: tuple[Metres, ...] = Field(min_length=1)
     off_track: tuple[bool, ...]
@@ -49,7 +50,7 @@ class Drives(BaseModel):
         return sum(self.total_cte_m) / len(self.total_cte_m)
 
 
-class CellResult(BaseModel):
+class CellResult(StrictModel):
     """What a finished cell found. The drives of both domains begin at the same starts in the same order; one domain may have only the first of them.
 
     Attributes:
@@ -66,13 +67,15 @@ class CellResult(BaseModel):
         date: When, ISO.
         surrogate: Drives in the learned scene; of an attack over the deployment scene's own frames (meshes) those of the ideal car there.
         deployed: Drives where it is deployed; None as long as they were not driven.
+        not_driven_live: Why live nodes could not drive it, because load or a fault of the stack spoiled all tries; empty otherwise. Such
+            a cell is never evidence.
         registration: Digest of the registration that the cell was run under; empty if there was none.
         policy_sha256: Content hash of the victim; empty in cells from before it was kept.
         kept: The drives of each domain, for whoever computes the numbers again; empty in cells from before they were kept.
         extra: Anything else, such as the file of a clip.
     """
 
-    model_config = ConfigDict(extra="allow", frozen=True)
+    model_config = ConfigDict(extra="allow")
 
     scenario: str = Field(min_length=1)
     victim: str = Field(min_length=1)
@@ -87,10 +90,17 @@ class CellResult(BaseModel):
     date: str
     surrogate: Drives
     deployed: Drives | None = None
+    not_driven_live: str = ""
     registration: str = ""
     policy_sha256: str = ""
     kept: dict[Domain, tuple[KeptDrive, ...]] = Field(default_factory=dict)
     extra: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _driven_or_not(self) -> CellResult:
+        if self.not_driven_live and (self.deployed is not None or "deployed" in self.kept):
+            raise ValueError("expected no deployed drives in a cell that was not driven live, got some")
+        return self
 
     @property
     def name(self) -> str:
@@ -128,8 +138,8 @@ def read_cell(path: Path) -> CellResult:
         CellError: It is not there, not JSON, or not a cell's.
     """
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        data = read_json(path)
+    except (OSError, ValueError) as error:
         raise CellError(f"{path}: cannot be read: {error}; remove it to run the cell again") from None
     return cell_from(data, str(path))
 

@@ -32,6 +32,7 @@ __all__ = [
     "Hop",
     "Laps",
     "Latency",
+    "LiveTries",
     "LossCurve",
     "Manifest",
     "MemoryRow",
@@ -255,6 +256,30 @@ class Laps(Record):
 
 
 @dataclass(frozen=True, eq=False)
+class LiveTries(Record):
+    """How often the live node graph drove one arm.
+
+    Attributes:
+        condition: What the object showed.
+        victim: Which policy.
+        seed: Seed of the attack.
+        driven: Whether all drives counted in the end. Otherwise the arm is "not driven live" and has no deployed runs.
+        spoiled: Reasons of the tries that load or a fault of the stack spoiled, over all starts.
+    """
+
+    condition: str
+    victim: Victim
+    seed: int
+    driven: bool
+    spoiled: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.check_named("condition")
+        self.check_choice("victim", VICTIMS)
+
+
+@dataclass(frozen=True, eq=False)
 class Manifest(Record):
     """How to make this report again.
 
@@ -296,6 +321,7 @@ class ReportData(Record):
     timings: tuple[StageTiming, ...] = ()
     laps: Laps | None = None
     limits: tuple[LiveLimit, ...] = ()
+    live_tries: tuple[LiveTries, ...] = ()
     not_measured: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

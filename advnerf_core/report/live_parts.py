@@ -77,6 +77,7 @@ def _fragments(data: ReportData) -> Any:
             "key_figures": key_figures(data),
             "targets": targets_table(evaluate_targets(data)).html(),
             "hops": tables.hop_table(data).html(),
+            "live_tries": tables.live_tries_table(data).html(),
             "memory_rows": tables.memory_table(data).html(),
             "timings": tables.timing_table(data).html(),
             "settings": _settings(data),

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from advnerf_core.strict import StrictModel
 
 Domain = Literal["surrogate", "deployed"]
 Measure = Literal["ratio", "spread", "off_track", "off_track_share"]
@@ -30,11 +32,7 @@ _OF_DRIVES = ("ratio", "mean_abs_cte_m", "off_track", "off_track_share")
 Total = Annotated[tuple[float, ...], Field(min_length=1, max_length=2)]
 
 
-class _Data(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Limit(_Data):
+class Limit(StrictModel):
     """What one line of a table must show.
 
     Attributes:
@@ -65,7 +63,7 @@ class Limit(_Data):
         return self
 
 
-class LiveLimit(_Data):
+class LiveLimit(StrictModel):
     """What a live experiment must show.
 
     Attributes:
@@ -99,7 +97,7 @@ class LiveLimit(_Data):
         return self
 
 
-class Reference(_Data):
+class Reference(StrictModel):
     """What tables and reports are held against.
 
     Attributes:

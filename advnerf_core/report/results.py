@@ -9,6 +9,8 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
+from advnerf_core.documents import read_json
+from advnerf_core.errors import ConfigError
 from advnerf_core.report.data import ReportData
 from advnerf_core.report.tables import transfer_rows
 from advnerf_core.report.targets import evaluate_targets
@@ -38,8 +40,8 @@ def write_results(data: ReportData, path: Path) -> Path:
 def read_results(path: Path) -> ReportData:
     """Read the records of a `results.json`; images come back as None."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as e:
+        content = read_json(path)
+    except ConfigError as e:
         raise ValueError(f"expected JSON in {path}, got: {e}; run the report stage again") from e
     schema = content.get("schema") if isinstance(content, dict) else None
     if schema != SCHEMA:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from advnerf_core.driving.metrics import drives, mean_cte_limit_m
+from advnerf_core.report.conditions import style_of
 from advnerf_core.report.data import Domain, ReportData
 from advnerf_core.report.tables import TransferRow, find_row, number, transfer_rows
 from advnerf_core.report.targets import Target, evaluate_targets
@@ -43,7 +44,20 @@ def key_figures(data: ReportData) -> tuple[KeyFigure, ...]:
 def opening(data: ReportData) -> tuple[str, ...]:
     """The opening paragraphs as plain text: what was done, what it did, what that is worth."""
     story = f"{_what_was_done(data)} {_what_it_did(data)}"
-    return tuple(p for p in (story, verdict(evaluate_targets(data)), _caveats(data)) if p)
+    return tuple(p for p in (not_driven(data), story, verdict(evaluate_targets(data)), _caveats(data)) if p)
+
+
+def not_driven(data: ReportData) -> str:
+    """Which arms were not driven live, and what that means; empty if all were."""
+    missing = [t for t in data.live_tries if not t.driven]
+    if not missing:
+        return ""
+    arms = ", ".join(f"{style_of(t.condition).title} ({t.victim}, seed {t.seed})" for t in missing)
+    return (
+        f"NOT DRIVEN LIVE: {arms}. Load or a fault of the stack spoiled every try, at last: {missing[-1].spoiled[-1]}. For these arms the "
+        "report has only the synchronous drives in the learned scene, which are no evidence of transfer. On a machine without other load, "
+        "give the command again with --retry."
+    )
 
 
 def _what_was_done(data: ReportData) -> str:

@@ -14,7 +14,7 @@ import rich.table
 from markupsafe import Markup
 from rich.text import Text
 
-from advnerf_core.report.conditions import NONE, order_of
+from advnerf_core.report.conditions import NONE, order_of, style_of
 from advnerf_core.report.data import DOMAINS, VICTIMS, Domain, ReportData, Run, Victim
 
 
@@ -195,6 +195,23 @@ def hop_table(data: ReportData) -> Table:
     )
     columns = ("hop", "frames", "p50 [ms]", "p95 [ms]", "p99 [ms]", "max [ms]")
     return Table("Live latency", columns, cells, (False, *[True] * 5), (len(cells) - 1,))
+
+
+def live_tries_table(data: ReportData) -> Table:
+    """Tries of the live drives of each arm, with the reasons of those that did not count."""
+    cells = tuple(
+        (
+            style_of(t.condition).title,
+            t.victim,
+            str(t.seed),
+            "yes" if t.driven else "NOT DRIVEN LIVE",
+            str(len(t.spoiled)),
+            "; ".join(t.spoiled),
+        )
+        for t in data.live_tries
+    )
+    columns = ("arm", "policy", "seed", "driven live", "spoiled tries", "why they do not count")
+    return Table("Live drives", columns, cells, (False, False, True, False, True, False))
 
 
 def memory_table(data: ReportData) -> Table:

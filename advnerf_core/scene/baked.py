@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.numpy import save as save_arrays
 from torch import Tensor
 
 from advnerf_core.files import with_sorted_header, write_atomically
 from advnerf_core.geometry import Array, Pinhole
 from advnerf_core.parallel import Work, run_slots, slot_bounds, thread_count
+from advnerf_core.places import open_tensors
 from advnerf_core.render.march import MarchConfig
 from advnerf_core.render.occupancy import Leaps, leap_distances
 from advnerf_core.render.rays import intrinsics_row, poses_in_box
@@ -179,7 +180,7 @@ class BakedScene:
             SceneFileError: The file is missing, damaged, or something else.
         """
         try:
-            with safe_open(str(path), framework="numpy") as file:
+            with open_tensors(path, "numpy") as file:
                 header = file.metadata() or {}
                 if header.get("format") != FORMAT:
                     raise SceneFileError(

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import save as save_tensors
 from torch import Tensor, nn
 
@@ -24,6 +24,7 @@ from advnerf_core.errors import AdvnerfError
 from advnerf_core.fields.hash_grid import HashGrid, HashGridConfig
 from advnerf_core.fields.spherical_harmonics import spherical_harmonics
 from advnerf_core.files import with_sorted_header, write_atomically
+from advnerf_core.places import open_tensors
 from advnerf_core.render.contraction import contract
 from advnerf_core.render.volume_kernels import MAX_LOG_DENSITY
 
@@ -225,7 +226,7 @@ def load_scene(path: str | Path) -> tuple[SceneField, NDArray[np.bool_], dict[st
     """
     path = Path(path)
     try:
-        with safe_open(str(path), framework="pt") as file:
+        with open_tensors(path, "pt") as file:
             header = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
     except (OSError, SafetensorError) as error:

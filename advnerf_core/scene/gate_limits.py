@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from advnerf_core.strict import StrictModel
 
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 
-class GateLimits(BaseModel):
+class GateLimits(StrictModel):
     """What a surrogate must reach; the first two follow the targets of the room's experiment."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     psnr_db: Positive = Field(default=25.0, description="Least mean PSNR at the policy's size [dB].")
     ssim: Annotated[float, Field(ge=0.0, le=1.0)] = Field(

@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.numpy import save as save_arrays
 
 from advnerf_core.data.dataset import ImageSet
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
+from advnerf_core.places import open_tensors
 from advnerf_core.render.march import Marcher, Samples
 from advnerf_core.render.occupancy import Leaps, OccupancyGrid, leap_distances, refine_occupied
 from advnerf_core.render.rays import intrinsics_row, pixel_rays, poses_in_box
@@ -187,7 +188,7 @@ class Trainer:
             CheckpointError: It cannot be read, or belongs to other images or settings.
         """
         try:
-            with safe_open(str(path), framework="numpy") as file:
+            with open_tensors(path, "numpy") as file:
                 state: dict[str, Any] = json.loads((file.metadata() or {})["state"])
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
         except (OSError, SafetensorError, KeyError, ValueError) as error:

@@ -14,9 +14,10 @@ from typing import Annotated
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import BeforeValidator, Field
 
 from advnerf_core.geometry import Array, Pinhole
+from advnerf_core.strict import StrictModel
 
 Rgb = NDArray[np.uint8]
 _Linear = NDArray[np.float32]
@@ -31,7 +32,7 @@ _MOMENTS = 5
 _SAMPLES = 16
 
 
-class CameraEffects(BaseModel):
+class CameraEffects(StrictModel):
     """A camera's imperfections; without any, pictures pass through unchanged.
 
     Attributes:
@@ -47,8 +48,6 @@ class CameraEffects(BaseModel):
         lost: Share of frames that never arrive.
         seed: Of all draws.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     exposure_s: _NotNegative = 0.0
     readout_s: _NotNegative = 0.0

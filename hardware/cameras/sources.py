@@ -6,8 +6,9 @@ from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from advnerf_core.strict import StrictModel
 from hardware.cameras.file import FileCamera
 from hardware.cameras.interface import Camera
 from hardware.cameras.oak import OakCamera, OakSettings
@@ -25,15 +26,13 @@ from hardware.cameras.zed.exposure import ZedExposure, exposure_lines
 Positive = Annotated[int, Field(gt=0)]
 
 
-class _Source(BaseModel, ABC):
+class _Source(StrictModel, ABC):
     """Settings that all sources have.
 
     Attributes:
         stall_s: Time without a frame after which the device is reopened [s].
         repeats: Number of identical images in a row that count as a stall; 0 for never.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     stall_s: float = Field(default=1.0, gt=0.0)
     repeats: int = Field(default=0, ge=0)
@@ -63,7 +62,7 @@ class _ControlledSource(_Source):
 
     white_balance_k: int | None = None
     power_line_hz: Literal[0, 50, 60] | None = None
-    controls: dict[str, int] = {}
+    controls: dict[str, int] = Field(default_factory=dict)
 
     def _controls(self, exposure_us: float | None = None, gain: int | None = None) -> Controls:
         return Controls(exposure_us, gain, self.white_balance_k, self.power_line_hz, self.controls)

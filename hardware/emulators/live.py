@@ -14,9 +14,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from advnerf_core.geometry import Array, VehicleState
+from advnerf_core.strict import StrictModel
 from hardware.cameras.effects import PRESETS, Effects, ImperfectCamera, Rgb
 from hardware.cameras.interface import Frame
 from hardware.emulators.frame_server import FrameServer
@@ -37,7 +38,7 @@ _HELD_UP_S = 0.2
 CAMERA_FAULTS = ("silent", "repeated")
 
 
-class LiveLabConfig(BaseModel):
+class LiveLabConfig(StrictModel):
     """The live twin.
 
     Attributes:
@@ -48,8 +49,6 @@ class LiveLabConfig(BaseModel):
         start_pose: Where the car stands at first: x [m], y [m], yaw [rad].
         camera_effects: What the camera adds to an ideal picture: ``ideal``, ``webcam``, ``zed``, or the effects themselves.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     lab: LabConfig = LabConfig()
     vesc: VescEmulatorConfig = VescEmulatorConfig()

@@ -11,8 +11,9 @@ import math
 from dataclasses import dataclass
 from typing import Protocol
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from advnerf_core.strict import StrictModel
 from hardware.motor.vesc_codec import Command, CommandId, FrameDecoder, decode_command, encode_frame
 from hardware.motor.vesc_replies import FirmwareVersion, Values, encode_firmware_version, encode_values
 from hardware.motor.vesc_settings import AppConfiguration, TimeoutSettings, decode_app_configuration
@@ -26,7 +27,7 @@ _RESETS_TIMEOUT = {
 }  # fmt: skip
 
 
-class VescEmulatorConfig(BaseModel):
+class VescEmulatorConfig(StrictModel):
     """Settings that a real VESC keeps in its application and motor configuration.
 
     Attributes:
@@ -42,8 +43,6 @@ class VescEmulatorConfig(BaseModel):
         supply_v: Battery voltage it reports [V].
         readable_settings: Whether it answers GET_APPCONF.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     timeout_ms: float = Field(default=1000.0, ge=0.0)
     timeout_brake_current_a: float = Field(default=0.0, ge=0.0)

@@ -13,9 +13,10 @@ import threading
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from advnerf_core.geometry import Array, make_transform, rotation_x, rotation_y, rotation_z
+from advnerf_core.strict import StrictModel
 from hardware.emulators.pacing import Pacer
 from hardware.mocap.vicon_codec import ObjectPose, encode_blocks, object_pose
 
@@ -23,7 +24,7 @@ OCCLUSION_FORMS = ("missing", "zeros", "nan", "frozen")
 _NOWHERE_ELSE = np.eye(4)
 
 
-class ViconEmulatorConfig(BaseModel):
+class ViconEmulatorConfig(StrictModel):
     """The twin's motion capture system.
 
     Attributes:
@@ -39,8 +40,6 @@ class ViconEmulatorConfig(BaseModel):
         duplication: Probability that it comes twice.
         reordering: Probability that it comes only after its successor.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     host: str = "127.0.0.1"
     port: int = Field(default=51001, ge=1, le=65535)

@@ -5,12 +5,13 @@
 
 from __future__ import annotations
 
-import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from advnerf_core.documents import read_json
 from advnerf_core.files import sha256_of
+from advnerf_core.places import user_place
 from hardware.worlds.remote import SERVERS
 from hardware.worlds.remote_errors import WorldNotInstalled
 
@@ -51,10 +52,8 @@ class Environment:
     @property
     def folder(self) -> Path:
         """Where it is installed: in ``$ADVNERF_WORLDS``, or among this user's data."""
-        data = (
-            Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share") / "advnerf" / "worlds"
-        )
-        return Path(os.environ.get(FOLDER_VARIABLE) or data) / self.name
+        chosen = os.environ.get(FOLDER_VARIABLE)
+        return (Path(chosen) if chosen else user_place("data") / "worlds") / self.name
 
     @property
     def interpreter(self) -> Path:
@@ -67,7 +66,7 @@ class Environment:
         made = self.folder / MADE
         if not made.exists() or not self.interpreter.exists():
             return "not installed"
-        fits = json.loads(made.read_text(encoding="utf-8")).get("lock_sha256") == sha256_of(self.lock)
+        fits = read_json(made).get("lock_sha256") == sha256_of(self.lock)
         return "installed" if fits else "installed from another lock file"
 
     def python(self) -> Path:

@@ -16,9 +16,10 @@ from typing import Any, Literal, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from advnerf_core.geometry import Array, Pinhole, VehicleState, planar_pose
+from advnerf_core.strict import StrictModel
 from hardware.worlds.remote import SERVERS, Answer, RemoteServer
 from hardware.worlds.remote_answers import (
     depth_in,
@@ -35,15 +36,13 @@ _World = TypeVar("_World", bound="RemoteWorld")
 _Arrays = Mapping[str, NDArray[Any]]
 
 
-class ServerDeadlines(BaseModel):
+class ServerDeadlines(StrictModel):
     """How long the process of a world may take; nothing that results depend on.
 
     Attributes:
         open_s: Opening the simulator: loading its models, compiling its shaders [s].
         call_s: Any other call [s].
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     open_s: float = Field(default=240.0, gt=0.0)
     call_s: float = Field(default=30.0, gt=0.0)

@@ -89,6 +89,11 @@ def messages_in_order(
         yield heappop(waiting)
 
 
+def time_spans(summary: Summary) -> list[tuple[int, int]]:
+    """Log times of the first and last message of each chunk, and of each run of messages outside chunks [ns since 1970]."""
+    return [(block.start_ns, block.end_ns) for block in _blocks(summary) if block.channels or block.end_ns]
+
+
 def _blocks(summary: Summary) -> list[_Block]:
     blocks = [
         _Block(

@@ -10,8 +10,7 @@ import re
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
 
-import yaml
-
+from advnerf_core.documents import read_yaml
 from nodes.runtime.errors import BagError
 
 METADATA_FILE = "metadata.yaml"
@@ -19,7 +18,6 @@ SUFFIXES = (".mcap", ".db3", ".bag")
 _NUMBERED = re.compile(r"(?P<name>.+)_(?P<number>\d{1,9})")
 # 83 parts take 15 kB. A foreign file may have any size.
 _MOST_METADATA_BYTES = 1 << 24
-_SafeLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def part_name(bag_name: str, number: int) -> str:
@@ -117,11 +115,10 @@ def _names_in(path: Path, mtime_ns: int, size_bytes: int) -> tuple[str, ...]:
             raise BagError(
                 f"{path}: expected at most {_MOST_METADATA_BYTES >> 20} MiB, got {size_bytes} bytes; {advice}"
             )
-        content = yaml.load(path.read_bytes(), Loader=_SafeLoader)
-        information = content["rosbag2_bagfile_information"]
+        information = read_yaml(path).data["rosbag2_bagfile_information"]
         # Old versions of rosbag2 wrote the folder before the name.
         names = tuple(PurePosixPath(name).name for name in information["relative_file_paths"])
-    except (OSError, yaml.YAMLError, ValueError, TypeError, KeyError, RecursionError) as error:
+    except (OSError, ValueError, TypeError, KeyError) as error:
         said = " ".join(str(error).split()) or type(error).__name__
         raise BagError(
             f"{path}: expected the metadata of a rosbag2 bag, got an unreadable file ({said:.120}); {advice}"

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+from nodes.bags.time_gaps import TimeGap
 from nodes.runtime.errors import MessageError
 
 PAUSE, RESUME, TOGGLE, STEP, RATE, STOP = "pause", "resume", "toggle", "step", "rate", "stop"
@@ -64,6 +66,13 @@ class Playhead:
     def jump(self, bag_ns: int, mono_ns: int) -> None:
         """Move to a time in the recording [ns since 1970]."""
         self._bag_ns, self._mono_ns = bag_ns, mono_ns
+
+    def skip(self, gaps: Sequence[TimeGap], mono_ns: int) -> None:
+        """Leave a gap of the recording at once."""
+        time_ns = self.time_ns(mono_ns)
+        for gap in gaps:
+            if not self.paused and gap.before_ns < time_ns < gap.after_ns:
+                self.jump(gap.after_ns, mono_ns)
 
     def pause(self, paused: bool, mono_ns: int) -> None:
         """Pause or resume."""

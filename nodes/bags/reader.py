@@ -13,7 +13,7 @@ from mcap.summary import Summary
 
 from advnerf_core.files import write_atomically
 from nodes.bags.check import diagnose
-from nodes.bags.chunks import messages_in_order, read_attachment_at, read_metadata_at
+from nodes.bags.chunks import messages_in_order, read_attachment_at, read_metadata_at, time_spans
 from nodes.bags.file import open_bag
 from nodes.bags.foreign import read_stored, stored_messages
 from nodes.bags.formats import Format, no_checksums, recognise
@@ -136,6 +136,16 @@ def read_info(bag: Path) -> BagInfo:
         next((part.metadata for part in parts if part.metadata), {}),
         next((part.unchecked for part in parts if part.unchecked), ""),
     )
+
+
+def message_spans(bag: Path) -> list[tuple[int, int]]:
+    """Spans of log time that cover all messages, from the index of the bag [ns since 1970]."""
+    spans: list[tuple[int, int]] = []
+    for part in _parts(bag):
+        if part.messages:
+            whole = [(part.start_ns, part.end_ns)]
+            spans += time_spans(_whole_file(part.path)[0]) if part.format is Format.MCAP else whole
+    return spans
 
 
 def read_attachment(bag: Path, name: str) -> bytes:

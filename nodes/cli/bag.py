@@ -37,6 +37,7 @@ def bag_info(
     from nodes.bags.check import diagnose
     from nodes.bags.parts import bag_parts
     from nodes.bags.reader import read_info
+    from nodes.bags.time_gaps import read_gaps, silence_s
 
     if not quick:
         for found in map(diagnose, bag_parts(bag)):
@@ -45,21 +46,22 @@ def bag_info(
                     print(f"{found.path}: {line}")
                 say_error(f"{found.path} is damaged; {found.lines[-1]}")
                 raise typer.Exit(_DAMAGED_EXIT)
-    info = read_info(bag)
+    info, gaps = read_info(bag), read_gaps(bag)
+    span_s = info.duration_s - silence_s(gaps)
     start = datetime.fromtimestamp(info.start_ns / 1e9).isoformat(" ", "milliseconds")
     files = f" in {len(info.parts)} files" if len(info.parts) > 1 else ""
     print(
-        f"{info.path}: {info.size_bytes / 1e6:.1f} MB{files}, {info.messages} messages in {info.duration_s:.2f} s from {start}"
+        f"{info.path}: {info.size_bytes / 1e6:.1f} MB{files}, {info.messages} messages in {span_s:.2f} s from {start}"
     )
+    for gap in gaps:
+        print(f"{gap}: the recorder's clock was set; replay, play and evaluate skip this time")
     for key, value in info.metadata.items():
         print(f"{key}: {value}")
     print(f"attachments: {', '.join(info.attachments) or 'none'}")
     print(checked_line(info, quick))
     rows = table("topic", "type", "messages", "rate", "lost")
     for topic in info.topics:
-        rate = (
-            f"{(topic.count - 1) / info.duration_s:.1f} Hz" if topic.count > 1 and info.duration_s > 0 else ""
-        )
+        rate = f"{(topic.count - 1) / span_s:.1f} Hz" if topic.count > 1 and span_s > 0 else ""
         rows.add_row(
             topic.name, topic.type, str(topic.count), rate, "?" if topic.lost is None else str(topic.lost)
         )

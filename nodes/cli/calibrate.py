@@ -331,10 +331,11 @@ def _transform(file: Path) -> Array:
     """Load a rigid transform ``[4, 4]`` from a text file."""
     import numpy as np
 
+    from advnerf_core.documents import read_text
     from calibration.schema import CalibrationError, require_rigid
 
     try:
-        rows = np.loadtxt(file)
+        rows = np.loadtxt(read_text(file).splitlines())
         if rows.shape != (4, 4):
             raise ValueError(f"expected four rows of four numbers, got {rows.shape}")
         require_rigid(tuple(map(tuple, rows.tolist())))

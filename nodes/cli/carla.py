@@ -167,8 +167,10 @@ def carla_release(host: Host = None, port: Port = None) -> None:
 def _config(
     file: Path | None, overrides: list[str] | None, host: str | None, port: int | None
 ) -> CarlaConfig:
+    from advnerf_core.documents import Document, read_yaml
+    from advnerf_core.strict import validate
     from hardware.worlds.carla.config import CarlaConfig
-    from nodes.runtime.config import Document, apply_overrides, read_yaml, validate
+    from nodes.runtime.config import apply_overrides
 
     document = Document({}, "command line") if file is None else read_yaml(file)
     named = ([f"server.host={host}"] if host is not None else []) + (

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from nodes.runtime.terminal import Overrides
+from nodes.runtime.terminal import Overrides, launch_argument
 
 if TYPE_CHECKING:
     from nodes.lab.doctor.check import Check, Finding
@@ -26,7 +26,7 @@ def doctor(
     file: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[LAUNCH]", help="Check only what this *.launch.yaml needs.", exists=True, dir_okay=False
+            metavar="[FILE|NAME]", help="Check only what this *.launch.yaml needs.", parser=launch_argument
         ),
     ] = None,
     folder: Annotated[Path, typer.Option("--folder", help="Folder for results.")] = Path("runs"),

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from nodes.runtime.terminal import Device, Overrides, print_table, say_error, table
+from nodes.runtime.terminal import Device, Overrides, experiment_argument, print_table, say_error, table
 from nodes.runtime.termination import ends_in_order
 
 if TYPE_CHECKING:
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 File = Annotated[
     Path,
     typer.Argument(
-        help="A *.experiment.yaml file, or a *.campaign.yaml file that lists several.",
-        exists=True,
-        dir_okay=False,
+        metavar="FILE|NAME",
+        help="A *.experiment.yaml file, or a *.campaign.yaml file that lists several, or the name of one.",
+        parser=experiment_argument,
     ),
 ]
 Setting = Annotated[
@@ -54,6 +54,7 @@ Only = Annotated[
 ]
 _COLOURS = {
     "done": "green",
+    "not driven live": "yellow",
     "failed": "red",
     "unreadable": "red",
     "changed": "yellow",
@@ -119,7 +120,9 @@ def experiment(
         ),
     ] = None,
     device: Device = None,
-    retry: Annotated[bool, typer.Option("--retry", help="Also run cells that failed before.")] = False,
+    retry: Annotated[
+        bool, typer.Option("--retry", help="Also run cells that failed, or were not driven live, before.")
+    ] = False,
     gate: Annotated[
         bool,
         typer.Option(
@@ -440,9 +443,16 @@ def publish(
     from nodes.experiment.campaign.published import publish as copy_cells
     from nodes.experiment.campaign.published import publish_build
     from nodes.experiment.campaign.set_film import write_film
+    from nodes.experiment.campaign.store import NOT_DRIVEN
 
     campaign, cells = load_cells(file, setting, folder, overrides, only)
-    found = copy_cells(campaign, statuses(campaign, cells), to, prune)
+    found_here = statuses(campaign, cells)
+    for each in found_here:
+        if each.state == NOT_DRIVEN:
+            say_error(
+                f"{each.cell.name} is no evidence and is not published: it was not driven live: {each.text}"
+            )
+    found = copy_cells(campaign, found_here, to, prune)
     for name in found.written:
         print(f"{to / campaign.name / name}.json")
     if withdraw:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import signal
 import time
@@ -12,6 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.places import use_writable_cache
+from nodes.cli import arm as cli_arm
 from nodes.cli import attack as cli_attack
 from nodes.cli import attack_node as cli_attack_node
 from nodes.cli import attack_poses as cli_attack_poses
@@ -30,34 +33,20 @@ from nodes.cli import policy as cli_policy
 from nodes.cli import replay as cli_replay
 from nodes.cli import room as cli_room
 from nodes.cli import scene as cli_scene
+from nodes.cli import start as cli_start
 from nodes.cli import teleop as cli_teleop
 from nodes.cli import topic as cli_topic
 from nodes.cli import trial as cli_trial
 from nodes.cli import verify as cli_verify
 from nodes.cli import world as cli_world
-from nodes.runtime.terminal import Overrides, RunDir, print_table, say_error, table
+from nodes.runtime.extras import installs
+from nodes.runtime.terminal import LaunchFile, Overrides, print_table, say_error, table
 
 if TYPE_CHECKING:
     from nodes.launching.launch import Launch
 
 OUR_PACKAGES = ("advnerf_core", "hardware", "calibration", "nodes")
 ERROR_EXIT, FAILURE_EXIT = 2, 1
-# The extra that installs each package which a base installation, such as the car's, does not have.
-_EXTRA_OF = dict.fromkeys(("torch", "numba", "scipy", "matplotlib", "jinja2", "av", "joblib"), "core") | {
-    "mujoco": "twin",
-    "pycolmap": "sfm",
-    "trimesh": "mesh",
-    "viser": "view",
-    "onnxruntime": "onnx",
-    "onnx": "onnx",
-    "mitsuba": "mesh",
-    "drjit": "mesh",
-    "ray": "cluster",
-    "carla": "carla",
-    "starlette": "page",
-    "uvicorn": "page",
-    "cryptography": "page",
-}
 
 app = typer.Typer(
     name="advnerf",
@@ -83,6 +72,8 @@ app.add_typer(cli_scene.app, name="scene")
 app.add_typer(cli_room.app, name="room")
 app.add_typer(cli_carla.app, name="carla")
 app.add_typer(cli_world.app, name="world")
+cli_start.add_to(app)
+cli_arm.add_to(app)
 cli_doctor.add_to(app)
 cli_experiment.add_to(app)
 cli_verify.add_to(app)
@@ -115,7 +106,7 @@ def options(
 
 @app.command()
 def launch(
-    file: Annotated[Path, typer.Argument(help="A *.launch.yaml file.", exists=True, dir_okay=False)],
+    file: LaunchFile,
     overrides: Overrides = None,
     run_dir: Annotated[
         Path | None,
@@ -191,49 +182,6 @@ def _say_problems(plan: Any) -> None:
         raise typer.Exit(ERROR_EXIT)
 
 
-@app.command()
-def arm(
-    run_dir: RunDir = None, reason: Annotated[str, typer.Option("--reason", help="Reason to record.")] = ""
-) -> None:
-    """Ask the safety node of a running launch to arm the car."""
-    from nodes.launching.watching import find_run_dir
-    from nodes.runtime.arm_requests import ask_to_arm
-
-    answer = ask_to_arm(find_run_dir(run_dir), reason)
-    if answer.granted and answer.armed:
-        print(f"armed by {answer.text}")
-        return
-    print(f"armed, but stopped again since: {answer.text}" if answer.granted else f"not armed: {answer.text}")
-    raise typer.Exit(FAILURE_EXIT)
-
-
-@app.command()
-def disarm(
-    run_dir: RunDir = None, reason: Annotated[str, typer.Option("--reason", help="Reason to record.")] = ""
-) -> None:
-    """Stop the car of a running launch and keep it stopped."""
-    from nodes.launching.watching import find_run_dir
-    from nodes.runtime.arm_requests import BRAKE_WAIT_S, ask_to_disarm
-
-    def silent(waited_s: float) -> None:
-        say_error(
-            f"NOT CONFIRMED: no answer from the safety node for {waited_s:.1f} s, and the car may be driving. Use the e-stop or"
-            " cut the power. Still asking (Ctrl-C gives up)"
-        )
-
-    answer = ask_to_disarm(find_run_dir(run_dir), reason, silent)
-    if answer.armed:
-        say_error("disarmed, but another request has armed the car again since")
-        raise typer.Exit(FAILURE_EXIT)
-    print(f"not armed: {answer.text}")
-    if not answer.braked:
-        say_error(
-            f"NOT CONFIRMED: disarmed, but the motor node did not report within {BRAKE_WAIT_S:g} s that it brakes. Watch the"
-            " car. If the motor node is down, the motor controller brakes after its own timeout"
-        )
-        raise typer.Exit(FAILURE_EXIT)
-
-
 def _is_for_people(error: Exception) -> bool:
     """Whether the message of an exception was written for the user."""
     return isinstance(error, AdvnerfError | OSError)
@@ -241,17 +189,19 @@ def _is_for_people(error: Exception) -> bool:
 
 def main() -> None:
     """Run the command line. An error that the user can fix is printed as one line, with exit code 2 and no traceback."""
+    with contextlib.suppress(
+        AdvnerfError, OSError
+    ):  # only what needs a cache fails without one; stopping the car does not
+        use_writable_cache()
     try:
         app()
     except KeyboardInterrupt:
         raise SystemExit(130) from None
     except ModuleNotFoundError as error:
         missing = (error.name or "").split(".")[0]
-        if _debug or missing in OUR_PACKAGES or missing not in _EXTRA_OF:
+        if _debug or missing in OUR_PACKAGES or (command := installs(missing)) is None:
             raise
-        say_error(
-            f"this command needs {missing}, which is not installed: pip install 'advnerf[{_EXTRA_OF[missing]}]'"
-        )
+        say_error(f"this command needs {missing}, which is not installed: {command}")
         raise SystemExit(ERROR_EXIT) from None
     except Exception as error:  # any other exception is a bug and keeps its traceback
         if _debug or not _is_for_people(error):

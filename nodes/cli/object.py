@@ -88,6 +88,7 @@ def object_build(
     """
     from advnerf_core.objects.voxel.build import build_from_mesh
     from advnerf_core.objects.voxel.model import save_object
+    from advnerf_core.places import require_utf8
     from nodes.runtime.errors import ConfigError
     from nodes.runtime.progress import ProgressDisplay
 
@@ -100,6 +101,8 @@ def object_build(
     if minutes is not None and steps is not None:
         raise ConfigError("expected either --steps or --minutes, got both; remove one of them")
     name = generate or _name(file or images or Path())
+    path = output or Path(f"{name}.object.safetensors")
+    require_utf8(path)
     with ProgressDisplay() as display:
         report = display.start("object")
         if images is not None:
@@ -107,7 +110,6 @@ def object_build(
         else:
             mesh, source = _mesh(file, generate, up, height_m)
             model = build_from_mesh(mesh, name, resolution, 400 if steps is None else steps, source, report)
-    path = output or Path(f"{name}.object.safetensors")
     save_object(path, model)
     _print_quality(path, model)
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from advnerf_core.documents import read_json
 from nodes.runtime.terminal import RunDir
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ def _say_address(run_dir: Path | None) -> None:
 
     folder = find_run_dir(run_dir)
     try:
-        door = json.loads((folder / DOOR).read_text(encoding="utf-8"))
+        door = read_json(folder / DOOR)
     except FileNotFoundError:
         raise LaunchError(
             f"expected a page node in {folder}, found none; launch launch/page.launch.yaml, or add a node with module nodes.page"

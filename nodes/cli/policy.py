@@ -8,11 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from nodes.cli import policy_train as cli_policy_train
+from nodes.runtime.paths import shipped
 from nodes.runtime.terminal import print_table, table
 
 if TYPE_CHECKING:
     from advnerf_core.policies.view import PolicyView
     from nodes.lab.policy_reference import Reference
+
+_TWIN_ROOM = shipped("calibration/twin/room.yaml")
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -56,8 +59,12 @@ def policy_check(
     ] = None,
     room: Annotated[
         Path,
-        typer.Option("--room", help="Room calibration with the path that the expert follows in the bag."),
-    ] = Path("calibration/twin/room.yaml"),
+        typer.Option(
+            "--room",
+            help="Room calibration with the path that the expert follows in the bag.",
+            show_default="the simulated lab's",
+        ),
+    ] = _TWIN_ROOM,
     goal: Annotated[
         list[float] | None,
         typer.Option("--goal", help="One number of the goal vector. Repeat for each number."),
@@ -146,12 +153,14 @@ def policy_export(
 
 @app.command("info")
 def policy_info(policy: Spec) -> None:
-    """Show a policy's declaration and its hash."""
+    """Show a policy's inputs and outputs, its declaration and its hash."""
     from advnerf_core.policies.load import load_adapted
 
     adapted, sha256 = load_adapted(policy)
     contract = adapted.contract
     rows = table("what", "value")
+    for name, value in adapted.described_tensors():
+        rows.add_row(name, value.replace("[", r"\["))
     for name, value in contract.to_dict().items():
         if name != "view":
             rows.add_row(name, str(value).replace("[", r"\["))
@@ -161,4 +170,6 @@ def policy_info(policy: Spec) -> None:
     crop = f"rows {kept_rows.start} to {kept_rows.stop - 1}, columns {kept_columns.start} to {kept_columns.stop - 1}"
     rows.add_row("view", f"{crop} of {view.camera.width} x {view.camera.height}")
     rows.add_row("sha256", sha256)
+    if adapted.identity:
+        rows.add_row("not fixed", f"asks another program, which may change: {adapted.identity}")
     print_table(rows)

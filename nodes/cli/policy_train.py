@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from nodes.runtime.terminal import print_table, table
+from nodes.runtime.terminal import experiment_argument, print_table, table
 
 if TYPE_CHECKING:
     from advnerf_core.driving.expert import Expert
@@ -84,9 +84,12 @@ def train(
             help="Run folder of an experiment. Views of its learned room are added to the training data.",
         ),
     ] = None,
-    experiment: Annotated[Path, typer.Option("--experiment", help="Experiment file of that run.")] = Path(
-        "launch/room.experiment.yaml"
-    ),
+    experiment: Annotated[
+        Path,
+        typer.Option(
+            "--experiment", help="Experiment file of that run, or its name.", parser=experiment_argument
+        ),
+    ] = Path("room"),
     setting: Annotated[str, typer.Option("--setting", help="Setting of that run.")] = "demo",
     steps: Annotated[int, typer.Option("--steps", min=1, help="Optimiser steps.")] = 800,
     seed: Annotated[int, typer.Option("--seed")] = 0,

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from nodes.cli.experiment import File
 from nodes.runtime.terminal import Overrides, print_table, table
 
 _REFUSED_EXIT = 1
@@ -20,7 +21,7 @@ def add_to(app: typer.Typer) -> None:
 
 
 def gate(
-    file: Annotated[Path, typer.Argument(help="A *.experiment.yaml file.", exists=True, dir_okay=False)],
+    file: File,
     setting: Annotated[str, typer.Option("--setting", help="Setting of the experiment file.")] = "full",
     run_folder: Annotated[Path | None, typer.Option("--run-folder", show_default="runs/<setting>")] = None,
     kind: Annotated[

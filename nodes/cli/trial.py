@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from nodes.runtime.terminal import Overrides, print_table, table
+from nodes.runtime.terminal import LaunchFile, Overrides, print_table, table
 
 if TYPE_CHECKING:
     from nodes.lab.trials.plan import Run
@@ -22,7 +22,7 @@ def add_to(app: typer.Typer) -> None:
 
 
 def trial(
-    file: Annotated[Path, typer.Argument(help="A *.launch.yaml file.", exists=True, dir_okay=False)],
+    file: LaunchFile,
     attack: Annotated[
         list[str] | None,
         typer.Option(

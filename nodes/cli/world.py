@@ -37,9 +37,10 @@ def world_check(
 
     Exit code 1 if a part of it is not met.
     """
+    from advnerf_core.documents import Document
     from nodes.lab.worlds.check import check_world
     from nodes.lab.worlds.named import read_world
-    from nodes.runtime.config import Document, apply_overrides
+    from nodes.runtime.config import apply_overrides
 
     document = Document({"kind": world}, "command line")
     apply_overrides(document, overrides or [])

@@ -12,6 +12,7 @@ from typing import Protocol
 
 from nodes.control.arming_gates import ClockGate, HandGate, edge_distance_m, inside
 from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.requests import ESTOP_LATCHED
 from nodes.runtime.wire import MessageInfo
 
 OPERATOR = "operator"
@@ -191,7 +192,7 @@ class Arming:
         self._check_held_up(mono_ns)
         began = self.hand.heard(mode, pressed_stop, info)
         if pressed_stop:
-            self._estop = "e-stop pressed; release it and re-arm"
+            self._estop = ESTOP_LATCHED
             self.disarm(self._estop, mono_ns)
         elif began and self.hand.required:
             self.arm(OPERATOR, info.publish_mono_ns, mono_ns, explicit=False)
@@ -290,6 +291,11 @@ class Arming:
                 (f"no command from the {self.driver}", self._drivers[self.driver], limits.drive_age_s)
             )
         return sources
+
+    @property
+    def stopped_by(self) -> str:
+        """Why the car is not armed. A latched e-stop comes before everything that happened since."""
+        return self._estop or self.reason
 
     def drive_age_s(self, mono_ns: int) -> float:
         """Age of the newest command [s]."""

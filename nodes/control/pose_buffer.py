@@ -47,6 +47,7 @@ class PoseBuffer:
         self._max_gap_ns = round(max_gap_s * _NS_PER_S)
         self._stamps: list[int] = []
         self._poses: dict[int, NDArray[np.float64]] = {}
+        self._late = False
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -57,11 +58,20 @@ class PoseBuffer:
         return self._stamps[-1] if self._stamps else None
 
     def add(self, stamp_ns: int, T: NDArray[np.float64]) -> None:
-        """Add a pose. Poses may arrive in any order; of two with the same stamp, the first is kept."""
+        """Add a pose. Poses may arrive in any order; of two with the same stamp, the first is kept.
+
+        A pose that is older than all that are kept is late, and ignored. Two in a row show that a clock was set back: the buffer starts
+        again with the second.
+        """
         if stamp_ns in self._poses:
             return
-        if self._stamps and stamp_ns < self._stamps[-1] - self._keep_ns:
+        late, self._late = self._late, bool(self._stamps) and stamp_ns < self._stamps[-1] - self._keep_ns
+        if self._late and not late:
             return
+        if self._late:
+            self._late = False
+            self._stamps.clear()
+            self._poses.clear()
         insort(self._stamps, stamp_ns)
         self._poses[stamp_ns] = np.array(T, dtype=np.float64)
         first = bisect_left(self._stamps, self._stamps[-1] - self._keep_ns)

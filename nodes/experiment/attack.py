@@ -19,6 +19,7 @@ from advnerf_core.attack.methods import Method, SearchRun, SearchSettings, load_
 from advnerf_core.attack.on_device import on_chosen_device, said_of_device
 from advnerf_core.attack.search.search import SearchResult
 from advnerf_core.attack.spaces.space import Shown, Space
+from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.pilotnet import LoadedPolicy, load_policy
 from advnerf_core.report.conditions import CONTROLS, EMPTY, NONE
@@ -80,7 +81,8 @@ def frozen_hashes(experiment: Experiment) -> dict[str, str]:
         **_frozen_place(experiment),
         **policies,
         "starts_and_seeds": hash_of(starts),
-        "config": hash_of(experiment.config.model_dump(mode="json")),
+        # As the experiment was run: a report may be of fewer methods.
+        "config": hash_of(json.loads((experiment.folder / "manifest.json").read_text())["config"]),
     }
 
 
@@ -127,7 +129,7 @@ def check_frozen(experiment: Experiment, cell: Cell, folder: Path) -> None:
     Raises:
         FrozenChangedError: Something of it changed.
     """
-    then, now = json.loads((folder / FROZEN).read_text()), _frozen_for(experiment, cell)
+    then, now = read_json(folder / FROZEN), _frozen_for(experiment, cell)
     changed = [name for name, value in now.items() if then.get(name) != value]
     if changed:
         raise FrozenChangedError(
@@ -152,7 +154,7 @@ def surrogate_part(
     """
     kept = folder / SEARCHED
     if kept.exists():
-        found: dict[str, Any] = json.loads(kept.read_text())
+        found: dict[str, Any] = read_json(kept)
         return found
     policy = _victim(victim_file(experiment, cell.victim))
     problem = attack_problem(experiment, space, policy, cell.scenario, cell.seed)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from advnerf_core.data.dataset import load_transforms
+from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, planar_poses
 from advnerf_core.scene.bake import NotBakedError, bake
@@ -37,7 +38,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         write_atomically(folder / COMPARED, json.dumps({"used": False, "why": str(error)}, indent=1) + "\n")
         return
     report(0.8, "comparing")
-    fidelity = json.loads((experiment.stage_folder("scene") / FIDELITY).read_text())
+    fidelity = read_json(experiment.stage_folder("scene") / FIDELITY)
     before_db, after_db = fidelity["mean"]["psnr_policy_db"], _held_out_psnr_db(experiment, baked)
     used = before_db - after_db <= _MOST_LOST_DB
     if used:

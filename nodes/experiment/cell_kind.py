@@ -38,9 +38,11 @@ class CellKind(ABC):
 
     Attributes:
         searches_apart: Whether `search` does a part of a cell that may run beside others.
+        code: Hash of a user's code; empty for the kind that this project brings.
     """
 
     searches_apart: ClassVar[bool] = False
+    code: str = ""
 
     @abstractmethod
     def load(self, file: Path, setting: str, overrides: Sequence[str], folder: Path) -> Any:
@@ -135,5 +137,7 @@ def settings_hash(kind: CellKind, experiment: Any, cell: Cell) -> str:
     }
     if code := method_digest(cell.code):
         named["code"] = code
+    if kind.code:
+        named["kind"] = kind.code
     # Through JSON, so that tuples and lists, or paths that were not turned into text, cannot change the hash between processes.
     return hash_of(json.loads(json.dumps(named, default=str)))

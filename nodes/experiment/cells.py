@@ -112,7 +112,7 @@ def run_cell(
         tell("driving")
         driven = clean if cell.method == NONE else folder
         data = cell_data(experiment, shared.space, shared.deployer, cell, driven, clean, tell)
-        if shared.deployer is None:
+        if shared.deployer is None or "not_driven_live" in data:
             return data
         film = kept_film(folder) or film_cell(
             experiment, shared.deployer.scene, shared.space, cell, folder, driven

@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from advnerf_core.attack.methods import method_name
 from advnerf_core.scene.gate_limits import GateLimits
+from advnerf_core.strict import StrictModel
 from nodes.experiment.deploy_config import DeployConfig
 from nodes.experiment.method_names import MethodReference
 from nodes.experiment.placed import PANEL, PlacedObject, WantedObject
@@ -28,11 +29,7 @@ PositiveNumber = Annotated[float, Field(gt=0)]
 Unit = Annotated[float, Field(ge=0, le=1)]
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class CaptureConfig(_Section):
+class CaptureConfig(StrictModel):
     """How the world is photographed."""
 
     photos: Positive = Field(default=450, description="Posed photographs that the scene is learned from.")
@@ -46,7 +43,7 @@ class CaptureConfig(_Section):
     seed: int = 0
 
 
-class SceneConfig(_Section):
+class SceneConfig(StrictModel):
     """How the radiance field is trained; the length is in steps, so that the result does not depend on the machine."""
 
     steps: Positive = Field(default=1500, description="Training iterations.")
@@ -91,7 +88,7 @@ class SceneConfig(_Section):
     seed: int = 0
 
 
-class ViewConfig(_Section):
+class ViewConfig(StrictModel):
     """What the policy sees of the driving camera: a window of its image, resized to 200 x 66; the default fits 336 x 188."""
 
     crop_top_px: Count = Field(default=24, description="First row that is kept.")
@@ -102,7 +99,7 @@ class ViewConfig(_Section):
     )
 
 
-class PolicyConfig(_Section):
+class PolicyConfig(StrictModel):
     """How the goal-conditioned policy is trained: frames per path and domain, rounds, optimiser steps."""
 
     stiffness_1pm: PositiveNumber = Field(
@@ -170,7 +167,7 @@ class PolicyConfig(_Section):
     seed: int = 0
 
 
-class ObjectConfig(_Section):
+class ObjectConfig(StrictModel):
     """How the objects are made; where they stand is the section objects."""
 
     car_resolution: Annotated[int, Field(ge=8, le=128)] = Field(
@@ -196,7 +193,7 @@ class ObjectConfig(_Section):
     )
 
 
-class MeasureConfig(_Section):
+class MeasureConfig(StrictModel):
     """From where finished attacks are measured, in both domains: the same starts for all methods and seeds."""
 
     starts: Positive = Field(default=5, description="Starts, none of which a search had.")
@@ -208,7 +205,7 @@ class MeasureConfig(_Section):
     )
 
 
-class AttackConfig(_Section):
+class AttackConfig(StrictModel):
     """The adversary, and what it may spend: all methods evaluate equally often."""
 
     methods: tuple[MethodReference, ...] = Field(
@@ -259,7 +256,7 @@ class AttackConfig(_Section):
         return self
 
 
-class RetrainConfig(_Section):
+class RetrainConfig(StrictModel):
     """The defence: how often the victim answers the attack, and what it learns from."""
 
     rounds: Positive = Field(default=1, description="Rounds of attack and retraining, at most.")
@@ -288,7 +285,7 @@ class RetrainConfig(_Section):
     seed: int = 0
 
 
-class ExperimentConfig(_Section):
+class ExperimentConfig(StrictModel):
     """One experiment, resolved: the file's values, one of its settings over them, then the command line."""
 
     @model_validator(mode="after")

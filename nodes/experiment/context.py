@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from advnerf_core.documents import Document, read_json
 from advnerf_core.driving.dynamics import Ackermann, Dubins
 from advnerf_core.driving.expert import Expert, ExpertConfig
 from advnerf_core.driving.metrics import Horizon
@@ -30,7 +31,7 @@ from nodes.experiment.placed import PlacedObject, in_a_lane
 from nodes.experiment.run_folder import RunFolder
 from nodes.lab.worlds.expert_drive import as_path
 from nodes.lab.worlds.named import NamedWorld, read_world, without
-from nodes.runtime.config import Document, load_config
+from nodes.runtime.config import load_config
 from nodes.runtime.errors import ConfigError
 
 WORLD, PLACED, CALIBRATION, CELLS = "world.json", "objects.json", "calibration", "cells"
@@ -53,7 +54,7 @@ class Experiment(RunFolder[ExperimentConfig]):
     @classmethod
     def resolved_in(cls, folder: FilePath) -> Experiment:
         """The experiment that a run folder is of, as its manifest resolved it."""
-        manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+        manifest = read_json(folder / "manifest.json")
         config = ExperimentConfig.model_validate(manifest["config"])
         return cls(config, FilePath(manifest["file"]), folder, manifest["setting"])
 
@@ -179,7 +180,7 @@ class Experiment(RunFolder[ExperimentConfig]):
     def _captured(self) -> dict[str, Any] | None:
         if not self._kept_world.exists():
             return None
-        kept: dict[str, Any] = json.loads(self._kept_world.read_text(encoding="utf-8"))
+        kept: dict[str, Any] = read_json(self._kept_world)
         return kept
 
     @cached_property
@@ -235,7 +236,7 @@ class Experiment(RunFolder[ExperimentConfig]):
             raise ConfigError(
                 f"expected {file}, where the capture stage writes the places of objects with a rule; run that stage first"
             )
-        return tuple(map(PlacedObject.model_validate, json.loads(file.read_text(encoding="utf-8"))))
+        return tuple(map(PlacedObject.model_validate, read_json(file)))
 
     def goal(self, scenario: str) -> tuple[float, ...]:
         """What the policy is told on a path; empty where it is told nothing."""

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import torch
 
 from advnerf_core.attack.spaces.space import Space
+from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.report.conditions import NONE
@@ -24,6 +25,7 @@ from nodes.experiment.drives import deployed_drives, totals
 from nodes.experiment.live import LiveRun, as_drive, drive_until_it_counts
 from nodes.experiment.policy import victim_file
 from nodes.experiment.spaces import dress, shown_there
+from nodes.lab.trials.tries import NotDrivenError
 
 DRIVES = "drives.json"
 
@@ -124,9 +126,9 @@ def cell_data(
 
     Returns:
         Attack id, seconds; for ``surrogate`` and ``deployed`` the total CTE [m] and whether the car left the track, per start, and the total
-        CTE without attack; see `advnerf_core.report.cells`.
+        CTE without attack; see `advnerf_core.report.cells`. A cell that was not driven live has no ``deployed``, and says why.
     """
-    learned, undisturbed = (json.loads((at / SEARCHED).read_text()) for at in (folder, clean))
+    learned, undisturbed = (read_json(at / SEARCHED) for at in (folder, clean))
     data = {
         "scenario": cell.scenario,
         "victim": cell.victim,
@@ -145,8 +147,14 @@ def cell_data(
         },
     }
     if deployer is not None:
-        without = deployed_part(space, deployer, cell.clean, clean, tell)
-        driven = without if folder == clean else deployed_part(space, deployer, cell, folder, tell)
+        try:
+            without = deployed_part(space, deployer, cell.clean, clean, tell)
+            driven = without if folder == clean else deployed_part(space, deployer, cell, folder, tell)
+        except NotDrivenError as error:
+            # Either arm can be the spoiled one. Without both there is nothing to compare, so the cell has no deployed drives at all.
+            data["not_driven_live"] = str(error)
+            data["extra"]["spoiled_tries"] = [list(error.spoiled)]
+            return data
         data["deployed"] = _drives_of(driven, without)
         data["kept"]["deployed"] = kept_drives(driven)
         data["extra"] |= {
@@ -173,6 +181,7 @@ def _live_extra(live: list[dict[str, Any]]) -> dict[str, Any]:
     return {
         "stopped_early": [each["outcome"]["stopped_early"] for each in live],
         "missed_frames": [each["missed"] for each in live],
+        "spoiled_tries": [each["spoiled"] for each in live],
         "time_to_leave_s": [each["metrics"]["time_to_leaving_s"] for each in live],
     }
 
@@ -183,7 +192,7 @@ def deployed_part(
     """Deployed drives of a searched cell from its starts, kept in ``drives.json``; what is there already is read."""
     kept = folder / DRIVES
     if kept.exists():
-        found: dict[str, Any] = json.loads(kept.read_text())
+        found: dict[str, Any] = read_json(kept)
         return found
     deployed = deployer.drive(space, cell, folder, tell)
     data = {

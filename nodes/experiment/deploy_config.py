@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from advnerf_core.strict import StrictModel
 from hardware.cameras.effects import PRESETS, Effects
 
 Count = Annotated[int, Field(ge=0)]
 Positive = Annotated[int, Field(ge=1)]
 
 
-class DeployConfig(BaseModel):
+class DeployConfig(StrictModel):
     """What drives past a found attack, and how often. All but ``through``, ``starts``, ``car``, ``world``, ``camera`` and ``panels`` concerns live nodes only."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     through: Literal["world", "nodes", "nothing"] = Field(
         default="world",

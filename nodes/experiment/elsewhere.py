@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from advnerf_core.documents import Document
 from advnerf_core.learning.recipe import SourcePlan
 from advnerf_core.learning.sources import RenderedSource
 from hardware.worlds.world import World
@@ -22,7 +23,7 @@ from nodes.experiment.deployed import seen_in
 from nodes.experiment.native import stand_in
 from nodes.experiment.objects import placed_objects, random_theta
 from nodes.experiment.placing import place_by_rule
-from nodes.runtime.config import Document, apply_overrides
+from nodes.runtime.config import apply_overrides
 from nodes.runtime.errors import ConfigError
 
 # What a policy carries from one place to the other.

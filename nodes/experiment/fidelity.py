@@ -7,7 +7,6 @@ calibration says the camera sees. No drive with the attack is looked at.
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.attack.spaces.space import Shown, Space
 from advnerf_core.attack.transfer import Scene
 from advnerf_core.data.dataset import load_transforms
+from advnerf_core.documents import read_json
 from advnerf_core.driving.measured_car import CarResponse, RespondingCar, fit_response
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.geometry import Array, invert_transform, planar_poses, yaw_of
@@ -153,7 +153,7 @@ def _measured_car(experiment: Experiment, clean: Path) -> RespondingCar:
     ideal = experiment.dynamics
     if experiment.config.deploy.car == "ideal" or not (clean / DRIVES).exists():
         return RespondingCar(ideal, CarResponse(ideal.speed_mps))
-    kept = json.loads((clean / DRIVES).read_text(encoding="utf-8"))
+    kept = read_json(clean / DRIVES)
     ends = [
         tick or len(commands) for tick, commands in zip(kept["blocked_tick"], kept["commands"], strict=True)
     ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.attack.spaces.space import Space
+from advnerf_core.documents import read_json
 from advnerf_core.geometry import Array, planar_poses
 from advnerf_core.report.clips import ClipTrack, write_clip
 from advnerf_core.report.conditions import NONE, style_of
@@ -57,6 +57,8 @@ def film_scenario(
     frames = [as_uint8(whole.render(pose[None], shown.colours).images[0]) for pose in poses]
     tracks = [_track(experiment, attacked, "learned scene, attacked", frames, learned)]
     for cell in (attacked.clean, attacked):
+        if not (driven_folder(experiment, cell) / DRIVES).exists():
+            continue  # not driven live
         title = "deployed, no attack" if cell.method == NONE else "deployed, attacked"
         tracks.append(_deployed_track(experiment, scene, space, cell, title, driven_folder(experiment, cell)))
     return write_clip(folder / f"{scenario}.mp4", tracks, rate_hz, experiment.world.off_track_m)
@@ -85,7 +87,7 @@ def _deployed_track(
     file = folder / DRIVES
     states = _states(file)[0][::every]
     if scene is None:
-        live = json.loads(file.read_text())["live"][0]
+        live = read_json(file)["live"][0]
         began_ns, period_s = live["outcome"]["start_real_ns"], every * experiment.config.dt_s
         views = list(evaluation.frames(folder / live["run"] / "bag", began_ns, len(states), period_s))
         note = live["outcome"]["stopped_early"] or "ended"
@@ -135,4 +137,4 @@ def drives_of(experiment: Experiment, domain: str, cell: Cell) -> list[Array]:
 
 
 def _states(file: Path) -> list[Array]:
-    return [np.array(states)[:, :3] for states in json.loads(file.read_text())["states"]]
+    return [np.array(states)[:, :3] for states in read_json(file)["states"]]

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from advnerf_core.plugins import PluginError, absolute_reference, resolve
+from advnerf_core.plugins import PluginError, absolute_reference, code_sha256, resolve
 from nodes.experiment.cell_kind import CellKind
 from nodes.runtime.errors import ConfigError
 
@@ -37,6 +37,7 @@ def load_kind(name: str, folder: Path | None = None) -> CellKind:
         raise ConfigError(
             f"expected a subclass of nodes.experiment.cell_kind.CellKind, got {name} = {found!r:.80}"
         )
+    made.code = code_sha256(name, KINDS, ENTRY_POINTS, folder)
     return made
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-import shutil
 import socket
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -15,17 +15,18 @@ import numpy as np
 
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.driving.metrics import DriveMetrics, Horizon, first_still_tick
-from advnerf_core.files import write_atomically
 from advnerf_core.policies.pilotnet import load_policy
 from hardware.worlds.lab.config import LabConfig
 from hardware.worlds.world import collided_with
+from nodes.control.stop_causes import is_stall
 from nodes.experiment.context import Experiment
 from nodes.experiment.deployed import DeployedDrive
 from nodes.experiment.faces import on_screen, panel_of, wanted_face
 from nodes.experiment.policy import HARDENED, victim_file
 from nodes.lab.trials.evaluation import attack_ids, counterfactual, score, timing, trajectory
-from nodes.lab.trials.trial import STALLED, NotStartedError, TrialPlan, counts
+from nodes.lab.trials.trial import TrialPlan
 from nodes.lab.trials.trial_runner import run_trial
+from nodes.lab.trials.tries import NotDrivenError, drive_with_tries
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError, RuntimeFault
 from nodes.runtime.progress import Report
@@ -33,11 +34,6 @@ from nodes.runtime.progress import Report
 Pose = tuple[float, float, float]
 # The absent panel of the empty scene stands outside the room, out of every camera's sight.
 _OUT_OF_SIGHT_M = 60.0
-_ATTEMPTS = 3
-
-
-class DriveFault(RuntimeFault):
-    """A live drive was ended again and again by a fault of the stack, so that it measures nothing."""
 
 
 @dataclass(frozen=True)
@@ -83,36 +79,23 @@ def lab_of(experiment: Experiment) -> LabConfig:
 def drive_until_it_counts(
     experiment: Experiment, live: LiveRun, folder: Path, tell: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Drive one run, again if a fault of the stack ended it or kept it from beginning: a busy machine is late now and then.
+    """Drive one run until it counts; see `drive_with_tries`, which says what it raises.
 
     Args:
         experiment: In the lab.
         live: Which run.
         folder: Where its folder and its JSON go; a run that is there is read.
-        tell: Told of drives that do not count.
+        tell: Told of tries that do not count.
+    """
+    return drive_with_tries(lambda: drive_live(experiment, live, folder), folder / f"{live.name}.json", tell)
+
+
+def drive_live(experiment: Experiment, live: LiveRun, folder: Path) -> dict[str, Any]:
+    """Drive one run through the node graph, which leaves its bag, and measure it.
 
     Raises:
-        DriveFault: None of a few attempts counts; no JSON is left.
+        SpoiledError: Load or a fault of the stack spoiled the drive. Nothing was measured.
     """
-    file, stopped = folder / f"{live.name}.json", ""
-    for attempt in range(1, _ATTEMPTS + 1):
-        if not file.exists():
-            shutil.rmtree(folder / live.name, ignore_errors=True)  # of a drive that was broken off
-            stopped = _fault_of(experiment, live, folder)
-        if not stopped:
-            found: dict[str, Any] = json.loads(file.read_text())
-            return found
-        tell(
-            f"{live.name} does not count, the stack stopped it: {stopped} (attempt {attempt} of {_ATTEMPTS})"
-        )
-    raise DriveFault(
-        f"the stack stopped the live drive {live.name} {_ATTEMPTS} times, at last: {stopped}; cure that (advnerf doctor, another load on this machine), "
-        "and give the command again, which goes on here"
-    )
-
-
-def drive_live(experiment: Experiment, live: LiveRun, folder: Path) -> None:
-    """Drive one run through the node graph; leaves its bag and a JSON of what was measured in it."""
     nodes, overrides = tuple(experiment.config.deploy.nodes), live_overrides(experiment, live)
     if live.compare:
         nodes, overrides = (*nodes, "counterfactual"), [*overrides, "params.counterfactual=true"]
@@ -145,7 +128,7 @@ def drive_live(experiment: Experiment, live: LiveRun, folder: Path) -> None:
     }
     if live.compare and (found := counterfactual(bag, outcome.start_real_ns, last_frame_ns)) is not None:
         result["counterfactual"] = asdict(found)
-    write_atomically(folder / f"{live.name}.json", json.dumps(result) + "\n")
+    return result
 
 
 def as_drive(experiment: Experiment, driven: dict[str, Any]) -> DeployedDrive:
@@ -159,7 +142,7 @@ def as_drive(experiment: Experiment, driven: dict[str, Any]) -> DeployedDrive:
 def blocked_tick(driven: dict[str, Any]) -> int | None:
     """The tick from which the car stood because it had run into something; None if it had not."""
     stopped = driven["outcome"]["stopped_early"]
-    return first_still_tick(driven["states"]) if not stopped or STALLED in stopped else None
+    return first_still_tick(driven["states"]) if not stopped or is_stall(stopped) else None
 
 
 def extra_runs(experiment: Experiment) -> dict[str, LiveRun]:
@@ -177,11 +160,12 @@ def extra_runs(experiment: Experiment) -> dict[str, LiveRun]:
 
 
 def run(experiment: Experiment, folder: Path, report: Report) -> None:
-    """Stage live: drive the runs of `extra_runs` that are not driven yet."""
+    """Stage live: drive the runs of `extra_runs` that are not driven yet. A run whose tries are all spoiled leaves no result."""
     runs = extra_runs(experiment)
     for index, live in enumerate(runs.values()):
         report(index / len(runs), live.name)
-        drive_until_it_counts(experiment, live, folder, partial(report, index / len(runs)))
+        with suppress(NotDrivenError):  # the report says so
+            drive_until_it_counts(experiment, live, folder, partial(report, index / len(runs)))
 
 
 def live_overrides(experiment: Experiment, live: LiveRun) -> list[str]:
@@ -206,21 +190,6 @@ def live_overrides(experiment: Experiment, live: LiveRun) -> list[str]:
     if live.empty:
         overrides.append(f"twin.lab.{wanted_face(experiment).panel}.x_m={_OUT_OF_SIGHT_M}")
     return overrides
-
-
-def _fault_of(experiment: Experiment, live: LiveRun, folder: Path) -> str:
-    """Drive once; empty, or the fault of the stack for which the drive does not count."""
-    file = folder / f"{live.name}.json"
-    try:
-        drive_live(experiment, live, folder)
-    except NotStartedError as error:
-        return str(error)
-    driven = json.loads(file.read_text())
-    stopped: str = driven["outcome"]["stopped_early"]
-    if counts(stopped, driven["metrics"]["off_track"]):
-        return ""
-    file.unlink()
-    return stopped
 
 
 def _horizon(experiment: Experiment, live: LiveRun) -> Horizon:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 from collections.abc import Iterator
@@ -14,8 +13,10 @@ import cv2
 import numpy as np
 
 from advnerf_core.attack.artifact import load_attack
+from advnerf_core.documents import read_json
 from advnerf_core.report import data as rd
-from advnerf_core.report import tables, targets
+from advnerf_core.report import summary, tables, targets
+from advnerf_core.report.cells import read_cell
 from advnerf_core.report.live_parts import LiveParts, live_parts
 from advnerf_core.report.results import read_results, write_results
 from nodes.experiment import films, memory
@@ -50,8 +51,16 @@ def make_parts(experiment: Experiment, folder: Path, report: Report) -> LivePart
 
 def target_rows(experiment: Experiment) -> tables.Table:
     """The targets of the finished report."""
-    data = read_results(experiment.stage_folder("report") / "results.json")
-    return targets.targets_table(targets.evaluate_targets(data))
+    return targets.targets_table(targets.evaluate_targets(_finished(experiment)))
+
+
+def not_driven(experiment: Experiment) -> str:
+    """Which arms of the finished report were not driven live; empty if all were."""
+    return summary.not_driven(_finished(experiment))
+
+
+def _finished(experiment: Experiment) -> rd.ReportData:
+    return read_results(experiment.stage_folder("report") / "results.json")
 
 
 def _report_data(
@@ -59,8 +68,9 @@ def _report_data(
 ) -> rd.ReportData:
     extras = experiment.stage_folder("live")
     driven = {
-        name: json.loads((extras / f"{run.name}.json").read_text())
+        name: read_json(file)
         for name, run in extra_runs(experiment).items()
+        if (file := extras / f"{run.name}.json").exists()
     }
     live = {cell: _live_results(experiment, cell) for cell in cells(experiment)}
     measured = [*driven.values(), *(each for found in live.values() for each in found)]
@@ -87,8 +97,34 @@ def _report_data(
             laps["metrics"]["off_track"],
         ),
         limits=experiment.held_to.live,
-        not_measured={} if laps else {"laps": "this setting drives no laps; make experiment does"},
+        live_tries=tuple(_live_tries(experiment, cell) for cell in cells(experiment)),
+        not_measured=_not_measured(experiment, driven, measured),
     )
+
+
+def _live_tries(experiment: Experiment, cell: Cell) -> rd.LiveTries:
+    result = read_cell(experiment.cell_result(cell))
+    spoiled = tuple(reason for each in result.extra.get("spoiled_tries", ()) for reason in each)
+    return rd.LiveTries(
+        cell.method, rd.victim_named(cell.victim), cell.seed, not result.not_driven_live, spoiled
+    )
+
+
+def _not_measured(
+    experiment: Experiment, driven: dict[str, dict[str, Any]], measured: list[dict[str, Any]]
+) -> dict[str, str]:
+    """Why parts of the report are missing."""
+    found = {}
+    if "laps" not in driven:
+        wanted = experiment.config.deploy.laps
+        found["laps"] = (
+            f"all tries were spoiled; remove {experiment.stage_folder('live')} to drive the laps again"
+            if wanted
+            else "this setting drives no laps; make experiment does"
+        )
+    if not measured:
+        found["latency"] = "no live drive counts"
+    return found
 
 
 def _settings(experiment: Experiment) -> rd.Settings:
@@ -150,12 +186,15 @@ def _surrogate_runs(experiment: Experiment) -> Iterator[rd.Run]:
 
 
 def _searched(experiment: Experiment, cell: Cell) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((driven_folder(experiment, cell) / SEARCHED).read_text())
+    found: dict[str, Any] = read_json(driven_folder(experiment, cell) / SEARCHED)
     return found
 
 
 def _live_results(experiment: Experiment, cell: Cell) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = json.loads((driven_folder(experiment, cell) / DRIVES).read_text())["live"]
+    file = driven_folder(experiment, cell) / DRIVES
+    if read_cell(experiment.cell_result(cell)).not_driven_live:
+        return []  # of an arm that was driven, when the one that it is compared with was not
+    found: list[dict[str, Any]] = read_json(file)["live"]
     return found
 
 
@@ -219,10 +258,8 @@ def _attacked(experiment: Experiment) -> list[Cell]:
 
 
 def _fidelity(experiment: Experiment) -> rd.Fidelity:
-    scene = json.loads((experiment.stage_folder("scene") / FIDELITY).read_text())
-    steering = json.loads((experiment.stage_folder("policy") / "policy.json").read_text())[
-        "on_held_out_views"
-    ]
+    scene = read_json(experiment.stage_folder("scene") / FIDELITY)
+    steering = read_json(experiment.stage_folder("policy") / "policy.json")["on_held_out_views"]
     shown = {int(i) for i in np.linspace(0, len(scene["views"]) - 1, SHOWN_VIEWS).round()}
     views = []
     for index, (view, angles) in enumerate(zip(scene["views"], steering, strict=True)):
@@ -245,7 +282,9 @@ def _fidelity(experiment: Experiment) -> rd.Fidelity:
     return rd.Fidelity(tuple(views))
 
 
-def _latency(experiment: Experiment, results: list[dict[str, Any]]) -> rd.Latency:
+def _latency(experiment: Experiment, results: list[dict[str, Any]]) -> rd.Latency | None:
+    if not results:
+        return None
     samples = np.concatenate([r["capture_to_serial_ms"] for r in results])
     hops = tuple(
         rd.Hop.from_samples(f"capture to {name}", np.concatenate([r["hops_ms"][name] for r in results]))
@@ -261,11 +300,11 @@ def _timings(experiment: Experiment) -> Iterator[rd.StageTiming]:
         if record is not None:
             yield rd.StageTiming(name, record.seconds)
     results = [experiment.cell_result(cell) for cell in cells(experiment)]
-    yield rd.StageTiming("cells", sum(json.loads(file.read_text())["seconds"] for file in results))
+    yield rd.StageTiming("cells", sum(read_json(file)["seconds"] for file in results))
 
 
 def _manifest(experiment: Experiment) -> rd.Manifest:
-    manifest = json.loads((experiment.folder / "manifest.json").read_text())
+    manifest = read_json(experiment.folder / "manifest.json")
     machine = {
         "processor": processor_name(),
         "cores": str(len(os.sched_getaffinity(0))),
@@ -283,7 +322,7 @@ def _manifest(experiment: Experiment) -> rd.Manifest:
 
 
 def _clips(experiment: Experiment, folder: Path) -> tuple[rd.Clip, ...]:
-    """Surrogate attacked, deployed clean and deployed attacked side by side, for the first seed."""
+    """Surrogate attacked, deployed clean and deployed attacked side by side, for the first seed, as far as they were driven."""
     caption = "What the driving camera sees: the attack in the learned scene, the live drive without it, and the live drive with it."
     space = make_space(experiment, None)
     return tuple(

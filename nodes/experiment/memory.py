@@ -15,10 +15,12 @@ from pathlib import Path
 import torch
 
 from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
+from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.memory import RETURNS_WHAT_IS_FREED, peak_mib, restart_peak
 from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.report.data import MemoryRow
+from advnerf_core.run_module import module_command
 from nodes.experiment.attack import attack_problem
 from nodes.experiment.context import Experiment
 from nodes.experiment.faces import face_space
@@ -31,11 +33,11 @@ HORIZONS = (50, 200, 400)
 def measure(experiment: Experiment, folder: Path, report: Report) -> tuple[MemoryRow, ...]:
     """Measure the horizons that are not measured yet; kept in ``memory.json`` so that a stopped report goes on."""
     kept = folder / "memory.json"
-    rows: dict[str, float] = json.loads(kept.read_text()) if kept.exists() else {}
+    rows: dict[str, float] = read_json(kept) if kept.exists() else {}
     for index, ticks in enumerate(HORIZONS):
         report(index / len(HORIZONS), f"memory of the adjoint at T = {ticks}")
         if str(ticks) not in rows:
-            command = [sys.executable, "-m", "nodes.experiment.memory", str(experiment.folder), str(ticks)]
+            command = module_command("nodes.experiment.memory", str(experiment.folder), str(ticks))
             environment = {**os.environ, **RETURNS_WHAT_IS_FREED}
             done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=environment)
             rows[str(ticks)] = float(done.stdout.split()[-1])

@@ -11,7 +11,7 @@ from pydantic_core import PydanticCustomError
 from advnerf_core.attack.methods import require_method
 from advnerf_core.plugins import PluginError, absolute_reference
 from advnerf_core.report.conditions import CONTROLS
-from nodes.runtime.config import COMPLETE
+from advnerf_core.strict import COMPLETE
 
 
 def _checked(name: str, info: ValidationInfo) -> str:

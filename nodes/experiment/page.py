@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from advnerf_core.documents import read_json
 from advnerf_core.report.clips import data_uri, image_uri
 from advnerf_core.report.conditions import style_of
 from advnerf_core.report.palette import LIGHT, LINE_STYLES
@@ -133,10 +133,8 @@ def _ground(ax: Any, experiment: Experiment) -> None:
 
 
 def _fidelity(experiment: Experiment) -> list[Markup]:
-    scene = json.loads((experiment.stage_folder("scene") / FIDELITY).read_text())
-    controls = json.loads((experiment.stage_folder("policy") / "policy.json").read_text())[
-        "on_held_out_views"
-    ]
+    scene = read_json(experiment.stage_folder("scene") / FIDELITY)
+    controls = read_json(experiment.stage_folder("policy") / "policy.json")["on_held_out_views"]
     difference = float(np.mean([abs(row["real"] - row["surrogate"]) for row in controls]))
     mean, views = scene["mean"], scene["views"]
     text = (
@@ -151,7 +149,7 @@ def _fidelity(experiment: Experiment) -> list[Markup]:
 
 
 def _how(experiment: Experiment) -> Markup:
-    manifest = json.loads((experiment.folder / "manifest.json").read_text())
+    manifest = read_json(experiment.folder / "manifest.json")
     frozen = frozen_hashes(experiment)
     records = {
         name: read_record(experiment.stage_folder(name))

@@ -8,9 +8,10 @@ from functools import lru_cache
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
+from pydantic import Discriminator, Field, Tag
 
 from advnerf_core.geometry import Array, make_transform, rotation_z
+from advnerf_core.strict import StrictModel
 from hardware.worlds.paths import ReferencePath
 from hardware.worlds.world import WorldDescription
 
@@ -25,7 +26,7 @@ OBJECT_SIZES_M: dict[ObjectKind, tuple[float, float]] = {
 _SPACING_M = 0.05  # of the points that stand for a lane's middle
 
 
-class PlacedObject(BaseModel):
+class PlacedObject(StrictModel):
     """Where an object of the attack stands. It is not part of the world: the deployment composes it by depth.
 
     Attributes:
@@ -37,8 +38,6 @@ class PlacedObject(BaseModel):
         yaw_rad: Heading of its front [rad]; a panel shows its texture there.
         scale: Size relative to the object as it was built.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str = Field(min_length=1)
     kind: ObjectKind
@@ -73,7 +72,7 @@ class PlacedObject(BaseModel):
         return [(self.x_m + c * u - s * v, self.y_m + s * u + c * v) for u, v in ends]
 
 
-class FirstSeen(BaseModel):
+class FirstSeen(StrictModel):
     """A rule for where an object stands: the first spot beside a path where it fits and is seen; see `nodes.experiment.placing`.
 
     Attributes:
@@ -83,15 +82,13 @@ class FirstSeen(BaseModel):
         least_px: So high it is then in the policy's picture [px].
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
     scenario: str | None = None
     side: Literal["right", "left", "either"] = "either"
     seen_s: float = Field(default=2.0, gt=0.0)
     least_px: float = Field(default=8.0, gt=0.0)
 
 
-class RuledObject(BaseModel):
+class RuledObject(StrictModel):
     """An object that stands where a rule puts it while the world is photographed.
 
     Attributes:
@@ -101,8 +98,6 @@ class RuledObject(BaseModel):
         scale: Size relative to the object as it was built.
         stands: The rule.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str = Field(min_length=1)
     kind: Literal["panel"]

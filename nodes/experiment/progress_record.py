@@ -15,6 +15,7 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from advnerf_core.documents import read_json
 from nodes.runtime.progress import MeasuringReport, Point
 
 if TYPE_CHECKING:  # the page's server reads records without what searches need
@@ -174,7 +175,7 @@ class ProgressRecord:
 def read_progress(folder: Path) -> dict[str, Any]:
     """The record in a run folder; empty if there is none that can be read."""
     try:
-        data = json.loads((folder / FILE).read_text(encoding="utf-8"))
+        data = read_json(folder / FILE)
     except (OSError, ValueError):
         return {}
     return data if isinstance(data, dict) and data.get("format") == FORMAT else {}

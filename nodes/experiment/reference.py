@@ -22,6 +22,7 @@ from nodes.experiment.stage_record import (
     read_record,
     write_record,
 )
+from nodes.runtime.paths import shipped
 
 # Where cells and stages are kept with the code.
 PUBLISHED = Path("docs/results")
@@ -39,13 +40,15 @@ class ReferenceBuild:
 
     Attributes:
         folder: Holds one folder for each; need not exist.
+        shipped: Where stages are read that are not in ``folder``.
     """
 
     folder: Path
+    shipped: Path | None = None
 
     def record(self, stage: Stage, key: str) -> StageRecord | None:
         """What is known of a stage with a key; None if it is not here."""
-        found = read_record(self._at(stage, key))
+        found = read_record(self._source(stage, key))
         return found if found is not None and found.key == key else None
 
     def digests(self, stages: Sequence[Stage], folder: Path) -> dict[str, str]:
@@ -73,7 +76,7 @@ class ReferenceBuild:
         Raises:
             ReferenceBuildError: Its files are not those that were kept.
         """
-        source, record = self._at(stage, key), self.record(stage, key)
+        source, record = self._source(stage, key), self.record(stage, key)
         if record is None:
             return None
         if digest_of(source) != record.kept:
@@ -101,11 +104,15 @@ class ReferenceBuild:
         _copy(folder, target, stage.bulk, record)
         return target
 
+    def _source(self, stage: Stage, key: str) -> Path:
+        at = self._at(stage, key)
+        return at if self.shipped is None or at.exists() else self.shipped / at.name
+
     def _at(self, stage: Stage, key: str) -> Path:
         return self.folder / f"{stage.name}_{key[:_KEY_DIGITS]}"
 
 
-REFERENCE = ReferenceBuild(PUBLISHED / BUILD)
+REFERENCE = ReferenceBuild(PUBLISHED / BUILD, shipped(str(PUBLISHED / BUILD)))
 
 
 def _copy(source: Path, target: Path, without: Sequence[str], record: StageRecord) -> None:

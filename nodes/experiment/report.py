@@ -33,11 +33,18 @@ _TABLE_WIDTH = 160
 _SEEN_AT_M = (9.0, 14.0)
 
 
-def run(experiment: Experiment, folder: Path, report: Report) -> None:
-    """Write ``report.html``, ``table.json``, ``table.csv``, ``table.md`` and a film of each drive; of live drives also what their bags tell."""
+def run(experiment: Experiment, folder: Path, report: Report, notes: Sequence[str] = ()) -> None:
+    """Write ``report.html``, ``table.json``, ``table.csv``, ``table.md`` and a film of each drive; of live drives also what their bags tell.
+
+    Args:
+        experiment: With all stages before finished, and all cells of its methods.
+        folder: Where to write.
+        report: Progress callback.
+        notes: Paragraphs at the top of the page, such as what is left out.
+    """
     if experiment.config.deploy.live:
         parts = live_report.make_parts(experiment, folder, report)
-        _write(experiment, folder, parts.sections, parts.lead, parts.targets)
+        _write(experiment, folder, parts.sections, (*notes, *parts.lead), parts.targets)
         return
     films_of: list[Path] = []
     with experiment.open_deployed_world() as scene:
@@ -51,7 +58,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         }
     report(0.95, "writing the page")
     sections = page.sections(experiment, overview, films_of, seen)
-    _write(experiment, folder, sections, (page.opening(experiment),))
+    _write(experiment, folder, sections, (*notes, page.opening(experiment)))
 
 
 def _write(
@@ -72,6 +79,8 @@ def print_summary(experiment: Experiment, console: Console) -> None:
     wide.print(text_table(table_of(experiment)).rich())
     if experiment.config.deploy.live:
         wide.print(live_report.target_rows(experiment).rich())
+        if text := live_report.not_driven(experiment):
+            console.print(text, highlight=False, markup=False, soft_wrap=True)
     console.print(f"report: {experiment.stage_folder('report') / PAGE}", highlight=False, soft_wrap=True)
 
 

@@ -23,6 +23,7 @@ from advnerf_core.attack.adjoint import evaluate
 from advnerf_core.attack.on_device import on_chosen_device
 from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.spaces.space import ColourSpace
+from advnerf_core.documents import read_json
 from advnerf_core.driving.path import Array
 from advnerf_core.files import write_atomically
 from advnerf_core.learning.frames import Frames, FrameStore
@@ -207,7 +208,7 @@ def _judged(
     """Ratios to no attack of the same victim in both domains, from the attack's starts; kept in the folder of the round."""
     seed, kept = experiment.config.attack.seeds[0], folder / "ratios.json"
     key = [policy.sha256, *(hashlib.sha256(theta.numpy().tobytes()).hexdigest() for theta in thetas.values())]
-    if kept.exists() and (known := json.loads(kept.read_text()))["of"] == key:
+    if kept.exists() and (known := read_json(kept))["of"] == key:
         return Found(thetas, known["ratios"])
     ratios: dict[str, dict[str, float]] = {"surrogate": {}, "deployed": {}}
     for scenario, theta in thetas.items():

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from advnerf_core.strict import StrictModel
 
 if TYPE_CHECKING:
     from advnerf_core.attack.robustness import Disturbances, Smoothness
@@ -14,10 +16,8 @@ if TYPE_CHECKING:
 _NotNegative = Annotated[float, Field(ge=0)]
 
 
-class RobustnessConfig(BaseModel):
+class RobustnessConfig(StrictModel):
     """What the attack shall bear: the loss is an expectation over these, drawn anew for every evaluation."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     noise: _NotNegative = Field(default=0.0, description="Pixel noise, standard deviation in 0..1.")
     gain: _NotNegative = Field(default=0.0, description="Spread of the logarithm of the exposure of a drive.")

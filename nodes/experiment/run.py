@@ -11,7 +11,10 @@ from typing import Any
 from rich.console import Console
 
 from advnerf_core.attack.methods import method_digest, method_name
+from advnerf_core.documents import Document, Key, read_yaml
+from advnerf_core.places import require_utf8
 from advnerf_core.plugins import unknown
+from advnerf_core.strict import validate
 from nodes.experiment import bake, capture, live, objects, policy, retrain, scene
 from nodes.experiment.config import ExperimentConfig
 from nodes.experiment.context import Experiment
@@ -24,7 +27,7 @@ from nodes.experiment.stage_record import Stage, StageRecord
 from nodes.experiment.stages import begun_with
 from nodes.lab.worlds.named import read_world
 from nodes.launching.launch_file import load_launch
-from nodes.runtime.config import Document, Key, apply_overrides, read_yaml, validate
+from nodes.runtime.config import apply_overrides
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import Display, MeasuringReport
 
@@ -58,6 +61,7 @@ def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: 
     Raises:
         ConfigError: With file, line and the valid keys.
     """
+    require_utf8(folder.absolute())
     document = read_setting(file, setting, overrides)
     config = validate(ExperimentConfig, document, file.parent)
     read_world(document.part(("world",)), file.resolve().parent)
@@ -268,7 +272,8 @@ def stages_of(experiment: Experiment) -> list[Stage]:
         after = ("scene", "object", "policy")
         stages.append(stage("retrain", retrain, settings, after, fewer, reads_bulk_of=("policy",)))
     if config.deploy.live and (config.deploy.laps or config.deploy.empty_scene):
-        graph = load_launch(experiment.launch_file).resolved
+        # The same on every machine, wherever it is installed.
+        graph = load_launch(experiment.launch_file, twin_calibration="calibration/twin").resolved
         stages.append(
             stage(
                 "live",

@@ -13,6 +13,7 @@ from typing import Any, Generic, TypeVar
 
 from rich.console import Console
 
+from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from nodes.experiment.reference import ReferenceBuild
 from nodes.experiment.stage_record import Stage, StageRecord
@@ -85,7 +86,7 @@ def require_own_folder(experiment: RunFolder[Any]) -> None:
     """
     manifest = experiment.folder / _MANIFEST
     try:
-        there = json.loads(manifest.read_text(encoding="utf-8"))["experiment"]
+        there = read_json(manifest)["experiment"]
     except (OSError, ValueError, KeyError, TypeError):
         return
     if there != experiment.config.name:

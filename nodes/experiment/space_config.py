@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from advnerf_core.strict import StrictModel
 
 Positive = Annotated[int, Field(ge=1)]
 PositiveNumber = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -12,11 +14,7 @@ NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Unit = Annotated[float, Field(ge=0, le=1)]
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class ColoursConfig(_Section):
+class ColoursConfig(StrictModel):
     """The colours of the objects."""
 
     kind: Literal["colours"] = "colours"
@@ -29,7 +27,7 @@ class ColoursConfig(_Section):
     )
 
 
-class PlacesConfig(_Section):
+class PlacesConfig(StrictModel):
     """Where the objects stand, and their colours unless these are kept."""
 
     kind: Literal["places"] = "places"
@@ -47,7 +45,7 @@ class PlacesConfig(_Section):
     colours: bool = Field(default=True, description="Search the colours too; false keeps the plain ones.")
 
 
-class _MeshConfig(_Section):
+class _MeshConfig(StrictModel):
     texels: Positive = Field(default=32, description="Texels along the longest side of an object.")
     ball_m: PositiveNumber | None = Field(
         default=None,
@@ -79,7 +77,7 @@ class MeshShapeConfig(_MeshConfig):
     boundary_samples: Positive = Field(default=1, description="Points a pixel for that of the silhouettes.")
 
 
-class FaceConfig(_Section):
+class FaceConfig(StrictModel):
     """One flat texture that a panel of the world carries: projected onto a board, or shown on a screen."""
 
     kind: Literal["face"] = "face"

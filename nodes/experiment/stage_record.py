@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from nodes.runtime.progress import MeasuringReport
 
@@ -62,7 +63,7 @@ class StageRecord:
 def read_record(folder: Path) -> StageRecord | None:
     """The record in a stage's folder; None if there is none that can be read."""
     try:
-        fields = json.loads((folder / RECORD).read_text())
+        fields = read_json(folder / RECORD)
         return StageRecord(
             str(fields["key"]),
             fields["digest"],

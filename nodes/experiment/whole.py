@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 from rich.console import Console
 
+from advnerf_core.attack.methods import method_name
+from advnerf_core.files import sha256_of
 from nodes.experiment import report
 from nodes.experiment.attack import cells
 from nodes.experiment.campaign.config import Campaign, campaign_of
 from nodes.experiment.campaign.plan import statuses
 from nodes.experiment.campaign.run import Options, run_campaign
+from nodes.experiment.campaign.store import FINISHED, NOT_DRIVEN
 from nodes.experiment.campaign.worker import Ended
 from nodes.experiment.cell import Cell, select
 from nodes.experiment.context import Experiment
@@ -36,7 +40,7 @@ def run_experiment(
     anew: bool = False,
     record: ProgressRecord | None = None,
 ) -> list[Ended]:
-    """Run the stages and the cells that are not there yet; where all cells are there, also the report.
+    """Run the stages and the cells that are not there yet, and the report; it leaves out methods of which a cell failed.
 
     Args:
         experiment: The experiment.
@@ -103,7 +107,7 @@ def _record_cells_there(
 ) -> None:
     """Cells that will not be run again: done, or failed before."""
     for each in statuses(campaign, chosen):
-        if each.state == "done":
+        if each.state in FINISHED and not (each.state == NOT_DRIVEN and options.retry):
             record.finish(each.cell.name, 0.0, cached=True)
         elif each.state == "failed" and not options.retry:
             record.fail(each.cell.name, each.text)
@@ -112,25 +116,48 @@ def _record_cells_there(
 def _write_report(
     experiment: Experiment, campaign: Campaign, console: Console, record: ProgressRecord | None
 ) -> None:
-    """The report, once every cell of these settings is here and deployed; what it was made of is part of its key."""
-    files = {cell.name: experiment.cell_result(cell) for cell in campaign.cells}
-    found = statuses(campaign, campaign.cells)
-    missing = [each.cell.name for each in found if each.state != "done" or not files[each.cell.name].exists()]
+    """The report of the methods whose cells are all here and deployed, once no cell is left to run.
+
+    A method of which a cell failed is left out and named. What the report was made of is part of its key.
+    """
     if experiment.config.deploy.through == "nothing":
         return
-    if missing:
-        text = f"no report yet: {len(missing)} of {len(found)} cells are missing"
-        console.print(text, highlight=False)
+    found = statuses(campaign, campaign.cells)
+    failed = {each.cell.method: f"{each.cell.name}: {each.text}" for each in found if each.state == "failed"}
+    reported = _of_methods(
+        experiment, [name for name in experiment.config.attack.method_names if name not in failed]
+    )
+    done = {each.cell.name for each in found if each.state in FINISHED}
+    files = {cell.name: experiment.cell_result(cell) for cell in cells(reported)}
+    missing = [name for name, file in files.items() if name not in done or not file.exists()]
+    notes = [f"not in the report, as a cell failed: {name} ({text})" for name, text in failed.items()]
+    if missing or not reported.config.attack.methods:
+        notes = [f"no report yet: {len(found) - len(done)} of {len(found)} cells are missing"]
+    for text in notes:
+        console.print(text, highlight=False, soft_wrap=True)
         if record is not None:
             record.say(text)
+    if missing or not reported.config.attack.methods:
         return
-    digests = {name: hashlib.sha256(file.read_bytes()).hexdigest() for name, file in files.items()}
+    digests = {name: sha256_of(file) for name, file in files.items()}
     with ProgressDisplay(console, record) as display:
-        run_stages([_report_stage(experiment, digests)], experiment.folder, display)
-    report.print_summary(experiment, console)
+        run_stages([_report_stage(reported, digests, notes)], experiment.folder, display)
+    report.print_summary(reported, console)
 
 
-def _report_stage(experiment: Experiment, digests: dict[str, str]) -> Stage:
+def _of_methods(experiment: Experiment, names: Sequence[str]) -> Experiment:
+    """The same experiment with some of its methods."""
+    attack = experiment.config.attack
+    kept = tuple(each for each in attack.methods if method_name(each) in names)
+    if kept == attack.methods:
+        return experiment
+    fewer = attack.model_copy(update={"methods": kept})
+    return replace(experiment, config=experiment.config.model_copy(update={"attack": fewer}))
+
+
+def _report_stage(experiment: Experiment, digests: dict[str, str], notes: Sequence[str] = ()) -> Stage:
     held_to = experiment.held_to.model_dump(mode="json")
-    settings = {"cells": digests, "setting": experiment.setting, "held_to": held_to}
-    return Stage(REPORT, lambda folder, told: report.run(experiment, folder, told), settings)
+    settings: dict[str, Any] = {"cells": digests, "setting": experiment.setting, "held_to": held_to}
+    if notes:
+        settings["notes"] = list(notes)
+    return Stage(REPORT, lambda folder, told: report.run(experiment, folder, told, notes), settings)

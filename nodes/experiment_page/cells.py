@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
+
+from advnerf_core.documents import read_json
 
 # Clocks of a file system and of this computer may differ by so much.
 _SLACK_S = 1.0
@@ -54,7 +55,7 @@ def result_of(folder: Path, name: str) -> dict[str, Any]:
 @lru_cache(maxsize=512)
 def _result(file: Path, changed_ns: int) -> Mapping[str, Any]:
     del changed_ns  # a changed file is another entry of the cache
-    data = json.loads(file.read_text(encoding="utf-8"))
+    data = read_json(file)
     measured = {
         domain: [round(_mean(data[domain][key]), 2) for key in ("total_cte_m", "none_total_cte_m")]
         for domain in ("surrogate", "deployed")
@@ -69,7 +70,7 @@ def _mean(values: list[float]) -> float:
 
 def _error(file: Path) -> str:
     try:
-        return str(json.loads(file.read_text(encoding="utf-8"))["error"])
+        return str(read_json(file)["error"])
     except (OSError, ValueError, KeyError, TypeError):
         return ""
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import TypeVar
 
+from advnerf_core.run_module import module_command
 from nodes.experiment.attack import planned_evaluations
 from nodes.experiment.context import Experiment
 from nodes.experiment.progress_record import ProgressRecord
@@ -44,7 +44,7 @@ class ExperimentPage:
             number = listening.fileno()
             with (folder / _LOG).open("wb") as log:
                 self._process = subprocess.Popen(
-                    [sys.executable, "-m", "nodes.experiment_page.server", str(folder), str(number)],
+                    module_command("nodes.experiment_page.server", str(folder), str(number)),
                     stdin=subprocess.PIPE,
                     stdout=subprocess.DEVNULL,
                     stderr=log,

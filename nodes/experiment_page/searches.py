@@ -10,9 +10,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 
 from advnerf_core.attack.artifact import COLOURS, MESH_TEXTURE, AttackFileError, face_texture, load_attack
+from advnerf_core.documents import read_json
+from advnerf_core.places import open_tensors
 
 ATTACK, SEARCHED, STATE = "attack.safetensors", "surrogate.json", "state.safetensors"
 # Spaces whose theta are colours. Of the others, places and shapes, there is no texture to show.
@@ -63,13 +65,13 @@ def read_search(folder: Path, state: str = STATE) -> Search | None:
 @lru_cache(maxsize=512)
 def _finished(file: Path, changed_ns: int) -> tuple[float, ...]:
     del changed_ns  # a changed file is another entry of the cache
-    return tuple(round(float(each), 3) for each in json.loads(file.read_text())["curve_total_cte_m"])
+    return tuple(round(float(each), 3) for each in read_json(file)["curve_total_cte_m"])
 
 
 @lru_cache(maxsize=64)
 def _running(file: Path, changed_ns: int) -> tuple[float, ...]:
     del changed_ns
-    with safe_open(file, framework="numpy") as handle:
+    with open_tensors(file, "numpy") as handle:
         history = json.loads((handle.metadata() or {})["history"])
     return tuple(round(sum(row["protocol_cte_m"]) / len(row["protocol_cte_m"]), 3) for row in history)
 
@@ -108,7 +110,7 @@ def _attack_pictures(file: Path) -> list[Pixels]:
 
 
 def _state_pictures(file: Path) -> list[Pixels]:
-    with safe_open(file, framework="numpy") as handle:
+    with open_tensors(file, "numpy") as handle:
         return [_picture(handle.get_tensor("best_theta"))]
 
 

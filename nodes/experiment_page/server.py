@@ -23,11 +23,11 @@ from nodes.experiment_page import shown_files
 from nodes.experiment_page.searches import has_texture, read_search, texture_png
 from nodes.experiment_page.state import cell_names, read_state, report_is_shown
 from nodes.operator_page.responses import Guard, web_file
+from nodes.runtime.priority import HELPER, take_share
 
 HOST = "127.0.0.1"
 PACKAGES = ("starlette", "uvicorn")
 _PACKAGE = "nodes.experiment_page"
-_NICENESS = 10
 _MOST_CONNECTIONS = 64
 _STATE_PERIOD_S = 0.5
 # The report has its style and its pictures inside; it runs no script.
@@ -143,7 +143,7 @@ def main() -> None:
     import uvicorn
 
     folder, number = Path(sys.argv[1]), int(sys.argv[2])
-    os.nice(_NICENESS)
+    take_share(HELPER)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     config = uvicorn.Config(
         application(Answers(folder)),

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
-from pydantic import TypeAdapter, ValidationError
 
+from advnerf_core.documents import parse_yaml
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.strict import parse_value
 from calibration.schema import CameraCalibration, load_calibration
 from hardware.cameras.interface import Frame
 from hardware.cameras.sources import CameraSource
@@ -93,15 +93,10 @@ class Trial:
 def parse_source(text: str) -> Any:
     """Parse a camera source in YAML, as in a launch file."""
     try:
-        return TypeAdapter(CameraSource).validate_python(yaml.safe_load(text))
-    except yaml.YAMLError as error:
-        raise ConfigError(
-            f"expected YAML such as '{{kind: v4l2, device: ...}}': {' '.join(str(error).split())}"
-        ) from None
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        key = ".".join(map(str, first["loc"])) or "source"
-        raise ConfigError(f"{key}: {first['msg'].removeprefix('Value error, ')}") from None
+        document = parse_yaml(text, "source")
+    except ConfigError as error:
+        raise ConfigError(f"expected YAML such as '{{kind: v4l2, device: ...}}': {error}") from None
+    return parse_value(CameraSource, document)
 
 
 def try_source(source: Any, frames: int = 50, timeout_s: float = 10.0) -> Trial:

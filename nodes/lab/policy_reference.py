@@ -28,6 +28,7 @@ from nodes.lab.policy_camera import require_camera
 from nodes.lab.policy_drive import See, drive_round
 from nodes.runtime.errors import BagError, ConfigError
 from nodes.runtime.messages import decode, pose_matrix, stamp_ns
+from nodes.runtime.paths import shipped
 from nodes.runtime.pictures import rgb_image
 from nodes.runtime.topics import topic as topic_row
 
@@ -64,7 +65,9 @@ def from_twin(view: PolicyView, count: int = 48, seed: int = 0) -> Reference:
     from hardware.worlds.lab.config import LabConfig
     from hardware.worlds.lab.lab import Lab
 
-    expert = Expert(load_calibration(RoomCalibration, _twin_calibration() / "room.yaml").reference_path)
+    expert = Expert(
+        load_calibration(RoomCalibration, shipped("calibration/twin") / "room.yaml").reference_path
+    )
     poses = _about_the_path(expert, count, seed)
 
     def frame(lab: Lab, x_m: float, y_m: float, yaw_rad: float) -> NDArray[np.uint8]:
@@ -76,7 +79,7 @@ def from_twin(view: PolicyView, count: int = 48, seed: int = 0) -> Reference:
             def see(states: torch.Tensor) -> torch.Tensor:
                 return images_to_tensor(np.stack([frame(lab, *state) for state in states[:, :3].tolist()]))
 
-            return _drives(see, _twin_calibration())(policy, goal)
+            return _drives(see, shipped("calibration/twin"))(policy, goal)
 
     with Lab(LabConfig()) as lab:
         images = np.stack([frame(lab, *pose) for pose in poses.tolist()])
@@ -238,9 +241,3 @@ def _seen(view: PolicyView, rgb: NDArray[np.uint8], source: str) -> NDArray[np.u
             f"{rgb.shape[0]} from {source}; give frames of the policy's camera with --bag"
         )
     return view.image(rgb)
-
-
-def _twin_calibration() -> Path:
-    import calibration
-
-    return Path(calibration.__file__).parent / "twin"

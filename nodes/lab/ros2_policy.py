@@ -63,6 +63,7 @@ class Ros2Network(nn.Module):
             self._inbox,
         )
         self._stamp_ns = 0
+        self.identity = f"ROS 2 program, domain {domain_id}, {images} to {commands} ({command_type})"
         self.eval()
 
     def forward(self, images: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ from advnerf_core.data.image_files import OPAQUE
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array
+from advnerf_core.places import require_utf8
 from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.field import SceneFieldConfig, save_scene
 from advnerf_core.scene.intervals import pixel_intervals
@@ -88,6 +89,7 @@ class TrainingRequest:
 
     def __post_init__(self) -> None:
         """Check the settings."""
+        require_utf8(self.output.absolute())
         if (self.steps is None) == (self.minutes is None):
             raise ConfigError("expected either --steps or --minutes; give exactly one of them")
         if self.box_m is not None and not all(low < high for low, high in zip(*self.box_m, strict=True)):

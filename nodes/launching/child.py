@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 from typing import IO, Any
 
+from advnerf_core.run_module import module_command
 from nodes.launching.launch_file import NodeEntry
 
 _SHIM = Path(__file__).with_name("shim.py")
@@ -66,7 +67,7 @@ class Child:
         self.log.parent.mkdir(parents=True, exist_ok=True)
         command = [
             *(sys.executable, "-I", "-S", str(_SHIM), str(os.getpid())),
-            *(sys.executable, "-m", self.entry.module, "--config", str(self.config)),
+            *module_command(self.entry.module, "--config", str(self.config)),
             *("--run-dir", str(self._run_dir), "--name", self.name),
         ]
         environment = {**os.environ, "PYTHONUNBUFFERED": "1", **self.entry.env}

@@ -16,16 +16,16 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
-import yaml
-
+from advnerf_core.documents import dump_yaml, read_json
 from advnerf_core.files import write_atomically
+from advnerf_core.places import private_folder, require_utf8
 from nodes.launching.child import Child
 from nodes.launching.launch_file import Plan, load_launch
 from nodes.runtime.bus import Bus
 from nodes.runtime.config import node_document
 from nodes.runtime.errors import LaunchError
 from nodes.runtime.locks import HeldError, hold
-from nodes.runtime.paths import RESOLVED_NAME, private_folder, user_folder
+from nodes.runtime.paths import RESOLVED_NAME, user_folder, user_folders
 from nodes.runtime.topics import status_topic
 
 _POLL_S = 0.05
@@ -55,8 +55,10 @@ class Launch:
         host: str | None = None,
     ) -> None:
         self.run_dir = Path(run_dir).resolve()
+        require_utf8(self.run_dir)
         self.plan: Plan = load_launch(Path(file), overrides, self.run_dir, host)
         self.failure = ""
+        self.timed_out = False  # whether a node was too slow, instead of ended by an error of its own
         self._report = report or (lambda line: None)
         self._children = {name: Child(name, entry, self.run_dir) for name, entry in self.plan.nodes.items()}
         # Plain flags: an Event takes a lock, and a signal handler that sets it could deadlock with itself.
@@ -107,6 +109,7 @@ class Launch:
             if self._done.is_set():
                 raise LaunchError(self.failure or "the launch was stopped before it was ready")
             if time.monotonic() > deadline:
+                self.timed_out = True
                 raise LaunchError(
                     f"expected the launch to be ready within {timeout_s:g} s: {self._what_is_missing()}"
                 )
@@ -128,11 +131,11 @@ class Launch:
         self._impatient = self._impatient or kill
 
     def _write_configuration(self) -> None:
-        resolved = yaml.safe_dump(self.plan.resolved, sort_keys=False)
+        resolved = dump_yaml(self.plan.resolved)
         write_atomically(self.run_dir / RESOLVED_NAME, resolved)
         for name, child in self._children.items():
             document = node_document(self.plan.documents[name])
-            write_atomically(child.config, yaml.safe_dump(document, sort_keys=False))
+            write_atomically(child.config, dump_yaml(document))
 
     def _supervise(self) -> None:
         try:
@@ -172,6 +175,7 @@ class Launch:
                 self._report(f"{child.name}: restarted, process {child.pid}")
         elif child.running:
             if trouble := _silence(child, now):
+                self.timed_out |= child.entry.required and not self.failure
                 child.signal(signal.SIGKILL)
                 self._died(child, f"{trouble} and was killed (log: {child.log})", now)
         elif not child.given_up:
@@ -267,11 +271,11 @@ class Launch:
 
 
 def active_launches() -> list[dict[str, Any]]:
-    """Running launches of this user on this host: name, run_dir, pid."""
+    """Running launches of this user on this host: name, run_dir, pid, and cwd, the folder in which it was started."""
     found = []
-    for card in sorted((user_folder() / "active").glob("*.json")):
+    for card in sorted(card for folder in user_folders() for card in (folder / "active").glob("*.json")):
         try:
-            launch = json.loads(card.read_text(encoding="utf-8"))
+            launch = read_json(card)
             if is_running(Path(launch["run_dir"])):
                 found.append(launch)
         except (OSError, ValueError, KeyError):
@@ -310,5 +314,7 @@ def is_running(run_dir: Path) -> bool:
 
 def _leave_card(name: str, run_dir: Path) -> Path:
     card = private_folder(user_folder() / "active") / f"{os.getpid()}-{run_dir.name}.json"
-    write_atomically(card, json.dumps({"name": name, "run_dir": str(run_dir), "pid": os.getpid()}))
+    write_atomically(
+        card, json.dumps({"name": name, "run_dir": str(run_dir), "pid": os.getpid(), "cwd": os.getcwd()})
+    )
     return card

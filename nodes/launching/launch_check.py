@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import yaml
-
+from advnerf_core.documents import dump_yaml
+from advnerf_core.run_module import module_command
 from nodes.launching.launch_file import Plan
 from nodes.runtime.config import node_document
 
@@ -48,10 +47,8 @@ def _processes(plan: Plan, folder: Path) -> Iterator[dict[str, subprocess.Popen[
     try:
         for name, entry in plan.nodes.items():
             config = folder / f"{name}.yaml"
-            config.write_text(
-                yaml.safe_dump(node_document(plan.documents[name]), sort_keys=False), encoding="utf-8"
-            )
-            command = [sys.executable, "-m", entry.module, "--check", "--config", str(config)]
+            config.write_text(dump_yaml(node_document(plan.documents[name])), encoding="utf-8")
+            command = module_command(entry.module, "--check", "--config", str(config))
             processes[name] = subprocess.Popen(
                 [*command, "--run-dir", str(folder), "--name", name],
                 stdin=subprocess.DEVNULL,

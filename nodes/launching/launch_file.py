@@ -4,26 +4,28 @@ from __future__ import annotations
 
 import importlib.util
 import re
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import ConfigDict, Field, field_validator
 
+from advnerf_core.documents import Document, read_yaml
+from advnerf_core.run_module import search_working_folder_last
+from advnerf_core.strict import StrictModel, validate
 from nodes.launching.launch_hosts import HostEntry, choose_host
-from nodes.runtime.config import Document, apply_overrides, read_yaml, validate
+from nodes.runtime.config import apply_overrides
 from nodes.runtime.errors import ConfigError, TopicError
-from nodes.runtime.paths import bus_folder
+from nodes.runtime.paths import bus_folder, shipped
 from nodes.runtime.topics import status_topic
 
 RECORDER = "recorder"
 _REFERENCE = re.compile(r"\$\{([A-Za-z_][A-Za-z0-9_]*)\}")
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
+class _Strict(StrictModel):
+    model_config = ConfigDict(populate_by_name=True)
 
 
 class Respawn(_Strict):
@@ -103,8 +105,9 @@ class LaunchFile(_Strict):
 
     Attributes:
         name: Name of the launch.
-        params: Values that the file and other parameters can use as ``${name}``. Two are predefined: ``${run_dir}``, and
-            ``${socket_dir}``, a folder whose path is short enough for Unix sockets.
+        params: Values that the file and other parameters can use as ``${name}``. Three are predefined: ``${run_dir}``,
+            ``${socket_dir}``, a folder whose path is short enough for Unix sockets, and ``${twin_calibration}``, the folder with the
+            calibration files of the simulated lab.
         nodes: The nodes, in the order of their start.
         record: Settings of an added recorder; true uses the defaults.
         include: Launch files, relative to this one, that this one extends.
@@ -146,7 +149,11 @@ class Plan:
 
 
 def load_launch(
-    file: Path, overrides: Sequence[str] = (), run_dir: Path | str = "<run_dir>", host: str | None = None
+    file: Path,
+    overrides: Sequence[str] = (),
+    run_dir: Path | str = "<run_dir>",
+    host: str | None = None,
+    twin_calibration: Path | str | None = None,
 ) -> Plan:
     """Read a launch file and resolve it.
 
@@ -156,6 +163,7 @@ def load_launch(
             ``hosts.name.key=value``, or ``keys=folder``.
         run_dir: Value of ``${run_dir}``.
         host: Host of the launch file that this computer is, or ``all``; None if the file has no hosts.
+        twin_calibration: Value of ``${twin_calibration}``; None for where it is on this computer.
     """
     file = Path(file)
     document = _read_with_includes(file, ())
@@ -164,7 +172,9 @@ def load_launch(
     for override in overrides:
         _apply_override(document, override)
     socket_dir = str(bus_folder(run_dir)) if isinstance(run_dir, Path) else "<socket_dir>"
-    params = {**(document.data.get("params") or {}), "run_dir": str(run_dir), "socket_dir": socket_dir}
+    twin = shipped("calibration/twin") if twin_calibration is None else twin_calibration
+    own = {"run_dir": str(run_dir), "socket_dir": socket_dir, "twin_calibration": str(twin)}
+    params = {**(document.data.get("params") or {}), **own}
     document.data = _substitute(document.data, params, document, ())
     launch = validate(LaunchFile, document)
     if launch.record is not False:
@@ -327,9 +337,7 @@ def _check(name: str, entry: NodeEntry, document: Document) -> None:
         )
     if entry.required and entry.respawn is not None:
         raise ConfigError(f"{place}: node {name} has respawn, so it must also have required: false")
-    # The node's process is started by `python -m` in this folder, and finds its modules there.
-    if (folder := str(Path.cwd())) not in sys.path:
-        sys.path.append(folder)
+    search_working_folder_last()  # as the node's process does
     try:
         found = importlib.util.find_spec(entry.module) is not None
     except ModuleNotFoundError:

@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-from nodes.runtime.config import Document
+from advnerf_core.documents import Document
+from advnerf_core.strict import StrictModel
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.topics import STATUS_PREFIX, TOPICS, status_topic
 
@@ -28,7 +29,7 @@ _SAFETY_MODULE = "nodes.safety"
 _COMMANDS = ("/policy/drive", "/expert/drive")
 
 
-class HostEntry(BaseModel):
+class HostEntry(StrictModel):
     """A host of a launch file.
 
     Attributes:
@@ -37,8 +38,6 @@ class HostEntry(BaseModel):
         drive_port: TCP port on which the listening host receives.
         key: Name of the host's key; none uses the name of the host.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     address: str | None = None
     watch_port: int = Field(default=5570, ge=1024, le=65535)

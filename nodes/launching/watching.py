@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from advnerf_core.documents import read_yaml
 from nodes.launching.launch import active_launches, is_running
 from nodes.runtime.bus import Bus, Received
 from nodes.runtime.clock import NS_PER_S
-from nodes.runtime.config import parse_yaml
 from nodes.runtime.errors import LaunchError, MessageError
 from nodes.runtime.messages import stamp_ns
 from nodes.runtime.paths import RESOLVED_NAME, bus_folder
@@ -77,7 +77,7 @@ def _launched(run_dir: Path) -> list[str]:
     try:
         if not is_running(run_dir):
             return []
-        resolved = parse_yaml((run_dir / RESOLVED_NAME).read_text(encoding="utf-8"), RESOLVED_NAME).data
+        resolved = read_yaml(run_dir / RESOLVED_NAME).data
         return [name for name, entry in resolved["nodes"].items() if entry.get("if", True)]
     except FileNotFoundError:
         return []

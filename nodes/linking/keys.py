@@ -18,6 +18,7 @@ from pathlib import Path
 import zmq
 
 from advnerf_core.files import write_atomically
+from advnerf_core.places import expanded, private_folder, user_place
 from nodes.runtime.errors import SecurityError
 
 WATCH, DRIVE = "watch", "drive"
@@ -46,8 +47,7 @@ class KeyRow:
 
 def default_folder() -> Path:
     """Default key folder of this user."""
-    base = os.environ.get("XDG_CONFIG_HOME") or str(Path.home() / ".config")
-    return Path(base) / "advnerf" / "keys"
+    return user_place("config") / "keys"
 
 
 class KeyFolder:
@@ -58,7 +58,7 @@ class KeyFolder:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = Path(path).expanduser()
+        self.path = expanded(path)
 
     def new(self, name: str) -> str:
         """Create a key pair and return the public key. A name that already has one is refused."""
@@ -68,8 +68,8 @@ class KeyFolder:
                 f"{self.path} already has a key {name}; use another name, or revoke the key and remove its files"
             )
         public, secret = (half.decode("ascii") for half in zmq.curve_keypair())
-        _private_folder(self.path)
-        _private_folder(secret_file.parent)
+        private_folder(self.path.resolve())
+        private_folder(secret_file.parent)
         descriptor = os.open(secret_file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
         with os.fdopen(descriptor, "w", encoding="ascii") as stream:
             stream.write(secret + "\n")
@@ -194,12 +194,6 @@ def require_keys(address: str, keys: KeyFolder | None, commands: Sequence[str] =
             f"without keys a link can only be used to watch, but this one would carry {shown} to the listening host, so any process on "
             f"{address} could drive the car. {_MAKE_KEYS}; or run all nodes on one computer with --host all"
         )
-
-
-def _private_folder(path: Path) -> None:
-    path.mkdir(mode=0o700, parents=True, exist_ok=True)
-    if stat.S_IMODE(path.stat().st_mode) & 0o077:
-        path.chmod(0o700)
 
 
 def _read_key(file: Path) -> str:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from nodes.operator_page.pictures import Picture
-from nodes.operator_page.said import Act, Hold, Seen, Wants, read_said
+from nodes.operator_page.said import STOPS, Act, Hold, Seen, Stop, Wants, read_said
 from nodes.runtime.errors import MessageError, SecurityError
 
 _CREDIT = 2
@@ -111,6 +111,7 @@ class Client:
         self._sent: OrderedDict[int, int] = OrderedDict()
         self._last_n = -1
         self._messages, self._acts = _Budget(_RATE_HZ, _BURST), _Budget(_ACT_RATE_HZ, _ACT_BURST)
+        self._stops = {kind: _Budget(_ACT_RATE_HZ, _ACT_BURST) for kind in STOPS}
 
     def offer_beat(self, beat: int) -> None:
         """Send the number of a beat; one that still waits is skipped."""
@@ -165,8 +166,12 @@ class Client:
         Raises:
             Misuse: The connection must be closed.
         """
-        self._messages.pay("messages")
         try:
+            # A request to stop pays for nothing but itself: neither other messages nor other acts use up its share.
+            if _is_stop(data) and isinstance(stop := read_said(data), Stop):
+                self._stops[stop.t].pay("stops")
+                return self._asked(stop)
+            self._messages.pay("messages")
             return self._read(data)
         except MessageError as error:
             self.malformed += 1
@@ -180,6 +185,8 @@ class Client:
         if isinstance(said, Wants):
             self.wants = frozenset(said.c)
             return None
+        if isinstance(said, Stop):
+            return self._asked(said)
         if isinstance(said, Seen):
             self._under_way[said.c] = max(0, self._under_way.get(said.c, 0) - 1)
             self._wake.set()
@@ -188,10 +195,21 @@ class Client:
             raise MessageError("expected an act with the key of this connection")
         if said.n <= self._last_n:
             raise MessageError(f"expected an act with a number above {self._last_n}, got {said.n}")
-        frame_ns = int(said.frame)
-        if frame_ns and frame_ns not in self._sent:
+        if said.frame != "0" and int(said.frame) not in self._sent:
             raise MessageError("expected the stamp of a picture that was sent to this page")
         self._last_n = said.n
         if not isinstance(said, Hold):
             self._acts.pay("acts")
-        return Asked(self.number, self.address, said, frame_ns, self._sent.get(frame_ns, 0), self.session)
+        return self._asked(said)
+
+    def _asked(self, act: Act) -> Asked:
+        frame_ns = int(act.frame)
+        received_ns = self._sent.get(frame_ns, 0)
+        return Asked(
+            self.number, self.address, act, frame_ns if received_ns else 0, received_ns, self.session
+        )
+
+
+def _is_stop(data: str | bytes) -> bool:
+    """Whether a message may be a request to stop. Cheap, because every message is asked."""
+    return isinstance(data, str) and any(f'"{kind}"' in data for kind in STOPS)

@@ -1,4 +1,4 @@
-"""The log of who did what, one line of JSON for each act."""
+"""The log of who did what, one line of JSON for each act. It is written by another thread, after the act took effect."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
+from nodes.operator_page.disk import DiskWriter
 from nodes.runtime.clock import Now
 
 _SHOWN = 12
@@ -16,14 +17,17 @@ _SHOWN = 12
 class Diary:
     """Appends acts to a file and remembers the last ones for the page.
 
+    A disk that is full or does not answer delays the log. It neither delays nor undoes an act.
+
     Args:
         file: The log. An existing one is continued.
+        disk: Writes it.
     """
 
-    def __init__(self, file: Path) -> None:
-        file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        descriptor = os.open(file, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
-        self._stream = os.fdopen(descriptor, "a", encoding="utf-8")
+    def __init__(self, file: Path, disk: DiskWriter) -> None:
+        self._file, self._disk = file, disk
+        self._descriptor: int | None = None
+        self._unwritten = b""
         self._last: deque[dict[str, Any]] = deque(maxlen=_SHOWN)
 
     @property
@@ -34,7 +38,7 @@ class Diary:
     def note(
         self, now: Now, operator: str, address: str, act: str, detail: str, frame_ns: int, answer: str
     ) -> None:
-        """Write an act to the log.
+        """Note an act. It is written to the log soon.
 
         Args:
             now: Current time.
@@ -55,8 +59,8 @@ class Diary:
             "frame_ns": frame_ns,
             "refused": answer,
         }
-        self._stream.write(json.dumps(row, ensure_ascii=False) + "\n")
-        self._stream.flush()
+        line = (json.dumps(row, ensure_ascii=False) + "\n").encode()
+        self._disk.submit(lambda: self._write(line))
         shown = {
             "real_ms": now.real_ns // 1_000_000,
             "operator": operator,
@@ -67,5 +71,16 @@ class Diary:
         self._last.append(shown)
 
     def close(self) -> None:
-        """Close the file."""
-        self._stream.close()
+        """Close the file. Close the writer before it."""
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+
+    def _write(self, line: bytes) -> None:
+        """Append a line. After a failure, the next call continues with the rest of the same line."""
+        if self._descriptor is None:
+            self._file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC
+            self._descriptor = os.open(self._file, flags, 0o600)
+        self._unwritten = self._unwritten or line
+        while self._unwritten:
+            self._unwritten = self._unwritten[os.write(self._descriptor, self._unwritten) :]

@@ -22,10 +22,20 @@ COOKIE = "advnerf_page"
 # 32 letters and digits without those that look alike: 8 of them are 40 bits.
 _LETTERS = "ABCDEFGHJKLMNPQRSTUVWXYZ23456789"
 _CODE_LENGTH = 8
-# Guessing one of 2^40 codes in so many tries succeeds once in 10^9. Fewer tries would let strangers keep the operator out.
-_TRIES = 1000
+# So many codes a second are looked at, from all addresses together: in the 300 s of a code, guessing one of 2^40 succeeds once in
+# 4 * 10^8. Codes that come faster wait for their turn, so strangers can slow the operator down, and cannot keep the operator out.
+_GUESSES_HZ = 10.0
+# Wrong codes of one address that cost nothing; each further one doubles the time until the next is looked at.
+_FREE_GUESSES, _LONGEST_WAIT_S = 3, 30.0
+_MOST_GUESSERS = 4096
 _SESSIONS = 64
 _SESSION_S = 12 * 3600.0
+
+
+@dataclass
+class _Guesser:
+    wrong: int = 0
+    free_ns: int = 0
 
 
 @dataclass
@@ -44,7 +54,8 @@ class Doors:
     codes: int = 0
     refused: int = 0
     _code_ns: int = 0
-    _tries: int = 0
+    _turn_ns: int = 0
+    _guessers: dict[str, _Guesser] = field(default_factory=dict)
     _sessions: dict[str, tuple[str, int]] = field(default_factory=dict)
 
     def renew(self, mono_ns: int) -> bool:
@@ -52,7 +63,7 @@ class Doors:
         if self.code and mono_ns - self._code_ns <= self.code_s * NS_PER_S:
             return False
         self.code = "".join(secrets.choice(_LETTERS) for _ in range(_CODE_LENGTH))
-        self._code_ns, self._tries = mono_ns, 0
+        self._code_ns = mono_ns
         self.codes += 1
         return True
 
@@ -60,20 +71,35 @@ class Doors:
         """Time for which the current code is still valid [s]."""
         return max(0.0, self.code_s - (mono_ns - self._code_ns) / NS_PER_S)
 
+    def wait_s(self, address: str, mono_ns: int) -> float:
+        """Time that this address must wait after its wrong codes before another one is looked at [s]; 0 if it need not wait."""
+        guesser = self._guessers.get(_network(address))
+        return 0.0 if guesser is None else max(0.0, (guesser.free_ns - mono_ns) / NS_PER_S)
+
+    def turn_s(self, address: str, mono_ns: int) -> float:
+        """Take a turn for one code. Returns the time until it is looked at [s]."""
+        self._turn_ns = max(mono_ns, self._turn_ns + round(NS_PER_S / _GUESSES_HZ))
+        # The next code of this address waits at least until this one was looked at.
+        self._guesser(address).free_ns = self._turn_ns
+        return (self._turn_ns - mono_ns) / NS_PER_S
+
     def enter(self, code: str, address: str, mono_ns: int) -> str:
         """Exchange a code for a session. Returns its token; empty if the code is wrong, used or expired.
 
-        A code is valid once. After a thousand wrong codes it is replaced, so that it cannot be guessed.
+        A code is valid once. Wrong codes make their address wait, and do not void the code.
         """
         given = code.strip().upper().replace("-", "").replace(" ", "").encode()
         fresh = bool(self.code) and mono_ns - self._code_ns <= self.code_s * NS_PER_S
         right = hmac.compare_digest(given, self.code.encode())
         if not (fresh and right):
             self.refused += 1
-            self._tries += 1
-            if self._tries >= _TRIES:
-                self.code = ""
+            guesser = self._guesser(address)
+            guesser.wrong += 1
+            if (excess := guesser.wrong - _FREE_GUESSES) >= 0:
+                delay_s = min(2.0 ** min(excess, 10), _LONGEST_WAIT_S)
+                guesser.free_ns = mono_ns + round(delay_s * NS_PER_S)
             return ""
+        self._guessers.pop(_network(address), None)
         self.code = ""
         return self.admit(address, mono_ns)
 
@@ -85,6 +111,14 @@ class Doors:
         self._sessions[token] = (address, mono_ns)
         return token
 
+    def _guesser(self, address: str) -> _Guesser:
+        network = _network(address)
+        if network not in self._guessers:
+            while len(self._guessers) >= _MOST_GUESSERS:
+                self._guessers.pop(next(iter(self._guessers)))
+            self._guessers[network] = _Guesser()
+        return self._guessers[network]
+
     def knows(self, token: str, address: str, mono_ns: int) -> bool:
         """Whether a token is a session of this address."""
         found = self._sessions.get(token)
@@ -92,6 +126,19 @@ class Doors:
             return False
         known_address, since_ns = found
         return known_address == address and mono_ns - since_ns <= _SESSION_S * NS_PER_S
+
+
+def _network(address: str) -> str:
+    """The network that guesses count for: an IPv4 address, or the first 64 bits of an IPv6 address, which one host can fill."""
+    try:
+        found = ipaddress.ip_address(address.partition("%")[0])
+    except ValueError:
+        return address
+    if isinstance(found, ipaddress.IPv6Address):
+        if found.ipv4_mapped is not None:
+            return str(found.ipv4_mapped)
+        return str(ipaddress.ip_network((found, 64), strict=False))
+    return str(found)
 
 
 def host_is_ours(host: str, names: tuple[str, ...] = ()) -> bool:

@@ -10,19 +10,21 @@ from dataclasses import dataclass
 from typing import Any
 
 from advnerf_core.geometry import planar_pose
+from nodes.launching.launched import Launched
 from nodes.operator_page.board import Board
 from nodes.operator_page.catalogue import Entry, Sender
 from nodes.operator_page.client import Asked
 from nodes.operator_page.desk import Desk
 from nodes.operator_page.diary import Diary
-from nodes.operator_page.launched import Launched
 from nodes.operator_page.recording import Recording
-from nodes.operator_page.requests import ArmAsker
-from nodes.operator_page.said import ChooseAttack, Hold, Label, Release, Take
+from nodes.operator_page.said import ChooseAttack, Hold, Label, Release, Stop, Take
 from nodes.operator_page.trial import Trial
+from nodes.runtime.arm_asker import ArmAsker
 from nodes.runtime.clock import NS_PER_S, Now
 from nodes.runtime.messages import header, pose_message, stamp_from_ns, types
 from nodes.runtime.node import Out
+from nodes.runtime.requests import ESTOP_LATCHED
+from nodes.runtime.wire import MessageInfo
 
 TELEOP, ACT, RESET, SWITCH, FILE = (
     "/teleop/state",
@@ -38,8 +40,6 @@ _REARM_NS = 120_000_000
 _TAKEN_S = 8.0
 _IDLE, _AUTONOMY = "idle", "autonomy"
 _ONLY_WATCHES = "this page only watches"
-# Anyone who may see the page may stop the car.
-_FOR_ALL = ("estop", "disarm", "take")
 
 
 @dataclass
@@ -55,7 +55,7 @@ class Parts:
         catalogue: Attacks by id.
         launched: Facts of the launch.
         start_pose: Start of a trial: x [m], y [m], yaw [rad]; None without a room.
-        operates: Whether the page may do more than show.
+        operates: Whether the page may do more than show and stop the car.
     """
 
     desk: Desk
@@ -89,18 +89,21 @@ class Operation:
         self._rearm_ns: int | None = None
         self._refused_press = (0, 0)
         self._why_ended = ""
+        self._knows_latch = False
         self.done = self.refused = 0
 
     def obey(self, asked: Asked, now: Now) -> list[Out]:
         """Decide an act, log it, and answer it."""
         act = asked.act
+        if isinstance(act, Stop):
+            return [*self._stop(asked, act, now), *self._note(asked, act.t, "", "", now)]
         if isinstance(act, Hold):
             return self._hold(asked, act, now)
         name, detail = act.t, ""
         outs: list[Out] = []
         if not self._parts.operates:
             refusal = _ONLY_WATCHES
-        elif name not in _FOR_ALL and (found := self._parts.desk.refusal(asked.client)):
+        elif not isinstance(act, Take) and (found := self._parts.desk.refusal(asked.client)):
             refusal = found
         else:
             self._parts.desk.acted(asked.client, now.mono_ns)
@@ -114,14 +117,26 @@ class Operation:
             return []
         return self._ended("the page was closed or lost its connection", lease.name, now)
 
-    def heard_safety(self, message: Any) -> None:
-        """Note a state of the safety node."""
-        self._asker.heard(message)
+    def heard_safety(self, message: Any, info: MessageInfo) -> None:
+        """Note a state of the safety node. A page that starts takes over the e-stop that is latched there."""
+        self._asker.heard(message, info)
+        if self._parts.operates and not self._knows_latch:
+            self._knows_latch = True
+            if message.reason == ESTOP_LATCHED:
+                self._parts.desk.stop()
+
+    def heard_motor(self, message: Any, info: MessageInfo) -> None:
+        """Note a report of the motor node."""
+        self._asker.heard_motor(message, info)
+
+    def stops(self) -> tuple[int, int]:
+        """Number of requests to disarm, and the number up to which they are confirmed (any thread)."""
+        return self._asker.stops_asked, self._asker.stops_confirmed
 
     def tick(self, now: Now) -> list[Out]:
         """Check the button, and repeat what has to be repeated."""
         if not self._parts.operates:
-            return []
+            return self._asker.tick(now)
         parts, outs = self._parts, []
         lease = parts.desk.lease
         if ended := parts.desk.check(now.mono_ns):
@@ -144,6 +159,7 @@ class Operation:
             "ended": self._why_ended,
             "estop": parts.desk.estop,
             "unanswered_s": round(self._asker.unanswered_s(now), 1),
+            "not_confirmed": self._asker.not_confirmed(now),
             "chosen": {
                 "id": self._chosen,
                 "show": self._show is not False,
@@ -196,9 +212,7 @@ class Operation:
             return "", act.text, []
         do = {
             "leave": self._leave,
-            "estop": self._stop,
             "reset_estop": self._reset,
-            "disarm": self._disarm,
             "trial": self._start_trial,
             "trial_end": self._give_up_trial,
             "attack_off": self._attack_off,
@@ -212,13 +226,19 @@ class Operation:
         self._parts.desk.leave(asked.client)
         return "", self._teleop(now)
 
-    def _stop(self, asked: Asked, now: Now) -> tuple[str, list[Out]]:
-        self._parts.desk.stop()
+    def _stop(self, asked: Asked, act: Stop, now: Now) -> list[Out]:
+        """Stop the car. Every admitted browser may do so; no rule of the desk applies. The e-stop stays latched."""
+        self._parts.desk.acted(asked.client, now.mono_ns)
         self._rearm_ns = None
-        return "", [
-            *self._teleop(now),
-            self._asker.disarm(now, f"e-stop on the page by {self._name(asked.client)}"),
-        ]
+        name = self._name(asked.client)
+        if not self._parts.operates:
+            return [self._asker.disarm(now, f"{act.t} on a page that watches, by {name}")]
+        if act.t == "estop":
+            self._knows_latch = True
+            self._parts.desk.stop()
+            return [*self._teleop(now), self._asker.disarm(now, f"e-stop on the page by {name}")]
+        self._parts.desk.drop()
+        return [self._asker.disarm(now, f"on the page by {name}"), *self._teleop(now)]
 
     def _reset(self, asked: Asked, now: Now) -> tuple[str, list[Out]]:
         """Release the e-stop. The safety node forgets its latch only at an explicit request of the operator.
@@ -229,10 +249,6 @@ class Operation:
         if not refusal and self._parts.launched.holds:
             self._rearm_ns = now.mono_ns + _REARM_NS
         return refusal, self._teleop(now)
-
-    def _disarm(self, asked: Asked, now: Now) -> tuple[str, list[Out]]:
-        self._parts.desk.drop()
-        return "", [self._asker.disarm(now, f"on the page by {self._name(asked.client)}"), *self._teleop(now)]
 
     def _start_trial(self, asked: Asked, now: Now) -> tuple[str, list[Out]]:
         """Begin a trial. The simulated car is put to the start; a real one must be carried there."""

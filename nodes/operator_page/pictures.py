@@ -10,8 +10,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 
+from advnerf_core.places import open_tensors
 from advnerf_core.policies.contract import ONNX_METADATA_KEY, PolicyContractError, declaration_beside
 from advnerf_core.policies.view import PolicyView
 
@@ -61,7 +62,7 @@ def view_of_policy(policy: str) -> PolicyView | None:
         if path.suffix == ".onnx":
             return _view_of_onnx(path)
         if path.suffix == ".safetensors":
-            with safe_open(path, framework="numpy") as file:
+            with open_tensors(path, "numpy") as file:
                 return PolicyView.from_dict(json.loads((file.metadata() or {})["view"]))
     except (SafetensorError, PolicyContractError, OSError, KeyError, ValueError):
         pass

@@ -40,8 +40,11 @@ class Recording:
             return f"{self._folder} exists; try again in a second"
         config = {"output": self._folder, "statuses_of": list(self._nodes)}
         child = Child(RECORDER, NodeEntry(module="nodes.recorder"), self._run_dir)
-        write_atomically(child.config, json.dumps(config))
-        child.start()
+        try:
+            write_atomically(child.config, json.dumps(config))
+            child.start()
+        except OSError as error:  # a full disk must not end the page
+            return f"cannot start a recorder: {error.strerror or error}"
         self._child, self._asked_s, self._trouble = child, None, ""
         return ""
 
@@ -73,8 +76,14 @@ class Recording:
             "stopping": self._child is not None and self._asked_s is not None,
             "folder": self._folder,
             "trouble": self._trouble,
-            "disk_left_gb": round(shutil.disk_usage(self._run_dir).free / 1e9, 1),
+            "disk_left_gb": self._disk_left_gb(),
         }
+
+    def _disk_left_gb(self) -> float:
+        try:
+            return round(shutil.disk_usage(self._run_dir).free / 1e9, 1)
+        except OSError:
+            return 0.0
 
     def close(self) -> None:
         """Finish the bag, and wait for it."""

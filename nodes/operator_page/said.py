@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, TypeAdapter, ValidationError
+from pydantic import (
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    StringConstraints,
+    TypeAdapter,
+    ValidationError,
+)
 
+from advnerf_core.strict import StrictModel
 from nodes.runtime.errors import MessageError
 
 LONGEST_BYTES = 2048
@@ -21,11 +29,20 @@ _Count = Annotated[int, Field(ge=0, lt=2**53, strict=True)]
 _Stamp = Annotated[str, StringConstraints(pattern=r"^(0|[1-9][0-9]{0,18})$")]
 
 
-class _Said(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+STOPS = ("estop", "disarm")
 
 
-class Seen(_Said):
+def _count_or_zero(value: Any) -> int:
+    return value if type(value) is int and 0 <= value < 2**53 else 0
+
+
+def _stamp_or_zero(value: Any) -> str:
+    return (
+        value if isinstance(value, str) and value.isascii() and value.isdigit() and len(value) < 20 else "0"
+    )
+
+
+class Seen(StrictModel):
     """A picture was drawn on the screen, or could not be decoded."""
 
     t: Literal["seen"]
@@ -33,14 +50,14 @@ class Seen(_Said):
     s: _Stamp
 
 
-class Wants(_Said):
+class Wants(StrictModel):
     """The pictures that the page shows."""
 
     t: Literal["wants"]
     c: Annotated[list[Annotated[int, Field(ge=0, le=2, strict=True)]], Field(max_length=3)]
 
 
-class _Act(_Said):
+class _Act(StrictModel):
     """An act carries the key of its connection, a number that grows, and the newest picture that its operator saw."""
 
     key: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{32}$")]
@@ -70,12 +87,20 @@ class Take(_Act):
     name: _Name
 
 
+class Stop(StrictModel):
+    """Stop the car. Only the kind matters: a wrong or missing number, picture or key refuses no stop."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    t: Literal["estop", "disarm"]
+    n: Annotated[int, BeforeValidator(_count_or_zero)] = 0
+    frame: Annotated[str, BeforeValidator(_stamp_or_zero)] = "0"
+
+
 class Plain(_Act):
     """An act without arguments."""
 
-    t: Literal[
-        "leave", "estop", "reset_estop", "disarm", "trial", "trial_end", "attack_off", "record", "record_stop"
-    ]
+    t: Literal["leave", "reset_estop", "trial", "trial_end", "attack_off", "record", "record_stop"]
 
 
 class ChooseAttack(_Act):
@@ -92,7 +117,7 @@ class Label(_Act):
     text: _Text
 
 
-Act = Hold | Release | Take | Plain | ChooseAttack | Label
+Act = Hold | Release | Take | Plain | Stop | ChooseAttack | Label
 Said = Seen | Wants | Act
 _ADAPTER: TypeAdapter[Said] = TypeAdapter(Annotated[Said, Field(discriminator="t")])
 

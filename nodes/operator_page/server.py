@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hashlib
+import math
 import socket
 import threading
 import time
@@ -18,12 +19,12 @@ from typing import Any
 
 from nodes.linking.keys import is_loopback
 from nodes.operator_page.certificate import Certificate, certificate
-from nodes.operator_page.client import Client, Gone, Misuse
+from nodes.operator_page.client import Asked, Client, Gone, Misuse
 from nodes.operator_page.doors import COOKIE, Doors, origin_is_ours, peer_is_same_user
 from nodes.operator_page.listening import bound_socket, require_packages
 from nodes.operator_page.pictures import Picture
 from nodes.operator_page.responses import Guard, code_in, web_file
-from nodes.operator_page.said import LONGEST_BYTES
+from nodes.operator_page.said import LONGEST_BYTES, STOPS, Stop
 from nodes.runtime.errors import BusError
 from nodes.runtime.inbox import Inbox
 
@@ -31,6 +32,7 @@ _PACKAGES = ("starlette", "uvicorn", "websockets", "cryptography")
 _MOST_CLIENTS = 16
 _MOST_CONNECTIONS = 96
 _WRONG_CODE_S = 1.0
+_CONFIRM_S, _LOOK_S = 0.9, 0.02
 _START_S = 10.0
 
 
@@ -75,6 +77,7 @@ class PageServer:
         inbox: Receives the acts of browsers, and `Gone`.
         png_of: Returns the picture of an attack by its id; None if there is none.
         welcome: Returns what a new browser is told first.
+        stops: Returns the number of requests to stop, and the number up to which they are confirmed.
         counts: What was refused.
     """
 
@@ -82,6 +85,7 @@ class PageServer:
     inbox: Inbox[Any]
     png_of: Callable[[str], bytes | None]
     welcome: Callable[[], Mapping[str, Any]]
+    stops: Callable[[], tuple[int, int]] = lambda: (0, 0)
     counts: Counts = field(default_factory=Counts)
 
     def __post_init__(self) -> None:
@@ -215,6 +219,7 @@ class PageServer:
             Route("/", self._index),
             Route("/session", self._session),
             Route("/enter", self._enter, methods=["POST"]),
+            Route("/stop/{kind}", self._stop, methods=["POST"]),
             Route("/web/{name}", self._file),
             Route("/attack/{attack_id}", self._attack),
             WebSocketRoute("/live", self._live),
@@ -246,10 +251,18 @@ class PageServer:
         ours = origin_is_ours(
             request.headers.get("origin"), request.headers.get("host", ""), self.tls is not None
         )
-        token = ""
+        token, host = "", request.client.host
         if ours and code:
             with self._door_lock:
-                token = self.doors.enter(code, request.client.host, time.monotonic_ns())
+                wait_s = self.doors.wait_s(host, time.monotonic_ns())
+                turn_s = 0.0 if wait_s else self.doors.turn_s(host, time.monotonic_ns())
+            if wait_s:
+                self.counts.refused += 1
+                headers = {"Retry-After": str(math.ceil(wait_s))}
+                return JSONResponse({"open": False, "wait_s": math.ceil(wait_s)}, 429, headers)
+            await asyncio.sleep(turn_s)
+            with self._door_lock:
+                token = self.doors.enter(code, host, time.monotonic_ns())
         if not token:
             self.counts.refused += 1
             await asyncio.sleep(_WRONG_CODE_S)
@@ -257,6 +270,22 @@ class PageServer:
         response = JSONResponse({"open": True})
         self._put_cookie(response, token)
         return response
+
+    async def _stop(self, request: Any) -> Any:
+        """Stop the car for an admitted browser that has no WebSocket, for example because all places are taken."""
+        from starlette.responses import JSONResponse
+
+        kind, host = request.path_params["kind"], request.headers.get("host", "")
+        ours = origin_is_ours(request.headers.get("origin"), host, self.tls is not None)
+        if not (ours and self._admitted(request) and kind in STOPS):
+            self.counts.refused += 1
+            return JSONResponse({"confirmed": False}, status_code=403)
+        before, _ = self.stops()
+        self.inbox.put(Asked(0, request.client.host, Stop(t=kind), 0, 0, self._public(request)), urgent=True)
+        deadline = time.monotonic() + _CONFIRM_S
+        while not before < self.stops()[1] and time.monotonic() < deadline:
+            await asyncio.sleep(_LOOK_S)
+        return JSONResponse({"confirmed": before < self.stops()[1]})
 
     async def _file(self, request: Any) -> Any:
         return web_file(request.path_params["name"])
@@ -279,7 +308,7 @@ class PageServer:
             return
         await websocket.accept()
         self._numbers += 1
-        session = hashlib.sha256(websocket.cookies[self._cookie].encode()).hexdigest()[:12]
+        session = self._public(websocket)
         client = Client(self._numbers, websocket.client.host, websocket, session)
         self._clients[client.number] = client
         client.answer(
@@ -313,7 +342,11 @@ class PageServer:
             finally:
                 self.counts.malformed += client.malformed - before
             if asked is not None:
-                self.inbox.put(asked)
+                self.inbox.put(asked, urgent=isinstance(asked.act, Stop))
+
+    def _public(self, connection: Any) -> str:
+        """Public name of a session."""
+        return hashlib.sha256(connection.cookies[self._cookie].encode()).hexdigest()[:12]
 
     def _admitted(self, connection: Any) -> bool:
         token = connection.cookies.get(self._cookie, "")

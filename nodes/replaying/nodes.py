@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib
 import inspect
-import sys
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,14 +15,15 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import yaml
 from pydantic import BaseModel
 
+from advnerf_core.documents import Document, decode_text, dump_yaml, parse_yaml
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.run_module import search_working_folder_last
+from advnerf_core.strict import validate
 from nodes.bags.reader import plain_name, read_attachments
 from nodes.launching.launch_file import NodeEntry, Plan, load_launch
 from nodes.runtime.clock import Clock
-from nodes.runtime.config import Document, parse_yaml, validate
 from nodes.runtime.errors import BagError, ConfigError
 from nodes.runtime.node import Node, NodeContext
 from nodes.runtime.paths import RESOLVED_NAME
@@ -91,8 +91,8 @@ def close_nodes(nodes: Mapping[str, Node]) -> None:
 def _plan(bag: Path, choice: Choice, folder: Path) -> Plan:
     modules = [f"{name}.module={spec.partition(':')[0]}" for name, spec in choice.replacements.items()]
     file = choice.launch or _launch_of_bag(bag, choice, folder)
-    if (choice.replacements or choice.launch) and str(Path.cwd()) not in sys.path:
-        sys.path.append(str(Path.cwd()))  # like `python -m`, with which a launch starts its modules
+    if choice.replacements or choice.launch:
+        search_working_folder_last()  # as the processes of a launch do
     plan = load_launch(file, [*modules, *choice.overrides], folder)
     if missing := [name for name in choice.nodes if name not in plan.nodes]:
         raise BagError(f"{file} has no node {', '.join(missing)}; it has {', '.join(plan.nodes)}")
@@ -107,7 +107,7 @@ def _launch_of_bag(bag: Path, choice: Choice, folder: Path) -> Path:
             f"expected {RESOLVED_NAME} attached to {bag}, found none; give the launch file with --launch FILE"
         )
     source = f"{bag}:{RESOLVED_NAME}"
-    data = parse_yaml(attachments[RESOLVED_NAME].decode("utf-8", "replace"), source).data
+    data = parse_yaml(decode_text(attachments[RESOLVED_NAME], source), source).data
     nodes = data.get("nodes") if isinstance(data, dict) else None
     if not isinstance(nodes, dict):
         raise ConfigError(f"{source}: expected a launch file with keys name and nodes")
@@ -121,7 +121,7 @@ def _launch_of_bag(bag: Path, choice: Choice, folder: Path) -> Path:
             )
     files = _put_down(bag, attachments, folder / "attachments")
     kept = {name: _found_again(nodes[name], files) for name in choice.nodes}
-    text = yaml.safe_dump({"name": str(data.get("name", "replay")), "nodes": kept}, sort_keys=False)
+    text = dump_yaml({"name": str(data.get("name", "replay")), "nodes": kept})
     file = folder / RESOLVED_NAME
     file.write_text(text, encoding="utf-8")
     return file

@@ -8,11 +8,13 @@ before the next message. No message is dropped for being late.
 from __future__ import annotations
 
 import tempfile
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from nodes.bags.reader import BagMessage, read_attachments, read_info, read_messages, require_readable
+from nodes.bags.time_gaps import silence_s, skipped_gaps
 from nodes.bags.writer import BagWriter
 from nodes.replaying.lockstep import BagClock, Lockstep, Summary
 from nodes.replaying.nodes import Choice, build_nodes, close_nodes
@@ -56,6 +58,8 @@ class Replay:
         try:
             self._nodes = build_nodes(bag, choice, Path(self._folder.name), self._clock)
             self._lockstep = Lockstep(self._nodes, self._clock, self.info.start_ns)
+            self._gaps = skipped_gaps(bag)
+            self._gaps_ahead = deque(self._gaps)
             recorded = [topic.name for topic in self.info.topics]
             self.left_out = [topic for topic in recorded if type_of_topic(topic) is None]
             self._heard = [
@@ -100,14 +104,22 @@ class Replay:
         for message in read_messages(self.bag, topics):
             if message.topic in self.made_topics:
                 continue
-            yield from (Replayed(made, True) for made in self._lockstep.advance_to(message.log_ns))
+            yield from (Replayed(made, True) for made in self._advance_to(message.log_ns))
             if self._whole:
                 yield Replayed(message, False)
             if message.topic in heard:
                 yield from (Replayed(made, True) for made in self._lockstep.feed(message))
-        yield from (Replayed(m, True) for m in self._lockstep.advance_to(self.info.end_ns))
+        yield from (Replayed(m, True) for m in self._advance_to(self.info.end_ns))
         self._lockstep.finish()
-        self.summary.duration_s = self.info.duration_s
+        self.summary.duration_s = self.info.duration_s - silence_s(self._gaps)
+
+    def _advance_to(self, real_ns: int) -> list[BagMessage]:
+        """Run the ticks that are due by a time. In a gap of the recording there are none."""
+        made: list[BagMessage] = []
+        while self._gaps_ahead and self._gaps_ahead[0].after_ns <= real_ns:
+            gap = self._gaps_ahead.popleft()
+            made += self._lockstep.jump(gap.before_ns, gap.after_ns)
+        return made + self._lockstep.advance_to(real_ns)
 
     def close(self) -> None:
         """Close the nodes."""

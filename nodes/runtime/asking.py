@@ -16,7 +16,6 @@ from nodes.runtime.errors import BusError, LaunchError, MessageError
 from nodes.runtime.requests import Asked
 
 T = TypeVar("T")
-_TELL_S = 1.0
 
 
 class NoAnswerError(LaunchError):
@@ -31,9 +30,7 @@ def ask(
     read: Callable[[str, Received], T | None],
     *,
     every_s: float,
-    patience_s: float | None,
-    silent: Callable[[float], None] = lambda waited_s: None,
-    silent_after_s: float = 1.0,
+    patience_s: float,
 ) -> T:
     """Publish a request repeatedly until it is answered.
 
@@ -44,9 +41,7 @@ def ask(
         answers: Topic on which the node answers.
         read: Returns the answer if a received message answers this id, else None.
         every_s: Time between two repeats [s].
-        patience_s: Time after which `NoAnswerError` is raised [s]; None waits for ever.
-        silent: Called every second with the time waited so far [s] while there is no answer.
-        silent_after_s: Time of the first call of `silent` [s].
+        patience_s: Time after which `NoAnswerError` is raised [s].
 
     Returns:
         The result of `read`.
@@ -59,7 +54,7 @@ def ask(
     bus.subscribe(answers)
     asked = Asked.at(clock.now())
     began = time.monotonic()
-    next_s, tell_s, taken = began, began + silent_after_s, None
+    next_s, taken = began, None
     while True:
         now_s = time.monotonic()
         if now_s >= next_s:
@@ -70,14 +65,10 @@ def ask(
             answer = _read(read, asked.ask_id, received)
             if answer is not None:
                 return answer
-        waited_s = time.monotonic() - began
-        if patience_s is not None and waited_s > patience_s:
+        if time.monotonic() - began > patience_s:
             raise taken or NoAnswerError(
                 f"expected an answer on {answers} to the request on {topic} within {patience_s:g} s, got none"
             )
-        if time.monotonic() >= tell_s:
-            tell_s = time.monotonic() + _TELL_S
-            silent(waited_s)
 
 
 def _publish(bus: Bus, topic: str, message: Any) -> BusError | None:

@@ -1,5 +1,8 @@
 """Publish and subscribe between the processes of one host, with one XPUB socket per topic and no broker.
 
+Of a topic that any process may send, such as a request to stop the car, the receivers bind the sockets and the senders connect. A
+sender then needs no endpoint, lock or file of its own.
+
 This module is the only one that uses ZeroMQ inside a host. Receivers of a ``latest`` topic drain it to the newest message. A small
 high-water mark alone would leave stale frames, and CONFLATE keeps only the last frame of a multipart message. Other topics keep
 their queue, and gaps in the sequence are counted. A bus belongs to the thread that made it. That thread must call `Bus.wait` or
@@ -8,6 +11,7 @@ their queue, and gaps in the sequence are counted. A bus belongs to the thread t
 
 from __future__ import annotations
 
+import contextlib
 import os
 import secrets
 import time
@@ -19,6 +23,7 @@ from typing import Any, TextIO
 import zmq
 
 from nodes.runtime.clock import NS_PER_S, Clock, SystemClock
+from nodes.runtime.descriptors import require_free
 from nodes.runtime.errors import BusError, MessageError
 from nodes.runtime.image_parts import IMAGE_TYPE, PartedInfo, join_image, split_image, with_parts
 from nodes.runtime.locks import HeldError, hold
@@ -70,7 +75,10 @@ class Counts:
 
 
 class Publisher:
-    """Publishes one topic. Each run folder allows as many publishers of a topic as the topic has senders, usually one."""
+    """Publishes one topic. Each run folder allows as many publishers of a topic as the topic has senders, usually one.
+
+    Any number of processes may publish a topic whose receivers bind.
+    """
 
     def __init__(
         self, context: zmq.Context[Any], run_dir: Path, topic: Topic, instance_id: int, clock: Clock
@@ -82,21 +90,19 @@ class Publisher:
         self._name = topic.name.encode()
         self._sequence = 0
         self._subscribers = 0
-        path, self._lock = _lock_endpoint(topic, run_dir)
+        self._lock: TextIO | None = None
         self._is_status = topic.name.startswith(STATUS_PREFIX)
         self._socket = context.socket(zmq.XPUB)
         self._socket.linger = 0
         self._socket.sndhwm = _SEND_QUEUE
         # XPUB_VERBOSER reports every subscriber that joins or leaves. The readiness barrier counts them.
         self._socket.setsockopt(zmq.XPUB_VERBOSER, 1)
-        try:
-            self._socket.bind(f"ipc://{path}")
-        except zmq.ZMQError as error:
-            self._socket.close()
-            self._lock.close()
-            raise BusError(
-                f"cannot publish {topic.name} at {path}: {error.strerror}; check the run folder"
-            ) from error
+        if topic.receivers:
+            # Without this option, a receiver that restarts would get the messages of the meantime, and would be counted twice.
+            self._socket.setsockopt(zmq.IMMEDIATE, 1)
+            _connect(self._socket, run_dir, topic)
+        else:
+            self._lock = _bind(self._socket, run_dir, topic)
 
     def publish(self, message: Any) -> None:
         """Send a message, or CDR bytes of the topic's type, without blocking."""
@@ -127,9 +133,10 @@ class Publisher:
         for part in cdr[:-1]:
             send(part, _NOBLOCK_MORE)
         send(cdr[-1], _NOBLOCK)
-        if self._is_status:
-            # The file's time keeps the age of the last status readable when this process hangs.
-            os.utime(self._lock.fileno())
+        if self._is_status and self._lock is not None:
+            # The file's time keeps the age of the last status readable when this process hangs. A disk may refuse it.
+            with contextlib.suppress(OSError):
+                os.utime(self._lock.fileno())
 
     def subscribers(self) -> int:
         """Number of connected subscribers."""
@@ -147,7 +154,8 @@ class Publisher:
 
     def unlock(self) -> None:
         """Release the endpoint. Call it after the context is destroyed, because the socket closes in another thread."""
-        self._lock.close()
+        if self._lock is not None:
+            self._lock.close()
 
 
 @dataclass
@@ -156,6 +164,7 @@ class _Subscription:
     socket: zmq.Socket[Any]
     take_all: bool
     limit: int
+    lock: TextIO | None = None
     counts: Counts = field(default_factory=Counts)
     instance_id: int | None = None
     sequence: int = 0
@@ -173,6 +182,7 @@ class Bus:
     def __init__(self, run_dir: Path, clock: Clock | None = None) -> None:
         self._run_dir = Path(run_dir)
         self._clock = clock or SystemClock()
+        require_free()
         self._context: zmq.Context[Any] = zmq.Context()
         self._poller = zmq.Poller()
         self._publishers: dict[str, Publisher] = {}
@@ -215,14 +225,14 @@ class Bus:
         socket.linger = 0
         socket.rcvhwm = limit if take_all else _LATEST_QUEUE
         socket.setsockopt(zmq.MAXMSGSIZE, 2 * MAX_SEQUENCE_LENGTH)
-        # A publisher that starts later must be found within its first period, without the growing default delay.
-        socket.setsockopt(zmq.RECONNECT_IVL, 20)
-        socket.setsockopt(zmq.RECONNECT_IVL_MAX, 100)
         socket.subscribe(row.name.encode())
-        for path in socket_paths(self._run_dir, row):
-            socket.connect(f"ipc://{path}")
+        lock = None
+        if row.receivers:
+            lock = _bind(socket, self._run_dir, row)
+        else:
+            _connect(socket, self._run_dir, row)
         self._poller.register(socket, zmq.POLLIN)
-        self._subscriptions[topic] = _Subscription(row, socket, take_all, limit)
+        self._subscriptions[topic] = _Subscription(row, socket, take_all, limit, lock)
 
     def watch(self, file_descriptor: int) -> None:
         """Make `wait` also return when a file descriptor is readable."""
@@ -335,6 +345,9 @@ class Bus:
         self._context.term()
         for publisher in self._publishers.values():
             publisher.unlock()
+        for subscription in self._subscriptions.values():
+            if subscription.lock is not None:
+                subscription.lock.close()
         self._publishers.clear()
         self._subscriptions.clear()
 
@@ -353,20 +366,62 @@ def age_s(info: MessageInfo, mono_ns: int) -> float:
 
 
 def socket_paths(run_dir: Path, topic: Topic) -> list[Path]:
-    """Paths of the Unix sockets of a topic, one for each process that may send it."""
+    """Paths of the Unix sockets of a topic, one for each process that may send it, or receive it if its receivers bind."""
     first = socket_path(run_dir, topic.name)
-    return [first, *(first.with_name(f"{first.name}.{number}") for number in range(2, topic.senders + 1))]
+    count = topic.receivers or topic.senders
+    return [first, *(first.with_name(f"{first.name}.{number}") for number in range(2, count + 1))]
 
 
-def _lock_endpoint(topic: Topic, run_dir: Path) -> tuple[Path, TextIO]:
-    """Hold a lock next to a socket. Without it, a second bind to an ipc path succeeds silently and takes the first one's readers."""
+def _connect(socket: zmq.Socket[Any], run_dir: Path, topic: Topic) -> None:
+    """Connect to all endpoints of a topic, whether a process has bound them yet or not. An error closes the socket.
+
+    An open socket would keep the bus from closing for ever.
+    """
+    try:
+        # A process that binds later must be found within its first period, without the growing default delay.
+        socket.setsockopt(zmq.RECONNECT_IVL, 20)
+        socket.setsockopt(zmq.RECONNECT_IVL_MAX, 100)
+        for path in socket_paths(run_dir, topic):
+            socket.connect(f"ipc://{path}")
+    except BaseException:
+        socket.close()
+        raise
+
+
+def _bind(socket: zmq.Socket[Any], run_dir: Path, topic: Topic) -> TextIO:
+    """Bind a socket to a free endpoint of a topic and return the lock of the endpoint. An error closes the socket.
+
+    Without the lock, a second bind to an ipc path succeeds silently and takes the first one's peers.
+    """
     owners = []
-    for path in socket_paths(run_dir, topic):
-        try:
-            return path, hold(lock_path(path))
-        except HeldError as error:
-            owners.append(error.owner)
-    raise BusError(
+    try:
+        for path in socket_paths(run_dir, topic):
+            try:
+                lock = hold(lock_path(path))
+            except HeldError as error:
+                owners.append(error.owner)
+                continue
+            try:
+                socket.bind(f"ipc://{path}")
+            except zmq.ZMQError as error:
+                lock.close()
+                raise BusError(
+                    f"cannot open {topic.name} at {path}: {error.strerror}; check the run folder"
+                ) from error
+            return lock
+        raise BusError(_taken(topic, run_dir, owners))
+    except BaseException:
+        socket.close()
+        raise
+
+
+def _taken(topic: Topic, run_dir: Path, owners: list[str]) -> str:
+    if topic.receivers:
+        return (
+            f"expected at most {topic.receivers} processes that receive {topic.name} in {run_dir}, got another one beside process "
+            f"{', '.join(owners)}; stop one of them"
+        )
+    return (
         f"{topic.name} is already published in {run_dir} by process {', '.join(owners)}: another launch uses the same endpoints. "
         "Stop it, or use another --run-dir"
     )

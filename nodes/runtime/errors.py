@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.errors import ConfigError as ConfigError
 
 
 class RuntimeFault(AdvnerfError):
     """Base of the errors raised by nodes and the runtime."""
-
-
-class ConfigError(RuntimeFault, ValueError):
-    """A configuration file or an override is wrong."""
 
 
 class MessageError(RuntimeFault, ValueError):

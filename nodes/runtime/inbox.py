@@ -10,10 +10,13 @@ from collections.abc import Callable
 from typing import Generic, TypeVar
 
 T = TypeVar("T")
+_MOST_URGENT = 1000
 
 
 class Inbox(Generic[T]):
     """Queue from one or more driver threads to the loop of one node. When it is full, the oldest item is dropped and counted.
+
+    Urgent items have a queue of their own and are taken first. So no other item can displace a request to stop the car.
 
     Args:
         capacity: Largest number of waiting items.
@@ -26,19 +29,23 @@ class Inbox(Generic[T]):
         if capacity < 1:
             raise ValueError(f"expected a capacity >= 1, got {capacity}")
         self._items: deque[T] = deque(maxlen=capacity)
+        self._urgent: list[T] = []
         self._lock = threading.Lock()
         self._failure: BaseException | None = None
         self._event = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._closed = False
         self.dropped = 0
 
-    def put(self, item: T) -> None:
+    def put(self, item: T, urgent: bool = False) -> None:
         """Add an item and wake the loop (any thread)."""
         with self._lock:
             if self._closed:
                 return
-            self.dropped += len(self._items) == self._items.maxlen
-            self._items.append(item)
+            if urgent and len(self._urgent) < _MOST_URGENT:
+                self._urgent.append(item)
+            else:
+                self.dropped += len(self._items) == self._items.maxlen
+                self._items.append(item)
             os.eventfd_write(self._event, 1)
 
     def fail(self, failure: BaseException) -> None:
@@ -50,13 +57,14 @@ class Inbox(Generic[T]):
             os.eventfd_write(self._event, 1)
 
     def take(self) -> list[T]:
-        """Return all waiting items, oldest first (the loop's thread)."""
+        """Return all waiting items, urgent ones first, then oldest first (the loop's thread)."""
         with self._lock:
             with contextlib.suppress(BlockingIOError):
                 os.eventfd_read(self._event)
-            if self._failure is not None:
+            if self._failure is not None and not self._urgent:
                 raise self._failure
-            items = list(self._items)
+            items = [*self._urgent, *self._items]
+            self._urgent.clear()
             self._items.clear()
         return items
 

@@ -25,10 +25,15 @@ class HeldError(RuntimeFault, OSError):
 def hold(path: Path) -> TextIO:
     """Take the lock and write the process id into its file. The lock is held until the returned file is closed.
 
+    A file that another user made, as of a lock of the whole machine, can be locked without being written.
+
     Raises:
         HeldError: Another process holds it.
     """
-    lock = open(path, "a+", encoding="ascii")  # noqa: SIM115 - kept open: it is the lock
+    try:
+        lock = open(path, "a+", encoding="ascii")  # noqa: SIM115 - kept open: it is the lock
+    except PermissionError:
+        lock = open(path, encoding="ascii")  # noqa: SIM115
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
@@ -36,7 +41,8 @@ def hold(path: Path) -> TextIO:
         owner = lock.read().strip() or "unknown"
         lock.close()
         raise HeldError(owner) from None
-    lock.truncate(0)
-    lock.write(f"{os.getpid()}\n")
-    lock.flush()
+    if lock.writable():
+        lock.truncate(0)
+        lock.write(f"{os.getpid()}\n")
+        lock.flush()
     return lock

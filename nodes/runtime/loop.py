@@ -11,9 +11,10 @@ import numpy as np
 
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import NS_PER_S, Clock, Now
+from nodes.runtime.descriptors import Reserve
 from nodes.runtime.errors import MessageError
 from nodes.runtime.messages import header, types
-from nodes.runtime.node import Node, Out
+from nodes.runtime.node import FAULT, Node, Out
 from nodes.runtime.topics import STATUS_RATE_HZ, status_topic
 
 _IDLE_S = 1.0
@@ -70,6 +71,7 @@ class NodeLoop:
         self._ending = threading.RLock()
         self._refusals: dict[str, str] = {}
         self._stated = ""
+        self._reserve = Reserve()
         start_ns = clock.now().mono_ns
         self._status_schedule = Schedule(STATUS_RATE_HZ, start_ns)
         self._tick_schedule = Schedule(node.tick_rate_hz, start_ns) if node.tick_rate_hz else None
@@ -105,6 +107,8 @@ class NodeLoop:
             if self._tick_schedule is not None and self._tick_schedule.due(now.mono_ns):
                 self._publish(self._node.tick(now))
             state, text = self._node.status()
+            if shortage := self._reserve.check():
+                state, text = FAULT, shortage
             # A change of state is published at once, because the safety node acts on it.
             if self._status_schedule.due(now.mono_ns) or state != self._stated:
                 self.publish_status(now, state, text)
@@ -113,6 +117,7 @@ class NodeLoop:
         """Close the loop's own file descriptors. Call it after the bus is closed; `stop` then does nothing."""
         with self._ending:
             self._stopping = True
+            self._reserve.close()
             os.close(self._stop_read)
             os.close(self._stop_write)
 

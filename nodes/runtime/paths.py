@@ -1,13 +1,13 @@
-"""Paths of the sockets and logs of a run."""
+"""Paths of the sockets and logs of a run, and of the files that come with advnerf."""
 
 from __future__ import annotations
 
 import hashlib
 import os
 import stat
-import tempfile
 from pathlib import Path
 
+from advnerf_core.places import PlaceError, private_folder, temporary_folder, temporary_path
 from nodes.runtime.errors import BusError
 
 # sizeof(sockaddr_un.sun_path) is 108 on Linux, including the final zero.
@@ -18,17 +18,46 @@ _LONGEST_NAME = 31
 RESOLVED_NAME = "launch.resolved.yaml"
 
 
-def private_folder(path: Path) -> Path:
-    """Create a folder that only this user may enter. A folder of another user is refused."""
-    path.mkdir(mode=0o700, parents=True, exist_ok=True)
-    found = path.lstat()
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid():
-        raise BusError(
-            f"expected {path} to belong to user {os.getuid()}, but it belongs to user {found.st_uid}; remove it"
-        )
-    if stat.S_IMODE(found.st_mode) & 0o077:
-        path.chmod(0o700)
-    return path
+def shipped(name: str) -> Path:
+    """File or folder that comes with advnerf, such as ``launch`` or ``calibration/twin``; read-only.
+
+    A checkout has it beside its packages, a wheel in ``nodes/shipped`` (setup.py).
+    """
+    package = Path(__file__).parents[1]
+    inside = package / "shipped" / name
+    return inside if inside.exists() else package.parent / name
+
+
+def named_file(name: str | Path, *kinds: str) -> Path:
+    """File that a command was given: a path, or a name like ``green_screen`` of one in ``launch`` here, or of one that is shipped.
+
+    Args:
+        name: Path or name.
+        kinds: Endings without ``.yaml``, such as ``launch``, in the order in which they are tried.
+
+    Raises:
+        PlaceError: There is none; the message lists the names.
+    """
+    path = Path(name)
+    if path.is_file():
+        return path
+    folders = Path("launch"), shipped("launch")
+    if path.name == str(name):
+        for file in (folder / f"{name}.{kind}.yaml" for folder in folders for kind in kinds):
+            if file.is_file():
+                return file
+    known = sorted(
+        {
+            file.name.split(".")[0]
+            for folder in folders
+            for kind in kinds
+            for file in folder.glob(f"*.{kind}.yaml")
+        }
+    )
+    raise PlaceError(
+        f"expected a file {' or '.join(f'*.{kind}.yaml' for kind in kinds)}, found none at {name}; correct the path, or give one of the names "
+        f"{', '.join(known)} (advnerf init copies these files to edit)"
+    )
 
 
 def user_folder() -> Path:
@@ -36,7 +65,22 @@ def user_folder() -> Path:
     base = os.environ.get("XDG_RUNTIME_DIR")
     if base and os.path.isdir(base) and os.access(base, os.W_OK):
         return private_folder(Path(base) / "advnerf")
-    return private_folder(Path(tempfile.gettempdir()) / f"advnerf-{os.getuid()}")
+    return temporary_folder()
+
+
+def user_folders() -> list[Path]:
+    """All folders that `user_folder` may have returned to other processes of this user, whose environment may be another one."""
+    base = os.environ.get("XDG_RUNTIME_DIR") or f"/run/user/{os.getuid()}"
+    candidates = (Path(base) / "advnerf", temporary_path())
+    return [folder for folder in candidates if _is_ours(folder)]
+
+
+def _is_ours(folder: Path) -> bool:
+    try:
+        found = folder.lstat()
+    except OSError:
+        return False
+    return stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid()
 
 
 def bus_folder(run_dir: Path) -> Path:

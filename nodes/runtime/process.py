@@ -22,6 +22,7 @@ from nodes.runtime.config import load_node_config
 from nodes.runtime.errors import BagError, ConfigError, NodeFinished, TopicError
 from nodes.runtime.loop import NodeLoop
 from nodes.runtime.node import FAULT, STARTING, Node, NodeContext
+from nodes.runtime.prepare import prepare_process
 from nodes.runtime.topics import status_topic
 
 C = TypeVar("C", bound=BaseModel)
@@ -190,6 +191,7 @@ def run_node_main(config_type: type[C], build: Callable[[C, NodeContext], Node])
     )
     parser.add_argument("--check", action="store_true", help="check the configuration, print errors and exit")
     options = parser.parse_args()
+    prepare_process(role)
     try:
         config = load_node_config(config_type, options.name, options.config, options.overrides)
     except (ValueError, OSError) as error:

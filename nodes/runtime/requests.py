@@ -11,6 +11,8 @@ from nodes.runtime.clock import Now
 from nodes.runtime.messages import stamp_ns
 from nodes.runtime.wire import MessageInfo
 
+# Reason of the safety node while an e-stop is latched, whatever stopped the car since.
+ESTOP_LATCHED = "e-stop pressed; release it and re-arm"
 _REMEMBERED = 256
 _LONGEST_ID = 64
 

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from nodes.runtime.paths import named_file
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -21,6 +23,24 @@ Device = Annotated[
         "--device",
         help="Where searches compute; cuda is an NVIDIA GPU.",
         show_default="ADVNERF_DEVICE, or cpu",
+    ),
+]
+
+
+def launch_argument(text: str | Path) -> Path:
+    """Launch file of an argument."""
+    return named_file(text, "launch")
+
+
+def experiment_argument(text: str | Path) -> Path:
+    """Experiment or campaign file of an argument."""
+    return named_file(text, "experiment", "campaign")
+
+
+LaunchFile = Annotated[
+    Path,
+    typer.Argument(
+        metavar="FILE|NAME", help="A *.launch.yaml file, or the name of one.", parser=launch_argument
     ),
 ]
 RunDir = Annotated[

@@ -22,7 +22,9 @@ class Topic:
         queue: Number of messages that a receiver keeps. 1 keeps only the newest; older ones are dropped and counted.
         max_age_s: Age since publication beyond which a receiver must not use a message [s]; None if age does not matter.
         publisher: Role of the node that publishes the topic.
-        senders: Number of processes per host that may publish the topic at the same time. A request to stop must not have to wait for another sender.
+        senders: Number of processes per host that may publish the topic at the same time.
+        receivers: Number of processes per host that may receive the topic at the same time, for a topic that any number of processes
+            may send; 0 for all other topics. A request to stop the car must not have to wait for a free endpoint.
     """
 
     name: str
@@ -32,6 +34,7 @@ class Topic:
     max_age_s: float | None
     publisher: str
     senders: int = 1
+    receivers: int = 0
 
     @property
     def latest(self) -> bool:
@@ -60,7 +63,7 @@ _ROWS = (
     Topic("/safety/drive", _ACKERMANN, 10.0, 1, 0.25, "safety"),
     Topic("/safety/state", "advnerf_msgs/msg/SafetyState", 10.0, 20, 0.5, "safety"),
     Topic("/clock/offset", "advnerf_msgs/msg/ClockOffset", 5.0, 20, 1.0, "gateway"),
-    Topic("/arm", "advnerf_msgs/msg/Arm", None, 20, None, "operator", senders=4),
+    Topic("/arm", "advnerf_msgs/msg/Arm", None, 20, None, "operator", receivers=8),
     Topic("/operator/act", "advnerf_msgs/msg/OperatorAct", None, 50, None, "page"),
     Topic("/twin/reset", "geometry_msgs/msg/PoseStamped", None, 5, None, "operator", senders=2),
     Topic("/attack/request", "advnerf_msgs/msg/AttackRequest", None, 5, None, "operator"),

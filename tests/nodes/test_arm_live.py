@@ -13,12 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nodes.runtime.arm_requests import arm_message, ask_to_arm, ask_to_disarm
+from nodes.runtime.arm_requests import arm_message, ask_to_arm
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import SystemClock
 from nodes.runtime.errors import LaunchError
 from nodes.runtime.messages import drive_message, header, pose_message, types
 from nodes.runtime.requests import Asked
+from nodes.runtime.stopping import ask_to_disarm
 
 pytestmark = pytest.mark.live
 
@@ -141,11 +142,13 @@ def test_no_request_is_lost_with_a_recorder(lab):
 def test_a_disarm_waits_loudly_for_a_safety_node_that_joins_late(lab):
     asking = command(lab, "disarm", "--reason", "look out")
     first = asking.stderr.readline()
-    assert "NOT CONFIRMED: no answer from the safety node for 0.3 s" in first
+    while "nothing is known yet" in first:  # a slow computer
+        first = asking.stderr.readline()
+    assert "NOT CONFIRMED: no answer from the safety node for 0." in first
     assert lab.recorded  # a recorder hears it all the time
     lab.start()
     output, _ = asking.communicate(timeout=30)
-    assert (asking.returncode, output) == (0, "not armed: disarmed by operator: look out\n")
+    assert (asking.returncode, output) == (0, "CONFIRMED: not armed: disarmed by operator: look out\n")
 
 
 def test_a_disarm_that_is_given_up_is_no_success(lab):
@@ -164,8 +167,11 @@ def test_a_disarm_without_a_motor_node_says_so(lab):
     asking = command(lab, "disarm")
     output, errors = asking.communicate(timeout=30)
     assert asking.returncode == 1
-    assert "not armed: disarmed by operator" in output
-    assert "NOT CONFIRMED: disarmed, but the motor node did not report within 0.3 s" in errors
+    assert output == ""
+    assert (
+        "NOT CONFIRMED: not armed: disarmed by operator: , but the motor node did not report within 0.3 s"
+        in errors
+    )
 
 
 def test_why_it_is_not_armed(lab):
@@ -178,7 +184,9 @@ def test_why_it_is_not_armed(lab):
     asking = command(lab, "arm")
     output, errors = asking.communicate(timeout=30)
     assert (asking.returncode, errors) == (1, "")
-    assert output.startswith("not armed: no pose of the car for ")
+    named, answer = output.splitlines()
+    assert named == f"{lab.folder}: no motor node on this host"
+    assert answer.startswith("not armed: no pose of the car for ")
 
 
 def test_a_hung_safety_node_answers_when_it_wakes_and_an_arm_is_void_by_then(lab):
@@ -193,7 +201,7 @@ def test_a_hung_safety_node_answers_when_it_wakes_and_an_arm_is_void_by_then(lab
         time.sleep(1.1)
         os.kill(lab.process.pid, signal.SIGCONT)
         output, _ = asking.communicate(timeout=30)
-        assert (asking.returncode, output) == (0, "not armed: disarmed by operator: \n")
+        assert (asking.returncode, output) == (0, "CONFIRMED: not armed: disarmed by operator: \n")
         state = send.until_answered(asked)
     assert not state.armed
     assert not state.granted

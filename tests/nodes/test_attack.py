@@ -180,8 +180,8 @@ def test_what_cannot_be_done_is_refused_in_words(bench, tmp_path):
     bench.request(text, "a")
     assert refused(text, "a") != "refused"
     assert refused(text, "b") == "busy with a; wait for it, or cancel it"
-    bench.cancel()
     assert "another request already" in refused(text.replace("horizon: 3", "horizon: 4"))
+    bench.cancel()
 
 
 def test_a_search_that_fails_says_why(bench, tmp_path):
@@ -192,6 +192,10 @@ def test_a_search_that_fails_says_why(bench, tmp_path):
     assert "policy.safetensors" in bench.progress()[-1].text
     assert "worker.log" in bench.progress()[-1].text
     assert bench.node.status()[0] == "ready"
+    # Nothing was found: the corrected request may have the same id.
+    bench.request(request_text(load_request(tiny_request(tmp_path), ["horizon=4"])))
+    assert bench.state() not in ("refused", "failed")
+    bench.cancel()
 
 
 @pytest.mark.slow

@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from advnerf_core.documents import parse_yaml
 from advnerf_core.geometry import Pinhole, planar_pose
 from advnerf_core.policies.load import load_driver
 from advnerf_core.policies.pilotnet import PilotNet, load_policy, save_policy
 from advnerf_core.policies.view import PolicyView
+from advnerf_core.strict import validate
 from nodes.bags.reader import read_messages
 from nodes.bags.writer import BagWriter
 from nodes.cli.main import app
@@ -24,7 +26,6 @@ from nodes.launching.launch_file import load_launch
 from nodes.replaying.nodes import Choice
 from nodes.replaying.replay import Replay, write_replay
 from nodes.runtime.clock import Now
-from nodes.runtime.config import parse_yaml, validate
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.messages import decode, encode, header, image_message, pose_message, types
 from nodes.runtime.node import MessageInfo, NodeContext

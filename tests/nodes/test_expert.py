@@ -137,10 +137,28 @@ class Hand:
         self.clock.advance(after_s)
         return self.node.tick(self.clock.now())
 
-    def answer(self, ask_id):
+    def brakes(self, braking):
+        sent = types.MotorSent(
+            header=header(0),
+            serial_write_mono_ns=0,
+            serial_write_real_ns=0,
+            speed_mps=0.0,
+            steering_rad=0.0,
+            erpm=0.0,
+            servo=0.5,
+            brake_current_a=0.0,
+            braking=braking,
+            reason="",
+            peer="TWIN",
+        )
+        now = self.clock.now()
+        self.node.handle("/motor/sent", sent, MessageInfo(now.mono_ns, now.mono_ns), now)
+
+    def answer(self, ask_id, armed=True):
+        now = self.clock.now()
         state = types.SafetyState(
             header=header(0),
-            armed=True,
+            armed=armed,
             stopping=False,
             reason="",
             source="operator",
@@ -150,7 +168,7 @@ class Hand:
             granted=True,
             answer="armed",
         )
-        self.node.handle("/safety/state", state, MessageInfo(0, 0), self.clock.now())
+        self.node.handle("/safety/state", state, MessageInfo(now.mono_ns, now.mono_ns), now)
 
 
 @pytest.fixture
@@ -177,20 +195,46 @@ def test_the_hand_goes_before_the_software_and_silence_is_letting_go(hand):
 
 
 def test_the_estop_stays_until_re_armed_which_is_asked_for_a_moment_later(hand):
-    ((_, state),) = hand.does(human=True, throttle=1.0, stops=1)
-    assert (state.estop, state.speed_mps) == (True, 0.0)
+    (_, state), (topic, stop) = hand.does(human=True, throttle=1.0, stops=1)
+    assert (state.estop, state.speed_mps, topic, stop.arm) == (True, 0.0, "/arm", False)
     hand.does(stops=1)
-    assert hand.tick()[0].message.estop
+    state, (_, repeat) = hand.tick()
+    assert (state.message.estop, repeat.ask_id, repeat.arm) == (True, stop.ask_id, False)
+    hand.answer(stop.ask_id, armed=False)
+    assert [t for t, _ in hand.tick()] == ["/teleop/state"]
     ((_, state),) = hand.does(stops=1, rearms=1)
     assert not state.estop
     assert [t for t, _ in hand.tick() + hand.tick()] == ["/teleop/state", "/teleop/state", "/arm"]
     (_, (_, first)), (_, (_, repeat)) = hand.tick(), hand.tick()
-    assert (first.ask_id, first.header) == (repeat.ask_id, repeat.header)
+    assert (first.ask_id, first.header, first.arm) == (repeat.ask_id, repeat.header, True)
     assert repeat.age_ns - first.age_ns == 50_000_000
     hand.answer("of another")
     assert [t for t, _ in hand.tick()] == ["/teleop/state", "/arm"]
     hand.answer(first.ask_id)
     assert [t for t, _ in hand.tick()] == ["/teleop/state"]
     hand.does(stops=2, rearms=2)  # both at once: stopping counts
-    assert [t for t, _ in hand.tick() + hand.tick()] == ["/teleop/state"] * 2
+    outs = hand.tick() + hand.tick()
+    assert [m.arm for t, m in outs if t == "/arm"] == [False, False]
     assert hand.tick()[0].message.estop
+
+
+def test_an_estop_is_not_confirmed_until_the_motor_node_brakes(hand, capsys):
+    _, (_, stop) = hand.does(stops=1)
+    hand.tick(0.2)
+    assert hand.node.status()[0] != "fault" or "NOT CONFIRMED" not in hand.node.status()[1]
+    hand.tick(0.2)
+    assert hand.node.status() == (
+        "fault",
+        "NOT CONFIRMED: no answer from the safety node for 0.4 s. Use the hardware stop",
+    )
+    hand.answer(stop.ask_id, armed=False)
+    hand.tick(0.4)
+    assert "the motor node does not report that it brakes" in hand.node.status()[1]
+    hand.brakes(False)
+    hand.tick()
+    assert "NOT CONFIRMED" in hand.node.status()[1]
+    hand.brakes(True)
+    hand.tick()
+    assert "NOT CONFIRMED" not in hand.node.status()[1]
+    said = capsys.readouterr().err.splitlines()
+    assert [line.split(":")[1] for line in said] == [" NOT CONFIRMED", " the car is stopped"]

@@ -1,6 +1,7 @@
 """The monitor attack as real processes on the twin: the attack reaches the lab's camera only while the car is armed."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from nodes.bags.reader import read_messages
 from nodes.lab.trials.evaluation import attack_ids
 from nodes.lab.trials.trial import TrialPlan
 from nodes.lab.trials.trial_runner import run_trial
+from nodes.lab.trials.tries import drive_with_tries
 from nodes.runtime.messages import decode, ns_from_stamp
 from nodes.runtime.pictures import rgb_image
 
@@ -55,13 +57,13 @@ def test_the_lab_camera_sees_the_attack_while_armed_and_not_before(tmp_path):
         "params.vicon_port=52801",
     ]
     start = (1.95, -0.5, 0.5 * np.pi)
-    outcome = run_trial(
-        ROOT / "launch" / "monitor.launch.yaml",
-        overrides,
-        tmp_path / "run",
-        TrialPlan(start, 1.5, NODES),
-        60.0,
+    launch, plan = ROOT / "launch" / "monitor.launch.yaml", TrialPlan(start, 1.5, NODES)
+    drive = drive_with_tries(
+        lambda: run_trial(launch, overrides, tmp_path / "run", plan, 60.0).to_dict(),
+        tmp_path / "run.json",
+        print,
     )
+    outcome = SimpleNamespace(**drive)
     bag = tmp_path / "run" / "bag"
     before, armed = [], []
     for message in read_messages(bag, ["/camera/image_raw"]):

@@ -85,3 +85,13 @@ def test_old_poses_are_forgotten():
     assert len(buffer) == 101
     with pytest.raises(ValueError, match="expected positive times"):
         PoseBuffer(keep_s=0.0)
+
+
+@pytest.mark.parametrize("ahead_s", [3.0, 3600.0])
+def test_a_pose_of_a_wrong_clock_does_not_lock_out_the_right_ones(ahead_s):
+    buffer = filled(until_s=10.0, keep_s=2.0)
+    buffer.add(round((10.0 + ahead_s) * 1e9), on_circle(10.0))
+    for k in range(1, 20):
+        buffer.add(10_000_000_000 + k * 20_000_000, on_circle(10.0 + 0.02 * k))
+    assert buffer.newest_ns == 10_380_000_000
+    assert buffer.at(10_250_000_000) is not None

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from advnerf_core.geometry import planar_pose
-from nodes.lab.trials.trial import Phase, TrialError, TrialNode, TrialPlan, counts
+from nodes.lab.trials.trial import Phase, TrialError, TrialNode, TrialPlan
 from nodes.runtime.clock import Now
 from nodes.runtime.errors import NodeFinished
 from nodes.runtime.messages import header, pose_message, types
@@ -238,19 +238,3 @@ def test_a_person_is_guided_to_the_start_and_arms_the_real_car():
     assert set(stage.sent) == {"/arm"}  # the disarming at the end
     assert not stage.armed
     assert stage.node.outcome.stopped_early == ""
-
-
-@pytest.mark.parametrize(
-    ("stopped_early", "off_track", "measures"),
-    [
-        ("", False, True),
-        ("outside of the fence", True, True),
-        ("disarmed by operator", False, True),
-        ("no fresh pose", True, False),
-        # Beside its track the car has run into something; on its track it is jammed.
-        ("stalled for 1.0 s: commanded 0.80 m/s, the car does not move", True, True),
-        ("stalled for 1.0 s: commanded 0.80 m/s, the car does not move", False, False),
-    ],
-)
-def test_a_drive_counts_if_the_policy_ended_it(stopped_early, off_track, measures):
-    assert counts(stopped_early, off_track) is measures

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import save
 from torch import Tensor
 
@@ -26,6 +26,7 @@ from advnerf_core.attack.methods import SearchRun, SearchSettings
 from advnerf_core.attack.problem import ScaledSensor, SearchDivergedError
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
+from advnerf_core.places import open_tensors
 
 __all__ = [
     "Evaluation", "OnEvaluation", "SearchDivergedError", "SearchResult", "SearchState", "SearchStateError", "begin",
@@ -121,17 +122,35 @@ class SearchState:
         return SearchResult(self.best_theta, self.best, tuple(self.history))
 
     def save(self, path: Path, fingerprint: str) -> None:
-        """Write the state file."""
+        """Write the state file. Each name gets a tensor of its own, also where a method has two names for one.
+
+        Raises:
+            SearchStateError: Something in ``tensors`` is no tensor, or has the name of the best theta.
+        """
         assert self.best_theta is not None
+        wrong = [name for name, value in self.tensors.items() if not isinstance(value, Tensor)]
+        if wrong or "best_theta" in self.tensors:
+            got = (
+                f"{wrong[0]}: {type(self.tensors[wrong[0]]).__name__}"
+                if wrong
+                else "best_theta, which is kept for the method"
+            )
+            raise SearchStateError(
+                f"expected tensors under names of their own in a search's state, got {got}"
+            )
         header = {"format": _FORMAT, "fingerprint": fingerprint}
         header["history"] = json.dumps([asdict(evaluation) for evaluation in self.history])
-        write_atomically(path, save({**self.tensors, "best_theta": self.best_theta}, metadata=header))
+        kept = {
+            name: value.detach().clone(memory_format=torch.contiguous_format)
+            for name, value in self.tensors.items()
+        }
+        write_atomically(path, save({**kept, "best_theta": self.best_theta}, metadata=header))
 
 
 def load_state(path: Path, fingerprint: str) -> SearchState:
     """Read a state file that a search with the same settings wrote."""
     try:
-        with safe_open(path, framework="pt") as handle:
+        with open_tensors(path, "pt") as handle:
             header = handle.metadata() or {}
             tensors = {name: handle.get_tensor(name) for name in handle.keys()}  # noqa: SIM118 - not a mapping
         if header.get("format") != _FORMAT:

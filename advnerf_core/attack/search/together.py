@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import save
 from torch import Tensor
 
@@ -31,6 +31,7 @@ from advnerf_core.attack.search.search import (
     search_fingerprint,
 )
 from advnerf_core.files import write_atomically
+from advnerf_core.places import open_tensors
 from advnerf_core.scene.many_textures import ManyTextures, ShowsMany
 from advnerf_core.scene.surrogate import Surrogate
 
@@ -183,7 +184,7 @@ def _save(path: Path, fingerprint: str, states: Sequence[SearchState], tensors: 
 
 def _load(path: Path, fingerprint: str, count: int) -> tuple[list[SearchState], dict[str, Tensor]]:
     try:
-        with safe_open(path, framework="pt") as handle:
+        with open_tensors(path, "pt") as handle:
             header = handle.metadata() or {}
             tensors = {name: handle.get_tensor(name) for name in handle.keys()}  # noqa: SIM118 - not a mapping
         best = tensors.pop("best_theta")

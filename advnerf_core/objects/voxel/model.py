@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.numpy import save
 from scipy import ndimage
 
@@ -22,6 +22,7 @@ from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.files import with_sorted_header, write_atomically
 from advnerf_core.geometry import Array
 from advnerf_core.objects.voxel.voxelise import OPAQUE_PER_VOXEL, ObjectGrids
+from advnerf_core.places import open_tensors
 
 FILE_FORMAT = "advnerf-object-1"
 # A ray that has crossed two voxels of full density is dark to one part in 10^17.
@@ -125,7 +126,7 @@ def load_object(path: Path) -> ObjectModel:
             f"expected an object file at {path}, found none: make one with `advnerf object build`"
         )
     try:
-        with safe_open(path, framework="numpy") as stream:
+        with open_tensors(path, "numpy") as stream:
             metadata = stream.metadata() or {}
             if metadata.get("format") != FILE_FORMAT:
                 raise ObjectFileError(

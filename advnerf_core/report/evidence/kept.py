@@ -6,10 +6,11 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, Field
 
 from advnerf_core.driving.metrics import DriveMetrics, Horizon, drive_metrics
 from advnerf_core.driving.path import Path
+from advnerf_core.strict import StrictModel
 
 Floats = NDArray[np.float64]
 # Metres and radians. A total over 60 ticks then differs from that of the drive itself by less than a millimetre.
@@ -25,7 +26,7 @@ def _numbers(text: str) -> str:
 Series = Annotated[str, AfterValidator(_numbers)]
 
 
-class KeptDrive(BaseModel):
+class KeptDrive(StrictModel):
     """One drive at its control ticks.
 
     Attributes:
@@ -37,8 +38,6 @@ class KeptDrive(BaseModel):
         collided: Whether the car ran into something.
         collided_with: Name of it; empty if the world named nothing.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     x_m: Series
     y_m: Series

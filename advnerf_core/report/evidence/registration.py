@@ -8,14 +8,16 @@ from collections.abc import Mapping
 from pathlib import Path as FilePath
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
+from advnerf_core.documents import read_json
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.driving.path import Path
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import cell_name
 from advnerf_core.report.reference import Domain
+from advnerf_core.strict import StrictModel
 
 FORMAT: Literal["advnerf-registration-1"] = "advnerf-registration-1"
 # In the folder of the published cells: what was registered, and which scenarios of it were given up later.
@@ -28,11 +30,7 @@ class RegistrationError(AdvnerfError, ValueError):
     """A registration is not usable, or would come too late."""
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class RegisteredScenario(_Part):
+class RegisteredScenario(StrictModel):
     """One scenario, or one placement of its objects.
 
     Attributes:
@@ -73,7 +71,7 @@ class RegisteredScenario(_Part):
         return Path.from_dict(self.path)
 
 
-class RegisteredCell(_Part):
+class RegisteredCell(StrictModel):
     """One cell.
 
     Attributes:
@@ -96,7 +94,7 @@ class RegisteredCell(_Part):
         return cell_name(self.scenario, self.victim, self.method, self.seed, self.placement)
 
 
-class PrimaryTest(_Part):
+class PrimaryTest(StrictModel):
     """A test that is claimed: the method's deployed excess against that of the baseline that is strongest in the surrogate.
 
     Attributes:
@@ -114,7 +112,7 @@ class PrimaryTest(_Part):
     against: tuple[str, ...] = Field(min_length=1)
 
 
-class Contrast(_Part):
+class Contrast(StrictModel):
     """Two conditions that the same attacks are driven under, and what differs between them.
 
     Attributes:
@@ -132,7 +130,7 @@ class Contrast(_Part):
     after_in: Domain = "deployed"
 
 
-class Registration(_Part):
+class Registration(StrictModel):
     """What will be run.
 
     Attributes:
@@ -191,7 +189,7 @@ def read_registration(folder: FilePath) -> Registration | None:
     if not file.exists():
         return None
     try:
-        return Registration.model_validate_json(file.read_text(encoding="utf-8"))
+        return Registration.model_validate(read_json(file))
     except (OSError, UnicodeDecodeError, ValidationError) as error:
         text = error.errors(include_url=False)[0]["msg"] if isinstance(error, ValidationError) else str(error)
         raise RegistrationError(
@@ -209,7 +207,7 @@ def read_withdrawn(folder: FilePath) -> dict[str, str]:
     if not file.exists():
         return {}
     try:
-        found = json.loads(file.read_text(encoding="utf-8"))
+        found = read_json(file)
         if not all(isinstance(each, str) and each for pair in found.items() for each in pair):
             raise ValueError("expected a reason for each scenario")
     except (OSError, ValueError, AttributeError) as error:

@@ -102,7 +102,7 @@ class Evidence:
 
     Args:
         registration: What was registered.
-        cells: The cells that are there; those without kept drives, or of a scenario that was not registered, are left out.
+        cells: The cells that are there; those without kept drives, not driven live, or of a scenario that was not registered, are left out.
     """
 
     def __init__(self, registration: Registration, cells: Sequence[CellResult]) -> None:
@@ -110,7 +110,9 @@ class Evidence:
         self.cells = {
             cell.name: cell
             for cell in cells
-            if cell.kept and registration.scenario(cell.scenario, cell.placement) is not None
+            if cell.kept
+            and not cell.not_driven_live
+            and registration.scenario(cell.scenario, cell.placement) is not None
         }
         self._named = {cell.name for cell in registration.cells}
         self._paths = {name: each.reference_path() for name, each in registration.scenarios.items()}

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import sha256_of, write_atomically
 from advnerf_core.report.cells import CellError, CellResult, read_cell
@@ -145,7 +146,7 @@ def _page(published: Path) -> str:
         registration = read_registration(published / name)
         if registration is not None and (published / name / SET).exists():
             registered = {**registration.model_dump(mode="json"), "digest": registration.digest}
-            data = json.loads((published / name / SET).read_text(encoding="utf-8"))
+            data = read_json(published / name / SET)
             filmed = (published / film_of(name)).exists()
             sets[name] = {**data, "registered": registered, "filmed": filmed}
     return results_page(sets)
@@ -171,7 +172,7 @@ def _known_digests(published: Path) -> dict[str, str]:
     file = published / DIGESTS
     if not file.exists():
         return {}
-    known: dict[str, str] = json.loads(file.read_text(encoding="utf-8"))
+    known: dict[str, str] = read_json(file)
     return known
 
 
@@ -179,7 +180,7 @@ def _files(folder: Path) -> Iterator[str]:
     """Whether the files are those of the manifest, and the manifest is the one that was published."""
     file = folder / SET
     try:
-        listed = json.loads(file.read_text(encoding="utf-8"))["files"]
+        listed = read_json(file)["files"]
         known = _known_digests(folder.parent).get(folder.name)
     except (OSError, ValueError, KeyError, TypeError) as error:
         yield f"{file}: cannot be read: {error}"
@@ -211,7 +212,9 @@ def _against_registration(
         elif name in evidence.cells and not evidence.is_registered(evidence.cells[name]):
             yield f"{name}: was registered, and was not run under this registration"
     for cell in cells:
-        if cell.name not in evidence.cells:
+        if cell.not_driven_live:
+            yield f"{cell.name}: was not driven live and is no evidence: {cell.not_driven_live}"
+        elif cell.name not in evidence.cells:
             yield f"{cell.name}: expected a cell of a registered scenario with its drives kept"
         elif not evidence.is_registered(cell) and cell.registration:
             yield f"{cell.name}: says that it was registered, and was not"
@@ -293,7 +296,7 @@ def _published(evidence: Evidence) -> dict[str, Any]:
 
 def _numbers(folder: Path, evidence: Evidence, withdrawn: Mapping[str, str]) -> tuple[int, list[str]]:
     """How many published numbers there are, and those that are not what the drives give."""
-    published = json.loads((folder / SET).read_text(encoding="utf-8"))
+    published = read_json(folder / SET)
     found = json.loads(json.dumps(_published(evidence)))
     count, wrong = 0, []
     if published["deployed_through"] != found["deployed_through"]:

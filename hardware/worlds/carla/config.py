@@ -5,19 +5,16 @@ from __future__ import annotations
 import math
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from advnerf_core.strict import StrictModel
 from hardware.worlds.junction.config import DubinsConfig, PhotoConfig
 from hardware.worlds.lab.config import CameraConfig
 
 _WHOLE_TICK_S = 1e-6
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class ServerConfig(_Frozen):
+class ServerConfig(StrictModel):
     """Where the server is, and how long it may take. Only the map is something that results depend on.
 
     Attributes:
@@ -43,7 +40,7 @@ class ServerConfig(_Frozen):
     allow_traffic: bool = Field(default=False, exclude=True)
 
 
-class JunctionConfig(_Frozen):
+class JunctionConfig(StrictModel):
     """Which junction, and how much road around it.
 
     Attributes:
@@ -63,7 +60,7 @@ class JunctionConfig(_Frozen):
     reach_m: float = Field(default=60.0, gt=0.0)
 
 
-class RenderConfig(_Frozen):
+class RenderConfig(StrictModel):
     """How the server draws.
 
     Attributes:
@@ -83,11 +80,11 @@ class RenderConfig(_Frozen):
     settle_ticks: int = Field(default=5, ge=0, le=100)
     exposure: Literal["fixed", "automatic"] = "fixed"
     exposure_bright: float | None = Field(default=None, gt=0.0)
-    camera_attributes: dict[str, str] = {
-        "motion_blur_intensity": "0.0",
-        "lens_flare_intensity": "0.0",
-        "bloom_intensity": "0.0",
-    }
+    camera_attributes: dict[str, str] = Field(
+        default_factory=lambda: dict.fromkeys(
+            ("motion_blur_intensity", "lens_flare_intensity", "bloom_intensity"), "0.0"
+        )
+    )
 
     def whole_ticks(self, duration_s: float) -> int:
         """Ticks that a duration takes.
@@ -103,7 +100,7 @@ class RenderConfig(_Frozen):
         return ticks
 
 
-class BodyConfig(_Frozen):
+class BodyConfig(StrictModel):
     """The car that is seen in CARLA. It has no physics: it is put where the Dubins car of the experiment is.
 
     Attributes:
@@ -130,7 +127,7 @@ class BodyConfig(_Frozen):
     )
 
 
-class CarlaConfig(_Frozen):
+class CarlaConfig(StrictModel):
     """CARLA as a world.
 
     Attributes:

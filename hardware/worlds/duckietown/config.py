@@ -5,18 +5,15 @@ from __future__ import annotations
 import math
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from advnerf_core.strict import StrictModel
 from hardware.worlds.junction.config import PhotoConfig
 from hardware.worlds.lab.config import CameraConfig
 from hardware.worlds.remote_world import ServerDeadlines
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class RobotConfig(_Frozen):
+class RobotConfig(StrictModel):
     """The differential drive: Duckietown's nominal motors, which answer 0.15 s late.
 
     Attributes:
@@ -28,7 +25,7 @@ class RobotConfig(_Frozen):
     max_turn_rate_radps: float = Field(default=3.6, gt=0.0, le=4.3)
 
 
-class DuckietownConfig(_Frozen):
+class DuckietownConfig(StrictModel):
     """The whole world.
 
     Attributes:

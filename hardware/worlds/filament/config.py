@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
+from advnerf_core.strict import StrictModel
 from hardware.worlds.lab.config import CameraConfig, LabConfig, MonitorOpticsConfig, PhoneConfig
 from hardware.worlds.remote_world import ServerDeadlines
 
 
-class FilamentConfig(BaseModel):
+class FilamentConfig(StrictModel):
     """The whole world.
 
     Attributes:
@@ -17,8 +18,6 @@ class FilamentConfig(BaseModel):
         ambient_occlusion: Whether Filament darkens corners. It does so by what is in the picture, so that a place looks different from elsewhere.
         server: Deadlines of its process.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     lab: LabConfig = LabConfig()
     brightness: float = Field(default=4.0, gt=0.0, le=20.0)

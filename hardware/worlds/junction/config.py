@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import math
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from advnerf_core.geometry import Pinhole
+from advnerf_core.strict import StrictModel
 from hardware.worlds.junction.paths import PathName, junction_paths
 from hardware.worlds.lab.config import CameraConfig
 from hardware.worlds.paths import ReferencePath
 from hardware.worlds.world import CarDescription
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class RoadConfig(_Frozen):
+class RoadConfig(StrictModel):
     """A main road along x with a side road to the south (negative y), two lanes each; the origin is the junction's middle.
 
     Attributes:
@@ -39,7 +36,7 @@ class RoadConfig(_Frozen):
     seed: int = Field(default=11, ge=0)
 
 
-class PhotoConfig(_Frozen):
+class PhotoConfig(StrictModel):
     """The camera that photographs the scene for learning: same colours as the driving camera, wider and larger.
 
     Attributes:
@@ -69,7 +66,7 @@ UNSEEN_OF_A_CAR = (
 )
 
 
-class DubinsConfig(_Frozen):
+class DubinsConfig(StrictModel):
     """The car: what the experiment asks of it, and how it really behaves.
 
     Attributes:
@@ -102,7 +99,7 @@ class DubinsConfig(_Frozen):
         return CarDescription("dubins", self.speed_mps, (-bound, bound))
 
 
-class IntersectionConfig(_Frozen):
+class IntersectionConfig(StrictModel):
     """The whole simulated intersection; the defaults are the scene of the experiments.
 
     Attributes:

@@ -5,19 +5,16 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from advnerf_core.geometry import Array, Pinhole, camera_mount, make_transform, rotation_z
+from advnerf_core.strict import StrictModel
 
 Colour = tuple[float, float, float]
 Matrix3 = tuple[Colour, Colour, Colour]
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class RoomConfig(_Frozen):
+class RoomConfig(StrictModel):
     """A square room centred at the world's origin.
 
     Attributes:
@@ -31,7 +28,7 @@ class RoomConfig(_Frozen):
     seed: int = 7
 
 
-class TrackConfig(_Frozen):
+class TrackConfig(StrictModel):
     """The closed line of tape, centred at the origin and driven counter-clockwise.
 
     Attributes:
@@ -55,7 +52,7 @@ class TrackConfig(_Frozen):
         return self
 
 
-class CameraConfig(_Frozen):
+class CameraConfig(StrictModel):
     """The driving camera: like the left eye of a ZED at half VGA, without distortion.
 
     Attributes:
@@ -89,7 +86,7 @@ class CameraConfig(_Frozen):
         return camera_mount(self.x_m, self.y_m, self.z_m, self.pitch_down_rad)
 
 
-class PhoneConfig(_Frozen):
+class PhoneConfig(StrictModel):
     """The camera that photographs the room: another field of view, resolution and colour response.
 
     Attributes:
@@ -116,7 +113,7 @@ class PhoneConfig(_Frozen):
         return _centred_pinhole(self.width, self.height, self.horizontal_fov_deg)
 
 
-class PanelConfig(_Frozen):
+class PanelConfig(StrictModel):
     """A flat upright panel that motion capture tracks: the board or the monitor's screen.
 
     Attributes:
@@ -145,7 +142,7 @@ class PanelConfig(_Frozen):
         return make_transform(rotation_z(self.yaw_rad), [self.x_m, self.y_m, self.z_m])
 
 
-class MonitorOpticsConfig(_Frozen):
+class MonitorOpticsConfig(StrictModel):
     """What the camera sees of a colour on the monitor; see `hardware.worlds.lab.monitor`. The default is seen as it is.
 
     Attributes:
@@ -180,7 +177,7 @@ class MonitorOpticsConfig(_Frozen):
         )
 
 
-class CarConfig(_Frozen):
+class CarConfig(StrictModel):
     """A RACECAR/J-sized car: what the driver believes (nominal) and how it really behaves (true).
 
     Attributes:
@@ -241,7 +238,7 @@ class CarConfig(_Frozen):
         return self.nominal_erpm_gain * speed_mps
 
 
-class LabConfig(_Frozen):
+class LabConfig(StrictModel):
     """The whole simulated lab; the defaults are the lab of the experiments.
 
     Attributes:

@@ -5,18 +5,15 @@ from __future__ import annotations
 import math
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from advnerf_core.strict import StrictModel
 from hardware.worlds.junction.config import PhotoConfig
 from hardware.worlds.lab.config import CameraConfig
 from hardware.worlds.remote_world import ServerDeadlines
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class RoadConfig(_Frozen):
+class RoadConfig(StrictModel):
     """A road of MetaDrive's generator, and the stretch of its route that is driven.
 
     Attributes:
@@ -39,7 +36,7 @@ class RoadConfig(_Frozen):
     length_m: float = Field(default=90.0, gt=10.0)
 
 
-class CarConfig(_Frozen):
+class CarConfig(StrictModel):
     """The car: MetaDrive's own Bullet vehicle under a speed and steering controller, or an ideal one.
 
     Attributes:
@@ -55,7 +52,7 @@ class CarConfig(_Frozen):
     max_wheel_rad: float = Field(default=0.4, gt=0.0, le=0.6)
 
 
-class MetaDriveConfig(_Frozen):
+class MetaDriveConfig(StrictModel):
     """The whole world.
 
     Attributes:

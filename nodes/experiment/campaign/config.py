@@ -7,17 +7,20 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
+from pydantic import Field, StringConstraints, model_validator
 
 from advnerf_core.attack.methods import method_name
+from advnerf_core.documents import read_yaml
+from advnerf_core.places import require_utf8
 from advnerf_core.report.conditions import CONTROLS, NONE, order_of
 from advnerf_core.report.evidence.registration import Contrast
 from advnerf_core.report.reference import Reference
 from advnerf_core.scene.gate_limits import GateLimits
+from advnerf_core.strict import StrictModel
 from nodes.experiment.cell import Cell
 from nodes.experiment.kinds import absolute_kind
 from nodes.experiment.method_names import ConditionReference
-from nodes.runtime.config import load_config, read_yaml
+from nodes.runtime.config import load_config
 from nodes.runtime.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -31,11 +34,7 @@ METHODS: tuple[str, ...] = (NONE, "random", "cem", "gradient")
 VICTIMS: tuple[Victim, ...] = ("hardened", "naive")
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class PlacementConfig(_Section):
+class PlacementConfig(StrictModel):
     """The objects somewhere else: changes of the experiment, in a run folder of their own."""
 
     run_folder: Path = Field(
@@ -44,7 +43,7 @@ class PlacementConfig(_Section):
     set: tuple[str, ...] = Field(default=(), description="key=value texts over the scenario's own.")
 
 
-class _NothingTwice(_Section):
+class _NothingTwice(StrictModel):
     """Cells are named by these: one that is named twice would be run twice under one name."""
 
     @model_validator(mode="after")
@@ -187,6 +186,7 @@ def load_campaign(file: Path, folder: Path | None = None, overrides: tuple[str, 
     """
     config = load_config(CampaignConfig, file, overrides)
     where = (folder or config.folder or Path("runs/campaigns") / config.name).resolve()
+    require_utf8(where)
     against = load_config(Reference, file.parent / config.reference) if config.reference else Reference()
     campaign = Campaign(
         config.name,

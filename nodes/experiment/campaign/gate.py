@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.attack.transfer import DEFAULT_DRAWS, TransferPrediction, predict_transfer
+from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.scene.fidelity import Agreement, Effect, Pictures, Verdict, agreement, judge
 from advnerf_core.scene.gate_limits import GateLimits
@@ -73,7 +74,7 @@ def cached_verdict(
     stages = stage_digests(experiment.folder, list(kind.needed_settings(experiment)))
     key = hash_of([stages, _weights_sha256(policy), limits.model_dump(mode="json"), *which])
     try:
-        kept = json.loads(file.read_text(encoding="utf-8"))
+        kept = read_json(file)
         if kept["key"] == key:
             return Verdict(kept["passed"], tuple(kept["reasons"]), kept["numbers"])
     except (OSError, ValueError, KeyError, TypeError):

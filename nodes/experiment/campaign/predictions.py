@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import CellResult
 from advnerf_core.report.conditions import CONTROLS
@@ -125,7 +126,7 @@ def prediction_file(folder: Path, name: str) -> Path:
 def kept_prediction(file: Path, settings_hash: str) -> dict[str, Any] | None:
     """A prediction that was made of a cell with these settings; None where there is none."""
     try:
-        kept: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        kept: dict[str, Any] = read_json(file)
     except (OSError, ValueError):
         return None
     return kept if kept.get("settings_hash") == settings_hash and kept.keys() >= _KEYS else None

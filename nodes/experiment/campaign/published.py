@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import CellResult, read_cell, read_cells
 from advnerf_core.report.transfer import TransferTable, make_table
@@ -121,7 +122,7 @@ def publish_build(
 
 
 def _prune_build(reference: ReferenceBuild, published: Path) -> list[Path]:
-    found = [json.loads(file.read_text(encoding="utf-8")) for file in published.glob("*/*.json")]
+    found = [read_json(file) for file in published.glob("*/*.json")]
     used = {digest for each in found if "stages" in each for digest in each["stages"].values()}
     removed = []
     for stage in sorted(each.parent for each in reference.folder.glob(f"*/{RECORD}")):

@@ -23,6 +23,7 @@ from advnerf_core.report.evidence.registration import (
 from nodes.experiment.attack import planned_evaluations
 from nodes.experiment.campaign.config import Campaign
 from nodes.experiment.campaign.plan import read_experiment, statuses
+from nodes.experiment.campaign.store import FINISHED
 from nodes.experiment.cell import Cell
 from nodes.experiment.cell_kind import CellKind
 from nodes.experiment.context import Experiment
@@ -136,7 +137,7 @@ def _refuse_late(campaign: Campaign) -> None:
     done = [
         each.cell.name
         for each in statuses(campaign, campaign.cells)
-        if each.state in ("done", "begun", "running")
+        if each.state in (*FINISHED, "begun", "running")
     ]
     if done:
         raise RegistrationError(

@@ -15,10 +15,11 @@ from rich.console import Console
 from nodes.experiment.campaign.admission import past_the_gate
 from nodes.experiment.campaign.config import Campaign
 from nodes.experiment.campaign.plan import Planned, elsewhere, plan_cells, read_experiment
-from nodes.experiment.campaign.store import Store, store_of
+from nodes.experiment.campaign.store import NOT_DRIVEN, Store, store_of
 from nodes.experiment.campaign.worker import Ended, Job, run_here, run_in_process
 from nodes.experiment.cell import Cell
 from nodes.experiment.kinds import load_kind
+from nodes.lab.trials.tries import allow_more_tries
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import Display, ProgressDisplay, Report
 
@@ -150,7 +151,7 @@ def _run_here(
                 job = replace(each.job, threads=_cores(), phase="search" if options.search_only else "whole")
                 ended.append(run_here(job, store, kind, experiment, display))
     for end in ended:
-        if end.how != "done":
+        if end.how != "done" or end.text:
             say(f"{end.name}: {end.how}: {end.text}")
     return ended
 
@@ -215,6 +216,12 @@ class _PrintedReport(Report):
 
 def _is_wanted(store: Store, each: Planned, elsewhere: Sequence[Path], options: Options, say: Say) -> bool:
     status = store.status(each.cell, each.job.settings_hash, elsewhere)
+    if status.state == NOT_DRIVEN:
+        if options.retry:
+            _allow_more_tries(store, each.cell.name)
+        else:
+            say(f"{each.cell.name}: not driven live, not tried again without --retry: {status.text}")
+        return options.retry
     if status.state == "failed" and not options.retry:
         say(f"{each.cell.name}: failed before, not run again without --retry: {status.text}")
         return False
@@ -222,6 +229,13 @@ def _is_wanted(store: Store, each: Planned, elsewhere: Sequence[Path], options: 
         say(f"{each.cell.name}: another process runs it")
         return False
     return status.state != "done"
+
+
+def _allow_more_tries(store: Store, name: str) -> None:
+    """Allow three more tries of a cell's drives, and of those without attack that it is compared with."""
+    work = store.work(name)
+    for folder in (work, *(work.parent / "shared").glob("*")):
+        allow_more_tries(folder)
 
 
 def _run_beside(jobs: list[Job], at_a_time: int, options: Options, say: Say) -> list[Ended]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import read_cells
 from advnerf_core.report.clips import read_clip, webp
@@ -28,7 +28,7 @@ _EVERY = 2  # of ten frames a second
 
 def write_film(campaign: Campaign, published: Path) -> Path | None:
     """Write the film of the first primary test beside the page; None if there is none, or a clip is not on this machine."""
-    primary = json.loads((published / SET).read_text(encoding="utf-8"))["primary"]
+    primary = read_json(published / SET)["primary"]
     clips = _clips(campaign, published, primary[0]) if primary else []
     if not clips or not all(clip.exists() for clip in clips):
         return None

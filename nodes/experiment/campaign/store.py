@@ -10,13 +10,16 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Literal
 
+from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import CellError, CellResult, cell_from, read_cell
 from nodes.experiment.campaign.config import Campaign
 from nodes.experiment.cell import Cell
 from nodes.runtime.locks import HeldError, hold
 
-State = Literal["done", "failed", "changed", "running", "begun", "missing", "unreadable"]
+State = Literal["done", "not driven live", "failed", "changed", "running", "begun", "missing", "unreadable"]
+NOT_DRIVEN: State = "not driven live"
+FINISHED = ("done", NOT_DRIVEN)
 _KEY, _ERROR = "key", "error.json"
 LOG = "log.txt"
 
@@ -27,10 +30,11 @@ class CellStatus:
 
     Attributes:
         cell: Which.
-        state: ``changed``: there is a result, but of other settings; ``begun``: stopped on the way, goes on when run.
+        state: ``not driven live``: searched, but all its live tries were spoiled; ``changed``: there is a result, but of other settings;
+            ``begun``: stopped on the way, goes on when run.
         text: Error, or the last line of its log.
         result: The result, of any settings; None where there is none.
-        file: Where the result of a done cell is.
+        file: Where the result of a done cell is, or of one that was not driven live.
     """
 
     cell: Cell
@@ -73,7 +77,7 @@ class Store:
     def error(self, name: str, settings_hash: str) -> str:
         """Why the cell failed with these settings; empty if it did not."""
         try:
-            data = json.loads((self.work(name) / _ERROR).read_text(encoding="utf-8"))
+            data = read_json(self.work(name) / _ERROR)
             return str(data["error"]) if data["settings_hash"] == settings_hash else ""
         except (OSError, ValueError, KeyError, TypeError):
             return ""
@@ -112,11 +116,14 @@ class Store:
             result = self.result(name)
         except CellError as broken:
             return CellStatus(cell, "unreadable", str(broken))
-        if result is not None and settings_hash is not None and result.settings_hash == settings_hash:
-            return CellStatus(cell, "done", "", result, self.result_file(name))
+        ours = result if result is not None and result.settings_hash == settings_hash else None
+        if ours is not None and not ours.not_driven_live:
+            return CellStatus(cell, "done", "", ours, self.result_file(name))
         if settings_hash is not None and (found := _first_of(elsewhere, settings_hash)) is not None:
             file, other = found
             return CellStatus(cell, "done", f"from {file}", _named(other, cell), file)
+        if ours is not None:
+            return CellStatus(cell, NOT_DRIVEN, ours.not_driven_live, ours, self.result_file(name))
         if settings_hash is not None and (error := self.error(name, settings_hash)):
             return CellStatus(cell, "failed", error, result)
         if result is not None:
@@ -156,7 +163,7 @@ def _first_of(files: Sequence[Path], settings_hash: str) -> tuple[Path, CellResu
             result = read_cell(file)
         except CellError:
             continue
-        if result.settings_hash == settings_hash:
+        if result.settings_hash == settings_hash and not result.not_driven_live:
             return file, result
     return None
 

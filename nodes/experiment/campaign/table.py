@@ -13,7 +13,7 @@ from advnerf_core.report.conditions import order_of
 from advnerf_core.report.transfer import TransferTable, Wanted, make_table
 from advnerf_core.report.transfer_page import as_csv, as_json, as_markdown, gather_clips, render_transfer_page
 from nodes.experiment.campaign.config import Campaign
-from nodes.experiment.campaign.store import CellStatus
+from nodes.experiment.campaign.store import FINISHED, CellStatus
 from nodes.experiment.cell import Cell
 
 
@@ -38,7 +38,7 @@ def campaign_table(campaign: Campaign, found: Sequence[CellStatus]) -> TransferT
         campaign: The campaign.
         found: Where the cells are that the table is of; only results of the settings as they are now are taken.
     """
-    cells = [each.result for each in found if each.result is not None and each.state == "done"]
+    cells = [each.result for each in found if each.result is not None and each.state in FINISHED]
     return make_table(
         wanted_rows([each.cell for each in found], list(campaign.scenarios)),
         cells,

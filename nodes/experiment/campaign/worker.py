@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, Literal, TextIO
 
 from advnerf_core.files import write_atomically
+from advnerf_core.run_module import module_command
 from nodes.experiment.campaign.store import LOG, Store
 from nodes.experiment.cell import Cell
 from nodes.experiment.cell_kind import CellKind, settings_hash
@@ -123,7 +124,7 @@ def run_in_process(job: Job) -> Ended:
     }
     environment.setdefault("MUJOCO_GL", "egl")
     process = subprocess.Popen(
-        [sys.executable, "-m", "nodes.experiment.campaign.worker", str(os.getpid())],
+        module_command("nodes.experiment.campaign.worker", str(os.getpid())),
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
@@ -143,7 +144,7 @@ def run_in_process(job: Job) -> Ended:
     code, seconds = process.returncode, time.monotonic() - began
     said = (errors.decode("utf-8", "replace").strip().splitlines() or [""])[-1]
     if code == _DONE:
-        return Ended(job.name, "done", "", seconds)
+        return Ended(job.name, "done", _not_driven(job, store), seconds)
     if code == _ELSEWHERE:
         return Ended(job.name, "elsewhere", said, seconds)
     # One that was asked to end closed what it had open, and says so by the shell's exit code.
@@ -179,7 +180,15 @@ def run_here(job: Job, store: Store, kind: CellKind, experiment: Any, display: D
             return Ended(job.name, "failed", text, time.monotonic() - began)
     seconds = time.monotonic() - began
     display.finish(job.name, seconds, cached=False)
-    return Ended(job.name, "done", "", seconds)
+    return Ended(job.name, "done", _not_driven(job, store), seconds)
+
+
+def _not_driven(job: Job, store: Store) -> str:
+    """What to tell of a finished cell that was not driven live; empty for any other."""
+    result = store.result(job.name) if job.phase == "whole" else None
+    return (
+        f"not driven live: {result.not_driven_live}" if result is not None and result.not_driven_live else ""
+    )
 
 
 def main() -> None:

@@ -13,14 +13,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from advnerf_core.run_module import module_command
 from nodes.runtime.inbox import Inbox, ReaderThread
 
-# As nodes.experiment.request.search calls it, which the node does not import: it would bring torch.
-REQUEST = "request.attack.yaml"
+# Names that nodes.experiment.request.search shares; the node does not import that, because it would bring torch.
+REQUEST, TOGETHER_STATE = "request.attack.yaml", "together.state.safetensors"
 _SHIM = Path(__file__).parents[2] / "launching" / "shim.py"
 _READ_S = 0.2
 _PIECE = 1 << 16
 _END_S = 2.0
+
+
+def is_begun(folder: Path) -> bool:
+    """Whether a search has written a state or a result into a folder. Until then another request may take its place."""
+    return (folder / TOGETHER_STATE).exists() or any(folder.glob("seed_*.safetensors"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,19 +61,10 @@ class Job:
         if threads:
             environment |= {"OMP_NUM_THREADS": str(threads), "NUMBA_NUM_THREADS": str(threads)}
         # It dies with the node, which then finds its state and goes on.
-        command = [
-            sys.executable,
-            "-I",
-            "-S",
-            str(_SHIM),
-            str(os.getpid()),
-            sys.executable,
-            "-m",
-            "nodes.experiment.request.worker",
-        ]
+        shim = [sys.executable, "-I", "-S", str(_SHIM), str(os.getpid())]
         with open(self.log, "ab") as log:
             self._process = subprocess.Popen(
-                [*command, str(folder)],
+                [*shim, *module_command("nodes.experiment.request.worker", str(folder))],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=log,

@@ -15,6 +15,7 @@ import torch
 
 from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
 from advnerf_core.memory import peak_mib, restart_peak
+from advnerf_core.run_module import module_command
 from nodes.experiment.request.prepare import prepare
 from nodes.experiment.request.request import AttackRequest, load_request, request_text
 
@@ -41,14 +42,7 @@ def measured_mib(request: AttackRequest, ticks: int, cache_mib: float = 0.0) -> 
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "request.attack.yaml"
         file.write_text(request_text(request))
-        command = [
-            sys.executable,
-            "-m",
-            "nodes.experiment.request.memory",
-            str(file),
-            str(ticks),
-            str(cache_mib),
-        ]
+        command = module_command("nodes.experiment.request.memory", str(file), str(ticks), str(cache_mib))
         done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
     return float(done.stdout.split()[-1])
 

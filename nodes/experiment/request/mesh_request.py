@@ -5,7 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from advnerf_core.strict import StrictModel
 
 AboveZero = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -13,11 +15,7 @@ Samples = Annotated[int, Field(ge=1, le=256)]
 Unit = Annotated[float, Field(ge=0, le=1)]
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class MeshRequest(_Section):
+class MeshRequest(StrictModel):
     """A mesh: a file, or one that is made."""
 
     file: Path | None = Field(default=None, description="GLB, OBJ, PLY, STL.")
@@ -38,7 +36,7 @@ class MeshRequest(_Section):
         return self
 
 
-class ShapeRequest(_Section):
+class ShapeRequest(StrictModel):
     """Shapes are attacked instead of colours, of all objects, which must be meshes."""
 
     bound_m: AboveZero = Field(default=0.2, description="No vertex moves farther [m].")

@@ -5,7 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
+
+from advnerf_core.strict import StrictModel
 
 Count = Annotated[int, Field(ge=1)]
 AboveZero = Annotated[float, Field(gt=0)]
@@ -13,11 +15,7 @@ Numbers = Annotated[tuple[float, ...], Field(min_length=1)]
 Interval = tuple[float, float]
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class PoseBoundsRequest(_Section):
+class PoseBoundsRequest(StrictModel):
     """Bounds of one object; an axis that is not given stays as it is."""
 
     x_m: Interval | None = Field(default=None, description="Lowest and highest x of the object's origin [m].")
@@ -35,7 +33,7 @@ class PoseBoundsRequest(_Section):
         return interval
 
 
-class LandscapeRequest(_Section):
+class LandscapeRequest(StrictModel):
     """A grid over the bounds of one object."""
 
     object: Annotated[int, Field(ge=0)] = Field(default=0, description="Number of the object.")
@@ -45,7 +43,7 @@ class LandscapeRequest(_Section):
     )
 
 
-class RobustnessMapRequest(_Section):
+class RobustnessMapRequest(StrictModel):
     """Starts and moves of an object; the map has every start with every move."""
 
     object: Annotated[int, Field(ge=0)] = Field(default=0, description="Number of the object that is moved.")
@@ -65,7 +63,7 @@ class RobustnessMapRequest(_Section):
     )
 
 
-class PosesRequest(_Section):
+class PosesRequest(StrictModel):
     """Where objects may stand, and the budget: ``samples * steps`` evaluations, for random poses as well."""
 
     bounds: tuple[PoseBoundsRequest, ...] = Field(

@@ -114,6 +114,8 @@ class Prepared:
             "start_states": self.problem.start_states[:, :3].tolist(),
             "objects_sha256": self.hashes["objects"],
         }
+        if identity := self.policy.metadata.get("not_fixed"):
+            extra["policy_not_fixed"] = identity
         if self.request.shape is not None:
             extra["shape"] = self.request.shape.model_dump(mode="json")
         return AttackFile(

@@ -11,16 +11,19 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from advnerf_core.attack.methods import METHODS, alternatives, method_name
+from advnerf_core.documents import Document, dump_yaml, parse_yaml, read_yaml
 from advnerf_core.geometry import Array, make_transform, rotation_z
+from advnerf_core.places import expanded
 from advnerf_core.policies.load import is_factory
+from advnerf_core.strict import StrictModel, validate
 from nodes.experiment.method_names import MethodReference
 from nodes.experiment.request.mesh_request import MeshRequest, ShapeRequest
 from nodes.experiment.request.pose_request import PosesRequest
 from nodes.experiment.robustness_config import RobustnessConfig
-from nodes.runtime.config import Document, apply_overrides, parse_yaml, read_yaml, validate
+from nodes.runtime.config import apply_overrides
 
 Count = Annotated[int, Field(ge=1)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -31,11 +34,7 @@ _RIGID_TOLERANCE = 1e-6
 SHAPE_METHODS = alternatives(name for name, row in METHODS.items() if row.reads_scale)
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class ObjectRequest(_Section):
+class ObjectRequest(StrictModel):
     """One object: where it is, and which of its colours are free.
 
     A ``face`` is a thin slab seen from its front only, as a projected or displayed texture is; a ``cube`` has one textured face
@@ -126,7 +125,7 @@ class ObjectRequest(_Section):
         )
 
 
-class StartsRequest(_Section):
+class StartsRequest(StrictModel):
     """Start poses optimised together: listed, or drawn around a nominal one."""
 
     poses: tuple[tuple[float, float, float], ...] = Field(
@@ -139,7 +138,7 @@ class StartsRequest(_Section):
     sigma: NotNegative = Field(default=0.1, description="Spread of the others [m and rad].")
 
 
-class DynamicsRequest(_Section):
+class DynamicsRequest(StrictModel):
     """What the surrogate's car is like beyond its calibration."""
 
     speed_mps: AboveZero = Field(default=0.8, description="Driving speed [m/s].")
@@ -151,7 +150,7 @@ class DynamicsRequest(_Section):
     slew_radps: AboveZero | None = Field(default=None, description="Limit of the wheels' rate [rad/s].")
 
 
-class SearchRequest(_Section):
+class SearchRequest(StrictModel):
     """The adversary and its budget."""
 
     method: MethodReference = Field(
@@ -197,7 +196,7 @@ class SearchRequest(_Section):
         return method_name(self.method)
 
 
-class AttackRequest(_Section):
+class AttackRequest(StrictModel):
     """One attack, resolved; see the sections for their values."""
 
     name: str = Field(default="attack", min_length=1)
@@ -295,11 +294,7 @@ def parse_request(
 
 def request_text(request: AttackRequest) -> str:
     """YAML text from which `parse_request` makes the same request on the same machine."""
-    import yaml
-
-    return yaml.safe_dump(
-        request.model_dump(mode="json"), sort_keys=False, default_flow_style=None, width=120
-    )
+    return dump_yaml(request.model_dump(mode="json"), default_flow_style=None, width=120)
 
 
 def _resolve(document: Document, folder: Path, overrides: Sequence[str]) -> AttackRequest:
@@ -309,7 +304,7 @@ def _resolve(document: Document, folder: Path, overrides: Sequence[str]) -> Atta
     def absolute(path: Path | None) -> Path | None:
         if path is None or is_factory(str(path)):
             return path
-        return (folder / path.expanduser()).resolve()
+        return (folder / expanded(path)).resolve()
 
     changes: dict[str, Any] = {name: absolute(getattr(request, name)) for name in _PATHS}
     changes["objects"] = tuple(

@@ -20,14 +20,13 @@ from advnerf_core.attack.on_device import all_on_chosen_device, on_chosen_device
 from advnerf_core.attack.search.search import Evaluation, OnEvaluation, SearchResult
 from advnerf_core.attack.search.together import gradient_attacks
 from advnerf_core.files import write_atomically
+from advnerf_core.places import require_utf8
+from nodes.experiment.request.job import REQUEST, TOGETHER_STATE, is_begun
 from nodes.experiment.request.prepare import Prepared, prepare
 from nodes.experiment.request.request import SHAPE_METHODS, AttackRequest, load_request, request_text
 from nodes.experiment.request.telling import telling
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import Display
-
-REQUEST = "request.attack.yaml"
-TOGETHER_STATE = "together.state.safetensors"
 
 
 def chosen_method(request: AttackRequest) -> tuple[Method, SearchSettings]:
@@ -108,6 +107,7 @@ def run_attack(
         PluginError: The method's code cannot be loaded.
     """
     chosen_method(request)  # before anything is loaded or written
+    require_utf8(folder.absolute())
     keep_request(request, folder)
     if request.search.together:
         return _run_together(request, folder, display, on_evaluation, on_prepared)
@@ -132,9 +132,9 @@ def attack_file(folder: Path, seed: int) -> Path:
 
 
 def keep_request(request: AttackRequest, folder: Path) -> None:
-    """Write the request into a fresh folder; another one in it is refused."""
+    """Write the request into a folder. Another one in it is refused once its search has begun; one that failed to load is replaced."""
     kept = folder / REQUEST
-    if not kept.exists():
+    if not kept.exists() or not is_begun(folder):
         write_atomically(kept, request_text(request))
     elif load_request(kept) != request:
         raise ConfigError(

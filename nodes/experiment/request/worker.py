@@ -14,15 +14,16 @@ from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import safe_open
 from torch import Tensor
 
 from advnerf_core.attack.artifact import face_texture, load_attack
 from advnerf_core.attack.search.search import Evaluation
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.places import open_tensors
 from advnerf_core.scene.surrogate import split_theta
+from nodes.experiment.request.job import TOGETHER_STATE
 from nodes.experiment.request.prepare import Prepared
-from nodes.experiment.request.search import TOGETHER_STATE, kept_request, planned_evaluations, run_attack
+from nodes.experiment.request.search import kept_request, planned_evaluations, run_attack
 from nodes.runtime.progress import MeasuringReport
 
 TEXTURE, PREVIEW = "texture", "preview"
@@ -104,7 +105,7 @@ class Speaker:
         state = self._folder / TOGETHER_STATE if together else self._state(prepared)
         if not state.exists():
             return None
-        with safe_open(state, framework="pt") as handle:
+        with open_tensors(state, "pt") as handle:
             best: Tensor = handle.get_tensor("best_theta")
             histories = json.loads((handle.metadata() or {}).get("histories", "[]"))
         if not together:
@@ -124,7 +125,7 @@ def _so_far(state: Path) -> tuple[int, float | None]:
     """Evaluations of a search that was cut off, and its best total [m]."""
     if not state.exists():
         return 0, None
-    with safe_open(state, framework="pt") as handle:
+    with open_tensors(state, "pt") as handle:
         history = json.loads((handle.metadata() or {}).get("history", "[]"))
     totals = [sum(entry["protocol_cte_m"]) / len(entry["protocol_cte_m"]) for entry in history]
     return len(totals), max(totals, default=None)

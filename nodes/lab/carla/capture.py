@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from advnerf_core.data.posed_images import write_posed_images
+from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import planar_pose
 from hardware.worlds.carla.config import CarlaConfig
@@ -94,7 +95,7 @@ def _claim(folder: Path, config: CarlaConfig, request: CaptureRequest, drives: d
     text = json.dumps({"config": about, "request": vars(request), "drives": drives}, sort_keys=True)
     digest, file = hashlib.sha256(text.encode()).hexdigest(), folder / REQUEST
     if file.exists():
-        if json.loads(file.read_text(encoding="utf-8")).get("sha256") != digest:
+        if read_json(file).get("sha256") != digest:
             raise ConfigError(
                 f"{folder} holds a capture with other settings: name another folder, or remove it"
             )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -12,6 +11,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.run_module import module_command
 
 OK, ABSENT, WARNING, FAILURE = "ok", "absent", "warning", "failure"
 STATES = (OK, ABSENT, WARNING, FAILURE)
@@ -68,10 +68,16 @@ class Answer:
     Attributes:
         data: The result; None if the probe failed.
         trouble: Why the probe failed.
+        late: Whether it gave no answer in time, which says nothing about what is installed.
     """
 
     data: Any
     trouble: str = ""
+    late: bool = False
+
+    def cure(self, of_failure: str) -> str:
+        """What to do: that of a failure, or wait where the computer is only slow."""
+        return "run advnerf doctor again when this computer has less to do" if self.late else of_failure
 
 
 def examine(checks: Sequence[Check]) -> Iterator[Finding]:
@@ -97,13 +103,13 @@ def in_child(probe: str, *arguments: Any, timeout_s: float = CHILD_S) -> Answer:
         arguments: Arguments of the probe, as plain data.
         timeout_s: Time after which the process is killed [s].
     """
-    command = [sys.executable, "-m", "nodes.lab.doctor.probes", probe, json.dumps(arguments)]
+    command = module_command("nodes.lab.doctor.probes", probe, json.dumps(arguments))
     try:
         done = subprocess.run(
             command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout_s, check=False
         )
     except subprocess.TimeoutExpired:
-        return Answer(None, f"no answer within {timeout_s:g} s")
+        return Answer(None, f"no answer within {timeout_s:g} s", late=True)
     if done.returncode < 0:
         return Answer(None, f"its process was ended by signal {-done.returncode}")
     lines = (done.stderr if done.returncode else done.stdout).strip().splitlines()

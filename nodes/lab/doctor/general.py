@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 
 from hardware.mocap.vicon import ViconConfig
-from nodes.lab.doctor import cameras, graphics, machine, mocap, motor
+from nodes.lab.doctor import cameras, graphics, machine, mocap, motor, priority
 from nodes.lab.doctor.check import CHILD_S, Check
 from nodes.lab.doctor.recording import Pictures, bytes_per_s
 
@@ -28,6 +28,8 @@ def checks(folder: Path, vicon_port: int, vesc_port: str | None = None) -> list[
     return [
         Check("versions", machine.versions),
         Check("machine", machine.machine),
+        Check("places", machine.places),
+        Check("priority", priority.shares, priority.DEADLINE_S),
         Check("torch", graphics.torch, _CHILD_DEADLINE_S),
         Check("EGL", graphics.egl, _CHILD_DEADLINE_S),
         Check("LLVM", graphics.llvm, _CHILD_DEADLINE_S),

@@ -8,6 +8,7 @@ from typing import Any
 
 from hardware.screen.edid import connected_displays
 from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, Answer, Finding, in_child
+from nodes.runtime.extras import CPU_TORCH, installs
 
 _EGL_CURE = "apt-get install libegl1 libgl1-mesa-dri libegl-mesa0 libopengl0 (Debian, Ubuntu)"
 _SCREEN_CURE = (
@@ -32,7 +33,9 @@ def egl(required: bool = False) -> list[Finding]:
         state = FAILURE if required else ABSENT
         return [Finding("EGL", state, "no simulated lab: MuJoCo is missing", "pip install 'advnerf[twin]'")]
     state = FAILURE if required else WARNING
-    return [Finding("EGL", state, f"the simulated lab cannot render: {answer.trouble}", _EGL_CURE)]
+    return [
+        Finding("EGL", state, f"the simulated lab cannot render: {answer.trouble}", answer.cure(_EGL_CURE))
+    ]
 
 
 def torch(required: bool = False) -> list[Finding]:
@@ -43,12 +46,15 @@ def torch(required: bool = False) -> list[Finding]:
             "is missing: no training, no attack, only ONNX policies" if _missing(answer) else answer.trouble
         )
         state = FAILURE if required else ABSENT if _missing(answer) else WARNING
-        return [Finding("torch", state, text, "pip install 'advnerf[core]'")]
+        return [Finding("torch", state, text, answer.cure(installs("torch") or ""))]
     version, gpus, built_for = (answer.data[key] for key in ("version", "gpus", "built_for"))
     if gpus:
         return [Finding("torch", OK, f"{version}, CUDA {built_for}: {', '.join(gpus)}")]
     if built_for:
-        do = "make nvidia-smi work first: install the driver, or start the container with --gpus all"
+        do = (
+            "make nvidia-smi work first: install the driver, or start the container with --gpus all; without such a GPU, "
+            f"pip uninstall torch, then {CPU_TORCH}, saves several GB"
+        )
         return [Finding("torch", WARNING, f"{version} is built for CUDA {built_for}, but sees no GPU", do)]
     return [Finding("torch", OK, f"{version}, CPU only")]
 
@@ -62,7 +68,9 @@ def llvm() -> list[Finding]:
         return [
             Finding("LLVM", ABSENT, "Mitsuba is missing: no attacks on meshes", "pip install 'advnerf[mesh]'")
         ]
-    return [Finding("LLVM", WARNING, answer.trouble, "apt-get install libllvm19 (Debian, Ubuntu)")]
+    return [
+        Finding("LLVM", WARNING, answer.trouble, answer.cure("apt-get install libllvm19 (Debian, Ubuntu)"))
+    ]
 
 
 def screens(display: Any | None = None) -> list[Finding]:
@@ -81,6 +89,8 @@ def screens(display: Any | None = None) -> list[Finding]:
         if _missing(answer):
             text = "pygame-ce is missing: no attack on a monitor"
             return [Finding("screens", state, text, "pip install 'advnerf[monitor]'")]
+        if answer.late:
+            return [Finding("screens", state, answer.trouble, answer.cure(""))]
         return [_no_window_system(answer.trouble, state, named)]
     if answer.data["driver"] in _NO_SCREEN and os.environ.get("SDL_VIDEODRIVER") != answer.data["driver"]:
         return [_no_window_system("SDL found neither X11 nor Wayland", state, named)]

@@ -12,6 +12,7 @@ from pydantic import BaseModel
 
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.policies.load import is_factory
+from advnerf_core.strict import validate
 from calibration.schema import CameraCalibration, load_calibration
 from hardware.mocap.vicon import ViconConfig
 from hardware.motor.vesc_settings import TimeoutSettings
@@ -27,7 +28,6 @@ from nodes.monitor import MonitorConfig, ScreenConfig
 from nodes.motor import MotorConfig
 from nodes.policy import PolicyConfig
 from nodes.recorder import RecorderConfig
-from nodes.runtime.config import validate
 from nodes.runtime.errors import ConfigError
 from nodes.safety import SafetyConfig
 from nodes.vicon import ViconNodeConfig
@@ -67,6 +67,7 @@ def checks_of(plan: Plan, folder: Path) -> list[Check]:
     checks = [
         Check("versions", machine.versions),
         Check("machine", machine.machine),
+        Check("places", machine.places),
         Check("sockets", machine.sockets),
         Check("launches", machine.launches),
         Check("nodes", partial(_nodes, plan), _NODES_S),
@@ -236,7 +237,7 @@ def _try_policy(
     answer = in_child("policy", config.policy, config.sha256)
     if answer.data is None:
         trouble = answer.trouble.partition(": ")[2] or answer.trouble
-        return None, [Finding("policy", FAILURE, trouble, "correct params.policy")]
+        return None, [Finding("policy", FAILURE, trouble, answer.cure("correct params.policy"))]
     data, rows = answer.data, []
     if size is not None and tuple(data["size"]) != size:
         text = f"trained for {data['size'][0]} x {data['size'][1]}, the camera is calibrated for {size[0]} x {size[1]}"

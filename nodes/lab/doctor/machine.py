@@ -11,15 +11,18 @@ import shutil
 import struct
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from advnerf_core.errors import AdvnerfError
+from advnerf_core.kernel_cache import use_own_folder
+from advnerf_core.places import PlaceError, is_writable, user_place
 from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, Finding
 from nodes.launching.launch import active_launches
 from nodes.linking.keys import DRIVE, KeyFolder, default_folder
 from nodes.runtime.bus import Bus
-from nodes.runtime.errors import BusError, SecurityError
 from nodes.runtime.machine import memory_gib
 from nodes.runtime.paths import user_folder
 from nodes.safety import SafetyConfig
@@ -59,9 +62,7 @@ def packages(requirements: Iterable[str]) -> list[Finding]:
     extras = [name for name in wrong if name and not wrong[name]]
     rows = [Finding("extras", OK, f"complete: {', '.join(extras) or 'none'}")]
     if base := wrong.get("", []):
-        rows.insert(
-            0, Finding("packages", FAILURE, "; ".join(base), "pip install -c constraints.txt advnerf")
-        )
+        rows.insert(0, Finding("packages", FAILURE, "; ".join(base), "pip install advnerf"))
     for name in (name for name in wrong if name and wrong[name]):
         stale = [trouble for trouble in wrong[name] if not trouble.endswith("missing")]
         if stale:
@@ -134,11 +135,41 @@ def disk(folder: Path, bytes_per_s: float, minutes: float = 30.0) -> list[Findin
     return [Finding("disk", OK, text)]
 
 
+def places() -> list[Finding]:
+    """Check whether this user has a home, and where compiled kernels are kept, by writing there."""
+    return [_home(), _cache()]
+
+
+def _home() -> Finding:
+    do = "set HOME to a folder of this user, or XDG_CONFIG_HOME (keys) and XDG_DATA_HOME (worlds)"
+    try:
+        folder = user_place("config")
+    except PlaceError as error:
+        return Finding("home", WARNING, str(error), do)
+    above = next(path for path in (folder, *folder.parents) if path.is_dir())
+    if not is_writable(above):
+        return Finding("home", WARNING, f"{above} cannot be written", do)
+    return Finding("home", OK, str(folder))
+
+
+def _cache() -> Finding:
+    do = "set NUMBA_CACHE_DIR to a folder of this user that stays"
+    try:
+        folder = use_own_folder()
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except (PlaceError, OSError) as error:
+        return Finding("cache", FAILURE, f"compiled kernels cannot be kept: {error}", do)
+    if folder.is_relative_to(tempfile.gettempdir()):
+        return Finding("cache", WARNING, f"{folder}, which a restart may empty", do)
+    return Finding("cache", OK, str(folder))
+
+
 def sockets() -> list[Finding]:
     """Check whether nodes can create their sockets."""
     try:
         return [Finding("sockets", OK, f"in {user_folder()}")]
-    except (BusError, OSError) as error:
+    except (AdvnerfError, OSError) as error:
         return [
             Finding(
                 "sockets",
@@ -151,14 +182,14 @@ def sockets() -> list[Finding]:
 
 def keys(folder: Path | None = None) -> list[Finding]:
     """Check the keys for a second host."""
-    folder = folder or default_folder()
-    store = KeyFolder(folder)
     try:
+        folder = folder or default_folder()
+        store = KeyFolder(folder)
         rows = store.rows()
         for row in rows:
             if row.ours:
                 store.secret(row.name)
-    except (SecurityError, OSError) as error:
+    except (AdvnerfError, OSError) as error:
         return [Finding("keys", WARNING, str(error))]
     ours = ", ".join(row.name for row in rows if row.ours)
     drivers = ", ".join(row.name for row in rows if DRIVE in row.rights) or "no key"

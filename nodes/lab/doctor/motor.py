@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import getpass
 import grp
 import os
+import pwd
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -85,7 +85,10 @@ def permission_cure(group: str) -> str:
         entry = grp.getgrnam(group)
     except KeyError:
         return f"this system has no group {group}; ls -l shows who may open the device"
-    user = getpass.getuser()
+    try:
+        user = pwd.getpwuid(os.getuid()).pw_name
+    except KeyError:  # as the user of a container
+        return f"start the container with --group-add {entry.gr_gid}, or give user {os.getuid()} a name and the group {group}"
     if entry.gr_gid in os.getgroups():
         return f"you are in the group {group}: ls -l shows who may open it; its udev rule sets GROUP and MODE"
     if user in entry.gr_mem:

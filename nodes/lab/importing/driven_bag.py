@@ -8,14 +8,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-import yaml
-from pydantic import ValidationError
 
 from advnerf_core.data.image_files import Rgb
 from advnerf_core.data.similarity import rotation_angles
+from advnerf_core.documents import decode_text
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array
-from calibration.schema import CalibrationError, CameraCalibration, load_calibration
+from calibration.schema import CameraCalibration, load_calibration, parse_calibration
 from nodes.bags.images import image_messages, image_topic
 from nodes.bags.reader import read_attachment, read_info, read_messages
 from nodes.control.pose_buffer import PoseBuffer
@@ -140,10 +139,9 @@ def _camera(bag: Path, file: Path | None) -> CameraCalibration:
         raise ImportRecordingError(
             f"expected the camera's calibration: {error}; give its file with --calibration"
         ) from error
-    try:
-        return CameraCalibration.model_validate(yaml.safe_load(text))
-    except (yaml.YAMLError, ValidationError) as error:
-        raise CalibrationError(f"{_ATTACHED_CALIBRATION} in {bag}: {' '.join(str(error).split())}") from error
+    return parse_calibration(
+        CameraCalibration, decode_text(text, source := f"{_ATTACHED_CALIBRATION} in {bag}"), source
+    )
 
 
 def _car_poses(bag: Path, config: BagConfig) -> PoseBuffer:

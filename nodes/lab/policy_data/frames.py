@@ -7,10 +7,8 @@ expert added to its steering are in neither: they are not in the expert's contro
 
 from __future__ import annotations
 
-import csv
 import math
 from bisect import bisect_left
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -19,6 +17,7 @@ import numpy as np
 
 from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.image_files import read_stored
+from advnerf_core.documents import CsvRow, raise_problems, read_csv
 from advnerf_core.driving.expert import Expert
 from advnerf_core.geometry import Pinhole, yaw_of
 from advnerf_core.learning.frames import Frames
@@ -142,28 +141,41 @@ def frames_of_log(
         rad_per_unit: Factor from that column to radians, left positive (negative for logs in which right is positive).
     """
     images, steering = [], []
-    for number, row in enumerate(_rows(log, (image_column, steering_column)), start=2):
+    problems: list[str] = []
+    for row in read_csv(log, (image_column, steering_column)):
         try:
-            rgb, _ = read_stored(log.parent / row[image_column].strip())
-        except DatasetError as error:
-            raise ConfigError(f"{log}:{number}: {error}, or remove the row") from error
-        try:
-            angle_rad = float(row[steering_column]) * rad_per_unit
-        except ValueError:
-            angle_rad = math.nan
-        if not abs(angle_rad) < 1.0:
-            raise ConfigError(
-                f"{log}:{number}: expected a steering angle below 1 rad, got {row[steering_column]!r} times {rad_per_unit:g};"
-                " give the factor from the log's unit to radians with --log-scale"
-            )
+            angle_rad = _angle_rad(row, steering_column, rad_per_unit)
+            rgb = _picture(row, log.parent, image_column)
+        except ConfigError as error:
+            problems.append(str(error))
+            continue
         view = view or view_for_size(rgb.shape[1], rgb.shape[0])
         _require_size(rgb, view, str(log))
         images.append(view.image(rgb))
         steering.append(angle_rad)
+    raise_problems(problems)
     if len(images) < 4 or view is None:
         raise ConfigError(f"expected at least 4 rows in {log}, got {len(images)}; record more")
     nowhere = [(math.nan,) * 3] * len(images)
     return _recording(images, nowhere, steering, steering, list(range(len(images))), str(log), {}), view
+
+
+def _angle_rad(row: CsvRow, column: str, rad_per_unit: float) -> float:
+    angle_rad = row.number(column) * rad_per_unit
+    if not abs(angle_rad) < 1.0:
+        raise ConfigError(
+            f"{row.place}: expected a steering angle below 1 rad, got {row.values[column]!r} times {rad_per_unit:g};"
+            " give the factor from the log's unit to radians with --log-scale"
+        )
+    return angle_rad
+
+
+def _picture(row: CsvRow, folder: Path, column: str) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    try:
+        rgb, _ = read_stored(folder / row.values[column].strip())
+    except DatasetError as error:
+        raise ConfigError(f"{row.place}: {error}, or remove the row") from error
+    return rgb
 
 
 def view_for_size(width: int, height: int) -> PolicyView:
@@ -174,28 +186,9 @@ def view_for_size(width: int, height: int) -> PolicyView:
 
 def first_image(log: Path, image_column: str) -> Path:
     """Path of the first image of a foreign log."""
-    for row in _rows(log, (image_column,)):
-        return log.parent / row[image_column].strip()
+    for row in read_csv(log, (image_column,)):
+        return log.parent / row.values[image_column].strip()
     raise ConfigError(f"expected at least 4 rows in {log}, got none; give a log with images")
-
-
-def _rows(log: Path, columns: tuple[str, ...]) -> Iterator[dict[str, str]]:
-    try:
-        with open(log, newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file, strict=True)
-            missing = [name for name in columns if name not in (reader.fieldnames or ())]
-            if missing:
-                raise ConfigError(
-                    f"expected columns {', '.join(columns)} in {log}, got {', '.join(reader.fieldnames or ()) or 'an empty file'}"
-                )
-            for row in reader:
-                if any(row[name] is None for name in columns):
-                    raise ConfigError(
-                        f"{log}:{reader.line_num}: expected {len(columns)} columns and more, got a short row"
-                    )
-                yield row
-    except (OSError, csv.Error, UnicodeDecodeError) as error:
-        raise ConfigError(f"expected a CSV file at {log}, got {error}") from error
 
 
 def _read_track(bag: Path, topics: list[str]) -> _Track:

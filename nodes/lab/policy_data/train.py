@@ -12,11 +12,13 @@ from typing import Any
 
 import torch
 
+from advnerf_core.documents import read_json
 from advnerf_core.driving.expert import Expert
 from advnerf_core.files import write_atomically
 from advnerf_core.learning.fit import FitConfig, fit, mean_absolute_error
 from advnerf_core.learning.frames import FrameSet, FrameStore
 from advnerf_core.learning.imitation import ImitationConfig, Progress, SourcePlan, train_policy
+from advnerf_core.places import require_utf8
 from advnerf_core.policies.pilotnet import PilotNet, save_policy
 from advnerf_core.policies.view import PolicyView
 from nodes.lab.policy_data.frames import Recording
@@ -85,6 +87,7 @@ def train_from_recordings(
     Frames and checkpoints are in ``out/work/<digest of all inputs>``. The same call resumes, or returns at once if finished. Other
     recordings or settings start a new training, and remove the earlier work when they are finished.
     """
+    require_utf8(out.absolute())
     claim = {
         "parts": {part.name: part.digest for part in parts},
         "view": view.to_dict(),
@@ -126,7 +129,7 @@ def _cut(part: Part, store: FrameStore, work: Path, report: Report) -> dict[str,
         recording = part.cut()
         write_atomically(record, json.dumps(recording.counts) + "\n")
         store.append(_shard(part), recording.frames)
-    return {reason: int(count) for reason, count in json.loads(record.read_text()).items()}
+    return {reason: int(count) for reason, count in read_json(record).items()}
 
 
 def _clone(

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import yaml
-
+from advnerf_core.documents import dump_yaml, read_yaml
 from advnerf_core.files import write_atomically
-from nodes.runtime.config import read_yaml
 from nodes.runtime.errors import ConfigError
 
 _POSE_KEYS = ("T_world_from_object", "x_m", "y_m", "z_m", "yaw_rad")
@@ -35,5 +33,5 @@ def write_measured_request(request: Path, pose: dict[str, float]) -> Path:
     faces[0].update(pose)
     stem = request.name.removesuffix(".yaml").removesuffix(".attack")
     output = request.with_name(f"{stem}.measured.attack.yaml")
-    write_atomically(output, yaml.safe_dump(data, sort_keys=False))
+    write_atomically(output, dump_yaml(data))
     return output

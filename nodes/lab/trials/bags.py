@@ -14,6 +14,7 @@ from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.geometry import yaw_of
 from calibration.schema import RoomCalibration, load_calibration
 from nodes.bags.reader import extract_attachments, read_info, read_messages
+from nodes.bags.time_gaps import skipped_gaps
 from nodes.lab.trials.evaluation import attack_ids, counterfactual, score, timing, trajectory
 from nodes.lab.trials.trial import MOVED_M
 from nodes.runtime.clock import NS_PER_S
@@ -53,12 +54,16 @@ def find_drives(bag: Path) -> list[DriveSpan]:
         )
     stamps, xy = _positions(bag)
     spans = []
+    gaps = skipped_gaps(bag)
     for armed_ns, disarmed_ns, reason in armings:
         first = int(np.searchsorted(stamps, armed_ns))
         origin = xy[max(first - 1, 0)]
         moved = np.flatnonzero(np.linalg.norm(xy[first:] - origin, axis=1) > MOVED_M)
         start_ns = int(stamps[first + moved[0]]) if moved.size else None
         end_ns = int(stamps[-1]) if disarmed_ns is None else disarmed_ns
+        for gap in gaps:  # a drive ends where the clock was set: what follows is at another time
+            if armed_ns <= gap.before_ns < end_ns:
+                end_ns, reason = gap.before_ns, str(gap)
         if start_ns is not None and start_ns < end_ns:
             spans.append(DriveSpan(start_ns, end_ns, reason))
     if not spans:

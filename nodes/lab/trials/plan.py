@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.attack.artifact import load_attack
+from advnerf_core.documents import read_json
 from advnerf_core.files import sha256_of, write_atomically
 from nodes.runtime.errors import RuntimeFault
 
@@ -155,7 +156,7 @@ def sha256_if_any(file: Path | None) -> str:
 
 def _read(file: Path) -> dict[str, Any]:
     try:
-        data = json.loads(file.read_text(encoding="utf-8"))
+        data = read_json(file)
     except (OSError, ValueError) as error:
         raise CampaignError(f"cannot read {file}: {error}; remove it to drive that run again") from None
     if not isinstance(data, dict):

@@ -6,8 +6,6 @@ may be interrupted between runs at any time.
 
 from __future__ import annotations
 
-import json
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from advnerf_core.files import write_atomically
 from calibration.schema import RoomCalibration, load_calibration
 from nodes.lab.trials.bags import measure_drives
 from nodes.lab.trials.plan import (
@@ -28,16 +25,15 @@ from nodes.lab.trials.plan import (
     make_runs,
     sha256_if_any,
 )
-from nodes.lab.trials.trial import NotStartedError, TrialPlan, counts
-from nodes.lab.trials.trial_runner import run_trial
+from nodes.lab.trials.trial import TrialPlan
+from nodes.lab.trials.trial_runner import TICK_S, run_trial
+from nodes.lab.trials.tries import NotDrivenError, drive_with_tries
 from nodes.launching.launch_file import Plan, load_launch
 from nodes.launching.launch_hosts import ALL_HOSTS, operator_of
 from nodes.runtime.errors import ConfigError
 
-TICK_S = 0.1
 # Time that the car drives after the last tick, so that there are poses after it.
 _TAIL_S = 0.2
-_ATTEMPTS = 3
 _NOT_WATCHED = ("recorder", "viewer")
 
 
@@ -135,28 +131,20 @@ def drive_series(
 def drive_run(
     series: Series, run: Run, ready_timeout_s: float, guide: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Drive one run and write its result. A run that was ended by a fault of the stack is repeated a few times."""
-    for attempt in range(1, _ATTEMPTS + 1):
-        try:
-            result = _attempt(series, run, ready_timeout_s, guide)
-            stopped = result["stopped_early"]
-        except NotStartedError as error:
-            stopped = str(error)
-        else:
-            if counts(stopped, result["off_track"]):
-                write_atomically(series.folder / f"{run.name}.json", json.dumps(result) + "\n")
-                return result
-        guide(f"this run does not count, the stack stopped it: {stopped} (attempt {attempt} of {_ATTEMPTS})")
-    raise CampaignError(
-        f"run {run.name} was stopped {_ATTEMPTS} times by the stack: {stopped}; fix this first"
-    )
+    """Drive one run and write its result. A run that load or a fault of the stack spoiled is driven again, at most three times."""
+    file = series.folder / f"{run.name}.json"
+    try:
+        return drive_with_tries(lambda: _drive_once(series, run, ready_timeout_s, guide), file, guide)
+    except NotDrivenError as error:
+        raise CampaignError(
+            f"{error}; fix this first, then remove {file.with_suffix('.tries.json')} to drive it again"
+        ) from None
 
 
-def _attempt(
+def _drive_once(
     series: Series, run: Run, ready_timeout_s: float, guide: Callable[[str], None]
 ) -> dict[str, Any]:
     plan, run_dir = series.plan, series.folder / run.name
-    shutil.rmtree(run_dir, ignore_errors=True)  # from an interrupted run
     trial = TrialPlan(plan.start_pose, plan.ticks * TICK_S + _TAIL_S, series.nodes, by_hand=True)
     overrides = [*plan.overrides, f"params.attack={run.attack}"]
     outcome = run_trial(Path(plan.launch), overrides, run_dir, trial, ready_timeout_s, guide, plan.host)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from advnerf_core.geometry import planar_pose, wrap_angle, yaw_of
-from nodes.runtime.arm_requests import arm_message
+from nodes.runtime.arm_requests import BRAKE_WAIT_S, arm_message
 from nodes.runtime.clock import NS_PER_S, Now
 from nodes.runtime.errors import NodeFinished, RuntimeFault
 from nodes.runtime.messages import ns_from_stamp, pose_matrix, pose_message
@@ -37,27 +37,8 @@ class TrialError(RuntimeFault):
     """A trial could not be carried out."""
 
 
-# Stops that belong to the drive: the car reached the fence, or the operator stopped it. All others are faults of the stack.
-_COUNTED_STOPS = ("fence", "disarmed by", "released")
-STALLED = "stalled"
-
-
-def counts(stopped_early: str, off_track: bool) -> bool:
-    """Whether a drive is a valid measurement, or was ended by a fault of the stack.
-
-    A car that stalls off the track has hit an obstacle, which is caused by the policy. A car that stalls on the track is jammed.
-
-    Args:
-        stopped_early: Why the stack stopped the car; empty for a complete drive.
-        off_track: Whether the car had left the track before.
-    """
-    if STALLED in stopped_early:
-        return off_track
-    return not stopped_early or any(word in stopped_early for word in _COUNTED_STOPS)
-
-
-class NotStartedError(TrialError):
-    """The stack stopped a trial before the car moved, for example because a command was late. The trial can be repeated."""
+class SpoiledError(TrialError):
+    """The drive measures nothing, because load or a fault of the stack ended, delayed or prevented it. It may be driven again."""
 
 
 class Phase(Enum):
@@ -184,9 +165,8 @@ class TrialNode(Node):
         waited_s = (now.mono_ns - self._phase_began_ns) / NS_PER_S
         a_persons_turn = self._by_hand and self.phase in (Phase.PLACING, Phase.ARMING)
         if self.phase is not Phase.DRIVING and not a_persons_turn and waited_s > self.plan.patience_s:
-            raise TrialError(
-                f"gave up after {waited_s:.0f} s of {self.phase.value}: {self._what_is_missing()}"
-            )
+            error = TrialError if self.phase is Phase.STOPPING else SpoiledError
+            raise error(f"gave up after {waited_s:.0f} s of {self.phase.value}: {self._what_is_missing()}")
         return step[self.phase](now)
 
     def status(self) -> tuple[str, str]:
@@ -278,6 +258,8 @@ class TrialNode(Node):
             self._enter(Phase.DONE, now)
             return []
         answered = self._asked is not None and self._seen.answered_id == self._asked.ask_id
+        if not answered and self._phase_s(now) > BRAKE_WAIT_S:
+            self._tell("NOT CONFIRMED: no answer from the safety node. Use the hardware stop", now)
         return [] if answered and not self._seen.armed else [self._arm_message(False, now)]
 
     def _enter(self, phase: Phase, now: Now) -> None:

@@ -8,7 +8,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from advnerf_core.files import write_atomically
-from nodes.lab.trials.trial import NotStartedError, TrialNode, TrialOutcome, TrialPlan
+from nodes.lab.trials.drive_health import read_health, spoiled_by
+from nodes.lab.trials.trial import SpoiledError, TrialError, TrialNode, TrialOutcome, TrialPlan
 from nodes.launching.launch import Launch
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import SystemClock
@@ -16,6 +17,7 @@ from nodes.runtime.errors import LaunchError, NodeFinished
 from nodes.runtime.loop import NodeLoop
 
 OPERATOR = "operator"
+TICK_S = 0.1
 
 
 def run_trial(
@@ -39,22 +41,28 @@ def run_trial(
         host: Host of the launch file that this computer is. The other host must be running.
 
     Raises:
-        LaunchError: A node died or never became ready.
-        TrialError: The trial failed; `NotStartedError` if the stack stopped it before the car moved.
+        LaunchError: A node died of an error, or the launch file is wrong.
+        TrialError: The trial failed; `SpoiledError` if load or a fault of the stack kept it from measuring anything.
     """
     with Launch(launch_file, overrides, run_dir, host=host) as launch:
-        launch.wait_ready(ready_timeout_s)
         node = TrialNode(plan, lambda: launch.failure, guide)
-        _operate(node, launch.run_dir)
+        try:
+            launch.wait_ready(ready_timeout_s)
+            _operate(node, launch.run_dir)
+        except (LaunchError, TrialError) as error:
+            raise (SpoiledError(str(error)) if launch.timed_out else error) from None
     if launch.failure:
-        raise LaunchError(launch.failure)
-    if not node.outcome.start_real_ns:
-        raise NotStartedError(
-            f"expected a drive in {run_dir}, but the stack stopped before the car moved: {node.outcome.stopped_early}; fix this "
-            "and start again. Finished runs are kept"
-        )
-    write_atomically(run_dir / "trial.json", json.dumps(node.outcome.to_dict(), indent=1) + "\n")
-    return node.outcome
+        raise SpoiledError(launch.failure) if launch.timed_out else LaunchError(launch.failure)
+    outcome = node.outcome
+    if not outcome.start_real_ns:
+        raise SpoiledError(f"the stack stopped before the car moved: {outcome.stopped_early}")
+    health = read_health(
+        run_dir / "bag", outcome.start_real_ns, outcome.end_real_ns, outcome.stopped_early, TICK_S
+    )
+    if spoiled := spoiled_by(health):
+        raise SpoiledError(spoiled)
+    write_atomically(run_dir / "trial.json", json.dumps(outcome.to_dict(), indent=1) + "\n")
+    return outcome
 
 
 def _operate(node: TrialNode, run_dir: Path) -> None:

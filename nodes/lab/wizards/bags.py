@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -15,6 +14,8 @@ from numpy.typing import NDArray
 from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.image_files import read_stored
 from advnerf_core.data.similarity import rotation_angles
+from advnerf_core.documents import read_csv
+from advnerf_core.errors import ConfigError, MissingFileError
 from advnerf_core.geometry import Array, make_transform
 from calibration.camera_to_car import MountView
 from calibration.charuco import BoardDetector, Detection
@@ -182,23 +183,19 @@ def read_shown(folder: Path) -> tuple[Array, Array, Array]:
     """
     table = folder / "shown.csv"
     try:
-        with table.open(newline="", encoding="utf-8") as stream:
-            rows = list(csv.DictReader(stream))
         keyed = [
             (
-                (float(r["red"]), float(r["green"]), float(r["blue"]), float(r.get("cos_angle") or 1.0)),
-                folder / r["file"],
+                (row.number("red"), row.number("green"), row.number("blue"), row.number("cos_angle", 1.0)),
+                folder / row.values["file"],
             )
-            for r in rows
+            for row in read_csv(table, ("file", "red", "green", "blue"))
         ]
-    except FileNotFoundError:
+    except MissingFileError:
         raise CalibrationError(
             f"expected {table} with columns file, red, green, blue, found none; write one row per image"
         ) from None
-    except (KeyError, TypeError, ValueError) as error:
-        raise CalibrationError(
-            f"{table}: expected columns file, red, green, blue in 0..255, got {error}"
-        ) from error
+    except ConfigError as error:
+        raise CalibrationError(str(error)) from error
     regions = {angle: _region(keyed, angle) for angle in {key[3] for key, _ in keyed}}
     shown, seen, angles = [], [], []
     for key, group in groupby(keyed, key=lambda row: row[0]):

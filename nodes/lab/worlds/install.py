@@ -52,7 +52,7 @@ def install(environment: Environment, say: Callable[[str], None], python: Path |
         interpreter = find_python(environment, python)
         shutil.rmtree(folder, ignore_errors=True)
         say(f"making {folder} with {interpreter}")
-        _run([str(interpreter), "-m", "venv", str(folder)], "make an environment")
+        _run([str(interpreter), "-I", "-m", "venv", str(folder)], "make an environment")
         say(
             f"installing the {_count(environment.lock)} packages of {environment.lock.name} (about {environment.size_mb} MB)"
         )

@@ -11,11 +11,11 @@ from typing import Any, cast
 
 from pydantic import BaseModel, TypeAdapter
 
-from advnerf_core.files import sha256_of
-from advnerf_core.plugins import PluginError, absolute_reference, is_file_reference, resolve
+from advnerf_core.documents import Document
+from advnerf_core.plugins import PluginError, absolute_reference, code_sha256, is_file_reference, resolve
+from advnerf_core.strict import validate
 from hardware.worlds import ENTRY_POINTS, WORLDS
 from hardware.worlds.world import World, WorldClass, members_of_a_world
-from nodes.runtime.config import Document, validate
 from nodes.runtime.errors import ConfigError
 
 _PAGE = "docs/worlds.md"
@@ -29,7 +29,7 @@ class NamedWorld:
         kind: Its name: built in, an entry point, or ``file.py:Class`` with the file's name alone.
         world_class: What the name stands for.
         config: Its checked configuration.
-        source_sha256: Hash of the file of a ``file.py:Class``; empty for other names.
+        source_sha256: Hash of the code of a ``file.py:Class`` or an entry point; empty for a built-in name.
     """
 
     kind: str
@@ -55,7 +55,7 @@ class NamedWorld:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What results depend on, as JSON data: the configuration without fields that are excluded, and a hash of a world's own file."""
+        """What results depend on, as JSON data: the configuration without fields that are excluded, and a hash of a user's code."""
         dumped = (
             self.config.model_dump(mode="json")
             if isinstance(self.config, BaseModel)
@@ -86,11 +86,10 @@ def read_world(document: Document, folder: Path) -> NamedWorld:
         raise ConfigError(f"{document.place(('kind',))}: {error}") from None
     changes = {key: value for key, value in document.data.items() if key != "kind"}
     config = validate(world_class.Config, Document(changes, document.source, document.places))
-    if not is_file_reference(kind):
-        return NamedWorld(kind, world_class, config, "")
-    file = Path(absolute_reference(kind, folder).rpartition(":")[0])
-    name = f"{file.name}:{kind.rpartition(':')[2]}"
-    return NamedWorld(name, world_class, config, sha256_of(file))
+    code = code_sha256(kind, WORLDS, ENTRY_POINTS, folder)
+    if is_file_reference(kind):
+        kind = Path(absolute_reference(kind, folder)).name
+    return NamedWorld(kind, world_class, config, code)
 
 
 def find_world(name: str, folder: Path) -> WorldClass:

@@ -39,7 +39,7 @@ class Answers:
     def __init__(self, max_age_s: float) -> None:
         self._limit_s = max_age_s
         self._sent_ns: OrderedDict[int, int] = OrderedDict()
-        self._answered_ns = -1
+        self._answered_sent_ns: int | None = None
 
     def sent(self, stamp_ns: int, mono_ns: int) -> None:
         """Note a message that ROS 2 gets.
@@ -62,11 +62,12 @@ class Answers:
         sent_ns = self._sent_ns.get(stamp_ns)
         if sent_ns is None:
             return "its stamp is not that of a message sent to ROS 2; copy the stamp of the image into the command"
-        if stamp_ns <= self._answered_ns:
+        if self._answered_sent_ns is not None and sent_ns <= self._answered_sent_ns:
             return "a newer message was already answered"
         if (age_s := (mono_ns - sent_ns) / NS_PER_S) > self._limit_s:
             return f"it answers a message {age_s:.2f} s old, the limit is {self._limit_s:g} s"
-        self._answered_ns = stamp_ns
+        # By the time of sending: a stamp of a wrong clock must not lock out the right ones.
+        self._answered_sent_ns = sent_ns
         return ""
 
 

@@ -6,8 +6,9 @@ import re
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from advnerf_core.strict import StrictModel
 from nodes.linking.ros2.conversions import ACKERMANN, COMPRESSED, IMAGE, POSE, convertible
 from nodes.runtime.errors import TopicError
 from nodes.runtime.topics import topic as topic_row
@@ -56,7 +57,7 @@ class Endpoint:
     depth: int
 
 
-class _Route(BaseModel):
+class _Route(StrictModel):
     """What both directions have in common.
 
     Attributes:
@@ -68,7 +69,6 @@ class _Route(BaseModel):
         rate_hz: Largest rate; more messages are skipped and counted. None carries every message [Hz].
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
     outward: ClassVar[bool]  # whether messages go to ROS
 
     topic: str

@@ -41,7 +41,11 @@ export class Link {
 
   /** Ask for an act. Returns its number, or null without a connection. */
   act(type, more = {}) {
-    if (!this.open) return null;
+    if (!this.open) {
+      // A stop also goes without a WebSocket.
+      if (type === "estop" || type === "disarm") fetch(`/stop/${type}`, { method: "POST" }).catch(() => {});
+      return null;
+    }
     this.#number += 1;
     this.#socket.send(JSON.stringify({ t: type, key: this.#key, n: this.#number, frame: this.hooks.frame(), ...more }));
     return this.#number;

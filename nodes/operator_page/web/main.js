@@ -78,7 +78,7 @@ function update(message) {
 }
 
 function me() {
-  return { operates: welcome.operates, session: welcome.session, mine: Boolean(state.lease) && state.lease.client === welcome.client };
+  return { operates: welcome.operates, stops: welcome.stops, session: welcome.session, mine: Boolean(state.lease) && state.lease.client === welcome.client };
 }
 
 /** Say what the button does now, and stop holding when the node has ended the hold. */

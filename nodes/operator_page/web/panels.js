@@ -26,13 +26,13 @@ export function showState(state, me) {
   text("hint", state.hint);
 }
 
-function showSafety({ safety, unanswered_s: unanswered }) {
+function showSafety({ safety, not_confirmed: notConfirmed }) {
   const pill = element("armed");
   const known = safety && safety.age_s < SILENT_S;
   const armed = known && safety.armed;
   text("armed", !safety ? "no safety node" : !known ? "safety node is silent" : armed ? "ARMED" : "disarmed");
   pill.classList.toggle("armed", Boolean(armed));
-  const late = unanswered > 0.3 ? `NOT CONFIRMED: no answer to disarm for ${unanswered.toFixed(1)} s. Use the hardware stop. ` : "";
+  const late = notConfirmed ? `${notConfirmed}. ` : "";
   text("reason", late + (safety ? (armed ? `by ${safety.source}` : safety.reason) : ""));
   element("reason").classList.toggle("bad", late !== "");
 }
@@ -133,7 +133,7 @@ function showActs(acts) {
   });
 }
 
-function showLease({ lease, viewers, estop }, { operates, mine, session }) {
+function showLease({ lease, viewers, estop }, { operates, stops, mine, session }) {
   const others = `${viewers} ${viewers === 1 ? "page is" : "pages are"} open.`;
   if (!operates) text("lease", `This page only watches. ${others}`);
   else if (mine) text("lease", `You operate as ${lease.name}. ${others}`);
@@ -145,7 +145,7 @@ function showLease({ lease, viewers, estop }, { operates, mine, session }) {
   element("estop").classList.toggle("latched", estop);
   text("estop", estop ? "E-stop is latched" : "E-stop");
   for (const id of ["hold", "reset_estop", "trial", "trial_end", "attack_off", "record", "record_stop"]) element(id).disabled = !mine;
-  for (const id of ["estop", "disarm"]) element(id).disabled = !operates;
+  for (const id of ["estop", "disarm"]) element(id).disabled = !stops;
   for (const button of document.querySelectorAll("#attacks button, #label-form button")) button.disabled = !mine;
 }
 

@@ -7,7 +7,13 @@ import torch
 from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
 from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.search.random_search import random_search
-from advnerf_core.attack.search.search import SearchDivergedError, SearchStateError, draw_start_states
+from advnerf_core.attack.search.search import (
+    SearchDivergedError,
+    SearchState,
+    SearchStateError,
+    draw_start_states,
+    load_state,
+)
 from advnerf_core.scene.surrogate import Rendered
 from benchmarks.attack_toy import toy_problem
 
@@ -79,6 +85,19 @@ def test_a_state_of_other_settings_or_garbage_is_refused(problem, tmp_path, sear
     path.write_bytes(path.read_bytes()[:50])
     with pytest.raises(SearchStateError, match="delete it to start afresh"):
         search(problem, 2, seed=1, state_path=path)
+
+
+def test_two_names_for_one_tensor_are_two_tensors_in_the_state(tmp_path):
+    whole = torch.arange(6.0).reshape(2, 3)
+    parts = {"a": whole, "again": whole, "part": whole[0], "turned": whole.T}
+    state = SearchState(parts, whole.clone())
+    state.save(tmp_path / "state", "f")
+    found = load_state(tmp_path / "state", "f")
+    assert found.tensors.keys() == parts.keys()
+    assert all(torch.equal(found.tensors[name], part) for name, part in parts.items())
+    for wrong, message in (({"number": 3}, "got number: int"), ({"best_theta": whole}, "got best_theta")):
+        with pytest.raises(SearchStateError, match=f"expected tensors under names of their own.*{message}"):
+            SearchState(wrong, whole).save(tmp_path / "state", "f")
 
 
 def test_random_textures_have_the_spread_and_differ_by_seed(problem):

@@ -1,12 +1,14 @@
 import dataclasses
 import json
 import re
+import tempfile
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from advnerf_core.report.data import Clip, ReportData, Texture
+from advnerf_core.report.data import Clip, LiveTries, ReportData, Texture
 from advnerf_core.report.live_parts import live_parts
 from advnerf_core.report.results import read_results, results_dict, write_results
 from advnerf_core.report.transfer import TransferTable
@@ -142,3 +144,39 @@ def test_single_drives_are_embedded_and_a_lost_clip_is_named(make, bare_report, 
 def test_unknown_missing_part_is_refused(make):
     with pytest.raises(ValueError, match=r"not_measured keys among .*, got \['latencies'\]"):
         ReportData(make.settings(), make.scene(), (), make.manifest(), not_measured={"latencies": "x"})
+
+
+def test_tries_are_listed_and_an_arm_that_was_not_driven_live_is_named_first(report):
+    late = "the stack stopped the car: no pose of the car for 0.21 s"
+    tries = (LiveTries("none", "hardened", 0, True, (late,)), LiveTries("random", "hardened", 0, True))
+    driven = dataclasses.replace(report, live_tries=tries)
+    page = render_page(driven)
+    assert page.count(late) == 1
+    assert "NOT DRIVEN LIVE" not in page
+    given_up = LiveTries("gradient", "hardened", 0, False, (late,) * 3)
+    runs = tuple(run for run in report.runs if (run.domain, run.condition) != ("deployed", "gradient"))
+    missing = dataclasses.replace(driven, runs=runs, live_tries=(*tries, given_up))
+    page = render_page(missing)
+    assert check(page)
+    assert page.index("NOT DRIVEN LIVE: gradient") < page.index("A texture for one flat board")
+    assert "are no evidence of transfer" in page
+    assert "On the live drive it was not measured in this run" in page
+
+
+def test_a_report_without_any_live_drive_is_a_whole_page(report):
+    given_up = tuple(
+        LiveTries(name, "hardened", 0, False, ("late",) * 3) for name in ("none", "random", "gradient")
+    )
+    runs = tuple(run for run in report.runs if run.domain == "surrogate")
+    bare = dataclasses.replace(report, runs=runs, live_tries=given_up, latency=None, laps=None)
+    page = render_page(bare)
+    assert check(page)
+    assert "NOT DRIVEN LIVE: " in page
+    assert [dataclasses.asdict(each) for each in read_results_of(bare)] == [
+        dataclasses.asdict(each) for each in given_up
+    ]
+
+
+def read_results_of(data):
+    with tempfile.TemporaryDirectory() as folder:
+        return read_results(write_results(data, Path(folder) / "results.json")).live_tries

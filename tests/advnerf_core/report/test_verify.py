@@ -52,6 +52,24 @@ def test_a_set_as_it_was_published_has_no_problem(original):
     assert found.numbers > 50
 
 
+def test_a_cell_that_was_not_driven_live_is_refused_as_evidence(copied):
+    file = next(copied.glob("*_gradient_0.json"))
+    data = json.loads(file.read_text())
+    data["not_driven_live"] = "live0 was spoiled 3 times"
+    del data["deployed"], data["kept"]["deployed"]
+    file.write_text(json.dumps(data))
+    assert file.stem not in evidence_of(copied).cells
+    with pytest.raises(SetError, match="was not driven live and is no evidence: live0 was spoiled 3 times"):
+        write_set(copied)
+    assert any("was not driven live and is no evidence" in text for text in verify_set(copied).problems)
+
+
+def test_a_cell_cannot_be_driven_live_and_not(copied):
+    file = next(copied.glob("*_gradient_0.json"))
+    file.write_text(json.dumps({**json.loads(file.read_text()), "not_driven_live": "late"}))
+    assert "expected no deployed drives in a cell that was not driven live" in verify_set(copied).problems[0]
+
+
 @pytest.mark.parametrize("kind", CHANGES)
 @pytest.mark.parametrize("seed", range(3))
 def test_every_kind_of_change_is_found(copied, kind, seed):

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from advnerf_core.documents import Document
 from hardware.worlds.remote import SERVERS, RemoteServer
 from hardware.worlds.remote_errors import (
     RemoteWorldError,
@@ -21,7 +22,6 @@ from hardware.worlds.remote_errors import (
 from hardware.worlds.world import NotOpenError, Panel
 from nodes.lab.worlds.check import check_world
 from nodes.lab.worlds.named import read_world
-from nodes.runtime.config import Document
 from tests.support.remote.faults import FAULTS, drive, ended, faulty_world, suffer
 from tests.support.remote.flat_world import FlatConfig, FlatWorld, plan_fault
 

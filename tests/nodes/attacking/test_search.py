@@ -71,6 +71,16 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, method):
         run_attack(load_request(file), tmp_path / "whole", ProgressDisplay())
 
 
+def test_a_request_that_failed_to_load_does_not_lock_its_folder(tmp_path, monkeypatch, capsys):
+    file, folder = tiny_request(tmp_path, evaluations=1), tmp_path / "out"
+    assert command(monkeypatch, "run", file, "-o", folder, "--set", "policy=not_here.safetensors") != 0
+    assert "not_here.safetensors" in capsys.readouterr().err
+    assert command(monkeypatch, "run", file, "-o", folder) == 0
+    assert command(monkeypatch, "run", file, "-o", folder, "--set", "horizon=4") != 0
+    assert "belongs to another attack" in capsys.readouterr().err
+    assert load_request(folder / "request.attack.yaml") == load_request(file)
+
+
 @pytest.mark.parametrize(
     "method", [pytest.param("distilled", marks=_SLOW), pytest.param("guided", marks=_SLOW)]
 )

@@ -7,10 +7,12 @@ import shutil
 import pytest
 from typer.testing import CliRunner
 
+from advnerf_core.report.evidence.registration import RegistrationError
 from nodes.cli.main import app
 from nodes.experiment.campaign.config import load_campaign
 from nodes.experiment.campaign.plan import elsewhere, plan_cells, statuses
 from nodes.experiment.campaign.published import Published, publish, publish_build, published_table
+from nodes.experiment.campaign.registering import _refuse_late
 from nodes.experiment.campaign.run import Options, run_campaign
 from nodes.experiment.campaign.table import campaign_table, write_table
 from nodes.experiment.cell import select
@@ -18,7 +20,7 @@ from nodes.experiment.reference import BUILD
 from nodes.runtime.errors import ConfigError
 
 
-def put(plan, folder, settings_hash=None):
+def put(plan, folder, settings_hash=None, **changes):
     """A finished cell, where the worker would put it."""
     drives = {"total_cte_m": [6.0], "off_track": [True], "none_total_cte_m": [2.0]}
     cell = plan.cell
@@ -34,6 +36,7 @@ def put(plan, folder, settings_hash=None):
         "date": "d",
         "surrogate": drives,
         "deployed": drives,
+        **changes,
     }
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{cell.name}.json").write_text(json.dumps(data))
@@ -43,6 +46,30 @@ def command(*arguments):
     done = CliRunner().invoke(app, [*map(str, arguments)])
     assert done.exit_code == 0, done.output
     return done.output
+
+
+def test_a_cell_that_was_not_driven_live_is_shown_and_never_published(here, tmp_path):
+    campaign = load_campaign(here.file)
+    plan = plan_cells(campaign, campaign.cells)
+    for each in plan:
+        late = {"deployed": None, "not_driven_live": "live0 was spoiled 3 times"}
+        put(each, here.cells, **(late if each.cell.method == "gradient" else {}))
+    found = statuses(campaign, campaign.cells)
+    table = campaign_table(campaign, found)
+    deployed, learned = (
+        table.find("straight", "hardened", "gradient", domain) for domain in ("deployed", "surrogate")
+    )
+    assert (deployed.drives, deployed.ratio, deployed.missing) == (0, None, (0, 1))
+    assert learned.drives == 2
+    written = publish(campaign, found, tmp_path / "kept").written
+    assert set(written) == {each.cell.name for each in plan if each.cell.method == "none"}
+    output = command("publish", here.file, "--to", tmp_path / "kept", "--no-build")
+    assert (
+        "straight_hardened_gradient_0 is no evidence and is not published: it was not driven live" in output
+    )
+    assert "2 are not finished" in output
+    with pytest.raises(RegistrationError, match="register before anything is run"):
+        _refuse_late(campaign)
 
 
 def test_a_table_and_published_cells_from_finished_cells(here, tmp_path):

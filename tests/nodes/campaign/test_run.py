@@ -57,6 +57,25 @@ def test_a_campaign_runs_once_and_only_what_changed_again(here):
     assert result["seconds"] <= time.monotonic() - began
 
 
+def test_a_cell_that_was_not_driven_live_ends_well_and_is_tried_again_only_on_request(here):
+    (here.folder / "late").touch()
+    ended, said = run(here)
+    assert {end.how for end in ended} == {"done"}
+    assert sum("not driven live: live0 was spoiled 3 times" in text for text in said) == 2
+    assert states(here) == {
+        f"straight_hardened_{method}_{seed}": "done" if method == "none" else "not driven live"
+        for method in ("none", "gradient")
+        for seed in (0, 1)
+    }
+    ended, said = run(here)
+    assert ended == []
+    assert sum("not tried again without --retry" in text for text in said) == 2
+    (here.folder / "late").unlink()
+    ended, _ = run(here, retry=True)
+    assert sorted(end.name for end in ended) == [f"straight_hardened_gradient_{seed}" for seed in (0, 1)]
+    assert set(states(here).values()) == {"done"}
+
+
 def test_a_killed_worker_loses_its_cell_and_no_other(here):
     process, worker = start_hanging(here, jobs=2)
     os.kill(worker, signal.SIGKILL)

@@ -7,7 +7,18 @@ import pytest
 
 from hardware.errors import LinkLost
 from nodes.lab.doctor import cameras, graphics
-from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, Check, Finding, examine, in_child, worst
+from nodes.lab.doctor.check import (
+    ABSENT,
+    FAILURE,
+    OK,
+    WARNING,
+    Answer,
+    Check,
+    Finding,
+    examine,
+    in_child,
+    worst,
+)
 
 pytestmark = pytest.mark.live
 
@@ -87,7 +98,16 @@ def test_what_is_not_installed_is_absent_unless_it_is_needed(library):
     assert [row.state for row in (*cameras.oaks(), *cameras.oaks(required=True))] == [ABSENT, FAILURE]
     library("torch", "raise ModuleNotFoundError('No module named torch', name='torch')\n")
     assert [row.state for row in (*graphics.torch(), *graphics.torch(required=True))] == [ABSENT, FAILURE]
-    assert graphics.torch()[0].do == "pip install 'advnerf[core]'"
+    assert graphics.torch()[0].do == "pip install 'advnerf[core]'"  # torch itself is installed here
+
+
+def test_a_library_that_is_only_slow_is_not_to_be_installed(monkeypatch):
+    late = Answer(None, "no answer within 60 s", late=True)
+    monkeypatch.setattr(graphics, "in_child", lambda probe: late)
+    rows = [*graphics.torch(True), *graphics.egl(True), *graphics.llvm(), *graphics.screens()]
+    for row in rows:
+        assert "no answer within 60 s" in row.found
+        assert row.do == "run advnerf doctor again when this computer has less to do"
 
 
 CUDA = """

@@ -57,6 +57,7 @@ def test_the_twin_needs_its_files_a_port_and_a_disk(tmp_path):
     assert [check.name for check in checks_of(plan, tmp_path)] == [
         "versions",
         "machine",
+        "places",
         "sockets",
         "launches",
         "nodes",
@@ -226,6 +227,8 @@ def test_a_computer_without_a_launch_file_in_mind(tmp_path, monkeypatch, capsys)
         "python",
         "extras",
         "machine",
+        "home",
+        "cache",
         "disk",
         "sockets",
         "keys",

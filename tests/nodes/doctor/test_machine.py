@@ -131,7 +131,7 @@ def test_specifiers(version, specifier, fits):
 
 def test_permission_is_cured_by_the_group_or_by_logging_in_again(monkeypatch):
     entry = namedtuple("entry", "gr_gid gr_mem")
-    monkeypatch.setattr(motor.getpass, "getuser", lambda: "ann")
+    monkeypatch.setattr(motor.pwd, "getpwuid", lambda uid: namedtuple("user", "pw_name")("ann"))
     monkeypatch.setattr(grp, "getgrnam", lambda name: entry(4711, []))
     assert motor.permission_cure("dialout") == "sudo usermod -aG dialout ann, then log out and in again"
     monkeypatch.setattr(grp, "getgrnam", lambda name: entry(4711, ["ann"]))

@@ -2,20 +2,26 @@
 
 import json
 import os
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from advnerf_core.attack.artifact import load_attack
+from advnerf_core.driving.metrics import drive_metrics
 from advnerf_core.report.results import read_results
+from nodes.experiment import films, live
 from nodes.experiment.campaign.gate import predict_cell
+from nodes.experiment.campaign.run import Options
 from nodes.experiment.cell import Cell
 from nodes.experiment.cells import run_cell
 from nodes.experiment.keys import driven_folder
 from nodes.experiment.kinds import load_kind
 from nodes.experiment.run import load_experiment, make_ready
 from nodes.experiment.whole import run_experiment
+from nodes.lab.trials.evaluation import HOPS
+from nodes.lab.trials.trial import SpoiledError
 
 LAUNCH = Path(__file__).parents[3] / "launch"
 SMALL = [
@@ -51,6 +57,74 @@ def test_from_photographs_to_report_and_nothing_twice(tmp_path, file):
     kept = (tmp_path / "report" / "report.html").stat().st_mtime_ns
     assert run_experiment(load_experiment(experiment, "demo", SMALL, tmp_path)) == []
     assert (tmp_path / "report" / "report.html").stat().st_mtime_ns == kept
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_an_experiment_that_load_keeps_from_driving_live_ends_well_and_says_so(tmp_path, monkeypatch):
+    """The attacked drive is spoiled every time, the others once; another command may try again."""
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    tried = []
+
+    def spoiled(experiment, run, folder):
+        tried.append(run.attack)
+        gradient = run.attack is not None and "gradient" in str(run.attack)
+        if gradient or tried.count(run.attack) == 1:
+            raise SpoiledError("12 of 59 control ticks had no new command; at most 5 may")
+        start = experiment.references[run.scenario].drive_start
+        states = np.array([[start[0] + 0.08 * k, start[1], 0.0] for k in range(61)])
+        return planted_result(experiment, run, states)
+
+    monkeypatch.setattr(live, "drive_live", spoiled)
+    monkeypatch.setattr(films, "_deployed_track", lambda *given: planted_track(*given))
+    experiment = load_experiment(LAUNCH / "room.experiment.yaml", "demo", SMALL, tmp_path)
+    ended = run_experiment(experiment, overrides=SMALL)
+    assert {end.how for end in ended} == {"done"}
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert "NOT DRIVEN LIVE: gradient (hardened, seed 0)" in page
+    data = read_results(tmp_path / "report" / "results.json")
+    assert {(run.domain, run.condition) for run in data.runs} == {
+        *(("surrogate", name) for name in ("none", "random", "gradient")),
+        *(("deployed", name) for name in ("none", "random")),
+    }
+    assert {tries.condition: (tries.driven, len(tries.spoiled)) for tries in data.live_tries} == {
+        "none": (True, 1),
+        "random": (True, 1),
+        "gradient": (False, 3),
+    }
+    count = len(tried)
+    again = load_experiment(LAUNCH / "room.experiment.yaml", "demo", SMALL, tmp_path)
+    assert run_experiment(again, overrides=SMALL) == []
+    assert len(tried) == count
+    options = Options(here=True, ready=True, retry=True)
+    (end,) = run_experiment(again, options=options, overrides=SMALL)
+    assert "spoiled 6 times" in end.text
+    assert len(tried) == count + 3
+
+
+def planted_result(experiment, run, states):
+    path = experiment.paths[run.scenario]
+    metrics = drive_metrics(path, states, experiment.limits)
+    attack = [] if run.attack is None else [load_attack(run.attack).attack_id]
+    return {
+        "victim": run.victim,
+        "attack_ids": attack,
+        "outcome": {"start_real_ns": 0, "end_real_ns": 6 * 10**9, "stopped_early": "", "peer": "TWIN"},
+        "states": states.tolist(),
+        "cte_m": path.project(states[:, :2]).cte_m.tolist(),
+        "metrics": asdict(metrics),
+        "frames": 60,
+        "missed": 0,
+        "capture_to_serial_ms": [50.0] * 60,
+        "hops_ms": {name: [20.0] * 60 for name in HOPS},
+    }
+
+
+def planted_track(experiment, scene, space, cell, title, folder):
+    """The film's track of a planted drive, which has no bag."""
+    states = np.array(json.loads((folder / "drives.json").read_text())["states"][0])
+    frames = [np.zeros((experiment.camera.height, experiment.camera.width, 3), np.uint8)] * len(states)
+    return films._track(experiment, cell, title, frames, states)
 
 
 @pytest.mark.slow

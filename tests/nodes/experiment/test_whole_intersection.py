@@ -36,7 +36,10 @@ def test_all_cells_and_the_report(trained: Experiment, tmp_path: Path) -> None:
     (folder / "scene" / "fidelity.json").write_text(json.dumps({"mean": means, "views": [view]}))
     rates = [{"real": 0.1, "surrogate": 0.12}]
     (folder / "policy" / "policy.json").write_text(json.dumps({"on_held_out_views": rates}))
-    (folder / "manifest.json").write_text(json.dumps({"command": "advnerf experiment <it>"}))
+    config = experiment.config.model_dump(mode="json")
+    (folder / "manifest.json").write_text(
+        json.dumps({"command": "advnerf experiment <it>", "config": config})
+    )
 
     kind = ExperimentCells()
     with kind.hold(experiment):

@@ -47,7 +47,8 @@ def test_what_a_page_says():
         json.dumps({"t": "label", "text": "x" * 201, **ACT}),
         json.dumps({"t": "attack", "id": "../../etc/pa", **ACT}),
         json.dumps({"t": "take", "name": "", **ACT}),
-        json.dumps({"t": "disarm", **ACT, "key": "0" * 31}),
+        json.dumps({"t": "trial", **ACT, "key": "0" * 31}),
+        json.dumps({"t": "reset_estop"}),
         "[" * 2000,
         '{"t":"label","text":"' + "x" * 3000,
     ],
@@ -87,7 +88,7 @@ def client():
 
 
 def act(client, n, frame="0", key=None):
-    return json.dumps({"t": "disarm", "key": client.key if key is None else key, "n": n, "frame": frame})
+    return json.dumps({"t": "trial", "key": client.key if key is None else key, "n": n, "frame": frame})
 
 
 def test_an_act_is_taken_once_and_only_with_the_key_of_its_connection(client):
@@ -104,6 +105,41 @@ def test_an_act_names_a_picture_that_was_sent(client):
     client._sent[77] = 5  # as after a picture with this stamp
     asked = client.hear(act(client, 2, frame="77"))
     assert (asked.frame_ns, asked.picture_ns) == (77, 5)
+
+
+@pytest.mark.parametrize("kind", ["estop", "disarm"])
+@pytest.mark.parametrize(
+    "more",
+    [
+        {},
+        {"frame": "77"},  # not among the pictures that were sent
+        {"frame": -3, "n": "x", "key": None},
+        {"frame": "9" * 40, "n": 2**70, "more": [1]},
+    ],
+)
+def test_a_stop_needs_no_key_number_or_picture(client, kind, more):
+    client._last_n = 10**6
+    asked = client.hear(json.dumps({"t": kind, **more}))
+    assert (asked.act.t, asked.frame_ns, asked.picture_ns) == (kind, 0, 0)
+    assert client.malformed == 0
+
+
+@pytest.mark.parametrize("kind", ["estop", "disarm"])
+def test_a_stop_names_the_picture_that_was_seen_if_there_was_one(client, kind):
+    client._sent[77] = 5
+    asked = client.hear(json.dumps({"t": kind, "frame": "77", "n": 4}))
+    assert (asked.frame_ns, asked.picture_ns, asked.act.n) == (77, 5, 4)
+
+
+def test_a_stop_is_heard_when_all_budgets_are_used_up(client):
+    client._messages._left = client._acts._left = -1e9
+    other = json.dumps({"t": "label", "key": client.key, "n": 1, "frame": "0", "text": "estop"})
+    assert client.hear('{"t":"disarm"}').act.t == "disarm"
+    with pytest.raises(Misuse):
+        client.hear(other)
+    for _ in range(30):
+        client.hear('{"t":"disarm"}')
+    assert client.hear('{"t":"estop"}').act.t == "estop"
 
 
 def test_a_stranger_in_the_connection_is_thrown_out(client):

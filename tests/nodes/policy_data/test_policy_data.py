@@ -39,15 +39,34 @@ def test_a_foreign_log_becomes_frames_with_its_own_view(tmp_path):
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (lambda t: t.replace("angle", "wheel"), "expected columns frame, angle .* got frame, wheel"),
+        (
+            lambda t: t.replace("angle", "wheel"),
+            "csv:1: expected columns frame, angle, got frame, wheel; correct the header",
+        ),
         (
             lambda t: t.replace("3.png", "no.png"),
             r"csv:5: expected a readable image, got .*no\.png: No such file",
         ),
-        (lambda t: t.replace("2.png, -0.25", "2.png, left"), r"csv:4: expected a steering angle"),
+        (lambda t: t.replace("2.png, -0.25", "2.png, left"), r"csv:4: angle: expected a number, got 'left'"),
         (lambda t: t.replace("2.png, -0.25", "2.png, 25"), "--log-scale"),
         (lambda t: "\n".join(t.split("\n")[:3]), "at least 4 rows"),
         (lambda t: "", "an empty file"),
+        (
+            lambda t: t.replace("2.png, -0.25", "2.png, -0,25"),
+            "csv:4: expected 2 fields as in the header, got 3.*decimal point",
+        ),
+        (
+            lambda t: t.replace("2.png, -0.25", '2.png,"-0,25"'),
+            "csv:4: angle: expected a number, got '-0,25'; write a decimal point",
+        ),
+        (
+            lambda t: t.replace("frame,angle", "frame,angle,angle"),
+            "csv:1: the column angle is given twice",
+        ),
+        (
+            lambda t: t.replace("2.png, -0.25", "2.png, left").replace("5.png", "no.png"),
+            "csv:4: angle.*\n.*csv:7: .*'no.png'",
+        ),
     ],
 )
 def test_what_is_wrong_with_a_log_is_said(tmp_path, change, reason):

@@ -72,3 +72,11 @@ def test_the_stamp_is_read_without_decoding():
     for wrong in (b"", cdr[:11], b"\x00\x07" + cdr[2:], b"\x01\x01" + cdr[2:]):
         with pytest.raises(MessageError, match="begin with a header"):
             stamp_of_cdr(wrong)
+
+
+def test_a_stamp_of_a_wrong_clock_does_not_lock_out_the_right_ones(answers):
+    answers.sent(10**18, 2 * S)  # an image with a stamp far in the future
+    assert answers.refusal(10**18, 2 * S) == ""
+    answers.sent(200, 2 * S + S // 10)
+    assert answers.refusal(200, 2 * S + S // 10) == ""
+    assert "already answered" in answers.refusal(10**18, 2 * S + S // 10)

@@ -10,6 +10,7 @@ from nodes.runtime.bus import Bus
 from nodes.runtime.errors import BusError, MessageError, TopicError
 from nodes.runtime.messages import drive_message, header, image_message, pose_message, types
 from nodes.runtime.messages import stamp_ns as stamp_of
+from nodes.runtime.paths import bus_folder
 from nodes.runtime.pictures import rgb_image
 from nodes.runtime.topics import topic
 
@@ -98,11 +99,9 @@ def test_subscribers_are_counted_up_and_down(tmp_path):
         buses = [Bus(tmp_path) for _ in range(3)]
         for bus in buses:
             bus.subscribe("/arm")
-        sender.wait_for_subscribers(["/arm"], 2.0, count=3)
+        wait_for(lambda: sender.subscribers("/arm") == 3, *buses)
         buses[0].close()
-        deadline = time.monotonic() + 2.0
-        while sender.subscribers("/arm") != 2:
-            assert time.monotonic() < deadline
+        wait_for(lambda: sender.subscribers("/arm") == 2, *buses[1:])
         for bus in buses[1:]:
             bus.close()
 
@@ -118,24 +117,70 @@ def test_second_publisher_is_one_clear_error_and_the_endpoint_is_free_afterwards
         third.publisher("/attack/request")
 
 
-def test_several_may_ask_for_a_stop_at_the_same_time(tmp_path):
-    """Teleop, a trial, a gateway and a command are heard by all, also by who listened before they began."""
-    senders = topic("/arm").senders
+def request_to_stop(source):
+    return types.Arm(header=header(1), arm=False, source=source, reason="", ask_id="a", age_ns=0)
+
+
+def wait_for(condition, *buses):
+    deadline = time.monotonic() + 60.0
+    while not condition():
+        assert time.monotonic() < deadline
+        for bus in buses:
+            bus.wait(0.01)
+
+
+def test_any_number_may_ask_for_a_stop_at_the_same_time(tmp_path):
+    """A request to stop takes no endpoint: far more processes may hold one open than the topic has receivers."""
+    senders = 3 * topic("/arm").receivers
     with Bus(tmp_path) as receiver, contextlib.ExitStack() as stack:
         receiver.subscribe("/arm")
         buses = [stack.enter_context(Bus(tmp_path)) for _ in range(senders)]
-        for number, bus in enumerate(buses):
+        for bus in buses:
             bus.publisher("/arm")
-            while bus.subscribers("/arm") == 0:
-                receiver.wait(0.01)
-            bus.publish(
-                "/arm",
-                types.Arm(header=header(1), arm=False, source=f"{number}", reason="", ask_id="a", age_ns=0),
-            )
-        got = receive_for(receiver, 0.2)
-        assert [received.message().source for received in got] == [f"{number}" for number in range(senders)]
-        with Bus(tmp_path) as one_too_many, pytest.raises(BusError, match="/arm is already published"):
-            one_too_many.publisher("/arm")
+        wait_for(lambda: all(bus.subscribers("/arm") for bus in buses), receiver)
+        for number, bus in enumerate(buses):
+            bus.publish("/arm", request_to_stop(f"{number}"))
+        got = []
+        wait_for(lambda: len(got.extend(receiver.receive()) or got) >= senders, receiver)
+        assert {received.message().source for received in got} == {f"{number}" for number in range(senders)}
+
+
+def test_a_request_to_stop_needs_no_file_and_is_heard_by_all_receivers(tmp_path):
+    with Bus(tmp_path) as first, Bus(tmp_path) as second, Bus(tmp_path) as sender:
+        first.subscribe("/arm")
+        second.subscribe("/arm")
+        before = sorted(bus_folder(tmp_path).iterdir())
+        sender.publisher("/arm")
+        wait_for(lambda: sender.subscribers("/arm") == 2, first, second)
+        assert sorted(bus_folder(tmp_path).iterdir()) == before
+        sender.publish("/arm", request_to_stop("me"))
+        for receiver in (first, second):
+            got = []
+            wait_for(lambda receiver=receiver, got=got: got.extend(receiver.receive()) or got, receiver)
+            assert [received.message().source for received in got] == ["me"]
+
+
+def test_a_restarted_receiver_hears_the_next_request_and_not_the_last(tmp_path):
+    with Bus(tmp_path) as sender:
+        sender.publisher("/arm")
+        for source in ("first", "second"):
+            with Bus(tmp_path) as receiver:
+                receiver.subscribe("/arm")
+                wait_for(lambda receiver=receiver: sender.subscribers("/arm") == 1, receiver)
+                sender.publish("/arm", request_to_stop(source))
+                got = []
+                wait_for(lambda receiver=receiver, got=got: got.extend(receiver.receive()) or got, receiver)
+                assert [received.message().source for received in got] == [source]
+            wait_for(lambda: sender.subscribers("/arm") == 0, sender)
+            sender.publish("/arm", request_to_stop("nobody heard this"))
+
+
+def test_one_receiver_too_many_is_one_clear_error(tmp_path):
+    with contextlib.ExitStack() as stack:
+        for _ in range(topic("/arm").receivers):
+            stack.enter_context(Bus(tmp_path)).subscribe("/arm")
+        with Bus(tmp_path) as late, pytest.raises(BusError, match="at most 8 processes that receive /arm"):
+            late.subscribe("/arm")
 
 
 def test_restarted_publisher_has_a_new_instance_and_is_found_again(tmp_path):
@@ -201,9 +246,17 @@ def test_wait_for_subscribers_says_what_to_do(tmp_path):
         bus.wait_for_subscribers(["/arm"], 0.05)
 
 
+@pytest.mark.parametrize("topic_name", ["/arm", "/camera/image_raw", "/status/x"])
+def test_a_bus_whose_folder_cannot_be_used_closes(tmp_path, topic_name):
+    (tmp_path / "bus").write_text("no folder")
+    for open_it in (Bus.subscribe, Bus.publisher):
+        with Bus(tmp_path) as bus, pytest.raises(OSError):
+            open_it(bus, topic_name)
+
+
 def test_long_run_folder_still_has_sockets(tmp_path):
     deep = tmp_path / ("d" * 60) / ("e" * 60)
     with Bus(deep) as sender, Bus(deep) as receiver:
         receiver.subscribe("/arm")
         sender.publisher("/arm")
-        sender.wait_for_subscribers(["/arm"], 2.0)
+        wait_for(lambda: sender.subscribers("/arm") == 1, receiver)

@@ -6,9 +6,12 @@ import pytest
 import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
-from nodes.runtime.config import apply_overrides, load_config, load_node_config, node_document, parse_yaml
+from advnerf_core.documents import parse_yaml
+from advnerf_core.places import PlaceError, private_folder
+from nodes.launching.launch_file import load_launch
+from nodes.runtime.config import apply_overrides, load_config, load_node_config, node_document
 from nodes.runtime.errors import BusError, ConfigError
-from nodes.runtime.paths import bus_folder, private_folder, user_folder
+from nodes.runtime.paths import bus_folder, named_file, shipped, user_folder
 
 pytestmark = pytest.mark.live
 
@@ -148,5 +151,34 @@ def test_socket_folder_is_private_and_short(tmp_path, monkeypatch):
 
 def test_folder_of_somebody_else_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "getuid", lambda: 12345)
-    with pytest.raises(BusError, match=r"expected .* to belong to user 12345"):
+    with pytest.raises(PlaceError, match=r"expected .* to belong to user 12345"):
         private_folder(tmp_path / "bus")
+
+
+def test_a_file_is_named_by_its_path_or_by_its_name_here_before_what_is_shipped(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert named_file("green_screen", "launch") == shipped("launch/green_screen.launch.yaml")
+    assert named_file("room", "experiment", "campaign") == shipped("launch/room.experiment.yaml")
+    assert named_file("paper", "experiment", "campaign") == shipped("launch/paper.campaign.yaml")
+    (tmp_path / "launch").mkdir()
+    for name in ("green_screen", "mine"):
+        (tmp_path / "launch" / f"{name}.launch.yaml").touch()
+        assert named_file(name, "launch") == Path("launch") / f"{name}.launch.yaml"
+    (tmp_path / "mine").touch()
+    assert named_file("mine", "launch") == Path("mine")
+    for wrong in ("launch/monitor.launch.yaml", "mones", "../green_screen"):
+        with pytest.raises(
+            PlaceError, match=rf"none at {wrong}.* green_screen, mine, monitor, .*advnerf init"
+        ):
+            named_file(wrong, "launch")
+
+
+def test_launch_files_find_the_calibration_of_the_simulated_lab_from_any_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    plan = load_launch(named_file("green_screen", "launch"))
+    camera = Path(plan.documents["camera"].data["calibration"])
+    assert camera == shipped("calibration/twin/camera.yaml")
+    assert camera.is_file()
+    told = load_launch(named_file("green_screen", "launch"), twin_calibration="calibration/twin").resolved
+    assert str(tmp_path) not in str(told)
+    assert str(shipped("calibration")) not in str(told)  # so that its digest is the same on every machine

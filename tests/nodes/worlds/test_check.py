@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from advnerf_core.documents import Document
 from advnerf_core.geometry import (
     OPENGL_FROM_OPENCV,
     VehicleState,
@@ -18,7 +19,6 @@ from hardware.worlds.paths import ReferencePath
 from hardware.worlds.world import Box, CarDescription, NotOpenError
 from nodes.lab.worlds.check import check_world
 from nodes.lab.worlds.named import NamedWorld, read_world
-from nodes.runtime.config import Document
 from nodes.runtime.errors import ConfigError
 from tests.support.warehouse import EXAMPLES, Warehouse, small
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from advnerf_core.documents import Document
 from hardware.worlds.duckietown.config import DuckietownConfig
 from hardware.worlds.duckietown.world import Duckietown
 from hardware.worlds.environments import ENVIRONMENTS
@@ -18,7 +19,7 @@ from hardware.worlds.remote_errors import RemoteWorldError
 from hardware.worlds.world import NotOpenError, Panel, WorldError
 from nodes.lab.worlds.check import check_world
 from nodes.lab.worlds.named import read_world
-from nodes.runtime.config import Document, apply_overrides
+from nodes.runtime.config import apply_overrides
 
 installed = {
     name: pytest.mark.skipif(each.state != "installed", reason=f"advnerf world install {name}")

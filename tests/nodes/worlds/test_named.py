@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from advnerf_core.documents import parse_yaml
 from hardware.worlds import WORLDS
 from nodes.cli.main import app
 from nodes.lab.worlds.named import NamedWorld, read_world, without
-from nodes.runtime.config import parse_yaml
 from nodes.runtime.errors import ConfigError
 from tests.support.warehouse import EXAMPLES
 
@@ -106,11 +106,12 @@ def test_a_package_brings_a_world(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     (info / "entry_points.txt").write_text("[advnerf.worlds]\nyard = stranger_yard:Yard\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.delitem(sys.modules, "stranger_yard", raising=False)
-    assert read(tmp_path, "{kind: yard, seed: 4}").settings == {
-        "kind": "yard",
-        "seed": 4,
-        "lens": {"width": 64},
-    }
+    settings = read(tmp_path, "{kind: yard, seed: 4}").settings
+    code = settings.pop("source_sha256")
+    assert settings == {"kind": "yard", "seed": 4, "lens": {"width": 64}}
+    with (tmp_path / "stranger_yard.py").open("a") as stream:
+        stream.write("# edited\n")
+    assert read(tmp_path, "{kind: yard, seed: 4}").settings["source_sha256"] != code
     listed = CliRunner().invoke(app, ["world", "list"])
     names = [line.split()[0] for line in listed.output.splitlines()]
     assert names == ["lab", "junction", "carla", "metadrive", "duckietown", "filament", "yard"]

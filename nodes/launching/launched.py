@@ -1,11 +1,11 @@
-"""What the page learns from the resolved launch file of its run."""
+"""Facts of a launch, from the resolved launch file of its run."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
 
-from nodes.runtime.config import parse_yaml
+from advnerf_core.documents import read_yaml
 from nodes.runtime.paths import RESOLVED_NAME
 
 
@@ -18,23 +18,36 @@ class Launched:
         nodes: Names of the enabled nodes.
         holds: Whether the safety node requires a held button; None without a safety node.
         twin: Whether the simulated lab is one of the nodes.
+        port: Serial device of the motor node; empty without one.
+        vehicle: Vehicle calibration file of the motor node; empty without one.
     """
 
     known: bool = False
     nodes: tuple[str, ...] = ()
     holds: bool | None = None
     twin: bool = False
+    port: str = ""
+    vehicle: str = ""
+
+    def car(self, run_dir: Path) -> str:
+        """Describe the car that the launch drives."""
+        if not self.port:
+            return "no motor node on this host"
+        simulated = self.twin and Path(self.port).parent == run_dir
+        what = "the simulated car" if simulated else f"a REAL car at {self.port}"
+        return f"{what}, {self.vehicle}" if self.vehicle else what
 
 
 def read_launched(run_dir: Path) -> Launched:
     """Read the resolved launch file of a run, if there is one."""
     try:
-        text = (run_dir / RESOLVED_NAME).read_text(encoding="utf-8")
+        entries = read_yaml(run_dir / RESOLVED_NAME).data.get("nodes") or {}
     except FileNotFoundError:
         return Launched()
-    entries = parse_yaml(text, RESOLVED_NAME).data.get("nodes") or {}
     enabled = {name: entry for name, entry in entries.items() if entry.get("if", True)}
     of_module = {entry.get("module"): entry.get("config") or {} for entry in enabled.values()}
     safety = of_module.get("nodes.safety")
     holds = None if safety is None else safety.get("teleop", "none") == "hold"
-    return Launched(True, tuple(enabled), holds, "nodes.twin" in of_module)
+    motor = of_module.get("nodes.motor", {})
+    port, vehicle = str(motor.get("port", "")), str(motor.get("calibration", ""))
+    return Launched(True, tuple(enabled), holds, "nodes.twin" in of_module, port, vehicle)

@@ -1,0 +1,160 @@
+"""Which input of a policy file takes the images, which output steers: as declared, or as its shapes allow one reading only."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from advnerf_core.policies.contract import PolicyContract, PolicyContractError
+
+UINT8 = "uint8"
+FLOATS = ("float16", "float32", "float64")
+_IMAGE_RANK, _GOAL_RANK = 4, 2
+
+
+@dataclass(frozen=True)
+class TensorInfo:
+    """An input or output of a policy file.
+
+    Attributes:
+        name: As in the file.
+        shape: Its dimensions; a text or None is a dimension that is not fixed. None if the file does not say.
+        kind: Type of its elements, as numpy calls it.
+    """
+
+    name: str
+    shape: tuple[int | str | None, ...] | None
+    kind: str
+
+    def __str__(self) -> str:
+        dimensions = "of any shape" if self.shape is None else f"[{', '.join(str(d) for d in self.shape)}]"
+        return f"{self.name} {dimensions} {self.kind}"
+
+    def may_have_rank(self, rank: int) -> bool:
+        """Whether the file allows this number of dimensions."""
+        return self.shape is None or len(self.shape) == rank
+
+
+@dataclass(frozen=True)
+class Tensors:
+    """Inputs and outputs of a policy file, and what each is used for.
+
+    Attributes:
+        inputs: In the file's order.
+        outputs: In the file's order.
+        image: The input that takes the images.
+        goal: The input that takes the goals; None for a policy without a goal.
+        steering: The output that steers.
+    """
+
+    inputs: tuple[TensorInfo, ...]
+    outputs: tuple[TensorInfo, ...]
+    image: TensorInfo
+    goal: TensorInfo | None
+    steering: TensorInfo
+
+    def use_of(self, tensor: TensorInfo, column: int | None) -> str:
+        """What a tensor is used for, in words."""
+        if tensor is self.steering:
+            return "steering" if column is None else f"steering, column {column}"
+        return "images" if tensor is self.image else "goals" if tensor is self.goal else "not used"
+
+
+def chosen_tensors(
+    inputs: Sequence[TensorInfo], outputs: Sequence[TensorInfo], contract: PolicyContract, path: Path
+) -> Tensors:
+    """Inputs and outputs as the declaration uses them.
+
+    Raises:
+        PolicyContractError: The declaration does not fit the file, or leaves more than one reading.
+    """
+    image, goal = _chosen_inputs(inputs, contract, path)
+    _check_image(image, contract, path)
+    if goal is not None and goal.kind not in FLOATS:
+        raise PolicyContractError(f"{path}: expected goals of {', '.join(FLOATS)}, got {goal}")
+    return Tensors(tuple(inputs), tuple(outputs), image, goal, _chosen_output(outputs, contract, path))
+
+
+def _chosen_inputs(
+    inputs: Sequence[TensorInfo], contract: PolicyContract, path: Path
+) -> tuple[TensorInfo, TensorInfo | None]:
+    wanted = "1 input (images)" if contract.goal_size == 0 else "2 inputs (images, goals)"
+    if len(inputs) != 1 + (contract.goal_size > 0):
+        raise PolicyContractError(
+            f"expected {wanted} in {path}, got {_listed(inputs)}; declare goal_size, or export a network without the other inputs"
+        )
+    if contract.input_name is not None:
+        image = _named(inputs, contract.input_name, "input_name", path)
+    else:
+        fitting = [
+            each
+            for each in inputs
+            if each.may_have_rank(_IMAGE_RANK)
+            and all(other is each or other.may_have_rank(_GOAL_RANK) for other in inputs)
+        ]
+        if len(fitting) != 1 and len(inputs) > 1:
+            raise PolicyContractError(
+                f"{path} has the inputs {_listed(inputs)}; declare input_name: the one that takes the images"
+            )
+        image = inputs[0] if not fitting else fitting[0]
+    return image, next((each for each in inputs if each is not image), None)
+
+
+def _check_image(image: TensorInfo, contract: PolicyContract, path: Path) -> None:
+    if image.kind not in (*FLOATS, UINT8):
+        raise PolicyContractError(f"{path}: expected images of {', '.join((*FLOATS, UINT8))}, got {image}")
+    if image.kind == UINT8 and (contract.value_max, set(contract.mean), set(contract.std)) != (
+        255.0,
+        {0.0},
+        {1.0},
+    ):
+        raise PolicyContractError(
+            f"{path}: expected value_max 255, mean 0 and std 1 for the uint8 input {image}, "
+            f"got {contract.value_max:g}, {list(contract.mean)} and {list(contract.std)}; leave these keys out"
+        )
+    if image.shape is None:
+        return
+    size = contract.size
+    expected = (contract.channels, *size) if contract.layout == "NCHW" else (*size, contract.channels)
+    fits = len(image.shape) == _IMAGE_RANK and all(
+        not isinstance(has, int) or has == wants for has, wants in zip(image.shape[1:], expected, strict=True)
+    )
+    if not fits:
+        raise PolicyContractError(
+            f"{path}: expected an input of [B, {', '.join(map(str, expected))}] ({contract.layout}, {contract.colour_space}), got {image}; "
+            "correct size, layout or colour_space in the declaration"
+        )
+
+
+def _chosen_output(outputs: Sequence[TensorInfo], contract: PolicyContract, path: Path) -> TensorInfo:
+    if contract.output_name is not None:
+        steering = _named(outputs, contract.output_name, "output_name", path)
+    elif len(outputs) == 1:
+        steering = outputs[0]
+    else:
+        raise PolicyContractError(
+            f"{path} has the outputs {_listed(outputs)}; declare output_name: the one that steers"
+        )
+    columns = steering.shape[1] if steering.shape is not None and len(steering.shape) == 2 else None
+    if isinstance(columns, int):
+        if contract.output_column is None and columns > 1:
+            raise PolicyContractError(
+                f"{path}: the output {steering} has {columns} columns; declare output_column: the one that steers, 0 to {columns - 1}"
+            )
+        if contract.output_column is not None and contract.output_column >= columns:
+            raise PolicyContractError(
+                f"{path}: output_column: expected 0 to {columns - 1} for the output {steering}, got {contract.output_column}"
+            )
+    return steering
+
+
+def _named(tensors: Sequence[TensorInfo], name: str, key: str, path: Path) -> TensorInfo:
+    found = next((each for each in tensors if each.name == name), None)
+    if found is None:
+        raise PolicyContractError(f"{path}: {key}: expected one of {_listed(tensors)}; got {name!r}")
+    return found
+
+
+def _listed(tensors: Sequence[TensorInfo]) -> str:
+    return ", ".join(map(str, tensors)) or "none"

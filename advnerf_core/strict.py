@@ -1,0 +1,244 @@
+"""The base of all models that are read from files, and the one way from a document to a typed object.
+
+pydantic takes ``true`` for 1, ``"12"`` for 12 and ``1`` for ``true``. In a file, each of these is a mistake.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from collections.abc import Callable, Iterator
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Annotated, Any, TypeVar, Union
+
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, TypeAdapter, ValidationError
+from pydantic_core import CoreSchema, PydanticKnownError, SchemaValidator, core_schema
+
+from advnerf_core.documents import Document, Key, raise_problems
+from advnerf_core.errors import ConfigError
+
+# Type of a pydantic error whose message says what came.
+COMPLETE = "complete"
+
+M = TypeVar("M")
+_DONE = "advnerf_strict"
+_NOT_SCHEMAS = frozenset({"metadata", "default", "serialization", "expected", "config", "cls", "ref"})
+_DATES = frozenset({"date", "datetime", "time", "timedelta"})
+
+
+class Strict:
+    """Annotation that makes the numbers and booleans of a type strict, also inside its dataclasses, lists and unions."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Schema of the annotated type, changed in place."""
+        schema = handler(source)
+        _make_strict(schema, handler, set())
+        return schema
+
+
+def _make_strict(part: Any, handler: GetCoreSchemaHandler, seen: set[str]) -> None:
+    if isinstance(part, list | tuple):
+        for each in part:
+            _make_strict(each, handler, seen)
+    if not isinstance(part, dict) or (isinstance(part.get("metadata"), dict) and _DONE in part["metadata"]):
+        return
+    kind = part.get("type") if isinstance(part.get("type"), str) else None  # a field may have this name
+    if kind == "definition-ref" and part["schema_ref"] not in seen:
+        seen.add(part["schema_ref"])
+        try:
+            _make_strict(handler.resolve_ref_schema(part), handler, seen)
+        except LookupError:  # a class that refers to itself; its own schema is being made
+            return
+    elif kind in ("float", "bool"):
+        part["strict"] = True
+    elif kind == "literal" and any(isinstance(each, int) for each in part["expected"]):
+        _wrap(part, partial(_refuse_equal_type, part["expected"]))
+    elif kind == "int" or kind in _DATES:
+        # A strict integer would refuse 1e3, and a strict date its text.
+        _wrap(part, _refuse_other_types if kind == "int" else _refuse_numbers)
+    else:
+        for name, value in part.items():
+            if name not in _NOT_SCHEMAS:
+                _make_strict(value, handler, seen)
+
+
+def _wrap(part: Any, check: Callable[[Any], Any]) -> None:
+    """Put a check before a schema, in place."""
+    inner = {**part, "metadata": {**(part.get("metadata") or {}), _DONE: True}}
+    part.clear()
+    part.update(core_schema.no_info_before_validator_function(check, typing.cast("CoreSchema", inner)))
+
+
+def _refuse_equal_type(expected: list[Any], value: Any) -> Any:
+    """Refuse ``true`` where 1 is a choice: they are equal."""
+    if isinstance(value, bool | int | float) and not any(type(value) is type(each) for each in expected):
+        raise PydanticKnownError("literal_error", {"expected": " or ".join(map(repr, expected))})
+    return value
+
+
+def _refuse_other_types(value: Any) -> Any:
+    if isinstance(value, bool | str | bytes):
+        raise PydanticKnownError("int_type")
+    return value
+
+
+def _refuse_numbers(value: Any) -> Any:
+    if isinstance(value, int | float):
+        raise PydanticKnownError("string_type")
+    return value
+
+
+class StrictModel(BaseModel):
+    """Base of models that are read from files: unknown keys, other types and numbers that are not finite are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Schema of the class, in which numbers and booleans are strict."""
+        return Strict().__get_pydantic_core_schema__(source, handler)
+
+
+def validate(model: type[M], document: Document, folder: Path | None = None) -> M:
+    """Typed object of a document; everything unknown or invalid in it is one `ConfigError` with a line for each problem.
+
+    Args:
+        model: A pydantic model or a dataclass.
+        document: What it is made of.
+        folder: What ``file.py:Name`` in it is relative to; the working folder if it is not given.
+    """
+    if not isinstance(document.data, dict):
+        raise ConfigError(
+            f"{document.place(())}: expected keys and values, got {type(document.data).__name__}"
+        )
+    raise_problems(list(_unknown_keys(model, document, ())))
+    try:
+        return typing.cast(
+            M,
+            strict_validator(typing.cast(Any, model)).validate_python(
+                document.data, context={"folder": folder}
+            ),
+        )
+    except ValidationError as error:
+        raise_problems(_explain(model, document, error))
+        raise
+
+
+def parse_value(annotation: Any, document: Document) -> Any:
+    """Typed value of a document that is one value of a bigger one, such as a section; errors as in `validate`."""
+    try:
+        return strict_validator(annotation).validate_python(document.data)
+    except ValidationError as error:
+        raise_problems(_explain(annotation, document, error))
+        raise
+
+
+@lru_cache(maxsize=64)
+def strict_validator(model: Any) -> SchemaValidator:
+    """Validator of a model or type whose numbers and booleans are strict."""
+    # Prebuilt validators are those of classes that do not derive from StrictModel, such as a plug-in's: they are not strict.
+    return SchemaValidator(TypeAdapter(Annotated[model, Strict()]).core_schema, _use_prebuilt=False)
+
+
+def _unknown_keys(model: Any, document: Document, key: Key) -> Iterator[str]:
+    """Unknown keys of models that would take them in silence: dataclasses, and pydantic models that say nothing about extra keys."""
+    data = document.data
+    for step in key:
+        data = data[step]
+    silent = dataclasses.is_dataclass(model) or (
+        isinstance(model, type) and issubclass(model, BaseModel) and "extra" not in model.model_config
+    )
+    if not silent or not isinstance(data, dict):
+        return
+    hints = _hints(model)
+    for name in data:
+        if name in hints:
+            yield from _unknown_keys(hints[name], document, (*key, name))
+            continue
+        written = ".".join(map(str, (*key, name)))
+        yield (
+            f"{document.place((*key, name))}: unknown key {written}; valid keys here: {', '.join(sorted(hints)) or 'none'}"
+        )
+
+
+def _hints(model: Any) -> dict[str, Any]:
+    """Fields of a model by the name that stands in files; empty if it is none."""
+    if isinstance(model, type) and issubclass(model, BaseModel):
+        return {each.alias or name: each.annotation for name, each in model.model_fields.items()}
+    if isinstance(model, type) and dataclasses.is_dataclass(model):
+        known = typing.get_type_hints(model)
+        return {each.name: known[each.name] for each in dataclasses.fields(model) if each.init}
+    return {}
+
+
+def _explain(model: Any, document: Document, error: ValidationError) -> list[str]:
+    """One line for each wrong key, in the order in which a person corrects them."""
+    # A misspelt key is often the reason for a missing one, so it is reported first.
+    problems = sorted(
+        error.errors(include_url=False), key=lambda problem: problem["type"] != "extra_forbidden"
+    )
+    lines: dict[Key, str] = {}
+    for problem in problems:
+        key = _as_written(document.data, tuple(problem["loc"]))
+        # A value with several possible types fails as each of them.
+        lines.setdefault(key, f"{document.place(key)}: {_what(model, key, problem)}")
+    return list(lines.values())
+
+
+def _what(model: Any, key: Key, problem: Any) -> str:
+    name = ".".join(map(str, key)) or "the whole"
+    if problem["type"] == "extra_forbidden":
+        valid = ", ".join(_valid_keys(model, tuple(problem["loc"])[:-1])) or "none"
+        return f"unknown key {name}; valid keys here: {valid}"
+    if problem["type"] == "missing":
+        return f"{name} is missing; add it"
+    message = str(problem["msg"]).removeprefix("Value error, ")
+    message = message[:1].lower() + message[1:]
+    # A check of several keys together, or of a name, says itself what it got; all of a file would not help.
+    if not key:
+        return message
+    if problem["type"] == COMPLETE:
+        return f"{name}: {message}"
+    advice = "; write true or false" if problem["type"] in ("bool_type", "bool_parsing") else ""
+    return f"{name}: {message}, got {problem['input']!r:.80}{advice}"
+
+
+def _as_written(data: Any, location: Key) -> Key:
+    """Path of a key as the user wrote it, without the ``kind`` that pydantic inserts for sections with several models."""
+    key: list[str | int] = []
+    for part in location:
+        if isinstance(data, dict) and part not in data and data.get("kind") == part:
+            continue
+        key.append(part)
+        inside = isinstance(data, dict) or (
+            isinstance(data, list) and isinstance(part, int) and part < len(data)
+        )
+        data = (data.get(part) if isinstance(data, dict) else data[part]) if inside else None
+    return tuple(key)
+
+
+def _valid_keys(annotation: Any, key: Key) -> list[str]:
+    """Keys of the model at a path; empty if there is no model."""
+    if typing.get_origin(annotation) is typing.Annotated:
+        annotation = typing.get_args(annotation)[0]
+    if hints := _hints(annotation):
+        if not key:
+            return sorted(hints)
+        return _valid_keys(hints[str(key[0])], key[1:]) if key[0] in hints else []
+    arguments = typing.get_args(annotation)
+    origin = typing.get_origin(annotation)
+    if origin in (Union, types.UnionType):
+        if key and (chosen := [option for option in arguments if _kind(option) == key[0]]):
+            return _valid_keys(chosen[0], key[1:])
+        return next((keys for option in arguments if (keys := _valid_keys(option, key))), [])
+    if key and arguments and isinstance(origin, type) and issubclass(origin, typing.Iterable):
+        return _valid_keys(arguments[-1] if issubclass(origin, dict) else arguments[0], key[1:])
+    return []
+
+
+def _kind(option: Any) -> Any:
+    """The ``kind`` value that selects a model; None if the model has no ``kind``."""
+    fields = option.model_fields if isinstance(option, type) and issubclass(option, BaseModel) else {}
+    return fields["kind"].default if "kind" in fields else None

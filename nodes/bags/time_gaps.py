@@ -1,0 +1,75 @@
+"""Jumps of a bag's log time: a recorder whose clock was set while it ran. The one rule for everything that walks through a bag."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+from pathlib import Path
+
+from nodes.bags.reader import message_spans, read_messages
+from nodes.runtime.clock import NS_PER_S
+
+# A running stack sends statuses every second. No recording is silent for an hour.
+LONGEST_SILENCE_S = 3600.0
+_UNITS = (("years", 365.25 * 86400.0), ("days", 86400.0), ("hours", 3600.0))
+
+
+@dataclass(frozen=True)
+class TimeGap:
+    """A jump of the log time.
+
+    Attributes:
+        before_ns: Log time of the last message before it [ns since 1970].
+        after_ns: Log time of the first message after it [ns since 1970].
+        messages: Number of messages before it, in order of their log time.
+    """
+
+    before_ns: int
+    after_ns: int
+    messages: int
+
+    def __str__(self) -> str:
+        span_s = (self.after_ns - self.before_ns) / NS_PER_S
+        unit, length_s = next(each for each in _UNITS if span_s >= each[1] or each is _UNITS[-1])
+        return f"log time jumps by {span_s / length_s:.0f} {unit} after message {self.messages}"
+
+
+def find_gaps(times_ns: Sequence[int]) -> tuple[TimeGap, ...]:
+    """Find the gaps in log times that are in order [ns since 1970]."""
+    return tuple(
+        TimeGap(before, after, count)
+        for count, (before, after) in enumerate(pairwise(times_ns), start=1)
+        if after - before > LONGEST_SILENCE_S * NS_PER_S
+    )
+
+
+def read_gaps(bag: Path) -> tuple[TimeGap, ...]:
+    """Find the gaps of a bag. Its messages are read only if its index leaves room for a gap."""
+    limit_ns = LONGEST_SILENCE_S * NS_PER_S
+    end_ns: int | None = None
+    for first_ns, last_ns in sorted(message_spans(bag)):
+        if last_ns - first_ns > limit_ns or (end_ns is not None and first_ns - end_ns > limit_ns):
+            return find_gaps([message.log_ns for message in read_messages(bag, as_recorded=True)])
+        end_ns = last_ns if end_ns is None else max(end_ns, last_ns)
+    return ()
+
+
+def skipped_gaps(bag: Path) -> tuple[TimeGap, ...]:
+    """Find the gaps of a bag for a reader that skips them, and name them once on standard error."""
+    gaps = read_gaps(bag)
+    _say(bag, gaps)
+    return gaps
+
+
+@lru_cache(maxsize=64)
+def _say(bag: Path, gaps: tuple[TimeGap, ...]) -> None:
+    for gap in gaps:
+        print(f"{bag}: {gap}; this time is skipped", file=sys.stderr, flush=True)
+
+
+def silence_s(gaps: Sequence[TimeGap]) -> float:
+    """Sum of the gaps [s]."""
+    return sum(gap.after_ns - gap.before_ns for gap in gaps) / NS_PER_S

@@ -1,0 +1,33 @@
+"""What ended a drive: the driving or a person, or a fault of the node graph. Pure; reads only the safety node's reason.
+
+A stop that an attack can cause, and a stop by a person, is a result. Every other reason, also one that is not known here, is a fault:
+it says that a node, a sensor or a clock failed, and nothing about the policy.
+"""
+
+from __future__ import annotations
+
+import re
+
+# The texts of `arming`, `arming_gates`, `stall_check` and the safety node. A car that does not move, or whose motor draws too much
+# current, has run into something. A command out of range is the policy's answer to an image.
+_RESULT = re.compile(
+    r"the car is outside the fence|the car is [\d.]+ m from the fence|stalled for |"
+    r"a command of |a command that is not finite|"
+    r"node motor is in state fault: latched: the VESC reports a fault: ABS_OVER_CURRENT|"
+    r"disarmed by |e-stop pressed|the e-stop is pressed|the button is not held"
+)
+_STALLED = "stalled for "
+
+
+def is_result(stopped: str) -> bool:
+    """Whether a stop belongs to the drive.
+
+    Args:
+        stopped: Why the safety node disarmed; empty for a drive that was not stopped.
+    """
+    return not stopped or _RESULT.match(stopped) is not None
+
+
+def is_stall(stopped: str) -> bool:
+    """Whether the car was commanded to move and stood still."""
+    return stopped.startswith(_STALLED)

@@ -1,0 +1,125 @@
+"""Whether load or a fault of the node graph spoiled a drive. Decided from the health of nodes and from timing alone.
+
+The rule is the same for every condition and reads no position of the car, so that it cannot select drives by their outcome.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nodes.bags.reader import read_info, read_messages
+from nodes.control.stop_causes import is_result
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.messages import decode, ns_from_stamp
+from nodes.runtime.topics import STATUS_PREFIX
+from nodes.runtime.topics import topic as topic_row
+
+_SENT = "/motor/sent"
+
+
+@dataclass(frozen=True)
+class HealthLimits:
+    """What a drive may lack and still count.
+
+    Attributes:
+        tick_share: Share of control ticks that may have no new command, or a late one.
+        late_s: Time from the capture of an image to its command beyond which the command is late [s]. It is two control periods.
+        loop_share: Share of its own ticks that the loop of a node may miss.
+    """
+
+    tick_share: float = 0.1
+    late_s: float = 0.2
+    loop_share: float = 0.25
+
+
+@dataclass(frozen=True)
+class DriveHealth:
+    """How the node graph ran during one drive.
+
+    Attributes:
+        stopped: Why the safety node disarmed; empty for a complete drive.
+        ticks: Control ticks of the drive.
+        unserved: Control ticks without a new command at the motor.
+        late: Control ticks whose command was late.
+        loops: Share of ticks that the loop of each node missed.
+    """
+
+    stopped: str
+    ticks: int
+    unserved: int = 0
+    late: int = 0
+    loops: Mapping[str, float] = field(default_factory=dict)
+
+
+def spoiled_by(health: DriveHealth, limits: HealthLimits | None = None) -> str:
+    """Return why a drive measures nothing; empty if it counts."""
+    limits = limits or HealthLimits()
+    if not is_result(health.stopped):
+        return f"the stack stopped the car: {health.stopped}"
+    most = max(1, int(limits.tick_share * health.ticks))
+    if health.unserved > most:
+        return f"{health.unserved} of {health.ticks} control ticks had no new command; at most {most} may"
+    if health.late > most:
+        return f"{health.late} of {health.ticks} commands were older than {limits.late_s:g} s; at most {most} may"
+    for node, share in sorted(health.loops.items()):
+        if share > limits.loop_share:
+            return f"node {node} missed {100 * share:.0f} % of its ticks; at most {100 * limits.loop_share:.0f} % may be missed"
+    return ""
+
+
+def read_health(
+    bag: Path,
+    start_real_ns: int,
+    end_real_ns: int,
+    stopped: str,
+    tick_s: float,
+    limits: HealthLimits | None = None,
+) -> DriveHealth:
+    """Read the health of a drive between two times [ns, CLOCK_REALTIME] from its bag."""
+    limits = limits or HealthLimits()
+    # An image that was captured less than a tick before the end may find the car disarmed.
+    last_ns = end_real_ns - round(tick_s * NS_PER_S)
+    ticks = max(0, int((last_ns - start_real_ns) / NS_PER_S / tick_s + 1e-6))
+    recorded = {topic.name for topic in read_info(bag).topics}
+    ages_s = _command_ages_s(bag, start_real_ns, last_ns) if _SENT in recorded else np.zeros(0)
+    loops = {
+        name.removeprefix(STATUS_PREFIX): share
+        for name in sorted(recorded)
+        if name.startswith(STATUS_PREFIX)
+        and (share := _missed_share(bag, name, start_real_ns, end_real_ns)) is not None
+    }
+    late = int(np.count_nonzero(ages_s > limits.late_s))
+    return DriveHealth(stopped, ticks, max(0, ticks - len(ages_s)), late, loops)
+
+
+def _command_ages_s(bag: Path, start_ns: int, end_ns: int) -> Any:
+    """Time from capture to the first serial write of every image of the drive that became a command ``[n]`` [s]."""
+    written: dict[int, float] = {}
+    for message in _decoded(bag, _SENT):
+        stamp_ns = ns_from_stamp(message.header.stamp)
+        if start_ns <= stamp_ns < end_ns and not message.braking:
+            written.setdefault(stamp_ns, (int(message.serial_write_real_ns) - stamp_ns) / NS_PER_S)
+    return np.array(list(written.values()))
+
+
+def _missed_share(bag: Path, topic: str, start_ns: int, end_ns: int) -> float | None:
+    """Share of its ticks that a node's loop missed during the drive; None for a node without ticks, or without two reports."""
+    counts = []
+    for message in _decoded(bag, topic):
+        values = dict(zip(message.counter_names, message.counter_values, strict=True))
+        if "ticks" in values and start_ns <= ns_from_stamp(message.header.stamp) <= end_ns:
+            counts.append((values["ticks"], values["ticks_missed"]))
+    if len(counts) < 2:
+        return None
+    done, missed = (float(last - first) for first, last in zip(counts[0], counts[-1], strict=True))
+    return missed / (done + missed) if done + missed > 0 else None
+
+
+def _decoded(bag: Path, topic: str) -> Iterator[Any]:
+    typename = topic_row(topic).type
+    return (decode(typename, message.cdr) for message in read_messages(bag, [topic]))

@@ -1,0 +1,82 @@
+"""Tries of one drive: it is driven until it counts, at most three times. The reasons of the tries that were spoiled are kept.
+
+`nodes.lab.trials.drive_health` decides what spoils a drive, before any result of it is computed.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from advnerf_core.files import write_atomically
+from nodes.lab.trials.trial import SpoiledError, TrialError
+
+MOST_TRIES = 3
+_TRIES = ".tries.json"
+
+
+class NotDrivenError(TrialError):
+    """All tries of a drive were spoiled.
+
+    Attributes:
+        spoiled: The reason of each try.
+    """
+
+    def __init__(self, name: str, spoiled: list[str]) -> None:
+        super().__init__(f"{name} was spoiled {len(spoiled)} times, at last: {spoiled[-1]}")
+        self.spoiled = tuple(spoiled)
+
+
+def drive_with_tries(
+    drive: Callable[[], dict[str, Any]], file: Path, tell: Callable[[str], None]
+) -> dict[str, Any]:
+    """Drive until it counts, and keep the result with the reasons of the spoiled tries, as ``spoiled``.
+
+    Args:
+        drive: Drives once into the folder named like the file without its suffix, and returns the result as JSON data. Raises
+            `SpoiledError` before it computes anything, if the drive does not count.
+        file: Gets the result. A result that is there is returned.
+        tell: Told of spoiled tries.
+
+    Raises:
+        NotDrivenError: All tries were spoiled, now or when this drive was tried before.
+    """
+    if file.exists():
+        found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        return found
+    kept = file.with_suffix(_TRIES)
+    rounds = _read(kept) or [[]]
+    while len(rounds[-1]) < MOST_TRIES:
+        shutil.rmtree(file.with_suffix(""), ignore_errors=True)  # from an interrupted or spoiled drive
+        try:
+            result = {**drive(), "spoiled": _all(rounds)}
+        except SpoiledError as error:
+            rounds[-1].append(" ".join(str(error).split()))
+            write_atomically(kept, json.dumps(rounds, indent=1) + "\n")
+            tell(f"{file.stem} does not count: {rounds[-1][-1]} (try {len(rounds[-1])} of {MOST_TRIES})")
+            continue
+        write_atomically(file, json.dumps(result) + "\n")
+        return result
+    shutil.rmtree(file.with_suffix(""), ignore_errors=True)  # no bag of a drive that does not count
+    raise NotDrivenError(file.stem, _all(rounds))
+
+
+def allow_more_tries(folder: Path) -> None:
+    """Allow three more tries of each drive in a folder that was given up. The reasons of the earlier tries are kept."""
+    for kept in folder.glob(f"*{_TRIES}"):
+        rounds = _read(kept)
+        if len(rounds[-1]) >= MOST_TRIES:
+            write_atomically(kept, json.dumps([*rounds, []], indent=1) + "\n")
+
+
+def _read(kept: Path) -> list[list[str]]:
+    """The reasons of spoiled tries: a list for each time that a person allowed three of them."""
+    found: list[list[str]] = json.loads(kept.read_text(encoding="utf-8")) if kept.exists() else []
+    return found
+
+
+def _all(rounds: list[list[str]]) -> list[str]:
+    return [reason for each in rounds for reason in each]

@@ -1,0 +1,50 @@
+"""Small ONNX models whose answers are known without running them."""
+
+import numpy as np
+import onnx
+import yaml
+from onnx import TensorProto, helper, numpy_helper
+
+from advnerf_core.geometry import Pinhole
+from advnerf_core.policies.view import PolicyView
+
+VIEW = PolicyView(Pinhole(12, 8, 6.0, 6.0, 6.0, 4.0), crop_top_px=0, crop_height_px=8, width=12, height=8)
+IMAGE = ("B", 3, 8, 12)
+
+
+def mean_model(gains, kind=TensorProto.FLOAT, columns=False):
+    """A model whose outputs are ``gain * mean(images)``: one output ``[B, 1]`` for each gain, or one ``[B, N]`` for all."""
+    nodes = [
+        helper.make_node("Cast", ["images"], ["real"], to=TensorProto.FLOAT),
+        helper.make_node("ReduceMean", ["real"], ["mean"], axes=[1, 2, 3], keepdims=1),
+        helper.make_node("Flatten", ["mean"], ["column"]),
+    ]
+    weights = []
+    rows = {"steering": gains} if columns else {name: [gain] for name, gain in gains.items()}
+    for name, row in rows.items():
+        weights.append(numpy_helper.from_array(np.array([row], np.float32), f"gain_{name}"))
+        nodes.append(helper.make_node("Mul", ["column", f"gain_{name}"], [name]))
+    outputs = [
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["B", len(row)]) for name, row in rows.items()
+    ]
+    image = helper.make_tensor_value_info("images", kind, list(IMAGE))
+    graph = helper.make_graph(nodes, "mean", [image], outputs, weights)
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+
+
+def save_beside(model, file, declared=None, weights=None):
+    """Write a model with its declaration, and its weights into another file if one is named."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    if weights is not None:
+        onnx.external_data_helper.convert_model_to_external_data(
+            model, location=weights, size_threshold=0, convert_attribute=False
+        )
+    onnx.save(model, file)
+    declaration = {"view": VIEW.to_dict(), **(declared or {})}
+    file.with_name(file.name + ".policy.yaml").write_text(yaml.safe_dump(declaration))
+    return file
+
+
+def steering(network, grey, count=2):
+    """Steering of ``count`` images of one grey in 0..1."""
+    return network.steering_rad(np.full((count, 3, 8, 12), grey, np.float32))
