@@ -12,7 +12,7 @@ from pathlib import Path
 
 from advnerf_core.objects.voxel.build import HELD_OUT_VIEWS, build_from_mesh
 from advnerf_core.objects.voxel.generators import hydrant
-from advnerf_core.objects.voxel.mesh import load_mesh
+from advnerf_core.objects.voxel.mesh_files import load_mesh
 from benchmarks.results import record_row
 
 TARGET_DB = 30.0
@@ -26,7 +26,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=400)
     parser.add_argument("--trial", action="store_true", help="print, but do not write the ledger")
     options = parser.parse_args()
-    mesh = hydrant() if options.mesh is None else load_mesh(options.mesh)
+    mesh = hydrant() if options.mesh is None else load_mesh(options.mesh, "z")
     name = "generated hydrant" if options.mesh is None else options.mesh.stem
     began = time.monotonic()
     model = build_from_mesh(mesh, name, options.resolution, options.steps)

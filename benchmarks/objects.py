@@ -29,7 +29,8 @@ from advnerf_core.fields.summed_levels import with_summed_levels
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.geometry import make_transform, rotation_z
 from advnerf_core.objects.voxel.generators import GENERATORS
-from advnerf_core.objects.voxel.mesh import SurfaceMesh, load_mesh, stand
+from advnerf_core.objects.voxel.mesh import SurfaceMesh, stand
+from advnerf_core.objects.voxel.mesh_files import load_mesh
 from advnerf_core.objects.voxel.model import ObjectModel
 from advnerf_core.objects.voxel.pictures import PosedRgba
 from advnerf_core.objects.voxel.rasterise import draw_mesh

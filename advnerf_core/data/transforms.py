@@ -7,7 +7,7 @@ a file is one `DatasetError` that names the file, the frame and the field.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +25,10 @@ _LENSES = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PE
 _FISHEYES = {"OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
 _SPLITS = (TRAIN, *HELD_OUT_SPLITS)
 _RIGID_TOLERANCE = 0.01
-# Single precision resolves a centimetre there; what is farther has a map's origin, not a scene's.
-_FARTHEST = 1e5
+# Times the spread of the cameras, whatever the unit: single precision resolves a thousandth of the spread there. What is farther has
+# a map's origin, not a scene's.
+_FARTHEST = 1e4
+_SPREAD_QUANTILE = 0.9
 _Values = dict[str, Any]
 
 
@@ -207,14 +209,18 @@ def _pose(values: _Values) -> Array:
     return np.asarray(matrix @ OPENGL_FROM_OPENCV, np.float64)
 
 
-def _refuse_far_away(path: Path, frames: Iterable[PosedImage]) -> None:
-    for frame in frames:
-        farthest = float(np.abs(frame.T_world_from_camera[:3, 3]).max())
-        if farthest > _FARTHEST:
-            raise DatasetError(
-                f"{path}: frame {frame.path.name}: transform_matrix: expected a camera within {_FARTHEST:.0f} m of the origin, got "
-                f"{farthest:.4g}; take a common offset off all positions (map coordinates have a far origin), or use metres"
-            )
+def _refuse_far_away(path: Path, frames: Sequence[PosedImage]) -> None:
+    places = np.stack([frame.T_world_from_camera[:3, 3] for frame in frames])
+    away = np.linalg.norm(places - np.median(places, axis=0), axis=1)
+    spread = float(np.quantile(away, _SPREAD_QUANTILE, method="lower"))
+    farthest = int(np.abs(places).max(axis=1).argmax())
+    value = float(np.abs(places[farthest]).max())
+    if spread > 0.0 and value > _FARTHEST * spread:
+        raise DatasetError(
+            f"{path}: frame {frames[farthest].path.name}: transform_matrix: expected a camera within {_FARTHEST:.0f} times the spread "
+            f"of the cameras, {spread:.4g}, of the origin, got {value:.4g}; take a common offset off all positions (map coordinates "
+            "have a far origin), or leave the frame out"
+        )
 
 
 def _lens(values: _Values) -> Lens:

@@ -47,6 +47,15 @@ class MarchConfig:
             step_growth=scale * self.step_growth,
         )
 
+    def in_unit(self, unit_m: float) -> MarchConfig:
+        """The same with its lengths in another unit [m]."""
+        return replace(
+            self,
+            near_m=self.near_m / unit_m,
+            smallest_step_m=self.smallest_step_m / unit_m,
+            largest_step_m=self.largest_step_m / unit_m,
+        )
+
     def steps(self, scale: float = 1.0) -> Array32:
         """Smallest and largest interval [m] and growth ``[3]``, as the kernels read them."""
         return np.array(

@@ -19,19 +19,23 @@ def intrinsics_row(pinhole: Pinhole) -> Array32:
     return np.array([pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy], np.float32)
 
 
-def poses_in_box(T_world_from_camera: ArrayLike, box_low_m: ArrayLike, extent_m: float) -> Array32:
+def poses_in_box(
+    T_world_from_camera: ArrayLike, box_low_m: ArrayLike, extent_m: float, ray_unit_m: float = 1.0
+) -> Array32:
     """Camera poses for the ray kernels.
 
     Args:
         T_world_from_camera: ``[B, 4, 4]``.
         box_low_m: Low corner of the box ``[3]`` [m].
         extent_m: Longest side of the box [m].
+        ray_unit_m: Unit of ray parameters [m].
 
     Returns:
-        ``[B, 3, 4]`` float32: rotation divided by the extent, so that ray parameters stay in metres, and position in box units.
+        ``[B, 3, 4]`` float32: rotation divided by the extent, so that ray parameters stay in their unit, and position in box units.
     """
     T = np.asarray(T_world_from_camera, np.float64)[..., :3, :] / extent_m
     T[..., 3] -= np.asarray(box_low_m, np.float64) / extent_m
+    T[..., :3] *= ray_unit_m
     return np.ascontiguousarray(T, np.float32)
 
 

@@ -43,10 +43,16 @@ def bake(
         NotBakedError: Colours of the field depend on the direction, it reaches beyond its box, or it is transparent.
     """
     config = source.config
-    if config.direction_bands > 1 or config.contraction or not config.learned_background:
+    if (
+        config.direction_bands > 1
+        or config.contraction
+        or not config.learned_background
+        or config.ray_unit_m != 1.0
+    ):
         raise NotBakedError(
             "expected a field in a box, opaque, with colours that do not depend on the direction, got one with contraction = "
-            f"{config.contraction}, learned_background = {config.learned_background}, direction_bands = {config.direction_bands}"
+            f"{config.contraction}, learned_background = {config.learned_background}, direction_bands = {config.direction_bands}, "
+            f"a longest side of {config.extent_m:.4g} m"
         )
     shape = source.leaps.distance.shape
     none_yet = np.full(shape, -1, np.int32), np.zeros(shape, np.uint8)

@@ -35,6 +35,9 @@ class SceneFileError(AdvnerfError):
     """A scene file cannot be used; the message says why."""
 
 
+_PLACES_M = (0.25, 1000.0)
+
+
 @dataclass(frozen=True)
 class SceneFieldConfig:
     """Sizes of a scene field.
@@ -72,6 +75,14 @@ class SceneFieldConfig:
             )
         if not 1 <= self.direction_bands <= 4:
             raise ValueError(f"expected 1..4 direction bands, got {self.direction_bands}")
+
+    @property
+    def ray_unit_m(self) -> float:
+        """Unit of ray parameters [m]: the metre, but for boxes of a size that no place has in metres, a quarter of their longest side.
+
+        Kernels step 0.1 mm beyond the edge of a cell, which must be less than a cell and more than rounding, whatever a file's unit.
+        """
+        return 1.0 if _PLACES_M[0] <= self.extent_m <= _PLACES_M[1] else 0.25 * self.extent_m
 
     @property
     def extent_m(self) -> float:

@@ -15,7 +15,7 @@ from advnerf_core.scene.field import SceneFieldConfig
 # Of cameras among the content, and of cameras that all stand outside the box and look at it.
 INTERVAL_PX, INTERVAL_PX_FROM_OUTSIDE = 4.0, 1.5
 # Shares of the box's longest side.
-_SHORTEST, _LONGEST = 1 / 1024, 1 / 64
+_SHORTEST, _LONGEST, NEAR = 1 / 1024, 1 / 64, 1 / 80
 # As many as Instant-NGP takes. Occupied space is short, so that few rays come near it.
 _MOST_SAMPLES = 1024
 
@@ -24,7 +24,7 @@ def pixel_intervals(
     pinholes: Sequence[Pinhole],
     T_world_from_camera: ArrayLike,
     field: SceneFieldConfig,
-    near_m: float = 0.1,
+    near_m: float | None = None,
     interval_px: float | None = None,
 ) -> MarchConfig:
     """Choose sample intervals that are a few pixels long, wherever the cameras stand.
@@ -52,17 +52,21 @@ def pixel_intervals(
             their focal lengths counts.
         T_world_from_camera: Poses of the training images ``[N, 4, 4]``.
         field: The field, for its box.
-        near_m: Nothing is sampled closer to a camera [m].
+        near_m: Nothing is sampled closer to a camera [m]; None: 1/80 of the longest side of the box, 5 cm in a room of 4 m.
         interval_px: Interval in pixels, instead of the rule's. Fewer give finer silhouettes and take more samples.
     """
     if interval_px is None:
         places = np.asarray(T_world_from_camera, np.float64)[:, :3, 3]
         inside = ((places >= np.array(field.box_low_m)) & (places <= np.array(field.box_high_m))).all(axis=1)
         interval_px = INTERVAL_PX if inside.any() else INTERVAL_PX_FROM_OUTSIDE
+    if near_m is not None and near_m >= field.extent_m:
+        raise ValueError(
+            f"expected near below {field.extent_m:.4g}, the longest side of the box, got {near_m:.4g}: is it in the unit of the cameras?"
+        )
     if not interval_px > 0.0:
         raise ValueError(f"expected interval_px > 0, got {interval_px}")
     return MarchConfig(
-        near_m=near_m,
+        near_m=NEAR * field.extent_m if near_m is None else near_m,
         smallest_step_m=_SHORTEST * field.extent_m,
         largest_step_m=_LONGEST * field.extent_m,
         step_growth=interval_px / median(pinhole.fx for pinhole in pinholes),

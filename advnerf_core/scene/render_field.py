@@ -107,7 +107,7 @@ class FieldRenderer:
         )
         tiles = len(poses) * -(-pinhole.height // SIDE) * -(-pinhole.width // SIDE)
         bounds, samples = slot_bounds(tiles, _SLOTS), np.zeros(_SLOTS, np.int64)
-        in_box = poses_in_box(poses, self.config.origin_m, self.config.extent_m)
+        in_box = poses_in_box(poses, self.config.origin_m, self.config.extent_m, self.config.ray_unit_m)
 
         def work(slot: int) -> None:
             samples[slot] = self._render_tiles(
@@ -120,7 +120,11 @@ class FieldRenderer:
         if not self.config.learned_background:
             opacity = alpha[..., None]
             colours = opacity * colours + (np.float32(1.0) - opacity) * np.array(self.behind, np.float32)
-        return torch.from_numpy(colours), torch.from_numpy(depth_m), torch.from_numpy(alpha)
+        return (
+            torch.from_numpy(colours),
+            torch.from_numpy(depth_m * np.float32(self.config.ray_unit_m)),
+            torch.from_numpy(alpha),
+        )
 
     __call__ = render
 
@@ -133,21 +137,22 @@ class FieldRenderer:
         depth_m: NDArray[np.float32],
         alpha: NDArray[np.float32],
     ) -> int:
+        march = self.march.in_unit(self.config.ray_unit_m)
         return int(
             render_tiles(
                 poses,
                 intrinsics,
                 *bounds,
                 self.config.box_high,
-                np.float32(self.march.near_m),
-                self.march.steps(),
+                np.float32(march.near_m),
+                march.steps(),
                 self.leaps.distance,
                 self.leaps.cells,
                 *self.networks,
                 self.weights["background"],
                 self.config.direction_bands,
                 np.float32(self.least_transmittance),
-                self.march.max_samples,
+                march.max_samples,
                 rgb,
                 depth_m,
                 alpha,

@@ -71,7 +71,10 @@ class Trainer:
         self.step, self.elapsed_s = 0, 0.0
         self.rays_per_step = min(self.config.max_rays, 2048)
         self.history: list[tuple[int, float, float]] = []
-        self._poses = poses_in_box(images.T_world_from_camera, field_config.origin_m, field_config.extent_m)
+        unit_m = field_config.ray_unit_m
+        self._poses = poses_in_box(
+            images.T_world_from_camera, field_config.origin_m, field_config.extent_m, unit_m
+        )
         self._intrinsics = np.stack([intrinsics_row(p) for p in images.pinholes])
         self.march = self.config.march or pixel_intervals(
             images.pinholes,
@@ -81,7 +84,9 @@ class Trainer:
             self.config.interval_px,
         )
         capacity = int(1.25 * self.config.samples_per_step)
-        self._marcher = Marcher(capacity, self.march, field_config.box_high, field_config.contraction)
+        self._marcher = Marcher(
+            capacity, self.march.in_unit(unit_m), field_config.box_high, field_config.contraction
+        )
         # Pixels to learn from, where a mask or an undistortion leaves some out.
         self._usable = None if images.valid is None else np.flatnonzero(images.valid)
         if self._usable is not None and not len(self._usable):

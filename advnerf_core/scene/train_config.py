@@ -34,7 +34,8 @@ class TrainConfig:
         occupancy_every: Steps between updates of the occupancy grid.
         warmup_steps: Steps during which sample intervals shrink to their final length and all cells are probed.
         march: How samples are placed, in training and rendering; None: by `pixel_intervals`, of the training images.
-        near_m: Nothing nearer to a camera than this is learned [m]; not used if ``march`` is given.
+        near_m: Nothing nearer to a camera than this is learned [m]; None: a share of the box, see `pixel_intervals`; not used if
+            ``march`` is given.
         interval_px: Sample intervals in pixels of the training images [px], instead of the rule's; not used if ``march`` is given.
         opacity: Weight of the rays' mean transmittance in the loss. A constant background is learned for what is left; without
             this pull it explains walls that all cameras see from one side, and is wrong from any other. Not used for images with
@@ -61,7 +62,7 @@ class TrainConfig:
     occupancy_every: int = 16
     warmup_steps: int = 256
     march: MarchConfig | None = None
-    near_m: float = 0.1
+    near_m: float | None = None
     interval_px: float | None = None
     opacity: float = 1.5e-3
     refine_depth: float = 0.05

@@ -360,7 +360,7 @@ def distortion_distances(samples: Samples, config: SceneFieldConfig) -> tuple[Ar
 
     In box sides; in a contracted field bounded.
     """
-    t = samples.t_mid_m / np.float32(config.extent_m)
+    t = samples.t_mid_m / np.float32(config.extent_m / config.ray_unit_m)
     return bounded_distances(t, samples.widths) if config.contraction else (t, samples.widths)
 
 

@@ -48,7 +48,22 @@ def object_build(
         int, typer.Option("--resolution", min=8, max=128, help="Voxels along the longest side.")
     ] = 64,
     height_m: Annotated[float | None, typer.Option("--height", help="Scale to this height [m].")] = None,
-    up: Annotated[str, typer.Option("--up", help="Axis of the file that points up: z or y.")] = "z",
+    up: Annotated[
+        str | None,
+        typer.Option(
+            "--up",
+            help="Axis of the file that points up: z or y.",
+            show_default="y for GLB and glTF, z for others",
+        ),
+    ] = None,
+    unit: Annotated[
+        str | None,
+        typer.Option(
+            "--unit",
+            help="Unit of length of the file: mm, cm, m or in.",
+            show_default="m for GLB and glTF; others need it, or --height",
+        ),
+    ] = None,
     steps: Annotated[
         int | None,
         typer.Option(
@@ -108,7 +123,7 @@ def object_build(
         if images is not None:
             model = _from_images(images, name, resolution, steps, minutes, size, coarse_to_fine, report)
         else:
-            mesh, source = _mesh(file, generate, up, height_m)
+            mesh, source = _mesh(file, generate, up, height_m, unit)
             model = build_from_mesh(mesh, name, resolution, 400 if steps is None else steps, source, report)
     save_object(path, model)
     _print_quality(path, model)
@@ -160,16 +175,17 @@ def object_info(file: ObjectPath) -> None:
     print_table(rows)
 
 
-def _mesh(file: Path | None, generate: str | None, up: str, height_m: float | None):  # type: ignore[no-untyped-def]
-    import hashlib
-
+def _mesh(  # type: ignore[no-untyped-def]
+    file: Path | None, generate: str | None, up: str | None, height_m: float | None, unit: str | None
+):
     from advnerf_core.objects.voxel.generators import GENERATORS
-    from advnerf_core.objects.voxel.mesh import load_mesh, stand
+    from advnerf_core.objects.voxel.mesh import stand
+    from advnerf_core.objects.voxel.mesh_files import load_mesh, mesh_digest
     from nodes.runtime.errors import ConfigError
 
     if file is not None:
-        mesh = load_mesh(file, up, height_m)
-        return mesh, {"mesh": file.name, "sha256": hashlib.sha256(file.read_bytes()).hexdigest()}
+        mesh = load_mesh(file, up, height_m, unit)
+        return mesh, {"mesh": file.name, "sha256": mesh_digest(file)}
     if generate not in GENERATORS:
         raise ConfigError(f"expected --generate to be one of {', '.join(GENERATORS)}; got {generate!r}")
     return stand(GENERATORS[generate](), height_m=height_m), {"generator": generate}
@@ -250,6 +266,5 @@ def _print_quality(path: Path, model: ObjectModel) -> None:
                 + ("" if own is None else f" ({own:.1f} dB on the object)")
             )
     print(", ".join(parts))
-    if "train_object_psnr_db" in model.about:
-        for text in advice(model.about):
-            print(f"warning: {text}")
+    for text in [*model.about.get("notes", ()), *advice(model.about)]:
+        print(f"warning: {text}")

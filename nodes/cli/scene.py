@@ -62,8 +62,14 @@ def scene_train(
         int, typer.Option("--every", min=2, help="Hold out every N-th image.")
     ] = _HELD_OUT_EVERY,
     near: Annotated[
-        float, typer.Option("--near", min=0.0, help="Learn nothing closer to a camera than this.")
-    ] = 0.05,
+        float | None,
+        typer.Option(
+            "--near",
+            min=0.0,
+            help="Learn nothing closer to a camera than this, in the unit of the file.",
+            show_default="1/80 of the box's longest side",
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option("--seed")] = 0,
     checkpoint_every_s: Annotated[
         float,

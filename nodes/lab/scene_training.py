@@ -11,7 +11,7 @@ from typing import Any
 import av
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from advnerf_core.data.dataset import ImageSet, PosedImages, load_transforms
 from advnerf_core.data.image_files import OPAQUE
@@ -22,6 +22,7 @@ from advnerf_core.places import require_utf8
 from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.field import SceneFieldConfig, save_scene
 from advnerf_core.scene.intervals import pixel_intervals
+from advnerf_core.scene.learning_check import LearningCheck
 from advnerf_core.scene.metrics import gain_fitted, psnr, ssim
 from advnerf_core.scene.presets import FAST, PHOTOGRAPH_BANDS
 from advnerf_core.scene.presets import PRESETS as SCENE_PRESETS
@@ -57,7 +58,7 @@ class TrainingRequest:
         size: ``(width, height)`` to which images are resized; None keeps their size.
         open_scene: Whether rays may leave the box and colours may depend on the direction, as outdoors.
         every: Every N-th image is held out, unless the data set has a split.
-        near: Distance from a camera below which nothing is learned, in the data set's unit.
+        near: Distance from a camera below which nothing is learned, in the data set's unit; None: 1/80 of the box's longest side.
         seed: Random seed.
         checkpoint_every_s: Time between checkpoints, the most training that a kill loses [s].
         unbounded: Whether the scene extends, contracted, outside the box; None: if the file's ``aabb_scale`` is more than 1.
@@ -77,7 +78,7 @@ class TrainingRequest:
     size: tuple[int, int] | None = None
     open_scene: bool = False
     every: int = 8
-    near: float = 0.05
+    near: float | None = None
     seed: int = 0
     checkpoint_every_s: float = 30.0
     unbounded: bool | None = None
@@ -114,7 +115,11 @@ def train(request: TrainingRequest, report: Report) -> dict[str, Any]:
     march = sample_intervals(request, field, images)
     print(_described(request, field, march))
 
+    check = LearningCheck(images)
+
     def progress(at: Progress) -> None:
+        if (told := check(at)) is not None:
+            print(f"warning: {told}", flush=True)
         report(0.95 * at.fraction, f"step {at.step}, {at.psnr_db:.1f} dB on training rays")
 
     trained = train_scene(
@@ -264,9 +269,12 @@ def scene_field(request: TrainingRequest, listed: PosedImages, transparent: bool
 
 def sample_intervals(request: TrainingRequest, field: SceneFieldConfig, images: ImageSet) -> MarchConfig:
     """Sample placement for training and rendering: by the default rule, unless the request overrides it."""
-    march = pixel_intervals(
-        images.pinholes, images.T_world_from_camera, field, request.near, request.interval_px
-    )
+    try:
+        march = pixel_intervals(
+            images.pinholes, images.T_world_from_camera, field, request.near, request.interval_px
+        )
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
     if request.interval is not None:
         march = replace(march, smallest_step_m=request.interval[0], largest_step_m=request.interval[1])
     return march if request.interval_growth is None else replace(march, step_growth=request.interval_growth)
@@ -308,7 +316,7 @@ def training_length(preset: str, steps: int | None, minutes: float | None) -> tu
 def _described(request: TrainingRequest, field: SceneFieldConfig, march: MarchConfig) -> str:
     """Describe the chosen settings and how to override them."""
     inside = "inner region" if field.contraction else "box"
-    low, high = (np.round(corner, 2).tolist() for corner in (field.box_low_m, field.box_high_m))
+    low, high = (_short(corner) for corner in (field.box_low_m, field.box_high_m))
     text = f"{inside} {low} .. {high}"
     if field.contraction:
         why = (
@@ -320,12 +328,19 @@ def _described(request: TrainingRequest, field: SceneFieldConfig, march: MarchCo
     if not field.learned_background:
         text += "; images have alpha: trained over random colours, transparent areas stay transparent"
     intervals = f"{march.smallest_step_m:.3g} .. {march.largest_step_m:.3g}, {march.step_growth:.3g} of the distance between"
-    return f"{text}; preset {request.preset}; sample intervals {intervals}"
+    return f"{text}; preset {request.preset}; nearest {march.near_m:.3g}; sample intervals {intervals}"
 
 
 def _span(listed: PosedImages) -> str:
     places = np.stack([frame.T_world_from_camera[:3, 3] for frame in listed.frames])
-    return f"{np.round(places.min(axis=0), 2).tolist()} .. {np.round(places.max(axis=0), 2).tolist()}"
+    return f"{_short(places.min(axis=0))} .. {_short(places.max(axis=0))}"
+
+
+def _short(corner: ArrayLike) -> list[float]:
+    """Coordinates with three digits of the largest, in any unit."""
+    values = np.asarray(corner, np.float64)
+    digits = 2 - int(np.floor(np.log10(max(float(np.abs(values).max()), 1e-30))))
+    return [float(value) for value in np.round(values, digits)]
 
 
 def _corner(corner: Array) -> tuple[float, float, float]:

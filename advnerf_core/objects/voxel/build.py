@@ -12,13 +12,13 @@ import numpy as np
 from advnerf_core.geometry import Array, Pinhole
 from advnerf_core.objects.voxel.fit import fit_grids
 from advnerf_core.objects.voxel.hull import visual_hull
-from advnerf_core.objects.voxel.mesh import SurfaceMesh
+from advnerf_core.objects.voxel.mesh import MeshError, SurfaceMesh
 from advnerf_core.objects.voxel.model import ObjectModel
 from advnerf_core.objects.voxel.pictures import PosedRgba
 from advnerf_core.objects.voxel.rasterise import draw_mesh
 from advnerf_core.objects.voxel.stages import fit_in_stages
 from advnerf_core.objects.voxel.views import dome, viewing_lens
-from advnerf_core.objects.voxel.voxelise import voxelise
+from advnerf_core.objects.voxel.voxelise import ObjectGrids, voxelise
 from advnerf_core.render.cast_object import cast_object
 
 Progress = Callable[[float, str], None]
@@ -26,6 +26,8 @@ FIT_VIEWS, FIT_PIXELS = 60, 160
 HELD_OUT_VIEWS = 12
 # Limits of a good fit to pictures; see `advice`.
 POOR_DB, UNFINISHED_DB, GAP_DB = 20.0, 0.3, 6.0
+# Shares of a mesh that its voxels may lose: without a warning, and at all.
+THIN, LOST = 0.05, 0.5
 # Rows that are drawn at once for a comparison: a whole picture of 800 x 800 takes as much memory as the pictures of a set.
 _STRIP_ROWS = 64
 # The held-out poses lie between those of the fit.
@@ -53,22 +55,35 @@ def build_from_mesh(
     told = progress or (lambda fraction, text: None)
     told(0.0, "voxelising")
     start = voxelise(mesh, resolution)
+    views = mesh_views(mesh, HELD_OUT_VIEWS, FIT_PIXELS, _HELD_OUT_PHASE)
+    _refuse_lost(Agreement.of(ObjectModel(name, start), views).missing, start, resolution)
     grids = (
         start
         if steps == 0
         else fit_grids(mesh_views(mesh, FIT_VIEWS, FIT_PIXELS), start, steps, progress=told).grids
     )
     model = ObjectModel(name, grids)
-    held_out = mesh_views(mesh, HELD_OUT_VIEWS, FIT_PIXELS, _HELD_OUT_PHASE)
+    judged = Agreement.of(model, views)
     about = {
         "source": source or {},
         "resolution": resolution,
         "steps": steps,
         "triangles": mesh.triangle_count,
-        "held_out_psnr_db": round(agreement_db(model, held_out), 2),
+        "held_out_psnr_db": round(judged.psnr_db, 2),
+        "held_out_object_psnr_db": round(judged.object_psnr_db, 2),
+        "missing": round(judged.missing, 3),
+        **({"notes": list(mesh.notes)} if mesh.notes else {}),
         "software_version": version("advnerf"),
     }
     return ObjectModel(name, model.grids, about)
+
+
+def _refuse_lost(missing: float, start: ObjectGrids, resolution: int) -> None:
+    if missing > LOST:
+        raise MeshError(
+            f"expected voxels that hold the object, {resolution} along its longest side lose {missing:.0%} of it: one is "
+            f"{1e3 * start.voxel:.3g} mm, longer than the object's thinnest parts; raise --resolution"
+        )
 
 
 def build_from_images(
@@ -125,12 +140,19 @@ def build_from_images(
 
 
 def advice(about: Mapping[str, Any]) -> list[str]:
-    """Say what is wrong with an object that was fitted to pictures, and what to do; empty if it is good.
+    """Say what is wrong with an object that was built, and what to do; empty if it is good.
 
+    A mesh loses parts that are thinner than a voxel: more than ``THIN`` of it is told. The rest is about pictures.
     The figures are those of the object's own pixels. ``POOR_DB`` is an error of a tenth of the colour range: colours that an
     attack changes must be known better than that. A fit is unfinished if the error fell by more than ``UNFINISHED_DB`` over the
     last fifth of its steps, and overfitted if held-out pictures are worse by more than ``GAP_DB``, twice the error.
     """
+    if about.get("missing", 0.0) > THIN:
+        return [
+            f"{about['missing']:.0%} of the object is lost: its thinnest parts are thinner than a voxel; raise --resolution"
+        ]
+    if "train_object_psnr_db" not in about:
+        return []
     train_db, held_out_db = about["train_object_psnr_db"], about.get("held_out_object_psnr_db")
     found = []
     worst_db = train_db if held_out_db is None else min(train_db, held_out_db)
@@ -189,15 +211,17 @@ class Agreement:
         psnr_db: Over all pixels of the pictures [dB].
         object_psnr_db: Over the pixels that the object covers, drawn or pictured [dB]. It does not depend on how much of a
             picture is empty.
+        missing: Share of the pictured object that is not drawn, 0..1.
     """
 
     psnr_db: float
     object_psnr_db: float
+    missing: float
 
     @classmethod
     def of(cls, model: ObjectModel, views: PosedRgba) -> Agreement:
         """Compare an object with pictures of it."""
-        squares, pixels, covered = 0.0, 0, 0
+        squares, pixels, covered, missing, pictured = 0.0, 0, 0, 0.0, 0.0
         for index, pinhole in enumerate(views.pinholes):
             image, pixels = views.picture(index), pixels + pinhole.width * pinhole.height
             for top in range(0, pinhole.height, _STRIP_ROWS):
@@ -208,7 +232,11 @@ class Agreement:
                 # Outside both silhouettes the error is zero: the sum is that of the covered pixels.
                 squares += float(np.square(error).sum())
                 covered += int(((drawn[..., 3] > 0.0) | (part[..., 3] > 0.0)).sum())
-        return cls(_psnr_db(squares, 3 * pixels), _psnr_db(squares, 3 * covered))
+                missing += float(np.maximum(part[..., 3] - drawn[..., 3], 0.0).sum())
+                pictured += float(part[..., 3].sum())
+        return cls(
+            _psnr_db(squares, 3 * pixels), _psnr_db(squares, 3 * covered), missing / max(pictured, 1e-12)
+        )
 
 
 def agreement_db(model: ObjectModel, views: PosedRgba) -> float:

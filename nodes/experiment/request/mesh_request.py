@@ -20,7 +20,12 @@ class MeshRequest(StrictModel):
 
     file: Path | None = Field(default=None, description="GLB, OBJ, PLY, STL.")
     generate: Literal["hydrant", "car", "ball"] | None = Field(default=None, description="Instead of a file.")
-    up: Literal["z", "y"] = Field(default="z", description="Which axis of the file points up.")
+    up: Literal["z", "y"] | None = Field(
+        default=None, description="Which axis of the file points up; y for glTF, z for others."
+    )
+    unit: Literal["mm", "cm", "m", "in"] | None = Field(
+        default=None, description="The file's unit; needed for others than glTF, or give height_m."
+    )
     height_m: AboveZero | None = Field(
         default=None, description="Scale to this height [m]; a ball's diameter."
     )

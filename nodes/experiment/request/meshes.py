@@ -13,7 +13,8 @@ from advnerf_core.objects.mesh.field import MeshField
 from advnerf_core.objects.mesh.shape import ShapeLimits, ShapeSensor
 from advnerf_core.objects.mesh.surface import TexturedMesh, sphere, unwrapped
 from advnerf_core.objects.voxel.generators import GENERATORS
-from advnerf_core.objects.voxel.mesh import load_mesh, stand
+from advnerf_core.objects.voxel.mesh import stand
+from advnerf_core.objects.voxel.mesh_files import load_mesh
 from advnerf_core.scene.surrogate import Surrogate, split_theta
 from nodes.experiment.request.mesh_request import MeshRequest, ShapeRequest
 
@@ -25,7 +26,9 @@ def mesh_field(wanted: MeshRequest, pose: Array, scale: float) -> MeshField:
         MeshError: A file that is no mesh.
     """
     if wanted.file is not None:
-        surface = load_mesh(wanted.file, wanted.up, wanted.height_m)
+        surface = load_mesh(wanted.file, wanted.up, wanted.height_m, wanted.unit)
+        for note in surface.notes:
+            print(f"warning: {note}")
     elif wanted.generate == "ball":
         surface = sphere(0.5 * (wanted.height_m or 0.7), wanted.rgb)
     else:

@@ -15,11 +15,11 @@ from advnerf_core.objects.voxel.generators import GENERATORS, hydrant, small_car
 from advnerf_core.objects.voxel.mesh import (
     MeshError,
     SurfaceMesh,
-    load_mesh,
     part_from_colours,
     stand,
     texture_colours,
 )
+from advnerf_core.objects.voxel.mesh_files import load_mesh
 from advnerf_core.objects.voxel.rasterise import draw_mesh
 from advnerf_core.objects.voxel.views import dome, look_at, ring, viewing_lens
 
@@ -38,10 +38,13 @@ def test_a_mesh_without_textures_has_its_vertex_colours(tmp_path):
     def coloured(box):
         return trimesh.visual.ColorVisuals(box, vertex_colors=np.tile([200, 100, 50, 255], (8, 1)))
 
-    mesh = load_mesh(textured_box(tmp_path / "box.glb", coloured))
+    mesh = load_mesh(textured_box(tmp_path / "box.ply", coloured), unit="m")
     np.testing.assert_allclose(mesh.size_m, [0.4, 0.6, 1.0], atol=1e-6)
     np.testing.assert_allclose(mesh.box[0], [-0.2, -0.3, 0.0], atol=1e-6)
     np.testing.assert_allclose(mesh.parts[0].texture[0, 0], [200 / 255, 100 / 255, 50 / 255], atol=1e-6)
+    # glTF's colours are linear light: 200, 100 and 50 of 255 are displayed as 229, 168 and 122 (IEC 61966-2-1).
+    linear = load_mesh(textured_box(tmp_path / "box.glb", coloured), up="z")
+    np.testing.assert_allclose(255 * linear.parts[0].texture[0, 0], [229.1, 168.1, 122.4], atol=0.5)
 
 
 def test_textures_are_embedded_and_scaled_meshes_stand_upright(tmp_path):
@@ -176,7 +179,7 @@ def test_cameras_look_at_the_object_from_around_it():
     [("fire_hydrant", (0.42, 0.42, 0.93)), ("hatchback_red", (2.14, 4.0, 1.57)), ("suv", (2.6, 5.0, 2.2))],
 )
 def test_models_from_the_world(name, size_m):
-    mesh = load_mesh(MODELS / f"{name}.glb")
+    mesh = load_mesh(MODELS / f"{name}.glb", up="z")  # these files ignore their format's convention
     np.testing.assert_allclose(mesh.size_m, size_m, atol=0.05)
     assert all(min(part.texture.shape[:2]) > 100 for part in mesh.parts)
     assert 0.05 < draw_mesh(mesh, ring(mesh.box, 1), viewing_lens(64))[0, ..., 3].mean() < 0.6

@@ -65,7 +65,7 @@ def test_a_foreign_log_becomes_frames_with_its_own_view(tmp_path):
         ),
         (
             lambda t: t.replace("2.png, -0.25", "2.png, left").replace("5.png", "no.png"),
-            "csv:4: angle.*\n.*csv:7: .*'no.png'",
+            r"csv:4: angle.*\n.*csv:7: .*no\.png",
         ),
     ],
 )

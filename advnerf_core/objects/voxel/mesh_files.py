@@ -1,0 +1,276 @@
+"""Mesh files: what trimesh reads, with what each format means by up, by length and by colour, and with all files that it names.
+
+Formats differ in what they say. glTF fixes metres, y up and linear colour factors; OBJ, PLY and STL say none of it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.geometry import Array
+from advnerf_core.objects.voxel.mesh import MeshError, MeshPart, SurfaceMesh, part_from_colours, stand
+
+UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
+_GLTF = (".glb", ".gltf")
+_GREY = (0.6, 0.6, 0.6)
+# What is put into a scene is larger than a nail and smaller than a stadium; other sizes come from another unit.
+_SANE_SIDE_M = (0.01, 100.0)
+# Extensions that change neither shape nor base colour, or that trimesh reads.
+_KNOWN_EXTENSIONS = ("KHR_materials_", "KHR_lights_", "EXT_texture_webp", "KHR_xmp")
+_TRANSPARENT = 250
+
+
+def load_mesh(
+    path: Path, up: str | None = None, height_m: float | None = None, unit: str | None = None
+) -> SurfaceMesh:
+    """Read a mesh file (GLB, OBJ, PLY, STL, ... whatever trimesh reads).
+
+    Args:
+        path: The file; textures and the scene graph's transforms are taken over.
+        up: Which axis of the file points up, ``"z"`` or ``"y"``; None: y for glTF, which says so, z for the others.
+        height_m: Scale to this height [m], whatever the unit.
+        unit: The file's unit of length: ``mm``, ``cm``, ``m`` or ``in``; None: the metre for glTF, whose unit it is.
+
+    Raises:
+        MeshError: No file, not a mesh, no triangles, an image that it names is missing or broken, coordinates that are not finite, a
+            unit that neither format nor caller say, or a size no object has.
+    """
+    if unit is not None and unit not in UNITS_M:
+        raise MeshError(f"expected a unit of {', '.join(UNITS_M)}, got {unit!r}")
+    if height_m is not None and not (np.isfinite(height_m) and height_m > 0):
+        raise MeshError(f"expected a height above zero, got {height_m}")
+    _refuse_broken_images(path, mesh_files(path)[1:])
+    notes: list[str] = []
+    parts = [_part(geometry, path, notes) for geometry in _geometries(path)]
+    if not parts or sum(len(part.triangles) for part in parts) == 0:
+        raise MeshError(
+            f"expected a mesh with triangles in {path}, got none: is it a point cloud or an empty scene?"
+        )
+    gltf = path.suffix.lower() in _GLTF
+    mesh = stand(SurfaceMesh(tuple(parts)), up or ("y" if gltf else "z"), height_m, str(path))
+    if height_m is None:
+        mesh = mesh.scaled(_metres(path, mesh, unit, gltf))
+    return SurfaceMesh(mesh.parts, tuple(dict.fromkeys(notes)))
+
+
+def mesh_files(path: Path) -> list[Path]:
+    """A mesh file with all files that it names: materials, buffers and images.
+
+    Raises:
+        MeshError: One of them is missing.
+    """
+    if not path.is_file():
+        raise MeshError(f"expected a mesh file at {path}, found none")
+    named = {".obj": _named_by_obj, ".gltf": _named_by_gltf, ".glb": _named_by_gltf}.get(path.suffix.lower())
+    files = [path, *([] if named is None else named(path))]
+    missing = [str(file) for file in files if not file.is_file()]
+    if missing:
+        raise MeshError(
+            f"expected the files that {path} names, missing: {', '.join(missing)}; put them there, or export the mesh as one GLB"
+        )
+    return list(dict.fromkeys(files))
+
+
+def mesh_digest(path: Path) -> str:
+    """SHA-256 of a mesh file and of all files that it names."""
+    digest = hashlib.sha256()
+    for file in mesh_files(path):
+        content = file.read_bytes()
+        digest.update(f"{file.name}:{len(content)}:".encode() + content)
+    return digest.hexdigest()
+
+
+def _metres(path: Path, mesh: SurfaceMesh, unit: str | None, gltf: bool) -> float:
+    """Factor from the file's unit to metres."""
+    side = float(mesh.size_m.max())
+    if unit is not None:
+        return UNITS_M[unit]
+    if gltf and _SANE_SIDE_M[0] <= side <= _SANE_SIDE_M[1]:
+        return 1.0
+    choices = ", ".join(f"{name} (longest side {side * factor:.4g} m)" for name, factor in UNITS_M.items())
+    if gltf:
+        raise MeshError(
+            f"expected {path} in metres, as glTF defines, got a longest side of {side:.4g} m; give its unit: {choices}; or its height"
+        )
+    raise MeshError(
+        f"expected the unit of {path}, which {path.suffix or 'its format'} does not say; give it: {choices}; or give its height"
+    )
+
+
+def _named_by_obj(path: Path) -> list[Path]:
+    found = []
+    for words in _lines(path):
+        if words[0] != "mtllib" or len(words) == 1:
+            continue
+        library = _beside(path, words[1:])
+        found.append(library)
+        if library.is_file():
+            maps = [line for line in _lines(library) if line[0] in ("map_Kd", "map_Ka")]
+            found += [_beside(library, line[1:]) for line in maps if len(line) > 1]
+    return found
+
+
+def _beside(path: Path, words: list[str]) -> Path:
+    """A named file: all words, or the last one after options."""
+    name = words[-1] if words[0].startswith("-") else " ".join(words)
+    return path.parent / name.replace("\\", "/")
+
+
+def _lines(path: Path) -> Iterator[list[str]]:
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        if line.lstrip().startswith(("mtllib", "map_")):
+            yield line.split()
+
+
+def _named_by_gltf(path: Path) -> list[Path]:
+    header = _gltf_header(path)
+    required = [
+        each for each in header.get("extensionsRequired", []) if not each.startswith(_KNOWN_EXTENSIONS)
+    ]
+    used = [each for each in header.get("extensionsUsed", []) if each == "KHR_texture_transform"]
+    if required or used:
+        raise MeshError(
+            f"expected a mesh without the glTF extension {', '.join({*required, *used})}, got {path}; export it again without it"
+        )
+    entries = [*header.get("images", []), *header.get("buffers", [])]
+    names = [str(entry["uri"]) for entry in entries if "uri" in entry]
+    return [path.parent / unquote(name) for name in names if not name.startswith("data:")]
+
+
+def _refuse_broken_images(path: Path, named: list[Path]) -> None:
+    """Refuse images that cannot be decoded: trimesh leaves them out, and shows white."""
+    from PIL import Image
+
+    contents = [
+        (str(file), file.read_bytes()) for file in named if file.suffix.lower() not in (".mtl", ".bin")
+    ]
+    if path.suffix.lower() == ".glb":
+        contents += [(f"image {k} of {path}", content) for k, content in enumerate(_embedded(path))]
+    for name, content in contents:
+        try:
+            with Image.open(io.BytesIO(content)) as image:
+                image.load()
+        except (OSError, SyntaxError, ValueError) as error:
+            raise MeshError(
+                f"expected a readable texture, got {name} ({len(content)} bytes): {error}"
+            ) from error
+
+
+def _embedded(path: Path) -> Iterator[bytes]:
+    """The images inside a GLB file."""
+    data, header = path.read_bytes(), _gltf_header(path)
+    start = 20 + struct.unpack_from("<I", data, 12)[0] + 8
+    for image in header.get("images", []):
+        if "bufferView" in image:
+            view = header["bufferViews"][image["bufferView"]]
+            at = start + view.get("byteOffset", 0)
+            yield data[at : at + view["byteLength"]]
+
+
+def _gltf_header(path: Path) -> dict[str, Any]:
+    data = path.read_bytes()
+    try:
+        if data.startswith(b"glTF"):
+            (length,) = struct.unpack_from("<I", data, 12)
+            data = data[20 : 20 + length]
+        header = json.loads(data)
+        if isinstance(header, dict):
+            return header
+    except (ValueError, struct.error):
+        pass
+    raise MeshError(f"cannot read {path} as a mesh (no glTF header); export it again")
+
+
+def _geometries(path: Path) -> list[Any]:
+    import trimesh
+
+    try:
+        scene = trimesh.load_scene(path)
+        dumped = scene.dump(concatenate=False)
+    except Exception as error:  # trimesh's readers raise whatever they stumble over
+        raise MeshError(
+            f"cannot read {path} as a mesh ({type(error).__name__}: {error}); export it again"
+        ) from error
+    return [geometry for geometry in dumped if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces)]
+
+
+def _part(geometry: Any, path: Path, notes: list[str]) -> MeshPart:
+    faces = np.asarray(geometry.faces)
+    triangles = np.asarray(geometry.vertices, dtype=np.float64)[faces]
+    visual, linear = geometry.visual, path.suffix.lower() in _GLTF
+    uv = getattr(visual, "uv", None)
+    if uv is not None and len(uv) == len(geometry.vertices):
+        texture = _texture(visual.material, path, linear, notes)
+        return MeshPart(triangles, np.nan_to_num(np.asarray(uv, dtype=np.float64))[faces], texture)
+    colours = getattr(visual, "face_colors", None)
+    if visual.kind == "vertex":
+        colours = np.asarray(visual.vertex_colors)[faces].mean(axis=1)
+    if visual.defined and colours is not None and len(colours) == len(faces):
+        return part_from_colours(triangles, _displayed(np.asarray(colours)[:, :3] / 255.0, linear))
+    material = getattr(visual, "material", None)
+    if _names_an_image(material):
+        raise MeshError(
+            f"expected texture coordinates for the image of {path}, got none; export it again with them"
+        )
+    return part_from_colours(triangles, np.broadcast_to(_plain_colour(material, linear), (len(faces), 3)))
+
+
+def _names_an_image(material: Any) -> bool:
+    return any(getattr(material, name, None) is not None for name in ("baseColorTexture", "image"))
+
+
+def _plain_colour(material: Any, linear: bool) -> Array:
+    """A material's colour without an image, in display values; grey where there is no material."""
+    if material is not None and linear:
+        factor = getattr(material, "baseColorFactor", None)
+        return np.ones(3) if factor is None else _displayed(np.asarray(factor)[:3] / 255.0, True)
+    main = getattr(material, "main_color", None)
+    return np.array(_GREY) if main is None else np.asarray(main, np.float64)[:3] / 255.0
+
+
+def _texture(material: Any, path: Path, linear: bool, notes: list[str]) -> NDArray[np.float32]:
+    image = getattr(material, "baseColorTexture", None)
+    if image is None:
+        image = getattr(material, "image", None)
+    if image is None:
+        return _plain_colour(material, linear).astype(np.float32).reshape(1, 1, 3)
+    try:
+        rgba = np.asarray(image.convert("RGBA"), dtype=np.float32) / np.float32(255.0)
+    except OSError as error:
+        raise MeshError(f"cannot read a texture of {path} ({error}); export it again") from error
+    opaque = linear and getattr(material, "alphaMode", None) in (None, "OPAQUE")
+    if not opaque and 255.0 * rgba[..., 3].min() < _TRANSPARENT:
+        share = float((255.0 * rgba[..., 3] < _TRANSPARENT).mean())
+        notes.append(
+            f"a texture of {path.name} is transparent in {share:.0%} of its texels; objects are opaque, so it is shown opaque there"
+        )
+    factor = getattr(material, "baseColorFactor", None)
+    rgb = np.ascontiguousarray(rgba[..., :3])
+    if factor is None or (np.asarray(factor)[:3] == 255).all():
+        return rgb
+    product = _linear(rgb) * np.asarray(factor, np.float64)[:3] / 255.0 if linear else rgb
+    return np.ascontiguousarray(_displayed(product, linear), dtype=np.float32)
+
+
+def _displayed(rgb: Array, linear: bool) -> Array:
+    """Display values of colours 0..1, by the sRGB curve (IEC 61966-2-1) where they are linear light."""
+    if not linear:
+        return np.asarray(rgb, np.float64)
+    low = np.asarray(rgb, np.float64) <= 0.0031308
+    return np.where(low, 12.92 * rgb, 1.055 * np.power(np.maximum(rgb, 0.0031308), 1 / 2.4) - 0.055)
+
+
+def _linear(rgb: NDArray[np.float32]) -> Array:
+    """Linear light of display values 0..1."""
+    values = np.asarray(rgb, np.float64)
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)

@@ -1,0 +1,218 @@
+"""What formats of meshes mean by up, length and colour, and what they name, against files that are written here by hand."""
+
+import base64
+import io
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from advnerf_core.objects.mesh.glb import glb_bytes
+from advnerf_core.objects.mesh.surface import sphere, unwrapped
+from advnerf_core.objects.voxel.build import LOST, THIN, advice, build_from_mesh
+from advnerf_core.objects.voxel.mesh import MeshError, SurfaceMesh, part_from_colours
+from advnerf_core.objects.voxel.mesh_files import load_mesh, mesh_digest, mesh_files
+
+CASE = Path(__file__).parents[4] / "shared/data/cases/glb_up_and_colour"
+TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0]], "<f4")
+UV = np.array([[0, 0], [1, 0], [0, 1]], "<f4")
+
+
+def png(colour=(10, 200, 30, 255)):
+    buffer = io.BytesIO()
+    Image.fromarray(np.full((4, 4, 4), colour, np.uint8)).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def gltf(path, material, image=None, **header):
+    """One triangle of 1 m along x and 2 m along y (glTF 2.0, sections 3.6 and 3.9)."""
+    body = TRIANGLE.tobytes() + UV.tobytes()
+    buffer = "data:application/octet-stream;base64," + base64.b64encode(body).decode()
+    content = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [
+            {"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "material": 0, "mode": 4}]}
+        ],
+        "materials": [material],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3", "min": [0, 0, 0], "max": [1, 2, 0]},
+            {"bufferView": 1, "componentType": 5126, "count": 3, "type": "VEC2"},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": 0, "byteLength": 36},
+            {"buffer": 0, "byteOffset": 36, "byteLength": 24},
+        ],
+        "buffers": [{"uri": buffer, "byteLength": len(body)}],
+        **header,
+    }  # fmt: skip
+    if image is not None:
+        content |= {"images": [{"uri": image}], "textures": [{"source": 0}]}
+    path.write_text(json.dumps(content))
+    return path
+
+
+def pbr(**values):
+    return {"pbrMetallicRoughness": values}
+
+
+TEXTURED = {"baseColorTexture": {"index": 0}}
+
+
+def obj(folder, name="a.obj", material="map_Kd my texture.png"):
+    (folder / name).write_text(
+        "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 0 2\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
+    )
+    if material is not None:
+        (folder / "a.mtl").write_text(f"newmtl m\nKd 0.5 0.25 0\n{material}\n")
+    return folder / name
+
+
+def test_gltf_stands_on_its_y_and_factors_are_linear_light(tmp_path):
+    mesh = load_mesh(gltf(tmp_path / "a.gltf", pbr(baseColorFactor=[0.5, 0.25, 0.0, 1.0])))
+    np.testing.assert_allclose(mesh.size_m, [1.0, 0.0, 2.0], atol=1e-6)
+    np.testing.assert_allclose(mesh.parts[0].texture[0, 0], [0.735, 0.537, 0.0], atol=2e-3)
+    np.testing.assert_allclose(load_mesh(tmp_path / "a.gltf", up="z").size_m, [1.0, 2.0, 0.0], atol=1e-6)
+
+
+def test_a_factor_darkens_a_texture_in_linear_light(tmp_path):
+    (tmp_path / "t.png").write_bytes(png((188, 188, 188, 255)))  # half of the light
+    plain = load_mesh(gltf(tmp_path / "a.gltf", pbr(**TEXTURED), "t.png"))
+    assert (np.rint(255 * plain.parts[0].texture) == 188).all()
+    half = load_mesh(gltf(tmp_path / "b.gltf", pbr(**TEXTURED, baseColorFactor=[0.5, 0.5, 0.5, 1]), "t.png"))
+    np.testing.assert_allclose(half.parts[0].texture, 0.537, atol=3e-3)  # a quarter of the light
+
+
+@pytest.mark.skipif(not CASE.exists(), reason="the shared cases are not here")
+def test_a_strangers_glb_stands_and_has_its_colour():
+    np.testing.assert_allclose(load_mesh(CASE / "yup.glb").size_m, [0.3, 0.3, 1.0], atol=0.01)
+    colour = load_mesh(CASE / "factor.glb").parts[0].texture[0, 0]
+    np.testing.assert_allclose(colour, [0.735, 0.537, 0.0], atol=3e-3)
+
+
+def test_what_this_software_writes_it_reads_upright(tmp_path):
+    tall = SurfaceMesh(
+        tuple(
+            part_from_colours(p.triangles * [1, 1, 3], np.ones((len(p.triangles), 3)))
+            for p in sphere(0.3, (1, 0, 0)).parts
+        )
+    )
+    (tmp_path / "found.glb").write_bytes(glb_bytes(unwrapped(tall)))
+    np.testing.assert_allclose(load_mesh(tmp_path / "found.glb").size_m, tall.size_m, atol=1e-5)
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("mm", 0.001), ("cm", 0.01), ("m", 1.0), ("in", 0.0254)])
+def test_a_unit_that_a_format_does_not_say_is_asked_for(tmp_path, unit, factor):
+    box = trimesh.creation.box((40.0, 60.0, 100.0))
+    for suffix in ("stl", "obj", "ply"):
+        path = tmp_path / f"box.{suffix}"
+        box.export(path)
+        with pytest.raises(
+            MeshError, match=rf"unit of .*box\.{suffix}, .*mm \(longest side 0\.1 m\).*in \(.*2\.54 m"
+        ):
+            load_mesh(path)
+        np.testing.assert_allclose(
+            load_mesh(path, unit=unit).size_m, np.array([40, 60, 100]) * factor, rtol=1e-6
+        )
+        assert load_mesh(path, height_m=0.5).size_m[2] == pytest.approx(0.5)
+    with pytest.raises(MeshError, match="expected a unit of mm, cm, m, in, got 'ft'"):
+        load_mesh(path, unit="ft")
+
+
+def test_a_gltf_in_millimetres_is_refused_with_the_line_to_add(tmp_path):
+    trimesh.Scene(trimesh.creation.box((40.0, 1000.0, 100.0))).export(tmp_path / "box.glb")
+    with pytest.raises(
+        MeshError, match=r"in metres, as glTF defines, got .* 1000 m; .*mm \(longest side 1 m\)"
+    ):
+        load_mesh(tmp_path / "box.glb")
+    np.testing.assert_allclose(load_mesh(tmp_path / "box.glb", unit="mm").size_m, [0.04, 0.1, 1.0])
+
+
+def test_an_objects_files_are_found_and_hashed(tmp_path):
+    path = obj(tmp_path)
+    (tmp_path / "my texture.png").write_bytes(png())
+    assert [file.name for file in mesh_files(path)] == ["a.obj", "a.mtl", "my texture.png"]
+    texture = load_mesh(path, unit="m").parts[0].texture
+    np.testing.assert_allclose(255 * texture[0, 0], [10, 200, 30], atol=0.5)
+    digests = [mesh_digest(path)]
+    (tmp_path / "my texture.png").write_bytes(png((11, 200, 30, 255)))
+    digests.append(mesh_digest(path))
+    (tmp_path / "a.mtl").write_text((tmp_path / "a.mtl").read_text() + "# other\n")
+    digests.append(mesh_digest(path))
+    assert len(set(digests)) == 3
+
+
+def test_named_files_that_are_missing_or_broken_are_errors(tmp_path):
+    path = obj(tmp_path, material=None)
+    with pytest.raises(MeshError, match=r"missing: .*a\.mtl"):
+        load_mesh(path, unit="m")
+    obj(tmp_path)
+    with pytest.raises(MeshError, match=r"missing: .*my texture\.png"):
+        load_mesh(path, unit="m")
+    for content in (b"", png()[:45]):
+        (tmp_path / "my texture.png").write_bytes(content)
+        with pytest.raises(MeshError, match=r"readable texture, got .*my texture\.png"):
+            load_mesh(path, unit="m")
+    with pytest.raises(MeshError, match=r"missing: .*not there\.png"):
+        load_mesh(gltf(tmp_path / "a.gltf", pbr(**TEXTURED), "not%20there.png"))
+
+
+def test_a_broken_image_inside_a_glb_is_an_error(tmp_path):
+    (tmp_path / "a.glb").write_bytes(glb_bytes(unwrapped(sphere(0.3, (1, 0, 0)))))
+    data = bytearray((tmp_path / "a.glb").read_bytes())
+    at = data.index(b"\x89PNG")
+    data[at + 8 : at + 40] = bytes(32)
+    (tmp_path / "a.glb").write_bytes(data)
+    with pytest.raises(MeshError, match=r"readable texture, got image 0 of .*a\.glb"):
+        load_mesh(tmp_path / "a.glb")
+
+
+@pytest.mark.parametrize("mode", ["OPAQUE", "MASK", "BLEND"])
+def test_a_transparent_texture_is_told_where_it_counts(tmp_path, mode):
+    (tmp_path / "t.png").write_bytes(png((10, 200, 30, 100)))
+    mesh = load_mesh(gltf(tmp_path / "a.gltf", {**pbr(**TEXTURED), "alphaMode": mode}, "t.png"))
+    np.testing.assert_allclose(255 * mesh.parts[0].texture[0, 0], [10, 200, 30], atol=0.5)
+    assert [("transparent in 100%" in note) for note in mesh.notes] == [True] * (mode != "OPAQUE")
+
+
+@pytest.mark.parametrize("key", ["extensionsRequired", "extensionsUsed"])
+def test_an_extension_that_changes_the_picture_is_named(tmp_path, key):
+    path = gltf(tmp_path / "a.gltf", pbr(), **{key: ["KHR_texture_transform"]})
+    with pytest.raises(MeshError, match="KHR_texture_transform"):
+        load_mesh(path)
+    load_mesh(gltf(tmp_path / "b.gltf", pbr(), **{key: ["KHR_materials_unlit"]}))
+
+
+def test_glb_headers_that_lie_are_one_error(tmp_path):
+    for content in (b"glTF", b"glTF" + struct.pack("<IIII", 2, 20, 1 << 30, 0), b"[]", b""):
+        (tmp_path / "a.glb").write_bytes(content)
+        with pytest.raises(MeshError, match=r"cannot read .*a\.glb"):
+            load_mesh(tmp_path / "a.glb")
+
+
+def bottle():
+    """35 mm thick below, 12 mm at its neck, 260 mm high."""
+    outline = np.array([[0, 0], [0.035, 0], [0.035, 0.16], [0.012, 0.2], [0.012, 0.26], [0, 0.26]])
+    surface = trimesh.creation.revolve(outline, sections=24)
+    return SurfaceMesh(
+        (part_from_colours(surface.vertices[surface.faces], np.full((len(surface.faces), 3), 0.5)),)
+    )
+
+
+def test_voxels_that_lose_the_object_are_refused_or_told():
+    with pytest.raises(
+        MeshError, match=r"8 along its longest side lose \d+% of it: one is 65 mm.*--resolution"
+    ):
+        build_from_mesh(bottle(), "bottle", 8, 0)
+    coarse = build_from_mesh(bottle(), "bottle", 16, 0).about
+    assert THIN < coarse["missing"] < LOST
+    assert "thinner than a voxel; raise --resolution" in advice(coarse)[0]
+    fine = build_from_mesh(bottle(), "bottle", 32, 0).about
+    assert (fine["missing"] < THIN, advice(fine)) == (True, [])
+    assert fine["held_out_object_psnr_db"] < fine["held_out_psnr_db"] - 5.0
