@@ -27,7 +27,6 @@ SMALL = [
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 @pytest.mark.parametrize("file", ["room", "monitor"])
 def test_from_photographs_to_report_and_nothing_twice(tmp_path, file):
     os.environ.setdefault("MUJOCO_GL", "egl")
@@ -54,7 +53,6 @@ def test_from_photographs_to_report_and_nothing_twice(tmp_path, file):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 @pytest.mark.parametrize("file", ["room", "monitor"])
 def test_a_face_is_also_deployed_without_nodes_and_meets_the_same_searches(tmp_path, file):
     """The second deployer: the lab's own car in this process, past the face that is drawn, or shown on the screen."""
@@ -75,7 +73,6 @@ def test_a_face_is_also_deployed_without_nodes_and_meets_the_same_searches(tmp_p
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 def test_a_cell_of_another_seed_is_searched_and_driven_live_once(tmp_path):
     os.environ.setdefault("MUJOCO_GL", "egl")
     experiment = load_experiment(LAUNCH / "monitor.experiment.yaml", "demo", SMALL, tmp_path / "run")
