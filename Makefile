@@ -5,9 +5,8 @@ BIN := $(VENV)/bin
 export MUJOCO_GL ?= egl
 # Kept byte code, whatever the shell asks for: the second run of pytest need not rewrite the assertions of 365 files again.
 export PYTHONDONTWRITEBYTECODE :=
-DEFAULT_TESTS := not slow and not gpu and not hardware and not data and not browser and not ros2
 
-.PHONY: help setup demo experiment evidence world test computing-tests test-slow test-gpu test-hardware test-browser setup-ros2 test-ros2 check bench bench-quick campaign rooms api docs fmt clean clean-runs
+.PHONY: help setup demo experiment evidence world test test-timing test-slow test-gpu test-hardware test-browser setup-ros2 test-ros2 check bench bench-quick campaign rooms api docs fmt clean clean-runs
 
 help:  ## Show this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -57,38 +56,23 @@ world: setup  ## A simulator of other people, from its installation to its table
 	$(BIN)/python -m benchmarks.learned_roads runs/$(NAME) --wall-s $$(( $$(date +%s) - began ))
 
 test: setup  ## The default tests (five to seven minutes on 2 cores)
-	@# Tests that measure time or start nodes run one after the other and mostly wait. Those that compute use what that leaves of the
-	@# processors and nothing else: the kernel gives an idle-class process no time that another one wants. Collecting only the files
-	@# that mark a test as live saves ten seconds of imports.
-	@chrt --idle 0 $(MAKE) -s computing-tests >$(VENV)/computing-tests.log 2>&1 & computing=$$!; \
-	trap "kill $$computing; exit 130" INT TERM; \
-	$(BIN)/pytest -q -m '$(DEFAULT_TESTS) and live' $$(grep -rl --include='*.py' 'mark\.live' tests); live=$$?; \
-	echo "waiting for the tests that compute ($(VENV)/computing-tests.log)"; \
-	wait $$computing; computing=$$?; cat $(VENV)/computing-tests.log; \
-	test $$live -eq 0 -a $$computing -eq 0
+	@$(BIN)/python -m tests.support.default_tests
 
-# One worker more than processors, as some wait for a process of theirs.
-computing-tests: $(VENV)/.kernels
-	@OMP_NUM_THREADS=1 $(BIN)/pytest -q -n $$(( $$(nproc) + 1 )) --maxprocesses 4 --dist worksteal -p no:cacheprovider \
-		-m '$(DEFAULT_TESTS) and not live'
-
-# The tiny experiment needs most kernels. Compiled by it, they are compiled once; otherwise each worker of the tests would do so.
-$(VENV)/.kernels: $(VENV)/.installed $(shell grep -rl --include='*.py' njit advnerf_core)
-	@OMP_NUM_THREADS=1 $(BIN)/pytest -q -p no:cacheprovider tests/nodes/experiment/test_versions.py
-	@touch $@
+test-timing: setup  ## The tests that hold code to a clock (two minutes, alone on a quiet machine)
+	@$(BIN)/pytest -q -m 'timing'
 
 test-slow: setup  ## The tests that take minutes, the default ones excluded
-	@$(BIN)/pytest -q -m 'slow' --timeout 1200
+	@$(BIN)/pytest -q -m 'slow' --timeout 3600
 
 test-gpu: setup  ## The tests that need a CUDA device, or only the compiler for one
 	@$(PIP) -e '.[gpu]'
-	@$(BIN)/pytest -q -m 'gpu' --timeout 1200
+	@$(BIN)/pytest -q -m 'gpu' --timeout 3600
 
 test-hardware: setup  ## The tests that need a real device; each says which, and skips without it
-	@$(BIN)/pytest -q -m 'hardware' --timeout 1200
+	@$(BIN)/pytest -q -m 'hardware'
 
 test-browser: setup  ## The tests that drive the operator page in Chromium (apt-get install chromium)
-	@$(BIN)/pytest -q -m 'browser' --timeout 300
+	@$(BIN)/pytest -q -m 'browser'
 
 # rclpy cannot share our environment: it has packages of ROS in the versions of one distribution.
 ROS2_VENV ?= .venv-ros2
@@ -99,7 +83,7 @@ $(ROS2_VENV)/.installed: benchmarks/rclpy_peers/requirements.txt
 	@touch $@
 
 test-ros2: setup setup-ros2  ## The tests with real rclpy programs as peers (two minutes)
-	@ADVNERF_RCLPY_PYTHON=$(ROS2_VENV)/bin/python $(BIN)/pytest -q -m 'ros2' --timeout 300
+	@ADVNERF_RCLPY_PYTHON=$(ROS2_VENV)/bin/python $(BIN)/pytest -q -m 'ros2'
 
 check: setup  ## Lint, types (also of the Python in the pages), import contracts
 	@$(BIN)/ruff check .

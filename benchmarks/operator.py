@@ -94,14 +94,14 @@ class LiveOperator:
         now = SystemClock().now()
         self.bus.publish("/arm", arm_message(Asked.at(now), now, arm, source, "test"))
 
-    def wait_ready(self, timeout_s: float = 40.0) -> None:
+    def wait_ready(self, timeout_s: float = 300.0) -> None:
         """Wait for all nodes."""
         self.wait_until(
             lambda: all(self.state_of(name) in _UP for name in self.nodes), timeout_s, "for the nodes"
         )
-        self.bus.wait_for_subscribers(["/arm", "/twin/reset"], 10.0)
+        self.bus.wait_for_subscribers(["/arm", "/twin/reset"], timeout_s)
 
-    def arm(self, timeout_s: float = 15.0) -> None:
+    def arm(self, timeout_s: float = 60.0) -> None:
         """Ask for arming until it is granted."""
         asked_s = 0.0
 

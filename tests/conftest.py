@@ -1,8 +1,12 @@
-"""What all tests share: live tests run again after the host paused, and tests that spoil their process get one of their own."""
+"""What all tests share: live tests run again after they got no processor, and tests that spoil their process get one of their own.
+
+No test meets the launches of the user, or of another run of the tests: each run has a runtime folder of its own.
+"""
 
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -13,35 +17,79 @@ from pathlib import Path
 import pytest
 from _pytest.runner import runtestprotocol
 
-from benchmarks.host_pauses import stolen
+from tests.support.processors import Shortage
 
-# A live test that fails while this share of the processors was withheld by the host says nothing.
-_STOLEN_SHARE, _ATTEMPTS, _REST_S = 0.01, 5, 4.0
+_ATTEMPTS, _REST_S = 5, 4.0
 _INSIDE = "ADVNERF_TEST_IN_ITS_OWN_PROCESS"
+
+
+class _Passed:
+    """Notes the tests that pass, or are skipped, in a file.
+
+    Args:
+        file: The file.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self._file, self._good = file, {}
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        self._good[report.nodeid] = self._good.get(report.nodeid, True) and not report.failed
+        if report.when == "teardown" and self._good.pop(report.nodeid):
+            with self._file.open("a", encoding="utf-8") as file:
+                file.write(f"{report.nodeid}\n")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """For `tests.support.default_tests`, which runs some tests in two attempts."""
+    parser.addoption(
+        "--passed", type=Path, help="file of tests that passed: they are left out, and others join them"
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Give this run a runtime folder: ``advnerf disarm`` of a test must not stop the car of another."""
+    folder = tempfile.mkdtemp(prefix="advnerf-tests-")
+    before = os.environ.get("XDG_RUNTIME_DIR")
+    os.environ["XDG_RUNTIME_DIR"] = folder
+
+    def undo() -> None:
+        shutil.rmtree(folder, ignore_errors=True)
+        os.environ.pop("XDG_RUNTIME_DIR")
+        if before is not None:
+            os.environ["XDG_RUNTIME_DIR"] = before
+
+    config.add_cleanup(undo)
+    if (passed := config.getoption("--passed")) and not hasattr(config, "workerinput"):
+        config.pluginmanager.register(_Passed(passed))
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out what has passed already."""
+    file = config.getoption("--passed")
+    if file is not None and file.exists():
+        passed = set(file.read_text(encoding="utf-8").splitlines())
+        items[:] = [item for item in items if item.nodeid not in passed]
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
-    """Run a live test again that failed while the host withheld the processors.
+    """Run a live test again that failed while the processors had no time to spare.
 
-    On a shared host a virtual machine may stand still for half a second, and then a car stops as it should, whatever the test
-    expects. The kernel counts such time; where it counts none (a machine of one's own), a failure is a failure at once.
+    The car stops when its nodes are late, as it should, whatever a test expects; and nodes are late where others take the processors,
+    be it other processes or the host of a virtual machine. Where there was time to spare a failure is a failure at once.
     """
     if not item.get_closest_marker("live"):
         return None
     for attempt in range(_ATTEMPTS):
-        before = stolen()
+        shortage = Shortage()
         item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
         reports = runtestprotocol(item, nextitem=nextitem, log=False)
-        share = (stolen()[0] - before[0]) / max(1, stolen()[1] - before[1])
-        again = (
-            any(report.failed for report in reports) and share >= _STOLEN_SHARE and attempt + 1 < _ATTEMPTS
-        )
+        why = shortage.found() if any(report.failed for report in reports) else ""
+        again = bool(why) and attempt + 1 < _ATTEMPTS
         if again:
-            print(
-                f"\n{item.nodeid} failed while the host withheld {share:.0%} of the processors; again",
-                file=sys.__stderr__,
-            )
+            item.session._setupstate.teardown_exact(None)  # what a failure leaves behind is not used again
+            print(f"\n{item.nodeid} failed while {why}; again", file=sys.__stderr__)
         else:
             for report in reports:
                 item.ihook.pytest_runtest_logreport(report=report)
@@ -83,7 +131,6 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
         text=True,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
-        timeout=100,
     )
     if done.returncode != 0:
         pytest.fail(f"in its own process:\n{done.stdout}", pytrace=False)

@@ -67,7 +67,6 @@ def home(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_the_blocks_of_a_page_run(home, page):
     mine = home / "runs" / "my_policy"

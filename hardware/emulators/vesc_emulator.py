@@ -22,7 +22,7 @@ from hardware.emulators.vesc_firmware import VescEmulatorConfig, VescFirmware, W
 from hardware.emulators.vesc_wire import require_wire_fault, wire_chunks
 from hardware.errors import HardwareError
 from hardware.motor.vesc_settings import TimeoutSettings
-from hardware.worlds.lab.vehicle import TwinVehicle
+from hardware.worlds.lab.vehicle import TwinVehicle, require_jam
 
 # Slower than this the car stands.
 STANDSTILL_MPS = 0.005
@@ -51,6 +51,7 @@ class VescEmulator:
         self._lock = threading.RLock()
         self._events: deque[WireEvent] = deque(maxlen=100_000)
         self._moving = False
+        self._jam: tuple[str | None, int] | None = None
         self._log: TextIO | None = None
         if log is not None:
             self._log = open(log, "w", buffering=1, encoding="ascii")  # noqa: SIM115 - closed in close()
@@ -101,6 +102,9 @@ class VescEmulator:
         """Move the car on by ``dt_s`` up to monotonic time ``mono_ns`` [ns] and let the firmware's watchdog look."""
         with self._lock:
             self._note(self._firmware.check_timeout(mono_ns))
+            if self._jam is not None and mono_ns >= self._jam[1]:
+                self.vehicle.jam(self._jam[0])
+                self._jam = None
             state = self.vehicle.advance(dt_s)
             moving = abs(state.speed_mps) > STANDSTILL_MPS
             if moving != self._moving:
@@ -121,9 +125,13 @@ class VescEmulator:
             self._note([WireEvent(time.monotonic_ns(), "PLACED")])
 
     def jam(self, how: str | None) -> None:
-        """Jam the car, as `TwinVehicle.jam` does; None releases it."""
+        """Jam the car from now on, as `TwinVehicle.jam` does; None releases it.
+
+        A step up to an earlier time, made late, is made without it: the log must not show an effect before its cause.
+        """
+        require_jam(how)
         with self._lock:
-            self.vehicle.jam(how)
+            self._jam = how, time.monotonic_ns()
 
     def disturb(self, fault: str | None) -> None:
         """Let replies reach the computer with a fault of `WIRE_FAULTS`; None heals the wire."""

@@ -134,7 +134,7 @@ def _unpacked(compression: str, data: bytes) -> bytes:
     return bytes(found)
 
 
-def records_of(data: bytes) -> Iterator[tuple[int, int, int]]:
+def records_of(data: bytes | bytearray) -> Iterator[tuple[int, int, int]]:
     """Yield opcode, start and end of the body of every record in a chunk."""
     at, limit = 0, len(data)
     while at < limit:

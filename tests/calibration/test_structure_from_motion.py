@@ -43,7 +43,6 @@ def scene(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(400)
 def test_poses_and_lens_of_two_cameras_are_found(scene):
     root, sources, truth = scene
     model = reconstruct(root, sources, root / "work")
@@ -63,7 +62,6 @@ def test_poses_and_lens_of_two_cameras_are_found(scene):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(400)
 def test_a_stopped_run_goes_on_and_other_inputs_begin_anew(scene, tmp_path):
     root, sources, _ = scene
 
@@ -93,7 +91,6 @@ def test_a_stopped_run_goes_on_and_other_inputs_begin_anew(scene, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(400)
 def test_photographs_without_overlap_are_refused_with_what_to_do(tmp_path):
     rng = np.random.default_rng(0)
     for k in range(4):
@@ -112,7 +109,6 @@ def true_focal_lengths(model, truth):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(400)
 def test_ten_photographs_by_ten_cameras_have_ten_sane_lenses(tmp_path):
     rng, poses = np.random.default_rng(1), poses_of(10, 2.6, 1.4, 0.2, 1.37)
     truth = write_photographs(tmp_path, poses, [some_camera(rng, 460) for _ in poses])
@@ -142,7 +138,6 @@ def test_ten_photographs_by_ten_cameras_have_ten_sane_lenses(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(400)
 def test_eleven_photographs_by_one_camera_give_its_focal_length(tmp_path):
     pinhole = Pinhole(480, 320, 450.0, 450.0, 240.0, 160.0)
     poses = poses_of(11, 2.6, 1.4, 0.2, 1.37)
@@ -169,7 +164,6 @@ def with_exif(folder, name, focal_length_35mm):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(400)
 @pytest.mark.parametrize("knows_itself", [False, True])
 def test_a_camera_whose_lens_cannot_be_told_is_left_out_by_name_or_held_at_its_exif_focal_length(
     tmp_path, knows_itself

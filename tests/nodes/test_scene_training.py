@@ -199,7 +199,6 @@ def test_help_says_what_presets_are_for(
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(400)
 def test_pictures_with_alpha_are_learned_with_it_end_to_end(
     pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -15,12 +15,15 @@ import yaml
 
 from advnerf_core.geometry import planar_pose
 from benchmarks.operator import LiveOperator
+from hardware.emulators.vesc_firmware import WireEvent
 from nodes.runtime.messages import pose_message
 from nodes.runtime.paths import bus_folder
+from tests.support.spoiled import Spoiled, unspoiled
 
 REPOSITORY = Path(__file__).parents[2]
 CALIBRATION = REPOSITORY / "calibration" / "twin"
 NODES = ("twin", "camera", "vicon", "compositor", "policy", "safety", "motor")
+BRAKES = ("SET_CURRENT_BRAKE", "TIMEOUT")
 START = (-1.1, -2.0, 0.0)
 TIMEOUT = {"timeout_ms": 250.0, "timeout_brake_current_a": 20.0}
 
@@ -66,7 +69,10 @@ class Stack(LiveOperator):
         command = [sys.executable, "-m", module, "--config", str(config), *arguments]
         log = open(self.run_dir / f"{name}.log", "ab")  # noqa: SIM115 - belongs to the child
         environment = {**os.environ, "MUJOCO_GL": "egl"}
-        return subprocess.Popen(command, stdout=log, stderr=log, env=environment, cwd=REPOSITORY)
+        # A session of its own, as in a launch: where sessions share the processors, each node has a share.
+        return subprocess.Popen(
+            command, stdout=log, stderr=log, env=environment, cwd=REPOSITORY, start_new_session=True
+        )
 
     def check(self) -> None:
         for name, process in self.processes.items():
@@ -74,22 +80,53 @@ class Stack(LiveOperator):
             assert process.poll() in (None, -signal.SIGKILL), f"{name} ended: {log.read_text()[-2000:]}"
 
     def drive(self, duration_s: float = 1.2) -> None:
-        self.wait_ready()
-        self.arm()
-        self.watch(duration_s)
-        assert self.armed, self.describe()
+        """Drive from the start; the car is driving afterwards."""
+
+        def attempt() -> None:
+            self.wait_ready()
+            self.put_back()
+            self.arm()
+            self.watch(duration_s)
+            if not self.armed:
+                raise Spoiled(self.seen["/safety/state"].reason)
+
+        unspoiled(attempt)
 
     def put_back(self) -> None:
         """Wait until the car stands and lift it to the start."""
         resets = sum(event.name == "PLACED" for event, *_ in self.wire())
 
-        def placed():
+        def placed() -> bool:
             # Stamped anew each time: the twin refuses an old request.
             self.bus.publish("/twin/reset", pose_message(planar_pose(*START), time.time_ns()))
             self.watch(0.3)
             return sum(event.name == "PLACED" for event, *_ in self.wire()) > resets
 
-        self.wait_until(placed, 10.0, "to put the car back")
+        self.wait_until(placed, 60.0, "to put the car back")
+
+    def disarm(self) -> None:
+        """Disarm, and wait until the car's motor is released."""
+
+        def disarmed() -> bool:
+            self.say_arm(False)
+            self.watch(0.3)
+            return self.seen["/safety/state"].reason == "disarmed by trial: test"
+
+        self.wait_until(disarmed, 60.0, "to be disarmed")
+        self.wait_until(lambda: self.commands_after(0)[-1].name == "SET_CURRENT", 60.0, "to be released")
+
+    def stopped(self, since_ns: int) -> list[WireEvent]:
+        """Wait for the end of a stop; the motor commands from its first brake on."""
+
+        def stop() -> list[WireEvent]:
+            events = self.commands_after(since_ns)
+            first = next((k for k, event in enumerate(events) if event.name in BRAKES), len(events))
+            return events[first:]
+
+        self.wait_until(
+            lambda: any(event.name == "SET_CURRENT" for event in stop()), 60.0, "for brake and release"
+        )
+        return stop()
 
     def signal(self, name: str, number: int) -> int:
         """Send a signal; monotonic time at which it was sent [ns]."""
@@ -105,7 +142,7 @@ class Stack(LiveOperator):
                 process.terminate()
         for process in self.processes.values():
             try:
-                process.wait(10.0)
+                process.wait(60.0)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()

@@ -85,6 +85,12 @@ def touched_by(body: Footprint, obstacles: Iterable[Footprint], half_m: float, e
     return ""
 
 
+def require_jam(how: str | None) -> None:
+    """Refuse what is no jam."""
+    if how not in (None, *JAMS):
+        raise ValueError(f"expected a jam of {', '.join(JAMS)}, got {how!r}")
+
+
 class TwinVehicle:
     """A car that obeys servo and motor commands as the real one does.
 
@@ -164,8 +170,7 @@ class TwinVehicle:
 
     def jam(self, how: str | None) -> None:
         """Hold the car where it is, with its wheels ``locked`` or ``spinning`` on the spot; None lets it go."""
-        if how not in (None, *JAMS):
-            raise ValueError(f"expected a jam of {', '.join(JAMS)}, got {how!r}")
+        require_jam(how)
         self._jam = how
 
     def advance(self, dt_s: float) -> VehicleState:

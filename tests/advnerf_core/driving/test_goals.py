@@ -116,7 +116,6 @@ def test_each_goal_is_taught_by_its_own_expert(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 def test_one_policy_learns_both_turns(tmp_path: Path) -> None:
     learning = replace(CONFIG, first_steps=200, dagger_rounds=0, batch_size=32, hidden=(100, 50, 10))
     policy = load_policy(train_policy(learning, plans(128), LEFT, VIEW, tmp_path).path).policy

@@ -160,7 +160,6 @@ print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kib) / 1024)
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(400)
 def test_a_hundred_large_pictures_fit_into_memory(tmp_path):
     """The pictures' own bytes, and not as much again for everything else: float32 pictures with their rays took 6 GiB."""
     count, side = 100, 800

@@ -18,7 +18,6 @@ TESTS = Path(__file__).parents[1]
         pytest.param("attack/test_on_device.py", 5, id="searches", marks=pytest.mark.slow),
     ],
 )
-@pytest.mark.timeout(300)  # the simulator's threads wait for each other, and longer where other tests run
 def test_the_code_for_a_gpu_computes_in_the_simulator_what_the_processor_does(file: str, least: int) -> None:
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "gpu", str(TESTS / file)]
     done = subprocess.run(

@@ -145,7 +145,6 @@ def test_a_checkpoint_of_other_intervals_is_refused(standing_back, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(200)
 def test_a_camera_that_stands_back_is_learned_from(standing_back):
     """Intervals of 1/160 of the box in training, and twice as long in rendering, whatever the pictures: 19.7 dB. By the rule: 23.5."""
     training, held_out = standing_back

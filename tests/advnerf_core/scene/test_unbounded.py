@@ -138,7 +138,6 @@ def environment_poses(count: int, seed: int) -> Array:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(400)
 @pytest.mark.parametrize("backend", ["numba", "torch"])
 def test_a_far_environment_is_learned_only_with_the_contraction(backend: str) -> None:
     poses, held_out = environment_poses(150, 0), environment_poses(6, 1)

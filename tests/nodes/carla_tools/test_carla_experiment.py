@@ -44,7 +44,6 @@ def file(tmp_path, settings):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 def test_every_stage_runs_against_a_server_and_leaves_it_as_it_was(as_carla, file, tmp_path):
     run = tmp_path / "run"
     experiment = load_experiment(file, "tiny", [], run)

@@ -80,7 +80,6 @@ def part_is(name, state):
       && row.cells[1].firstChild.innerText === '{state}')"""
 
 
-@pytest.mark.timeout(400)
 def test_a_tiny_experiment_is_watched_until_its_report(browser, tmp_path):
     with watched_experiment(tmp_path, TINY) as (process, url):
         watcher = Watcher(browser, DESK, url)

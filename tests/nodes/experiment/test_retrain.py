@@ -51,7 +51,6 @@ def test_the_unseen_start_is_a_metre_back_and_to_the_left(trained: Experiment) -
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 def test_a_round_of_retraining_and_the_attack_on_it(attacked: Experiment) -> None:
     folder = attacked.stage_folder("retrain")
     retrain.run(attacked, folder, silent)
@@ -96,7 +95,6 @@ def test_a_round_of_retraining_and_the_attack_on_it(attacked: Experiment) -> Non
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 def test_an_attack_that_does_not_pay_ends_it(attacked: Experiment) -> None:
     config = attacked.config.model_copy(update={"retrain": SMALL.model_copy(update={"pays_ratio": 1e6})})
     experiment = replace(attacked, config=config)

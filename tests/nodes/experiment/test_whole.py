@@ -33,7 +33,6 @@ SMALL = [
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 @pytest.mark.parametrize("file", ["room", "monitor"])
 def test_from_photographs_to_report_and_nothing_twice(tmp_path, file):
     os.environ.setdefault("MUJOCO_GL", "egl")
@@ -60,7 +59,6 @@ def test_from_photographs_to_report_and_nothing_twice(tmp_path, file):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 def test_an_experiment_that_load_keeps_from_driving_live_ends_well_and_says_so(tmp_path, monkeypatch):
     """The attacked drive is spoiled every time, the others once; another command may try again."""
     os.environ.setdefault("MUJOCO_GL", "egl")
@@ -128,7 +126,6 @@ def planted_track(experiment, scene, space, cell, title, folder):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 @pytest.mark.parametrize("file", ["room", "monitor"])
 def test_a_face_is_also_deployed_without_nodes_and_meets_the_same_searches(tmp_path, file):
     """The second deployer: the lab's own car in this process, past the face that is drawn, or shown on the screen."""
@@ -149,7 +146,6 @@ def test_a_face_is_also_deployed_without_nodes_and_meets_the_same_searches(tmp_p
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 def test_a_cell_of_another_seed_is_searched_and_driven_live_once(tmp_path):
     os.environ.setdefault("MUJOCO_GL", "egl")
     experiment = load_experiment(LAUNCH / "monitor.experiment.yaml", "demo", SMALL, tmp_path / "run")

@@ -22,7 +22,6 @@ def silent(fraction: float, text: str = "") -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 def test_all_cells_and_the_report(trained: Experiment, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     shutil.copytree(trained.folder, folder)

@@ -26,7 +26,6 @@ from nodes.runtime.messages import header as make_header
 pytestmark = [
     pytest.mark.ros2,
     pytest.mark.live,
-    pytest.mark.timeout(280),
     pytest.mark.skipif(rclpy_python() is None, reason="no rclpy environment; make setup-ros2 installs one"),
 ]
 pytest.importorskip("cyclonedds")

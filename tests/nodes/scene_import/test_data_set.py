@@ -69,7 +69,6 @@ def test_pictures_of_a_person_are_never_touched(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(400)
 def test_photographs_of_the_lab_become_a_data_set(tmp_path):
     config = lab_with_phone(800)
     poses = video_poses(config, 120)[:18]
@@ -97,7 +96,6 @@ def test_photographs_of_the_lab_become_a_data_set(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 def test_phone_and_car_come_out_metric_in_the_motion_capture_world(tmp_path):
     config = lab_with_phone(800)
     # A third of a lap, round the first corner: high and inwards, high and outwards, low and ahead.

@@ -133,7 +133,6 @@ def test_a_bag_that_cannot_be_imported_leaves_nothing(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_a_stopped_import_ends_in_one_line_and_goes_on(tmp_path, number, code):
     poses = poses_of(6, 2.6, 1.4, 0.4, 1.1)

@@ -12,7 +12,6 @@ from tests.support.warehouse import EXAMPLES
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 def test_a_cell_whose_process_dies_has_no_result_and_the_others_go_on(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -15,7 +15,6 @@ from tests.support.warehouse import EXAMPLES
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 def test_every_stage_runs_in_a_strangers_world(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
