@@ -15,7 +15,7 @@ from nodes.experiment.run_folder import RunFolder
 from nodes.runtime.errors import RuntimeFault
 
 STEERING = "steering"
-# Experiments of this project have 0.06 and 0.998 or better, whether the control is a wheel angle or a turn rate.
+# The room's victims differ by 0.04; all published sets, of wheel angles and turn rates, correlate by 0.998 or better.
 MOST_DIFFERENCE, LEAST_CORRELATION = 0.25, 0.9
 
 
