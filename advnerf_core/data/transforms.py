@@ -7,6 +7,7 @@ a file is one `DatasetError` that names the file, the frame and the field.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,29 @@ from advnerf_core.geometry import OPENGL_FROM_OPENCV, Array, Pinhole
 
 _LENSES = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
 _FISHEYES = {"OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+_LENS_KEYS = {
+    "k1",
+    "k2",
+    "k3",
+    "k4",
+    "k5",
+    "k6",
+    "p1",
+    "p2",
+    "is_fisheye",
+    "is_equirectangular",
+    "equirectangular",
+}
+# What other software reads of a lens, in the words of all of them: whoever ignores one of these learns another camera.
+_LENS_LIKE = re.compile(
+    r"(k|p|s|b|d|sx|sy|ftheta_p)\d+|.*(distort|fisheye|shutter|skew|lens|latlong|equirect|orthographic|mitsuba).*",
+    re.I,
+)
+# Keys with which other software learns something else; the camera is the same without them.
+_OTHER_KEYS = (
+    "white_transparent", "black_transparent", "mask_color", "fix_premult", "fisheye_crop_radius", "depth_file_path", "depth_path",
+    "timestamp", "time",
+)  # fmt: skip
 _SPLITS = (TRAIN, *HELD_OUT_SPLITS)
 _RIGID_TOLERANCE = 0.01
 # Times the spread of the cameras, whatever the unit: single precision resolves a thousandth of the spread there. What is farther has
@@ -52,7 +76,8 @@ def load_transforms(path: str | Path, require_all: bool = False) -> PosedImages:
     frames = tuple(frame for each in sets for frame in each.frames)
     missing = tuple(name for each in sets for name in each.missing)
     _refuse_far_away(files[0][0], frames)
-    return PosedImages(frames, missing, first.aabb_scale, first.scale, first.offset, first.file)
+    ignored = tuple(dict.fromkeys(key for each in sets for key in each.ignored))
+    return PosedImages(frames, missing, first.aabb_scale, first.scale, first.offset, first.file, ignored)
 
 
 def _files(path: Path) -> list[tuple[Path, str | None]]:
@@ -92,7 +117,9 @@ def _read_set(path: Path, split: str | None, require_all: bool) -> PosedImages:
             "put the images there, or take the entries out of the file"
         )
     scale, offset, aabb = _ngp_box(path, content)
-    return PosedImages(tuple(frames), tuple(missing), aabb, scale, offset, path)
+    entries = [content, *(entry for entry in listed if isinstance(entry, dict))]
+    ignored = tuple(key for key in _OTHER_KEYS if any(_says_something(entry.get(key)) for entry in entries))
+    return PosedImages(tuple(frames), tuple(missing), aabb, scale, offset, path, ignored)
 
 
 def _read_json(path: Path) -> _Values:
@@ -229,6 +256,17 @@ def _lens(values: _Values) -> Lens:
         raise _FieldError(
             f"camera_model: expected {', '.join(sorted(_LENSES | _FISHEYES))}, got {model}; undistort the images first"
         )
+    for key, value in values.items():
+        if (
+            _LENS_LIKE.fullmatch(key)
+            and key not in _LENS_KEYS
+            and key not in _OTHER_KEYS
+            and _says_something(value)
+        ):
+            raise _FieldError(
+                f"{key}: expected a lens of {', '.join(sorted(_LENS_KEYS - {'k5', 'k6'}))} alone, got {key} = {value!r:.60}, which other "
+                "software reads; undistort the images first, or take it out if they are ideal"
+            )
     fisheye = model in _FISHEYES or bool(values.get("is_fisheye"))
     keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
     strange = ("p1", "p2") if fisheye else ("k4", "k5", "k6")
@@ -238,6 +276,13 @@ def _lens(values: _Values) -> Lens:
                 f"{key}: expected only {', '.join(keys)} with camera_model {model}, got {values[key]}; undistort the images first"
             )
     return Lens(tuple(_number(values, key, 0.0) for key in keys), fisheye)
+
+
+def _says_something(value: Any) -> bool:
+    """Whether a value is more than a zero, an empty text or a list of zeros."""
+    if isinstance(value, list | tuple):
+        return any(_says_something(each) for each in value)
+    return value not in (None, False, 0, "", "none", "pinhole", "perspective", "PINHOLE", "PERSPECTIVE")
 
 
 def _pinhole(image: Path, values: _Values) -> Pinhole:

@@ -9,6 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from advnerf_core.data.errors import DatasetError
@@ -19,10 +20,12 @@ from advnerf_core.files import write_atomically
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
 _RECORD = "keyframes.json"
+_SQUARE = 1e-3
 
 
 def read_video(path: Path) -> Iterator[tuple[int, float, float, Rgb]]:
-    """Frames of a video: number, time [s], share of the video that is over (0..1), image ``[H, W, 3]`` uint8 upright.
+    """Frames of a video: number, time [s], share of the video that is over (0..1), image ``[H, W, 3]`` uint8, upright, of square
+    pixels.
 
     Raises:
         DatasetError: The file is no video, or not one frame of it can be read. A damaged end only ends the video early.
@@ -42,7 +45,7 @@ def read_video(path: Path) -> Iterator[tuple[int, float, float, Rgb]]:
                 share = min(max(time_s / length_s, 0.0), 1.0) if length_s > 0.0 else 0.0
                 # Phones store the sensor's picture and say how to turn it.
                 turns = round(getattr(frame, "rotation", 0) / 90.0) % 4
-                rgb = np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), turns))
+                rgb = np.ascontiguousarray(np.rot90(_square_pixels(frame, stream), turns))
                 yield number, time_s, share, rgb
                 number += 1
     except (av.error.FFmpegError, OSError) as error:
@@ -53,6 +56,17 @@ def read_video(path: Path) -> Iterator[tuple[int, float, float, Rgb]]:
             ) from error
     if number == 0:
         raise DatasetError(f"expected a video with frames, got {path} without any; copy it again")
+
+
+def _square_pixels(frame: Any, stream: Any) -> Rgb:
+    """A frame's image with pixels as wide as high: some cameras store fewer columns than they show (1440 x 1080, anamorphic)."""
+    rgb: Rgb = frame.to_ndarray(format="rgb24")
+    aspect = float(stream.codec_context.sample_aspect_ratio or stream.sample_aspect_ratio or 1.0)
+    if aspect <= 0.0 or abs(aspect - 1.0) < _SQUARE:
+        return rgb
+    height, width = rgb.shape[:2]
+    size = (round(width * aspect), height) if aspect > 1.0 else (width, round(height / aspect))
+    return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_CUBIC), np.uint8)
 
 
 def keep_keyframes(

@@ -104,6 +104,7 @@ class PosedImages:
         scale: Instant-NGP's scale from the file's coordinates to its unit cube.
         offset: Its offset, applied after the scale.
         file: The file that lists them.
+        ignored: Keys of the file that other software reads and that have no effect here.
     """
 
     frames: tuple[PosedImage, ...]
@@ -112,6 +113,15 @@ class PosedImages:
     scale: float = NGP_SCALE
     offset: tuple[float, float, float] = NGP_OFFSET
     file: Path | None = None
+    ignored: tuple[str, ...] = ()
+
+    @property
+    def remarks(self) -> list[str]:
+        """What of the file is not used, in lines for its user."""
+        lines = [f"skipped, file not found: {path}" for path in self.missing]
+        if self.ignored:
+            lines.append(f"no effect here: the keys {', '.join(self.ignored)} of {self._name}")
+        return lines
 
     @property
     def splits(self) -> tuple[str, ...]:

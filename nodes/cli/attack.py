@@ -69,7 +69,7 @@ def _run(folder: Path, request: object) -> None:
 
 @app.command("show")
 def attack_show(
-    file: Annotated[Path, typer.Argument(help="An attack file.", dir_okay=False)],
+    file: Annotated[Path, typer.Argument(help="An attack file.", exists=True, dir_okay=False)],
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", help="Folder of the pictures and meshes.", show_default="beside FILE"),
@@ -129,7 +129,7 @@ def attack_show(
 
 @app.command("print")
 def attack_print(
-    file: Annotated[Path, typer.Argument(help="An attack file.", dir_okay=False)],
+    file: Annotated[Path, typer.Argument(help="An attack file.", exists=True, dir_okay=False)],
     output: Annotated[
         Path | None,
         typer.Option(

@@ -18,7 +18,9 @@ app = typer.Typer(
     no_args_is_help=True, help="Build objects from meshes, photographs or generators, and inspect them."
 )
 
-ObjectPath = Annotated[Path, typer.Argument(help="An object file (*.object.safetensors).", dir_okay=False)]
+ObjectPath = Annotated[
+    Path, typer.Argument(help="An object file (*.object.safetensors).", exists=True, dir_okay=False)
+]
 _TURNTABLE_VIEWS, _TURNTABLE_PIXELS = 8, 240
 _HELD_OUT_EVERY, _FEWEST_TO_SPLIT = 8, 16
 _DEFAULT_STEPS, _NO_STEP_LIMIT = 600, 1_000_000
@@ -27,7 +29,7 @@ _DEFAULT_STEPS, _NO_STEP_LIMIT = 600, 1_000_000
 @app.command("build")
 def object_build(
     file: Annotated[
-        Path | None, typer.Argument(help="Mesh file: GLB, OBJ, PLY or STL.", dir_okay=False)
+        Path | None, typer.Argument(help="Mesh file: GLB, OBJ, PLY or STL.", exists=True, dir_okay=False)
     ] = None,
     generate: Annotated[
         str | None,
@@ -37,6 +39,7 @@ def object_build(
         Path | None,
         typer.Option(
             "--images",
+            exists=True,
             help="Learn from images with an alpha channel instead of reading FILE: their transforms.json.",
         ),
     ] = None,
@@ -212,8 +215,8 @@ def _from_images(
     from advnerf_core.objects.voxel.pictures import load_pictures
 
     listed = load_transforms(transforms)
-    for path in listed.missing:
-        print(f"skipped, file not found: {path}")
+    for remark in listed.remarks:
+        print(remark)
     training, held_out = _split(listed)
     rule = "split of the data set" if listed.splits else f"every {_HELD_OUT_EVERY}th is held out"
     counts = (

@@ -9,7 +9,7 @@ import typer
 
 from nodes.cli import policy_train as cli_policy_train
 from nodes.runtime.paths import shipped
-from nodes.runtime.terminal import print_table, table
+from nodes.runtime.terminal import PolicyName, print_table, table
 
 if TYPE_CHECKING:
     from advnerf_core.policies.view import PolicyView
@@ -21,12 +21,6 @@ app = typer.Typer(
     no_args_is_help=True,
     help="Train a policy from recordings; evaluate, check, export and inspect any policy.",
 )
-Spec = Annotated[
-    str,
-    typer.Argument(
-        metavar="POLICY", help="Policy: a .safetensors, .onnx or .pt2 file, or package.module:factory."
-    ),
-]
 cli_policy_train.add_to(app)
 _COLOURS = {"ok": "green", "warning": "yellow", "failure": "red"}
 _FAILURE_EXIT = 1
@@ -34,33 +28,39 @@ _FAILURE_EXIT = 1
 
 @app.command("check")
 def policy_check(
-    policy: Spec,
+    policy: PolicyName,
     run_folder: Annotated[
         Path | None,
         typer.Option(
             "--run-folder",
+            exists=True,
             help="Run folder of an experiment: check on the camera frames of its capture and on drives in its learned scene.",
         ),
     ] = None,
     scene: Annotated[
         Path | None,
         typer.Option(
-            "--scene", help="Learned scene: check on its views and on drives in it. Needs --calibration."
+            "--scene",
+            exists=True,
+            help="Learned scene: check on its views and on drives in it. Needs --calibration.",
         ),
     ] = None,
     calibration: Annotated[
         Path | None,
         typer.Option(
-            "--calibration", help="Folder with camera.yaml, room.yaml and vehicle.yaml of the scene."
+            "--calibration",
+            exists=True,
+            help="Folder with camera.yaml, room.yaml and vehicle.yaml of the scene.",
         ),
     ] = None,
     bag: Annotated[
-        Path | None, typer.Option("--bag", help="Bag of a drive: check on its frames and poses.")
+        Path | None, typer.Option("--bag", exists=True, help="Bag of a drive: check on its frames and poses.")
     ] = None,
     room: Annotated[
         Path,
         typer.Option(
             "--room",
+            exists=True,
             help="Room calibration with the path that the expert follows in the bag.",
             show_default="the simulated lab's",
         ),
@@ -122,7 +122,7 @@ def _reference(
 
 @app.command("export")
 def policy_export(
-    policy: Spec,
+    policy: PolicyName,
     onnx: Annotated[
         Path | None, typer.Option("--onnx", help="Write an ONNX file, which runs without torch.")
     ] = None,
@@ -152,7 +152,7 @@ def policy_export(
 
 
 @app.command("info")
-def policy_info(policy: Spec) -> None:
+def policy_info(policy: PolicyName) -> None:
     """Show a policy's inputs and outputs, its declaration and its hash."""
     from advnerf_core.policies.load import load_adapted
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from nodes.runtime.terminal import experiment_argument, print_table, table
+from nodes.runtime.terminal import PolicyName, experiment_argument, print_table, table
 
 if TYPE_CHECKING:
     from advnerf_core.driving.expert import Expert
@@ -17,12 +17,18 @@ if TYPE_CHECKING:
     from nodes.lab.policy_data.train import Part
 
 Camera = Annotated[
-    Path | None, typer.Option("--camera", help="Camera calibration.", show_default="the one in the first bag")
+    Path | None,
+    typer.Option(
+        "--camera", exists=True, help="Camera calibration.", show_default="the one in the first bag"
+    ),
 ]
 Room = Annotated[
     Path | None,
     typer.Option(
-        "--room", help="Room calibration with the reference path.", show_default="the one in the first bag"
+        "--room",
+        exists=True,
+        help="Room calibration with the reference path.",
+        show_default="the one in the first bag",
     ),
 ]
 Stiffness = Annotated[
@@ -59,11 +65,13 @@ def train(
         list[Path] | None,
         typer.Option(
             "--bags",
+            exists=True,
             help="Bag of a drive; may be repeated. The expert labels it, no matter which driver recorded it.",
         ),
     ] = None,
     logs: Annotated[
-        list[Path] | None, typer.Option("--log", help="CSV file of a log from another car; may be repeated.")
+        list[Path] | None,
+        typer.Option("--log", exists=True, help="CSV file of a log from another car; may be repeated."),
     ] = None,
     labels: Annotated[
         Literal["expert", "recorded"],
@@ -81,6 +89,7 @@ def train(
         Path | None,
         typer.Option(
             "--surrogate",
+            exists=True,
             help="Run folder of an experiment. Views of its learned room are added to the training data.",
         ),
     ] = None,
@@ -132,14 +141,12 @@ def train(
 
 
 def evaluate(
-    policy: Annotated[
-        str,
-        typer.Argument(
-            metavar="POLICY", help="Policy: a .safetensors, .onnx or .pt2 file, or package.module:factory."
-        ),
-    ],
+    policy: PolicyName,
     recording: Annotated[
-        Path, typer.Argument(metavar="BAG", help="Bag of a drive, or CSV file of a log from another car.")
+        Path,
+        typer.Argument(
+            metavar="BAG", exists=True, help="Bag of a drive, or CSV file of a log from another car."
+        ),
     ],
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for the plot and the saliency maps.")

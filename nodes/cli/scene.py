@@ -18,7 +18,9 @@ app.add_typer(cli_scene_import.app)
 cli_scene_gate.add_to(app)
 
 DataSet = Annotated[Path, typer.Argument(help="A transforms.json, or its folder.", exists=True)]
-SceneFile = Annotated[Path, typer.Argument(help="A scene file (scene.safetensors).", dir_okay=False)]
+SceneFile = Annotated[
+    Path, typer.Argument(help="A scene file (scene.safetensors).", exists=True, dir_okay=False)
+]
 Size = Annotated[
     tuple[int, int] | None,
     typer.Option("--size", help="Resize the images to this width and height.", show_default="their size"),
@@ -227,7 +229,7 @@ def scene_view(
         Path | None, typer.Option("--cameras", help="A transforms.json whose cameras are shown.", exists=True)
     ] = None,
     objects: Annotated[
-        list[Path] | None, typer.Option("--object", help="Object file to place at the origin.")
+        list[Path] | None, typer.Option("--object", exists=True, help="Object file to place at the origin.")
     ] = None,
     room: Annotated[
         Path | None, typer.Option("--room", help="Room calibration whose path is drawn.", exists=True)

@@ -446,9 +446,10 @@ class ExperimentConfig(StrictModel):
     measure: MeasureConfig = MeasureConfig()
     space: SpaceConfig = Field(default=ColoursConfig(), description="What the attacks may change.")
     deploy: DeployConfig = DeployConfig()
-    gate: GateLimits | None = Field(
-        default=None,
-        description="What the learned scene must reach before it is attacked; none: it is not judged.",
+    gate: Literal["steering"] | GateLimits | None = Field(
+        default="steering",
+        description="What the learned scene must reach before it is attacked: that the policy steers in it as on real pictures, or "
+        "limits of your own; null: it is not judged.",
     )
     reference: Path | None = Field(
         default=None, description="File of what the report is held to, relative to this file; none: nothing."

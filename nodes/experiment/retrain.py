@@ -43,6 +43,7 @@ from nodes.experiment.objects import placed_objects
 from nodes.experiment.policy import HARDENED, plans, victim_file
 from nodes.experiment.spaces import colour_space, random_placements
 from nodes.experiment.stage_record import hash_of
+from nodes.experiment.steering_gate import require_same_steering
 from nodes.runtime.progress import Report
 
 _NEAR_M, _TURNED_RAD, _GIVE_UP_M = 1.0, 0.15, 3.0  # metres of half a lane of 1.75 m
@@ -66,6 +67,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     """Write a folder per round, and after each ``retrain.json`` with the curve and the drives under the old attacks, and ``curve.png``."""
     wanted = experiment.config.retrain
     assert wanted is not None, "the stage runs only where the experiment asks for it"
+    require_same_steering(experiment)
     space = colour_space(experiment)
     file, rounds, kept = victim_file(experiment, HARDENED), [], _old_frames(experiment)
     victim = load_policy(file)

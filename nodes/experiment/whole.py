@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from rich.console import Console
@@ -25,6 +26,7 @@ from nodes.experiment.run import make_ready, stages_of
 from nodes.experiment.run_folder import require_own_folder
 from nodes.experiment.stage_record import Stage
 from nodes.experiment.stages import check_until, run_stages
+from nodes.experiment.steering_gate import require_same_steering
 from nodes.runtime.progress import ProgressDisplay
 
 REPORT = "report"
@@ -74,6 +76,7 @@ def run_experiment(
     if until in (None, REPORT):
         campaign = campaign_of(experiment, overrides, plan)
         options = options or Options(here=True, ready=True)
+        require_same_steering(experiment, not options.gate, partial(_say, console, record))
         ended = _run_cells(experiment, campaign, chosen, options, console, record)
         _write_report(experiment, campaign, console, record)
     console.print(
@@ -94,12 +97,13 @@ def _run_cells(
     if record is not None:
         _record_cells_there(campaign, chosen, options, record)
 
-    def say(text: str) -> None:
-        console.print(text, highlight=False, soft_wrap=True)
-        if record is not None:
-            record.say(text)
+    return run_campaign(campaign, chosen, options, partial(_say, console, record), known, console, record)
 
-    return run_campaign(campaign, chosen, options, say, known, console, record)
+
+def _say(console: Console, record: ProgressRecord | None, text: str) -> None:
+    console.print(text, highlight=False, soft_wrap=True)
+    if record is not None:
+        record.say(text)
 
 
 def _record_cells_there(
@@ -134,9 +138,7 @@ def _write_report(
     if missing or not reported.config.attack.methods:
         notes = [f"no report yet: {len(found) - len(done)} of {len(found)} cells are missing"]
     for text in notes:
-        console.print(text, highlight=False, soft_wrap=True)
-        if record is not None:
-            record.say(text)
+        _say(console, record, text)
     if missing or not reported.config.attack.methods:
         return
     digests = {name: sha256_of(file) for name, file in files.items()}

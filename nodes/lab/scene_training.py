@@ -108,8 +108,8 @@ class TrainingRequest:
 def train(request: TrainingRequest, report: Report) -> dict[str, Any]:
     """Train, and write the scene file and the metrics on held-out images. Returns the metrics."""
     training, held_out = load_transforms(request.transforms).training_and_held_out(request.every)
-    for path in training.missing:
-        print(f"skipped, file not found: {path}")
+    for remark in training.remarks:
+        print(remark)
     images = training.load(request.size)
     field = scene_field(request, training, transparent=_transparent(images))
     march = sample_intervals(request, field, images)

@@ -13,6 +13,7 @@ from nodes.runtime.paths import named_file
 if TYPE_CHECKING:
     from rich.table import Table
 
+_POLICY_FILES = (".safetensors", ".onnx", ".pt2")
 Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Override a value of the file. May be repeated."),
@@ -37,6 +38,26 @@ def experiment_argument(text: str | Path) -> Path:
     return named_file(text, "experiment", "campaign")
 
 
+def policy_argument(text: str) -> str:
+    """Name of a policy: a file, which must be there, or a factory. It is checked here, as loading one takes seconds."""
+    if text.endswith(_POLICY_FILES):
+        if not Path(text).is_file():
+            raise typer.BadParameter(f"expected a policy file at {text}, found none; correct the path")
+    elif ":" not in text:
+        raise typer.BadParameter(
+            f"expected a file of {', '.join(_POLICY_FILES)}, or package.module:factory, got {text}"
+        )
+    return text
+
+
+PolicyName = Annotated[
+    str,
+    typer.Argument(
+        metavar="POLICY",
+        help="Policy: a .safetensors, .onnx or .pt2 file, or package.module:factory.",
+        callback=policy_argument,
+    ),
+]
 LaunchFile = Annotated[
     Path,
     typer.Argument(

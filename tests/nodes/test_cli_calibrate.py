@@ -324,7 +324,7 @@ def test_display_from_a_folder(tmp_path, capsys):
     (tmp_path / "seen" / "006.png").write_bytes(b"no picture")
     for name, words in (
         ("005", "pictures of 90 x 60"),
-        ("006", "cannot decode its 10 bytes"),
+        ("006", "006.png (10 bytes): it is damaged"),
         ("666", "No such file"),
     ):
         rows = [

@@ -123,7 +123,6 @@ def test_sixteen_pictures_hold_out_two_and_can_be_made_smaller(command, tmp_path
     [
         ([], "expected exactly one of FILE, --generate and --images"),
         (["--generate", "tree"], "expected --generate to be one of hydrant, car; got 'tree'"),
-        (["{folder}/none.glb"], "found none"),
         (["--generate", "car", "--height", "-1"], "height above zero"),
         (
             ["--generate", "car", "--minutes", "1"],

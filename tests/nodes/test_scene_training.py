@@ -243,7 +243,7 @@ def test_intervals_follow_the_images_unless_the_user_says_otherwise(pictures: Pa
         return sample_intervals(request, scene_field(request, listed, transparent=True), images)
 
     rule = chosen()
-    assert rule == MarchConfig(0.05, 1.6 / 1024, 1.6 / 64, INTERVAL_PX_FROM_OUTSIDE / 50.0, 1024)
+    assert rule == MarchConfig(1.6 * (1 / 80), 1.6 / 1024, 1.6 / 64, INTERVAL_PX_FROM_OUTSIDE / 50.0, 1024)
     assert chosen(interval_px=0.5 * INTERVAL_PX_FROM_OUTSIDE) == dataclasses.replace(
         rule, step_growth=0.5 * rule.step_growth
     )
@@ -268,7 +268,7 @@ def test_options_of_intervals_reach_training_and_renderer(
     text = run("train", pictures, "-o", tmp_path, "--steps", 1, "--size", 16, 16, *box, *own)
     assert "sample intervals 0.02 .. 0.04, 0.5 of the distance between" in text
     scene = tmp_path / "scene.safetensors"
-    assert FieldRenderer.from_file(scene).march == MarchConfig(0.05, 0.02, 0.04, 0.5, 1024)
+    assert FieldRenderer.from_file(scene).march == MarchConfig(1.6 * (1 / 80), 0.02, 0.04, 0.5, 1024)
     # After one step nothing is dense enough to be kept; haze shows intervals as well as walls do.
     field, occupied, metadata = load_scene(scene)
     save_scene(scene, field, np.ones_like(occupied), metadata)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import json
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +16,8 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
+from advnerf_core.documents import parse_json
+from advnerf_core.errors import ConfigError
 from advnerf_core.geometry import Array
 from advnerf_core.objects.voxel.mesh import MeshError, MeshPart, SurfaceMesh, part_from_colours, stand
 
@@ -183,12 +184,12 @@ def _gltf_header(path: Path) -> dict[str, Any]:
         if data.startswith(b"glTF"):
             (length,) = struct.unpack_from("<I", data, 12)
             data = data[20 : 20 + length]
-        header = json.loads(data)
-        if isinstance(header, dict):
-            return header
-    except (ValueError, struct.error):
-        pass
-    raise MeshError(f"cannot read {path} as a mesh (no glTF header); export it again")
+        header = parse_json(data, str(path))
+    except (ConfigError, struct.error) as error:
+        raise MeshError(f"cannot read {path} as a mesh (glTF: {error}); export it again") from error
+    if not isinstance(header, dict):
+        raise MeshError(f"cannot read {path} as a mesh (glTF: no object in JSON); export it again")
+    return header
 
 
 def _geometries(path: Path) -> list[Any]:

@@ -234,7 +234,8 @@ def campaign_of(experiment: Experiment, overrides: Sequence[str], cells: Sequenc
         experiment.folder,
         scenarios,
         tuple(cells),
-        experiment.config.gate,
+        # By default the experiment itself judges, see `steering_gate`.
+        experiment.config.gate if isinstance(experiment.config.gate, GateLimits) else None,
     )
 
 

@@ -85,7 +85,7 @@ def test_missing_images_are_reported_or_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{", "expected JSON"),
+        ("{", "expected valid JSON"),
         ("[]", "expected a JSON object"),
         ("{}", "expected a list 'frames'"),
         ('{"frames": [{"file_path": "a.png"}]}', "frame 0"),

@@ -1,3 +1,5 @@
+from fractions import Fraction
+
 import av
 import cv2
 import numpy as np
@@ -129,3 +131,22 @@ def test_a_video_that_was_cut_off_gives_what_it_has(tmp_path):
     data = video.read_bytes()
     video.write_bytes(data[: len(data) * 2 // 3])
     assert 10 < len(list(read_video(video))) < 60
+
+
+@pytest.mark.parametrize(
+    ("aspect", "size"),
+    [((1, 1), (144, 108)), ((4, 3), (192, 108)), ((3, 4), (144, 144)), ((0, 1), (144, 108))],
+)
+def test_frames_have_square_pixels_whatever_the_video_stores(tmp_path, aspect, size):
+    path, left = tmp_path / "a.mp4", np.zeros((108, 144, 3), np.uint8)
+    left[:, :72] = 200
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 144, 108, "yuv420p"
+        stream.codec_context.sample_aspect_ratio = Fraction(*aspect)
+        container.mux(stream.encode(av.VideoFrame.from_ndarray(left, format="rgb24")))
+        container.mux(stream.encode())
+    ((_, _, _, rgb),) = read_video(path)
+    assert rgb.shape == (size[1], size[0], 3)
+    columns = rgb.mean(axis=(0, 2))
+    assert abs(int((columns > 100).sum()) - size[0] // 2) <= 2, "stretched, not padded"

@@ -194,3 +194,42 @@ def test_fox_as_it_is_distributed():
     view = held_out.with_frames(held_out.frames[:1]).load((270, 480))
     assert view.rgb.shape == (1, 480, 270, 3)
     assert view.pinholes[0].fx == pytest.approx(1375.52 / 4, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("distortion_params", [0.1, 0, 0, 0, 0, 0]),
+        ("rolling_shutter", [0, 0, 1, 0]),
+        ("ftheta_p0", 0.3),
+        ("s1", 0.01),
+        ("b1", 2.0),
+        ("skew", 0.5),
+        ("latlong", True),
+        ("from_mitsuba", True),
+        ("lens_model", "brown"),
+    ],
+)
+@pytest.mark.parametrize("in_frame", [False, True])
+def test_a_lens_that_others_read_and_we_do_not_is_named(tmp_path, key, value, in_frame):
+    def file(value):
+        frames = [{"file_path": f"{k}.png", "transform_matrix": pose(k)} for k in range(2)]
+        if in_frame:
+            frames[1][key] = value
+        return write(tmp_path, frames, **({} if in_frame else {key: value}))
+
+    with pytest.raises(DatasetError, match=rf"{key}: expected a lens of .*undistort"):
+        load_transforms(file(value))
+    nothing = [0] * len(value) if isinstance(value, list) else type(value)()
+    assert load_transforms(file(nothing)).frames[1].lens.is_ideal
+
+
+def test_keys_of_others_that_change_no_camera_are_told(tmp_path):
+    frames = [
+        {"file_path": f"{k}.png", "transform_matrix": pose(k), "depth_file_path": "d.png"} for k in range(2)
+    ]
+    listed = load_transforms(write(tmp_path, frames, white_transparent=True, fisheye_crop_radius=0))
+    assert listed.ignored == ("white_transparent", "depth_file_path")
+    assert listed.with_frames(listed.frames[:1]).remarks == [
+        f"no effect here: the keys white_transparent, depth_file_path of {tmp_path / 'transforms.json'}"
+    ]

@@ -16,6 +16,7 @@ from nodes.experiment.whole import run_experiment
 from nodes.runtime.errors import ConfigError
 
 TINY = {
+    "gate": None,
     "capture": {"photos": 6, "held_out": 3},
     "scene": {"steps": 4, "log2_entries": 10, "finest": 32, "occupancy": 16},
     "object": {"car_resolution": 12, "hydrant_resolution": 10, "fit_steps": 0},

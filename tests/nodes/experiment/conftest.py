@@ -43,7 +43,7 @@ def write_file(folder: Path, **changes: Any) -> Path:
     data = yaml.safe_load(LAUNCH.read_text())
     data["settings"] = {"tiny": TINY}
     file = folder / "tiny.experiment.yaml"
-    file.write_text(yaml.safe_dump({**data, "horizon": 3, **changes}))
+    file.write_text(yaml.safe_dump({**data, "horizon": 3, "gate": None, **changes}))
     return file
 
 
