@@ -183,12 +183,12 @@ def _mesh(  # type: ignore[no-untyped-def]
 ):
     from advnerf_core.objects.voxel.generators import GENERATORS
     from advnerf_core.objects.voxel.mesh import stand
-    from advnerf_core.objects.voxel.mesh_files import load_mesh, mesh_digest
+    from advnerf_core.objects.voxel.mesh_files import load_mesh
     from nodes.runtime.errors import ConfigError
 
     if file is not None:
         mesh = load_mesh(file, up, height_m, unit)
-        return mesh, {"mesh": file.name, "sha256": mesh_digest(file)}
+        return mesh, {"mesh": file.name, "sha256": mesh.sha256}
     if generate not in GENERATORS:
         raise ConfigError(f"expected --generate to be one of {', '.join(GENERATORS)}; got {generate!r}")
     return stand(GENERATORS[generate](), height_m=height_m), {"generator": generate}

@@ -46,10 +46,12 @@ class SurfaceMesh:
     Attributes:
         parts: Its parts [m].
         notes: What of its file it does not show, in sentences.
+        sha256: Hash of its file and of all files that this names; empty for a mesh that was made.
     """
 
     parts: tuple[MeshPart, ...]
     notes: tuple[str, ...] = ()
+    sha256: str = ""
 
     @property
     def box(self) -> tuple[Array, Array]:

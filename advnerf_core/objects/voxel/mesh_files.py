@@ -5,11 +5,10 @@ Formats differ in what they say. glTF fixes metres, y up and linear colour facto
 
 from __future__ import annotations
 
-import hashlib
 import io
 import struct
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Callable, Iterator
+from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import unquote
 
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from advnerf_core.documents import parse_json
 from advnerf_core.errors import ConfigError
 from advnerf_core.geometry import Array
+from advnerf_core.inputs import InputFileError, InputFiles
 from advnerf_core.objects.voxel.mesh import MeshError, MeshPart, SurfaceMesh, part_from_colours, stand
 
 UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
@@ -50,9 +50,10 @@ def load_mesh(
         raise MeshError(f"expected a unit of {', '.join(UNITS_M)}, got {unit!r}")
     if height_m is not None and not (np.isfinite(height_m) and height_m > 0):
         raise MeshError(f"expected a height above zero, got {height_m}")
-    _refuse_broken_images(path, mesh_files(path)[1:])
+    files, named = read_mesh_files(path)
+    _refuse_broken_images(files)
     notes: list[str] = []
-    parts = [_part(geometry, path, notes) for geometry in _geometries(path)]
+    parts = [_part(geometry, path, notes) for geometry in _geometries(files, named)]
     if not parts or sum(len(part.triangles) for part in parts) == 0:
         raise MeshError(
             f"expected a mesh with triangles in {path}, got none: is it a point cloud or an empty scene?"
@@ -61,34 +62,39 @@ def load_mesh(
     mesh = stand(SurfaceMesh(tuple(parts)), up or ("y" if gltf else "z"), height_m, str(path))
     if height_m is None:
         mesh = mesh.scaled(_metres(path, mesh, unit, gltf))
-    return SurfaceMesh(mesh.parts, tuple(dict.fromkeys(notes)))
+    return SurfaceMesh(mesh.parts, tuple(dict.fromkeys(notes)), files.sha256())
 
 
-def mesh_files(path: Path) -> list[Path]:
-    """A mesh file with all files that it names: materials, buffers and images.
+def read_mesh_files(path: Path) -> tuple[InputFiles, dict[str, bytes]]:
+    """A mesh file with all files that it names: materials, buffers and images. Each is read once; links and other folders are refused.
+
+    Returns:
+        The files, and the content of those that are named, under the names that the mesh file uses.
 
     Raises:
-        MeshError: One of them is missing.
+        MeshError: Some of them cannot be read; all are named.
     """
     if not path.is_file():
         raise MeshError(f"expected a mesh file at {path}, found none")
-    named = {".obj": _named_by_obj, ".gltf": _named_by_gltf, ".glb": _named_by_gltf}.get(path.suffix.lower())
-    files = [path, *([] if named is None else named(path))]
-    missing = [str(file) for file in files if not file.is_file()]
-    if missing:
-        raise MeshError(
-            f"expected the files that {path} names, missing: {', '.join(missing)}; put them there, or export the mesh as one GLB"
-        )
-    return list(dict.fromkeys(files))
+    files = InputFiles(path)
+    contents: dict[str, bytes] = {}
+    problems: list[str] = []
 
+    def read(written: str, name: str) -> bytes:
+        try:
+            contents[written] = files.read(name)
+        except InputFileError as error:
+            problems.append(str(error))
+        return contents.get(written, b"")
 
-def mesh_digest(path: Path) -> str:
-    """SHA-256 of a mesh file and of all files that it names."""
-    digest = hashlib.sha256()
-    for file in mesh_files(path):
-        content = file.read_bytes()
-        digest.update(f"{file.name}:{len(content)}:".encode() + content)
-    return digest.hexdigest()
+    kind = path.suffix.lower()
+    if kind == ".obj":
+        _read_named_by_obj(files.content, read)
+    elif kind in _GLTF:
+        _read_named_by_gltf(path, files.content, read)
+    if problems:
+        raise MeshError(f"{'; '.join(problems)}; or export the mesh as one GLB")
+    return files, contents
 
 
 def _metres(path: Path, mesh: SurfaceMesh, unit: str | None, gltf: bool) -> float:
@@ -108,33 +114,33 @@ def _metres(path: Path, mesh: SurfaceMesh, unit: str | None, gltf: bool) -> floa
     )
 
 
-def _named_by_obj(path: Path) -> list[Path]:
-    found = []
-    for words in _lines(path):
+_Read = Callable[[str, str], bytes]
+
+
+def _read_named_by_obj(content: bytes, read: _Read) -> None:
+    for words in _lines(content):
         if words[0] != "mtllib" or len(words) == 1:
             continue
-        library = _beside(path, words[1:])
-        found.append(library)
-        if library.is_file():
-            maps = [line for line in _lines(library) if line[0] in ("map_Kd", "map_Ka")]
-            found += [_beside(library, line[1:]) for line in maps if len(line) > 1]
-    return found
+        library = _name(words[1:])
+        for line in _lines(read(library, library)):
+            if line[0] in ("map_Kd", "map_Ka") and len(line) > 1:
+                image = _name(line[1:])
+                read(image, (PurePosixPath(library.replace("\\", "/")).parent / image).as_posix())
 
 
-def _beside(path: Path, words: list[str]) -> Path:
+def _name(words: list[str]) -> str:
     """A named file: all words, or the last one after options."""
-    name = words[-1] if words[0].startswith("-") else " ".join(words)
-    return path.parent / name.replace("\\", "/")
+    return words[-1] if words[0].startswith("-") else " ".join(words)
 
 
-def _lines(path: Path) -> Iterator[list[str]]:
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+def _lines(content: bytes) -> Iterator[list[str]]:
+    for line in content.decode(errors="replace").splitlines():
         if line.lstrip().startswith(("mtllib", "map_")):
             yield line.split()
 
 
-def _named_by_gltf(path: Path) -> list[Path]:
-    header = _gltf_header(path)
+def _read_named_by_gltf(path: Path, content: bytes, read: _Read) -> None:
+    header = _gltf_header(path, content)
     required = [
         each for each in header.get("extensionsRequired", []) if not each.startswith(_KNOWN_EXTENSIONS)
     ]
@@ -144,19 +150,24 @@ def _named_by_gltf(path: Path) -> list[Path]:
             f"expected a mesh without the glTF extension {', '.join({*required, *used})}, got {path}; export it again without it"
         )
     entries = [*header.get("images", []), *header.get("buffers", [])]
-    names = [str(entry["uri"]) for entry in entries if "uri" in entry]
-    return [path.parent / unquote(name) for name in names if not name.startswith("data:")]
+    for name in (str(entry["uri"]) for entry in entries if "uri" in entry):
+        if not name.startswith("data:"):
+            read(name, unquote(name))
 
 
-def _refuse_broken_images(path: Path, named: list[Path]) -> None:
+def _refuse_broken_images(files: InputFiles) -> None:
     """Refuse images that cannot be decoded: trimesh leaves them out, and shows white."""
     from PIL import Image
 
+    path = files.path
     contents = [
-        (str(file), file.read_bytes()) for file in named if file.suffix.lower() not in (".mtl", ".bin")
+        (str(path.parent / name), content)
+        for name, content in files.others.items()
+        if PurePosixPath(name).suffix.lower() not in (".mtl", ".bin")
     ]
     if path.suffix.lower() == ".glb":
-        contents += [(f"image {k} of {path}", content) for k, content in enumerate(_embedded(path))]
+        embedded = enumerate(_embedded(path, files.content))
+        contents += [(f"image {k} of {path}", content) for k, content in embedded]
     for name, content in contents:
         try:
             with Image.open(io.BytesIO(content)) as image:
@@ -167,9 +178,9 @@ def _refuse_broken_images(path: Path, named: list[Path]) -> None:
             ) from error
 
 
-def _embedded(path: Path) -> Iterator[bytes]:
+def _embedded(path: Path, data: bytes) -> Iterator[bytes]:
     """The images inside a GLB file."""
-    data, header = path.read_bytes(), _gltf_header(path)
+    header = _gltf_header(path, data)
     start = 20 + struct.unpack_from("<I", data, 12)[0] + 8
     for image in header.get("images", []):
         if "bufferView" in image:
@@ -178,8 +189,7 @@ def _embedded(path: Path) -> Iterator[bytes]:
             yield data[at : at + view["byteLength"]]
 
 
-def _gltf_header(path: Path) -> dict[str, Any]:
-    data = path.read_bytes()
+def _gltf_header(path: Path, data: bytes) -> dict[str, Any]:
     try:
         if data.startswith(b"glTF"):
             (length,) = struct.unpack_from("<I", data, 12)
@@ -192,11 +202,14 @@ def _gltf_header(path: Path) -> dict[str, Any]:
     return header
 
 
-def _geometries(path: Path) -> list[Any]:
+def _geometries(files: InputFiles, named: dict[str, bytes]) -> list[Any]:
+    """Geometries of what was read; trimesh opens no file itself."""
     import trimesh
 
+    path = files.path
     try:
-        scene = trimesh.load_scene(path)
+        kind = path.suffix.lower().removeprefix(".")
+        scene = trimesh.load_scene(io.BytesIO(files.content), file_type=kind, resolver=named)
         dumped = scene.dump(concatenate=False)
     except Exception as error:  # trimesh's readers raise whatever they stumble over
         raise MeshError(

@@ -17,10 +17,11 @@ from advnerf_core.objects.voxel.mesh import stand
 from advnerf_core.objects.voxel.mesh_files import load_mesh
 from advnerf_core.scene.surrogate import Surrogate, split_theta
 from nodes.experiment.request.mesh_request import MeshRequest, ShapeRequest
+from nodes.experiment.stage_record import hash_of
 
 
-def mesh_field(wanted: MeshRequest, pose: Array, scale: float) -> MeshField:
-    """The object of a request.
+def mesh_field(wanted: MeshRequest, pose: Array, scale: float) -> tuple[MeshField, str]:
+    """The object of a request, and its hash: of geometry and pose, and of the files that it was read from.
 
     Raises:
         MeshError: A file that is no mesh.
@@ -33,7 +34,8 @@ def mesh_field(wanted: MeshRequest, pose: Array, scale: float) -> MeshField:
         surface = sphere(0.5 * (wanted.height_m or 0.7), wanted.rgb)
     else:
         surface = stand(GENERATORS[str(wanted.generate)](), height_m=wanted.height_m)
-    return MeshField(unwrapped(surface, wanted.texels), pose, scale)
+    field = MeshField(unwrapped(surface, wanted.texels), pose, scale)
+    return field, hash_of([field.sha256, surface.sha256]) if surface.sha256 else field.sha256
 
 
 def mesh_name(wanted: MeshRequest) -> str:

@@ -62,8 +62,8 @@ def place(wanted: ObjectRequest) -> PlacedObject:
     if wanted.kind == "file":
         return _from_file(wanted)
     if wanted.mesh is not None:
-        mesh = mesh_field(wanted.mesh, wanted.pose, wanted.scale)
-        return PlacedObject(mesh_name(wanted.mesh), mesh, None, mesh.sha256)
+        mesh, sha256 = mesh_field(wanted.mesh, wanted.pose, wanted.scale)
+        return PlacedObject(mesh_name(wanted.mesh), mesh, None, sha256)
     field = cube_face_object(
         wanted.size_m,
         wanted.resolution,

@@ -15,7 +15,7 @@ from advnerf_core.objects.mesh.glb import glb_bytes
 from advnerf_core.objects.mesh.surface import sphere, unwrapped
 from advnerf_core.objects.voxel.build import LOST, THIN, advice, build_from_mesh
 from advnerf_core.objects.voxel.mesh import MeshError, SurfaceMesh, part_from_colours
-from advnerf_core.objects.voxel.mesh_files import load_mesh, mesh_digest, mesh_files
+from advnerf_core.objects.voxel.mesh_files import load_mesh, read_mesh_files
 
 CASE = Path(__file__).parents[4] / "shared/data/cases/glb_up_and_colour"
 TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0]], "<f4")
@@ -137,29 +137,62 @@ def test_a_gltf_in_millimetres_is_refused_with_the_line_to_add(tmp_path):
 def test_an_objects_files_are_found_and_hashed(tmp_path):
     path = obj(tmp_path)
     (tmp_path / "my texture.png").write_bytes(png())
-    assert [file.name for file in mesh_files(path)] == ["a.obj", "a.mtl", "my texture.png"]
+    assert list(read_mesh_files(path)[0].others) == ["a.mtl", "my texture.png"]
     texture = load_mesh(path, unit="m").parts[0].texture
     np.testing.assert_allclose(255 * texture[0, 0], [10, 200, 30], atol=0.5)
-    digests = [mesh_digest(path)]
+    digests = [load_mesh(path, unit="m").sha256]
     (tmp_path / "my texture.png").write_bytes(png((11, 200, 30, 255)))
-    digests.append(mesh_digest(path))
+    digests.append(load_mesh(path, unit="m").sha256)
     (tmp_path / "a.mtl").write_text((tmp_path / "a.mtl").read_text() + "# other\n")
-    digests.append(mesh_digest(path))
+    digests.append(load_mesh(path, unit="m").sha256)
+    (tmp_path / "notes.txt").write_text("not named by it")
+    assert load_mesh(path, unit="m").sha256 == digests[-1]
     assert len(set(digests)) == 3
+
+
+def test_named_files_elsewhere_or_behind_a_link_are_refused(tmp_path):
+    folder, other = tmp_path / "mesh", tmp_path / "my texture.png"
+    folder.mkdir()
+    other.write_bytes(png())
+    path = obj(folder)
+    (folder / "my texture.png").symlink_to(other)
+    with pytest.raises(MeshError, match=r"refers to my texture\.png, expected .* without links"):
+        load_mesh(path, unit="m")
+    for name in ("../my%20texture.png", str(other)):
+        with pytest.raises(MeshError, match=r"refer to files in its own folder, got .*my texture\.png"):
+            load_mesh(gltf(folder / "a.gltf", pbr(**TEXTURED), name))
+
+
+def test_a_mesh_is_made_of_what_was_hashed(tmp_path, monkeypatch):
+    """A file that changes while the mesh is read: image and hash are of the same content."""
+    path = obj(tmp_path)
+    (tmp_path / "my texture.png").write_bytes(png())
+    before = load_mesh(path, unit="m")
+    reads = trimesh.load_scene
+
+    def changed_meanwhile(*given, **options):
+        (tmp_path / "my texture.png").write_bytes(png((0, 0, 0, 255)))
+        (tmp_path / "a.mtl").unlink()
+        return reads(*given, **options)
+
+    monkeypatch.setattr(trimesh, "load_scene", changed_meanwhile)
+    read = load_mesh(path, unit="m")
+    assert read.sha256 == before.sha256
+    np.testing.assert_array_equal(read.parts[0].texture, before.parts[0].texture)
 
 
 def test_named_files_that_are_missing_or_broken_are_errors(tmp_path):
     path = obj(tmp_path, material=None)
-    with pytest.raises(MeshError, match=r"missing: .*a\.mtl"):
+    with pytest.raises(MeshError, match=r"refers to a\.mtl, .*No such file"):
         load_mesh(path, unit="m")
     obj(tmp_path)
-    with pytest.raises(MeshError, match=r"missing: .*my texture\.png"):
+    with pytest.raises(MeshError, match=r"refers to my texture\.png, .*No such file"):
         load_mesh(path, unit="m")
     for content in (b"", png()[:45]):
         (tmp_path / "my texture.png").write_bytes(content)
         with pytest.raises(MeshError, match=r"readable texture, got .*my texture\.png"):
             load_mesh(path, unit="m")
-    with pytest.raises(MeshError, match=r"missing: .*not there\.png"):
+    with pytest.raises(MeshError, match=r"refers to not there\.png, .*No such file"):
         load_mesh(gltf(tmp_path / "a.gltf", pbr(**TEXTURED), "not%20there.png"))
 
 

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from advnerf_core.attack.artifact import load_attack
+from advnerf_core.data.image_files import write_image
 from advnerf_core.objects.mesh.engine import MeshEngineError, engine
 from advnerf_core.objects.mesh.glb import read_glb
 from nodes.cli import main as cli
@@ -138,3 +139,16 @@ def test_a_file_that_is_no_mesh_is_one_line_and_exit_code_2(tmp_path, capsys, mo
     error = capsys.readouterr().err
     assert "broken.glb" in error
     assert "Traceback" not in error
+
+
+def test_a_search_is_of_the_mesh_and_of_all_files_that_it_names(tmp_path):
+    (tmp_path / "a.obj").write_text(
+        "mtllib a.mtl\nv 0 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
+    )
+    (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd t.png\n")
+    placed = "{kind: mesh, x_m: 1, y_m: 1, z_m: 0, mesh: {file: a.obj, texels: 8, height_m: 0.5}}"
+    request, found = load_request(asked(tmp_path, placed)), []
+    for colour in (10, 20, 10):
+        write_image(tmp_path / "t.png", np.full((4, 4, 3), colour, np.uint8))
+        found.append(prepare(request).settings_hash)
+    assert found[0] == found[2] != found[1]

@@ -78,7 +78,8 @@ def test_a_road_is_the_same_in_every_process_and_another_seed_is_another_road() 
 
     first, again, other = route(4), route(4), route(7)
     assert first[0] == again[0]  # type: ignore[index]
-    assert np.array_equal(first[1], again[1])  # type: ignore[index]
+    # As docs/foreign_worlds.md promises: samples on edges may fall on the other side in another process.
+    assert np.mean(np.any(first[1] != again[1], axis=-1)) <= 1e-3  # type: ignore[index]
     assert first[0] != other[0]  # type: ignore[index]
 
 
