@@ -115,7 +115,7 @@ class Rig(threading.Thread):
         ours.allow("desk", DRIVE)
         ports = dict(zip(("watch_port", "drive_port"), _free_ports(2), strict=True))
         seen = ["/safety/state", "/motor/sent"]
-        link = {**ports, "exports": seen, "imports": ["/arm"], "keys": str(ours.path)}
+        link: dict[str, Any] = {**ports, "exports": seen, "imports": ["/arm"], "keys": str(ours.path)}
         self._run_node("gateway", listen="127.0.0.1", key="robot", **link)
         link = {**ports, "exports": ["/arm"], "imports": seen, "keys": str(theirs.path)}
         self._run_node("gateway_desk", self.desk, "gateway", connect="127.0.0.1", key="desk", **link)
@@ -246,7 +246,12 @@ def ask(origin: str, kind: str, rig: Rig, browser: Browser | None, keys: int | N
         found: list[tuple[str, int]] = []
         thread = threading.Thread(target=lambda: found.append(_request_verdict(rig, kind)))
         thread.start()
-        return lambda: (thread.join(), found[0])[1]
+
+        def answer() -> tuple[str, int]:
+            thread.join()
+            return found[0]
+
+        return answer
     if origin == "teleop":
         assert keys is not None
         os.write(keys, b" ")
@@ -401,7 +406,11 @@ def _report(rows: list[dict[str, Any]], record: bool) -> None:
     lost = [row for row in rows if row["brake_ms"] is None]
     brakes = [row["brake_ms"] for row in rows if row["brake_ms"] is not None]
     # A command and a trial first start a Python process; their brake is counted from the start of that process.
-    nodes = [r["brake_ms"] for r in rows if r["brake_ms"] is not None and r["origin"] in ("page", "teleop")]
+    nodes = [
+        r["brake_ms"]
+        for r in rows
+        if r["brake_ms"] is not None and r["origin"].startswith(("page", "teleop"))
+    ]
     late = [row for row in rows if row["origin"] != "trial" and row["word_ms"] > VERDICT_LIMIT_MS]
     text = (
         f"brake p99 {np.percentile(brakes, 99):.0f} ms, worst {max(brakes):.0f} ms" if brakes else "no brake"

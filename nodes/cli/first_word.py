@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 # A command has this long since the start of its process to import its code and to ask.
-_FIRST_WORD_S = 0.8
+_FIRST_WORD_S = 0.9
 _TEXT = (
     "error: NOT CONFIRMED: nothing is known yet, and the car may be driving. Use the e-stop or cut the power."
     " Still asking (Ctrl-C gives up)"
