@@ -112,6 +112,7 @@ QUESTIONS = (
             "thirty_minutes",
             "page_faults",
             "page_strangers",
+            "stops",
         ),
     ),
     Question(

@@ -22,7 +22,7 @@ QUICK = (
 LONG = ("attack_kill", "scene_kill", "adjoint_memory --compare", "newcomer")
 CAMPAIGN = (
     "one_hop", "frame_age", "car_nodes", "launch_times", "calibrations", "lockstep_replay", "strangers", "ros2_strangers", "two_hosts", "bag_kill", "bag_kill --splits",
-    "requests", "fuzz", "page_strangers", "page_latency", "page_faults", "pose_jumps", "stalls", "policy_from_bags", "fault_campaign", "thirty_minutes",
+    "requests", "fuzz", "page_strangers", "page_latency", "page_faults", "stops", "pose_jumps", "stalls", "policy_from_bags", "fault_campaign", "thirty_minutes",
     "world_faults",
 )  # fmt: skip
 OF_A_RUN = ("baked_scene", "gradient_pass", "objects", "phone_to_car", "closed_loop_cosine")

@@ -1,6 +1,6 @@
 """``python -m nodes.cli``: the command without its installed script."""
 
-from nodes.cli.main import main
+from nodes.cli.program import main
 
 if __name__ == "__main__":
     main()

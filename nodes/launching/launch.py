@@ -6,9 +6,6 @@ required node that dies, hangs or does not start stops the whole launch. The sup
 
 from __future__ import annotations
 
-import fcntl
-import json
-import os
 import signal
 import threading
 import time
@@ -16,16 +13,17 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
-from advnerf_core.documents import dump_yaml, read_json
+from advnerf_core.documents import dump_yaml
 from advnerf_core.files import write_atomically
-from advnerf_core.places import private_folder, require_utf8
+from advnerf_core.places import require_utf8
 from nodes.launching.child import Child
 from nodes.launching.launch_file import Plan, load_launch
+from nodes.launching.running import leave_card
 from nodes.runtime.bus import Bus
 from nodes.runtime.config import node_document
 from nodes.runtime.errors import LaunchError
 from nodes.runtime.locks import HeldError, hold
-from nodes.runtime.paths import RESOLVED_NAME, user_folder, user_folders
+from nodes.runtime.paths import RESOLVED_NAME
 from nodes.runtime.topics import status_topic
 
 _POLL_S = 0.05
@@ -139,7 +137,7 @@ class Launch:
 
     def _supervise(self) -> None:
         try:
-            self._card = _leave_card(self.plan.launch.name, self.run_dir)
+            self._card = leave_card(self.plan.launch.name, self.run_dir)
             self._bus = Bus(self.run_dir)
             for name in self._children:
                 self._bus.subscribe(status_topic(name))
@@ -270,19 +268,6 @@ class Launch:
             self._report(f"{late}: still running after {number.name}")
 
 
-def active_launches() -> list[dict[str, Any]]:
-    """Running launches of this user on this host: name, run_dir, pid, and cwd, the folder in which it was started."""
-    found = []
-    for card in sorted(card for folder in user_folders() for card in (folder / "active").glob("*.json")):
-        try:
-            launch = read_json(card)
-            if is_running(Path(launch["run_dir"])):
-                found.append(launch)
-        except (OSError, ValueError, KeyError):
-            continue  # it ended while we looked
-    return found
-
-
 def _silence(child: Child, now: float) -> str:
     if child.status_at is None:
         limit_s = child.entry.start_timeout_s
@@ -300,21 +285,3 @@ def _lock_run(run_dir: Path) -> TextIO:
             f"{run_dir} is in use by the launch of process {error.owner}, and two launches cannot share endpoints; stop it, or use "
             "another --run-dir"
         ) from None
-
-
-def is_running(run_dir: Path) -> bool:
-    """Whether a launch is running in a run folder."""
-    with open(run_dir / "launch.lock", encoding="ascii") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except OSError:
-            return True
-    return False
-
-
-def _leave_card(name: str, run_dir: Path) -> Path:
-    card = private_folder(user_folder() / "active") / f"{os.getpid()}-{run_dir.name}.json"
-    write_atomically(
-        card, json.dumps({"name": name, "run_dir": str(run_dir), "pid": os.getpid(), "cwd": os.getcwd()})
-    )
-    return card

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from advnerf_core.documents import read_yaml
-from nodes.launching.launch import active_launches, is_running
+from nodes.launching.running import active_launches, is_running
 from nodes.runtime.bus import Bus, Received
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import LaunchError, MessageError

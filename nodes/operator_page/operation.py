@@ -161,6 +161,7 @@ class Operation:
             "estop": parts.desk.estop,
             "unanswered_s": round(self._asker.unanswered_s(now), 1),
             "not_confirmed": self._asker.not_confirmed(now),
+            "stops": list(self.stops()),
             "chosen": {
                 "id": self._chosen,
                 "show": self._show is not False,

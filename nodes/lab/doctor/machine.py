@@ -20,7 +20,7 @@ from advnerf_core.errors import AdvnerfError
 from advnerf_core.kernel_cache import use_own_folder
 from advnerf_core.places import PlaceError, is_writable, user_place
 from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, Finding
-from nodes.launching.launch import active_launches
+from nodes.launching.running import active_launches
 from nodes.linking.keys import DRIVE, KeyFolder, default_folder
 from nodes.runtime.bus import Bus
 from nodes.runtime.machine import memory_gib

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from nodes.lab.doctor.check import OK, WARNING, Finding
-from nodes.launching.launch import active_launches
+from nodes.launching.running import active_launches
 from nodes.runtime.paths import lock_path, socket_path
 from nodes.runtime.priority import FIRST, Share, share_of
 from nodes.runtime.topics import status_topic

@@ -10,8 +10,9 @@ import psutil
 import pytest
 import yaml
 
-from nodes.launching.launch import Launch, active_launches
+from nodes.launching.launch import Launch
 from nodes.launching.launch_file import load_launch
+from nodes.launching.running import active_launches
 from nodes.recorder import RecorderConfig
 from nodes.runtime.errors import ConfigError, LaunchError
 
