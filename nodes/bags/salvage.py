@@ -97,7 +97,7 @@ def _wrong_byte(records: bytes, crc: int) -> tuple[int, int] | None:
 def _without_record_at(records: bytes, at: int, difference: int) -> bytes:
     right = bytearray(records)
     right[at] ^= difference
-    for _, body, end in records_of(right):
+    for _, body, end in records_of(bytes(right)):
         if body - RECORD_HEAD.size <= at < end:
             return bytes(right[: body - RECORD_HEAD.size] + right[end:])
     return bytes(right)

@@ -13,12 +13,14 @@ from advnerf_core.attack.artifact import AttackFile, face_texture, save_attack
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.geometry import Pinhole, planar_pose
 from benchmarks.host_pair import exchange_keys
+from nodes.bags.reader import read_messages
 from nodes.bags.writer import BagWriter
 from nodes.cli.main import app
 from nodes.lab.trials.bags import evaluate_bag, find_drives
 from nodes.lab.trials.plan import CampaignError, finished, make_order, williams_rows
 from nodes.lab.trials.series import drive_series, prepare_series, summarise
 from nodes.launching.launch import Launch
+from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError, ConfigError
 from nodes.runtime.messages import encode, header, pose_message, types
 
@@ -229,6 +231,20 @@ def write_bag(folder, drives, offset_m=0.1, rate_hz=100):
         put("/vicon/car", pose_message(planar_pose(x, -2.0 + offset_m, 0.0), START_NS + round(t * 1e9)))
     writer.close()
     return folder / "bag"
+
+
+def test_a_drive_ends_where_the_clock_of_the_recorder_was_set(tmp_path, capsys):
+    drives = [(1.0, 2.2, "outside the fence")]
+    (straight,) = find_drives(write_bag(tmp_path / "straight", drives))
+    with BagWriter(tmp_path / "jump") as writer:
+        for number, each in enumerate(read_messages(tmp_path / "straight" / "bag")):
+            log_ns = each.log_ns + 7200 * NS_PER_S * (each.log_ns > straight.start_real_ns + NS_PER_S)
+            writer.write(each.topic, each.cdr, log_ns, log_ns, number)
+    (span,) = find_drives(tmp_path / "jump")
+    assert span.start_real_ns == straight.start_real_ns
+    assert (span.end_real_ns - span.start_real_ns) / NS_PER_S == pytest.approx(1.0, abs=0.05)
+    assert span.reason.startswith("log time jumps by 2 hours after message ")
+    assert span.reason in capsys.readouterr().err
 
 
 def test_the_numbers_of_a_bag_follow_from_the_bag_alone(tmp_path):
