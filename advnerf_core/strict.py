@@ -140,8 +140,31 @@ def strict_validator(model: Any) -> SchemaValidator:
 
 @lru_cache(maxsize=64)
 def _validator(model: Any) -> SchemaValidator:
-    # Prebuilt validators are those of classes that do not derive from StrictModel, such as a plug-in's: they are not strict.
-    return SchemaValidator(TypeAdapter(Annotated[model, Strict()]).core_schema, _use_prebuilt=False)
+    schema = TypeAdapter(Annotated[model, Strict()]).core_schema
+    # pydantic takes over the validators of complete models. A plug-in's model that does not derive from StrictModel is not strict, nor
+    # are those that hold it.
+    found = set(_models_in(schema))
+    others = set() if all(issubclass(each, StrictModel) for each in found) else found
+    try:
+        for each in others:
+            each.__pydantic_complete__ = False
+        return SchemaValidator(schema)
+    finally:
+        for each in others:
+            each.__pydantic_complete__ = True
+
+
+def _models_in(part: Any) -> Iterator[type[BaseModel]]:
+    """Complete models in a core schema."""
+    if isinstance(part, list | tuple):
+        for each in part:
+            yield from _models_in(each)
+    elif isinstance(part, dict):
+        if part.get("type") == "model" and part["cls"].__pydantic_complete__:
+            yield part["cls"]
+        for name, value in part.items():
+            if name not in _NOT_SCHEMAS:
+                yield from _models_in(value)
 
 
 def _unknown_keys(model: Any, document: Document, key: Key) -> Iterator[str]:
