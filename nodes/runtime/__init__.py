@@ -41,9 +41,10 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
+    from advnerf_core.errors import ConfigError
     from nodes.runtime.bus import Bus, Received
     from nodes.runtime.clock import Clock, ManualClock, Now, SystemClock
-    from nodes.runtime.errors import ConfigError, MessageError, NodeFinished
+    from nodes.runtime.errors import MessageError, NodeFinished
     from nodes.runtime.inbox import Inbox, ReaderThread
     from nodes.runtime.messages import (
         camera_info_message,
@@ -68,7 +69,8 @@ else:
         {
             "nodes.runtime.bus": "Bus Received",
             "nodes.runtime.clock": "Clock ManualClock Now SystemClock",
-            "nodes.runtime.errors": "ConfigError MessageError NodeFinished",
+            "advnerf_core.errors": "ConfigError",
+            "nodes.runtime.errors": "MessageError NodeFinished",
             "nodes.runtime.inbox": "Inbox ReaderThread",
             "nodes.runtime.messages": "camera_info_message decode drive_message encode header image_message pose_matrix pose_message stamp_ns types",
             "nodes.runtime.node": "Node NodeContext Out",
