@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 
+from advnerf_core.documents import read_json
 from advnerf_core.geometry import planar_pose
 from benchmarks.page_client import Browser, cookie_of, request
 from benchmarks.processes import end
@@ -311,7 +312,7 @@ def _port(rig: Rig) -> int:
     deadline = time.monotonic() + 60.0
     while not door.exists() and time.monotonic() < deadline:
         time.sleep(0.05)
-    return int(json.loads(door.read_text())["url"].rstrip("/").rpartition(":")[2])
+    return int(read_json(door)["url"].rstrip("/").rpartition(":")[2])
 
 
 def measure(

@@ -25,6 +25,7 @@ WIRE = {
     "nodes/experiment/campaign/worker.py": 1,  # a job on standard input
     "nodes/experiment/request/job.py": 1,  # lines of a search process
     "nodes/lab/doctor/check.py": 1,  # a probe's answer
+    "nodes/lab/doctor/priority.py": 1,  # a child's answer
     "nodes/lab/doctor/probes.py": 1,  # a probe's arguments
     "nodes/operator_page/responses.py": 1,  # a request of the page
     "nodes/operator_page/said.py": 1,  # messages of the page
@@ -37,6 +38,7 @@ WIRE = {
     "benchmarks/page_strangers.py": 2,
     "benchmarks/rclpy_peer.py": 1,
     "benchmarks/seeds_together.py": 1,
+    "benchmarks/stops.py": 1,  # the page's answer
 }
 HEADERS = {  # text in the header of a tensor file or archive that our own writer made
     "advnerf_core/attack/artifact.py": 2,

@@ -82,7 +82,7 @@ def frozen_hashes(experiment: Experiment) -> dict[str, str]:
         **policies,
         "starts_and_seeds": hash_of(starts),
         # As the experiment was run: a report may be of fewer methods.
-        "config": hash_of(json.loads((experiment.folder / "manifest.json").read_text())["config"]),
+        "config": hash_of(read_json(experiment.folder / "manifest.json")["config"]),
     }
 
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from nodes.lab.trials.trial import SpoiledError, TrialError
 
@@ -45,7 +46,7 @@ def drive_with_tries(
         NotDrivenError: All tries were spoiled, now or when this drive was tried before.
     """
     if file.exists():
-        found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        found: dict[str, Any] = read_json(file)
         return found
     kept = file.with_suffix(_TRIES)
     rounds = _read(kept) or [[]]
@@ -74,7 +75,7 @@ def allow_more_tries(folder: Path) -> None:
 
 def _read(kept: Path) -> list[list[str]]:
     """The reasons of spoiled tries: a list for each time that a person allowed three of them."""
-    found: list[list[str]] = json.loads(kept.read_text(encoding="utf-8")) if kept.exists() else []
+    found: list[list[str]] = read_json(kept) if kept.exists() else []
     return found
 
 
