@@ -67,6 +67,21 @@ def running(emulator):
         thread.join()
 
 
+def test_a_jam_has_no_effect_on_a_step_up_to_an_earlier_time():
+    with VescEmulator(VescEmulatorConfig(), vehicle()) as emulator:
+        emulator.vehicle.command(erpm=4000.0)
+        before_ns = time.monotonic_ns()
+        emulator.advance(0.5, before_ns)
+        emulator.jam("locked")
+        assert emulator.advance(0.005, before_ns + 1).speed_mps > 0.5, "due before, made late"
+        assert names(emulator) == ["MOVING"]
+        later_ns = time.monotonic_ns()
+        assert emulator.advance(0.005, later_ns).speed_mps == 0.0
+        assert [e.mono_ns for e in emulator.events() if e.name == "STANDSTILL"] == [later_ns]
+        with pytest.raises(ValueError, match="expected a jam of locked, spinning, got 'stuck'"):
+            emulator.jam("stuck")
+
+
 def test_who_is_there(emulator):
     with driver(emulator) as vesc:
         assert vesc.identify() == FirmwareVersion(5, 2, "TWIN", b"advnerf-twin")
