@@ -28,7 +28,7 @@ def in_a_fresh_process(statement, *others):
     code = "\n".join(line.strip() for line in code.strip().splitlines())
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, *others, "-c", code]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, timeout=60)
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, timeout=600)
     assert done.returncode == 0, done.stderr
     loaded, taken = json.loads(done.stdout)
     return set(loaded), taken

@@ -177,6 +177,6 @@ class Run:
                 process.send_signal(signal.SIGCONT)
                 process.terminate()
         for process in self.processes.values():
-            process.wait(15.0)
+            process.wait(120)
         if self.car.is_alive():
             self.car.join()
