@@ -32,10 +32,10 @@ def request(
     if tls:
         context = unchecked()
         connection = http.client.HTTPSConnection(
-            "127.0.0.1", port, timeout=10, context=context, source_address=source
+            "127.0.0.1", port, timeout=60, context=context, source_address=source
         )
     else:
-        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10, source_address=source)
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60, source_address=source)
     try:
         connection.request(method, path, body, headers or {})
         response = connection.getresponse()
@@ -185,7 +185,7 @@ class Browser:
         self.held = False
         return self.do("release", press=self.press)
 
-    def wait(self, condition: Callable[[], Any], what: str, timeout_s: float = 10.0) -> None:
+    def wait(self, condition: Callable[[], Any], what: str, timeout_s: float = 60.0) -> None:
         deadline = time.monotonic() + timeout_s
         while not condition():
             assert time.monotonic() < deadline, f"gave up waiting for {what}; {self.answers[-3:]}"

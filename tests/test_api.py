@@ -28,17 +28,21 @@ def in_a_fresh_process(statement, *others):
     code = "\n".join(line.strip() for line in code.strip().splitlines())
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, *others, "-c", code]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, timeout=60)
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, timeout=600)
     assert done.returncode == 0, done.stderr
     loaded, taken = json.loads(done.stdout)
     return set(loaded), taken
 
 
 @pytest.mark.parametrize("package", write_api.PACKAGES)
-def test_a_package_loads_nothing_but_itself_within_50_ms(package):
-    runs = [in_a_fresh_process(f"import {package}") for _ in range(3)]
-    assert [loaded for loaded, _ in runs] == [set()] * 3
-    assert min(taken for _, taken in runs) < 0.05
+def test_a_package_loads_nothing_but_itself(package):
+    assert in_a_fresh_process(f"import {package}")[0] == set()
+
+
+@pytest.mark.timing
+@pytest.mark.parametrize("package", write_api.PACKAGES)
+def test_a_package_loads_within_50_ms(package):
+    assert min(in_a_fresh_process(f"import {package}")[1] for _ in range(3)) < 0.05
 
 
 @pytest.mark.parametrize(

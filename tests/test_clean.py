@@ -23,7 +23,9 @@ def folder(tmp_path):
 
 
 def make(folder, *words, **options):
-    return subprocess.run(["make", *words], cwd=folder, capture_output=True, text=True, timeout=60, **options)
+    return subprocess.run(
+        ["make", *words], cwd=folder, capture_output=True, text=True, timeout=600, **options
+    )
 
 
 def present(folder):

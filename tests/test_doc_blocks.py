@@ -80,7 +80,7 @@ def test_the_blocks_of_a_page_run(home, page):
         env={**os.environ, "PYTHONPATH": str(ROOT), "MUJOCO_GL": "egl"},
         capture_output=True,
         text=True,
-        timeout=500,
+        timeout=600,
     )
     assert done.returncode == 0, done.stderr[-2000:]
 

@@ -40,7 +40,7 @@ def run(*arguments):
             "MUJOCO_GL": "egl",
             "OMP_NUM_THREADS": "1",
         },
-        timeout=110,
+        timeout=600,
     )
 
 

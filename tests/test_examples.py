@@ -37,7 +37,7 @@ def run(*command):
         text=True,
         cwd=ROOT,
         env=environment,
-        timeout=110,
+        timeout=600,
     )
     assert done.returncode == 0, done.stderr
     assert "Warning" not in done.stderr
@@ -96,7 +96,7 @@ def test_a_copied_example_runs_in_an_empty_folder(tmp_path):
     copy = shutil.copy(EXAMPLES / "spiral_method.py", tmp_path)
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     done = subprocess.run(
-        [sys.executable, copy], capture_output=True, text=True, cwd=tmp_path, env=environment, timeout=110
+        [sys.executable, copy], capture_output=True, text=True, cwd=tmp_path, env=environment, timeout=600
     )
     assert done.returncode == 0, done.stderr
     assert figures(done.stdout)[2] > 0.0

@@ -37,7 +37,7 @@ def wheel(tmp_path_factory):
         *("build", "--build-base", folder / "build"),
         *("bdist_wheel", "--bdist-dir", folder / "content", "--dist-dir", folder),
     ]
-    done = subprocess.run(list(map(str, command)), cwd=ROOT, capture_output=True, text=True, timeout=110)
+    done = subprocess.run(list(map(str, command)), cwd=ROOT, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     (file,) = folder.glob("*.whl")
     return file
@@ -92,7 +92,7 @@ def test_names_are_found_in_it_from_an_empty_folder(unpacked, tmp_path):
         env=environment,
         capture_output=True,
         text=True,
-        timeout=110,
+        timeout=600,
     )
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
@@ -111,7 +111,7 @@ def test_init_copies_what_can_be_edited_and_keeps_what_was(unpacked, tmp_path):
         environment = {**os.environ, "PYTHONPATH": str(unpacked)}
         command = [sys.executable, "-m", "nodes.cli", *arguments]
         return subprocess.run(
-            command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60
+            command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=600
         )
 
     (tmp_path / "car" / "launch").mkdir(parents=True)
@@ -147,9 +147,9 @@ class Installed:
             self.as_stranger = []
         python = self._python()
         command = [python, "-m", "venv", "--without-pip", str(self.environment)]
-        subprocess.run(command, check=True, timeout=100)
+        subprocess.run(command, check=True, timeout=600)
         pip = [sys.executable, "-m", "pip", "--python", str(self.environment / "bin" / "python"), "install"]
-        subprocess.run([*pip, "-q", "--no-index", "--no-deps", str(wheel)], check=True, timeout=100)
+        subprocess.run([*pip, "-q", "--no-index", "--no-deps", str(wheel)], check=True, timeout=600)
         (self.packages,) = self.environment.glob("lib/python*/site-packages")
         # A plain path: what is installed there for editing stays off.
         (self.packages / "others.pth").write_text(sysconfig.get_path("purelib") + "\n")

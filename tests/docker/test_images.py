@@ -45,7 +45,7 @@ def resolve(tmp_path, wanted, python, constraints):
     command += [part for platform in PLATFORMS for part in ("--platform", platform)]
     command += ["-c", str(REPOSITORY / "constraints.txt")] if constraints else []
     done = subprocess.run(
-        [*command, "-r", str(tmp_path / "wanted.txt")], capture_output=True, text=True, timeout=280
+        [*command, "-r", str(tmp_path / "wanted.txt")], capture_output=True, text=True, timeout=600
     )
     if "Temporary failure in name resolution" in done.stderr or "Connection refused" in done.stderr:
         pytest.skip("no package index")

@@ -19,6 +19,7 @@ from hardware.motor.vesc_codec import CommandId, encode_command
 from hardware.motor.vesc_replies import FirmwareVersion
 from hardware.worlds.lab.config import CarConfig
 from hardware.worlds.lab.vehicle import TwinVehicle
+from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.live
 
@@ -41,13 +42,6 @@ def names(emulator):
     return [event.name for event in emulator.events() if event.name not in ("GET_VALUES", "FW_VERSION")]
 
 
-def wait_for(condition, timeout_s=2.0):
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "timed out"
-        time.sleep(0.002)
-
-
 @contextlib.contextmanager
 def running(emulator):
     """Let the car live in real time."""
@@ -67,6 +61,21 @@ def running(emulator):
         thread.join()
 
 
+def test_a_jam_has_no_effect_on_a_step_up_to_an_earlier_time():
+    with VescEmulator(VescEmulatorConfig(), vehicle()) as emulator:
+        emulator.vehicle.command(erpm=4000.0)
+        before_ns = time.monotonic_ns()
+        emulator.advance(0.5, before_ns)
+        emulator.jam("locked")
+        assert emulator.advance(0.005, before_ns + 1).speed_mps > 0.5, "due before, made late"
+        assert names(emulator) == ["MOVING"]
+        later_ns = time.monotonic_ns()
+        assert emulator.advance(0.005, later_ns).speed_mps == 0.0
+        assert [e.mono_ns for e in emulator.events() if e.name == "STANDSTILL"] == [later_ns]
+        with pytest.raises(ValueError, match="expected a jam of locked, spinning, got 'stuck'"):
+            emulator.jam("stuck")
+
+
 def test_who_is_there(emulator):
     with driver(emulator) as vesc:
         assert vesc.identify() == FirmwareVersion(5, 2, "TWIN", b"advnerf-twin")
@@ -78,7 +87,7 @@ def test_who_is_there(emulator):
 def test_drive_sends_servo_then_rpm_and_says_what_it_sent(emulator):
     with driver(emulator) as vesc:
         sent = vesc.drive(0.3, 0.1)
-        wait_for(lambda: len(emulator.events()) == 2)
+        wait_for(lambda: len(emulator.events()) == 2, "two events")
         servo, rpm = emulator.events()
         assert (servo.name, rpm.name) == ("SET_SERVO_POS", "SET_RPM")
         assert (sent.servo, sent.erpm, sent.braking) == (servo.value, rpm.value, False)
@@ -102,7 +111,7 @@ def test_a_command_that_is_not_finite_brakes(emulator, command):
     with driver(emulator, stop_brake_current_a=12.0) as vesc:
         sent = vesc.drive(*command)
         assert (sent.braking, sent.brake_current_a, sent.erpm) == (True, 12.0, 0.0)
-        wait_for(lambda: names(emulator) == ["SET_CURRENT_BRAKE"])
+        wait_for(lambda: names(emulator) == ["SET_CURRENT_BRAKE"], "the brake")
 
 
 def test_leaving_the_context_brakes_then_lets_go(emulator):
@@ -113,7 +122,7 @@ def test_leaving_the_context_brakes_then_lets_go(emulator):
 
     with pytest.raises(RuntimeError, match="mistake"):
         make_a_mistake()
-    wait_for(lambda: names(emulator)[-1] == "SET_CURRENT")
+    wait_for(lambda: names(emulator)[-1] == "SET_CURRENT", "the release")
     assert names(emulator)[2:] == ["SET_CURRENT_BRAKE", "SET_CURRENT"]
     assert emulator.events()[-1].value == 0.0
 
@@ -167,7 +176,7 @@ def test_the_car_moves_and_telemetry_says_so(emulator):
         with pytest.raises(HardwareError, match="at rest"):
             emulator.place(0.0, 0.0, 0.0)
         vesc.brake(20.0)
-        wait_for(lambda: emulator.state.speed_mps == 0.0)
+        wait_for(lambda: emulator.state.speed_mps == 0.0, "standstill")
         emulator.place(1.0, 2.0, 0.5)
         assert (emulator.state.x_m, emulator.state.y_m, emulator.state.yaw_rad) == (1.0, 2.0, 0.5)
     motion = [e.name for e in emulator.events() if e.name in ("MOVING", "STANDSTILL", "PLACED")]
@@ -177,7 +186,7 @@ def test_the_car_moves_and_telemetry_says_so(emulator):
 def test_wire_log_tells_what_came_and_where_the_car_was(emulator, tmp_path):
     with driver(emulator) as vesc:
         vesc.drive(0.5, 0.0)
-        wait_for(lambda: len(names(emulator)) == 2)
+        wait_for(lambda: len(names(emulator)) == 2, "two commands")
     rows = read_wire_log(tmp_path / "wire.csv")
     kept = [(event.name, event.value) for event, _, _ in rows if event.name != "GET_VALUES"]
     assert kept[:2] == [("SET_SERVO_POS", 0.53), ("SET_RPM", 1614.0)]

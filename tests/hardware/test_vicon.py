@@ -169,13 +169,15 @@ def test_receiver_on_a_real_socket():
                 sender.sendto(datagram, ("127.0.0.1", receiver.port))
         time.sleep(0.05)
         read_ns = time.time_ns()
-        poses = receiver.read(timeout_s=1.0)
+        poses = receiver.read(timeout_s=60.0)
         assert [p.frame_number for p in poses] == list(range(20))
         assert poses[-1].T_world_from_subject == pytest.approx(planar_pose(1.9, 1.0, 0.3), abs=1e-9)
         # The stamp is the arrival, not the reading 50 ms later.
         assert all(before <= p.stamp_real_ns <= read_ns - 40_000_000 for p in poses)
-        age_ns = time.time_ns() - poses[0].stamp_real_ns
-        assert time.monotonic_ns() - poses[0].receive_mono_ns == pytest.approx(age_ns, abs=5e6)
+        # Both clocks are read one after the other, and now and then something comes in between.
+        offsets_ns = [time.time_ns() - time.monotonic_ns() for _ in range(10)]
+        off_ns = np.subtract(offsets_ns, poses[0].stamp_real_ns - poses[0].receive_mono_ns)
+        assert np.abs(off_ns).min() < 5e6
 
 
 def test_port_in_use_is_one_clear_error():

@@ -75,7 +75,7 @@ class Lab:
     def wait_ready(self, reason="not armed since the start"):
         with Bus(self.folder) as bus:
             bus.subscribe("/safety/state")
-            deadline = time.monotonic() + 20.0
+            deadline = time.monotonic() + 60.0
             while time.monotonic() < deadline:
                 bus.wait(0.1)
                 for received in bus.receive():
@@ -147,7 +147,7 @@ def test_a_disarm_waits_loudly_for_a_safety_node_that_joins_late(lab):
     assert "NOT CONFIRMED: no answer from the safety node for 0." in first
     assert lab.recorded  # a recorder hears it all the time
     lab.start()
-    output, _ = asking.communicate(timeout=30)
+    output, _ = asking.communicate(timeout=600)
     assert (asking.returncode, output) == (0, "CONFIRMED: not armed: disarmed by operator: look out\n")
 
 
@@ -155,7 +155,7 @@ def test_a_disarm_that_is_given_up_is_no_success(lab):
     asking = command(lab, "disarm")
     assert "NOT CONFIRMED" in asking.stderr.readline()
     asking.send_signal(signal.SIGINT)
-    assert asking.wait(10) == 130
+    assert asking.wait(120) == 130
     asking.stdout.close()
     asking.stderr.close()
 
@@ -165,7 +165,7 @@ def test_a_disarm_without_a_motor_node_says_so(lab):
     lab.wait_ready()
     lab.motor = False
     asking = command(lab, "disarm")
-    output, errors = asking.communicate(timeout=30)
+    output, errors = asking.communicate(timeout=600)
     assert asking.returncode == 1
     assert output == ""
     assert (
@@ -182,7 +182,7 @@ def test_why_it_is_not_armed(lab):
     lab.well = False
     time.sleep(0.4)
     asking = command(lab, "arm")
-    output, errors = asking.communicate(timeout=30)
+    output, errors = asking.communicate(timeout=600)
     assert (asking.returncode, errors) == (1, "")
     named, answer = output.splitlines()
     assert named == f"{lab.folder}: no motor node on this host"
@@ -200,7 +200,7 @@ def test_a_hung_safety_node_answers_when_it_wakes_and_an_arm_is_void_by_then(lab
         send(asked)
         time.sleep(1.1)
         os.kill(lab.process.pid, signal.SIGCONT)
-        output, _ = asking.communicate(timeout=30)
+        output, _ = asking.communicate(timeout=600)
         assert (asking.returncode, output) == (0, "CONFIRMED: not armed: disarmed by operator: \n")
         state = send.until_answered(asked)
     assert not state.armed
@@ -249,7 +249,7 @@ class Sender:
 
     def until_answered(self, asked):
         self._bus.receive()
-        sent_ns, deadline = time.monotonic_ns(), time.monotonic() + 5.0
+        sent_ns, deadline = time.monotonic_ns(), time.monotonic() + 60.0
         while time.monotonic() < deadline:
             self(asked)
             self._bus.wait(0.02)

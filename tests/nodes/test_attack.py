@@ -67,7 +67,7 @@ class Bench:
             types.AttackCancel(header=header(0), request_id=request_id, reason="enough", ask_id=""),
         )
 
-    def run_until(self, condition, timeout_s=40.0):
+    def run_until(self, condition, timeout_s=300.0):
         deadline = time.monotonic() + timeout_s
         while not condition():
             assert time.monotonic() < deadline, self.progress()[-1:]
@@ -237,7 +237,7 @@ def node_process(module, run_dir, config):
 
 def end(process):
     process.send_signal(signal.SIGTERM)
-    assert process.wait(10) == 0
+    assert process.wait(120) == 0
 
 
 class Car:
@@ -289,7 +289,7 @@ def test_a_killed_node_goes_on_and_a_running_compositor_takes_the_attack_over(tm
             attack = node_process("nodes.attack", run_dir, {"repeat_s": 0.2})
             first = _wait(bus, lambda message: message.state == "searching")
             assert first.evaluation >= 3
-            deadline = time.monotonic() + 60
+            deadline = time.monotonic() + 300
             while not (car.labels and car.labels[-1].attack_id):
                 assert time.monotonic() < deadline
                 car.see()
@@ -309,7 +309,7 @@ def test_a_killed_node_goes_on_and_a_running_compositor_takes_the_attack_over(tm
             process.wait()
 
 
-def _wait(bus, condition, timeout_s=60.0):
+def _wait(bus, condition, timeout_s=300.0):
     deadline = time.monotonic() + timeout_s
     while time.monotonic() < deadline:
         bus.wait(0.1)

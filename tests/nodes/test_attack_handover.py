@@ -113,7 +113,7 @@ class Drive:
     def close(self):
         self.process.send_signal(signal.SIGTERM)
         try:
-            assert self.process.wait(10) == 0
+            assert self.process.wait(120) == 0
         finally:
             self.process.kill()
             self.bus.close()

@@ -28,7 +28,7 @@ START_NS = 1_700_000_000_000_000_000
 SQUARE = DrivingPath.rounded_square(4.0, 1.1)
 
 
-def advnerf(*arguments, timeout=60):
+def advnerf(*arguments, timeout=600):
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-m", "nodes.cli", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout, cwd=ROOT, env=environment)

@@ -20,6 +20,7 @@ from nodes.runtime.errors import RuntimeFault
 from nodes.runtime.messages import ns_from_stamp, pinhole_from_camera_info, pose_matrix
 from nodes.runtime.pictures import rgb_image
 from nodes.vicon import ViconNode, ViconNodeConfig
+from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.live
 
@@ -27,7 +28,7 @@ TWIN = Path(__file__).parents[2] / "calibration" / "twin"
 CLOCK = SystemClock()
 
 
-def take(node, timeout_s=2.0):
+def take(node, timeout_s=60.0):
     """Let the inbox wake the node, as the loop does."""
     deadline = time.monotonic() + timeout_s
     while time.monotonic() < deadline:
@@ -60,10 +61,7 @@ def camera(tmp_path, node_context):
 
 
 def connected(server):
-    deadline = time.monotonic() + 3.0
-    while server.clients == 0:
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
+    wait_for(lambda: server.clients, "the camera node to connect")
     return server
 
 
@@ -176,9 +174,7 @@ def test_vicon_with_two_senders_is_a_fault_that_withholds_the_poses(vicon, track
     assert len(take(vicon)) == 1
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as another:
         send_pose(another, vicon, 2, "car", planar_pose(2.5, -0.2, 0.7))
-    deadline = time.monotonic() + 2.0
-    while not (items := vicon.inbox.take()) and time.monotonic() < deadline:
-        time.sleep(0.01)
+    items = wait_for(vicon.inbox.take, "the loop to wake up")
     assert items == [[]]  # no pose, and yet the loop wakes up to say so
     state, text = vicon.status()
     assert state == "fault"

@@ -201,12 +201,12 @@ def test_a_foreign_bag_is_played_in_our_types_and_under_our_names(tmp_path, writ
         bus.subscribe("/camera/image_raw", queue=50)
         wanted = ("--wait-for", "/vicon/car", "--wait-for", "/camera/image_raw")
         process = player(bag, tmp_path / "run", "--remap", "/front/image:=/camera/image_raw", *wanted)
-        got, deadline = [], time.monotonic() + 30
+        got, deadline = [], time.monotonic() + 120
         while process.poll() is None and time.monotonic() < deadline:
             bus.wait(0.05)
             got += bus.receive()
         got += bus.receive()
-    assert process.wait(10) == 0
+    assert process.wait(120) == 0
     (warning,) = process.stderr.read().splitlines()
     assert "unchecked: " in warning
     assert "has no checksums" in warning
@@ -236,7 +236,7 @@ def test_a_foreign_bag_is_played_in_our_types_and_under_our_names(tmp_path, writ
 )
 def test_a_wrong_wish_of_the_player_is_one_line_and_exit_code_2(tmp_path, arguments, said):
     process = player(WRITERS["mcap"](tmp_path / "drive"), tmp_path / "run", *arguments)
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=600)
     assert process.returncode == 2
     assert errors.count("\n") == 1
     assert said in errors
@@ -248,6 +248,6 @@ def test_a_file_that_is_no_bag_is_one_line_and_exit_code_2(tmp_path):
     path = tmp_path / "notes.mcap"
     path.write_text("drove well today\n")
     process = player(path, tmp_path / "run")
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=600)
     assert (process.returncode, errors.count("\n")) == (2, 1)
     assert "notes.mcap is a text file; expected a bag" in errors

@@ -111,7 +111,7 @@ class Car:
                 process.send_signal(signal.SIGCONT)
                 process.terminate()
         for process in self._processes.values():
-            process.wait(30.0)
+            process.wait(120)
         self._stopping = True
         self._thread.join()
         self.emulator.close()
@@ -131,7 +131,7 @@ def played(folder, bag, *settings):
     command = [sys.executable, "-m", "nodes.player", "--run-dir", str(folder), "--set", f"bag={bag}"]
     for setting in ("rate=4", "wait_for=[]", *settings):
         command += ["--set", setting]
-    return subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=120)
+    return subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=600)
 
 
 def stranger(folder, topic, age_ns, duration_s):

@@ -22,7 +22,7 @@ def replay(*arguments):
     command = [sys.executable, "-m", "nodes.cli", "replay", *map(str, arguments)]
     root = str(Path(__file__).parents[2])
     environment = {"PYTHONPATH": f"{root}:{HERE}", "PATH": "/usr/bin:/bin", "HOME": "/tmp"}
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=HERE, env=environment)
+    return subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=HERE, env=environment)
 
 
 def test_command_makes_both_files_again_byte_for_byte(tmp_path):

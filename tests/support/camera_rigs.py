@@ -147,7 +147,7 @@ class OakRig:
 
     def produce(self):
         self.feed.put((self.count, np.full(SHAPE, 40 + self.count, np.uint8)))
-        deadline = time.monotonic() + 2.0
+        deadline = time.monotonic() + 60.0
         while self.count not in self.sent:  # by depthai's own thread
             assert time.monotonic() < deadline
             time.sleep(0.001)
@@ -179,7 +179,7 @@ class SocketRig:
         self.count = 0
 
     def produce(self):
-        deadline = time.monotonic() + 2.0
+        deadline = time.monotonic() + 60.0
         while self.server.clients == 0:
             assert time.monotonic() < deadline
             time.sleep(0.001)

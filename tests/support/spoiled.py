@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 import time
 from collections.abc import Callable
 from typing import TypeVar
@@ -36,6 +37,6 @@ def unspoiled(drive: Callable[[], T]) -> T:
         except Spoiled as spoiled:
             if not _LATE.search(str(spoiled)) or attempt + 1 == _DRIVES:
                 raise
-            print(f"spoiled by load, again: {spoiled}")
+            print(f"\na drive was spoiled by load ({spoiled}); again", file=sys.__stderr__)
             time.sleep(_REST_S)
     raise AssertionError("unreachable")

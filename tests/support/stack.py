@@ -142,7 +142,7 @@ class Stack(LiveOperator):
                 process.terminate()
         for process in self.processes.values():
             try:
-                process.wait(60.0)
+                process.wait(120)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()

@@ -142,6 +142,7 @@ def test_a_fine_pattern_far_away_is_averaged_not_aliased():
     assert np.abs(inner.astype(float) - 127.5).max() < 12
 
 
+@pytest.mark.timing
 def test_it_is_fast_enough_for_the_live_path():
     overlay = FaceOverlay(face_texture(theta()), CORNERS, CAMERA)
     T = invert_transform(planar_pose(1.8, -1.9, 0.0) @ MOUNT) @ T_WORLD_FROM_FACE

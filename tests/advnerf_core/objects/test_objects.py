@@ -174,7 +174,7 @@ def test_a_hundred_large_pictures_fit_into_memory(tmp_path):
     content = {"fl_x": views.pinholes[0].fx * side / 64, "frames": frames}
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     done = subprocess.run(
-        [sys.executable, "-c", MEMORY_SCRIPT, str(tmp_path)], capture_output=True, text=True, timeout=300
+        [sys.executable, "-c", MEMORY_SCRIPT, str(tmp_path)], capture_output=True, text=True, timeout=600
     )
     assert done.returncode == 0, done.stderr
     pictures_mib = count * side * side * 4 / 2**20

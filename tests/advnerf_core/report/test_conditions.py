@@ -30,7 +30,7 @@ def test_a_stranger_is_called_by_its_name_and_keeps_its_colour_in_every_process(
     assert (style.light, style.dark) == (LIGHT[style.key], DARK[style.key])
     code = "from advnerf_core.report.conditions import style_of; print(style_of('Spiral').key)"
     done = subprocess.run(
-        [sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd=ROOT, timeout=60
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd=ROOT, timeout=600
     )
     assert done.stdout.strip() == style.key
     assert len({style_of(f"method{k}").key for k in range(100)}) == len(SPARE)

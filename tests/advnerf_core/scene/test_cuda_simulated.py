@@ -26,7 +26,7 @@ def test_the_code_for_a_gpu_computes_in_the_simulator_what_the_processor_does(fi
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        timeout=280,
+        timeout=600,
     )
     assert done.returncode == 0, done.stdout
     assert int(re.search(r"(\d+) passed", done.stdout)[1]) >= least, done.stdout

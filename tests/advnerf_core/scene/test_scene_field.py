@@ -134,7 +134,7 @@ def test_unusable_checkpoints_are_refused_with_the_way_out(tmp_path: Path) -> No
 def test_time_limit_ends_a_training() -> None:
     trainer = Trainer(room_images(3), FIELD, dataclasses.replace(TRAIN, steps=10**6, max_seconds=0.3))
     trainer.run()
-    assert trainer.elapsed_s < 5.0
+    assert trainer.elapsed_s < 60.0
     assert trainer.step < 10**6
 
 

@@ -133,5 +133,5 @@ def test_without_the_library_importing_works_and_using_says_what_to_install():
         "try:\n    CarlaScene().__enter__()\n"
         "except hardware.worlds.carla.CarlaNotInstalled as error:\n    print(error)\n"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=600)
     assert "pip install 'advnerf[carla]'" in done.stdout, done.stderr

@@ -15,6 +15,7 @@ from nodes.experiment.campaign.run import Options, _shares, run_campaign
 from nodes.experiment.campaign.store import Store
 from nodes.experiment.campaign.worker import take_cell
 from nodes.runtime.locks import hold
+from tests.support.waiting import wait_for
 
 
 def run(bench, jobs=2, **options):
@@ -82,7 +83,7 @@ def test_a_killed_worker_loses_its_cell_and_no_other(here):
     pid_of(here, "straight_hardened_gradient_1")
     assert states(here)["straight_hardened_gradient_1"] == "running"
     (here.folder / "hang").unlink()
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=600)
     assert process.returncode == 1
     assert "killed by SIGKILL" in err
     assert "straight_hardened_gradient_0: lost" in out
@@ -100,7 +101,7 @@ def test_a_killed_campaign_takes_its_workers_along_and_goes_on(here):
     process, worker = start_hanging(here)
     process.kill()
     process.communicate()
-    wait_for(lambda: not is_alive(worker))
+    wait_for(lambda: not is_alive(worker), "the worker to end")
     done = set(here.cells.glob("*.json"))
     (here.folder / "hang").unlink()
     ended, _ = run(here)
@@ -185,7 +186,7 @@ def start_hanging(bench, jobs=1):
 
 def pid_of(bench, name):
     file = bench.cells / name / "pid"
-    wait_for(lambda: file.exists() and file.read_text())
+    wait_for(lambda: file.exists() and file.read_text(), f"something in {file}")
     return int(file.read_text())
 
 
@@ -197,19 +198,12 @@ def is_alive(pid):
     return False
 
 
-def wait_for(condition, timeout_s=60.0):
-    until = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < until
-        time.sleep(0.02)
-
-
 def test_a_worker_that_is_asked_to_end_has_not_failed(here):
     """As by a daemon that frees memory: it goes on when the campaign is run again, without being asked to try again."""
     here.write("seeds: [0]\nmethods: [gradient]\nvictims: [hardened]\n")
     process, worker = start_hanging(here)
     os.kill(worker, signal.SIGTERM)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=600)
     assert process.returncode == 1
     assert "straight_hardened_gradient_0: lost" in out
     assert "killed by SIGTERM" in err
@@ -242,8 +236,8 @@ def test_a_worker_that_is_asked_to_end_closes_what_is_open(here):
     here.write("seeds: [0]\nmethods: [gradient]\nvictims: [hardened]\n")
     process, worker = start_hanging(here)
     process.terminate()  # its worker is told by the kernel
-    process.communicate(timeout=60)
-    wait_for(lambda: not is_alive(worker))
+    process.communicate(timeout=600)
+    wait_for(lambda: not is_alive(worker), "the worker to end")
     assert any(line.startswith("closed straight_hardened_gradient_0") for line in here.calls)
 
 

@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[3]
 def advnerf(*arguments):
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "200"}
     command = [sys.executable, "-m", "nodes.cli", "carla", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=ROOT, env=environment)
+    return subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=ROOT, env=environment)
 
 
 @pytest.fixture

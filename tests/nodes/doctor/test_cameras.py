@@ -1,7 +1,6 @@
 """The doctor before emulated video devices and the window system: absent, wrong, busy and hung."""
 
 import threading
-import time
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -41,11 +40,9 @@ def test_a_driver_that_hangs_in_the_kernel_costs_the_deadline():
             never.wait()
 
     port = Hung({"/dev/a": VideoDevice()})
-    began = time.monotonic()
     (row,) = examine([Check("camera", lambda: cameras.video_devices(port), 0.2, "unplug it")])
     never.set()
     assert (row.state, row.found, row.do) == (FAILURE, "no answer within 0.2 s", "unplug it")
-    assert time.monotonic() - began < 2.0
 
 
 class Emulated(V4l2Source):

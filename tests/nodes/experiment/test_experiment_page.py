@@ -210,7 +210,7 @@ def test_clients_that_never_read_do_not_reach_the_experiment(served):
     for step in range(1000):
         report(step / 1000, f"step {step}")
     record.finish("scene", 1.0, cached=False)
-    assert time.monotonic() - began_s < 5.0
+    assert time.monotonic() - began_s < 60.0
     for client in silent:
         client.close()
     while request(port, "/state.json")[0] == 503:

@@ -1,6 +1,7 @@
 """The page node with real processes and sockets: who may act, and what stops the car."""
 
 import json
+import re
 import signal
 import time
 
@@ -11,7 +12,8 @@ pytest.importorskip("starlette")
 pytest.importorskip("websockets")
 
 from benchmarks.page_client import Browser, cookie_of, request
-from tests.support.page import STOP_S, Run
+from tests.support.page import IN_TIME, Run
+from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.live
 
@@ -23,6 +25,12 @@ def run(tmp_path_factory):
         yield run.start()
     finally:
         run.close()
+
+
+@pytest.fixture(params=IN_TIME)
+def stop_s(request):
+    """So long a stop may take [s]."""
+    return request.param
 
 
 @pytest.fixture
@@ -39,16 +47,22 @@ def browser(run):
 
 
 def drive(run, ann):
-    """Hold until the car moves."""
-    ann.hold()
-    run.wait(lambda: run.car.armed, "the car to be armed")
-    since_ns = time.monotonic_ns()
-    run.wait(
-        lambda: any(t > since_ns and speed > 0.0 for t, speed in list(run.car.moves)), "a command to move"
-    )
+    """Hold until the car moves; a press that load ended is made again."""
+
+    def moves():
+        pressed_s, since_ns = time.monotonic(), time.monotonic_ns()
+        ann.hold()
+        while time.monotonic() < pressed_s + 5.0:
+            if run.car.armed and any(t > since_ns and speed > 0.0 for t, speed in list(run.car.moves)):
+                return True
+            time.sleep(0.01)
+        ann.release()
+        return False
+
+    wait_for(moves, "a command to move", 120.0)
 
 
-def test_the_car_drives_while_the_button_is_held(run, browser):
+def test_the_car_drives_while_the_button_is_held(run, browser, stop_s):
     ann = browser()
     assert ann.take() == ""
     drive(run, ann)
@@ -57,7 +71,7 @@ def test_the_car_drives_while_the_button_is_held(run, browser):
     since_ns = time.monotonic_ns()
     assert ann.release() == ""
     run.wait(lambda: not run.car.armed, "the car to be disarmed")
-    assert run.car.stop_after(since_ns) < STOP_S
+    assert run.car.stop_after(since_ns) < stop_s
     assert run.car.reason == "the button is not held"
     held = [act for act in run.car.acts if act.act == "hold"][-1]
     assert (held.operator, held.granted, held.address) == ("Ann", True, "127.0.0.1")
@@ -84,7 +98,7 @@ def test_the_page_shows_what_happens(run, browser):
 
 
 @pytest.mark.parametrize("how", ["closed", "killed", "silent", "blind"])
-def test_a_browser_that_goes_stops_the_car(run, browser, how):
+def test_a_browser_that_goes_stops_the_car(run, browser, stop_s, how):
     ann = browser()
     ann.take()
     drive(run, ann)
@@ -99,17 +113,16 @@ def test_a_browser_that_goes_stops_the_car(run, browser, how):
         run.car.pictures = False
         run.wait(lambda: not run.car.armed, "the car to be disarmed")
         run.car.pictures = True
-        assert 0.8 < run.car.stop_after(since_ns) < 1.0 + STOP_S
+        assert 0.8 < run.car.stop_after(since_ns) < 1.0 + stop_s
         # The act comes from the page, the state from the safety node: either may be heard first.
         run.wait(
             lambda: any(act.act == "let_go" for act in run.car.acts[before:]), "the reason for letting go"
         )
         let_go = next(act for act in run.car.acts[before:] if act.act == "let_go")
-        assert let_go.detail.startswith("the picture on the page is 1.")
+        assert re.match(r"the picture on the page is [1-9]", let_go.detail)
         return
     run.wait(lambda: not run.car.armed, "the car to be disarmed")
-    time.sleep(0.1)
-    assert run.car.stop_after(since_ns) < STOP_S
+    assert run.car.stop_after(since_ns) < stop_s
     if how == "silent":
         ann.responsive = True
         time.sleep(0.5)
@@ -132,15 +145,14 @@ def test_answers_to_old_beats_do_not_hold(run, browser):
     }
 
 
-def test_a_page_node_that_hangs_stops_the_car(run, browser):
+def test_a_page_node_that_hangs_stops_the_car(run, browser, stop_s):
     ann = browser()
     ann.take()
     drive(run, ann)
     since_ns = time.monotonic_ns()
     run.processes["page"].send_signal(signal.SIGSTOP)
     try:
-        time.sleep(0.5)
-        assert run.car.stop_after(since_ns) < STOP_S
+        assert run.car.stop_after(since_ns) < stop_s
     finally:
         run.processes["page"].send_signal(signal.SIGCONT)
     time.sleep(0.5)
@@ -167,14 +179,14 @@ def test_one_operator_and_others_who_watch(run, browser):
     run.wait(lambda: not run.car.armed, "the car to be disarmed")
 
 
-def test_the_e_stop_of_a_watcher_latches_until_the_operator_resets_it(run, browser):
+def test_the_e_stop_of_a_watcher_latches_until_the_operator_resets_it(run, browser, stop_s):
     ann, bob = browser(), browser()
     ann.take()
     drive(run, ann)
     since_ns = time.monotonic_ns()
     assert bob.do("estop") == ""
     run.wait(lambda: not run.car.armed, "the car to be disarmed")
-    assert run.car.stop_after(since_ns) < STOP_S
+    assert run.car.stop_after(since_ns) < stop_s
     ann.held = False
     ann.hold()
     time.sleep(0.3)
@@ -203,10 +215,10 @@ def test_a_label_is_in_the_bag_with_the_picture_that_its_author_saw(run, browser
     assert (
         ann.do("label", text="still too early") == "the recorder is still starting; label again in a second"
     )
-    ann.wait(lambda: ann.state["recording"]["records"], "the recorder to receive messages of the page", 60.0)
+    ann.wait(lambda: ann.state["recording"]["records"], "the recorder to receive messages of the page")
     assert ann.do("label", text="a person crossed") == ""
     assert ann.do("record_stop") == ""
-    ann.wait(lambda: not ann.state["recording"]["on"], "the recorder to end", 15.0)
+    ann.wait(lambda: not ann.state["recording"]["on"], "the recorder to end")
     assert ann.state["recording"]["trouble"] == ""
     bag = run.folder / ann.state["recording"]["folder"]
     acts = [decode("advnerf_msgs/msg/OperatorAct", m.cdr) for m in read_messages(bag, ["/operator/act"])]

@@ -69,14 +69,14 @@ class Bridge:
                 return
 
     def wait_for_readers(self, *names):
-        deadline = time.monotonic() + 30.0
+        deadline = time.monotonic() + 120.0
         while not all(self.counters.get(f"readers {name}") for name in names):
             assert time.monotonic() < deadline, self.counters
             self.watch(0.1)
 
     def close(self):
         self.process.send_signal(signal.SIGINT)
-        assert self.process.wait(10.0) == 0
+        assert self.process.wait(120) == 0
         self.bus.close()
 
 
@@ -158,7 +158,7 @@ def test_commands_of_rclpy_arrive_as_answers_only(bridge_of, peer_of):
     assert bridge.state[0] == "active"
     # A second publisher makes the first one worthless, too.
     peer_of(PEERS / "answering.py", "--commands", "/cmd_vel", "--speed", "0.9")
-    deadline = time.monotonic() + 20.0
+    deadline = time.monotonic() + 120.0
     while bridge.state[0] != "fault" and time.monotonic() < deadline:
         bridge.watch(0.1)
     assert "2 publishers" in bridge.state[1]
@@ -210,7 +210,7 @@ def test_rclpy_reads_poses_odometry_diagnostics_and_commands(bridge_of, peer_of)
         ("/safety/drive", drive_message(0.5, 0.2, now_ns)),
     ):
         bridge.bus.publish(topic, message)
-    deadline = time.monotonic() + 10.0
+    deadline = time.monotonic() + 120.0
     while len(dict(peer.lines)) < 4 and time.monotonic() < deadline:
         bridge.watch(0.1)
     got = dict(reversed(peer.lines))  # the first of each
@@ -291,7 +291,7 @@ def test_a_car_in_ros_obeys_the_safety_node_only(tmp_path, peer_of):
         operator.bus.close()
         os.kill(operator.pid_of("safety"), signal.SIGCONT)
         launch.send_signal(signal.SIGINT)
-        launch.wait(30.0)
+        launch.wait(120)
 
 
 def test_a_policy_in_ros_answers_as_a_black_box(tmp_path, peer_of):
@@ -354,7 +354,7 @@ def test_a_policy_in_ros_drives_the_lab_and_the_drive_is_recorded(tmp_path, peer
     finally:
         operator.bus.close()
         launch.send_signal(signal.SIGINT)
-        assert launch.wait(30.0) == 0
+        assert launch.wait(120) == 0
     bag = run_dir / "bag"
     counts = {topic.name: topic.count for topic in read_info(bag).topics}
     assert counts["/policy/drive"] >= 40

@@ -234,7 +234,7 @@ def test_command_plays_under_a_terminal_and_obeys_keys_and_bus(bag, tmp_path):
 
     def control_says(*words):
         program = [sys.executable, "-m", "nodes.cli", "bag", "control", *words, "--run-dir", str(tmp_path)]
-        return subprocess.run(program, capture_output=True, text=True, timeout=30, check=False)
+        return subprocess.run(program, capture_output=True, text=True, timeout=600, check=False)
 
     with Bus(tmp_path) as bus:
         bus.subscribe("/vicon/car", queue=500)
@@ -242,7 +242,7 @@ def test_command_plays_under_a_terminal_and_obeys_keys_and_bus(bag, tmp_path):
             [*command, "--topics", "/vicon/car"], stdin=slave, stdout=subprocess.PIPE, text=True
         )
 
-        def hear(wanted, limit_s=20.0):
+        def hear(wanted, limit_s=60.0):
             got, deadline = [], time.monotonic() + limit_s
             while len(got) < wanted and time.monotonic() < deadline:
                 bus.wait(0.05)
@@ -253,7 +253,7 @@ def test_command_plays_under_a_terminal_and_obeys_keys_and_bus(bag, tmp_path):
             assert "space: pause" in process.stdout.readline()
             with Bus(tmp_path) as recorder:
                 recorder.subscribe("/player/control")  # its only subscriber may be a recorder
-                deadline = time.monotonic() + 20.0
+                deadline = time.monotonic() + 60.0
                 while control_says("rate 1").returncode and time.monotonic() < deadline:
                     pass
             assert hear(1, 0.5) == []
@@ -266,7 +266,7 @@ def test_command_plays_under_a_terminal_and_obeys_keys_and_bus(bag, tmp_path):
             os.write(master, b" ")
             assert len(hear(20)) >= 20
             os.write(master, b"q")
-            assert process.wait(10) == 0
+            assert process.wait(120) == 0
         finally:
             process.kill()
             process.wait()

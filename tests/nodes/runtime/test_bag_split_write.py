@@ -4,6 +4,7 @@ import errno
 import os
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -122,19 +123,17 @@ def test_the_split_bag_is_replayed_and_compared_like_the_whole_one(tmp_path):
 
 
 def test_a_slow_disk_at_the_split_does_not_hold_up_the_recorder(tmp_path, monkeypatch):
-    finish = PartWriter.finish
+    finish, written = PartWriter.finish, threading.Event()
 
     def slow(part, metadata=None):
-        time.sleep(0.5)
+        assert written.wait(60), "all is written while the first part is not finished"
         finish(part, metadata)
 
     monkeypatch.setattr(PartWriter, "finish", slow)
     writer = BagWriter(tmp_path / "drive", limits=SplitLimits(duration_s=0.5))
-    begun = time.perf_counter()
     fill(writer, 400)
-    took_s = time.perf_counter() - begun
+    written.set()
     writer.close()
-    assert took_s < 0.4
     assert [m.sequence for m in read_messages(tmp_path / "drive")] == list(range(400))
 
 
@@ -206,7 +205,7 @@ def killed_bags(tmp_path, counts):
     """Bags of recorders that were killed at these changes to the disk, each with the number of messages it had taken."""
     here = str(Path(__file__).parent)
     command = [sys.executable, "-c", KILLED, str(tmp_path), ",".join(map(str, counts)), here, os.getcwd()]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    result = subprocess.run(command, capture_output=True, text=True, timeout=600, check=True)
     for line in result.stdout.splitlines():
         count, taken = map(int, line.split())
         yield tmp_path / str(count) / "drive", taken
@@ -256,7 +255,7 @@ writer.close()
 def test_memory_does_not_grow_with_the_number_of_parts(tmp_path, minutes):
     chunks = minutes * 60 * 60
     command = [sys.executable, "-c", STREAM, str(tmp_path / "bag"), os.getcwd(), str(chunks)]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=100, check=True)
+    result = subprocess.run(command, capture_output=True, text=True, timeout=600, check=True)
     rows = [tuple(map(int, line.split())) for line in result.stdout.splitlines()]
     assert rows[-1][1] >= 10  # a part grows until the one before it is on the disk
     minute = 36  # rows in a minute

@@ -13,6 +13,7 @@ from nodes.runtime.messages import stamp_ns as stamp_of
 from nodes.runtime.paths import bus_folder
 from nodes.runtime.pictures import rgb_image
 from nodes.runtime.topics import topic
+from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.live
 
@@ -99,9 +100,9 @@ def test_subscribers_are_counted_up_and_down(tmp_path):
         buses = [Bus(tmp_path) for _ in range(3)]
         for bus in buses:
             bus.subscribe("/arm")
-        wait_for(lambda: sender.subscribers("/arm") == 3, *buses)
+        wait_with(lambda: sender.subscribers("/arm") == 3, "the subscribers", *buses)
         buses[0].close()
-        wait_for(lambda: sender.subscribers("/arm") == 2, *buses[1:])
+        wait_with(lambda: sender.subscribers("/arm") == 2, "the subscribers", *buses[1:])
         for bus in buses[1:]:
             bus.close()
 
@@ -121,12 +122,15 @@ def request_to_stop(source):
     return types.Arm(header=header(1), arm=False, source=source, reason="", ask_id="a", age_ns=0)
 
 
-def wait_for(condition, *buses):
-    deadline = time.monotonic() + 60.0
-    while not condition():
-        assert time.monotonic() < deadline
+def wait_with(condition, what, *buses):
+    """Wait while the buses see who comes and goes."""
+
+    def seen():
         for bus in buses:
-            bus.wait(0.01)
+            bus.wait(0.0)
+        return condition()
+
+    wait_for(seen, what)
 
 
 def test_any_number_may_ask_for_a_stop_at_the_same_time(tmp_path):
@@ -137,11 +141,11 @@ def test_any_number_may_ask_for_a_stop_at_the_same_time(tmp_path):
         buses = [stack.enter_context(Bus(tmp_path)) for _ in range(senders)]
         for bus in buses:
             bus.publisher("/arm")
-        wait_for(lambda: all(bus.subscribers("/arm") for bus in buses), receiver)
+        wait_with(lambda: all(bus.subscribers("/arm") for bus in buses), "the subscribers", receiver)
         for number, bus in enumerate(buses):
             bus.publish("/arm", request_to_stop(f"{number}"))
         got = []
-        wait_for(lambda: len(got.extend(receiver.receive()) or got) >= senders, receiver)
+        wait_with(lambda: len(got.extend(receiver.receive()) or got) >= senders, "the messages", receiver)
         assert {received.message().source for received in got} == {f"{number}" for number in range(senders)}
 
 
@@ -151,12 +155,16 @@ def test_a_request_to_stop_needs_no_file_and_is_heard_by_all_receivers(tmp_path)
         second.subscribe("/arm")
         before = sorted(bus_folder(tmp_path).iterdir())
         sender.publisher("/arm")
-        wait_for(lambda: sender.subscribers("/arm") == 2, first, second)
+        wait_with(lambda: sender.subscribers("/arm") == 2, "the subscribers", first, second)
         assert sorted(bus_folder(tmp_path).iterdir()) == before
         sender.publish("/arm", request_to_stop("me"))
         for receiver in (first, second):
             got = []
-            wait_for(lambda receiver=receiver, got=got: got.extend(receiver.receive()) or got, receiver)
+            wait_with(
+                lambda receiver=receiver, got=got: got.extend(receiver.receive()) or got,
+                "the messages",
+                receiver,
+            )
             assert [received.message().source for received in got] == ["me"]
 
 
@@ -166,12 +174,18 @@ def test_a_restarted_receiver_hears_the_next_request_and_not_the_last(tmp_path):
         for source in ("first", "second"):
             with Bus(tmp_path) as receiver:
                 receiver.subscribe("/arm")
-                wait_for(lambda receiver=receiver: sender.subscribers("/arm") == 1, receiver)
+                wait_with(
+                    lambda receiver=receiver: sender.subscribers("/arm") == 1, "the subscribers", receiver
+                )
                 sender.publish("/arm", request_to_stop(source))
                 got = []
-                wait_for(lambda receiver=receiver, got=got: got.extend(receiver.receive()) or got, receiver)
+                wait_with(
+                    lambda receiver=receiver, got=got: got.extend(receiver.receive()) or got,
+                    "the messages",
+                    receiver,
+                )
                 assert [received.message().source for received in got] == [source]
-            wait_for(lambda: sender.subscribers("/arm") == 0, sender)
+            wait_with(lambda: sender.subscribers("/arm") == 0, "the subscribers", sender)
             sender.publish("/arm", request_to_stop("nobody heard this"))
 
 
@@ -213,11 +227,11 @@ def test_subscriber_started_first_loses_nothing_after_the_barrier(tmp_path):
         receiver.subscribe("/vicon/car")
         process = subprocess.Popen([sys.executable, "-c", script, str(tmp_path)])
         got = []
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + 60
         while len(got) < 15 and time.monotonic() < deadline:
             receiver.wait(0.1)
             got += receiver.receive()
-        assert process.wait(5) == 0
+        assert process.wait(120) == 0
     assert [stamp_of(g.message()) for g in got] == list(range(15))
 
 
@@ -259,4 +273,4 @@ def test_long_run_folder_still_has_sockets(tmp_path):
     with Bus(deep) as sender, Bus(deep) as receiver:
         receiver.subscribe("/arm")
         sender.publisher("/arm")
-        wait_for(lambda: sender.subscribers("/arm") == 1, receiver)
+        wait_with(lambda: sender.subscribers("/arm") == 1, "the subscribers", receiver)

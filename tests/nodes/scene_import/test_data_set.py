@@ -44,7 +44,7 @@ def test_a_walk_is_put_upright_centred_and_to_scale():
 
 def run(*arguments):
     command = [sys.executable, "-m", "nodes.cli", "scene", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
 
 
 def test_an_error_is_one_line_and_exit_code_2(tmp_path):

@@ -79,7 +79,7 @@ def suffer(
     return None, ended(pid)
 
 
-def ended(pid: int, orphan: bool = False, within_s: float = 2.0) -> bool:
+def ended(pid: int, orphan: bool = False, within_s: float = 60.0) -> bool:
     """Whether a process is gone, and somebody has waited for it; nobody waits for an orphan where process 1 does not."""
     until = time.monotonic() + within_s
     while time.monotonic() < until:

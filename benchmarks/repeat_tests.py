@@ -1,0 +1,91 @@
+"""Are tests green every time? ``python -m benchmarks.repeat_tests TEST ... --times 100 [--busy 4] [--cores 1]``.
+
+Runs a selection of tests again and again, if asked beside endless loops of other sessions or on fewer cores, and counts the runs that
+are green. What a red run printed is shown. Arguments after ``--`` are pytest's own, e.g. ``-- -m live``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import shlex
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+
+from benchmarks.results import REPOSITORY, record_row
+
+_LOOP = "while True: pass"
+_AGAIN = "; again"
+
+
+@contextlib.contextmanager
+def busy(count: int) -> Iterator[None]:
+    """Endless loops, each in a session of its own, so that each has a whole share where sessions share the processors."""
+    loops = [subprocess.Popen([sys.executable, "-c", _LOOP], start_new_session=True) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for loop in loops:
+            loop.kill()
+            loop.wait()
+
+
+def repeat(command: list[str], times: int) -> tuple[int, list[float], int]:
+    """Run a command again and again; how often it succeeded, its times [s], and how many tests were run again for want of time."""
+    green, seconds, again = 0, [], 0
+    for number in range(1, times + 1):
+        began_s = time.monotonic()
+        done = subprocess.run(
+            command, cwd=REPOSITORY, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+        )
+        seconds.append(time.monotonic() - began_s)
+        again += done.stdout.count(_AGAIN)
+        green += done.returncode == 0
+        print(
+            f"{number:3d} {'green' if done.returncode == 0 else 'RED'} {seconds[-1]:.0f} s, {green} green",
+            flush=True,
+        )
+        if done.returncode != 0:
+            print(done.stdout, flush=True)
+    return green, seconds, again
+
+
+def main() -> int:
+    """Command line; 0 if every run was green."""
+    given, _, extra = " ".join(map(shlex.quote, sys.argv[1:])).partition(" -- ")
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("tests", nargs="+", help="files or names of tests, as pytest takes them")
+    parser.add_argument("--times", type=int, default=20)
+    parser.add_argument("--busy", type=int, default=0, help="so many endless loops beside them")
+    parser.add_argument("--cores", type=int, default=0, help="on so many cores; 0: all")
+    parser.add_argument("--trial", action="store_true", help="record nothing")
+    options = parser.parse_args(shlex.split(given))
+    cores = sorted(os.sched_getaffinity(0))[: options.cores or None]
+    os.sched_setaffinity(0, cores)
+    with busy(options.busy):
+        command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *options.tests]
+        green, seconds, again = repeat([*command, *shlex.split(extra)], options.times)
+    beside = (
+        f", beside {options.busy} busy loops" * bool(options.busy)
+        + f", on {len(cores)} cores" * bool(options.cores)
+    ).replace("on 1 cores", "on one core")
+    print(f"{green} of {options.times} green{beside}; {again} tests run again")
+    if not options.trial:
+        record_row(
+            f"repeated tests, {' '.join([*options.tests, extra]).strip()}{beside}",
+            green,
+            f"of {options.times}",
+            f"{options.times}",
+            green == options.times,
+            f"python -m benchmarks.repeat_tests {' '.join(map(shlex.quote, sys.argv[1:]))}",
+            f"median {statistics.median(seconds):.0f} s, longest {max(seconds):.0f} s; {again} live tests were run again, as the processors had no time to spare",
+        )
+    return int(green != options.times)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
