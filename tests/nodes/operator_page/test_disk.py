@@ -4,6 +4,7 @@ import contextlib
 import json
 import os
 import resource
+import signal
 import threading
 import time
 
@@ -28,11 +29,14 @@ def note(diary, act):
 def files_of_at_most(size):
     """A disk on which files cannot grow beyond this size: writes are short, then fail (setrlimit(2), RLIMIT_FSIZE)."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    # Python ignores this signal from its start; a library that an earlier test loaded may have put its default back, which kills.
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, before)
 
 
 def acts_in(file):
