@@ -71,7 +71,7 @@ def test_a_wrong_path_costs_no_heavy_import(tmp_path, arguments):
         capture_output=True,
         text=True,
         cwd=tmp_path,
-        timeout=100,
+        timeout=600,
         env={"PYTHONPATH": str(Path(__file__).parents[2]), "PATH": "/usr/bin:/bin", "HOME": str(tmp_path)},
     )
     assert ran.stdout.split() == ["code", "2", "heavy", "[]"], ran.stderr

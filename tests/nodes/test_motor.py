@@ -93,7 +93,7 @@ def test_motor_obeys_and_reports_the_origin(drives):
     assert ns_from_stamp(message.header.stamp) == stamp_ns
     assert not message.braking
     assert message.speed_mps == pytest.approx(0.3, abs=1e-3)
-    assert abs(int(message.serial_write_mono_ns) - time.monotonic_ns()) < 1e9
+    assert abs(int(message.serial_write_mono_ns) - time.monotonic_ns()) < 60e9
     time.sleep(0.05)
     assert drives.names()[-2:] == ["SET_SERVO_POS", "SET_RPM"]
     assert drives.node.status()[0] == "active"

@@ -31,10 +31,10 @@ def test_a_real_client_gets_the_published_bytes_and_the_schema(tmp_path):
             Bus(tmp_path) as eyes,
             client.connect(f"ws://127.0.0.1:{node.port}", subprotocols=["foxglove.sdk.v1"]) as socket,
         ):
-            info = json.loads(socket.recv(timeout=5))
+            info = json.loads(socket.recv(timeout=60))
             assert info["op"] == "serverInfo"
             assert not {"clientPublish", "services", "parameters"} & set(info["capabilities"])
-            advertised = json.loads(socket.recv(timeout=5))["channels"][0]
+            advertised = json.loads(socket.recv(timeout=60))["channels"][0]
             assert (advertised["topic"], advertised["encoding"]) == ("/camera/image_raw", "cdr")
             assert advertised["schemaEncoding"] == "ros2msg"
             assert advertised["schema"] == type_definition("sensor_msgs/msg/Image")
@@ -42,7 +42,7 @@ def test_a_real_client_gets_the_published_bytes_and_the_schema(tmp_path):
             socket.send(json.dumps({"op": "subscribe", "subscriptions": [subscription]}))
             eyes.subscribe("/camera/image_raw")
             bus.publisher("/camera/image_raw")
-            bus.wait_for_subscribers(["/camera/image_raw"], 5.0)
+            bus.wait_for_subscribers(["/camera/image_raw"], 60.0)
             data = None
             for _ in range(100):
                 bus.publish("/camera/image_raw", message)

@@ -51,7 +51,7 @@ def test_over_the_bus_images_are_views_and_recorders_get_the_same_bytes(tmp_path
     with Bus(tmp_path) as sender, Bus(tmp_path) as receiver:
         receiver.subscribe("/camera/image_raw")
         sender.publisher("/camera/image_raw")
-        sender.wait_for_subscribers(["/camera/image_raw"], 2.0)
+        sender.wait_for_subscribers(["/camera/image_raw"], 60.0)
         sender.publish("/camera/image_raw", message)
         receiver.wait(1.0)
         (got,) = receiver.receive()
