@@ -271,7 +271,7 @@ def test_a_loop_that_did_not_run_disarms_and_latches(driving, paused_ms):
 def test_the_motor_node_alone_did_not_run(driving):
     gate = driving.motor._gate
     for _ in range(15):
-        driving.wait(120)
+        driving.wait(20)
     action = gate.tick(driving.mono_ns)
     assert "held up for 0.3" in gate.reason
     assert action.current_a > 0.0

@@ -51,9 +51,11 @@ def computing_tests(passed: Path, idle: bool) -> int:
         _KERNELS.touch()
     # One worker more than processors, as some wait for a process of theirs.
     workers = min(len(os.sched_getaffinity(0)) + 1, 4)
-    options = ("-n", str(workers), "--dist", "worksteal", "-p", "no:cacheprovider", "--passed", str(passed))
+    options = ("-n", str(workers), "--dist", "worksteal", "-p", "no:cacheprovider", f"--passed={passed}")
     limit = ("--timeout", "0") if idle else ()
-    code = subprocess.call([*_PYTEST, *options, *limit, "-m", f"({DEFAULT}) and not live"], cwd=ROOT)
+    # The folder is named: pytest must find our option in its conftest.py before it reads the options.
+    command = [*_PYTEST, *options, *limit, "-m", f"({DEFAULT}) and not live", "tests"]
+    code = subprocess.call(command, cwd=ROOT)
     return 0 if code == _NO_TESTS and passed.exists() else code
 
 

@@ -43,8 +43,16 @@ def browser(run, **options):
 
 
 def arm(run):
-    wait_for(lambda: ask_to_arm(run.folder, "").armed, "the car to be armed")
-    run.wait(lambda: run.car.armed, "the state of the safety node", 60.0)
+    """Arm the car. The page repeats a stop until it is answered, so the last one may still disarm a car that was armed at once."""
+
+    def armed():
+        heard = len(run.car.heard["/safety/state"]) + 2  # reports from after the answer
+        if not ask_to_arm(run.folder, "").armed:
+            return False
+        wait_for(lambda: len(run.car.heard["/safety/state"]) > heard, "reports of the safety node")
+        return run.car.armed
+
+    wait_for(armed, "the car to be armed")
 
 
 def stopped_by(run, ask, reason):
