@@ -55,7 +55,7 @@ world: setup  ## A simulator of other people, from its installation to its table
 	$(BIN)/advnerf experiment launch/$(NAME).experiment.yaml --setting panel --run-folder runs/$(NAME) $(CHANGES) && \
 	$(BIN)/python -m benchmarks.learned_roads runs/$(NAME) --wall-s $$(( $$(date +%s) - began ))
 
-test: setup  ## The default tests (five to seven minutes on 2 cores)
+test: setup  ## The default tests (six to twelve minutes on 2 cores)
 	@$(BIN)/python -m tests.support.default_tests
 
 test-timing: setup  ## The tests that hold code to a clock (two minutes, alone on a quiet machine)
