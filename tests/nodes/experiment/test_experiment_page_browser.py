@@ -30,6 +30,7 @@ TINY = [
     "policy.first_steps=60",
     "policy.round_steps=3",
     "policy.naive_steps=0",
+    "gate=null",  # so small a scene is not like the place
     "attack.methods=[random]",
     "attack.horizon=6",
     "attack.evaluations=6",
