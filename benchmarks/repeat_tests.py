@@ -1,6 +1,6 @@
 """Are tests green every time? ``python -m benchmarks.repeat_tests TEST ... --times 100 [--busy 4] [--cores 1]``.
 
-Runs a selection of tests again and again, if asked beside endless loops of other sessions or on fewer cores, and counts the runs that
+``make test`` and ``make demo`` in place of tests repeat that target. Runs a selection of tests again and again, if asked beside endless loops of other sessions or on fewer cores, and counts the runs that
 are green. What a red run printed is shown. Arguments after ``--`` are pytest's own, e.g. ``-- -m live``.
 """
 
@@ -58,7 +58,9 @@ def main() -> int:
     """Command line; 0 if every run was green."""
     given, _, extra = " ".join(map(shlex.quote, sys.argv[1:])).partition(" -- ")
     parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("tests", nargs="+", help="files or names of tests, as pytest takes them")
+    parser.add_argument(
+        "tests", nargs="+", help="files or names of tests, as pytest takes them; or make and a target"
+    )
     parser.add_argument("--times", type=int, default=20)
     parser.add_argument("--busy", type=int, default=0, help="so many endless loops beside them")
     parser.add_argument("--cores", type=int, default=0, help="on so many cores; 0: all")
@@ -67,7 +69,8 @@ def main() -> int:
     cores = sorted(os.sched_getaffinity(0))[: options.cores or None]
     os.sched_setaffinity(0, cores)
     with busy(options.busy):
-        command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *options.tests]
+        pytest = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
+        command = [*([] if options.tests[0] == "make" else pytest), *options.tests]
         green, seconds, again = repeat([*command, *shlex.split(extra)], options.times)
     beside = (
         f", beside {options.busy} busy loops" * bool(options.busy)
@@ -76,7 +79,7 @@ def main() -> int:
     print(f"{green} of {options.times} green{beside}; {again} tests run again")
     if not options.trial:
         record_row(
-            f"repeated tests, {' '.join([*options.tests, extra]).strip()}{beside}",
+            f"repeated, {' '.join([*options.tests, extra]).strip()}{beside}",
             green,
             f"of {options.times}",
             f"{options.times}",
