@@ -140,6 +140,12 @@ QUESTIONS = (
         ("gap", "predictions", "learned_roads", "unseen_roads", "make world"),
     ),
     Question(
+        "green",
+        "Are tests and demo green on a slow or busy machine?",
+        "Repeated runs, beside endless loops and on one core, and tests of whole kinds of faults.",
+        ("repeat_tests",),
+    ),
+    Question(
         "nothing_is_lost",
         "Is anything lost when something breaks?",
         "Damaged and cut files, killed processes, and hostile input.",

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import re
 import shlex
 import statistics
 import subprocess
@@ -34,9 +35,13 @@ def busy(count: int) -> Iterator[None]:
             loop.wait()
 
 
-def repeat(command: list[str], times: int) -> tuple[int, list[float], int]:
-    """Run a command again and again; how often it succeeded, its times [s], and how many tests were run again for want of time."""
-    green, seconds, again = 0, [], 0
+def repeat(command: list[str], times: int) -> tuple[int, list[float], int, str]:
+    """Run a command again and again.
+
+    Returns:
+        How often it succeeded, its times [s], how many tests were run again for want of time, and pytest's last summary.
+    """
+    green, seconds, again, summary = 0, [], 0, ""
     for number in range(1, times + 1):
         began_s = time.monotonic()
         done = subprocess.run(
@@ -44,6 +49,7 @@ def repeat(command: list[str], times: int) -> tuple[int, list[float], int]:
         )
         seconds.append(time.monotonic() - began_s)
         again += done.stdout.count(_AGAIN)
+        summary = "; ".join(re.findall(r"^\d+ passed[^\n]*(?= in )", done.stdout, re.M)) or summary
         green += done.returncode == 0
         print(
             f"{number:3d} {'green' if done.returncode == 0 else 'RED'} {seconds[-1]:.0f} s, {green} green",
@@ -51,7 +57,7 @@ def repeat(command: list[str], times: int) -> tuple[int, list[float], int]:
         )
         if done.returncode != 0:
             print(done.stdout, flush=True)
-    return green, seconds, again
+    return green, seconds, again, summary
 
 
 def main() -> int:
@@ -64,6 +70,7 @@ def main() -> int:
     parser.add_argument("--times", type=int, default=20)
     parser.add_argument("--busy", type=int, default=0, help="so many endless loops beside them")
     parser.add_argument("--cores", type=int, default=0, help="on so many cores; 0: all")
+    parser.add_argument("--line", default="", help="what the tests show, as the row of results calls it")
     parser.add_argument("--trial", action="store_true", help="record nothing")
     options = parser.parse_args(shlex.split(given))
     cores = sorted(os.sched_getaffinity(0))[: options.cores or None]
@@ -71,7 +78,7 @@ def main() -> int:
     with busy(options.busy):
         pytest = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
         command = [*([] if options.tests[0] == "make" else pytest), *options.tests]
-        green, seconds, again = repeat([*command, *shlex.split(extra)], options.times)
+        green, seconds, again, summary = repeat([*command, *shlex.split(extra)], options.times)
     beside = (
         f", beside {options.busy} busy loops" * bool(options.busy)
         + f", on {len(cores)} cores" * bool(options.cores)
@@ -79,13 +86,14 @@ def main() -> int:
     print(f"{green} of {options.times} green{beside}; {again} tests run again")
     if not options.trial:
         record_row(
-            f"repeated, {' '.join([*options.tests, extra]).strip()}{beside}",
+            f"{options.line or ' '.join([*options.tests, extra]).strip()}: green runs{beside}",
             green,
             f"of {options.times}",
             f"{options.times}",
             green == options.times,
             f"python -m benchmarks.repeat_tests {' '.join(map(shlex.quote, sys.argv[1:]))}",
-            f"median {statistics.median(seconds):.0f} s, longest {max(seconds):.0f} s; {again} live tests were run again, as the processors had no time to spare",
+            f"{summary}{'; ' * bool(summary)}median {statistics.median(seconds):.0f} s, longest {max(seconds):.0f} s"
+            + f"; {again} live tests were run again, as the processors had no time to spare" * bool(again),
         )
     return int(green != options.times)
 
