@@ -13,6 +13,7 @@ in front of the face sees texture row 0 at the top and column 0 at the left, whi
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -131,6 +132,28 @@ class VoxelGridObject:
             [lsqr(self.mixing, values[:, k], atol=1e-6, btol=1e-6, iter_lim=200)[0] for k in range(3)],
             axis=-1,
         )
+
+    @property
+    def sha256(self) -> str:
+        """Hash of everything about the object but the colours that are searched for."""
+        digest = hashlib.sha256(
+            repr((self.theta_shape, self.scale, self.one_sided, self.step_units)).encode()
+        )
+        parts = [
+            self.slots,
+            self.fixed_colours,
+            self.box_min,
+            self.box_max,
+            self.T_world_from_object,
+            self.density,
+        ]
+        if self.mixing is not None:
+            parts += [self.mixing.data, self.mixing.indices, self.mixing.indptr]
+        for part in parts:
+            array: NDArray[np.generic] = np.zeros(0) if part is None else np.ascontiguousarray(part)
+            digest.update(f"{array.dtype} {array.shape}".encode())
+            digest.update(array.tobytes())
+        return digest.hexdigest()
 
     def check_theta(self, theta: Tensor) -> None:
         """Raise ``ValueError`` unless ``theta`` has the object's ``theta_shape``."""

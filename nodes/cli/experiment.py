@@ -316,7 +316,7 @@ def _page_folder(campaign: Campaign) -> Path:
 
 def _show_table(campaign: Campaign, cells: Sequence[Cell], output: Path | None) -> None:
     from nodes.experiment.campaign.plan import statuses
-    from nodes.experiment.campaign.table import campaign_table
+    from nodes.experiment.campaign.published import campaign_table
 
     found = statuses(campaign, cells)
     full = campaign_table(campaign, found)
@@ -346,7 +346,7 @@ def _write_and_print(
     from advnerf_core.report.transfer_prediction import prediction_section, prediction_table, skill_text
     from advnerf_core.report.transfer_targets import table_targets
     from nodes.experiment.campaign.predictions import predicted
-    from nodes.experiment.campaign.table import write_table
+    from nodes.experiment.table import write_table
 
     pairs = predicted(folder, list(full.cells.values()))
     page = None

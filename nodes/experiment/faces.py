@@ -21,7 +21,6 @@ from calibration.schema import load_calibration
 from hardware.worlds.world import Panel, Rgb, World
 from nodes.experiment.context import Experiment
 from nodes.experiment.learned_scene import load_background
-from nodes.experiment.request.objects import object_sha256
 from nodes.experiment.screen import cos_angle, face_picture, plain_picture, screens_of
 from nodes.experiment.space_config import FaceConfig
 from nodes.runtime.errors import ConfigError
@@ -93,7 +92,7 @@ def face_space(
         background or load_background(experiment), experiment.view.pinhole, experiment.mount, [field]
     )
     mount = FaceMount(wanted.panel, (panel.square_m, panel.square_m), corners_on(panel))
-    named = NamedObject("face", object_sha256(field))
+    named = NamedObject("face", field.sha256)
     ideal = not wanted.display_model if ideal is None else ideal
     if ideal or not on_screen(experiment):
         return FaceSpace(surrogate, named, mount)

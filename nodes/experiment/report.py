@@ -18,13 +18,13 @@ from advnerf_core.report.transfer_page import text_table
 from hardware.worlds.world import World
 from nodes.experiment import films, live_report, page
 from nodes.experiment.attack import cells, load_found, load_shown
-from nodes.experiment.campaign.table import wanted_rows, write_table
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import CELLS, Experiment
 from nodes.experiment.keys import driven_folder
 from nodes.experiment.overview import from_above
 from nodes.experiment.policy import HARDENED
 from nodes.experiment.spaces import dress, make_space, shown_there
+from nodes.experiment.table import wanted_rows, write_table
 from nodes.runtime.progress import Report
 
 PAGE = "report.html"

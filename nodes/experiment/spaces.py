@@ -39,7 +39,6 @@ from nodes.experiment.objects import (
 )
 from nodes.experiment.placed import OBJECT_SIZES_M, PANEL, PlacedObject
 from nodes.experiment.request.frames import DeployedFrames
-from nodes.experiment.request.objects import object_sha256
 from nodes.experiment.space_config import (
     ColoursConfig,
     FaceConfig,
@@ -155,7 +154,7 @@ def random_placements(experiment: Experiment, count: int, seed: int) -> list[tup
 def geometry_sha256(experiment: Experiment, kind: str) -> str:
     """Hash of the object file of a kind; of a panel, that of the panel at scale 1."""
     if kind == PANEL:
-        return object_sha256(panel_object(experiment, OBJECT_SIZES_M[PANEL][1]))
+        return panel_object(experiment, OBJECT_SIZES_M[PANEL][1]).sha256
     path = object_file(experiment, kind)
     return _file_sha256(path, path.stat().st_mtime_ns)
 

@@ -16,12 +16,12 @@ from nodes.experiment.campaign.admission import gate_file, gate_key
 from nodes.experiment.campaign.config import Campaign
 from nodes.experiment.campaign.plan import read_experiment
 from nodes.experiment.campaign.predictions import kept_prediction, prediction_file
-from nodes.experiment.campaign.store import CellStatus
-from nodes.experiment.campaign.table import wanted_rows
+from nodes.experiment.campaign.store import FINISHED, CellStatus
 from nodes.experiment.cell import Cell
 from nodes.experiment.kinds import load_kind
 from nodes.experiment.reference import BUILD, ReferenceBuild
 from nodes.experiment.stage_record import RECORD, read_record
+from nodes.experiment.table import wanted_rows
 from nodes.runtime.errors import ConfigError
 
 
@@ -171,6 +171,22 @@ def published_table(folder: Path, campaign: Campaign, cells: Sequence[Cell] | No
     return make_table(
         wanted_rows(campaign.cells if cells is None else cells, list(campaign.scenarios)),
         found,
+        campaign.name,
+        campaign.reference,
+    )
+
+
+def campaign_table(campaign: Campaign, found: Sequence[CellStatus]) -> TransferTable:
+    """The table of the cells that are there.
+
+    Args:
+        campaign: The campaign.
+        found: Where the cells are that the table is of; only results of the settings as they are now are taken.
+    """
+    cells = [each.result for each in found if each.result is not None and each.state in FINISHED]
+    return make_table(
+        wanted_rows([each.cell for each in found], list(campaign.scenarios)),
+        cells,
         campaign.name,
         campaign.reference,
     )

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.fields.summed_levels import with_summed_levels
@@ -73,7 +71,7 @@ def place(wanted: ObjectRequest) -> PlacedObject:
         depth_m=wanted.size_m if wanted.kind == "cube" else 0.01,
     )
     field = _scaled(field, wanted.scale)
-    return PlacedObject(wanted.kind, field, _face(wanted), object_sha256(field))
+    return PlacedObject(wanted.kind, field, _face(wanted), field.sha256)
 
 
 def _from_file(wanted: ObjectRequest) -> PlacedObject:
@@ -85,7 +83,7 @@ def _from_file(wanted: ObjectRequest) -> PlacedObject:
     field = load_object(wanted.file).placed(wanted.pose, wanted.scale)
     if wanted.levels:
         field = with_summed_levels(field, wanted.levels, finest=max(field.slots.shape))
-    return PlacedObject(wanted.file.name.partition(".")[0], field, None, object_sha256(field))
+    return PlacedObject(wanted.file.name.partition(".")[0], field, None, field.sha256)
 
 
 def _scaled(field: VoxelGridObject, scale: float) -> VoxelGridObject:
@@ -100,25 +98,3 @@ def _face(wanted: ObjectRequest) -> Face:
     corners = target.corners
     shown = (float(np.linalg.norm(corners[1] - corners[0])), float(np.linalg.norm(corners[3] - corners[0])))
     return Face(shown, target.subject, corners)
-
-
-def object_sha256(field: VoxelGridObject) -> str:
-    """Hash of everything about an object except the colours that are searched for."""
-    digest = hashlib.sha256(
-        repr((field.theta_shape, field.scale, field.one_sided, field.step_units)).encode()
-    )
-    parts = [
-        field.slots,
-        field.fixed_colours,
-        field.box_min,
-        field.box_max,
-        field.T_world_from_object,
-        field.density,
-    ]
-    if field.mixing is not None:
-        parts += [field.mixing.data, field.mixing.indices, field.mixing.indptr]
-    for part in parts:
-        array: NDArray[np.generic] = np.zeros(0) if part is None else np.ascontiguousarray(part)
-        digest.update(f"{array.dtype} {array.shape}".encode())
-        digest.update(array.tobytes())
-    return digest.hexdigest()

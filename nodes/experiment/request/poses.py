@@ -29,7 +29,6 @@ from advnerf_core.attack.search.search import SearchResult
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.files import write_atomically
 from advnerf_core.render.soft_pose import placement_of
-from nodes.experiment.request.objects import object_sha256
 from nodes.experiment.request.pose_request import PosesRequest
 from nodes.experiment.request.prepare import Prepared, prepare
 from nodes.experiment.request.request import AttackRequest
@@ -183,7 +182,7 @@ def pose_attack_file(ready: PreparedPoses, result: SearchResult) -> AttackFile:
     moved_fields = placed(ready.sensor.space.objects, ready.sensor.placements(result.theta))
     predicted_m = float(judge(ready.problem, result.theta).protocol_cte_m.mean())
     objects = tuple(
-        replace(each, field=moved, sha256=object_sha256(moved))
+        replace(each, field=moved, sha256=moved.sha256)
         for each, moved in zip(ready.prepared.objects, moved_fields, strict=True)
     )
     prepared = replace(ready.prepared, surrogate=surrogate, objects=objects)

@@ -9,8 +9,8 @@ from advnerf_core.report.transfer_page import text_table
 from benchmarks.attack_toy import toy_problem
 from nodes.experiment.campaign.config import load_campaign
 from nodes.experiment.campaign.plan import statuses
+from nodes.experiment.campaign.published import campaign_table
 from nodes.experiment.campaign.run import Options, run_campaign
-from nodes.experiment.campaign.table import campaign_table
 from nodes.experiment.cell import select
 from nodes.runtime.errors import ConfigError
 from tests.support.strangers import install_method, spiral_code, spiral_theta, write_spiral

@@ -1,4 +1,4 @@
-"""The table of a campaign from its cells, and the page of it."""
+"""The lines of a result table, and its page."""
 
 from __future__ import annotations
 
@@ -10,10 +10,8 @@ from markupsafe import Markup
 
 from advnerf_core.files import write_atomically
 from advnerf_core.report.conditions import order_of
-from advnerf_core.report.transfer import TransferTable, Wanted, make_table
+from advnerf_core.report.transfer import TransferTable, Wanted
 from advnerf_core.report.transfer_page import as_csv, as_json, as_markdown, gather_clips, render_transfer_page
-from nodes.experiment.campaign.config import Campaign
-from nodes.experiment.campaign.store import FINISHED, CellStatus
 from nodes.experiment.cell import Cell
 
 
@@ -29,22 +27,6 @@ def wanted_rows(cells: Sequence[Cell], scenarios: Sequence[str]) -> list[Wanted]
         key=lambda key: (scenarios.index(key[0]), key[1], victims.index(key[2]), order_of(key[3])),
     )
     return [Wanted(*key, tuple(seeds[key])) for key in order]
-
-
-def campaign_table(campaign: Campaign, found: Sequence[CellStatus]) -> TransferTable:
-    """The table of the cells that are there.
-
-    Args:
-        campaign: The campaign.
-        found: Where the cells are that the table is of; only results of the settings as they are now are taken.
-    """
-    cells = [each.result for each in found if each.result is not None and each.state in FINISHED]
-    return make_table(
-        wanted_rows([each.cell for each in found], list(campaign.scenarios)),
-        cells,
-        campaign.name,
-        campaign.reference,
-    )
 
 
 def write_table(
