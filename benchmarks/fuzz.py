@@ -30,7 +30,7 @@ from hardware.motor.vesc_codec import FrameDecoder, decode_command, encode_frame
 from hardware.motor.vesc_replies import decode_firmware_version, decode_values
 from nodes.bags.reader import read_info, read_messages
 from nodes.bags.writer import BagWriter
-from nodes.launching.launch_file import LaunchFile
+from nodes.launching.launch_schema import LaunchFile
 from nodes.runtime.image_parts import join_image, split_image
 from nodes.runtime.messages import (
     decode,

@@ -17,7 +17,8 @@ import numpy as np
 from advnerf_core.data.errors import DatasetError, raise_all
 from advnerf_core.data.image_files import SUFFIXES, image_size
 from advnerf_core.data.lens import Lens
-from advnerf_core.data.views import HELD_OUT_SPLITS, NGP_OFFSET, NGP_SCALE, TRAIN, PosedImage, PosedImages
+from advnerf_core.data.posed_image import PosedImage
+from advnerf_core.data.views import HELD_OUT_SPLITS, NGP_OFFSET, NGP_SCALE, TRAIN, PosedImages
 from advnerf_core.documents import read_json
 from advnerf_core.errors import ConfigError, MissingFileError
 from advnerf_core.geometry import OPENGL_FROM_OPENCV, Array, Pinhole

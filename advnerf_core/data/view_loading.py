@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -13,10 +12,8 @@ from numpy.typing import NDArray
 from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.image_files import OPAQUE, Grey, Rgb, read_mask, read_stored, unpremultiplied
 from advnerf_core.data.lens import straightening
+from advnerf_core.data.posed_image import PosedImage
 from advnerf_core.geometry import Pinhole
-
-if TYPE_CHECKING:
-    from advnerf_core.data.views import PosedImage
 
 # Sizes may differ from the listed ones (half-size copies), their ratio may not: then the image is another one, or turned.
 _ASPECT_TOLERANCE = 0.01

@@ -17,41 +17,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from advnerf_core.data.errors import DatasetError, raise_all
 from advnerf_core.data.image_files import OPAQUE, Grey, Rgb
-from advnerf_core.data.lens import Lens
+from advnerf_core.data.posed_image import PosedImage
 from advnerf_core.data.view_loading import View, load_view
 from advnerf_core.geometry import Array, Pinhole
 
 # Instant-NGP maps the file's coordinates into its unit cube by 0.33 x + 0.5, unless the file says otherwise.
 NGP_SCALE, NGP_OFFSET = 0.33, (0.5, 0.5, 0.5)
 TRAIN, HELD_OUT_SPLITS = "train", ("val", "test")
-
-
-@dataclass(frozen=True, eq=False)
-class PosedImage:
-    """One photograph on disk.
-
-    Attributes:
-        path: The image file.
-        pinhole: Intrinsics for the listed size.
-        lens: Distortion.
-        T_world_from_camera: Pose ``[4, 4]``, OpenCV axes.
-        mask: File whose black pixels are to be left out; None if all count.
-        camera_id: Which camera took it.
-        split: ``train``, ``val`` or ``test`` where the data set says so.
-    """
-
-    path: Path
-    pinhole: Pinhole
-    lens: Lens
-    T_world_from_camera: Array
-    mask: Path | None = None
-    camera_id: str = ""
-    split: str | None = None
-
-    @property
-    def distortion(self) -> tuple[float, ...]:
-        """Coefficients of the lens."""
-        return self.lens.coefficients
 
 
 @dataclass(frozen=True, eq=False)

@@ -91,7 +91,7 @@ def _recording(bag: Path, folder: Path, port: int, rate: float) -> tuple[PageCon
     from advnerf_core.files import write_atomically
     from nodes.bags.reader import read_attachments, read_info
     from nodes.launching.child import Child
-    from nodes.launching.launch_file import NodeEntry
+    from nodes.launching.launch_schema import NodeEntry
     from nodes.page import PageConfig
     from nodes.runtime.topics import STATUS_PREFIX, type_of_topic
 

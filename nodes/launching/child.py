@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from advnerf_core.run_module import module_command
-from nodes.launching.launch_file import NodeEntry
+from nodes.launching.launch_schema import NodeEntry
 
 _SHIM = Path(__file__).with_name("shim.py")
 

@@ -7,17 +7,12 @@ topic lists of the gateways follow from the topic table, which has the publisher
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Protocol
-
-from pydantic import Field
+from typing import Any, Protocol
 
 from advnerf_core.documents import Document
-from advnerf_core.strict import StrictModel
+from nodes.launching.launch_schema import LaunchFile
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.topics import STATUS_PREFIX, TOPICS, status_topic
-
-if TYPE_CHECKING:
-    from nodes.launching.launch_file import LaunchFile
 
 GATEWAY = "gateway"
 ALL_HOSTS = "all"
@@ -27,22 +22,6 @@ _HOST_COUNT = 2
 _TOGETHER = ("safety", "motor")
 _SAFETY_MODULE = "nodes.safety"
 _COMMANDS = ("/policy/drive", "/expert/drive")
-
-
-class HostEntry(StrictModel):
-    """A host of a launch file.
-
-    Attributes:
-        address: Address of this host. Exactly one host has an address, and listens there.
-        watch_port: TCP port on which the listening host sends.
-        drive_port: TCP port on which the listening host receives.
-        key: Name of the host's key; none uses the name of the host.
-    """
-
-    address: str | None = None
-    watch_port: int = Field(default=5570, ge=1024, le=65535)
-    drive_port: int = Field(default=5571, ge=1024, le=65535)
-    key: str | None = None
 
 
 class _Entry(Protocol):

@@ -11,7 +11,7 @@ from typing import Any
 
 from advnerf_core.files import write_atomically
 from nodes.launching.child import Child
-from nodes.launching.launch_file import NodeEntry
+from nodes.launching.launch_schema import NodeEntry
 
 RECORDER, LAUNCH_RECORDER, TELEOP = "page_recorder", "recorder", "/teleop/state"
 _KILL_AFTER_S = 10.0

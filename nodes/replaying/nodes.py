@@ -22,7 +22,8 @@ from advnerf_core.errors import AdvnerfError
 from advnerf_core.run_module import search_working_folder_last
 from advnerf_core.strict import validate
 from nodes.bags.reader import plain_name, read_attachments
-from nodes.launching.launch_file import NodeEntry, Plan, load_launch
+from nodes.launching.launch_file import Plan, load_launch
+from nodes.launching.launch_schema import NodeEntry
 from nodes.runtime.clock import Clock
 from nodes.runtime.errors import BagError, ConfigError
 from nodes.runtime.node import Node, NodeContext

@@ -1,0 +1,37 @@
+"""One photograph on disk, with the lens and the pose that a data set gives it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from advnerf_core.data.lens import Lens
+from advnerf_core.geometry import Array, Pinhole
+
+
+@dataclass(frozen=True, eq=False)
+class PosedImage:
+    """One photograph on disk.
+
+    Attributes:
+        path: The image file.
+        pinhole: Intrinsics for the listed size.
+        lens: Distortion.
+        T_world_from_camera: Pose ``[4, 4]``, OpenCV axes.
+        mask: File whose black pixels are to be left out; None if all count.
+        camera_id: Which camera took it.
+        split: ``train``, ``val`` or ``test`` where the data set says so.
+    """
+
+    path: Path
+    pinhole: Pinhole
+    lens: Lens
+    T_world_from_camera: Array
+    mask: Path | None = None
+    camera_id: str = ""
+    split: str | None = None
+
+    @property
+    def distortion(self) -> tuple[float, ...]:
+        """Coefficients of the lens."""
+        return self.lens.coefficients
