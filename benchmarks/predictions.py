@@ -54,12 +54,14 @@ class Predicted:
         band: 80 % band of its factor.
         ours: Score of the predictor.
         rival: Score of the rival.
+        same_searches: Earlier sets that drove the same searches elsewhere.
     """
 
     found: Transfer
     band: tuple[float, float]
     ours: Score
     rival: Score
+    same_searches: tuple[str, ...]
 
     def holds(self, factor: float) -> bool:
         """Whether a factor is within the band."""
@@ -96,7 +98,9 @@ def forward(evidence: Evidence, sets: Sequence[Evidence], baseline: bool) -> Pre
         known.bands(found.surrogate, found.scale, LEVEL),
         rival_bands(earlier, found.surrogate, LEVEL),
     )
-    return Predicted(found, (float(low), float(high)), *(score_bands(each, found.deployed) for each in bands))
+    ours, rival = (score_bands(each, found.deployed) for each in bands)
+    same = tuple(each.name for each in earlier if np.array_equal(each.surrogate, found.surrogate))
+    return Predicted(found, (float(low), float(high)), ours, rival, same)
 
 
 def before(evidence: Evidence, sets: Sequence[Evidence], baseline: bool) -> list[Transfer]:
@@ -117,6 +121,7 @@ def record_forward(found: Sequence[Predicted], baseline: bool) -> None:
     inside = sum(each.holds(each.found.factor) for each in found)
     sets = "; ".join(
         f"{each.found.name} {each.found.factor:.2f} in {each.band[0]:.2f} to {each.band[1]:.2f}"
+        + (f" (the searches of {' and '.join(each.same_searches)})" if each.same_searches else "")
         for each in found
     )
     record(f"factor of deployed excess, {which}: sets within the 80 % band from earlier sets", inside, len(found), sets + _AFTER)  # fmt: skip

@@ -18,8 +18,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
-# Small odds find small effects in many searches, large ones find separated methods in few.
-ODDS = (3.0, 9.0, 27.0, 81.0, 243.0, 729.0)
+# Small odds find small effects in many searches, large ones find separated methods in few. These find most between methods that are
+# one to three standard deviations apart, in four to twelve pairs.
+ODDS = (3.0, 9.0, 27.0)
 
 
 @dataclass(frozen=True)

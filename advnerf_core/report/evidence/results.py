@@ -76,6 +76,21 @@ class Row:
 
 
 @dataclass(frozen=True)
+class SearchMeans:
+    """What one search does, mean over its starts.
+
+    Attributes:
+        surrogate_m: Excess |CTE| per tick in the surrogate [m].
+        deployed_m: The same deployed [m].
+        shift_m: Signed CTE minus that without attack, per tick in the surrogate [m]; positive is to the left.
+    """
+
+    surrogate_m: float
+    deployed_m: float
+    shift_m: float
+
+
+@dataclass(frozen=True)
 class TestResult:
     """A primary test.
 
@@ -91,7 +106,7 @@ class TestResult:
         difference_surrogate_m: The difference where both search, in the surrogate [m].
         p_surrogate: p of the same test there; a description, not adjusted, and too large if there are several baselines, since
             the strongest one is chosen from these drives.
-        searches_m: Mean excess of each search in the surrogate and deployed [m], by method.
+        searches: What each search of the two does, by method.
         anytime: The test that could have stopped earlier, deployed; a description, not adjusted.
         mcnemar: Off-track against the baseline, search by search.
     """
@@ -106,7 +121,7 @@ class TestResult:
     reason: str
     difference_surrogate_m: float
     p_surrogate: float | None
-    searches_m: dict[str, list[tuple[float, float]]]
+    searches: dict[str, list[SearchMeans]]
     anytime: AnytimeTest
     mcnemar: tuple[McNemar, ...] = field(default=())
 
@@ -214,6 +229,7 @@ def as_data(evidence: Evidence) -> dict[str, Any]:
             {
                 **vars(test),
                 "test": test.test.model_dump(mode="json"),
+                "searches": {name: [vars(each) for each in found] for name, found in test.searches.items()},
                 "anytime": vars(test.anytime),
                 "mcnemar": [vars(each) for each in test.mcnemar],
             }
@@ -289,10 +305,7 @@ def _test(evidence: Evidence, test: PrimaryTest) -> TestResult | None:
         reason=found.reason,
         difference_surrogate_m=there.difference,
         p_surrogate=there.p,
-        searches_m={
-            name: list(zip(*(means(name, domain).tolist() for domain in DOMAINS), strict=True))
-            for name in two
-        },
+        searches={name: [_search_means(evidence, cell) for cell in by_method[name]] for name in two},
         anytime=anytime_test(deployed, against, evidence.registration.alpha),
         mcnemar=mcnemar_per_search(off[0], off[1]) if len(off[0]) == len(off[1]) else (),
     )
@@ -309,6 +322,15 @@ def _difference(
     if not _equally_many([*one, *other]):
         return None
     return difference_interval(np.array(one), np.array(other), evidence.registration.level)
+
+
+def _search_means(evidence: Evidence, cell: CellResult) -> SearchMeans:
+    clean = evidence.without(cell)
+    assert clean is not None, "without it there is no outcome"
+    drives = zip(evidence.metrics(cell, "surrogate"), evidence.metrics(clean, "surrogate"), strict=False)
+    shifts = [float(np.mean(attacked.ctes_m) - np.mean(none.ctes_m)) for attacked, none in drives]
+    excess = [_mean_excess_m(evidence, cell, domain) for domain in DOMAINS]
+    return SearchMeans(excess[0], excess[1], float(np.mean(shifts)))
 
 
 def _mean_excess_m(evidence: Evidence, cell: CellResult, domain: Domain) -> float:
