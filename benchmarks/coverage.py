@@ -2,7 +2,8 @@
 
 Each replication is one experiment: searches, all driven from the same starts, with random effects of search, start and drive.
 The skewed designs are lognormal, or off-track-like: the car leaves the track (+2 m) where a latent sum of the effects is high.
-``python -m benchmarks.coverage`` records the coverage of each design, and the error rates of the tests.
+``python -m benchmarks.coverage`` records the coverage of each design, and the error rates of the tests. Parts can be recorded alone:
+``python -m benchmarks.coverage differences``.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri, stdtrit
 
 from advnerf_core.report.evidence.exact import permutation_test
-from advnerf_core.report.evidence.mean_estimate import MeanEstimate, crossed
+from advnerf_core.report.evidence.mean_estimate import MeanEstimate, crossed, difference
 from benchmarks.results import record_row
 
 Floats = NDArray[np.float64]
@@ -25,6 +26,7 @@ SEARCHES, STARTS = 6, 20
 LEVEL, ALPHA = 0.95, 0.05
 LOWEST, HIGHEST = 93.0, 97.0
 COMMAND = "python -m benchmarks.coverage"
+PARTS = ("means", "differences")
 OFF_TRACK_M, WOBBLE_M = 2.0, 0.1
 
 
@@ -76,6 +78,44 @@ SMALLER = (
 )
 
 
+@dataclass(frozen=True)
+class TwoMethods:
+    """Two methods whose searches are unrelated and whose starts are shared.
+
+    Attributes:
+        name: What it is.
+        kind: ``normal`` [m], or ``lognormal`` (the deviations are of the logarithm).
+        searches_vary: Standard deviations of the searches of each method.
+        deviations: Standard deviations of the start, of what a start does to one method, and of the drive.
+        searches: Numbers of searches of each method.
+        starts: Number of starts.
+    """
+
+    name: str
+    kind: str
+    searches_vary: tuple[float, float]
+    deviations: tuple[float, float, float]
+    searches: tuple[int, int] = (SEARCHES, SEARCHES)
+    starts: int = STARTS
+
+    @property
+    def line(self) -> str:
+        return f"95 % interval of a difference, {self.searches[0]} and {self.searches[1]} searches x {self.starts} starts, {self.name}: coverage"
+
+
+DIFFERENCES = (
+    TwoMethods("normal, equal effects", "normal", (0.3, 0.3), (0.3, 0.2, 0.3)),
+    TwoMethods("normal, one method varies", "normal", (0.02, 0.3), (0.3, 0.2, 0.1)),
+    TwoMethods("normal, starts dominate", "normal", (0.05, 0.05), (0.3, 0.3, 0.1)),
+    TwoMethods("normal, noise only", "normal", (0.0, 0.0), (0.3, 0.0, 0.3)),
+    TwoMethods("normal, unequal numbers", "normal", (0.3, 0.3), (0.3, 0.2, 0.3), searches=(3, 6), starts=8),
+    TwoMethods("normal, few starts", "normal", (0.02, 0.3), (0.3, 0.2, 0.1), starts=5),
+    TwoMethods("lognormal, equal effects", "lognormal", (0.3, 0.3), (0.3, 0.2, 0.3)),
+    TwoMethods("lognormal, one method varies", "lognormal", (0.05, 0.5), (0.3, 0.1, 0.1)),
+    TwoMethods("lognormal, one method varies, heavy tail", "lognormal", (0.05, 1.0), (0.3, 0.1, 0.1)),
+)
+
+
 def simulate(design: Design, replications: int, rng: np.random.Generator) -> tuple[Floats, float]:
     """Excess of simulated drives ``[replications, searches, starts]`` [m], and the true mean [m]."""
     of_search, of_start, of_drive = design.deviations
@@ -99,12 +139,12 @@ def record_coverage(
     drives, truth = simulate(design, replications, rng)
     estimate = crossed(drives)
     low, high = estimate.ends(LEVEL)
-    inside = _percent((low <= truth) & (truth <= high))
+    inside = percent((low <= truth) & (truth <= high))
     half = stdtrit(estimate.degrees_of_freedom, 0.5 * (1.0 + LEVEL)) * estimate.standard_error
-    plain = _percent(np.abs(estimate.mean - truth) <= half)
+    plain = percent(np.abs(estimate.mean - truth) <= half)
     note = (
-        f"{replications} replications; true mean of {truth:.2f} m below the interval in {_percent(truth < low):.1f} %, "
-        f"above it in {_percent(truth > high):.1f} %; median width {np.median(high - low):.2f} m; "
+        f"{replications} replications; true mean of {truth:.2f} m below the interval in {percent(truth < low):.1f} %, "
+        f"above it in {percent(truth > high):.1f} %; median width {np.median(high - low):.2f} m; "
         f"coverage without the correction for skewness {plain:.1f} %"
     )
     targeted = design in DESIGNS
@@ -127,6 +167,47 @@ def _reason(design: Design, inside: float, targeted: bool) -> str:
     return f"; {design.searches} searches do not show how heavy the tail of their distribution is"
 
 
+def simulate_two(
+    design: TwoMethods, replications: int, rng: np.random.Generator
+) -> tuple[Floats, Floats, float]:
+    """Drives of both methods ``[replications, searches, starts]`` [m], and the true difference of their means [m]."""
+    common, own, of_drive = design.deviations
+    shared = common * rng.standard_normal((replications, 1, design.starts))
+    drives, means = [], []
+    for searches, varies in zip(design.searches, design.searches_vary, strict=True):
+        shape = replications, searches, design.starts
+        effects = shared + own * rng.standard_normal((replications, 1, design.starts))
+        effects = (
+            effects + varies * rng.standard_normal((*shape[:2], 1)) + of_drive * rng.standard_normal(shape)
+        )
+        skewed = design.kind == "lognormal"
+        drives.append(np.exp(effects) if skewed else effects)
+        variance = varies**2 + common**2 + own**2 + of_drive**2
+        means.append(float(np.exp(variance / 2)) if skewed else 0.0)
+    return drives[0], drives[1], means[0] - means[1]
+
+
+def record_difference(
+    design: TwoMethods, replications: int, rng: np.random.Generator, record: Callable[..., None]
+) -> None:
+    """Coverage of the interval of a difference, beside that of the one that pairs unrelated searches."""
+    one, other, truth = simulate_two(design, replications, rng)
+    low, high = difference(one, other).ends(LEVEL)
+    inside = percent((low <= truth) & (truth <= high))
+    few = min(design.searches)
+    paired = crossed(one[:, :few] - other[:, :few]).ends(LEVEL)
+    note = (
+        f"{replications} replications; true difference of {truth:.2f} m below the interval in {percent(truth < low):.1f} %, above it in "
+        f"{percent(truth > high):.1f} %; median width {np.median(high - low):.2f} m, {np.median(paired[1] - paired[0]):.2f} m with unrelated searches "
+        f"paired, whose coverage is {percent((paired[0] <= truth) & (truth <= paired[1])):.1f} %"
+    )
+    if inside > HIGHEST:
+        note += "; wider than necessary, which is conservative"
+    if inside < LOWEST:
+        note += f"; {few} searches do not show how heavy the tail of their distribution is"
+    record(design.line, inside, "%", "93 to 97 %", LOWEST <= inside <= HIGHEST, COMMAND, note)
+
+
 def record_bootstraps(replications: int, rng: np.random.Generator, record: Callable[..., None]) -> None:
     """Coverage of two percentile bootstraps on the first design, for comparison."""
     drives, truth = simulate(DESIGNS[0], replications, rng)
@@ -141,7 +222,7 @@ def record_bootstraps(replications: int, rng: np.random.Generator, record: Calla
         low, high = np.quantile(means, [0.5 * (1 - LEVEL), 0.5 * (1 + LEVEL)], axis=1)
         note = f"{replications} replications of {draws} resamples; not used for results"
         line = f"{name}, 6 searches x 20 starts, {DESIGNS[0].name}: coverage"
-        record(line, _percent((low <= truth) & (truth <= high)), "%", "-", None, COMMAND, note)
+        record(line, percent((low <= truth) & (truth <= high)), "%", "-", None, COMMAND, note)
 
 
 def _by_draw(drives: Floats, weights: Floats) -> Floats:
@@ -154,7 +235,7 @@ def record_equivalence(replications: int, rng: np.random.Generator, record: Call
     for design in (DESIGNS[0], DESIGNS[5], DESIGNS[9]):
         drives, truth = simulate(design, replications, rng)
         estimate: MeanEstimate = crossed(drives)
-        wrong = _percent(np.maximum(estimate.p_above(-truth), estimate.p_below(truth)) < ALPHA)
+        wrong = percent(np.maximum(estimate.p_above(-truth), estimate.p_below(truth)) < ALPHA)
         line = f"equivalence test, 6 searches x 20 starts, {design.name}: false positives at the margin"
         note = (
             f"{replications} replications with the true mean at the upper margin, {truth:.2f} m, at level 5 %"
@@ -198,15 +279,17 @@ def _false_positives(spread_m: float, replications: int, rng: np.random.Generato
     noise = 0.3 * rng.standard_normal((replications, 2, SEARCHES, STARTS))
     means = (starts + methods + searches + noise).mean(axis=3)
     ps = [permutation_test(a, b).p for a, b in means]
-    return _percent(np.array(ps, dtype=np.float64) <= ALPHA)
+    return percent(np.array(ps, dtype=np.float64) <= ALPHA)
 
 
-def _percent(flags: NDArray[np.bool_]) -> float:
+def percent(flags: NDArray[np.bool_]) -> float:
+    """Share of flags that are true [%]."""
     return 100.0 * float(np.mean(flags))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("parts", nargs="*", help=f"of {', '.join(PARTS)}; all if none is named")
     parser.add_argument("--replications", type=int, default=50_000, help="experiments of each design")
     parser.add_argument("--dry-run", action="store_true", help="print, but do not write the ledger")
     arguments = parser.parse_args()
@@ -217,11 +300,19 @@ def main() -> None:
         if not arguments.dry_run:
             record_row(line, value, unit, target, met, *rest)
 
-    for design in (*DESIGNS, *SMALLER):
-        record_coverage(design, arguments.replications, rng, record)
-    record_bootstraps(min(arguments.replications, 4_000), rng, record)
-    record_equivalence(arguments.replications, rng, record)
-    record_permutation(arguments.replications, rng, record)
+    count = arguments.replications
+    chosen = arguments.parts or PARTS
+    if unknown := sorted(set(chosen) - set(PARTS)):
+        parser.error(f"expected parts of {', '.join(PARTS)}, got {', '.join(unknown)}")
+    if "means" in chosen:
+        for design in (*DESIGNS, *SMALLER):
+            record_coverage(design, count, rng, record)
+        record_bootstraps(min(count, 4_000), rng, record)
+        record_equivalence(count, rng, record)
+        record_permutation(count, rng, record)
+    if "differences" in chosen:
+        for two in DIFFERENCES:
+            record_difference(two, count, np.random.default_rng(1), record)
     print(f"{time.monotonic() - began:.0f} s")
 
 

@@ -1,7 +1,8 @@
 """What is left of an attack where everything is the world's own? ``python -m benchmarks.gap SET...``.
 
 Reads published gap sets (`launch/gap_*.campaign.yaml`): the difference between the gradient and the random family that is strongest in the
-surrogate, past a panel that the world's own renderer shows, driven by the world's own car; and how much of the surrogate's excess is left.
+surrogate, past a panel that the world's own renderer shows, driven by the world's own car; and how much of the surrogate's excess is left,
+of the gradient's searches and of random ones that are strong in the surrogate.
 """
 
 from __future__ import annotations
@@ -9,8 +10,11 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+import numpy as np
+
 from advnerf_core.documents import read_json
 from advnerf_core.report.conditions import style_of
+from advnerf_core.report.evidence.luck import luck_of
 from advnerf_core.report.evidence.registration import read_registration
 from benchmarks.results import REPOSITORY, record_row
 
@@ -24,6 +28,7 @@ def main() -> None:
     """Record the rows of each set."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("sets", nargs="+", help="names of published gap sets")
+    last = []
     for name in parser.parse_args().sets:
         registration = read_registration(PUBLISHED / name)
         if registration is None:
@@ -33,6 +38,11 @@ def main() -> None:
         scenario = registration.scenario(test["test"]["scenario"])
         assert scenario is not None, "a primary test is of a registered scenario"
         record(name, test, data["rows"], scenario.off_track_m)
+        record_luck(name, test)
+        record_largest_loss(name, test, data.get("contrasts", []))
+        last.append((name, test))
+    if len(last) > 1:
+        record_all_luck(last)
 
 
 def record(name: str, test: dict[str, Any], rows: list[dict[str, Any]], half_lane_m: float) -> None:
@@ -59,6 +69,54 @@ def record(name: str, test: dict[str, Any], rows: list[dict[str, Any]], half_lan
     print(
         f"{name}: lower bound {low:.3f} half lanes per tick, {kept:.0f} % of the surrogate's excess left; {note}"
     )
+
+
+def record_luck(name: str, test: dict[str, Any]) -> None:
+    """What is left of the random search that is strongest in the surrogate, beside the others and the gradient's."""
+    found, pairs = luck_of(test), test["searches"][test["baseline"]]
+    best = int(np.argmax([each["surrogate_m"] for each in pairs]))
+    others = [100.0 * share for each, share in enumerate(found.baseline_shares) if each != best]
+    ours = [100.0 * share for share in found.method_shares]
+    there = "not tested" if test["p_surrogate"] is None else f"p = {test['p_surrogate']:.4f}, not adjusted"
+    note = (
+        f"{style_of(test['baseline']).title}: {pairs[best]['surrogate_m']:.3f} to {pairs[best]['deployed_m']:.3f} m per tick; its other searches keep {min(others):.0f} to "
+        f"{max(others):.0f} %, median {np.median(others):.0f} %; the gradient's {min(ours):.0f} to {max(ours):.0f} %; {len(found.lucky)} of {len(pairs)} "
+        f"are stronger in the surrogate than every gradient search{', and push to the other side' * found.other_side}; there the gradient adds {test['difference_surrogate_m']:+.3f} m per tick ({there})"
+    )
+    value = round(100.0 * found.baseline_shares[best])
+    record_row(f"{name}: share left of the random search that is strongest in the surrogate, deployed natively", value, "%", "", None, f"python -m benchmarks.gap {name}", note)  # fmt: skip
+    print(f"{name}: {value} % of the strongest random search left; {note}")
+
+
+def record_all_luck(tests: list[tuple[str, dict[str, Any]]]) -> None:
+    """What is left of random searches that are stronger in the surrogate than every gradient search, over the sets."""
+    found = [(name, luck_of(test)) for name, test in tests]
+    lucky = [(name, 100.0 * share) for name, each in found for share in each.lucky_shares]
+    if not lucky:
+        return
+    ours = [100.0 * share for _, each in found for share in each.method_shares]
+    theirs = [100.0 * share for _, each in found for share in each.baseline_shares]
+    note = (
+        f"{len(lucky)} of {len(theirs)} random searches: {', '.join(f'{name} {share:.0f} %' for name, share in lucky)}; all random searches: median "
+        f"{np.median(theirs):.0f} %; {len(ours)} gradient searches: {min(ours):.0f} to {max(ours):.0f} %, median {np.median(ours):.0f} %"
+    )
+    value = round(max(share for _, share in lucky))
+    record_row("random searches that are stronger in the surrogate than every gradient search: largest share left, deployed natively", value, "%", "", None, f"python -m benchmarks.gap {' '.join(name for name, _ in tests)}", note)  # fmt: skip
+    print(f"{value} %: {note}")
+
+
+def record_largest_loss(name: str, test: dict[str, Any], contrasts: list[dict[str, Any]]) -> None:
+    """Which single difference takes most of the random searches' excess, and what it takes of the gradient's."""
+    singles = [row for row in contrasts if not row["name"].startswith("all of it")]
+    changed = {(row["name"], row["method"]): 100.0 * row["difference_m"] / row["before_m"] for row in singles}
+    losses = {what: share for (what, method), share in changed.items() if method == test["baseline"]}
+    if not losses:
+        return
+    what = min(losses, key=lambda each: losses[each])
+    ours = changed[what, test["test"]["method"]]
+    note = f"{what}; it changes the gradient's excess by {ours:+.0f} %"
+    record_row(f"{name}: largest change of the random searches' excess by a single difference", round(losses[what]), "%", "", None, f"python -m benchmarks.gap {name}", note)  # fmt: skip
+    print(f"{name}: {losses[what]:+.0f} % by {note}")
 
 
 if __name__ == "__main__":

@@ -71,7 +71,7 @@ QUESTIONS = (
         "statistics",
         "Are the intervals and tests right?",
         "Coverage of intervals and error rates of tests on simulated drives whose true effect is known.",
-        ("coverage", "planted_changes"),
+        ("coverage", "anytime", "planted_changes"),
     ),
     Question(
         "hardened",

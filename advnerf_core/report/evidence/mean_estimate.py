@@ -11,6 +11,16 @@ the two-way cluster estimate (Cameron, Gelbach and Miller 2011). Its degrees of 
 Satterthwaite (1946). If A <= E, then the data show no search effect, and the start means are one sample.
 If B <= E, then the search means are one sample. If both hold, then all drives are one sample.
 
+The difference of two methods has I searches of one and K of the other, all driven from the same J starts. Search
+i of one method has nothing to do with search i of the other, so only starts are paired. With d_j the difference
+of the start means, and A, E the mean squares of each method as above,
+
+    Var(difference) = Var(a) / I + Var(a') / K + Var(b) / J + Var(e) / (I J) + Var(e') / (K J),
+
+where b is what the two methods' effects of a start differ by. An unbiased estimate is
+``Var(d_j) / J + (A - E) / (I J) + (A' - E') / (K J)``. Effects that the data do not show are dropped as above;
+without a start effect, what is left is Welch's two samples of search means.
+
 Intervals correct for skewness by the monotone cubic of Hall (1992), "On the removal of skewness by
 transformation". Hall takes normal or bootstrap quantiles; here they are quantiles of t, because six searches
 leave few degrees of freedom. With skewness 0 the interval is the ordinary t interval.
@@ -106,6 +116,74 @@ def crossed(values: Floats) -> MeanEstimate:
         cases, [_third_cumulant(flat) / count**2, skew_starts, skew_searches], skew_searches + skew_starts
     )
     return _estimate(mean, square / count, freedom, skew)
+
+
+def difference(one: Floats, other: Floats) -> MeanEstimate:
+    """Estimate a mean difference: drives ``[..., I, J]`` of a method minus drives ``[..., K, J]`` of another one.
+
+    Both drive from the same J >= 2 starts, each with at least two searches. Searches are not paired.
+    """
+    starts = one.shape[-1]
+    by_start = one.mean(axis=-2) - other.mean(axis=-2)
+    of_starts = by_start.var(axis=-1, ddof=1) / starts
+    parts = [_of_searches(drives) for drives in (one, other)]
+    shown = of_starts > sum(part.residual for part in parts)
+    # Variances of the mean, each with the sign and the degrees of freedom of its mean square.
+    terms = [(np.where(shown, of_starts, 0.0), starts - 1.0)]
+    third = np.where(shown, _third_cumulant(by_start) / starts**2, 0.0)
+    for part, drives, sign in zip(parts, (one, other), (1.0, -1.0), strict=True):
+        searches = drives.shape[-2]
+        differ = part.searches > part.residual
+        alone = ~differ & ~shown
+        terms += [
+            (np.where(differ, part.searches, 0.0), searches - 1.0),
+            (np.where(differ & shown, -part.residual, 0.0), (searches - 1.0) * (starts - 1.0)),
+            (np.where(alone, part.drives, 0.0), searches * starts - 1.0),
+        ]
+        third = third + sign * np.select([differ, alone], [part.third, part.third_of_drives], 0.0)
+    total = np.sum([variance for variance, _ in terms], axis=0)
+    variances, freedoms = zip(*terms, strict=True)
+    freedom = _satterthwaite(total, variances, freedoms)
+    return _estimate(by_start.mean(axis=-1), total, freedom, third)
+
+
+@dataclass(frozen=True)
+class _Method:
+    """What the drives of one method add to the variance of a difference; each an array ``[...]``.
+
+    Attributes:
+        searches: Variance of the mean if the searches are the sample.
+        residual: The part of it that the drives alone explain.
+        drives: Variance of the mean if all drives are one sample.
+        third: Third cumulant of the mean if the searches are the sample.
+        third_of_drives: The same if all drives are one sample.
+    """
+
+    searches: Floats
+    residual: Floats
+    drives: Floats
+    third: Floats
+    third_of_drives: Floats
+
+
+def _of_searches(drives: Floats) -> _Method:
+    searches, starts = drives.shape[-2:]
+    count = searches * starts
+    means, flat = drives.mean(axis=-1), drives.reshape(*drives.shape[:-2], count)
+    left = (
+        drives
+        - means[..., :, None]
+        - drives.mean(axis=-2)[..., None, :]
+        + flat.mean(axis=-1)[..., None, None]
+    )
+    residual = (left**2).sum(axis=(-2, -1)) / ((searches - 1.0) * (starts - 1.0)) / count
+    return _Method(
+        means.var(axis=-1, ddof=1) / searches,
+        residual,
+        flat.var(axis=-1, ddof=1) / count,
+        _third_cumulant(means) / searches**2,
+        _third_cumulant(flat) / count**2,
+    )
 
 
 def _estimate(mean: Floats, variance: Floats, freedom: Floats, third: Floats) -> MeanEstimate:

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from advnerf_core.report.conditions import NONE, style_of
+from advnerf_core.report.evidence.intervals import MEASURED_COVERAGE
+from advnerf_core.report.evidence.luck import luck_sentences
 from advnerf_core.report.tables import Table
 
 _HEAD = """# Does it transfer?
@@ -15,11 +17,14 @@ are metres: excess |CTE| per tick is the mean |CTE| of a drive with the attack m
 drive without it from the same start. All of it was registered before it was run, and
 `advnerf verify` computes it again from the drives that are kept. What is registered, kept and
 tested is explained in [evidence.md](../evidence.md).
-"""
+
+Intervals are nominal 95 % intervals. On simulated drives with a known truth they cover {:.0f} to {:.0f} %, least
+where a few searches differ strongly from the rest: [statistics](statistics.md).
+""".format(*MEASURED_COVERAGE)
 _MOST_SENTENCES = 4
 _TESTS_SAY = """Primary tests: the deployed excess of the attack minus that of the baseline that is strongest in the
 surrogate, under each condition; exact permutation tests over searches, adjusted by Holm over this
-table.
+table. The difference where they search, and its p, are beside it and are not adjusted.
 """
 _CONTRASTS_SAY = """The same attacks, driven under two conditions that differ in one thing: excess after minus before,
 paired by search and start.
@@ -90,7 +95,17 @@ def _tests(data: Mapping[str, Any]) -> list[str]:
     """Sentences about the primary tests; a table where there are many."""
     if len(data["primary"]) <= _MOST_SENTENCES:
         return [_sentences(test, data["rows"]) + "\n" for test in data["primary"]]
-    columns = ("condition", "victim", "method", "against", "difference [m per tick]", "95 %", "p after Holm")
+    columns = (
+        "condition",
+        "victim",
+        "method",
+        "against",
+        "difference [m per tick]",
+        "95 %",
+        "p after Holm",
+        "where they search",
+        "p there",
+    )
     rows = tuple(
         (
             _place(test["test"]),
@@ -100,6 +115,8 @@ def _tests(data: Mapping[str, Any]) -> list[str]:
             f"{test['difference_m']:.3f}",
             _ends(test),
             test["reason"] if test["p"] is None else _p(test["p_holm"]),
+            f"{test['difference_surrogate_m']:+.3f}",
+            "" if test["p_surrogate"] is None else _p(test["p_surrogate"]),
         )
         for test in data["primary"]
     )
@@ -179,9 +196,23 @@ def _sentences(test: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> st
     baseline = f"{style_of(test['baseline']).title}, the strongest baseline in the surrogate"
     between = "" if test["low_m"] is None else f", 95 % interval {_ends(test)} m"
     difference = f"{first} The difference to {baseline}, is {test['difference_m']:.3f} m per tick{between}"
+    there = f"Where they search, in the learned scene, it is {test['difference_surrogate_m']:+.3f} m per tick"
     if test["p"] is None:
-        return f"{difference}. {test['reason']}."
-    return f"{difference} (exact permutation test over searches, p = {_p(test['p_holm'])} after Holm's adjustment)."
+        return f"{difference}. {there}. {test['reason']}."
+    return " ".join(
+        [
+            f"{difference} (exact permutation test over searches, p = {_p(test['p_holm'])} after Holm's adjustment).",
+            f"{there} (same test, p = {_p(test['p_surrogate'])}, not adjusted).",
+            *filter(None, [_sooner(test["anytime"]), luck_sentences(test)]),
+        ]
+    )
+
+
+def _sooner(found: Mapping[str, Any]) -> str:
+    """Whether fewer searches would have decided; empty if not."""
+    if found["pairs"] is None or found["pairs"] == found["of_pairs"]:
+        return ""
+    return f"An anytime-valid test would have decided after {found['pairs']} of {found['of_pairs']} pairs of searches."
 
 
 def _between(row: Mapping[str, Any]) -> str:

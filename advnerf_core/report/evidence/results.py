@@ -13,8 +13,13 @@ from numpy.typing import NDArray
 from advnerf_core.driving.metrics import DriveMetrics
 from advnerf_core.report.cells import CellResult, cell_name
 from advnerf_core.report.conditions import NONE
+from advnerf_core.report.evidence.anytime import AnytimeTest, anytime_test
 from advnerf_core.report.evidence.exact import McNemar, holm, mcnemar_per_search, permutation_test
-from advnerf_core.report.evidence.intervals import ClusteredInterval, clustered_interval
+from advnerf_core.report.evidence.intervals import (
+    ClusteredInterval,
+    clustered_interval,
+    difference_interval,
+)
 from advnerf_core.report.evidence.outcome import Outcome, drive_outcome
 from advnerf_core.report.evidence.registration import (
     PrimaryTest,
@@ -71,6 +76,21 @@ class Row:
 
 
 @dataclass(frozen=True)
+class SearchMeans:
+    """What one search does, mean over its starts.
+
+    Attributes:
+        surrogate_m: Excess |CTE| per tick in the surrogate [m].
+        deployed_m: The same deployed [m].
+        shift_m: Signed CTE minus that without attack, per tick in the surrogate [m]; positive is to the left.
+    """
+
+    surrogate_m: float
+    deployed_m: float
+    shift_m: float
+
+
+@dataclass(frozen=True)
 class TestResult:
     """A primary test.
 
@@ -78,11 +98,16 @@ class TestResult:
         test: Which, as it was registered.
         baseline: The baseline that is strongest in the surrogate.
         difference_m: Mean excess of the method minus that of the baseline, deployed [m].
-        low_m: Lower end of its interval [m]; None where the two have other numbers of searches or too few drives.
+        low_m: Lower end of its interval over new searches of both and new starts [m]; None where there are too few.
         high_m: Upper end [m].
         p: Exact p of the permutation test; None where none is claimed.
         p_holm: Adjusted for all primary tests.
         reason: Why there is no p.
+        difference_surrogate_m: The difference where both search, in the surrogate [m].
+        p_surrogate: p of the same test there; a description, not adjusted, and too large if there are several baselines, since
+            the strongest one is chosen from these drives.
+        searches: What each search of the two does, by method.
+        anytime: The test that could have stopped earlier, deployed; a description, not adjusted.
         mcnemar: Off-track against the baseline, search by search.
     """
 
@@ -94,6 +119,10 @@ class TestResult:
     p: float | None
     p_holm: float | None
     reason: str
+    difference_surrogate_m: float
+    p_surrogate: float | None
+    searches: dict[str, list[SearchMeans]]
+    anytime: AnytimeTest
     mcnemar: tuple[McNemar, ...] = field(default=())
 
 
@@ -200,6 +229,8 @@ def as_data(evidence: Evidence) -> dict[str, Any]:
             {
                 **vars(test),
                 "test": test.test.model_dump(mode="json"),
+                "searches": {name: [vars(each) for each in found] for name, found in test.searches.items()},
+                "anytime": vars(test.anytime),
                 "mcnemar": [vars(each) for each in test.mcnemar],
             }
             for test in primary_tests(evidence)
@@ -258,36 +289,48 @@ def _test(evidence: Evidence, test: PrimaryTest) -> TestResult | None:
         return np.array([_mean_excess_m(evidence, cell, domain) for cell in by_method[method]])
 
     baseline = max(test.against, key=lambda method: float(means(method, "surrogate").mean()))
-    found = permutation_test(means(test.method, "deployed"), means(baseline, "deployed"))
+    two = (test.method, baseline)
+    (searched, theirs), (deployed, against) = ([means(name, domain) for name in two] for domain in DOMAINS)
+    found, there = permutation_test(deployed, against), permutation_test(searched, theirs)
     interval = _difference(evidence, by_method[test.method], by_method[baseline])
-    off = [_off_track(evidence, by_method[name]) for name in (test.method, baseline)]
-    same = len(off[0]) == len(off[1])
+    off = [_off_track(evidence, by_method[name]) for name in two]
     return TestResult(
         test,
         baseline,
-        found.difference,
-        interval.low if interval else None,
-        interval.high if interval else None,
-        found.p,
-        None,
-        found.reason,
-        mcnemar_per_search(off[0], off[1]) if same else (),
+        difference_m=found.difference,
+        low_m=interval.low if interval else None,
+        high_m=interval.high if interval else None,
+        p=found.p,
+        p_holm=None,
+        reason=found.reason,
+        difference_surrogate_m=there.difference,
+        p_surrogate=there.p,
+        searches={name: [_search_means(evidence, cell) for cell in by_method[name]] for name in two},
+        anytime=anytime_test(deployed, against, evidence.registration.alpha),
+        mcnemar=mcnemar_per_search(off[0], off[1]) if len(off[0]) == len(off[1]) else (),
     )
 
 
 def _difference(
     evidence: Evidence, method: Sequence[CellResult], baseline: Sequence[CellResult]
 ) -> ClusteredInterval | None:
-    """Interval of the difference in deployed excess, search by search from the same starts."""
-    if len(method) != len(baseline):
-        return None
+    """Interval of the difference in deployed excess: searches of two methods, from the same starts."""
     one, other = (
         [[outcome.excess_cte_m_per_tick for outcome in evidence.outcomes(cell, "deployed")] for cell in cells]
         for cells in (method, baseline)
     )
-    if len({len(each) for each in (*one, *other)}) != 1:
+    if not _equally_many([*one, *other]):
         return None
-    return clustered_interval(list(np.array(one) - np.array(other)), evidence.registration.level)
+    return difference_interval(np.array(one), np.array(other), evidence.registration.level)
+
+
+def _search_means(evidence: Evidence, cell: CellResult) -> SearchMeans:
+    clean = evidence.without(cell)
+    assert clean is not None, "without it there is no outcome"
+    drives = zip(evidence.metrics(cell, "surrogate"), evidence.metrics(clean, "surrogate"), strict=False)
+    shifts = [float(np.mean(attacked.ctes_m) - np.mean(none.ctes_m)) for attacked, none in drives]
+    excess = [_mean_excess_m(evidence, cell, domain) for domain in DOMAINS]
+    return SearchMeans(excess[0], excess[1], float(np.mean(shifts)))
 
 
 def _mean_excess_m(evidence: Evidence, cell: CellResult, domain: Domain) -> float:

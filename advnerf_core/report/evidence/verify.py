@@ -69,7 +69,14 @@ def sets_in(published: Path) -> list[str]:
 
 
 def write_set(folder: Path) -> Path:
-    """Write the manifest, the numbers and the picture of a set; beside its folder its digest, and the page of all sets.
+    """Write a set as `write_numbers` does, and the page of all sets."""
+    file = write_numbers(folder)
+    write_page(folder.parent)
+    return file
+
+
+def write_numbers(folder: Path) -> Path:
+    """Write the manifest, the numbers and the picture of a set, and beside its folder its digest.
 
     Raises:
         SetError: Nothing was registered there, or its cells contradict the registration.
@@ -98,7 +105,6 @@ def write_set(folder: Path) -> Path:
     known[folder.name] = sha256_of(folder / SET)
     write_atomically(folder.parent / DIGESTS, json.dumps(known, indent=1, sort_keys=True) + "\n")
     write_png(excess_plot(evidence), folder.parent / picture_of(folder.name), dpi=110)
-    write_page(folder.parent)
     return folder / SET
 
 
@@ -135,7 +141,13 @@ def verify_set(folder: Path) -> Verified:
 
 def _page_problems(published: Path) -> list[str]:
     page = published / PAGE
-    same = page.exists() and page.read_text(encoding="utf-8") == _page(published)
+    try:
+        made = _page(published)
+    except (KeyError, TypeError) as error:
+        return [
+            f"{page}: cannot be made: a set has not the numbers that this version publishes: {error}; publish it again"
+        ]
+    same = page.exists() and page.read_text(encoding="utf-8") == made
     return [] if same else [f"{page}: is not the page of the published sets"]
 
 
@@ -328,4 +340,4 @@ def _equal(said: Any, again: Any) -> bool:
     return bool(said == again)
 
 
-__all__ = ["DIGESTS", "SET", "SetError", "Verified", "sets_in", "verify_set", "write_set"]
+__all__ = ["DIGESTS", "SET", "SetError", "Verified", "sets_in", "verify_set", "write_numbers", "write_set"]

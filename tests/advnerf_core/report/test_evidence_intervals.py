@@ -11,7 +11,9 @@ from hypothesis.extra.numpy import arrays
 from scipy import optimize, stats
 
 from advnerf_core.report.evidence import clustered_interval, equivalence
-from advnerf_core.report.evidence.mean_estimate import crossed, one_sample
+from advnerf_core.report.evidence.intervals import MEASURED_COVERAGE, difference_interval
+from advnerf_core.report.evidence.mean_estimate import crossed, difference, one_sample
+from benchmarks.results import read_rows
 
 RNG = np.random.default_rng(0)
 SYMMETRIC = [0.1, 0.2, 0.4, 0.6, 0.8, 0.9]
@@ -256,3 +258,98 @@ def test_a_margin_is_positive_and_a_test_level_is_below_a_half():
     for alpha in (0.0, 0.5, math.nan):
         with pytest.raises(ValueError, match=r"alpha within 0..0.5, got"):
             equivalence([SYMMETRIC], 1.0, alpha)
+
+
+def two_methods(rng, count=(), searches=(6, 6), starts=20, varies=(0.3, 0.3), common=0.3, own=0.2, noise=0.3):
+    """Drives of two methods from shared starts, whose true means are equal."""
+    shared = common * rng.standard_normal((*count, 1, starts))
+    return [
+        shared
+        + own * rng.standard_normal((*count, 1, starts))
+        + each * rng.standard_normal((*count, number, 1))
+        + noise * rng.standard_normal((*count, number, starts))
+        for number, each in zip(searches, varies, strict=True)
+    ]
+
+
+@given(
+    st.integers(0, 10_000), st.permutations(range(6)), st.permutations(range(4)), st.permutations(range(5))
+)
+def test_the_interval_of_a_difference_does_not_depend_on_the_order_of_searches(seed, mine, theirs, starts):
+    one, other = two_methods(np.random.default_rng(seed), searches=(6, 4), starts=5)
+    found = difference_interval(one, other)
+    moved = difference_interval(one[mine][:, starts], other[theirs][:, starts])
+    assert (moved.low, moved.high) == pytest.approx((found.low, found.high))
+    turned = difference_interval(other, one)
+    assert (turned.low, turned.high) == pytest.approx((-found.high, -found.low))
+
+
+def test_a_difference_without_start_effects_is_welchs():
+    one, other = RNG.normal(0, 1, 6), RNG.normal(3, 0.2, 4)
+    estimate = difference(np.repeat(one[:, None], 5, axis=1), np.repeat(other[:, None], 5, axis=1))
+    welch = stats.ttest_ind(one, other, equal_var=False)
+    assert float(estimate.degrees_of_freedom) == pytest.approx(welch.df)
+    assert t_interval(estimate) == pytest.approx(tuple(welch.confidence_interval(0.95)))
+
+
+def test_a_difference_between_searches_that_are_alike_is_a_paired_test_over_starts():
+    shared, extra = RNG.normal(0, 5, 9), RNG.normal(1, 1, 9)
+    estimate = difference(np.repeat((shared + extra)[None], 6, axis=0), np.repeat(shared[None], 3, axis=0))
+    paired = stats.ttest_1samp(extra, 0.0)
+    assert float(estimate.degrees_of_freedom) == pytest.approx(paired.df)
+    assert t_interval(estimate) == pytest.approx(tuple(paired.confidence_interval(0.95)))
+
+
+def test_the_squared_standard_error_of_a_difference_is_that_of_its_parts():
+    rng = np.random.default_rng(4)
+    pair = two_methods(rng, searches=(5, 3), starts=7, varies=(1.0, 2.0), own=1.5)
+    starts = np.array([pair[0][:, j].mean() - pair[1][:, j].mean() for j in range(7)])
+    parts = [(sum((starts - starts.mean()) ** 2) / 6 / 7, 6)]
+    for drives in pair:
+        count = len(drives)
+        rows, columns, mean = drives.mean(axis=1), drives.mean(axis=0), drives.mean()
+        left = sum((drives[i, j] - rows[i] - columns[j] + mean) ** 2 for i in range(count) for j in range(7))
+        parts.append((sum((rows - mean) ** 2) / (count - 1) / count, count - 1))
+        parts.append((-left / ((count - 1) * 6) / (7 * count), (count - 1) * 6))
+    found = difference_interval(*pair)
+    total = sum(part for part, _ in parts)
+    assert found.standard_error == pytest.approx(math.sqrt(total))
+    assert found.degrees_of_freedom == pytest.approx(
+        total**2 / sum(part**2 / freedom for part, freedom in parts)
+    )
+    assert (found.searches, found.drives, found.over) == (8, 56, "searches and starts")
+
+
+@pytest.mark.parametrize(
+    "design",
+    [
+        {},
+        {"varies": (0.02, 0.3), "noise": 0.1},
+        {"searches": (3, 6), "starts": 8},
+        {"varies": (0.05, 0.05), "own": 0.3, "noise": 0.1},
+    ],
+)
+def test_intervals_of_a_difference_cover_93_to_97_percent(design):
+    one, other = two_methods(np.random.default_rng(5), count=(6_000,), **design)
+    low, high = difference(one, other).ends(0.95)
+    assert 0.93 <= np.mean((low <= 0.0) & (high >= 0.0)) <= 0.97
+    first = difference_interval(one[0], other[0])
+    assert (first.low, first.high) == pytest.approx((float(low[0]), float(high[0])))
+
+
+def test_a_difference_of_single_searches_has_no_interval_and_other_starts_are_refused():
+    assert difference_interval([SYMMETRIC], [SKEWED, SKEWED]) is None
+    assert difference_interval([[0.1], [0.2]], [[0.3], [0.4]]) is None
+    with pytest.raises(ValueError, match="expected the same starts for both methods, got 6 and 5"):
+        difference_interval([SYMMETRIC] * 2, [SKEWED[:5]] * 2)
+
+
+def test_the_coverage_that_pages_name_is_the_measured_one():
+    named = f"searches x {20} starts"
+    measured = [
+        row["value"]
+        for row in read_rows()
+        if row["line"].startswith("95 % interval") and f"6 {named}" in row["line"] and row["met"] is not None
+    ]
+    assert len(measured) > 15
+    assert (round(min(measured)), round(max(measured))) == MEASURED_COVERAGE

@@ -1,22 +1,16 @@
-"""Scores of predicted bands, against sums by hand."""
+"""Scores of predicted bands, against sums by hand and scipy."""
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from advnerf_core.report.cells import read_cells
-from advnerf_core.report.evidence.prediction_score import interval_score, past_differences, score_cells
-from advnerf_core.report.evidence.registration import read_registration
-from advnerf_core.report.evidence.results import Evidence
-from benchmarks.planted_changes import write_simulated_set
-
-
-@pytest.fixture(scope="module")
-def evidence(tmp_path_factory: pytest.TempPathFactory) -> Evidence:
-    folder = tmp_path_factory.mktemp("published") / "simulated"
-    write_simulated_set(folder)
-    registration = read_registration(folder)
-    assert registration is not None
-    return Evidence(registration, read_cells(folder))
+from advnerf_core.report.evidence.prediction_score import (
+    binomial_interval,
+    interval_score,
+    registered_bands,
+    score_bands,
+)
+from advnerf_core.report.evidence.transfer_factor import Transfer
 
 
 def test_the_interval_score_is_that_of_the_paper() -> None:
@@ -29,28 +23,29 @@ def test_the_interval_score_is_that_of_the_paper() -> None:
     assert best < interval_score(-1.8, 1.8, values).mean()
 
 
-def test_drives_are_scored_in_half_lanes(evidence: Evidence) -> None:
-    name = "track_hardened_gradient_0"
-    cell = evidence.cells[name]
-    half_lane_m = evidence.scenario_of(cell).off_track_m
-    learned, deployed = (
-        [outcome.excess_cte_m_per_tick / half_lane_m for outcome in evidence.outcomes(cell, domain)]
-        for domain in ("surrogate", "deployed")
-    )
-    low, high = np.quantile(deployed, (0.2, 0.7))
-    said = {"excess_low_m": low * half_lane_m, "excess_high_m": high * half_lane_m}
-    unknown = {name: said, "track_hardened_none_0": said, "not_there": said}
-    (found,) = score_cells(evidence, unknown, [evidence])
-    assert found.measured == pytest.approx(tuple(deployed))
-    assert found.held == sum(low <= value <= high for value in deployed)
-    assert found.score == pytest.approx(interval_score(low, high, deployed).mean())
-    differences = past_differences([evidence])
-    assert len(differences) == 2 * 6 * 5  # two methods of six searches from five starts
-    pairs = [one + other for one in learned for other in differences]
-    assert found.trivial_band == pytest.approx(tuple(np.quantile(pairs, (0.1, 0.9))))
+def test_a_score_is_over_all_drives_of_a_set() -> None:
+    bands = np.array([[[1.0, 3.0], [0.0, 1.0]], [[1.0, 3.0], [2.0, 4.0]]])
+    found = score_bands(bands, np.array([[2.0, 0.5], [0.0, 4.0]]))
+    assert (found.held, found.drives) == (3, 4)
+    assert found.score == pytest.approx((2.0 + 1.0 + 12.0 + 2.0) / 4)
 
 
-def test_a_past_without_attacks_is_refused(evidence: Evidence) -> None:
-    none = [cell for cell in evidence.cells.values() if cell.method == "none"]
-    with pytest.raises(ValueError, match="name a published set"):
-        score_cells(evidence, {}, [Evidence(evidence.registration, none)])
+def test_registered_bands_are_in_half_lanes_and_of_every_search() -> None:
+    drives = Transfer("set", ("one", "other"), np.ones((2, 3)), np.ones((2, 3)))
+    said = {
+        "one": {"excess_low_m": 0.1, "excess_high_m": 0.2},
+        "other": {"excess_low_m": 0.3, "excess_high_m": 0.4},
+    }
+    found = registered_bands(drives, said, 0.5)
+    assert found is not None
+    assert found.shape == (2, 3, 2)
+    assert found[1, 2] == pytest.approx([0.6, 0.8])
+    assert registered_bands(drives, {"one": said["one"]}, 0.5) is None
+
+
+@pytest.mark.parametrize(("held", "count"), [(0, 6), (5, 6), (6, 6), (27, 35)])
+def test_the_binomial_interval_is_that_of_clopper_and_pearson(held: int, count: int) -> None:
+    expected = stats.binomtest(held, count).proportion_ci(0.95, method="exact")
+    assert binomial_interval(held, count) == pytest.approx((expected.low, expected.high))
+    with pytest.raises(ValueError, match="expected some of at least one"):
+        binomial_interval(7, 6)

@@ -118,6 +118,28 @@ def test_the_primary_test_is_that_of_scipy(original):
     assert found.p_holm == found.p == pytest.approx(1 / 924)
     assert found.baseline == "random"
     assert len(found.mcnemar) == 6
+    # Where they search, it is the same test, and each search is kept in both domains.
+    searches = [found.searches[method] for method in ("gradient", "random")]
+    here, there = (
+        tuple([getattr(search, name) for search in each] for each in searches)
+        for name in ("surrogate_m", "deployed_m")
+    )
+    assert there == (ours, theirs)
+    assert found.difference_surrogate_m == pytest.approx(np.mean(here[0]) - np.mean(here[1]))
+    expected = stats.permutation_test(
+        here, lambda a, b, axis: a.mean(axis) - b.mean(axis), alternative="greater", vectorized=True
+    )
+    assert found.p_surrogate == pytest.approx(expected.pvalue)
+    cell, path = (
+        evidence.cells["track_hardened_gradient_2"],
+        evidence.registration.scenarios["track"].reference_path(),
+    )
+    ctes = [
+        np.mean([path.project(drive.poses()[1:, :2]).cte_m.mean() for drive in each.kept["surrogate"]])
+        for each in (cell, evidence.without(cell))
+    ]
+    assert searches[0][2].shift_m == pytest.approx(ctes[0] - ctes[1], abs=1e-9)
+    assert (found.anytime.pairs, found.anytime.of_pairs) == (4, 6)
 
 
 def test_the_page_says_it_in_two_sentences_and_a_changed_page_is_found(copied):
