@@ -18,7 +18,7 @@ from advnerf_core.attack.clean import clean_drive
 from advnerf_core.attack.methods import Method, SearchRun, SearchSettings, load_method
 from advnerf_core.attack.on_device import on_chosen_device, said_of_device
 from advnerf_core.attack.search.search import SearchResult
-from advnerf_core.attack.spaces.space import Shown, Space
+from advnerf_core.attack.spaces.space import Shown, Space, half_precision
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.pilotnet import LoadedPolicy, load_policy
@@ -39,6 +39,7 @@ from nodes.experiment.space_config import (
 )
 from nodes.experiment.spaces import geometry_sha256, over_the_world
 from nodes.experiment.stage_record import hash_of
+from nodes.experiment.verdicts import passing_digest
 from nodes.runtime.errors import RuntimeFault
 
 FROZEN, SEARCHED, ATTACK = "frozen.json", "surrogate.json", "attack.safetensors"
@@ -120,7 +121,14 @@ def _frozen_place(experiment: Experiment) -> dict[str, str]:
 def freeze(experiment: Experiment, cell: Cell, folder: Path) -> None:
     """Write what is fixed before the search of a cell, once."""
     if not (folder / FROZEN).exists():
-        write_atomically(folder / FROZEN, json.dumps(_frozen_for(experiment, cell), indent=1) + "\n")
+        fixed = _frozen_for(experiment, cell)
+        fixed["hardness"] = passing_digest(experiment, fixed["policy"])
+        write_atomically(folder / FROZEN, json.dumps(fixed, indent=1) + "\n")
+
+
+def _hardness_before(folder: Path) -> str:
+    """Digest of the passing verdict of the victim that was there when a search began; empty without one."""
+    return str(read_json(folder / FROZEN).get("hardness", "")) if (folder / FROZEN).exists() else ""
 
 
 def check_frozen(experiment: Experiment, cell: Cell, folder: Path) -> None:
@@ -171,6 +179,7 @@ def surrogate_part(
     data = {
         "attack_id": attack_id,
         "policy_sha256": policy.sha256,
+        "hardness": _hardness_before(folder),
         "states": states.tolist(),
         "commands": commands.tolist(),
         **totals(scores),
@@ -306,11 +315,12 @@ def _attack_file(
     result: SearchResult,
 ) -> AttackFile:
     clean = clean_drive(past(problem, space, space.plain), space.plain.colours)
+    theta = half_precision(result.theta)
     attack = AttackFile(
         method=cell.method,
         space=space.name,
-        objects=space.attacked(result.theta),
-        face=space.face(result.theta),
+        objects=space.attacked(theta),
+        face=space.face(theta),
         camera=experiment.view.pinhole,
         scene_sha256=hash_of(experiment.world_settings)
         if over_the_world(experiment)

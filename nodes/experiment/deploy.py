@@ -144,6 +144,7 @@ def cell_data(
             "horizon": experiment.config.horizon,
             "space": experiment.config.space.model_dump(mode="json"),
             "deployed_through": experiment.config.deploy.through,
+            "hardness": learned.get("hardness", ""),
         },
     }
     if deployer is not None:
