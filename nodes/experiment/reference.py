@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.report.evidence import kept_build
 from nodes.experiment.stage_record import (
     RECORD,
     Stage,
@@ -26,7 +27,7 @@ from nodes.runtime.paths import shipped
 
 # Where cells and stages are kept with the code.
 PUBLISHED = Path("docs/results")
-BUILD = "reference"
+BUILD = kept_build.BUILD
 _KEY_DIGITS = 16
 
 

@@ -11,9 +11,10 @@ from typing import Any
 
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
+from advnerf_core.report.evidence import kept_build
 from nodes.runtime.progress import MeasuringReport
 
-RECORD = "stage.json"
+RECORD = kept_build.RECORD
 
 
 @dataclass(frozen=True)

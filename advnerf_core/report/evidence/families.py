@@ -11,23 +11,24 @@ RANDOM_FAMILIES = ("random", "random_coarse", "random_levels", "random_pink", "r
 # They search a coarse texture, with the answers of the policy alone.
 COARSE_SEARCHES = ("cem", "evolution")
 GRADIENT, COARSE_GRADIENT = "gradient", "gradient_coarse"
-# Methods whose texture has `cells` cells along an edge; all others have those of the object.
-_COARSE = ("random_coarse", *COARSE_SEARCHES, COARSE_GRADIENT)
+# Baselines whose texture has `cells` cells along an edge; all others have those of the object.
+COARSE_BASELINES = ("random_coarse", *COARSE_SEARCHES)
 LEAST_FAMILIES = 3
 
 
-def lacking_baselines(methods: Collection[str], other_cells: bool) -> list[str]:
+def lacking_baselines(methods: Collection[str], other_cells: bool, families: Sequence[str]) -> list[str]:
     """What a set with a primary test of the gradient must also run, in words; empty if nothing is missing.
 
     Args:
         methods: Methods of one scenario, without those that the victim was trained or validated on.
         other_cells: Whether coarse textures have fewer cells than the object.
+        families: Families of random textures that may be baselines.
     """
-    families = [name for name in RANDOM_FAMILIES if name in methods]
+    ran = sum(name in methods for name in families)
     found = []
-    if len(families) < LEAST_FAMILIES:
-        others = ", ".join(name for name in RANDOM_FAMILIES if name not in methods)
-        found.append(f"{LEAST_FAMILIES - len(families)} more families of random textures (of {others})")
+    if ran < LEAST_FAMILIES:
+        others = ", ".join(name for name in families if name not in methods)
+        found.append(f"{LEAST_FAMILIES - ran} more of the random textures {others}")
     if not any(name in methods for name in COARSE_SEARCHES):
         found.append(f"a coarse search ({' or '.join(COARSE_SEARCHES)})")
     if other_cells and COARSE_GRADIENT not in methods:
@@ -78,6 +79,6 @@ def _marks(against: Sequence[str], ran: Collection[str], scenario: RegisteredSce
         )
     if not any(name in COARSE_SEARCHES for name in against):
         yield "no coarse search"
-    coarse = [name for name in against if name in _COARSE]
+    coarse = [name for name in against if name in COARSE_BASELINES]
     if coarse and COARSE_GRADIENT not in ran and coarse_cells_differ(scenario):
         yield f"baseline of other cells ({', '.join(style_of(name).title for name in coarse)}) than the gradient's"

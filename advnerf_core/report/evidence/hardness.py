@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, ValidationError, model_validator
-from scipy.special import stdtrit
 
 from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
@@ -61,6 +60,8 @@ class FamilyHardness(StrictModel):
             excess_m: As above.
             level: Of the one-sided bound: Student's t over the starts of the texture with the largest mean.
         """
+        from scipy.special import stdtrit  # reading verdicts needs no SciPy
+
         values = np.asarray(excess_m, np.float64)
         means = values.mean(axis=1)
         worst, starts = values[means.argmax()], values.shape[1]
@@ -201,20 +202,23 @@ def merged(records: Iterable[HardnessRecord]) -> HardnessRecord:
     return found
 
 
-def victim_title(victim: str, cells: Iterable[CellResult], record: HardnessRecord) -> str:
+def victim_title(
+    victim: str, cells: Iterable[CellResult], record: HardnessRecord, baselines: Collection[str] = ()
+) -> str:
     """What pages call a victim; the name ``hardened`` of files and keys is only a name.
 
     Args:
         victim: Its name in files.
         cells: Cells of the set; read only if a verdict passed.
         record: The verdicts that are published with the set.
+        baselines: Methods that the set's tests compare with; a verdict on one of these families counts for nothing.
     """
     if victim != HARDENED:
         return victim
     if not any(verdict.passed for verdict in record.verdicts):
         return TRAINED_WITH_TEXTURES
     searched = [cell for cell in cells if cell.victim == victim and cell.method.startswith("gradient")]
-    judged = bool(searched) and all(_judged_before(cell, record) for cell in searched)
+    judged = bool(searched) and all(_judged_before(cell, record, baselines) for cell in searched)
     return HARDENED if judged else TRAINED_WITH_TEXTURES
 
 
@@ -226,9 +230,11 @@ def with_titles(folder: Path, data: Mapping[str, Any]) -> dict[str, Any]:
         data: What is in its ``set.json``.
     """
     record = read_hardness(folder / PUBLISHED_FILE)
+    baselines = {name for test in data["primary"] for name in test["test"]["against"]}
     names = {row["victim"] for row in data["rows"]}
     titles = {
-        name: victim_title(name, map(read_cell, sorted(folder.glob("*.json"))), record) for name in names
+        name: victim_title(name, map(read_cell, sorted(folder.glob("*.json"))), record, baselines)
+        for name in names
     }
 
     def titled(row: Mapping[str, Any]) -> dict[str, Any]:
@@ -242,7 +248,9 @@ def with_titles(folder: Path, data: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _judged_before(cell: CellResult, record: HardnessRecord) -> bool:
-    """Whether a passing verdict of the cell's policy was there when its search began."""
+def _judged_before(cell: CellResult, record: HardnessRecord, baselines: Collection[str]) -> bool:
+    """Whether a passing verdict of the cell's policy, on other families than the baselines, was there when its search began."""
     verdict = record.passing(cell.policy_sha256)
-    return verdict is not None and cell.extra.get("hardness") == verdict.digest
+    if verdict is None or cell.extra.get("hardness") != verdict.digest:
+        return False
+    return not {*verdict.trained_on, *verdict.validated_on} & {*baselines}

@@ -60,7 +60,7 @@ def _section(name: str, data: Mapping[str, Any]) -> str:
         ),
         f"![Excess of every drive, by method and domain]({picture_of(name)})\n",
         _where(data["deployed_through"]) + "\n",
-        *data["notes"],
+        *data.get("notes", ()),
         *_withdrawn(data),
         *_tests(data),
         _table(registered),

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from advnerf_core.attack.artifact import AttackFileError, load_attack, save_attack
 from advnerf_core.report.cells import CellResult, read_cell
+from advnerf_core.report.evidence.verify import Verified
 from nodes.experiment.campaign.config import Campaign
 from nodes.experiment.campaign.store import CellStatus, store_of
 from nodes.experiment.search_files import ATTACK, is_published_with_its_attack
@@ -62,6 +64,13 @@ def attack_problems(folder: Path) -> Iterator[str]:
     for file in sorted((folder / FOLDER).glob("*")):
         if file.stem not in used:
             yield f"{file}: no cell was driven with this attack"
+
+
+def with_attacks(verified: Verified, folder: Path) -> Verified:
+    """What verifying a set found, with what is wrong with its attacks."""
+    if verified.problems:  # cells that cannot be read say nothing about attacks
+        return verified
+    return replace(verified, problems=tuple(attack_problems(folder)))
 
 
 def _problems_of(cell: CellResult, file: Path) -> Iterator[str]:

@@ -11,9 +11,12 @@ from pathlib import Path
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import CellResult, read_cell, read_cells
+from advnerf_core.report.evidence.hardness import FILE as HARDNESS
+from advnerf_core.report.evidence.hardness import PUBLISHED_FILE, merged, read_hardness, write_hardness
 from advnerf_core.report.transfer import TransferTable, make_table
 from nodes.experiment.campaign.admission import gate_file, gate_key
 from nodes.experiment.campaign.config import Campaign
+from nodes.experiment.campaign.kept_attacks import publish_attacks
 from nodes.experiment.campaign.plan import read_experiment
 from nodes.experiment.campaign.predictions import kept_prediction, prediction_file
 from nodes.experiment.campaign.store import CellStatus
@@ -68,6 +71,8 @@ def publish(campaign: Campaign, found: Sequence[CellStatus], folder: Path, prune
         write_atomically(target, text)
         written.append(each.cell.name)
     _publish_beside(campaign, [each for each in found if each.state == "done"], folder / campaign.name)
+    publish_attacks(campaign, found, folder / campaign.name)
+    _publish_hardness(campaign, folder / campaign.name)
     return Published(tuple(written), tuple(same), tuple(stale))
 
 
@@ -152,6 +157,16 @@ def _publish_beside(campaign: Campaign, done: Sequence[CellStatus], folder: Path
         for drive in (False, True):
             if (verdict := gate_file(campaign.folder, key, drive)).exists():
                 write_atomically(gate_file(folder, key, drive), verdict.read_text(encoding="utf-8"))
+
+
+def _publish_hardness(campaign: Campaign, folder: Path) -> None:
+    """Publish every verdict of the victims, also of recipes that did not pass."""
+    runs = dict.fromkeys(campaign.run_folder(cell) for cell in campaign.cells)
+    record = merged(
+        [read_hardness(folder / PUBLISHED_FILE), *(read_hardness(run / HARDNESS) for run in runs)]
+    )
+    if record.verdicts:
+        write_hardness(folder / PUBLISHED_FILE, record)
 
 
 def published_table(folder: Path, campaign: Campaign, cells: Sequence[Cell] | None = None) -> TransferTable:
