@@ -73,12 +73,9 @@ class Strongest:
     margin_m: float
 
     @property
-    def text(self) -> str:
-        """All of it, in words."""
-        return (
-            f"{style_of(self.method).title}, {self.searches} searches, each the best of {self.evaluations} textures. Learned scene: "
-            f"{self.surrogate.text}. Deployed: {self.deployed.text}"
-        )
+    def how(self) -> str:
+        """How it was searched, in words."""
+        return f"{style_of(self.method).title}, {self.searches} searches, each the best of {self.evaluations} textures"
 
 
 def strongest_random(folder: Path) -> list[Strongest]:
