@@ -129,12 +129,14 @@ def publish_build(
 def _prune_build(reference: ReferenceBuild, published: Path) -> list[Path]:
     found = [read_json(file) for file in published.glob("*/*.json")]
     used = {digest for each in found if "stages" in each for digest in each["stages"].values()}
-    removed = []
-    for stage in sorted(each.parent for each in reference.folder.glob(f"*/{RECORD}")):
-        record = read_record(stage)
-        if record is None or record.digest not in used:
-            shutil.rmtree(stage)
-            removed.append(stage)
+    records = {file.parent: read_record(file.parent) for file in sorted(reference.folder.glob(f"*/{RECORD}"))}
+    kept = {
+        stage: record for stage, record in records.items() if record is not None and record.digest in used
+    }
+    shared = {record.files_in for record in kept.values()}
+    removed = [stage for stage in records if stage not in kept and stage.name not in shared]
+    for stage in removed:
+        shutil.rmtree(stage)
     return removed
 
 
