@@ -222,8 +222,8 @@ def victim_title(
     return HARDENED if judged else TRAINED_WITH_TEXTURES
 
 
-def with_titles(folder: Path, data: Mapping[str, Any]) -> dict[str, Any]:
-    """The published numbers of a set with its victims as pages call them.
+def titles_of(folder: Path, data: Mapping[str, Any]) -> dict[str, str]:
+    """What pages call the victims of a set, by their names in files.
 
     Args:
         folder: Of the set.
@@ -232,10 +232,21 @@ def with_titles(folder: Path, data: Mapping[str, Any]) -> dict[str, Any]:
     record = read_hardness(folder / PUBLISHED_FILE)
     baselines = {name for test in data["primary"] for name in test["test"]["against"]}
     names = {row["victim"] for row in data["rows"]}
-    titles = {
-        name: victim_title(name, map(read_cell, sorted(folder.glob("*.json"))), record, baselines)
-        for name in names
-    }
+
+    def title(name: str) -> str:
+        return victim_title(name, map(read_cell, sorted(folder.glob("*.json"))), record, baselines)
+
+    return {name: title(name) for name in sorted(names)}
+
+
+def with_titles(folder: Path, data: Mapping[str, Any]) -> dict[str, Any]:
+    """The published numbers of a set with its victims as pages call them.
+
+    Args:
+        folder: Of the set.
+        data: What is in its ``set.json``.
+    """
+    titles = titles_of(folder, data)
 
     def titled(row: Mapping[str, Any]) -> dict[str, Any]:
         return {**row, "victim": titles.get(row["victim"], row["victim"])}

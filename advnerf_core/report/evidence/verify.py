@@ -20,7 +20,7 @@ from advnerf_core.files import sha256_of, write_atomically
 from advnerf_core.report.cells import CellError, CellResult, read_cell
 from advnerf_core.report.evidence.contrasts import contrast_data
 from advnerf_core.report.evidence.families import families_note
-from advnerf_core.report.evidence.hardness import with_titles
+from advnerf_core.report.evidence.hardness import titles_of, with_titles
 from advnerf_core.report.evidence.kept import KeptDrive
 from advnerf_core.report.evidence.kept_build import lost_note
 from advnerf_core.report.evidence.page import film_of, picture_of, results_page
@@ -100,7 +100,9 @@ def write_set(folder: Path) -> Path:
     known = _known_digests(folder.parent)
     known[folder.name] = sha256_of(folder / SET)
     write_atomically(folder.parent / DIGESTS, json.dumps(known, indent=1, sort_keys=True) + "\n")
-    write_png(excess_plot(evidence), folder.parent / picture_of(folder.name), dpi=110)
+    write_png(
+        excess_plot(evidence, titles_of(folder, data)), folder.parent / picture_of(folder.name), dpi=110
+    )
     write_page(folder.parent)
     return folder / SET
 
