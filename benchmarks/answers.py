@@ -9,6 +9,9 @@ from typing import Any
 
 from advnerf_core.documents import read_json
 from advnerf_core.report.conditions import style_of
+from advnerf_core.report.evidence.families import GRADIENT
+from advnerf_core.report.evidence.hardness import with_titles
+from advnerf_core.report.evidence.strongest import strongest_random
 
 # Worlds that this project did not write, or did not draw, by what the names of their sets contain.
 _FOREIGN = {
@@ -16,7 +19,6 @@ _FOREIGN = {
     "duckietown": "in Duckietown, with its own renderer and robot",
     "filament": "in the lab's room as MuJoCo 4's renderer Filament draws it",
 }
-_HARDENED = "python -m benchmarks.hardening"
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ def answers(rows: Sequence[Mapping[str, Any]], published: Path) -> list[Answer]:
     sets = _sets(published)
     found = [
         Answer("Does it transfer?", "results/transfer.md", _transfers(sets)),
-        Answer("Against which victims?", "results/hardened.md", _victims(rows)),
+        Answer("Against which victims?", "results/hardened.md", _victims(sets, published)),
         Answer("Better than what?", "results/transfer.md", _better(sets)),
         Answer("How realistic is the learned copy?", "results/room.md", _realistic(rows)),
         Answer("In whose world?", "was_not_run.md", _worlds(sets)),
@@ -72,16 +74,18 @@ def sets_table(published: Path) -> str:
 
 
 def _sets(published: Path) -> list[dict[str, Any]]:
-    return [read_json(file) for file in sorted(published.glob("*/set/set.json"))]
+    files = sorted(published.glob("*/set/set.json"))
+    return [with_titles(file.parents[1], read_json(file)) for file in files]
 
 
 def _told(sets: Sequence[Mapping[str, Any]]) -> list[tuple[Mapping[str, Any], Mapping[str, Any]]]:
     """Sets with their tests that are told here: of one with contrasts that under its last condition, in which everything is the world's own."""
-    return [
-        (found, test)
-        for found in sets
-        for test in (found["primary"][-1:] if found.get("contrasts") else found["primary"])
-    ]
+    told = []
+    for found in sets:
+        # The gradient in coarse cells is on the page of the sets.
+        tests = [test for test in found["primary"] if test["test"]["method"] == GRADIENT]
+        told += [(found, test) for test in (tests[-1:] if found.get("contrasts") else tests)]
+    return told
 
 
 def _row(rows: Sequence[Mapping[str, Any]], test: Mapping[str, Any], domain: str) -> Mapping[str, Any]:
@@ -138,13 +142,24 @@ def _better(sets: Sequence[Mapping[str, Any]]) -> str:
     )
 
 
-def _victims(rows: Sequence[Mapping[str, Any]]) -> str:
-    found = [abs(row["value"]) for row in rows if row["command"].startswith(_HARDENED)]
+def _victims(sets: Sequence[Mapping[str, Any]], published: Path) -> str:
+    # The last scenario of a set is the one in which everything is the world's own.
+    named = [
+        (data["name"], each[-1]) for data in sets if (each := strongest_random(published / data["name"]))
+    ]
+    found = [each for _, each in named]
     if not found:
         return ""
+    titles = sorted({row["victim"] for data in sets for row in data["rows"]})
+    worst = max(found, key=lambda each: each.deployed.best_m)
+    off = max(found, key=lambda each: each.deployed.off_track / each.deployed.drives)
+    place = next(name for name, each in named if each is off)
     return (
-        f"A policy trained on random textures. Of {len(found)} families of random textures none moves it by more than {max(found):.3f} m per tick. "
-        "Results with a policy that never saw one are of the [first build](results/first_build.md)."
+        f"Policies {' or '.join(titles)}. The best random search of each set moves them {min(each.deployed.best_m for each in found):.3f} to "
+        f"{worst.deployed.best_m:.3f} m per tick where it is deployed (set {place}: {off.deployed.off_track} of {off.deployed.drives} drives off the track, "
+        f"{off.deployed.all_off_track} of {off.deployed.all_drives} of all {off.searches} searches), and up to "
+        f"{max(each.surrogate.best_m for each in found):.3f} m in the learned copy. Results with a policy that never saw a texture are of the "
+        "[first build](results/first_build.md)."
     )
 
 

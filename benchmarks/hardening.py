@@ -1,6 +1,7 @@
-"""Does the hardened victim ignore random textures, also of families it was not trained on? ``python -m benchmarks.hardening RUN_FOLDER``.
+"""Does a victim withstand random textures? ``python -m benchmarks.hardening RUN_FOLDER`` judges one, and keeps the verdict.
 
-Run it before any gradient: the label "hardened" needs equivalence to no attack on the families that validate.
+Run it when the policies are trained, and before any gradient search: ``advnerf experiment FILE --until policy``. Without a run folder it tells what the
+best random search of each published set did to the set's victim, from the kept drives.
 """
 
 from __future__ import annotations
@@ -9,37 +10,75 @@ import argparse
 import os
 from pathlib import Path
 
+from advnerf_core.report.evidence.strongest import Strongest, strongest_random
+from advnerf_core.report.evidence.verify import sets_in
 from benchmarks.results import record_row
+
+PUBLISHED = Path("docs/results")
 
 
 def main() -> None:
+    """Judge the victim of a run folder, or read the published sets."""
     os.environ.setdefault("MUJOCO_GL", "egl")
-    from nodes.experiment.context import Experiment
-    from nodes.experiment.hardening import TRAINED_ON, hardness, margin_m
-    from nodes.experiment.policy import HARDENED
-
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("run", type=Path)
-    parser.add_argument("--textures", type=int, default=12)
+    parser.add_argument("run", type=Path, nargs="?", help="run folder; without one: the published sets")
+    parser.add_argument("--victim", default="hardened")
+    parser.add_argument(
+        "--textures", type=int, default=0, help="of each family; 0: as many as a search evaluates"
+    )
     options = parser.parse_args()
-    experiment = Experiment.resolved_in(options.run.resolve())
-    limit_m = margin_m(experiment)
-    for found in hardness(experiment, HARDENED, options.textures):
-        test, role = found.test, "trained on" if found.family == TRAINED_ON else "validates"
-        interval = test.interval
+    if options.run is None:
+        for name in sets_in(PUBLISHED):
+            for found in strongest_random(PUBLISHED / name)[-1:]:  # where everything is the world's own
+                _record_published(name, found)
+    else:
+        _judge(options.run, options.victim, options.textures)
+
+
+def _judge(run: Path, victim: str, textures: int) -> None:
+    from nodes.experiment.context import Experiment
+    from nodes.experiment.hardening import judge
+
+    experiment = Experiment.resolved_in(run.resolve())
+    verdict = judge(experiment, victim, textures)
+    for found in verdict.families:
+        bound = "no bound from one start" if found.upper_m is None else f"at most {found.upper_m:.4f} m"
+        met = found.upper_m is not None and found.upper_m <= verdict.margin_m
         note = (
-            f"{role}; 90 % interval {interval.low:.3f} to {interval.high:.3f} m, p = {test.p:.4f}; worst texture {found.worst_m:.3f} m; "
-            f"{options.textures} textures x {experiment.config.measure.starts} starts, surrogate"
+            f"mean over {verdict.starts} starts, {bound} (one-sided {100 * verdict.level:.0f} %); trained on {', '.join(verdict.trained_on)}; surrogate; "
+            f"policy {verdict.policy_sha256[:12]}"
         )
-        print(f"{found.scenario}, {found.family}: {interval.mean:.4f} m per tick, {note}")
+        print(
+            f"{found.scenario}, {found.family}: worst of {verdict.textures} textures {found.worst_m:.4f} m per tick, {note}"
+        )
         record_row(
-            f"{experiment.config.name}, {found.scenario}: hardened victim past {found.family}, mean excess",
-            interval.mean,
+            f"{experiment.config.name}, {found.scenario}: {victim} with the worst of {verdict.textures} textures, {found.family}",
+            found.worst_m,
             "m per tick",
-            f"equivalent to 0 within {limit_m:g} m",
-            test.equivalent,
-            f"python -m benchmarks.hardening {options.run}",
+            f"upper bound <= {verdict.margin_m:g} m",
+            met,
+            f"python -m benchmarks.hardening {run}",
             note,
+        )
+    print(
+        "passed: pages call it hardened"
+        if verdict.passed
+        else "not passed: pages call it trained with textures"
+    )
+
+
+def _record_published(name: str, found: Strongest) -> None:
+    place = " ".join(filter(None, (found.scenario, found.placement))).replace("_", " ")
+    for domain, reached in (("learned scene", found.surrogate), ("deployed", found.deployed)):
+        print(f"{name}, {place}, {domain}: {found.how}: {reached.text}")
+        record_row(
+            f"{name}, {place}: best random search against the victim, {domain}",
+            reached.best_m,
+            "m per tick",
+            f"<= {found.margin_m:g} m, the margin of a hardened victim",
+            reached.best_m <= found.margin_m,
+            "python -m benchmarks.hardening",
+            f"{found.how}: {reached.text}",
         )
 
 

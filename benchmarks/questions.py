@@ -75,8 +75,9 @@ QUESTIONS = (
     ),
     Question(
         "hardened",
-        "Is the hardened victim hard?",
-        "Drives past random textures of five families, four of which the victim was not trained on, compared with no attack.",
+        "Does a victim trained with textures withstand random ones?",
+        "The best random search of every published set, and victims that were judged by the worst of N textures. A victim is called hardened only "
+        "where the worst texture of a family that did not train it moves it by less than the margin, judged before any gradient search.",
         ("hardening",),
     ),
     Question(

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
+from advnerf_core.attack.packed import PACKED_FORMAT, packed, unpacked
 from advnerf_core.driving.clean_drive import CleanDrive
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import with_sorted_header, write_atomically
@@ -293,10 +294,20 @@ def face_texture(theta: ArrayLike, size_px: int = TEXTURE_PX) -> NDArray[np.uint
     return np.round(255.0 * np.clip(enlarged, 0.0, 1.0)).astype(np.uint8)
 
 
-def save_attack(path: str | os.PathLike[str], attack: AttackFile) -> str:
-    """Write an attack file atomically and return its id."""
+def save_attack(path: str | os.PathLike[str], attack: AttackFile, small: bool = False) -> str:
+    """Write an attack file atomically and return its id.
+
+    Args:
+        path: Where it goes.
+        attack: What is written.
+        small: Leave out what follows from the rest, see `advnerf_core.attack.packed`; `load_attack` reads both.
+    """
     header = {"format": FILE_FORMAT, "sha256": attack.sha256, "metadata": _canonical(attack._metadata())}
-    write_atomically(Path(path), with_sorted_header(save(attack._tensors(), metadata=header)))
+    tensors = attack._tensors()
+    if small:
+        header["format"] = PACKED_FORMAT
+        tensors = packed(tensors, attack.face.carried_by if attack.face else None, face_texture)
+    write_atomically(Path(path), with_sorted_header(save(tensors, metadata=header)))
     return attack.attack_id
 
 
@@ -333,12 +344,16 @@ def attack_from_bytes(content: bytes, source: str) -> AttackFile:
 
 
 def _checked(header: dict[str, Any], tensors: dict[str, NDArray[Any]], source: str) -> AttackFile:
-    if header.get("format") != FILE_FORMAT:
+    if header.get("format") not in (FILE_FORMAT, PACKED_FORMAT):
         raise AttackFileError(
             f"expected {source} to be of format {FILE_FORMAT}, got {header.get('format')!r}"
         )
     try:
-        attack = _from_parts(json.loads(header["metadata"]), tensors)
+        metadata = json.loads(header["metadata"])
+        if header["format"] == PACKED_FORMAT:
+            face = metadata["face"]
+            tensors = unpacked(tensors, None if face is None else face["carried_by"], face_texture)
+        attack = _from_parts(metadata, tensors)
     except AttackFileError:
         raise
     except (KeyError, TypeError, ValueError) as error:

@@ -444,8 +444,15 @@ def publish(
     from nodes.experiment.campaign.published import publish_build
     from nodes.experiment.campaign.set_film import write_film
     from nodes.experiment.campaign.store import NOT_DRIVEN
+    from nodes.runtime.errors import ConfigError
 
     campaign, cells = load_cells(file, setting, folder, overrides, only)
+    registered = (to / campaign.name / registration.FILE).exists()
+    if registered and not build:
+        raise ConfigError(
+            f"expected to publish the registered set {campaign.name} with its scene and victim, got --no-build; leave it out: without them nobody "
+            "can drive the set again"
+        )
     found_here = statuses(campaign, cells)
     for each in found_here:
         if each.state == NOT_DRIVEN:
@@ -457,13 +464,13 @@ def publish(
         print(f"{to / campaign.name / name}.json")
     if withdraw:
         registration.withdraw(to / campaign.name, dict(_scenario_and_reason(each) for each in withdraw))
-    if (to / campaign.name / registration.FILE).exists():
+    if build:  # before the page, which says whether the set can be driven again
+        _say_build(publish_build(campaign, cells, to, prune))
+    if registered:
         print(write_set(to / campaign.name))
         if (film := write_film(campaign, to / campaign.name)) is not None:
             print(film)
         print(write_page(to))
-    if build:
-        _say_build(publish_build(campaign, cells, to, prune))
     unfinished = len(cells) - len(found.written) - len(found.same)
     print(f"{len(found.written)} cells written, {len(found.same)} were there, {unfinished} are not finished")
     if found.stale:

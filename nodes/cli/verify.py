@@ -38,6 +38,11 @@ def register(
     print(
         f"{len(found.cells)} cells, {len(found.scenarios)} scenarios, {len(found.primary)} primary tests; commit it, then run the experiment"
     )
+    for name, scenario in found.scenarios.items():
+        limit_m = scenario.drives_well_mean_cte_m
+        print(
+            f"{name}: a victim whose mean |CTE| without attack exceeds {limit_m:.3g} m, or that leaves the track, fails the set"
+        )
 
 
 def verify(
@@ -47,12 +52,14 @@ def verify(
     published: Published = Path("docs/results"),
     again: Annotated[
         int,
-        typer.Option("--redrive", min=0, help="Also search and drive so many cells again, in the surrogate."),
+        typer.Option("--redrive", min=0, help="Also drive so many cells again, in the surrogate."),
     ] = 0,
     seed: Annotated[int, typer.Option("--seed", help="Which cells are drawn for that.")] = 0,
 ) -> None:
     """Compute every published number again from the kept drives, and check digests, registration and completeness."""
+    from advnerf_core.report.evidence.kept_build import LOST, is_kept
     from advnerf_core.report.evidence.verify import SetError, sets_in, verify_set
+    from nodes.experiment.campaign.kept_attacks import with_attacks
 
     known = sets_in(published)
     if name is not None and name not in known:
@@ -61,7 +68,7 @@ def verify(
         )
     wrong = 0
     for each in [name] if name is not None else known:
-        found = verify_set(published / each)
+        found = with_attacks(verify_set(published / each), published / each)
         wrong += len(found.problems)
         if found.awaits_results:
             print(f"{found.name}: registered, nothing published yet")
@@ -71,6 +78,9 @@ def verify(
         for problem in found.problems:
             say_error(problem)
         if again and not found.problems:
+            if not is_kept(published / each):
+                print(f"{each} {LOST}")
+                continue
             wrong += _redrive(published / each, again, seed)
     if wrong:
         raise typer.Exit(_FAILURE_EXIT)

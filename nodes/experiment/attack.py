@@ -18,7 +18,7 @@ from advnerf_core.attack.clean import clean_drive
 from advnerf_core.attack.methods import Method, SearchRun, SearchSettings, load_method
 from advnerf_core.attack.on_device import on_chosen_device, said_of_device
 from advnerf_core.attack.search.search import SearchResult
-from advnerf_core.attack.spaces.space import Shown, Space
+from advnerf_core.attack.spaces.space import Shown, Space, half_precision
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.pilotnet import LoadedPolicy, load_policy
@@ -26,10 +26,11 @@ from advnerf_core.report.conditions import CONTROLS, EMPTY, NONE
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.drives import learned_drives, totals
-from nodes.experiment.faces import has_face, panel_of
+from nodes.experiment.frozen import frozen_for, hardness_before
 from nodes.experiment.learned_scene import baked_file, load_field, scene_sha256
 from nodes.experiment.policy import HARDENED, victim_file, victims
 from nodes.experiment.request.telling import telling
+from nodes.experiment.search_files import ATTACK, SEARCHED
 from nodes.experiment.space_config import (
     ColoursConfig,
     FaceConfig,
@@ -37,16 +38,10 @@ from nodes.experiment.space_config import (
     MeshTextureConfig,
     PlacesConfig,
 )
-from nodes.experiment.spaces import geometry_sha256, over_the_world
+from nodes.experiment.spaces import over_the_world
 from nodes.experiment.stage_record import hash_of
-from nodes.runtime.errors import RuntimeFault
 
-FROZEN, SEARCHED, ATTACK = "frozen.json", "surrogate.json", "attack.safetensors"
 _STATE = "state.safetensors"
-
-
-class FrozenChangedError(RuntimeFault):
-    """Something that was fixed before the first attack is no longer what it was."""
 
 
 def cells(experiment: Experiment) -> list[Cell]:
@@ -66,75 +61,6 @@ def cells(experiment: Experiment) -> list[Cell]:
         for scenario in experiment.config.scenarios
     ]
     return list(dict.fromkeys(found))
-
-
-def frozen_hashes(experiment: Experiment) -> dict[str, str]:
-    """What is fixed before the first attack: scene, victims, objects and their places, starts and seeds."""
-    policies = {f"policy_{name}": _policy_sha256(experiment, name) for name in victims(experiment)}
-    starts = {
-        f"{scenario} {seed}": experiment.start_states(scenario, seed).tolist()
-        for scenario in experiment.config.scenarios
-        for seed in experiment.config.attack.seeds
-    }
-    starts |= {name: experiment.measured_starts(name).tolist() for name in experiment.config.scenarios}
-    return {
-        **_frozen_place(experiment),
-        **policies,
-        "starts_and_seeds": hash_of(starts),
-        # As the experiment was run: a report may be of fewer methods.
-        "config": hash_of(read_json(experiment.folder / "manifest.json")["config"]),
-    }
-
-
-def _frozen_for(experiment: Experiment, cell: Cell) -> dict[str, str]:
-    """What is fixed before the search of a cell; other seeds and victims do not matter to it."""
-    return {
-        **_frozen_place(experiment),
-        "policy": _policy_sha256(experiment, cell.victim),
-        "starts": hash_of(
-            [
-                experiment.start_states(cell.scenario, cell.seed).tolist(),
-                experiment.measured_starts(cell.scenario).tolist(),
-            ]
-        ),
-    }
-
-
-def _policy_sha256(experiment: Experiment, victim: str) -> str:
-    return load_policy(victim_file(experiment, victim)).sha256
-
-
-def _frozen_place(experiment: Experiment) -> dict[str, str]:
-    """Scene, objects, and where they stand."""
-    things = experiment.objects
-    return {
-        "scene": scene_sha256(experiment),
-        "objects": hash_of([geometry_sha256(experiment, thing.kind) for thing in things]),
-        "placement": hash_of(
-            [thing.model_dump(mode="json") for thing in things]
-            + ([panel_of(experiment).to_dict()] if has_face(experiment) else [])
-        ),
-    }
-
-
-def freeze(experiment: Experiment, cell: Cell, folder: Path) -> None:
-    """Write what is fixed before the search of a cell, once."""
-    if not (folder / FROZEN).exists():
-        write_atomically(folder / FROZEN, json.dumps(_frozen_for(experiment, cell), indent=1) + "\n")
-
-
-def check_frozen(experiment: Experiment, cell: Cell, folder: Path) -> None:
-    """Refuse to drive if scene, victims, objects, places or starts are not those of the search.
-
-    Raises:
-        FrozenChangedError: Something of it changed.
-    """
-    then, now = read_json(folder / FROZEN), _frozen_for(experiment, cell)
-    changed = [name for name, value in now.items() if then.get(name) != value]
-    if changed:
-        raise FrozenChangedError(
-            f"expected {', '.join(changed)} as frozen before the search in {folder}, got another; remove that folder to search again"
-        )
 
 
 def surrogate_part(
@@ -165,23 +91,43 @@ def surrogate_part(
         curve = [evaluation.predicted_total_cte_m for evaluation in result.history]
         attack = _attack_file(experiment, space, problem, policy, cell, result)
         attack_id = save_attack(folder / ATTACK, attack)
-    shown = load_shown(space, folder, cell)
-    measured = from_measured_starts(experiment, cell.scenario, past_field(experiment, problem, space, shown))
-    states, commands, scores = learned_drives(experiment, measured, shown.colours)
     data = {
         "attack_id": attack_id,
         "policy_sha256": policy.sha256,
-        "states": states.tolist(),
-        "commands": commands.tolist(),
-        **totals(scores),
-        "mean_cte_m": [score.mean_cte_m for score in scores],
-        "time_to_leave_s": [score.time_to_leaving_s for score in scores],
+        "hardness": hardness_before(folder),
+        **surrogate_drives(experiment, space, cell, folder),
         "curve_total_cte_m": curve,
         "seconds": seconds,
     }
     write_atomically(kept, json.dumps(data) + "\n")
     (folder / _STATE).unlink(missing_ok=True)
     return data
+
+
+def surrogate_drives(experiment: Experiment, space: Space, cell: Cell, folder: Path) -> dict[str, Any]:
+    """Drives in the surrogate from the measured starts, past what the attack file in a folder says.
+
+    Args:
+        experiment: The experiment.
+        space: What was searched.
+        cell: Which; of a control nothing is read.
+        folder: Holds ``attack.safetensors``.
+
+    Returns:
+        States ``[S, T + 1, n]``, commands ``[S, T]`` and metrics, as JSON data.
+    """
+    policy = _victim(victim_file(experiment, cell.victim))
+    problem = attack_problem(experiment, space, policy, cell.scenario, cell.seed)
+    shown = load_shown(space, folder, cell)
+    measured = from_measured_starts(experiment, cell.scenario, past_field(experiment, problem, space, shown))
+    states, commands, scores = learned_drives(experiment, measured, shown.colours)
+    return {
+        "states": states.tolist(),
+        "commands": commands.tolist(),
+        **totals(scores),
+        "mean_cte_m": [score.mean_cte_m for score in scores],
+        "time_to_leave_s": [score.time_to_leaving_s for score in scores],
+    }
 
 
 def attack_problem(
@@ -284,7 +230,7 @@ def _search(
     report: Callable[..., None],
 ) -> SearchResult:
     wanted = experiment.config.space.model_dump(mode="json")
-    settings_hash = hash_of({**_frozen_for(experiment, cell), "scenario": cell.scenario, "space": wanted})
+    settings_hash = hash_of({**frozen_for(experiment, cell), "scenario": cell.scenario, "space": wanted})
     method = load_method(cell.code)
     settings = search_settings(experiment, method)
     told = telling(method.evaluations(problem, settings), report)
@@ -306,11 +252,12 @@ def _attack_file(
     result: SearchResult,
 ) -> AttackFile:
     clean = clean_drive(past(problem, space, space.plain), space.plain.colours)
+    theta = half_precision(result.theta)
     attack = AttackFile(
         method=cell.method,
         space=space.name,
-        objects=space.attacked(result.theta),
-        face=space.face(result.theta),
+        objects=space.attacked(theta),
+        face=space.face(theta),
         camera=experiment.view.pinhole,
         scene_sha256=hash_of(experiment.world_settings)
         if over_the_world(experiment)

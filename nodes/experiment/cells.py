@@ -13,12 +13,13 @@ from advnerf_core.attack.spaces.space import Space
 from advnerf_core.report.conditions import NONE
 from hardware.worlds.world import World, traits_of
 from nodes.experiment import fidelity, pose_maps
-from nodes.experiment.attack import ATTACK, check_frozen, freeze, surrogate_part
+from nodes.experiment.attack import surrogate_part
 from nodes.experiment.cell import Cell
 from nodes.experiment.cell_kind import CellKind
 from nodes.experiment.context import Experiment
 from nodes.experiment.deploy import Deployer, ThroughNodes, ThroughWorld, cell_data
 from nodes.experiment.films import film_cell, kept_film, with_film
+from nodes.experiment.frozen import check_frozen, freeze
 from nodes.experiment.keys import (
     NEEDED,
     CellError,
@@ -29,6 +30,7 @@ from nodes.experiment.keys import (
 )
 from nodes.experiment.reference import ReferenceBuild
 from nodes.experiment.run import load_experiment, prepare_victims, stages_of
+from nodes.experiment.search_files import ATTACK
 from nodes.experiment.shared_search import take_search
 from nodes.experiment.space_config import PlacesConfig
 from nodes.experiment.spaces import make_space, over_the_world

@@ -17,13 +17,14 @@ from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.report.conditions import NONE
 from advnerf_core.report.evidence.kept import kept_drives
 from hardware.worlds.world import World
-from nodes.experiment.attack import ATTACK, SEARCHED, load_found, load_shown
+from nodes.experiment.attack import load_found, load_shown
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.deployed import DeployedDrive
 from nodes.experiment.drives import deployed_drives, totals
 from nodes.experiment.live import LiveRun, as_drive, drive_until_it_counts
 from nodes.experiment.policy import victim_file
+from nodes.experiment.search_files import ATTACK, SEARCHED, THETA
 from nodes.experiment.spaces import dress, shown_there
 from nodes.lab.trials.tries import NotDrivenError
 
@@ -144,6 +145,8 @@ def cell_data(
             "horizon": experiment.config.horizon,
             "space": experiment.config.space.model_dump(mode="json"),
             "deployed_through": experiment.config.deploy.through,
+            "hardness": learned.get("hardness", ""),
+            **({} if learned["attack_id"] is None else {"theta": THETA}),
         },
     }
     if deployer is not None:

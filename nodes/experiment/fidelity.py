@@ -32,7 +32,7 @@ from advnerf_core.scene.surrogate import Surrogate
 from nodes.bags.reader import read_messages
 from nodes.control.pose_buffer import PoseBuffer
 from nodes.experiment import capture
-from nodes.experiment.attack import ATTACK, attack_problem, from_measured_starts, load_found
+from nodes.experiment.attack import attack_problem, from_measured_starts, load_found
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.deploy import DRIVES, live_name
@@ -41,6 +41,7 @@ from nodes.experiment.faces import face_space, has_face, on_screen, panel_of
 from nodes.experiment.images import as_uint8
 from nodes.experiment.objects import surrogate_of
 from nodes.experiment.policy import victim_file
+from nodes.experiment.search_files import ATTACK
 from nodes.experiment.spaces import dress, make_space, shown_there
 from nodes.runtime.errors import BagError, RuntimeFault
 from nodes.runtime.messages import decode, ns_from_stamp, pose_matrix

@@ -15,7 +15,7 @@ from advnerf_core.report.clips import ClipTrack, write_clip
 from advnerf_core.report.conditions import NONE, style_of
 from advnerf_core.scene.surrogate import Surrogate
 from hardware.worlds.world import World
-from nodes.experiment.attack import SEARCHED, load_found, load_shown
+from nodes.experiment.attack import load_found, load_shown
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.deploy import DRIVES
@@ -23,6 +23,7 @@ from nodes.experiment.images import as_uint8
 from nodes.experiment.keys import driven_folder
 from nodes.experiment.learned_scene import load_background
 from nodes.experiment.policy import HARDENED
+from nodes.experiment.search_files import SEARCHED
 from nodes.experiment.spaces import dress, shown_there
 from nodes.lab.trials import evaluation
 

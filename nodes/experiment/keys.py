@@ -21,7 +21,7 @@ from nodes.runtime.errors import RuntimeFault
 # The stages that cells need of their experiment; what comes after is the cells themselves.
 NEEDED = ("capture", "scene", "policy", "object")
 # As of a stage (`run.VERSIONS`): raised when what a cell finds changes with the same settings.
-VERSION = 3
+VERSION = 4  # 4: textures are rounded to half precision before they are driven past
 # What a cell does not depend on: which others there are, how much memory may be used, and what is told of the world elsewhere.
 _FREE: Mapping[str, bool | set[str]] = {
     "name": True,

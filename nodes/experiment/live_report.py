@@ -20,14 +20,16 @@ from advnerf_core.report.cells import read_cell
 from advnerf_core.report.live_parts import LiveParts, live_parts
 from advnerf_core.report.results import read_results, write_results
 from nodes.experiment import films, memory
-from nodes.experiment.attack import ATTACK, SEARCHED, cells, frozen_hashes
+from nodes.experiment.attack import cells
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.deploy import DRIVES
+from nodes.experiment.frozen import frozen_hashes
 from nodes.experiment.keys import driven_folder
 from nodes.experiment.learned_scene import FIDELITY
 from nodes.experiment.live import extra_runs, lab_of
 from nodes.experiment.policy import HARDENED
+from nodes.experiment.search_files import ATTACK, SEARCHED
 from nodes.experiment.spaces import make_space
 from nodes.experiment.stage_record import read_record
 from nodes.lab.trials import evaluation

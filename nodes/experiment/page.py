@@ -18,9 +18,10 @@ from advnerf_core.report.conditions import style_of
 from advnerf_core.report.palette import LIGHT, LINE_STYLES
 from advnerf_core.report.plots import new_axes, svg
 from nodes.experiment import films
-from nodes.experiment.attack import cells, frozen_hashes
+from nodes.experiment.attack import cells
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
+from nodes.experiment.frozen import frozen_hashes
 from nodes.experiment.learned_scene import FIDELITY
 from nodes.experiment.policy import HARDENED
 from nodes.experiment.stage_record import read_record

@@ -1,7 +1,8 @@
 """The reference build: what stages made, kept with the code and found by its key.
 
 With it a machine that has only the repository goes on where another stopped: it has the very scene, victims and objects that the
-published cells were run with. One folder per stage, named by stage and key. Left out is bulk (`Stage.bulk`), as photographs and
+published cells were run with. One folder per stage, named by stage and key; of two with the same
+files one has them, and the record of the other names it. Left out is bulk (`Stage.bulk`), as photographs and
 training frames are, which only a stage that is made anew reads; then those that it reads are made anew as well.
 """
 
@@ -13,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.report.evidence import kept_build
 from nodes.experiment.stage_record import (
     RECORD,
     Stage,
@@ -26,7 +28,7 @@ from nodes.runtime.paths import shipped
 
 # Where cells and stages are kept with the code.
 PUBLISHED = Path("docs/results")
-BUILD = "reference"
+BUILD = kept_build.BUILD
 _KEY_DIGITS = 16
 
 
@@ -79,6 +81,9 @@ class ReferenceBuild:
         source, record = self._source(stage, key), self.record(stage, key)
         if record is None:
             return None
+        if record.files_in:
+            source = source.with_name(record.files_in)
+            record = replace(record, files_in="")
         if digest_of(source) != record.kept:
             raise ReferenceBuildError(
                 f"expected the files in {source} as they were kept, got others; restore them (git checkout -- {source}), or remove the folder to "
@@ -102,7 +107,23 @@ class ReferenceBuild:
         ):
             return None
         _copy(folder, target, stage.bulk, record)
+        self._share(target)
         return target
+
+    def _share(self, target: Path) -> None:
+        """Keep the files of a stage once, where another folder of the same stage has the same ones."""
+        ours = read_record(target)
+        assert ours is not None, "it was kept"
+        for file in sorted(self.folder.glob(f"{target.name.rpartition('_')[0]}_*/{RECORD}")):
+            other = read_record(file.parent)
+            if (
+                file.parent != target
+                and other is not None
+                and (other.kept, other.files_in) == (ours.kept, "")
+            ):
+                shutil.rmtree(target)
+                write_record(target, replace(ours, files_in=file.parent.name))
+                return
 
     def _source(self, stage: Stage, key: str) -> Path:
         at = self._at(stage, key)

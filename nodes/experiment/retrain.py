@@ -33,11 +33,12 @@ from advnerf_core.learning.sources import Seen, steer_with
 from advnerf_core.policies.pilotnet import LoadedPolicy, load_policy
 from hardware.worlds.world import World
 from nodes.experiment import retrain_plot
-from nodes.experiment.attack import attack_problem, freeze, load_shown, surrogate_part
+from nodes.experiment.attack import attack_problem, load_shown, surrogate_part
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.deployed import Dressed
 from nodes.experiment.drives import deployed_drives
+from nodes.experiment.frozen import freeze
 from nodes.experiment.native import stand_in
 from nodes.experiment.objects import placed_objects
 from nodes.experiment.policy import HARDENED, plans, victim_file

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from advnerf_core.attack.methods import method_digest
 from advnerf_core.files import write_atomically
-from nodes.experiment.attack import ATTACK, SEARCHED
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.keys import cell_inputs
+from nodes.experiment.search_files import ATTACK, SEARCHED
 from nodes.experiment.stage_record import hash_of
 
 _KEY = "search_key"

@@ -11,9 +11,10 @@ from typing import Any
 
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
+from advnerf_core.report.evidence import kept_build
 from nodes.runtime.progress import MeasuringReport
 
-RECORD = "stage.json"
+RECORD = kept_build.RECORD
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,7 @@ class StageRecord:
         seconds: How long it took.
         settings: A part of the key already; apart from it they say what a folder was made with.
         kept: Of a stage from a reference build, which has no bulk: digest of the files that it does have.
+        files_in: Of a stage in a reference build: folder beside it that has the same files, which are kept once; empty where its own folder has them.
     """
 
     key: str
@@ -58,6 +60,7 @@ class StageRecord:
     seconds: float
     settings: Mapping[str, Any]
     kept: str | None = None
+    files_in: str = ""
 
 
 def read_record(folder: Path) -> StageRecord | None:
@@ -70,6 +73,7 @@ def read_record(folder: Path) -> StageRecord | None:
             float(fields["seconds"]),
             fields["settings"],
             fields.get("kept"),
+            fields.get("files_in", ""),
         )
     except (FileNotFoundError, ValueError, KeyError, TypeError):
         # An unreadable record means unknown contents: the stage is run again from nothing.
@@ -114,5 +118,6 @@ def write_record(folder: Path, record: StageRecord) -> None:
         "seconds": round(record.seconds, 3),
         "settings": record.settings,
         **({} if record.kept is None else {"kept": record.kept}),
+        **({"files_in": record.files_in} if record.files_in else {}),
     }
     write_atomically(folder / RECORD, json.dumps(known, indent=1) + "\n")

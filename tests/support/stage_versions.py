@@ -10,6 +10,7 @@ import json
 import os
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -74,15 +75,16 @@ def measured(folder: Path) -> dict[str, dict[str, Any]]:
     return {name: {"version": versions[name], "numbers": each} for name, each in numbers.items()}
 
 
-def tiny_experiment(folder: Path) -> Experiment:
+def tiny_experiment(folder: Path, changes: Sequence[str] = ()) -> Experiment:
     """The experiment that is summed up.
 
     Args:
         folder: The run folder.
+        changes: More ``key=value`` texts.
     """
     from nodes.experiment.run import load_experiment
 
-    return load_experiment(ROOT / "launch" / "room.experiment.yaml", "demo", TINY, folder)
+    return load_experiment(ROOT / "launch" / "room.experiment.yaml", "demo", [*TINY, *changes], folder)
 
 
 def main() -> None:

@@ -73,6 +73,12 @@ class NamedObject:
     sha256: str
 
 
+def half_precision(theta: Tensor) -> Tensor:
+    """Theta as half precision has it, in its own type: what is kept of an attack is what is driven past."""
+    largest = torch.finfo(torch.float16).max
+    return theta.detach().clamp(-largest, largest).half().to(theta.dtype)
+
+
 class Space(Protocol):
     """What is searched."""
 

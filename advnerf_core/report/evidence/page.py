@@ -47,7 +47,8 @@ def results_page(sets: Mapping[str, Mapping[str, Any]]) -> str:
     """The page in Markdown.
 
     Args:
-        sets: By name, what is in each ``set.json``, with the registration under ``registered``, and under ``filmed`` whether there is a film.
+        sets: By name, what is in each ``set.json``, with the registration under ``registered``, under ``filmed`` whether there is a film, and under ``notes``
+            paragraphs about its baselines and about what is kept.
     """
     return "\n".join([_HEAD, *(_section(name, data) for name, data in sorted(sets.items()))])
 
@@ -64,6 +65,7 @@ def _section(name: str, data: Mapping[str, Any]) -> str:
         ),
         f"![Excess of every drive, by method and domain]({picture_of(name)})\n",
         _where(data["deployed_through"]) + "\n",
+        *data.get("notes", ()),
         *_withdrawn(data),
         *_tests(data),
         _table(registered),
@@ -189,7 +191,7 @@ def _sentences(test: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> st
     )
     place = _place(which)
     first = (
-        f"**{place}, {which['victim']} victim.** Where it is deployed, the {style_of(which['method']).title} attack moves the car "
+        f"**{place}, victim: {which['victim']}.** Where it is deployed, the {style_of(which['method']).title} attack moves the car "
         f"{row['excess_m']:.3f} m per tick further from its path{_between(row)}, and {row['off_track']} of {row['drives']} drives leave the "
         "track."
     )

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
+
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -13,13 +16,18 @@ from advnerf_core.report.plots import new_axes
 _MOST_COLUMNS = 8
 
 
-def excess_plot(evidence: Evidence) -> Figure:
-    """Excess |CTE| per tick of each drive, one column per search; of sets with many conditions the means, one line per condition."""
+def excess_plot(evidence: Evidence, titles: Mapping[str, str] = MappingProxyType({})) -> Figure:
+    """Excess |CTE| per tick of each drive, one column per search; of sets with many conditions the means, one line per condition.
+
+    Args:
+        evidence: The set.
+        titles: What its victims are called, by name, where that is another.
+    """
     shown = [row for row in rows(evidence) if row.method != NONE]
-    return _drives(evidence, shown) if len(shown) <= _MOST_COLUMNS else _means(shown)
+    return _drives(evidence, shown, titles) if len(shown) <= _MOST_COLUMNS else _means(shown, titles)
 
 
-def _drives(evidence: Evidence, shown: list[Row]) -> Figure:
+def _drives(evidence: Evidence, shown: list[Row], titles: Mapping[str, str]) -> Figure:
     """Every drive, with the interval of the mean beside them."""
     with new_axes(max(5.0, 1.1 * len(shown) + 1.5), 3.4) as ax:
         ax.axhline(0.0, color=LIGHT["tape"], lw=1.0, zorder=1)
@@ -35,7 +43,7 @@ def _drives(evidence: Evidence, shown: list[Row]) -> Figure:
                 error = [[row.excess_m - row.low_m], [row.high_m - row.excess_m]]
                 ax.errorbar(place + 0.3, row.excess_m, error, fmt="_", color=LIGHT["ink"], ms=7, capsize=3)
         names = [
-            f"{style_of(row.method).title}\n{row.domain}\n{' '.join(filter(None, (row.scenario, row.placement)))}, {row.victim}"
+            f"{style_of(row.method).title}\n{row.domain}\n{' '.join(filter(None, (row.scenario, row.placement)))},\n{titles.get(row.victim, row.victim)}"
             for row in shown
         ]
         ax.set_xticks(range(len(shown)), names, size=7.5)
@@ -45,7 +53,7 @@ def _drives(evidence: Evidence, shown: list[Row]) -> Figure:
     return figure
 
 
-def _means(shown: list[Row]) -> Figure:
+def _means(shown: list[Row], titles: Mapping[str, str]) -> Figure:
     """Means with their intervals: deployed ones filled, those in the learned scene hollow."""
     places = list(dict.fromkeys((row.scenario, row.placement, row.victim) for row in shown))
     methods = list(dict.fromkeys(row.method for row in shown))
@@ -69,7 +77,7 @@ def _means(shown: list[Row]) -> Figure:
             ax.plot([row.excess_m], [down], marker=style.marker, ls="none", label=label, **drawn)
         entries = dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
         ax.figure.legend(entries.values(), entries.keys(), loc="outside upper left", ncols=3)
-        names = [f"{' '.join(filter(None, place[:2]))}, {place[2]}" for place in places]
+        names = [f"{' '.join(filter(None, place[:2]))}, {titles.get(place[2], place[2])}" for place in places]
         ax.set_yticks(range(len(places)), [name.replace("_", " ") for name in names])
         ax.set(xlabel="excess |CTE| per tick [m]", ylim=(len(places) - 0.5, -0.5))
         ax.grid(axis="y", visible=False)

@@ -19,7 +19,10 @@ from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import sha256_of, write_atomically
 from advnerf_core.report.cells import CellError, CellResult, read_cell
 from advnerf_core.report.evidence.contrasts import contrast_data
+from advnerf_core.report.evidence.families import families_note
+from advnerf_core.report.evidence.hardness import titles_of, with_titles
 from advnerf_core.report.evidence.kept import KeptDrive
+from advnerf_core.report.evidence.kept_build import lost_note
 from advnerf_core.report.evidence.page import film_of, picture_of, results_page
 from advnerf_core.report.evidence.registration import (
     FILE,
@@ -104,7 +107,9 @@ def write_numbers(folder: Path) -> Path:
     known = _known_digests(folder.parent)
     known[folder.name] = sha256_of(folder / SET)
     write_atomically(folder.parent / DIGESTS, json.dumps(known, indent=1, sort_keys=True) + "\n")
-    write_png(excess_plot(evidence), folder.parent / picture_of(folder.name), dpi=110)
+    write_png(
+        excess_plot(evidence, titles_of(folder, data)), folder.parent / picture_of(folder.name), dpi=110
+    )
     return folder / SET
 
 
@@ -158,9 +163,10 @@ def _page(published: Path) -> str:
         registration = read_registration(published / name)
         if registration is not None and (published / name / SET).exists():
             registered = {**registration.model_dump(mode="json"), "digest": registration.digest}
-            data = read_json(published / name / SET)
+            data = with_titles(published / name, read_json(published / name / SET))
             filmed = (published / film_of(name)).exists()
-            sets[name] = {**data, "registered": registered, "filmed": filmed}
+            notes = [*families_note(registration), *lost_note(published / name)]
+            sets[name] = {**data, "registered": registered, "filmed": filmed, "notes": notes}
     return results_page(sets)
 
 

@@ -11,9 +11,12 @@ from pathlib import Path
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import CellResult, read_cell, read_cells
+from advnerf_core.report.evidence.hardness import FILE as HARDNESS
+from advnerf_core.report.evidence.hardness import PUBLISHED_FILE, merged, read_hardness, write_hardness
 from advnerf_core.report.transfer import TransferTable, make_table
 from nodes.experiment.campaign.admission import gate_file, gate_key
 from nodes.experiment.campaign.config import Campaign
+from nodes.experiment.campaign.kept_attacks import publish_attacks
 from nodes.experiment.campaign.plan import read_experiment
 from nodes.experiment.campaign.predictions import kept_prediction, prediction_file
 from nodes.experiment.campaign.store import FINISHED, CellStatus
@@ -68,6 +71,8 @@ def publish(campaign: Campaign, found: Sequence[CellStatus], folder: Path, prune
         write_atomically(target, text)
         written.append(each.cell.name)
     _publish_beside(campaign, [each for each in found if each.state == "done"], folder / campaign.name)
+    publish_attacks(campaign, found, folder / campaign.name)
+    _publish_hardness(campaign, folder / campaign.name)
     return Published(tuple(written), tuple(same), tuple(stale))
 
 
@@ -124,12 +129,14 @@ def publish_build(
 def _prune_build(reference: ReferenceBuild, published: Path) -> list[Path]:
     found = [read_json(file) for file in published.glob("*/*.json")]
     used = {digest for each in found if "stages" in each for digest in each["stages"].values()}
-    removed = []
-    for stage in sorted(each.parent for each in reference.folder.glob(f"*/{RECORD}")):
-        record = read_record(stage)
-        if record is None or record.digest not in used:
-            shutil.rmtree(stage)
-            removed.append(stage)
+    records = {file.parent: read_record(file.parent) for file in sorted(reference.folder.glob(f"*/{RECORD}"))}
+    kept = {
+        stage: record for stage, record in records.items() if record is not None and record.digest in used
+    }
+    shared = {record.files_in for record in kept.values()}
+    removed = [stage for stage in records if stage not in kept and stage.name not in shared]
+    for stage in removed:
+        shutil.rmtree(stage)
     return removed
 
 
@@ -152,6 +159,16 @@ def _publish_beside(campaign: Campaign, done: Sequence[CellStatus], folder: Path
         for drive in (False, True):
             if (verdict := gate_file(campaign.folder, key, drive)).exists():
                 write_atomically(gate_file(folder, key, drive), verdict.read_text(encoding="utf-8"))
+
+
+def _publish_hardness(campaign: Campaign, folder: Path) -> None:
+    """Publish every verdict of the victims, also of recipes that did not pass."""
+    runs = dict.fromkeys(campaign.run_folder(cell) for cell in campaign.cells)
+    record = merged(
+        [read_hardness(folder / PUBLISHED_FILE), *(read_hardness(run / HARDNESS) for run in runs)]
+    )
+    if record.verdicts:
+        write_hardness(folder / PUBLISHED_FILE, record)
 
 
 def published_table(folder: Path, campaign: Campaign, cells: Sequence[Cell] | None = None) -> TransferTable:

@@ -1,8 +1,9 @@
-"""Driving published cells again: the search from its seed, and the drives in the surrogate, must come out as they were published."""
+"""Driving published cells again: drives in the surrogate past a published attack must come out as they were published."""
 
 from __future__ import annotations
 
 import random
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,14 +12,18 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from advnerf_core.report.cells import read_cell
+from advnerf_core.report.conditions import NONE
 from advnerf_core.report.evidence.kept import KeptDrive, kept_drives
-from nodes.experiment.attack import surrogate_part
+from advnerf_core.report.evidence.kept_build import LOST, is_kept
+from nodes.experiment.attack import surrogate_drives, surrogate_part
 from nodes.experiment.campaign.config import Campaign
+from nodes.experiment.campaign.kept_attacks import attack_file
 from nodes.experiment.campaign.plan import read_experiment
 from nodes.experiment.cell import Cell
 from nodes.experiment.cells import Bench
 from nodes.experiment.context import Experiment
 from nodes.experiment.run import prepare_victims
+from nodes.experiment.search_files import ATTACK
 from nodes.runtime.errors import RuntimeFault
 
 # Of positions, between machines: sums are taken in another order, and a search takes many steps.
@@ -47,7 +52,7 @@ class Redriven:
 def redrive(
     campaign: Campaign, published: Path, count: int, seed: int, tell: Callable[[str], None]
 ) -> list[Redriven]:
-    """Search and drive some cells of a set again, in the surrogate; scenes and victims come from the reference build where they fit.
+    """Drive some cells of a set again, in the surrogate, with the scene, the victim and the attacks that are kept.
 
     Args:
         campaign: The registered cells, with a run folder that may be empty.
@@ -57,28 +62,35 @@ def redrive(
         tell: Told which cell is driven.
 
     Raises:
-        RedriveError: A cell is not of an experiment file.
+        RedriveError: The set's scene and victim were not kept, or a cell is not of an experiment file.
     """
+    if not is_kept(published):
+        raise RedriveError(f"{published.name} {LOST}")
     names = {file.stem for file in published.glob("*.json")}
     known = [cell for cell in campaign.cells if cell.name in names]
     chosen = random.Random(seed).sample(known, min(count, len(known)))
     found = []
     for cell in chosen:
         tell(f"{cell.name}: driven again")
-        said = read_cell(published / f"{cell.name}.json").kept["surrogate"]
-        found.append(_compared(cell.name, said, _again(campaign, cell)))
+        said = read_cell(published / f"{cell.name}.json")
+        again = _again(campaign, cell, attack_file(published, said.attack_id or NONE))
+        found.append(_compared(cell.name, said.kept["surrogate"], again))
     return found
 
 
-def _again(campaign: Campaign, cell: Cell) -> list[KeptDrive]:
+def _again(campaign: Campaign, cell: Cell, attack: Path) -> list[KeptDrive]:
+    """Drives in the surrogate past the published attack; of a set without attacks, past what its search finds again."""
     experiment = read_experiment(campaign, cell)
     if not isinstance(experiment, Experiment):
         raise RedriveError(f"{cell.name}: expected a cell of an experiment file, got one of another kind")
     prepare_victims(experiment)
     with TemporaryDirectory() as work, Bench(experiment) as bench:
-        found = surrogate_part(
-            experiment, bench.space, campaign.inside(cell), Path(work), lambda fraction, text="": None
-        )
+        inside, folder = campaign.inside(cell), Path(work)
+        if attack.exists():
+            shutil.copy(attack, folder / ATTACK)
+            found = surrogate_drives(experiment, bench.space, inside, folder)
+        else:
+            found = surrogate_part(experiment, bench.space, inside, folder, lambda fraction, text="": None)
     return [KeptDrive.model_validate(each) for each in kept_drives(found)]
 
 

@@ -10,7 +10,13 @@ from pathlib import Path
 
 from advnerf_core.driving.metrics import mean_cte_limit_m
 from advnerf_core.files import write_atomically
-from advnerf_core.report.conditions import CONTROLS
+from advnerf_core.report.evidence.families import (
+    COARSE_BASELINES,
+    COARSE_GRADIENT,
+    GRADIENT,
+    RANDOM_FAMILIES,
+    lacking_baselines,
+)
 from advnerf_core.report.evidence.registration import (
     FILE,
     PrimaryTest,
@@ -26,14 +32,16 @@ from nodes.experiment.campaign.plan import read_experiment, statuses
 from nodes.experiment.campaign.store import FINISHED
 from nodes.experiment.cell import Cell
 from nodes.experiment.cell_kind import CellKind
+from nodes.experiment.config import ExperimentConfig
 from nodes.experiment.context import Experiment
 from nodes.experiment.keys import registered_settings
 from nodes.experiment.kinds import load_kind
+from nodes.experiment.placed import PANEL
 from nodes.experiment.policy import HARDENED
 from nodes.experiment.registered import registered_cell
+from nodes.experiment.space_config import ColoursConfig, FaceConfig
 from nodes.experiment.stage_record import hash_of
-
-_CLAIMED = "gradient"  # the method that primary tests are about
+from nodes.experiment.verdicts import TRAINED_ON, VALIDATED_ON, unseen
 
 
 def register(campaign: Campaign, setting: str, overrides: Sequence[str], published: Path) -> Registration:
@@ -46,7 +54,7 @@ def register(campaign: Campaign, setting: str, overrides: Sequence[str], publish
         published: Folder of all published sets; the file goes into a folder of the campaign's name.
 
     Raises:
-        RegistrationError: Other things are registered under this name, or cells of these settings were run already.
+        RegistrationError: Other things are registered under this name, cells of these settings were run already, or a test lacks baselines.
     """
     found = Registration(
         name=campaign.name,
@@ -57,7 +65,7 @@ def register(campaign: Campaign, setting: str, overrides: Sequence[str], publish
         software_version=version("advnerf"),
         scenarios=_scenarios(campaign),
         cells=tuple(registered_cell(cell) for cell in campaign.cells),
-        primary=tuple(_primary(campaign.cells)),
+        primary=tuple(primary_tests(campaign)),
         contrasts=campaign.contrasts,
     )
     folder = published / campaign.name
@@ -114,23 +122,50 @@ def _scenario(experiment: Experiment, name: str) -> RegisteredScenario:
     )
 
 
-def _primary(cells: Sequence[Cell]) -> list[PrimaryTest]:
-    """The gradient against all other methods, per scenario, on the hardened victim."""
+def primary_tests(campaign: Campaign) -> list[PrimaryTest]:
+    """The tests on the victim trained with textures, per scenario: the gradient against all baselines, and that in coarse cells against coarse ones.
+
+    Baselines are the methods whose textures neither trained nor judged the victim. A scenario without any has no test.
+
+    Raises:
+        RegistrationError: A scenario with a baseline lacks some of those that a test needs.
+    """
     tests = []
-    for scenario, placement in dict.fromkeys((cell.scenario, cell.placement) for cell in cells):
-        methods = dict.fromkeys(
-            cell.method
-            for cell in cells
-            if (cell.scenario, cell.placement, cell.victim) == (scenario, placement, HARDENED)
-        )
-        against = tuple(method for method in methods if method not in (*CONTROLS, _CLAIMED))
-        if _CLAIMED in methods and against:
-            tests.append(
-                PrimaryTest(
-                    scenario=scenario, placement=placement, victim=HARDENED, method=_CLAIMED, against=against
-                )
+    for scenario, placement in dict.fromkeys((cell.scenario, cell.placement) for cell in campaign.cells):
+        found = [each for each in campaign.cells if (each.scenario, each.placement) == (scenario, placement)]
+        methods = unseen(cell.method for cell in found if cell.victim == HARDENED and cell.searched)
+        against = [name for name in methods if name not in (GRADIENT, COARSE_GRADIENT)]
+        if GRADIENT not in methods or not against:
+            continue
+        lacking = _lacking(methods, read_experiment(campaign, found[0]).config)
+        if lacking:
+            raise RegistrationError(
+                f"{scenario_key(scenario, placement)}: expected the baselines that a test of the gradient needs, got {', '.join(against)} "
+                f"(textures of {', '.join(TRAINED_ON)} train the victim, those of {', '.join(VALIDATED_ON)} judge it); add {'; '.join(lacking)} to "
+                "the methods"
             )
+        coarse = [name for name in against if name in COARSE_BASELINES] if COARSE_GRADIENT in methods else []
+        tests += [
+            PrimaryTest(
+                scenario=scenario, placement=placement, victim=HARDENED, method=method, against=tuple(names)
+            )
+            for method, names in ((GRADIENT, against), (COARSE_GRADIENT, coarse))
+            if names
+        ]
     return tests
+
+
+def _lacking(methods: Sequence[str], config: ExperimentConfig) -> list[str]:
+    return lacking_baselines(methods, _coarse_cells_differ(config), unseen(RANDOM_FAMILIES))
+
+
+def _coarse_cells_differ(config: ExperimentConfig) -> bool:
+    """Whether coarse textures have other cells than the gradient's, where the gradient can have theirs: on a face, or on one panel."""
+    space = config.space
+    if isinstance(space, FaceConfig):
+        return 0 < space.cells < space.resolution
+    panel = len(config.objects) == 1 and config.objects[0].kind == PANEL
+    return isinstance(space, ColoursConfig) and panel and 0 < space.cells < config.object.panel_resolution
 
 
 def _refuse_late(campaign: Campaign) -> None:

@@ -21,7 +21,7 @@ from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.report.clips import read_clip
 from hardware.worlds.junction.config import DubinsConfig
 from hardware.worlds.world import World
-from nodes.experiment.attack import SEARCHED, attack_problem, surrogate_part
+from nodes.experiment.attack import attack_problem, surrogate_part
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.deploy import DRIVES, ThroughWorld, cell_data
@@ -30,6 +30,7 @@ from nodes.experiment.films import film_cell, filmed
 from nodes.experiment.objects import placed_objects, surrogate_of
 from nodes.experiment.policy import HARDENED, victim_file
 from nodes.experiment.run import load_experiment
+from nodes.experiment.search_files import SEARCHED
 from nodes.experiment.spaces import colour_space
 
 LAUNCH = Path(__file__).parents[3] / "launch" / "junction.experiment.yaml"

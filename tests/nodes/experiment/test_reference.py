@@ -4,9 +4,9 @@ import json
 import subprocess
 from pathlib import Path
 
-from nodes.experiment.reference import BUILD, PUBLISHED
+from nodes.experiment.reference import BUILD, PUBLISHED, ReferenceBuild
 from nodes.experiment.run import load_experiment
-from nodes.experiment.stage_record import RECORD, digest_of, read_record
+from nodes.experiment.stage_record import RECORD, Stage, StageRecord, digest_of, read_record, write_record
 
 ROOT = Path(__file__).parents[3]
 KEPT = ROOT / PUBLISHED / BUILD
@@ -18,7 +18,17 @@ def test_it_is_whole_and_small_enough():
     assert stages
     assert sorted(KEPT.iterdir()) == stages
     for stage in stages:
-        assert digest_of(stage) == read_record(stage).kept, f"{stage} is not as it was kept"
+        record = read_record(stage)
+        files = stage.with_name(record.files_in or stage.name)
+        assert digest_of(files) == record.kept, f"{files} is not as it was kept"
+        assert not record.files_in or [file.name for file in stage.iterdir()] == [RECORD]
+    kept = [read_record(stage) for stage in stages]
+    large = [
+        (stage.name[:5], each.kept)
+        for stage, each in zip(stages, kept, strict=True)
+        if stage.name[:5] == "scene" and not each.files_in
+    ]
+    assert len(set(large)) == len(large), "a scene is kept twice"
     assert sum(file.stat().st_size for file in KEPT.rglob("*")) < MOST_BYTES
 
 
@@ -39,3 +49,24 @@ def test_published_cells_of_the_room_are_of_it(tmp_path, monkeypatch):
     assert cells
     for file in cells:
         assert json.loads(file.read_text())["stages"] == dict(experiment.kept), file.name
+
+
+def test_two_stages_with_the_same_files_are_kept_once_and_both_are_taken(tmp_path):
+    build, work = ReferenceBuild(tmp_path / "build"), tmp_path / "run" / "scene"
+    work.mkdir(parents=True)
+    (work / "scene.bin").write_bytes(b"the same")
+    stage = Stage("scene", lambda folder, report: None, {})
+    for key in ("a" * 64, "b" * 64):
+        write_record(work, StageRecord(key, digest_of(work), 1.0, {}))
+        assert build.keep(stage, key, work) == build.folder / f"scene_{key[:16]}"
+        assert build.keep(stage, key, work) is None
+    assert sorted(file.name for file in build.folder.rglob("*") if file.is_file()) == [
+        "scene.bin",
+        RECORD,
+        RECORD,
+    ]
+    for key in ("a" * 64, "b" * 64):
+        taken = build.take(stage, key, tmp_path / key)
+        assert (taken.key, taken.files_in) == (key, "")
+        assert (tmp_path / key / "scene.bin").read_bytes() == b"the same"
+        assert read_record(tmp_path / key).key == key

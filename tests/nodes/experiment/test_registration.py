@@ -9,16 +9,27 @@ from advnerf_core.report.evidence.registration import FILE, RegistrationError, r
 from nodes.experiment.attack import cells
 from nodes.experiment.campaign.config import campaign_of
 from nodes.experiment.campaign.plan import plan_cells
-from nodes.experiment.campaign.registering import register
+from nodes.experiment.campaign.registering import primary_tests, register
 from nodes.experiment.keys import registered_settings
 from nodes.experiment.registered import registered_under
+from tests.support.stage_versions import TINY, tiny_experiment
 
 GRADIENT = "right_hardened_gradient_0"
+FAMILIES = ("random_coarse", "random_levels", "random_pink")
+METHODS = ("random", *FAMILIES, "cem", "gradient")
 
 
 @pytest.fixture
 def campaign(trained, tmp_path):
-    return campaign_of(replace(trained, folder=tmp_path / "run"), ["measure.seed=10000"], cells(trained))
+    return made_of(trained, tmp_path, METHODS)
+
+
+def made_of(trained, tmp_path, methods, **changes):
+    """A campaign of the experiment with other methods, and with other sections of its configuration."""
+    attack = trained.config.attack.model_copy(update={"methods": methods})
+    config = trained.config.model_copy(update={"attack": attack, **changes})
+    ours = replace(trained, config=config)
+    return campaign_of(replace(ours, folder=tmp_path / "run"), ["measure.seed=10000"], cells(ours))
 
 
 def test_a_registration_says_what_will_be_run(campaign, trained, tmp_path):
@@ -31,12 +42,48 @@ def test_a_registration_says_what_will_be_run(campaign, trained, tmp_path):
     assert scenario.evaluations == trained.config.attack.evaluations
     assert scenario.victims["naive_steps"] == trained.config.policy.naive_steps
     test = next(each for each in found.primary if each.scenario == "right")
-    assert (test.method, test.against) == ("gradient", ("random", "cem"))
+    # White noise has trained the victim: it is run, and is no baseline of the test.
+    assert (test.method, test.against) == ("gradient", (*FAMILIES, "cem"))
     # Once more it is the same; of another experiment it is refused.
     assert register(campaign, "tiny", [], tmp_path) == found
     fewer = replace(campaign, cells=campaign.cells[:5])
     with pytest.raises(RegistrationError, match="remove the file"):
         register(fewer, "tiny", [], tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("methods", "lacks"),
+    [
+        (("random_coarse", "gradient"), "2 more of the random textures random_levels, random_pink; a coarse search (cem or evolution)"),
+        (("random", "random_natural", *FAMILIES[:2], "cem", "gradient"), "1 more of the random textures random_pink"),
+        ((*FAMILIES, "gradient"), "a coarse search (cem or evolution)"),
+        ((*FAMILIES, "evolution", "gradient"), ""),
+        (("gradient",), ""),
+    ],
+)  # fmt: skip
+def test_a_test_needs_three_unseen_families_and_a_coarse_search(trained, tmp_path, methods, lacks):
+    if not lacks:
+        tests = primary_tests(made_of(trained, tmp_path, methods))
+        assert {test.against for test in tests} == ({methods[:-1]} if methods[:-1] else set())
+        return
+    with pytest.raises(RegistrationError, match="baselines that a test of the gradient needs") as refused:
+        primary_tests(made_of(trained, tmp_path, methods))
+    assert f"add {lacks} to the methods" in str(refused.value)
+
+
+def test_where_coarse_textures_have_other_cells_the_gradient_is_run_in_both(tmp_path):
+    def on_a_face(edge, methods):
+        changes = [f"space.cells={edge}", f"attack.methods=[{','.join(methods)}]"]
+        made = tiny_experiment(tmp_path / "run", changes)
+        return primary_tests(campaign_of(made, [*TINY, *changes], cells(made)))
+
+    methods = (*FAMILIES, "cem", "gradient")
+    assert [test.method for test in on_a_face(0, methods)] == ["gradient"]
+    with pytest.raises(RegistrationError, match="add gradient_coarse, as coarse textures have other cells"):
+        on_a_face(4, methods)
+    fine, coarse = on_a_face(4, (*methods, "gradient_coarse"))
+    assert (fine.method, fine.against) == ("gradient", methods[:-1])
+    assert (coarse.method, coarse.against) == ("gradient_coarse", ("random_coarse", "cem"))
 
 
 def test_a_registration_after_the_fact_is_refused(campaign, tmp_path):

@@ -1,0 +1,119 @@
+"""The best random search of a published set: what an attacker without a gradient reaches."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from advnerf_core.driving.metrics import mean_cte_limit_m
+from advnerf_core.report.cells import read_cell
+from advnerf_core.report.conditions import CONTROLS, style_of
+from advnerf_core.report.evidence.families import COARSE_SEARCHES, RANDOM_FAMILIES
+from advnerf_core.report.evidence.outcome import Outcome
+from advnerf_core.report.evidence.registration import read_registration
+from advnerf_core.report.evidence.results import DOMAINS, Evidence, Key
+
+
+@dataclass(frozen=True)
+class Reached:
+    """What searches of one method reached in one domain.
+
+    Attributes:
+        best_m: Excess of the best search, mean over its starts [m per tick].
+        off_track: Drives of the best search that left the track.
+        drives: Drives of the best search.
+        mean_m: Excess, mean over all searches [m per tick].
+        all_off_track: Drives of all searches that left the track.
+        all_drives: Drives of all searches.
+    """
+
+    best_m: float
+    off_track: int
+    drives: int
+    mean_m: float
+    all_off_track: int
+    all_drives: int
+
+    @property
+    def text(self) -> str:
+        """All of it, in words."""
+        return (
+            f"up to {self.best_m:.3f} m per tick ({self.off_track} of {self.drives} drives off the track), {self.mean_m:.3f} m in the mean of the "
+            f"searches ({self.all_off_track} of {self.all_drives})"
+        )
+
+
+@dataclass(frozen=True)
+class Strongest:
+    """The method without a gradient that moves a victim most where it is deployed, of one scenario.
+
+    Attributes:
+        scenario: Name of the scenario.
+        placement: Name of the placement.
+        victim: Name of the victim.
+        method: The method.
+        searches: Searches of it.
+        evaluations: Textures that each search tried.
+        surrogate: What they reached in the learned scene.
+        deployed: What they reached where they were deployed.
+        margin_m: Excess that counts as none for a victim that is called hardened [m per tick].
+    """
+
+    scenario: str
+    placement: str
+    victim: str
+    method: str
+    searches: int
+    evaluations: int
+    surrogate: Reached
+    deployed: Reached
+    margin_m: float
+
+    @property
+    def how(self) -> str:
+        """How it was searched, in words."""
+        return f"{style_of(self.method).title}, {self.searches} searches, each the best of {self.evaluations} textures"
+
+
+def strongest_random(folder: Path) -> list[Strongest]:
+    """The strongest method without a gradient in every scenario of a published set; none where none was deployed.
+
+    Args:
+        folder: Of the set.
+    """
+    registration = read_registration(folder)
+    if registration is None:
+        return []
+    wanted = {*RANDOM_FAMILIES, *COARSE_SEARCHES, *CONTROLS}
+    cells = [cell for file in sorted(folder.glob("*.json")) if (cell := read_cell(file)).method in wanted]
+    evidence = Evidence(registration, cells)
+    by_place: dict[tuple[str, str, str], dict[str, None]] = {}
+    for cell in evidence.cells.values():
+        if cell.method not in CONTROLS and cell.kept.get("deployed") and evidence.without(cell):
+            by_place.setdefault((cell.scenario, cell.placement, cell.victim), {})[cell.method] = None
+    found = [
+        [_of_method(evidence, (*place, method)) for method in methods] for place, methods in by_place.items()
+    ]
+    return [max(each, key=lambda strongest: strongest.deployed.best_m) for each in found]
+
+
+def _of_method(evidence: Evidence, key: Key) -> Strongest:
+    searches = [cell for cell in evidence.searches(key) if cell.kept.get("deployed")]
+    surrogate, deployed = (
+        _reached([evidence.outcomes(cell, domain) for cell in searches]) for domain in DOMAINS
+    )
+    scenario = evidence.scenario_of(searches[0])
+    margin_m = 0.5 * mean_cte_limit_m(scenario.off_track_m)
+    return Strongest(*key, len(searches), scenario.evaluations, surrogate, deployed, margin_m)
+
+
+def _reached(outcomes: Sequence[Sequence[Outcome]]) -> Reached:
+    means = [float(np.mean([each.excess_cte_m_per_tick for each in found])) for found in outcomes]
+    off = [sum(each.off_track for each in found) for found in outcomes]
+    best = int(np.argmax(means))
+    return Reached(
+        means[best], off[best], len(outcomes[best]), float(np.mean(means)), sum(off), sum(map(len, outcomes))
+    )

@@ -1,0 +1,86 @@
+"""A tiny set is registered, run and published; then nothing but the published files is left, and it is driven again."""
+
+import shutil
+from dataclasses import replace
+
+import pytest
+
+from advnerf_core.attack.artifact import load_attack, save_attack
+from advnerf_core.report.cells import read_cells
+from advnerf_core.report.evidence.hardness import PUBLISHED_FILE
+from advnerf_core.report.evidence.kept_build import LOST
+from advnerf_core.report.evidence.verify import verify_set, write_set
+from nodes.experiment import run
+from nodes.experiment.attack import cells
+from nodes.experiment.campaign.config import campaign_of
+from nodes.experiment.campaign.kept_attacks import attack_problems, with_attacks
+from nodes.experiment.campaign.plan import statuses
+from nodes.experiment.campaign.published import publish, publish_build
+from nodes.experiment.campaign.redrive import RedriveError, redrive
+from nodes.experiment.campaign.registering import register
+from nodes.experiment.campaign.run import Options, run_campaign
+from nodes.experiment.cells import ExperimentCells
+from nodes.experiment.reference import BUILD, ReferenceBuild
+from tests.support.stage_versions import TINY, tiny_experiment
+
+CHANGES = ("attack.methods=[gradient]", "attack.seeds=[0,1]", "measure.starts=2", "deploy.starts=1")
+
+
+def campaign_in(folder):
+    made = tiny_experiment(folder, CHANGES)
+    return campaign_of(made, [*TINY, *CHANGES], cells(made))
+
+
+@pytest.fixture
+def published(tiny_room, tmp_path, monkeypatch):
+    """Folder of a published set, of which only the published files are left."""
+    build, results = ReferenceBuild(tmp_path / "trained"), tmp_path / "docs" / "results"
+    assert ExperimentCells().keep(tiny_experiment(tiny_room[0]), build)
+    monkeypatch.setattr(run, "REFERENCE", build)
+    monkeypatch.chdir(tmp_path)
+    campaign = campaign_in(tmp_path / "run")
+    register(campaign, "demo", CHANGES, results)
+    run.make_ready(run.load_experiment(campaign.file, "demo", [*TINY, *CHANGES], campaign.folder), "policy")
+    ended = run_campaign(
+        campaign, campaign.cells, Options(here=True, ready=True, gate=False), lambda text: None
+    )
+    assert {end.how for end in ended} == {"done"}
+    publish(campaign, statuses(campaign, campaign.cells), results)
+    assert len(publish_build(campaign, campaign.cells, results).written) == 4
+    write_set(results / campaign.name)
+    shutil.rmtree(campaign.folder)
+    shutil.rmtree(build.folder)
+    monkeypatch.setattr(run, "REFERENCE", ReferenceBuild(results / BUILD))
+    return results / campaign.name
+
+
+def test_it_is_driven_again_from_the_published_files_alone(published, tmp_path):
+    found = verify_set(published)
+    assert with_attacks(found, published).problems == ()
+    searched = [cell for cell in read_cells(published) if cell.attack_id]
+    assert {file.stem for file in (published / "attacks").iterdir()} == {cell.attack_id for cell in searched}
+    assert not (published / PUBLISHED_FILE).exists()  # nobody judged its victim
+    page = (published.parent / "transfer.md").read_text()
+    assert "trained with textures" in page
+    assert "hardened" not in page
+    assert LOST not in page
+
+    again = redrive(campaign_in(tmp_path / "again"), published, 3, 0, lambda text: None)
+    assert len(again) == 3
+    # What is kept is what drove, so that poses come out as they were written: to the last digit that is kept.
+    assert max(each.off_m for each in again) < 2e-5
+    assert not list((tmp_path / "again" / "policy").glob("data*"))  # no victim was trained for it
+
+    # With another texture it would not.
+    first = sorted((published / "attacks").iterdir())[0]
+    attack = load_attack(first)
+    other = replace(attack.objects[0], theta=-attack.objects[0].theta)
+    save_attack(first, replace(attack, objects=(other,)), small=True)
+    (problem,) = attack_problems(published)
+    assert "expected attack, victim, method and seed" in problem
+    first.unlink()
+    assert any("found none" in text for text in attack_problems(published))
+
+    shutil.rmtree(published.parent / BUILD)
+    with pytest.raises(RedriveError, match=f"room {LOST}"):
+        redrive(campaign_in(tmp_path / "again"), published, 1, 0, lambda text: None)

@@ -1,0 +1,34 @@
+"""What the repository may weigh, as it is cloned."""
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from nodes.experiment.campaign.set_film import MOST_BYTES
+
+ROOT = Path(__file__).parents[1]
+MOST_TRACKED_BYTES = 70_000_000
+
+
+@pytest.fixture(scope="module")
+def tracked():
+    if not (ROOT / ".git").exists():
+        pytest.skip("no repository here")
+    names = subprocess.run(
+        ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
+    return [file for name in names.split("\0") if name and (file := ROOT / name).is_file()]
+
+
+def test_all_tracked_files_are_at_most_70_mb(tracked):
+    sizes = {file.relative_to(ROOT).as_posix(): file.stat().st_size for file in tracked}
+    largest = sorted(sizes, key=sizes.__getitem__)[-5:]
+    assert sum(sizes.values()) <= MOST_TRACKED_BYTES, f"the largest are {largest}"
+
+
+def test_films_of_published_sets_are_at_most_250_kb(tracked):
+    films = [file for file in tracked if file.match("docs/results/*.webp")]
+    assert films
+    assert {file.name: file.stat().st_size for file in films if file.stat().st_size > MOST_BYTES} == {}
+    assert MOST_BYTES == 250_000
