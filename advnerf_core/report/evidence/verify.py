@@ -18,9 +18,10 @@ from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import sha256_of, write_atomically
 from advnerf_core.report.cells import CellError, CellResult, read_cell
+from advnerf_core.report.evidence.about import check_about, read_about
 from advnerf_core.report.evidence.contrasts import contrast_data
 from advnerf_core.report.evidence.kept import KeptDrive
-from advnerf_core.report.evidence.page import film_of, picture_of, results_page
+from advnerf_core.report.evidence.page import above_of, film_of, picture_of, results_page
 from advnerf_core.report.evidence.registration import (
     FILE,
     WITHDRAWN,
@@ -68,8 +69,12 @@ def sets_in(published: Path) -> list[str]:
     return sorted(file.parents[1].name for file in published.glob(f"*/{FILE}"))
 
 
-def write_set(folder: Path) -> Path:
-    """Write the manifest, the numbers and the picture of a set; beside its folder its digest, and the page of all sets.
+def write_set(folder: Path, page: bool = True) -> Path:
+    """Write the manifest, the numbers and the pictures of a set; beside its folder its digest, and the page of all sets.
+
+    Args:
+        folder: Of the set.
+        page: Whether to write the page too, which reads all other sets.
 
     Raises:
         SetError: Nothing was registered there, or its cells contradict the registration.
@@ -89,16 +94,18 @@ def write_set(folder: Path) -> Path:
         **_published(evidence),
     }
     write_atomically(folder / SET, json.dumps(data, indent=1) + "\n")
-    from advnerf_core.report.evidence.plot import (
-        excess_plot,  # they load matplotlib, which verifying does not need
-    )
+    # They load matplotlib, which verifying does not need.
+    from advnerf_core.report.evidence.above import write_above_of
+    from advnerf_core.report.evidence.plot import excess_plot
     from advnerf_core.report.plots import write_png
 
     known = _known_digests(folder.parent)
     known[folder.name] = sha256_of(folder / SET)
     write_atomically(folder.parent / DIGESTS, json.dumps(known, indent=1, sort_keys=True) + "\n")
     write_png(excess_plot(evidence), folder.parent / picture_of(folder.name), dpi=110)
-    write_page(folder.parent)
+    write_above_of(folder)
+    if page:
+        write_page(folder.parent)
     return folder / SET
 
 
@@ -134,6 +141,10 @@ def verify_set(folder: Path) -> Verified:
 
 
 def _page_problems(published: Path) -> list[str]:
+    try:
+        check_about(published, sets_in(published))
+    except AdvnerfError as error:
+        return [str(error)]
     page = published / PAGE
     same = page.exists() and page.read_text(encoding="utf-8") == _page(published)
     return [] if same else [f"{page}: is not the page of the published sets"]
@@ -141,14 +152,21 @@ def _page_problems(published: Path) -> list[str]:
 
 def _page(published: Path) -> str:
     """The page of all sets, from their manifests and registrations."""
-    sets = {}
+    sets, about = {}, read_about(published)
     for name in sets_in(published):
         registration = read_registration(published / name)
         if registration is not None and (published / name / SET).exists():
             registered = {**registration.model_dump(mode="json"), "digest": registration.digest}
             data = read_json(published / name / SET)
-            filmed = (published / film_of(name)).exists()
-            sets[name] = {**data, "registered": registered, "filmed": filmed}
+            filmed, pictured = ((published / of(name)).exists() for of in (film_of, above_of))
+            said = about[name].model_dump(mode="json") if name in about else None
+            sets[name] = {
+                **data,
+                "registered": registered,
+                "about": said,
+                "filmed": filmed,
+                "pictured": pictured,
+            }
     return results_page(sets)
 
 
@@ -305,7 +323,7 @@ def _numbers(folder: Path, evidence: Evidence, withdrawn: Mapping[str, str]) -> 
         )
     if published.get("withdrawn", {}) != withdrawn:
         wrong.append(f"{SET}: expected what {WITHDRAWN} says was withdrawn, got {published.get('withdrawn')}")
-    for part in ("rows", "primary", *(["contrasts"] if "contrasts" in found else [])):
+    for part in ("searches", "rows", "primary", *(["contrasts"] if "contrasts" in found else [])):
         there = published.get(part, [])
         if len(there) != len(found[part]):
             wrong.append(f"{SET}, {part}: expected {len(found[part])}, got {len(there)}")
