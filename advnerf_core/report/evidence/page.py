@@ -18,11 +18,10 @@ of the place. No real car was driven ([what was and was not run](../was_not_run.
 start. There are two controls: the *plain object*, in its own colours, and *no object*. Claims use
 the smaller excess. Each set was registered before its cells were run, and `advnerf verify` computes
 all numbers again from the kept drives. [Evidence](../evidence.md) explains the method. Conditions of
-one set that share their searches share the drives in the learned scene, which stand once. A film
-shows the first search from the first start.
-"""
-_CONTRASTS_SAY = """The same attacks under two conditions that differ in one thing: excess over the plain object, after
-minus before, paired by search and start.
+one set that share their searches share the drives in the learned scene, which stand once. Films
+and stills show the first search from the first start. Tests are exact permutation tests over
+searches, adjusted by Holm over the set. *What each difference costs* compares the same attacks under
+two conditions: excess over the plain object, after minus before, paired by search and start.
 """
 # Columns that are left out where they tell no line from another.
 _OPTIONAL = ("condition", "victim", "collided")
@@ -33,7 +32,7 @@ def results_page(sets: Mapping[str, Mapping[str, Any]]) -> str:
 
     Args:
         sets: By name, what is in each ``set.json``, with the registration under ``registered``, its entry of `ABOUT` under ``about`` (None
-            without one), and under ``filmed`` and ``pictured`` whether there are a film and a picture of all drives.
+            without one), and under ``filmed`` whether there is a film.
     """
     return "\n".join([_HEAD, *_overview(sets), *(_section(name, sets) for name in sorted(sets))])
 
@@ -117,7 +116,7 @@ def _section(name: str, sets: Mapping[str, Mapping[str, Any]]) -> str:
             f"![Drives past the plain object, the strongest baseline and the attack]({film_of(name)})\n"
         )
     if data.get("contrasts"):
-        parts += ["### What each difference costs\n", _CONTRASTS_SAY, _contrasts(data["contrasts"])]
+        parts += ["### What each difference costs\n", _contrasts(data["contrasts"])]
     if explored:
         parts += ["### Not registered\n", "Run, and not registered before.\n", _table(explored)]
     parts += ["### How to run it\n", _commands(name, data["registered"])]
@@ -125,14 +124,10 @@ def _section(name: str, sets: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def _picture(name: str, data: Mapping[str, Any]) -> list[str]:
-    if not data.get("pictured") or not data["primary"]:
+    if not data["primary"]:
         return []
     shown, filmed = (place_of(data["primary"][at]["test"]) for at in (-1, 0))
-    stills = (
-        f" Stills: {filmed}, first search, first start; the kept frames nearest to these times."
-        if data["filmed"]
-        else ""
-    )
+    stills = f" Stills: {filmed}." if data["filmed"] else ""
     place = (data.get("about") or {}).get("object")
     stands = (
         f" Place of the object: {place['source']}." if place else " The place of the object was not kept."
@@ -159,11 +154,11 @@ def _role(name: str, sets: Mapping[str, Mapping[str, Any]]) -> list[str]:
 def _where(through: Sequence[str]) -> str:
     """Where it was deployed, so that no simulation passes for a real car."""
     known = {
-        "nodes": "the simulated lab, driven in real time by the live nodes",
-        "world": "the simulator of the place, with its own car where the condition names no other",
+        "nodes": "the simulated lab, driven by the live nodes",
+        "world": "the simulator, with its own car unless the condition says ideal",
         "nothing": "nowhere",
     }
-    return f"*Deployed* is {' and '.join(known.get(each, each) for each in through) or 'nowhere'}.\n"
+    return f"*Deployed* here: {' and '.join(known.get(each, each) for each in through) or 'nowhere'}.\n"
 
 
 def _withdrawn(data: Mapping[str, Any]) -> list[str]:

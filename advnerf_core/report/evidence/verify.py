@@ -21,7 +21,7 @@ from advnerf_core.report.cells import CellError, CellResult, read_cell
 from advnerf_core.report.evidence.about import check_about, read_about
 from advnerf_core.report.evidence.contrasts import contrast_data
 from advnerf_core.report.evidence.kept import KeptDrive
-from advnerf_core.report.evidence.page import above_of, film_of, picture_of, results_page
+from advnerf_core.report.evidence.page import film_of, picture_of, results_page
 from advnerf_core.report.evidence.registration import (
     FILE,
     WITHDRAWN,
@@ -158,15 +158,9 @@ def _page(published: Path) -> str:
         if registration is not None and (published / name / SET).exists():
             registered = {**registration.model_dump(mode="json"), "digest": registration.digest}
             data = read_json(published / name / SET)
-            filmed, pictured = ((published / of(name)).exists() for of in (film_of, above_of))
+            filmed = (published / film_of(name)).exists()
             said = about[name].model_dump(mode="json") if name in about else None
-            sets[name] = {
-                **data,
-                "registered": registered,
-                "about": said,
-                "filmed": filmed,
-                "pictured": pictured,
-            }
+            sets[name] = {**data, "registered": registered, "about": said, "filmed": filmed}
     return results_page(sets)
 
 

@@ -97,12 +97,12 @@ def _other_control(row: Mapping[str, Any], used: Excess) -> str:
 
 def _against_baseline(test: Mapping[str, Any]) -> str:
     only = len(test["test"]["against"]) == 1
-    baseline = f"{style_of(test['baseline']).title}, {'the only baseline that was run' if only else 'the strongest baseline in the learned scene'}"
+    baseline = f"{style_of(test['baseline']).title}, {'the only baseline run' if only else 'the strongest baseline in the learned scene'}"
     between = "" if test["low_m"] is None else f", 95 % interval {ends(test['low_m'], test['high_m'])} m"
-    said = f"The difference to {baseline}, is {test['difference_m']:.3f} m per tick{between}"
+    said = f"The difference to {baseline}, is {test['difference_m']:.3f} m{between}"
     if test["p"] is None:
         return f"{said}. {test['reason']}."
-    said += f" (exact permutation test over searches, p = {p_text(test['p_holm'])} after Holm's adjustment)."
+    said += f" (p = {p_text(test['p_holm'])} after Holm's adjustment)."
     searched = test.get("p_surrogate")
     if searched is None or searched < 0.05:
         return said
