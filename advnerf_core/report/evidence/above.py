@@ -130,7 +130,9 @@ def _groups(evidence: Evidence, test: PrimaryTest, baseline: str) -> list[_Group
         metrics = [each for cell in cells for each in evidence.metrics(cell, "deployed")]
         poses = [drive.poses() for cell in cells for drive in cell.kept["deployed"]]
         off = sum(each.off_track for each in metrics)
-        found.append(_Group(style_of(method).title, colour, poses, [each.ctes_m for each in metrics], off))
+        found.append(
+            _Group(style_of(method).title, colour, poses, [np.array(each.ctes_m) for each in metrics], off)
+        )
     return found
 
 
