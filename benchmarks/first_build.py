@@ -14,17 +14,20 @@ from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import CellResult, read_cells
 from advnerf_core.report.conditions import CONTROLS, order_of, style_of
 from advnerf_core.report.evidence.registration import FILE
+from advnerf_core.report.evidence.words import DOMAIN_TITLES
 from advnerf_core.report.transfer import DOMAINS, drives_in
+from benchmarks.questions import LOST
 from benchmarks.results import REPOSITORY
 
 PUBLISHED = REPOSITORY / "docs" / "results"
 PAGE = PUBLISHED / "first_build.md"
-_HEAD = """# The first build, in metres
+_HEAD = f"""# The first build, in metres
 
-These cells were run before results were registered. They kept the total |CTE| of each drive and
-not the drive itself, and each search was measured from the starts that it had searched from. They
-have no intervals and claim no test. The weights of their victims are lost, so they cannot be
-driven again. They will be replaced; what counts is on [Does it transfer?](transfer.md).
+{LOST}
+
+These cells were not registered. They kept the total |CTE| of each drive and not the drive itself,
+and each search was measured from the starts that it had searched from. They have no intervals and
+claim no test.
 
 `python -m benchmarks.first_build` writes this page from the cells beside it.
 """
@@ -64,7 +67,7 @@ def _rows(cells: list[CellResult]) -> Iterator[str]:
             off = [each for _, drives in found for each in drives.off_track]
             place = " ".join(filter(None, key[:2]))
             yield (
-                f"| {place} | {key[2]} | {style_of(key[3]).title} | {domain} | {len(found)} | {np.mean(excess):.3f} "
+                f"| {place} | {key[2]} | {style_of(key[3]).title} | {DOMAIN_TITLES[domain]} | {len(found)} | {np.mean(excess):.3f} "
                 f"| {sum(off)} of {len(off)} |\n"
             )
 

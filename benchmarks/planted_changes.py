@@ -24,6 +24,7 @@ from advnerf_core.driving.metrics import drive_metrics
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.files import sha256_of
 from advnerf_core.report.cells import cell_name
+from advnerf_core.report.evidence.about import ABOUT
 from advnerf_core.report.evidence.kept import KeptDrive
 from advnerf_core.report.evidence.page import film_of
 from advnerf_core.report.evidence.registration import (
@@ -63,7 +64,7 @@ def main() -> None:
                 shutil.copytree(PUBLISHED / name, original.parent / name)
                 if (film := PUBLISHED / film_of(name)).exists():
                     shutil.copy(film, original.parent / film.name)
-            for beside in (DIGESTS, PAGE):
+            for beside in (DIGESTS, PAGE, ABOUT):
                 shutil.copy(PUBLISHED / beside, original.parent / beside)
         else:
             write_simulated_set(original)

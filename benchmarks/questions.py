@@ -15,13 +15,23 @@ class Question:
         title: The question.
         answers: What it is about, in a sentence.
         commands: Benchmarks (``python -m benchmarks.NAME``) and other commands, by their beginning, that measure its rows.
+        picture: What stands first on the page, relative to it; empty for nothing.
+        lost: Whether its rows are of the earlier build, whose victims are lost.
     """
 
     slug: str
     title: str
     answers: str
     commands: tuple[str, ...]
+    picture: str = ""
+    lost: bool = False
 
+
+# At the head of each page of the earlier build.
+LOST = (
+    "**Results of an earlier build.** The weights of its victims were lost, so these drives cannot be repeated. The page goes when its "
+    "successor is there. Registered results are in [Does it transfer?](transfer.md)."
+)
 
 QUESTIONS = (
     Question(
@@ -40,6 +50,7 @@ QUESTIONS = (
             "mesh_render",
             "black_box",
             "ros2_black_box",
+            "campaign_scaling",
         ),
     ),
     Question(
@@ -66,6 +77,7 @@ QUESTIONS = (
         "Does an attack found in the learned room work live?",
         "The room with green screen and monitor, driven live on the simulated lab.",
         ("make experiment", "newcomer", "counterfactual_live"),
+        picture="room_above.webp",
     ),
     Question(
         "statistics",
@@ -84,19 +96,22 @@ QUESTIONS = (
         "junction",
         "Does an attack found in the learned junction work there?",
         "The paper's transfer experiment: objects beside three paths, searched in the learned scene, driven in the world itself.",
-        ("advnerf experiment launch/paper", "advnerf predict launch/paper", "campaign_scaling"),
+        ("advnerf experiment launch/paper", "advnerf predict launch/paper"),
+        lost=True,
     ),
     Question(
         "places_and_meshes",
         "Do places, mesh textures and mesh shapes work as attacks?",
         "The same transfer experiment over other spaces of search.",
         ("advnerf experiment launch/poses", "advnerf experiment launch/meshes"),
+        lost=True,
     ),
     Question(
         "retraining",
         "Does retraining on attacks help?",
         "Policies trained again on the attacks that were found against them.",
         ("advnerf experiment launch/",),
+        lost=True,
     ),
     Question(
         "stopping",
@@ -139,6 +154,7 @@ QUESTIONS = (
         "What is left of an attack in another world?",
         "Attacks on a panel that the world's own renderer shows, driven by the world's own car, and how well that was predicted.",
         ("gap", "predictions", "learned_roads", "unseen_roads", "make world"),
+        picture="gap_duckietown_robust_above.webp",
     ),
     Question(
         "green",

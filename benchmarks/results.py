@@ -21,12 +21,26 @@ from typing import Any
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from benchmarks.answers import Answer, answers, sets_table, table
-from benchmarks.questions import OTHER, QUESTIONS, Question, question_of
+from benchmarks.questions import LOST, OTHER, QUESTIONS, Question, question_of
 from nodes.runtime.machine import memory_gib, processor_name
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 LEDGER = REPOSITORY / "docs" / "results.json"
 PAGE = REPOSITORY / "docs" / "results.md"
+_PICTURE = """![All deployed drives in Duckietown's simulator from above, and what the camera saw](results/gap_duckietown_robust_above.webp)
+
+*All deployed drives of one registered set, in Duckietown's simulator. [Each set](results/transfer.md) has this picture. No real car
+was driven: [what was and was not run](was_not_run.md).*
+
+"""
+
+# Names in recorded rows, and those on pages.
+_NAMES = {
+    "surrogate": "learned scene",
+    "surrogates": "learned scenes",
+    "no attack": "plain object",
+}
+_NAMES_IN_ROWS = re.compile(rf"\b({'|'.join(_NAMES)})\b")
 
 # An absolute path, but not the second half of a relative one, of a fraction or of a unit.
 MACHINE_PATH = re.compile(r"(?<![\w.~$}<)/])/(?:tmp|var|home|root|work|opt|mnt|media|Users)/\S*")
@@ -114,36 +128,48 @@ def write_pages(rows: list[dict[str, Any]], page: Path, published: Path = PAGE.p
     folder.mkdir(parents=True, exist_ok=True)
     for question, found in answered.items():
         write_atomically(folder / f"{question.slug}.md", _question_page(question, found))
+    write_atomically(folder / "missed.md", _missed_page(answered))
     write_atomically(page, _index_page(answered, answers(rows, published), sets_table(published)))
 
 
 def _index_page(answered: dict[Question, list[dict[str, Any]]], found: list[Answer], sets: str) -> str:
     head = (
-        "# Measured results\n\nEvery figure was written by the command beside it, on the machine and day that its row names. A row that "
-        "misses its target stays, with the reason. The rows are in `results.json`; `python -m benchmarks.results` makes these pages.\n\n"
-        "## In short\n\n"
+        "# Measured results\n\n"
+        + (_PICTURE if sets else "")
+        + "Each figure was written by the command beside it, on the machine and day that its row names. `python -m benchmarks.results` makes these "
+        "pages from `results.json`.\n\n## In short\n\n"
         + table(found)
-        + "\n"
-        + (sets and f"{sets}\n")
-        + "## All rows\n\n| question | rows | with a target | missed |\n|---|---|---|---|\n"
+        + (sets and f"\n{sets}")
+        + "\n## All rows\n\nA row that misses its target stays, with the reason: [missed targets](results/missed.md).\n\n"
+        "| question | rows | with a target | missed |\n|---|---|---|---|\n"
     )
     lines = [
-        f"| [{question.title}](results/{question.slug}.md) {question.answers} | {len(found)} "
+        f"| [{question.title}](results/{question.slug}.md){' (earlier build)' if question.lost else ''} | {len(found)} "
         f"| {sum(row['met'] is not None for row in found)} | {sum(row['met'] is False for row in found)} |\n"
         for question, found in answered.items()
     ]
+    return head + "".join(lines)
+
+
+def _missed_page(answered: dict[Question, list[dict[str, Any]]]) -> str:
+    """All rows that miss their targets, as a table."""
     missed = [
-        f"- {row['line']}: {_value(row)}, target {row['target']} ([{question.slug.replace('_', ' ')}](results/{question.slug}.md))\n"
+        f"| {_escaped(_renamed(row['line']))} | {_renamed(_value(row))} | {_escaped(_renamed(row['target']))} | [{question.slug.replace('_', ' ')}]({question.slug}.md) |\n"
         for question, found in answered.items()
         for row in found
         if row["met"] is False
     ]
-    return head + "".join(lines) + "\n## Missed targets\n\n" + ("".join(missed) or "None.\n")
+    head = "# Missed targets\n\nRows that miss their targets. The reasons stand on the page of each row. [All questions](../results.md).\n\n"
+    return head + (
+        "| measured | value | target | page |\n|---|---|---|---|\n" + "".join(missed) if missed else "None.\n"
+    )
 
 
 def _question_page(question: Question, rows: list[dict[str, Any]]) -> str:
     """A page with one table for each command, in the order of the rows."""
-    text = f"# {question.title}\n\n{question.answers} [All questions](../results.md).\n"
+    text = f"# {question.title}\n\n" + (f"{LOST}\n\n" if question.lost else "")
+    text += f"![{question.title}]({question.picture})\n\n" if question.picture else ""
+    text += f"{question.answers} [All questions](../results.md).\n"
     for command in dict.fromkeys(row["command"] for row in rows):
         text += f"\n## `{command}`\n\n| measured | value | target | met | note | machine, date |\n|---|---|---|---|---|---|\n"
         text += "".join(_render_row(row) for row in rows if row["command"] == command)
@@ -157,8 +183,18 @@ def _value(row: dict[str, Any]) -> str:
 
 def _render_row(row: dict[str, Any]) -> str:
     met = {True: "yes", False: "**no**", None: "-"}[row["met"]]
-    cells = [row["line"], _value(row), row["target"], met, row["note"], f"{row['machine']}, {row['date']}"]
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
+    named = (row["line"], _value(row), row["target"], met, row["note"])
+    cells = [*map(_renamed, named), f"{row['machine']}, {row['date']}"]
+    return "| " + " | ".join(map(_escaped, cells)) + " |\n"
+
+
+def _renamed(text: str) -> str:
+    """The one name that pages have for each thing."""
+    return _NAMES_IN_ROWS.sub(lambda found: _NAMES[found[0]], text)
+
+
+def _escaped(cell: str) -> str:
+    return cell.replace("|", "\\|")
 
 
 @contextmanager

@@ -45,7 +45,7 @@ def _rows(*styles: Style) -> Mapping[str, Style]:
 
 # In the order of tables and legends.
 CONDITIONS: Mapping[str, Style] = _rows(
-    Style("no attack", NONE, "#0072b2", "#4fb0f2", "o"),
+    Style("plain object", NONE, "#0072b2", "#4fb0f2", "o"),
     Style("best random", "random", "#dd9300", "#f7cc5a", "s"),
     Style("random, coarse", "random_coarse", "#63470b", "#e99835", (4, 1, 0)),
     Style("random, levels", "random_levels", "#5a5841", "#b8ad79", (4, 1, 45)),

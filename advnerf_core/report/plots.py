@@ -23,7 +23,7 @@ from advnerf_core.report.conditions import EMPTY, NONE, order_of, style_of
 from advnerf_core.report.data import Domain, Fidelity, Laps, Latency, MemoryRow, ReportData, Run, Victim
 from advnerf_core.report.palette import LIGHT, LINE_STYLES, themed_svg
 
-_STYLE: dict[str, Any] = {
+STYLE: dict[str, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9,
     "svg.fonttype": "none",
@@ -57,7 +57,7 @@ _STYLE: dict[str, Any] = {
 @contextmanager
 def new_axes(width_in: float = 6.0, height_in: float = 3.4) -> Iterator[Any]:
     """Axes of a new figure in the report's style."""
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         yield Figure(figsize=(width_in, height_in), layout="constrained").add_subplot()
 
 
@@ -265,7 +265,7 @@ def svg(figure: Figure, description: str) -> str:
     """
     buffer = io.StringIO()
     nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure.savefig(buffer, format="svg", metadata=nothing)
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
@@ -284,7 +284,7 @@ def write_png(figure: Figure, path: Path, dpi: int = 160) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with matplotlib.rc_context(_STYLE):
+        with matplotlib.rc_context(STYLE):
             figure.savefig(temporary, format="png", dpi=dpi, facecolor="white")
         os.replace(temporary, path)
     finally:

@@ -68,7 +68,7 @@ def _what_was_done(data: ReportData) -> str:
         " Both were then shown to the driving car, frame by frame, by the live node graph." if live else ""
     )
     return (
-        f"A texture for one flat board was searched for in a learned copy of the room: {s.iterations} gradient steps over "
+        f"A texture for one flat board was searched for in a learned scene of the room: {s.iterations} gradient steps over "
         f"{s.horizon_steps} control ticks ({s.horizon_steps * s.control_period_s:g} s) from {_count(starts, 'start pose')} with "
         f"{_count(seeds, 'seed')}, against the best of {s.random_evaluations} random textures.{shown}"
     )
@@ -80,7 +80,7 @@ def _what_it_did(data: ReportData) -> str:
         _effect(rows, domain, data.settings.off_track_m) for domain in ("surrogate", "deployed")
     )
     return (
-        f"In the surrogate the total cross-track error (total CTE, the summed distance from the tape) {surrogate}. "
+        f"In the learned scene the total cross-track error (total CTE, the summed distance from the tape) {surrogate}. "
         f"On the live drive it {deployed}."
     )
 

@@ -438,6 +438,7 @@ def publish(
 ) -> None:
     """Copy the finished cells, and the scenes, victims and objects that they were run with, to where they are kept with the code."""
     from advnerf_core.report.evidence import registration
+    from advnerf_core.report.evidence.above import write_above_of
     from advnerf_core.report.evidence.verify import write_page, write_set
     from nodes.experiment.campaign.plan import statuses
     from nodes.experiment.campaign.published import publish as copy_cells
@@ -470,6 +471,7 @@ def publish(
         print(write_set(to / campaign.name))
         if (film := write_film(campaign, to / campaign.name)) is not None:
             print(film)
+            print(write_above_of(to / campaign.name))  # with frames of the film
         print(write_page(to))
     unfinished = len(cells) - len(found.written) - len(found.same)
     print(f"{len(found.written)} cells written, {len(found.same)} were there, {unfinished} are not finished")

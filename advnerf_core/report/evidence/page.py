@@ -1,81 +1,173 @@
-"""The page of registered results: for each set a picture, two sentences, the table in metres, and how to run it again."""
+"""The page of registered results: for each set a picture, a claim, the tables in metres, and how to run it again."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from advnerf_core.report.conditions import NONE, style_of
+from advnerf_core.report.conditions import EMPTY, NONE, style_of
 from advnerf_core.report.evidence.intervals import MEASURED_COVERAGE
 from advnerf_core.report.evidence.luck import luck_sentences
+from advnerf_core.report.evidence.words import DOMAIN_TITLES, NOT_DRIVEN, claim, ends, p_text, place_of
 from advnerf_core.report.tables import Table
 
 _HEAD = """# Does it transfer?
 
-Attacks are found in a learned copy of a place, then driven where they are deployed. The numbers
-are metres: excess |CTE| per tick is the mean |CTE| of a drive with the attack minus that of the
-drive without it from the same start. All of it was registered before it was run, and
-`advnerf verify` computes it again from the drives that are kept. What is registered, kept and
-tested is explained in [evidence.md](../evidence.md).
+An attack is found in the *learned scene* of a place. Then it is *deployed*: driven in the simulator
+of the place. No real car was driven ([what was and was not run](../was_not_run.md)).
 
-Intervals are nominal 95 % intervals. On simulated drives with a known truth they cover {:.0f} to {:.0f} %, least
-where a few searches differ strongly from the rest: [statistics](statistics.md).
+*Excess* is the mean |CTE| per tick of a drive past the attack, minus that of a control from the same
+start. There are two controls: the *plain object*, in its own colours, and *no object*. Claims use
+the smaller excess. Each set was registered before its cells were run, and `advnerf verify` computes
+all numbers again from the kept drives. [Evidence](../evidence.md) explains the method. Conditions of
+one set that share their searches share the drives in the learned scene, which stand once. Films
+and stills show the first search from the first start. Tests are exact permutation tests over
+searches, adjusted by Holm over the set. *What each difference costs* compares the same attacks under
+two conditions: excess over the plain object, after minus before, paired by search and start.
+
+Intervals are nominal 95 % intervals. On simulated drives with a known truth they cover {:.0f} to {:.0f} %,
+least where a few searches differ strongly from the rest: [statistics](statistics.md). *Decided after*
+is when a test that may be read after every pair of searches would have ended; it claims nothing.
 """.format(*MEASURED_COVERAGE)
-_MOST_SENTENCES = 4
-_TESTS_SAY = """Primary tests: the deployed excess of the attack minus that of the baseline that is strongest in the
-surrogate, under each condition; exact permutation tests over searches, adjusted by Holm over this
-table. The difference where they search, and its p, are beside it and are not adjusted.
-"""
-_CONTRASTS_SAY = """The same attacks, driven under two conditions that differ in one thing: excess after minus before,
-paired by search and start.
-"""
-_COLUMNS = (
-    "victim",
-    "object shows",
-    "driven in",
-    "searches x starts",
-    "excess [m per tick]",
-    "95 %",
-    "off track",
-    "collided",
-    "ticks off lane",
-    "leaves after [s]",
-)
+# Columns that are left out where they tell no line from another.
+_OPTIONAL = ("condition", "victim", "collided")
 
 
 def results_page(sets: Mapping[str, Mapping[str, Any]]) -> str:
     """The page in Markdown.
 
     Args:
-        sets: By name, what is in each ``set.json``, with the registration under ``registered``, under ``filmed`` whether there is a film, and under ``notes``
-            paragraphs about its baselines and about what is kept.
+        sets: By name, what is in each ``set.json``, with the registration under ``registered``, its entry of `ABOUT` under ``about`` (None
+            without one), under ``filmed`` whether there is a film, and under ``notes`` paragraphs about its baselines and about what is kept.
     """
-    return "\n".join([_HEAD, *(_section(name, data) for name, data in sorted(sets.items()))])
+    return "\n".join([_HEAD, *_overview(sets), *(_section(name, sets) for name in sorted(sets))])
 
 
-def _section(name: str, data: Mapping[str, Any]) -> str:
+def groups_of_searches(sets: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
+    """Names of sets, together where they share searches."""
+    groups: list[tuple[set[str], list[str]]] = []
+    for name, data in sorted(sets.items()):
+        attacks, names = {each["attack_id"] for each in data["searches"]}, [name]
+        for group in [each for each in groups if each[0] & attacks]:
+            groups.remove(group)
+            attacks, names = attacks | group[0], group[1] + names
+        groups.append((attacks, names))
+    return sorted(names for _, names in groups)
+
+
+def above_of(name: str) -> str:
+    """File name of the picture of all drives of a set, beside the page."""
+    return f"{name}_above.webp"
+
+
+def picture_of(name: str) -> str:
+    """File name of the picture of the excess of a set, beside the page."""
+    return f"{name}_excess.png"
+
+
+def film_of(name: str) -> str:
+    """File name of the film of a set, beside the page."""
+    return f"{name}_drives.webp"
+
+
+def _overview(sets: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Which sets there are, how many of them are independent, and what each was for."""
+    said = {name: data["about"] for name, data in sets.items() if data.get("about")}
+    if not said:
+        return []
+    count, worlds = len(groups_of_searches(sets)), len({about["world"] for about in said.values()})
+    columns = ("set", "world", "role", "searches", "shares searches with")
+    rows = tuple(
+        (
+            f"[{name}](#{name})",
+            about["world"],
+            about["role"],
+            str(len(sets[name]["searches"])),
+            _shared(name, sets),
+        )
+        for name, about in sorted(said.items())
+    )
+    sentence = f"The {len(sets)} sets are {count} groups of searches in {worlds} worlds. Sets that share searches are not independent.\n"
+    return [sentence, _markdown(columns, rows)]
+
+
+def _shared(name: str, sets: Mapping[str, Mapping[str, Any]]) -> str:
+    """Other sets that drove the same searches, and how many of them; empty without any."""
+    own = {each["attack_id"] for each in sets[name]["searches"]}
+    counts = {
+        other: len(own & {each["attack_id"] for each in data["searches"]})
+        for other, data in sorted(sets.items())
+        if other != name
+    }
+    return ", ".join(f"{other} ({count} of {len(own)})" for other, count in counts.items() if count)
+
+
+def _section(name: str, sets: Mapping[str, Mapping[str, Any]]) -> str:
+    data = sets[name]
     registered, explored = (
         [row for row in data["rows"] if row["registered"] is wanted] for wanted in (True, False)
     )
     parts = [
         f"## {name}\n",
-        *(
-            [f"![Drives without attack, past the strongest baseline, past the attack]({film_of(name)})\n"]
-            * data["filmed"]
-        ),
-        f"![Excess of every drive, by method and domain]({picture_of(name)})\n",
-        _where(data["deployed_through"]) + "\n",
+        *_picture(name, data),
+        *_role(name, sets),
+        _where(data["deployed_through"]),
         *data.get("notes", ()),
         *_withdrawn(data),
-        *_tests(data),
-        _table(registered),
     ]
+    if data["primary"]:
+        told = data["primary"][-1]
+        said = filter(None, [claim(told, data["rows"]), luck_sentences(told)])
+        parts += [*(f"{each}\n" for each in said), _tests(data["primary"])]
+    parts += [_table(registered), f"![Excess of every drive, by method and domain]({picture_of(name)})\n"]
+    if data["filmed"]:
+        parts.append(
+            f"![Drives past the plain object, the strongest baseline and the attack]({film_of(name)})\n"
+        )
     if data.get("contrasts"):
-        parts += ["### What each difference costs\n", _CONTRASTS_SAY, _contrasts(data["contrasts"])]
+        parts += ["### What each difference costs\n", _contrasts(data["contrasts"])]
     if explored:
-        parts += ["### Exploration\n", "Run, and not registered before.\n", _table(explored)]
+        parts += ["### Not registered\n", "Run, and not registered before.\n", _table(explored)]
     parts += ["### How to run it\n", _commands(name, data["registered"])]
     return "\n".join(parts)
+
+
+def _picture(name: str, data: Mapping[str, Any]) -> list[str]:
+    if not data["primary"]:
+        return []
+    shown, filmed = (place_of(data["primary"][at]["test"]) for at in (-1, 0))
+    stills = f" Stills: {filmed}." if data["filmed"] else ""
+    place = (data.get("about") or {}).get("object")
+    stands = (
+        f" Place of the object: {place['source']}." if place else " The place of the object was not kept."
+    )
+    return [
+        f"![All deployed drives from above, and what the camera saw]({above_of(name)})\n",
+        f"*Drives: {shown}.{stills}{stands}*\n",
+    ]
+
+
+def _role(name: str, sets: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    about = sets[name].get("about")
+    if not about:
+        return []
+    after = f", registered after {about['after']}" if about["after"] else ""
+    shared = _shared(name, sets)
+    return [
+        f"**{about['role'].capitalize()}**{after}. What changed: {about['changed']}"
+        + (f" Searches shared with {shared}." if shared else "")
+        + "\n"
+    ]
+
+
+def _where(through: Sequence[str]) -> str:
+    """Where it was deployed, so that no simulation passes for a real car."""
+    known = {
+        "nodes": "the simulated lab, driven by the live nodes",
+        "world": "the simulator, with its own car unless the condition says ideal",
+        "nothing": "nowhere",
+    }
+    return f"*Deployed* here: {' and '.join(known.get(each, each) for each in through) or 'nowhere'}.\n"
 
 
 def _withdrawn(data: Mapping[str, Any]) -> list[str]:
@@ -93,159 +185,102 @@ def _withdrawn(data: Mapping[str, Any]) -> list[str]:
     return sentences
 
 
-def _tests(data: Mapping[str, Any]) -> list[str]:
-    """Sentences about the primary tests; a table where there are many."""
-    if len(data["primary"]) <= _MOST_SENTENCES:
-        return [_sentences(test, data["rows"]) + "\n" for test in data["primary"]]
-    columns = (
-        "condition",
-        "victim",
-        "method",
-        "against",
-        "difference [m per tick]",
-        "95 %",
-        "p after Holm",
-        "where they search",
-        "p there",
-    )
-    rows = tuple(
-        (
-            _place(test["test"]),
-            test["test"]["victim"],
-            style_of(test["test"]["method"]).title,
-            style_of(test["baseline"]).title,
-            f"{test['difference_m']:.3f}",
-            _ends(test),
-            test["reason"] if test["p"] is None else _p(test["p_holm"]),
-            f"{test['difference_surrogate_m']:+.3f}",
-            "" if test["p_surrogate"] is None else _p(test["p_surrogate"]),
-        )
-        for test in data["primary"]
-    )
-    return [_TESTS_SAY, Table("", columns, rows, (False,) * len(columns)).markdown()]
-
-
-def _contrasts(found: Sequence[Mapping[str, Any]]) -> str:
-    columns = (
-        "what differs",
-        "victim",
-        "attack",
-        "searches x starts",
-        "before [m per tick]",
-        "after",
-        "difference",
-        "95 %",
-    )
-    rows = tuple(
-        (
-            row["name"] + ("" if row["registered"] else " (exploration)"),
-            row["victim"],
-            style_of(row["method"]).title,
-            f"{row['searches']} x {row['drives'] // row['searches']}",
-            f"{row['before_m']:.3f}",
-            f"{row['after_m']:.3f}",
-            f"{row['difference_m']:+.3f}",
-            _ends(row),
-        )
-        for row in found
-    )
-    return Table("", columns, rows, (False,) * len(columns)).markdown()
-
-
-def _ends(row: Mapping[str, Any]) -> str:
-    return "" if row["low_m"] is None else f"{row['low_m']:.3f} to {row['high_m']:.3f}"
-
-
-def _place(row: Mapping[str, Any]) -> str:
-    """A condition as readers see it."""
-    return f"{row['scenario']} {row['placement']}".strip().replace("_", " ")
-
-
-def picture_of(name: str) -> str:
-    """File name of the picture of a set, beside the page."""
-    return f"{name}_excess.png"
-
-
-def film_of(name: str) -> str:
-    """File name of the film of a set, beside the page."""
-    return f"{name}_drives.webp"
-
-
-def _where(through: Sequence[str]) -> str:
-    """Where it was deployed, so that no simulation passes for a real car."""
-    known = {
-        "nodes": "the simulated lab, driven in real time by the live nodes",
-        "world": "the simulator of the place, with its own car where the condition names no other",
-        "nothing": "nowhere",
-    }
-    return f"*Deployed* is {' and '.join(known.get(each, each) for each in through) or 'nowhere'}. No real car was driven."
-
-
-def _sentences(test: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
-    which = test["test"]
-    key = {name: which[name] for name in ("scenario", "placement", "victim", "method")}
-    row = next(
-        each
-        for each in rows
-        if each["domain"] == "deployed" and all(each[name] == value for name, value in key.items())
-    )
-    place = _place(which)
-    first = (
-        f"**{place}, victim: {which['victim']}.** Where it is deployed, the {style_of(which['method']).title} attack moves the car "
-        f"{row['excess_m']:.3f} m per tick further from its path{_between(row)}, and {row['off_track']} of {row['drives']} drives leave the "
-        "track."
-    )
-    baseline = f"{style_of(test['baseline']).title}, the strongest baseline in the surrogate"
-    between = "" if test["low_m"] is None else f", 95 % interval {_ends(test)} m"
-    difference = f"{first} The difference to {baseline}, is {test['difference_m']:.3f} m per tick{between}"
-    there = f"Where they search, in the learned scene, it is {test['difference_surrogate_m']:+.3f} m per tick"
-    if test["p"] is None:
-        return f"{difference}. {there}. {test['reason']}."
-    return " ".join(
+def _tests(tests: Sequence[Mapping[str, Any]]) -> str:
+    """The primary tests: deployed excess of the attack minus that of the baseline."""
+    return _lines(
         [
-            f"{difference} (exact permutation test over searches, p = {_p(test['p_holm'])} after Holm's adjustment).",
-            f"{there} (same test, p = {_p(test['p_surrogate'])}, not adjusted).",
-            *filter(None, [_sooner(test["anytime"]), luck_sentences(test)]),
+            {
+                "condition": place_of(test["test"]),
+                "victim": test["test"]["victim"],
+                "attack": style_of(test["test"]["method"]).title,
+                "minus": style_of(test["baseline"]).title,
+                "difference [m per tick]": f"{test['difference_m']:.3f}",
+                "95 %": ends(test["low_m"], test["high_m"]),
+                "p deployed, after Holm": "not tested" if test["p"] is None else p_text(test["p_holm"]),
+                "in the learned scene": f"{test['difference_surrogate_m']:+.3f}",
+                "p there, not adjusted": _optional_p(test["p_surrogate"]),
+                "decided after": _decided(test["anytime"]),
+            }
+            for test in tests
         ]
     )
 
 
-def _sooner(found: Mapping[str, Any]) -> str:
-    """Whether fewer searches would have decided; empty if not."""
-    if found["pairs"] is None or found["pairs"] == found["of_pairs"]:
-        return ""
-    return f"An anytime-valid test would have decided after {found['pairs']} of {found['of_pairs']} pairs of searches."
+def _decided(found: Mapping[str, Any]) -> str:
+    """After how many pairs of searches the anytime-valid test would have decided."""
+    return f"{found['pairs'] or '-'} of {found['of_pairs']} pairs" if found["of_pairs"] else ""
 
 
-def _between(row: Mapping[str, Any]) -> str:
-    return "" if row["low_m"] is None else f" (95 % interval {row['low_m']:.3f} to {row['high_m']:.3f} m)"
+def _optional_p(value: float | None) -> str:
+    return "" if value is None else p_text(value)
 
 
-def _p(value: float) -> str:
-    return f"{value:.4f}" if value >= 0.001 else f"{value:.1e}"
+def _contrasts(found: Sequence[Mapping[str, Any]]) -> str:
+    return _lines(
+        [
+            {
+                "what differs": row["name"] + ("" if row["registered"] else " (not registered)"),
+                "victim": row["victim"],
+                "attack": style_of(row["method"]).title,
+                "searches x starts": f"{row['searches']} x {row['drives'] // row['searches']}",
+                "before [m per tick]": f"{row['before_m']:.3f}",
+                "after": f"{row['after_m']:.3f}",
+                "difference": f"{row['difference_m']:+.3f}",
+                "95 %": ends(row["low_m"], row["high_m"]),
+            }
+            for row in found
+        ]
+    )
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> str:
-    several = len({_place(row) for row in rows}) > 1
-    columns = ("condition", *_COLUMNS) if several else _COLUMNS
-    cells = tuple(((_place(row),) if several else ()) + tuple(_cells(row)) for row in rows)
-    return Table("", columns, cells, (False,) * len(columns)).markdown()
+    """One line for each method and domain. Conditions of the same searches share their drives in the learned scene, which stand once."""
+    shown: list[dict[str, str]] = []
+    for cells in map(_cells, rows):
+        before = [
+            {**other, "condition": ""}
+            for other in shown
+            if other["driven in"] == cells["driven in"] != DOMAIN_TITLES["deployed"]
+        ]
+        if {**cells, "condition": ""} not in before:
+            shown.append(cells)
+    return _lines(shown)
 
 
-def _cells(row: Mapping[str, Any]) -> list[str]:
-    excess = f"{row['excess_m']:.3f}" if row["method"] != NONE else f"(mean abs. CTE {row['excess_m']:.3f})"
-    return [
-        row["victim"],
-        style_of(row["method"]).title,
-        row["domain"],
-        f"{row['searches']} x {row['drives'] // row['searches']}",
-        excess,
-        _ends(row),
-        f"{row['off_track']} of {row['drives']}",
-        _collisions(row["collided"]),
-        f"{100 * row['off_lane_share']:.0f} %",
-        "" if row["leaving_s"] is None else f"{row['leaving_s']:.1f}",
-    ]
+def _lines(lines: Sequence[Mapping[str, str]]) -> str:
+    """A table of lines by column, without those of `_OPTIONAL` that say the same in all lines."""
+    columns = tuple(
+        name
+        for name in (lines[0] if lines else {})
+        if name not in _OPTIONAL or len({line[name] for line in lines}) > 1
+    )
+    return _markdown(columns, tuple(tuple(line[name] for name in columns) for line in lines))
+
+
+def _cells(row: Mapping[str, Any]) -> dict[str, str]:
+    plain = f"{row['excess_m']:.3f}" if row["method"] != NONE else f"(mean abs. CTE {row['excess_m']:.3f})"
+    bare = "" if row["method"] == EMPTY else NOT_DRIVEN
+    if row["over_no_object_m"] is not None:
+        bare = f"{row['over_no_object_m']:.3f}"
+    return {
+        "condition": place_of(row),
+        "victim": row["victim"],
+        "object": style_of(row["method"]).title,
+        "driven in": DOMAIN_TITLES[row["domain"]],
+        "searches x starts": f"{row['searches']} x {row['drives'] // row['searches']}",
+        "excess over plain object [m per tick]": plain,
+        "95 %": ends(row["low_m"], row["high_m"]),
+        "over no object": bare,
+        "95 % of it": ends(row["over_no_object_low_m"], row["over_no_object_high_m"]),
+        "off track": f"{row['off_track']} of {row['drives']}",
+        "collided": _collisions(row["collided"]),
+        "ticks off lane": f"{100 * row['off_lane_share']:.0f} %",
+        "leaves after [s]": "" if row["leaving_s"] is None else f"{row['leaving_s']:.1f}",
+    }
+
+
+def _markdown(columns: tuple[str, ...], rows: tuple[tuple[str, ...], ...]) -> str:
+    return Table("", columns, rows, (False,) * len(columns)).markdown()
 
 
 def _collisions(counts: Mapping[str, int]) -> str:

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from advnerf_core.report.conditions import NONE, style_of
 from advnerf_core.report.evidence.results import Evidence, Row, rows
+from advnerf_core.report.evidence.words import DOMAIN_TITLES
 from advnerf_core.report.palette import LIGHT
 from advnerf_core.report.plots import new_axes
 
@@ -43,11 +44,12 @@ def _drives(evidence: Evidence, shown: list[Row], titles: Mapping[str, str]) -> 
                 error = [[row.excess_m - row.low_m], [row.high_m - row.excess_m]]
                 ax.errorbar(place + 0.3, row.excess_m, error, fmt="_", color=LIGHT["ink"], ms=7, capsize=3)
         names = [
-            f"{style_of(row.method).title}\n{row.domain}\n{' '.join(filter(None, (row.scenario, row.placement)))},\n{titles.get(row.victim, row.victim)}"
+            f"{style_of(row.method).title}\n{DOMAIN_TITLES[row.domain]}\n{' '.join(filter(None, (row.scenario, row.placement)))},"
+            f"\n{titles.get(row.victim, row.victim)}"
             for row in shown
         ]
         ax.set_xticks(range(len(shown)), names, size=7.5)
-        ax.set(ylabel="excess |CTE| per tick [m]", xlim=(-0.6, len(shown) - 0.4))
+        ax.set(ylabel="excess |CTE| per tick over the plain object [m]", xlim=(-0.6, len(shown) - 0.4))
         ax.grid(axis="x", visible=False)
     figure: Figure = ax.figure
     return figure
@@ -67,7 +69,7 @@ def _means(shown: list[Row], titles: Mapping[str, str]) -> Figure:
             )
             if row.low_m is not None and row.high_m is not None:
                 ax.plot([row.low_m, row.high_m], [down, down], color=style.light, lw=1.2, zorder=2)
-            label = f"{style.title}, {row.domain}"
+            label = f"{style.title}, {DOMAIN_TITLES[row.domain]}"
             drawn = {
                 "color": style.light,
                 "mfc": style.light if filled else LIGHT["paper"],
@@ -79,7 +81,7 @@ def _means(shown: list[Row], titles: Mapping[str, str]) -> Figure:
         ax.figure.legend(entries.values(), entries.keys(), loc="outside upper left", ncols=3)
         names = [f"{' '.join(filter(None, place[:2]))}, {titles.get(place[2], place[2])}" for place in places]
         ax.set_yticks(range(len(places)), [name.replace("_", " ") for name in names])
-        ax.set(xlabel="excess |CTE| per tick [m]", ylim=(len(places) - 0.5, -0.5))
+        ax.set(xlabel="excess |CTE| per tick over the plain object [m]", ylim=(len(places) - 0.5, -0.5))
         ax.grid(axis="y", visible=False)
     figure: Figure = ax.figure
     return figure

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from advnerf_core.driving.metrics import DriveMetrics
 from advnerf_core.report.cells import CellResult, cell_name
-from advnerf_core.report.conditions import NONE
+from advnerf_core.report.conditions import CONTROLS, EMPTY, NONE
 from advnerf_core.report.evidence.anytime import AnytimeTest, anytime_test
 from advnerf_core.report.evidence.exact import McNemar, holm, mcnemar_per_search, permutation_test
 from advnerf_core.report.evidence.intervals import (
@@ -46,9 +46,12 @@ class Row:
         domain: surrogate or deployed.
         searches: Number of searches.
         drives: Number of drives.
-        excess_m: Mean excess |CTE| per tick [m]; of ``none`` its mean |CTE|.
+        excess_m: Mean excess |CTE| per tick over the plain object [m]; of ``none`` its mean |CTE|.
         low_m: Lower end of its interval [m]; None where there are too few drives.
         high_m: Upper end [m].
+        over_no_object_m: Mean excess over no object [m]; None where no drive without object was made, and of these drives themselves.
+        over_no_object_low_m: Lower end of its interval [m].
+        over_no_object_high_m: Upper end [m].
         over: What the interval is over.
         off_track: Drives that left the track.
         collided: Drives that ended in a collision, by what the car ran into.
@@ -67,6 +70,9 @@ class Row:
     excess_m: float
     low_m: float | None
     high_m: float | None
+    over_no_object_m: float | None
+    over_no_object_low_m: float | None
+    over_no_object_high_m: float | None
     over: str
     off_track: int
     collided: dict[str, int]
@@ -168,13 +174,13 @@ class Evidence:
             self._metrics[key] = [drive.metrics(path, horizon) for drive in cell.kept.get(domain, ())]
         return self._metrics[key]
 
-    def without(self, cell: CellResult) -> CellResult | None:
-        """The cell of the same drives without attack."""
-        return self.cells.get(cell_name(cell.scenario, cell.victim, NONE, 0, cell.placement))
+    def without(self, cell: CellResult, control: str = NONE) -> CellResult | None:
+        """The cell of the same drives past a control: the plain object (``none``) or no object (``empty``)."""
+        return self.cells.get(cell_name(cell.scenario, cell.victim, control, 0, cell.placement))
 
-    def outcomes(self, cell: CellResult, domain: Domain) -> list[Outcome]:
-        """Outcomes of the drives of a cell, each against the drive without attack from the same start."""
-        clean, horizon = self.without(cell), self.scenario_of(cell).horizon
+    def outcomes(self, cell: CellResult, domain: Domain, control: str = NONE) -> list[Outcome]:
+        """Outcomes of the drives of a cell, each against the drive past a control from the same start; none without such drives."""
+        clean, horizon = self.without(cell, control), self.scenario_of(cell).horizon
         if clean is None:
             return []
         pairs = zip(
@@ -224,6 +230,7 @@ def as_data(evidence: Evidence) -> dict[str, Any]:
     through = {str(cell.extra.get("deployed_through", "simulation")) for cell in evidence.cells.values()}
     return {
         "deployed_through": sorted(through),
+        "searches": search_list(evidence),
         "rows": [vars(row) for row in rows(evidence)],
         "primary": [
             {
@@ -238,13 +245,26 @@ def as_data(evidence: Evidence) -> dict[str, Any]:
     }
 
 
+def search_list(evidence: Evidence) -> list[dict[str, Any]]:
+    """The searches of a set, each once: conditions, and other sets, may have driven what one search found."""
+    found = {
+        (cell.victim, cell.method, cell.seed, cell.attack_id or "")
+        for cell in evidence.cells.values()
+        if cell.method not in CONTROLS
+    }
+    keys = ("victim", "method", "seed", "attack_id")
+    return [dict(zip(keys, each, strict=True)) for each in sorted(found)]
+
+
 def _row(evidence: Evidence, key: Key, domain: Domain) -> Row | None:
     cells = [cell for cell in evidence.searches(key) if cell.kept.get(domain)]
     outcomes = [evidence.outcomes(cell, domain) for cell in cells]
     if not cells or not all(outcomes):
         return None
     values = [_values_m(evidence, cell, domain, found) for cell, found in zip(cells, outcomes, strict=True)]
-    interval = clustered_interval(values, evidence.registration.level, shared_starts=_equally_many(values))
+    interval = _interval(evidence, values)
+    bare = _over_no_object_m(evidence, cells, domain)
+    bare_interval = _interval(evidence, bare) if bare else None
     flat = [outcome for found in outcomes for outcome in found]
     leaving = [outcome.time_to_leaving_s for outcome in flat if outcome.time_to_leaving_s is not None]
     return Row(
@@ -255,6 +275,9 @@ def _row(evidence: Evidence, key: Key, domain: Domain) -> Row | None:
         excess_m=float(np.mean([np.mean(each) for each in values])),
         low_m=interval.low if interval else None,
         high_m=interval.high if interval else None,
+        over_no_object_m=float(np.mean([np.mean(each) for each in bare])) if bare else None,
+        over_no_object_low_m=bare_interval.low if bare_interval else None,
+        over_no_object_high_m=bare_interval.high if bare_interval else None,
         over=interval.over if interval else "",
         off_track=sum(outcome.off_track for outcome in flat),
         collided=dict(sorted(Counter(filter(None, (outcome.collided_with for outcome in flat))).items())),
@@ -272,8 +295,15 @@ def _values_m(
     return [outcome.excess_cte_m_per_tick for outcome in outcomes]
 
 
-def _equally_many(values: Sequence[Sequence[float]]) -> bool:
-    return len({len(each) for each in values}) == 1
+def _over_no_object_m(evidence: Evidence, cells: Sequence[CellResult], domain: Domain) -> list[list[float]]:
+    """Excess of each drive over no object, by cell; empty where a cell has no drives to compare with, or is the control itself."""
+    found = [evidence.outcomes(cell, domain, EMPTY) for cell in cells if cell.method != EMPTY]
+    return [[each.excess_cte_m_per_tick for each in outcomes] for outcomes in found] if all(found) else []
+
+
+def _interval(evidence: Evidence, values: Sequence[Sequence[float]]) -> ClusteredInterval | None:
+    shared = len({len(each) for each in values}) == 1
+    return clustered_interval(values, evidence.registration.level, shared_starts=shared)
 
 
 def _test(evidence: Evidence, test: PrimaryTest) -> TestResult | None:
@@ -319,7 +349,7 @@ def _difference(
         [[outcome.excess_cte_m_per_tick for outcome in evidence.outcomes(cell, "deployed")] for cell in cells]
         for cells in (method, baseline)
     )
-    if not _equally_many([*one, *other]):
+    if len({len(each) for each in (*one, *other)}) != 1:
         return None
     return difference_interval(np.array(one), np.array(other), evidence.registration.level)
 

@@ -18,6 +18,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import sha256_of, write_atomically
 from advnerf_core.report.cells import CellError, CellResult, read_cell
+from advnerf_core.report.evidence.about import check_about, read_about
 from advnerf_core.report.evidence.contrasts import contrast_data
 from advnerf_core.report.evidence.families import families_note
 from advnerf_core.report.evidence.hardness import titles_of, with_titles
@@ -99,9 +100,9 @@ def write_numbers(folder: Path) -> Path:
         **_published(evidence),
     }
     write_atomically(folder / SET, json.dumps(data, indent=1) + "\n")
-    from advnerf_core.report.evidence.plot import (
-        excess_plot,  # they load matplotlib, which verifying does not need
-    )
+    # They load matplotlib, which verifying does not need.
+    from advnerf_core.report.evidence.above import write_above_of
+    from advnerf_core.report.evidence.plot import excess_plot
     from advnerf_core.report.plots import write_png
 
     known = _known_digests(folder.parent)
@@ -110,6 +111,7 @@ def write_numbers(folder: Path) -> Path:
     write_png(
         excess_plot(evidence, titles_of(folder, data)), folder.parent / picture_of(folder.name), dpi=110
     )
+    write_above_of(folder)
     return folder / SET
 
 
@@ -145,6 +147,10 @@ def verify_set(folder: Path) -> Verified:
 
 
 def _page_problems(published: Path) -> list[str]:
+    try:
+        check_about(published, sets_in(published))
+    except AdvnerfError as error:
+        return [str(error)]
     page = published / PAGE
     try:
         made = _page(published)
@@ -158,7 +164,7 @@ def _page_problems(published: Path) -> list[str]:
 
 def _page(published: Path) -> str:
     """The page of all sets, from their manifests and registrations."""
-    sets = {}
+    sets, about = {}, read_about(published)
     for name in sets_in(published):
         registration = read_registration(published / name)
         if registration is not None and (published / name / SET).exists():
@@ -166,7 +172,8 @@ def _page(published: Path) -> str:
             data = with_titles(published / name, read_json(published / name / SET))
             filmed = (published / film_of(name)).exists()
             notes = [*families_note(registration), *lost_note(published / name)]
-            sets[name] = {**data, "registered": registered, "filmed": filmed, "notes": notes}
+            said = about[name].model_dump(mode="json") if name in about else None
+            sets[name] = {**data, "registered": registered, "about": said, "filmed": filmed, "notes": notes}
     return results_page(sets)
 
 
@@ -323,7 +330,7 @@ def _numbers(folder: Path, evidence: Evidence, withdrawn: Mapping[str, str]) -> 
         )
     if published.get("withdrawn", {}) != withdrawn:
         wrong.append(f"{SET}: expected what {WITHDRAWN} says was withdrawn, got {published.get('withdrawn')}")
-    for part in ("rows", "primary", *(["contrasts"] if "contrasts" in found else [])):
+    for part in ("searches", "rows", "primary", *(["contrasts"] if "contrasts" in found else [])):
         there = published.get(part, [])
         if len(there) != len(found[part]):
             wrong.append(f"{SET}, {part}: expected {len(found[part])}, got {len(there)}")

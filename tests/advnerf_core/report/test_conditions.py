@@ -48,7 +48,7 @@ def test_a_stranger_appears_in_the_report(make):
     curves = (LossCurve("Spiral", 0, [1.0, 3.0, 2.0]), LossCurve("gradient", 0, [1.0, 2.0, 3.0]))
     data = ReportData(make.settings(), make.scene(), runs, make.manifest(), curves=curves)
     shown = [style_of(row.condition).title for row in transfer_rows(data)]
-    assert shown == ["no attack", "cross-entropy", "gradient", "Spiral"]
+    assert shown == ["plain object", "cross-entropy", "gradient", "Spiral"]
     legend = [text.get_text() for text in plots.cte_over_time(data, "surrogate").legends[0].get_texts()]
     assert legend == [f"{name}, surrogate" for name in shown]
     legend = [text.get_text() for text in plots.loss_curves(data).legends[0].get_texts()]

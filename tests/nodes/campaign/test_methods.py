@@ -78,7 +78,7 @@ def test_methods_of_a_file_and_of_a_package_run_in_worker_processes_and_appear_i
     found = torch.tensor(result["extra"]["theta"])
     assert min(float((found - theta).abs().max()) for theta in thetas) < 1e-5
     table = text_table(campaign_table(campaign, statuses(campaign, campaign.cells)))
-    assert [row[2] for row in table.rows if row[2]] == ["no attack", "Spiral", "spiral"]
+    assert [row[2] for row in table.rows if row[2]] == ["plain object", "Spiral", "spiral"]
 
 
 def test_its_cells_run_again_when_its_code_changes_and_no_others(searching):

@@ -1,0 +1,268 @@
+"""The picture of a set: all deployed drives from above and over time, and what the camera saw with and without the attack."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+from PIL import Image
+
+from advnerf_core.documents import read_json
+from advnerf_core.files import write_atomically
+from advnerf_core.report.cells import read_cells
+from advnerf_core.report.conditions import NONE, style_of
+from advnerf_core.report.evidence.about import ObjectPlace, read_about
+from advnerf_core.report.evidence.page import above_of, film_of
+from advnerf_core.report.evidence.registration import PrimaryTest, read_registration
+from advnerf_core.report.evidence.results import Evidence
+from advnerf_core.report.evidence.verify import SET
+from advnerf_core.report.palette import LIGHT
+from advnerf_core.report.plots import STYLE
+
+Floats = NDArray[np.float64]
+MOST_BYTES = 250_000
+_SIZE_IN, _DPI = (12.0, 6.2), 100
+# Left, bottom, width and height in shares of the picture.
+_MAP, _TIME = (0.055, 0.085, 0.455, 0.8), (0.59, 0.085, 0.4, 0.165)
+_STILLS_LEFT, _STILLS_BOTTOM, _STILL = (0.545, 0.772), (0.35, 0.645), (0.22, 0.24)
+_QUALITIES = (90, 80, 65, 50)
+# Share of a film's height that its captions take, and how many of its frames there are per second.
+_CAPTION, _FILM_HZ, _COLUMNS = 0.2, 5.0, 3
+_BEFORE_S = 1.0  # of the moment, when the object is in sight
+_SPACING = 0.05  # of points along the path, in half lanes
+
+
+@dataclass(frozen=True)
+class _Group:
+    """All deployed drives past what the object shows.
+
+    Attributes:
+        title: What it shows.
+        colour: Of its lines.
+        poses: ``[T + 1, 3]`` of each drive: x [m], y [m], yaw [rad].
+        ctes_m: ``[T]`` signed cross-track error of each drive [m].
+        off_track: Drives that left the track.
+    """
+
+    title: str
+    colour: str
+    poses: Sequence[Floats]
+    ctes_m: Sequence[Floats]
+    off_track: int
+
+
+def write_above_of(folder: Path) -> Path | None:
+    """Write the picture of a published set beside its folder, of its last primary test; None where it has none.
+
+    Args:
+        folder: Of the set, with its ``set.json``.
+    """
+    registration, primary = read_registration(folder), read_json(folder / SET)["primary"]
+    if registration is None or not primary:
+        return None
+    about = read_about(folder.parent).get(folder.name)
+    film, target = folder.parent / film_of(folder.name), folder.parent / above_of(folder.name)
+    evidence = Evidence(registration, read_cells(folder))
+    return write_above(evidence, primary[-1], primary[0], about.object if about else None, film, target)
+
+
+def write_above(
+    evidence: Evidence,
+    shown: Mapping[str, Any],
+    filmed: Mapping[str, Any],
+    place: ObjectPlace | None,
+    film: Path,
+    target: Path,
+) -> Path:
+    """Write the picture of one primary test of a set.
+
+    Args:
+        evidence: All drives of the set.
+        shown: A primary test as in ``set.json``: which drives are drawn.
+        filmed: The primary test that the film shows.
+        place: Where the object stands; None where that was not kept.
+        film: The kept film; without the file there are no stills.
+        target: The picture, a ``.webp``.
+    """
+    test = PrimaryTest.model_validate(shown["test"])
+    groups = _groups(evidence, test, shown["baseline"])
+    registered = evidence.registration.scenario(test.scenario, test.placement)
+    assert registered is not None, "the test was registered"
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=_SIZE_IN, dpi=_DPI, facecolor="white")
+        _draw_map(figure.add_axes(_MAP), groups, registered.reference_path(), registered.off_track_m, place)
+        _draw_deviation(figure.add_axes(_TIME), groups, registered.off_track_m, registered.dt_s)
+        _draw_stills(figure, evidence, filmed, film)
+        _add_legend(figure, groups, place)
+    write_atomically(target, _webp(figure))
+    return target
+
+
+def moment_of(evidence: Evidence, test: PrimaryTest) -> tuple[float, bool]:
+    """When the first deployed drive of the first search leaves the track, or deviates most.
+
+    Returns:
+        Time from the start [s], and whether it left.
+    """
+    cell = evidence.searches((test.scenario, test.placement, test.victim, test.method))[0]
+    horizon = evidence.scenario_of(cell).horizon
+    deviation = np.abs(evidence.metrics(cell, "deployed")[0].ctes_m)
+    off = deviation > horizon.off_track_m
+    left = bool(off.any())
+    return float((off.argmax() if left else deviation.argmax()) + 1) * horizon.dt_s, left
+
+
+def _groups(evidence: Evidence, test: PrimaryTest, baseline: str) -> list[_Group]:
+    # Three fixed colours, of different lightness, whatever the method.
+    colours = {NONE: LIGHT[NONE], baseline: LIGHT["random"], test.method: LIGHT["gradient"]}
+    found = []
+    for method, colour in colours.items():
+        cells = evidence.searches((test.scenario, test.placement, test.victim, method))
+        metrics = [each for cell in cells for each in evidence.metrics(cell, "deployed")]
+        poses = [drive.poses() for cell in cells for drive in cell.kept["deployed"]]
+        off = sum(each.off_track for each in metrics)
+        found.append(
+            _Group(style_of(method).title, colour, poses, [np.array(each.ctes_m) for each in metrics], off)
+        )
+    return found
+
+
+def _draw_map(
+    ax: Any, groups: Sequence[_Group], path: Any, off_track_m: float, place: ObjectPlace | None
+) -> None:
+    along = np.asarray(path.pose_at(np.arange(0.0, path.length_m, _SPACING * off_track_m)))
+    across = np.stack([-np.sin(along[:, 2]), np.cos(along[:, 2])], axis=1)
+    for side in (-off_track_m, off_track_m):
+        ax.plot(*(along[:, :2] + side * across).T, color=LIGHT["muted"], lw=1.1, zorder=1)
+    ax.plot(*along[:, :2].T, color=LIGHT["grid"], lw=1.1, zorder=1)
+    for level, group in enumerate(groups):
+        for poses in group.poses:
+            ax.plot(*poses[:, :2].T, color=group.colour, lw=_width(group), alpha=0.75, zorder=4 - level)
+            ax.plot(*poses[-1, :2], "o", ms=2.6, color=group.colour, zorder=5)
+    driven = np.concatenate([poses[:, :2] for group in groups for poses in group.poses])
+    corners = [driven.min(axis=0) - 1.3 * off_track_m, driven.max(axis=0) + 1.3 * off_track_m]
+    if place is not None:
+        middle = _draw_object(ax, place)
+        corners += [middle - 0.7 * place.width_m, middle + 0.7 * place.width_m]
+    low, high = _in_shape(np.min(corners, axis=0), np.max(corners, axis=0))
+    ax.set(
+        xlim=(low[0], high[0]),
+        ylim=(low[1], high[1]),
+        xlabel="x [m]",
+        ylabel="y [m]",
+        title="every deployed drive from above; dots: where it ends",
+    )
+    ax.set_aspect("equal")
+
+
+def _in_shape(low: Floats, high: Floats) -> tuple[Floats, Floats]:
+    """Corners of a box around another one that has the shape of the map."""
+    wanted = _MAP[2] * _SIZE_IN[0] / (_MAP[3] * _SIZE_IN[1])
+    size = np.maximum(high - low, [wanted * (high - low)[1], (high - low)[0] / wanted])
+    middle = 0.5 * (low + high)
+    return middle - 0.5 * size, middle + 0.5 * size
+
+
+def _width(group: _Group) -> float:
+    """Thin where there are many drives."""
+    return 1.2 if len(group.poses) <= 20 else 0.6
+
+
+def _draw_object(ax: Any, place: ObjectPlace) -> Floats:
+    """Draw the face from above, with an arrow to where it faces; its middle."""
+    middle = np.array([place.x_m, place.y_m])
+    front = np.array([np.cos(place.yaw_rad), np.sin(place.yaw_rad)])
+    half = 0.5 * place.width_m * np.array([-front[1], front[0]])
+    ax.plot(
+        *np.stack([middle - half, middle + half]).T,
+        color=LIGHT["ink"],
+        lw=4.0,
+        solid_capstyle="butt",
+        zorder=6,
+    )
+    arrow = {"arrowstyle": "-|>", "color": LIGHT["ink"], "lw": 1.0}
+    ax.annotate("", middle + 0.6 * place.width_m * front, middle, arrowprops=arrow, zorder=6)
+    return middle
+
+
+def _draw_deviation(ax: Any, groups: Sequence[_Group], off_track_m: float, dt_s: float) -> None:
+    for side in (-off_track_m, off_track_m):
+        ax.axhline(side, color=LIGHT["muted"], lw=1.1, zorder=1)
+    ax.axhline(0.0, color=LIGHT["grid"], lw=1.1, zorder=1)
+    for level, group in enumerate(groups):
+        for ctes_m in group.ctes_m:
+            times = dt_s * np.arange(1, len(ctes_m) + 1)
+            ax.plot(times, ctes_m, color=group.colour, lw=_width(group), alpha=0.75, zorder=4 - level)
+    ax.set(xlabel="time [s]", ylabel="left of the path [m]", title="distance of every drive from the path")
+    ax.set_xlim(0.0, dt_s * len(groups[0].ctes_m[0]))
+    ax.grid(axis="x", visible=False)
+
+
+def _draw_stills(figure: Figure, evidence: Evidence, filmed: Mapping[str, Any], film: Path) -> None:
+    """What the camera saw at the moment and a second before: above with the attack, below past the plain object."""
+    when_s, left = moment_of(evidence, PrimaryTest.model_validate(filmed["test"]))
+    moment = "it leaves the track" if left else "it deviates most"
+    for at_s, x in zip((max(when_s - _BEFORE_S, 0.0), when_s), _STILLS_LEFT, strict=True):
+        views = _frame_at(film, at_s) if film.exists() else None
+        note = f" ({moment})" if at_s == when_s else ""
+        for column, title, y in (
+            (0, f"plain object, {at_s:.1f} s", _STILLS_BOTTOM[0]),
+            (2, f"attack, {at_s:.1f} s{note}", _STILLS_BOTTOM[1]),
+        ):
+            ax = figure.add_axes((x, y, *_STILL))
+            ax.set_axis_off()
+            ax.set_title(title)
+            if views is None:
+                ax.text(0.5, 0.5, "no film was kept", ha="center", va="center", transform=ax.transAxes)
+            else:
+                ax.imshow(views[column], interpolation="bicubic")
+
+
+def _frame_at(film: Path, when_s: float) -> list[NDArray[np.uint8]]:
+    """The pictures of the three drives, without captions, in the kept frame that is nearest to a time."""
+    with Image.open(film) as opened:
+        opened.seek(min(round(when_s * _FILM_HZ), int(getattr(opened, "n_frames", 1)) - 1))
+        frame = np.asarray(opened.convert("RGB"))
+    edges = np.linspace(0, frame.shape[1], _COLUMNS + 1).round().astype(int)
+    top = round(_CAPTION * frame.shape[0])
+    return [frame[top:, begin + 1 : end - 1] for begin, end in pairwise(edges)]
+
+
+def _add_legend(figure: Figure, groups: Sequence[_Group], place: ObjectPlace | None) -> None:
+    handles = [
+        Line2D(
+            [],
+            [],
+            color=group.colour,
+            lw=2.2,
+            label=f"{group.title}: {group.off_track} of {len(group.poses)} off track",
+        )
+        for group in groups
+    ]
+    handles.append(Line2D([], [], color=LIGHT["muted"], lw=1.1, label="edge of the track"))
+    if place is not None:
+        handles.append(
+            Line2D([], [], color=LIGHT["ink"], lw=4.0, label="object" + " (estimated)" * place.estimated)
+        )
+    figure.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.01, 0.995), ncols=len(handles))
+
+
+def _webp(figure: Figure) -> bytes:
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format="png", dpi=_DPI, facecolor="white")
+    picture = Image.open(drawn).convert("RGB")
+    for quality in _QUALITIES:
+        data = io.BytesIO()
+        picture.save(data, "WEBP", quality=quality, method=6)
+        if data.tell() <= MOST_BYTES:
+            break
+    return data.getvalue()

@@ -1,0 +1,25 @@
+"""Write the numbers, pictures and page of published sets again from what is kept: ``python -m benchmarks.set_pages [SET ...]``.
+
+Registrations, cells and films stay as they are. `advnerf publish` does the same for one set whose run folder is on this machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from advnerf_core.report.evidence.verify import sets_in, write_numbers, write_page
+
+PUBLISHED = Path(__file__).resolve().parents[1] / "docs" / "results"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("sets", nargs="*", default=sets_in(PUBLISHED))
+    for name in parser.parse_args().sets:
+        print(write_numbers(PUBLISHED / name).relative_to(PUBLISHED))
+    write_page(PUBLISHED)
+
+
+if __name__ == "__main__":
+    main()

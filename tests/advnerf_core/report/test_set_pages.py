@@ -1,0 +1,232 @@
+"""What every registered set must show: all drives from above, stills, both controls, its role; and what no page may say."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from advnerf_core.errors import ConfigError
+from advnerf_core.report.cells import read_cells
+from advnerf_core.report.evidence.about import ABOUT, AboutError, check_about, read_about
+from advnerf_core.report.evidence.above import MOST_BYTES, moment_of, write_above_of
+from advnerf_core.report.evidence.page import above_of, film_of, groups_of_searches
+from advnerf_core.report.evidence.registration import PrimaryTest, read_registration
+from advnerf_core.report.evidence.results import Evidence, rows
+from advnerf_core.report.evidence.verify import sets_in, verify_set
+from advnerf_core.report.evidence.words import claim, excesses, smaller_excess
+from benchmarks.planted_changes import write_simulated_set
+
+DOCS = Path(__file__).parents[3] / "docs"
+PUBLISHED = DOCS / "results"
+SETS = sets_in(PUBLISHED)
+PAGE = (PUBLISHED / "transfer.md").read_text()
+
+
+def section(name):
+    return re.split(r"^## ", PAGE.split(f"\n## {name}\n")[1], flags=re.MULTILINE)[0]
+
+
+def published(name):
+    return json.loads((PUBLISHED / name / "set" / "set.json").read_text())
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_every_set_shows_its_drives_from_above_and_what_the_camera_saw(name):
+    text, picture = section(name), PUBLISHED / above_of(name)
+    assert text.lstrip().startswith(
+        f"![All deployed drives from above, and what the camera saw]({picture.name})"
+    )
+    assert picture.stat().st_size <= MOST_BYTES == 250_000
+    assert Image.open(picture).size[0] == 1200
+    assert (PUBLISHED / film_of(name)).exists()  # the stills are frames of it
+    assert "Place of the object:" in text or "The place of the object was not kept" in text
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_every_set_shows_both_controls_and_the_sentence_uses_the_smaller_excess(name):
+    data, text = published(name), section(name)
+    assert "| over no object |" in text
+    missing = [row["method"] for row in data["rows"] if row["over_no_object_m"] is None]
+    assert text.count("| not driven |") == len([method for method in missing if method != "empty"])
+    test = data["primary"][-1]
+    (row,) = [
+        each
+        for each in data["rows"]
+        if each["domain"] == "deployed"
+        and all(each[key] == test["test"][key] for key in ("scenario", "victim", "method"))
+    ]
+    values = [row["excess_m"]] + [row["over_no_object_m"]] * (row["over_no_object_m"] is not None)
+    assert f"the car is {min(values):.3f} m per tick further" in text
+    assert all(f"{value:.3f}" in text for value in values)
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_every_set_says_what_it_is_for_and_its_p_values(name):
+    data, text = published(name), section(name)
+    assert re.search(
+        r"^\*\*(Exploration|Confirmation)\*\*, registered after .+ What changed: ", text, re.MULTILINE
+    )
+    assert "p deployed, after Holm" in text
+    assert all("p_surrogate" not in test for test in data["primary"]) or "p in the learned scene" in text
+
+
+def test_sets_that_share_searches_are_one_group_and_the_page_says_so():
+    cells = {
+        name: {
+            cell.attack_id for cell in read_cells(PUBLISHED / name) if cell.method not in ("none", "empty")
+        }
+        for name in SETS
+    }
+    assert cells["gap_filament"] < cells["gap_room"]
+    groups = groups_of_searches({name: published(name) for name in SETS})
+    assert ["gap_filament", "gap_room"] in [sorted(group) for group in groups]
+    assert len(groups) == len(SETS) - 1
+    assert "The 7 sets are 6 groups of searches in 3 worlds." in PAGE
+    for name, attacks in cells.items():
+        assert {each["attack_id"] for each in published(name)["searches"]} == attacks
+
+
+def test_excess_over_no_object_is_that_over_the_plain_object_and_that_of_the_plain_object():
+    name = "gap_metadrive"
+    evidence = Evidence(read_registration(PUBLISHED / name), read_cells(PUBLISHED / name))
+    found = {(row.scenario, row.method, row.domain): row for row in rows(evidence)}
+    for (scenario, method, domain), row in found.items():
+        if method in ("none", "empty"):
+            continue
+        plain = found[scenario, "none", domain]
+        assert row.over_no_object_m == pytest.approx(row.excess_m + plain.over_no_object_m)
+        assert plain.over_no_object_m == pytest.approx(-found[scenario, "empty", domain].excess_m)
+        assert found[scenario, "empty", domain].over_no_object_m is None
+    # By hand, from the poses alone.
+    (scenario,) = {key[0] for key in found if key[0] == "native_own"}
+    registered = evidence.registration.scenarios[scenario]
+    path = registered.reference_path()
+
+    def ctes_m(method):
+        cells = [
+            cell for cell in evidence.cells.values() if (cell.scenario, cell.method) == (scenario, method)
+        ]
+        drives = [drive.poses()[1:, :2] for cell in cells for drive in cell.kept["deployed"]]
+        return np.mean([np.abs(path.project(xy).cte_m).mean() for xy in drives])
+
+    by_hand = ctes_m("gradient") - ctes_m("empty")
+    assert found[scenario, "gradient", "deployed"].over_no_object_m == pytest.approx(by_hand, abs=1e-4)
+    assert by_hand == pytest.approx(0.067, abs=1e-3)
+
+
+def test_a_claim_names_the_control_that_leaves_less_and_a_p_where_it_searched():
+    row = {
+        "scenario": "s",
+        "placement": "",
+        "victim": "hardened",
+        "method": "gradient",
+        "domain": "deployed",
+        "off_track": 1,
+        "drives": 8,
+    }
+    row |= {
+        "excess_m": 0.2,
+        "low_m": 0.1,
+        "high_m": 0.3,
+        "over_no_object_m": 0.05,
+        "over_no_object_low_m": -0.01,
+        "over_no_object_high_m": 0.1,
+    }
+    assert [each.over for each in excesses(row)] == ["plain object", "no object"]
+    assert (smaller_excess(row).mean_m, smaller_excess(row).is_shown) == (0.05, False)
+    against = {
+        "scenario": "s",
+        "placement": "",
+        "victim": "hardened",
+        "method": "gradient",
+        "against": ["random"],
+    }
+    test = {
+        "test": against,
+        "baseline": "random",
+        "difference_m": 0.1,
+        "low_m": 0.05,
+        "high_m": 0.2,
+        "p": 0.001,
+        "p_holm": 0.002,
+    }
+    said = claim({**test, "p_surrogate": 0.77}, [row])
+    assert "0.050 m per tick further from its path than with no object" in said
+    assert "no effect is shown" in said
+    assert "Over the plain object the excess is 0.200 m." in said
+    assert "the only baseline run" in said
+    assert "In the learned scene, where it was searched, it is not shown to be better (p = 0.7700)." in said
+    assert "not shown to be better" not in claim({**test, "p_surrogate": 0.01}, [row])
+    bare = row | {"over_no_object_m": None, "over_no_object_low_m": None, "over_no_object_high_m": None}
+    assert "Drives with no object were not made." in claim(test, [bare])
+
+
+def test_an_entry_for_each_set_is_read_strictly(tmp_path):
+    write_simulated_set(tmp_path / "simulated")
+    assert verify_set(tmp_path / "simulated").problems == ()  # nothing is said about any set
+    entry = {"world": "room", "role": "exploration", "changed": "All."}
+    (tmp_path / ABOUT).write_text(json.dumps({"other": entry}))
+    with pytest.raises(AboutError, match="expected an entry for simulated, got none; add world, role"):
+        check_about(tmp_path, ["simulated"])
+    assert "expected an entry for simulated" in verify_set(tmp_path / "simulated").problems[0]
+    with pytest.raises(AboutError, match="got other; remove it"):
+        check_about(tmp_path, [])
+    for wrong in ({"role": "proof"}, {"world": ""}, {"colour": "red"}, {"object": {"x_m": "1"}}):
+        (tmp_path / ABOUT).write_text(json.dumps({"simulated": entry | wrong}))
+        with pytest.raises(ConfigError, match=next(iter(wrong))):
+            read_about(tmp_path)
+    assert set(read_about(PUBLISHED)) == set(SETS)
+
+
+def test_the_moment_of_the_stills_is_that_of_the_kept_poses():
+    name = "gap_duckietown_robust"
+    folder = PUBLISHED / name
+    evidence = Evidence(read_registration(folder), read_cells(folder))
+    registered = evidence.registration.scenarios["more"]
+    test = next(each for each in evidence.registration.primary if each.scenario == "more")
+    drive = evidence.cells["more_hardened_gradient_6"].kept["deployed"][0]
+    off = np.abs(registered.reference_path().project(drive.poses()[:, :2]).cte_m) > registered.off_track_m
+    assert moment_of(evidence, test) == (pytest.approx(np.argmax(off) * registered.dt_s), True)
+    still = PrimaryTest.model_validate({**test.model_dump(), "method": "random_coarse"})
+    assert not moment_of(evidence, still)[1]
+
+
+def test_a_set_without_a_film_and_a_known_object_has_its_drives_from_above(tmp_path):
+    write_simulated_set(tmp_path / "simulated")
+    picture = tmp_path / above_of("simulated")
+    picture.unlink()
+    assert write_above_of(tmp_path / "simulated") == picture
+    shown = np.asarray(Image.open(picture).convert("RGB")).reshape(-1, 3).astype(int)
+    for colour in ((0x00, 0x72, 0xB2), (0xDD, 0x93, 0x00), (0xB0, 0x12, 0x3C)):
+        assert (np.abs(shown - colour).max(axis=1) < 40).sum() > 100  # all three are drawn
+
+
+FORBIDDEN = ("the real place", "the real car", "learned copy", "no attack", "7 of 7 registered")
+
+
+@pytest.mark.parametrize("phrase", FORBIDDEN)
+def test_no_page_of_results_says_what_never_happened_or_has_a_second_name(phrase):
+    pages = [
+        DOCS / "results.md",
+        DOCS / "was_not_run.md",
+        DOCS / "evidence.md",
+        DOCS.parent / "README.md",
+        *PUBLISHED.glob("*.md"),
+    ]
+    assert [page.name for page in pages if re.search(rf"\b{phrase}\b", page.read_text(), re.IGNORECASE)] == []
+
+
+def test_pages_that_speak_of_cars_link_what_was_not_run_and_the_first_is_short():
+    for page in (DOCS.parent / "README.md", DOCS / "results.md", PUBLISHED / "transfer.md"):
+        assert "was_not_run.md" in page.read_text()
+    assert len((DOCS / "results.md").read_text().split()) <= 1500
+    for name in SETS:
+        prose = [
+            line
+            for line in section(name).splitlines()
+            if line and not line.startswith(("|", "    ", "!", "#", "**Registered, and not run"))
+        ]
+        assert len(" ".join(prose).split()) <= 165
