@@ -206,7 +206,7 @@ def _victims(sets: Sequence[Mapping[str, Any]], published: Path) -> str:
         f"Policies {' or '.join(titles)}. The best random search of each set moves them {min(each.deployed.best_m for each in found):.3f} to "
         f"{worst.deployed.best_m:.3f} m per tick where it is deployed (set {place}: {off.deployed.off_track} of {off.deployed.drives} drives off the track, "
         f"{off.deployed.all_off_track} of {off.deployed.all_drives} of all {off.searches} searches), and up to "
-        f"{max(each.surrogate.best_m for each in found):.3f} m in the learned copy. Results with a policy that never saw a texture are of the "
+        f"{max(each.surrogate.best_m for each in found):.3f} m in the learned scene. Results with a policy that never saw a texture are of the "
         "[first build](results/first_build.md)."
     )
 

@@ -68,8 +68,8 @@ def luck_sentences(test: Mapping[str, Any], alpha: float = 0.05) -> str:
     text += (
         f" Of the {len(found.baseline_shares)} searches of {theirs}, {len(found.lucky)} {'is' if one else 'are'} stronger in the learned scene than "
         f"every {ours} search ({strength} m per tick). Deployed, {left} % of that is left; of the {ours} searches "
-        f"{100 * min(found.method_shares):.0f} to {100 * max(found.method_shares):.0f} %. Excess is measured from starts that no search has, so "
-        f"{'this texture moves' if one else 'these textures move'} the policy in the learned scene, and not where it is deployed."
+        f"{100 * min(found.method_shares):.0f} to {100 * max(found.method_shares):.0f} %. No search has these starts: "
+        f"{'this texture works' if one else 'these textures work'} in the learned scene alone."
     )
     if found.other_side:
         text += f" {'It pushes' if one else 'They push'} the car to the other side of the path than every {ours} search does."
