@@ -119,7 +119,7 @@ def test_many_conditions_are_drawn_by_their_means(evidence: Evidence) -> None:
         for row in rows(evidence)
         if row.method != "none"
     ]
-    figure = _means(shown)
+    figure = _means(shown, {})
     drawn = {(round(float(x), 9)) for line in figure.axes[0].lines for x in line.get_xdata()}
     assert {round(row.excess_m, 9) for row in shown} <= drawn
     assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == [
