@@ -60,6 +60,7 @@ def _section(name: str, data: Mapping[str, Any]) -> str:
         f"![Excess of every drive, by method and domain]({picture_of(name)})\n",
         _where(data["deployed_through"]) + "\n",
         *_withdrawn(data),
+        *_drives_badly(data),
         *_tests(data),
         _table(registered),
     ]
@@ -84,6 +85,15 @@ def _withdrawn(data: Mapping[str, Any]) -> list[str]:
             f"p = 1 in Holm's adjustment. {reason}\n"
         )
     return sentences
+
+
+def _drives_badly(data: Mapping[str, Any]) -> list[str]:
+    """Sentences about victims that break the registered rule of what drives well."""
+    return [
+        f"**Does not drive well:** without attack, the {row['victim']} victim has a mean abs. CTE of {row['mean_cte_m']:.4f} m {row['domain']} in "
+        f"{_place(row)}, and {row['off_track']} drives leave the track. Registered were at most {row['limit_m']:.4f} m, and none. {row['reason']}\n"
+        for row in data.get("does_not_drive_well", [])
+    ]
 
 
 def _tests(data: Mapping[str, Any]) -> list[str]:
