@@ -12,7 +12,7 @@ from typing import Any
 from advnerf_core.documents import read_json
 from advnerf_core.report.conditions import style_of
 from advnerf_core.report.evidence.registration import read_registration
-from benchmarks.results import REPOSITORY, record_row
+from benchmarks.results import REPOSITORY, LedgerRow
 
 PUBLISHED = REPOSITORY / "docs" / "results"
 _LEAST = 0.25
@@ -25,17 +25,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("sets", nargs="+", help="names of published gap sets")
     for name in parser.parse_args().sets:
-        registration = read_registration(PUBLISHED / name)
-        if registration is None:
-            raise SystemExit(f"expected a published set in {PUBLISHED / name}, got none; run advnerf publish")
-        data = read_json(PUBLISHED / name / "set" / "set.json")
-        test = data["primary"][-1]
-        scenario = registration.scenario(test["test"]["scenario"])
-        assert scenario is not None, "a primary test is of a registered scenario"
-        record(name, test, data["rows"], scenario.off_track_m)
+        for row in ledger_rows(name):
+            row.record()
+            print(f"{row.line}: {row.value} {row.unit}; {row.note}")
 
 
-def record(name: str, test: dict[str, Any], rows: list[dict[str, Any]], half_lane_m: float) -> None:
+def ledger_rows(name: str) -> list[LedgerRow]:
+    """The rows of one set, from its published numbers."""
+    registration = read_registration(PUBLISHED / name)
+    if registration is None:
+        raise SystemExit(f"expected a published set in {PUBLISHED / name}, got none; run advnerf publish")
+    data = read_json(PUBLISHED / name / "set" / "set.json")
+    test = data["primary"][-1]
+    scenario = registration.scenario(test["test"]["scenario"])
+    assert scenario is not None, "a primary test is of a registered scenario"
+    return rows_of(name, test, data["rows"], scenario.off_track_m)
+
+
+def rows_of(
+    name: str, test: dict[str, Any], rows: list[dict[str, Any]], half_lane_m: float
+) -> list[LedgerRow]:
     """The rows of one set, from the test under its last condition."""
     command, which = f"python -m benchmarks.gap {name}", test["test"]
     said, real = (
@@ -53,12 +62,12 @@ def record(name: str, test: dict[str, Any], rows: list[dict[str, Any]], half_lan
     )
     low = (test["low_m"] or 0.0) / half_lane_m
     target, met = (f">= {_LEAST:g}", low >= _LEAST) if name in _FOREIGN else ("", None)
-    record_row(f"{name}: gradient minus the strongest random family, deployed natively, lower 95 % bound", round(low, 3), "half lanes per tick", target, met, command, note)  # fmt: skip
     kept = 100.0 * real["excess_m"] / said["excess_m"]
-    record_row(f"{name}: share of the surrogate's excess that is left, deployed natively", round(kept), "%", "", None, command, f"{said['excess_m']:.3f} to {real['excess_m']:.3f} m per tick")  # fmt: skip
-    print(
-        f"{name}: lower bound {low:.3f} half lanes per tick, {kept:.0f} % of the surrogate's excess left; {note}"
-    )
+    left = f"{said['excess_m']:.3f} to {real['excess_m']:.3f} m per tick"
+    return [
+        LedgerRow(f"{name}: gradient minus the strongest random family, deployed natively, lower 95 % bound", round(low, 3), "half lanes per tick", target, met, command, note),
+        LedgerRow(f"{name}: share of the surrogate's excess that is left, deployed natively", round(kept), "%", "", None, command, left),
+    ]  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -8,6 +8,8 @@ with the spread between surrogate and deployment that earlier sets had".
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +19,7 @@ from advnerf_core.report.cells import read_cells
 from advnerf_core.report.evidence.prediction_score import ScoredCell, score_cells
 from advnerf_core.report.evidence.registration import read_registration
 from advnerf_core.report.evidence.results import Evidence
-from benchmarks.results import REPOSITORY, record_row
+from benchmarks.results import REPOSITORY, LedgerRow
 
 PUBLISHED = REPOSITORY / "docs" / "results"
 _HOLD = (0.65, 0.95)
@@ -34,21 +36,32 @@ def main() -> None:
         help="those that were made after the drives, whose rows are no result",
     )
     options = parser.parse_args()
-    folder = PUBLISHED / options.set / ("predictions_afterwards" if options.afterwards else "predictions")
-    found = score_cells(
-        evidence_of(options.set), predictions_in(folder), [evidence_of(name) for name in options.past]
-    )
-    if not found:
-        raise SystemExit(f"no predictions of deployed cells in {folder}")
-    for each in found:
+    for each in scored(options.set, options.past, options.afterwards):
         print(
             f"{each.name}: said {each.band[0]:.3f} to {each.band[1]:.3f}, was {np.mean(each.measured):.3f} half lanes per tick, "
             f"{each.held} of {len(each.measured)} drives held; score {each.score:.3f}, trivial {each.trivial_score:.3f}"
         )
-    command = f"python -m benchmarks.predictions {options.set}{' --afterwards' if options.afterwards else ''} --past {' '.join(options.past)}"
-    record(options.set, found, command, options.afterwards)
+    for row in ledger_rows(options.set, options.past, options.afterwards):
+        print(f"{row.line}: {row.value} {row.unit}; {row.note}")
+        row.record()
 
 
+def scored(name: str, past: Sequence[str], afterwards: bool) -> list[ScoredCell]:
+    """The scored predictions of a published set."""
+    folder = PUBLISHED / name / ("predictions_afterwards" if afterwards else "predictions")
+    found = score_cells(evidence_of(name), predictions_in(folder), [evidence_of(each) for each in past])
+    if not found:
+        raise SystemExit(f"no predictions of deployed cells in {folder}")
+    return found
+
+
+def ledger_rows(name: str, past: Sequence[str], afterwards: bool) -> list[LedgerRow]:
+    """The rows of a published set."""
+    command = f"python -m benchmarks.predictions {name}{' --afterwards' * afterwards} --past {' '.join(past)}"
+    return rows_of(name, scored(name, past, afterwards), command, afterwards)
+
+
+@cache
 def evidence_of(name: str) -> Evidence:
     """A published set."""
     registration = read_registration(PUBLISHED / name)
@@ -62,8 +75,8 @@ def predictions_in(folder: Path) -> dict[str, dict[str, float]]:
     return {file.stem: read_json(file) for file in folder.glob("*.json")}
 
 
-def record(name: str, found: list[ScoredCell], command: str, afterwards: bool) -> None:
-    """Print and record the two rows."""
+def rows_of(name: str, found: list[ScoredCell], command: str, afterwards: bool) -> list[LedgerRow]:
+    """The two rows of scored predictions."""
     drives = sum(len(each.measured) for each in found)
     share = sum(each.held for each in found) / drives
     ours, trivial = (
@@ -76,11 +89,11 @@ def record(name: str, found: list[ScoredCell], command: str, afterwards: bool) -
     if afterwards:
         which, held, better = f"{name}, predicted afterwards", None, None
         note += "; the predictor reads no attacked drive, but these were made after them"
-    print(
-        f"{100 * share:.0f} % of {drives} drives in their 80 % bands; mean interval score {ours:.3f}, trivial {trivial:.3f}"
-    )
-    record_row(f"deployed drives within their predicted 80 % bands, {which}", round(100 * share), "%", "65 to 95 %", held, command, note)  # fmt: skip
-    record_row(f"interval score of predicted excess against the surrogate's with the past's spread, {which}", ours / trivial, "x", "< 1", better, command, f"{note}; {ours:.3f} against {trivial:.3f} half lanes per tick")  # fmt: skip
+    scores = f"{note}; {ours:.3f} against {trivial:.3f} half lanes per tick"
+    return [
+        LedgerRow(f"deployed drives within their predicted 80 % bands, {which}", round(100 * share), "%", "65 to 95 %", held, command, note),
+        LedgerRow(f"interval score of predicted excess against the surrogate's with the past's spread, {which}", ours / trivial, "x", "< 1", better, command, scores),
+    ]  # fmt: skip
 
 
 if __name__ == "__main__":

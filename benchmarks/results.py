@@ -14,6 +14,7 @@ import platform
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from typing import Any
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from benchmarks.answers import Answer, answers, sets_table, table
+from benchmarks.kept_commands import NOT_KEPT, kept_by
 from benchmarks.questions import OTHER, QUESTIONS, Question, question_of
 from nodes.runtime.machine import memory_gib, processor_name
 
@@ -35,6 +37,30 @@ MACHINE_PATH = re.compile(r"(?<![\w.~$}<)/])/(?:tmp|var|home|root|work|opt|mnt|m
 def machine_description() -> str:
     """The machine in words: processor, cores usable, memory, accelerator if torch sees one."""
     return f"{processor_name()}, {len(os.sched_getaffinity(0))} cores, {memory_gib():.0f} GiB, Python {platform.python_version()}"
+
+
+@dataclass(frozen=True)
+class LedgerRow:
+    """One measured claim; see `record_row`."""
+
+    line: str
+    value: float | str
+    unit: str
+    target: str
+    met: bool | None
+    command: str
+    note: str = ""
+    machine: str = ""
+    date: str = ""
+
+    def with_command(self, command: str) -> LedgerRow:
+        """The same row of another command."""
+        return replace(self, command=command)
+
+    def record(self) -> None:
+        """Write it into the ledger."""
+        where = {"machine": self.machine, "date": self.date}
+        record_row(self.line, self.value, self.unit, self.target, self.met, self.command, self.note, **where)
 
 
 def record_row(
@@ -120,7 +146,8 @@ def write_pages(rows: list[dict[str, Any]], page: Path, published: Path = PAGE.p
 def _index_page(answered: dict[Question, list[dict[str, Any]]], found: list[Answer], sets: str) -> str:
     head = (
         "# Measured results\n\nEvery figure was written by the command beside it, on the machine and day that its row names. A row that "
-        "misses its target stays, with the reason. The rows are in `results.json`; `python -m benchmarks.results` makes these pages.\n\n"
+        "misses its target stays, with the reason. `advnerf verify` computes rows of kept drives again; the others were "
+        "measured once, and what they were measured from is not kept. The rows are in `results.json`; `python -m benchmarks.results` makes these pages.\n\n"
         "## In short\n\n"
         + table(found)
         + "\n"
@@ -145,7 +172,8 @@ def _question_page(question: Question, rows: list[dict[str, Any]]) -> str:
     """A page with one table for each command, in the order of the rows."""
     text = f"# {question.title}\n\n{question.answers} [All questions](../results.md).\n"
     for command in dict.fromkeys(row["command"] for row in rows):
-        text += f"\n## `{command}`\n\n| measured | value | target | met | note | machine, date |\n|---|---|---|---|---|---|\n"
+        kept = "Computed again by `advnerf verify`." if kept_by(command) else NOT_KEPT
+        text += f"\n## `{command}`\n\n{kept}\n\n| measured | value | target | met | note | machine, date |\n|---|---|---|---|---|---|\n"
         text += "".join(_render_row(row) for row in rows if row["command"] == command)
     return text
 
