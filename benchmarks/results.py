@@ -88,7 +88,7 @@ def record_row(
         command: The command that measured it, runnable from the project root.
         note: The reason for a miss, or what the reader must know.
         machine: Where it was measured; this machine if it is not said.
-        date: When, ISO; today if it is not said.
+        date: When, ISO; now if it is not said.
         ledger: Where the ledger is kept.
         page: Where the index of the pages is written; the questions lie beside it in ``results/``.
     """
@@ -105,7 +105,8 @@ def record_row(
         "command": command,
         "note": note,
         "machine": machine or machine_description(),
-        "date": date or datetime.now(timezone.utc).date().isoformat(),
+        # To the second: it names one measurement, so that a changed value is told from one that was measured again.
+        "date": date or datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }
     with _locked(ledger):
         rows = [r for r in read_rows(ledger) if r["line"] != line]
@@ -185,7 +186,7 @@ def _value(row: dict[str, Any]) -> str:
 
 def _render_row(row: dict[str, Any]) -> str:
     met = {True: "yes", False: "**no**", None: "-"}[row["met"]]
-    cells = [row["line"], _value(row), row["target"], met, row["note"], f"{row['machine']}, {row['date']}"]
+    cells = [row["line"], _value(row), row["target"], met, row["note"], f"{row['machine']}, {row['date'][:10]}"]
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
 
 

@@ -13,10 +13,12 @@ from typing import Any
 from advnerf_core.documents import parse_json, read_json
 from advnerf_core.report.evidence.registration import FILE
 from advnerf_core.report.evidence.verifying.git import Change, History, NoHistory, blob_of
-from advnerf_core.report.evidence.verifying.layout import cell_files, sets_in
+from advnerf_core.report.evidence.verifying.layout import BUILD, SET, cell_files, sets_in
 from advnerf_core.report.evidence.verifying.removed import LOG, read_removed
 
 LEDGER = "../results.json"
+# What names one measurement of a row.
+_MEASUREMENT = ("date", "machine", "command", "note", "unit")
 Log = Mapping[tuple[str, str], str]
 
 
@@ -51,6 +53,7 @@ def verify_history(published: Path) -> Witnessed:
             for name in sets_in(published)
             for problem in _set_problems(history, published / name, log)
         ]
+        problems += _changed(history, published, log)
         problems += _gone(history, published, log)
         problems += _rows(history, published, log)
     except NoHistory as error:
@@ -59,11 +62,9 @@ def verify_history(published: Path) -> Witnessed:
 
 
 def _set_problems(history: History, folder: Path, log: Log) -> Iterator[str]:
-    """Whether the registration is as it was committed, before every cell, and no cell was changed since it was committed."""
+    """Whether the registration is as it was committed, before every cell."""
     name = folder.name
-    cells = {
-        file.stem: (file, _since_added(history.of(f"{name}/{file.name}"))) for file in cell_files(folder)
-    }
+    cells = [(file, _since_added(history.of(f"{name}/{file.name}"))) for file in cell_files(folder)]
     registered = _since_added(history.of(f"{name}/{FILE}"))
     if not registered:
         if cells:
@@ -74,14 +75,21 @@ def _set_problems(history: History, folder: Path, log: Log) -> Iterator[str]:
         yield f"{folder / FILE}: is not the one that was committed in {last.commit[:9]}"
     if len(registered) > 1 and ("registration", name) not in log:
         yield f"{folder / FILE}: was changed in {last.commit[:9]} after it had been committed, and {LOG} does not say why"
-    for cell, (file, changes) in cells.items():
-        if not changes:
-            continue  # not committed yet
-        if not history.is_before(last.commit, changes[0].commit):
+    for file, changes in cells:
+        if changes and not history.is_before(last.commit, changes[0].commit):
             yield f"{file}: was committed in {changes[0].commit[:9]}, which does not come after its registration in {last.commit[:9]}"
-        changed = len(changes) > 1 or blob_of(file, changes[0].blob) != changes[0].blob
-        if changed and ("cell", f"{name}/{cell}") not in log:
-            yield f"{file}: was changed after it had been committed in {changes[0].commit[:9]}, and {LOG} does not say why"
+
+
+def _changed(history: History, published: Path, log: Log) -> Iterator[str]:
+    """Files of registered sets and of the reference build that were changed since they were committed, and that is not logged."""
+    for name in (*sets_in(published), BUILD):
+        for file in sorted(path for path in (published / name).rglob("*") if path.is_file()):
+            path = file.relative_to(published).as_posix()
+            changes = _since_added(history.of(path))
+            if not changes or path.endswith((f"/{SET}", f"/{FILE}")) or ("file", path) in log:
+                continue
+            if len(changes) > 1 or blob_of(file, changes[0].blob) != changes[0].blob:
+                yield f"{file}: was changed after it had been committed in {changes[0].commit[:9]}, and {LOG} does not say why"
 
 
 def _since_added(changes: list[Change]) -> list[Change]:
@@ -93,32 +101,27 @@ def _since_added(changes: list[Change]) -> list[Change]:
 
 
 def _gone(history: History, published: Path, log: Log) -> Iterator[str]:
-    """Sets, their cells and registered scenarios that were committed once and are not there now, and whose removal is not logged."""
+    """Sets, their files and registered scenarios that were committed once and are not there now, and whose removal is not logged."""
+    once = [name for name in history.below() if _is_kept(name)]
     for kind, names in (
-        ("set", _sets_once(history) - {file.name for file in published.iterdir() if file.is_dir()}),
-        ("cell", _cells_once(history) - _cells_now(published)),
+        ("set", {name.split("/")[0] for name in once if not (published / name.split("/")[0]).is_dir()}),
+        ("file", {name for name in once if not (published / name).exists()}),
         ("scenario", _scenarios_once(history) - _scenarios_now(published)),
     ):
         for name in sorted(names):
-            gone_with_its_set = kind != "set" and ("set", name.split("/")[0]) in log
+            gone_with_its_set = kind != "set" and not (published / name.split("/")[0]).is_dir()
             if (kind, name) not in log and not gone_with_its_set:
-                yield f"{published}: the {kind} {name} was published or registered once, is not there, and {LOG} does not say why"
+                yield f"{published}: the {kind} {name} was committed once, is not there, and {LOG} does not say why"
 
 
-def _sets_once(history: History) -> set[str]:
-    return {name.split("/")[0] for name in history.below() if name.count("/") and name.endswith(".json")}
-
-
-def _cells_once(history: History) -> set[str]:
-    return {
-        name.removesuffix(".json")
-        for name in history.below()
-        if name.count("/") == 1 and name.endswith(".json")
-    }
-
-
-def _cells_now(published: Path) -> set[str]:
-    return {f"{file.parent.name}/{file.stem}" for file in published.glob("*/*.json")}
+def _is_kept(name: str) -> bool:
+    """Whether a published file is of a set and not made from its other files."""
+    return (
+        "/" in name
+        and name.endswith(".json")
+        and not name.startswith(f"{BUILD}/")
+        and not name.endswith(f"/{SET}")
+    )
 
 
 def _scenarios_once(history: History) -> set[str]:
@@ -154,32 +157,37 @@ def _scenarios_now(published: Path) -> set[str]:
 
 
 def _rows(history: History, published: Path, log: Log) -> Iterator[str]:
-    """Missed rows of the ledger that are gone, or met now with nothing measured again."""
+    """Missed rows of the ledger that are gone, and rows with another value or verdict though nothing was measured again."""
     changes = [change for change in history.of(LEDGER) if change.status != "D"]
     if not changes:
         return
     now = {row["line"]: row for row in read_json(published / LEDGER)} if (published / LEDGER).exists() else {}
     told: set[str] = set()
     for text in history.contents(dict.fromkeys(change.blob for change in changes)):
-        for row in _missed(text):
+        for row in _ledger(text):
             line = row["line"]
             if line in told or ("row", line) in log:
                 continue
-            if line not in now:
+            if problem := _row_problem(row, now.get(line)):
                 told.add(line)
-                yield f"{published / LEDGER}: the missed row {line!r} is gone, and {LOG} does not say why"
-            elif now[line]["met"] is not False and _same_measurement(row, now[line]):
-                told.add(line)
-                yield f"{published / LEDGER}: the row {line!r} was missed and is not now, of the same measurement"
+                yield f"{published / LEDGER}: the row {line!r} {problem}, and {LOG} does not say why"
 
 
-def _missed(text: bytes) -> list[dict[str, Any]]:
+def _row_problem(once: Mapping[str, Any], now: Mapping[str, Any] | None) -> str:
+    """What happened to a row that must be logged; empty if nothing."""
+    if now is None:
+        return "was missed and is gone" if once["met"] is False else ""
+    if any(once.get(key) != now.get(key) for key in _MEASUREMENT):
+        return ""  # it was measured again
+    if once["value"] != now["value"]:
+        return f"had the value {once['value']} and has {now['value']}, of one measurement"
+    if once["met"] != now["met"] and once["target"] == now["target"]:
+        return "has another verdict on the same value"
+    return ""
+
+
+def _ledger(text: bytes) -> list[dict[str, Any]]:
     try:
-        return [row for row in parse_json(text, LEDGER) if row["met"] is False]
-    except (ValueError, KeyError, TypeError):  # a ledger that was damaged once
+        return [row for row in parse_json(text, LEDGER) if row.keys() >= {"line", "value", "met", "target"}]
+    except (ValueError, KeyError, TypeError, AttributeError):  # a ledger that was damaged once
         return []
-
-
-def _same_measurement(row: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    keys = ("date", "machine", "command", "note")
-    return all(row.get(key) == other.get(key) for key in keys)

@@ -18,14 +18,14 @@ class Removed(StrictModel):
     """Things that were removed or written again for one reason.
 
     Attributes:
-        kind: What they are: rows of the ledger, registered scenarios (``SET/SCENARIO``), cells (``SET/CELL``), sets, or registrations
-            that were written again before anything of their sets was run (``SET``).
+        kind: What they are: rows of the ledger, registered scenarios (``SET/SCENARIO``), files (by path), sets, or registrations that
+            were written again before anything of their sets was run (``SET``).
         names: Of each.
         reason: Why.
         commit: Which one, as far as its number goes; for readers.
     """
 
-    kind: Literal["row", "scenario", "cell", "set", "registration"]
+    kind: Literal["row", "scenario", "file", "set", "registration"]
     names: tuple[str, ...] = Field(min_length=1)
     reason: str = Field(min_length=10)
     commit: str = ""
