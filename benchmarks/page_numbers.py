@@ -1,12 +1,13 @@
-"""Numbers with a unit on hand-written pages: of a published row, a setting, or marked as measured once.
+"""Numbers with a unit on hand-written pages: of a published row, a setting, or measured once. ``python -m benchmarks.page_numbers``.
 
 A page may hold numbers of three kinds. A result stands in a row of ``docs/results.json`` or in a published set, and is found there as it
 is written. A setting or a limit is no result; pages of nothing else are listed in `SETTINGS`. A page with any other number says `MARK` at
-its head.
+its head, and its numbers are listed in `LIST`, which the command writes: a number that is edited is then in neither.
 """
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -14,8 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.documents import read_json
+from advnerf_core.files import write_atomically
 
 MARK = "measured once, not kept"
+LIST = "measured_once.json"  # in the folder of the pages
 _HEAD_LINES = 8
 # Made from rows and code by commands, which tests hold them to.
 _GENERATED = ("results.md", "api.md")
@@ -57,26 +60,48 @@ def count_numbers(docs: Path, rows: Iterable[Mapping[str, Any]]) -> Counted:
         rows: Of the ledger.
     """
     known = {*_of_rows(rows), *_of_sets(docs / "results")}
+    listed = read_json(docs / LIST) if (docs / LIST).exists() else {}
     counts, problems = {"published": 0, "marked": 0, "settings": 0}, []
-    for page in [docs.parent / "README.md", *sorted(docs.glob("*.md"))]:
-        if page.name in _GENERATED or not page.exists():
-            continue
+    for page in _pages(docs):
         text = page.read_text(encoding="utf-8")
-        found = list(numbers_in(text))
         settings = _SETTINGS_ON.get(page.name, set())
+        found = list(numbers_in(text))
         others = [each for each in found if each not in known | settings]
         counts["published"] += sum(each in known for each in found)
         counts["settings"] += sum(each in settings - known for each in found)
         if is_marked(text):
             counts["marked"] += len(others)
+            problems += _not_listed(page, others, listed.get(page.name, []))
         elif page.name in SETTINGS:
             counts["settings"] += len(others)
         elif others:
-            number, unit = others[0]
+            first = " ".join(others[0])
             problems.append(
-                f"{page}: {number} {unit} is in no published row or set; say at the head of the page that it was {MARK!r}"
+                f"{page}: {first} is in no published row or set; say at its head that figures were {MARK!r}"
             )
     return Counted(**counts, problems=tuple(problems))
+
+
+def measured_once(docs: Path, rows: Iterable[Mapping[str, Any]]) -> dict[str, list[str]]:
+    """Numbers of marked pages that no published row or set has, by page."""
+    known, found = {*_of_rows(rows), *_of_sets(docs / "results")}, {}
+    for page in _pages(docs):
+        text = page.read_text(encoding="utf-8")
+        if is_marked(text):
+            found[page.name] = sorted({" ".join(each) for each in numbers_in(text) if each not in known})
+    return found
+
+
+def _not_listed(page: Path, others: Iterable[tuple[str, str]], listed: Iterable[str]) -> Iterator[str]:
+    wrong = sorted({" ".join(each) for each in others} ^ set(listed))
+    if wrong:
+        yield f"{page}: {wrong[0]} is in no published row or set and not in {LIST}, or only there; python -m benchmarks.page_numbers writes it"
+
+
+def _pages(docs: Path) -> Iterator[Path]:
+    for page in [docs.parent / "README.md", *sorted(docs.glob("*.md"))]:
+        if page.name not in _GENERATED and page.exists():
+            yield page
 
 
 def is_marked(text: str) -> bool:
@@ -113,3 +138,17 @@ def _of_sets(published: Path) -> Iterator[tuple[str, str]]:
 
 def _rounded(value: float, unit: str) -> Iterator[tuple[str, str]]:
     return ((f"{value:.{decimals}f}", unit) for decimals in _DECIMALS)
+
+
+def main() -> None:
+    """Write the list of numbers that were measured once."""
+    from benchmarks.results import REPOSITORY, read_rows
+
+    docs = REPOSITORY / "docs"
+    found = measured_once(docs, read_rows())
+    write_atomically(docs / LIST, json.dumps(found, indent=1) + "\n")
+    print(f"{docs / LIST}: {sum(map(len, found.values()))} numbers of {len(found)} pages")
+
+
+if __name__ == "__main__":
+    main()

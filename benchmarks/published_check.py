@@ -55,15 +55,20 @@ def target_problems(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
 
 def page_problems(rows: list[dict[str, Any]]) -> Iterator[str]:
     """Pages that are not those of the rows and of the first build's cells."""
-    with TemporaryDirectory() as work:
-        made = Path(work) / PAGE.name
-        write_pages(rows, made)
-        for file in [made, *sorted((made.parent / "results").iterdir())]:
-            published = PAGE.parent / file.relative_to(made.parent)
-            if not published.exists() or published.read_text("utf-8") != file.read_text("utf-8"):
-                yield f"{published.relative_to(REPOSITORY)}: is not the page of the rows; python -m benchmarks.results writes it"
+    yield from row_page_problems(rows, PAGE)
     if FIRST_BUILD.read_text("utf-8") != page_text():
-        yield f"{FIRST_BUILD.relative_to(REPOSITORY)}: is not the page of its cells; python -m benchmarks.first_build writes it"
+        yield f"{FIRST_BUILD}: is not the page of its cells; python -m benchmarks.first_build writes it"
+
+
+def row_page_problems(rows: list[dict[str, Any]], page: Path) -> Iterator[str]:
+    """Pages that are not those of the rows, beside the index ``page`` too."""
+    with TemporaryDirectory() as work:
+        made = Path(work) / page.name
+        write_pages(rows, made, page.parent / "results")
+        for file in [made, *sorted((made.parent / "results").iterdir())]:
+            published = page.parent / file.relative_to(made.parent)
+            if not published.exists() or published.read_text("utf-8") != file.read_text("utf-8"):
+                yield f"{published}: is not the page of the rows; python -m benchmarks.results writes it"
 
 
 def gate_problems() -> Iterator[str]:

@@ -186,7 +186,14 @@ def _value(row: dict[str, Any]) -> str:
 
 def _render_row(row: dict[str, Any]) -> str:
     met = {True: "yes", False: "**no**", None: "-"}[row["met"]]
-    cells = [row["line"], _value(row), row["target"], met, row["note"], f"{row['machine']}, {row['date'][:10]}"]
+    cells = [
+        row["line"],
+        _value(row),
+        row["target"],
+        met,
+        row["note"],
+        f"{row['machine']}, {row['date'][:10]}",
+    ]
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
 
 

@@ -57,6 +57,7 @@ def verify(
 ) -> None:
     """Compute every published number again from the kept drives, and check digests, registration, completeness and the history in git."""
     from advnerf_core.report.evidence.verify import SetError, sets_in, verify_beside, verify_set
+    from advnerf_core.report.evidence.verifying.pictures import picture_problems
 
     known = sets_in(published)
     if name is not None and name not in known:
@@ -72,6 +73,8 @@ def verify(
         wrong += _say(f"{found.name}: {found.numbers} numbers from {found.drives} drives", found.problems)
         for finding in found.findings:
             print(f"  declared: {finding}")
+        if not found.problems:
+            wrong += _say_problems(list(picture_problems(published / each)))
         if again and not found.problems:
             wrong += _redrive(published / each, again, seed)
     wrong += _say("page, pictures, films and reference build", verify_beside(published))
@@ -84,6 +87,10 @@ def verify(
 def _say(what: str, problems: Sequence[str]) -> int:
     """Print a verdict and its problems; returns how many there are."""
     print(f"{what}: {f'{len(problems)} problems' if problems else 'all as published'}")
+    return _say_problems(problems)
+
+
+def _say_problems(problems: Sequence[str]) -> int:
     for problem in problems:
         say_error(problem)
     return len(problems)

@@ -7,13 +7,14 @@ from pathlib import Path
 
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
-from advnerf_core.report.evidence.page import film_of, picture_of, results_page
+from advnerf_core.report.evidence.page import film_of, results_page
 from advnerf_core.report.evidence.registration import read_registration, read_withdrawn
 from advnerf_core.report.evidence.results import Evidence
 from advnerf_core.report.evidence.verifying.checks import set_problems
 from advnerf_core.report.evidence.verifying.digests import digests_of, write_beside, write_known_digest
 from advnerf_core.report.evidence.verifying.layout import PAGE, SET, SetError, read_set, sets_in
 from advnerf_core.report.evidence.verifying.numbers import published_numbers
+from advnerf_core.report.evidence.verifying.pictures import write_picture
 from advnerf_core.report.evidence.verifying.victims import read_declared
 
 
@@ -24,10 +25,6 @@ def write_set(folder: Path) -> Path:
         SetError: Nothing was registered there, its cells contradict the registration, or a victim does not drive well and that is not
             declared.
     """
-    # They load matplotlib, which verifying does not need.
-    from advnerf_core.report.evidence.plot import excess_plot
-    from advnerf_core.report.plots import write_png
-
     registration, cells = read_set(folder)
     evidence, withdrawn, declared = (
         Evidence(registration, cells),
@@ -42,7 +39,7 @@ def write_set(folder: Path) -> Path:
     data = {**named, "files": digests_of(folder), **numbers}
     write_atomically(folder / SET, json.dumps(data, indent=1) + "\n")
     write_known_digest(folder)
-    write_png(excess_plot(evidence), folder.parent / picture_of(folder.name), dpi=110)
+    write_picture(evidence, folder.parent, folder.name)
     write_page(folder.parent)
     return folder / SET
 

@@ -81,9 +81,10 @@ def _set_problems(history: History, folder: Path, log: Log) -> Iterator[str]:
 
 
 def _changed(history: History, published: Path, log: Log) -> Iterator[str]:
-    """Files of registered sets and of the reference build that were changed since they were committed, and that is not logged."""
-    for name in (*sets_in(published), BUILD):
-        for file in sorted(path for path in (published / name).rglob("*") if path.is_file()):
+    """Files of registered sets and of the reference build, and films, that were changed since they were committed, and that is not logged."""
+    folders = [published / name for name in (*sets_in(published), BUILD)]
+    for part in (*(folder.rglob("*") for folder in folders), published.glob("*.webp")):
+        for file in sorted(path for path in part if path.is_file()):
             path = file.relative_to(published).as_posix()
             changes = _since_added(history.of(path))
             if not changes or path.endswith((f"/{SET}", f"/{FILE}")) or ("file", path) in log:
