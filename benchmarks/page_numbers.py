@@ -83,8 +83,8 @@ def count_numbers(docs: Path, rows: Iterable[Mapping[str, Any]]) -> Counted:
 
 
 def measured_once(docs: Path, rows: Iterable[Mapping[str, Any]]) -> dict[str, list[str]]:
-    """Numbers of marked pages that no published row or set has, by page."""
-    known, found = {*_of_rows(rows), *_of_sets(docs / "results")}, {}
+    """Numbers of marked pages that no row has, by page."""
+    known, found = set(_of_rows(rows)), {}
     for page in _pages(docs):
         text = page.read_text(encoding="utf-8")
         if is_marked(text):
@@ -93,9 +93,9 @@ def measured_once(docs: Path, rows: Iterable[Mapping[str, Any]]) -> dict[str, li
 
 
 def _not_listed(page: Path, others: Iterable[tuple[str, str]], listed: Iterable[str]) -> Iterator[str]:
-    wrong = sorted({" ".join(each) for each in others} ^ set(listed))
+    wrong = sorted({" ".join(each) for each in others} - set(listed))
     if wrong:
-        yield f"{page}: {wrong[0]} is in no published row or set and not in {LIST}, or only there; python -m benchmarks.page_numbers writes it"
+        yield f"{page}: {wrong[0]} is in no published row or set, and not in {LIST}; python -m benchmarks.page_numbers writes it"
 
 
 def _pages(docs: Path) -> Iterator[Path]:

@@ -28,11 +28,11 @@ class Kind:
 
 
 def a_past_of_its_own(world: World) -> None:
-    """Drives that were scaled before anything was committed: the whole history is made up.
+    """Drives that were made up before anything was committed: the whole history is made up.
 
     Whoever has a clone of the true history sees it, or whoever drives again.
     """
-    of_cells.wider_drives_of_a_method(world)
+    of_cells.stronger_drives(world)
     shutil.move(world.root / ".git", world.true_history)
     World(world.root, world.name, random.Random(0)).begin()
 
@@ -59,9 +59,7 @@ KINDS: dict[str, Kind] = {
     "another start, renewed": Kind(of_cells.another_start),
     "a leap, renewed": Kind(of_cells.a_leap),
     "wider poses, renewed": Kind(of_cells.wider_poses),
-    "wider drives of the attack with their headings, renewed": Kind(
-        of_cells.wider_drives_of_a_method, "history"
-    ),
+    "stronger drives of the attack, renewed": Kind(of_cells.stronger_drives, "history"),
     "a copied drive, renewed": Kind(of_cells.a_copied_drive),
     "swapped seeds, renewed": Kind(of_cells.swapped_seeds, "history"),
     "a shared attack, renewed": Kind(of_cells.a_shared_attack),

@@ -81,16 +81,17 @@ def wider_poses(world: World) -> None:
     world.renew_all()
 
 
-def wider_drives_of_a_method(world: World) -> None:
-    """All deployed drives of the attack scaled, with headings that agree."""
-    factor = world.rng.uniform(1.1, 1.3)
-    for file in sorted(world.folder.glob("*.json")):
+def stronger_drives(world: World) -> None:
+    """All deployed drives of the attack turn away further from those without attack, as the car can drive."""
+    factor = world.rng.uniform(1.05, 1.3)
+    for file in sorted(world.folder.glob("*_gradient_*.json")):
         data = read_json(file)
-        if data["method"] == "gradient":
-            for number in range(len(data["kept"]["deployed"])):
-                poses = _wider(poses_of(data, "deployed", number), factor)
-                world.set_drive(data, "deployed", number, _turned_along(poses))
-            world.put(file, data)
+        name = cell_name(data["scenario"], data["victim"], "none", 0, data.get("placement", ""))
+        clean = read_json(world.folder / f"{name}.json")
+        for number in range(len(data["kept"]["deployed"])):
+            drives = [poses_of(each, "deployed", number) for each in (data, clean)]
+            world.set_drive(data, "deployed", number, _turned_further(*drives, factor))
+        world.put(file, data)
     world.renew_all()
 
 
@@ -264,3 +265,21 @@ def _turned_along(poses: Floats) -> Floats:
     turned[1:-1, 2] = (directions[:-1] + directions[1:]) / 2.0
     turned[-1, 2] = directions[-1]
     return turned
+
+
+def _turned_further(poses: Floats, clean: Floats, factor: float) -> Floats:
+    """Poses of a drive whose headings differ from another one's by more, with its own steps along them."""
+    steps = np.diff(poses[:, :2], axis=0)
+    headings = np.unwrap(poses[:, 2])
+    other = np.unwrap(clean[:, 2])
+    new = headings + (factor - 1.0) * (headings - other - (headings[0] - other[0]))
+    turned = (new - headings)[:-1] + np.diff(new - headings) / 2.0
+    moved = np.stack(
+        [
+            np.cos(turned) * steps[:, 0] - np.sin(turned) * steps[:, 1],
+            np.sin(turned) * steps[:, 0] + np.cos(turned) * steps[:, 1],
+        ],
+        axis=1,
+    )
+    places = poses[0, :2] + np.concatenate([np.zeros((1, 2)), np.cumsum(moved, axis=0)])
+    return np.column_stack([places, new])
