@@ -96,6 +96,8 @@ def planted(world: World, count: int, seed: int = 0) -> Counts:
         if not found:
             counts.missed[kind] += 1
         world.restore()
+        if not (number + 1) % 100:
+            print(f"{number + 1} of {count}", flush=True)
     return counts
 
 

@@ -16,12 +16,12 @@ from benchmarks.planting.world import World
 
 def a_digit(world: World) -> None:
     """Another digit in some file of the set."""
-    _other_digit(world.rng.choice(_files(world)), world.rng)
+    _other_digit(world.rng.choice(_with_digits(world)), world.rng)
 
 
 def a_digit_with_its_digest(world: World) -> None:
     """Another digit in some file of the set, with the digests renewed."""
-    _other_digit(world.rng.choice([file for file in _files(world) if not file.match(SET)]), world.rng)
+    _other_digit(world.rng.choice([file for file in _with_digits(world) if not file.match(SET)]), world.rng)
     world.renew_digests()
 
 
@@ -118,6 +118,10 @@ def a_digest(world: World) -> None:
 
 def _files(world: World) -> list[Path]:
     return sorted(file for file in world.folder.rglob("*.json"))
+
+
+def _with_digits(world: World) -> list[Path]:
+    return [file for file in _files(world) if any(letter.isdigit() for letter in file.read_text())]
 
 
 def _reference(world: World) -> Path:

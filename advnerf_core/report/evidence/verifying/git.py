@@ -54,7 +54,15 @@ class History:
             raise NoHistory("this is a shallow clone; git fetch --unshallow gets the rest")
         self.prefix = known[1]
         inside = [path for path in paths if self.prefix or not path.startswith("..")]
-        shown = ("-c", "--raw", "--no-abbrev", "--no-renames", f"--format={_SEPARATOR}%H")
+        shown = (
+            "--full-history",
+            "--topo-order",
+            "-c",
+            "--raw",
+            "--no-abbrev",
+            "--no-renames",
+            f"--format={_SEPARATOR}%H",
+        )
         text = self._git("log", *shown, "--", *inside)
         self.changes = _changes(text)
         if not self.changes:
