@@ -1,15 +1,16 @@
 """Numbers with a unit on hand-written pages: of a published row, a setting, or measured once. ``python -m benchmarks.page_numbers``.
 
-A page may hold numbers of three kinds. A result stands in a row of ``docs/results.json`` or in a published set, and is found there as it
-is written. A setting or a limit is no result; pages of nothing else are listed in `SETTINGS`. A page with any other number says `MARK` at
-its head, and its numbers are listed in `LIST`, which the command writes: a number that is edited is then in neither.
+A page may hold numbers of three kinds. A result stands in a row of ``docs/results.json`` or in a published set, rounded as it may be. A
+setting or a limit is no result; pages of nothing else are listed in `SETTINGS`. A page with any other number says `MARK` at its head.
+The command lists the numbers of all pages but those of settings in `LIST`, by kind: a number that is edited is then not listed, and one
+whose row has changed is not published any more.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 
 MARK = "measured once, not kept"
-LIST = "measured_once.json"  # in the folder of the pages
+LIST = "page_numbers.json"  # in the folder of the pages
 _HEAD_LINES = 8
 # Made from rows and code by commands, which tests hold them to.
 _GENERATED = ("results.md", "api.md")
@@ -33,6 +34,7 @@ _UNIT = r"%|dB|ms|us|s|min|h|x|×|mm|cm|m|MB|GB|kB|MiB|GiB|rad|degrees|Hz"  # no
 _NUMBER = re.compile(rf"(?<![\w.#/=-])(-?\d[\d,]*(?:\.\d+)?) ?({_UNIT})(?![\w/])")
 _CODE = re.compile(r"^(?: {4}.*|```[\s\S]*?```)$|`[^`]*`|\]\([^)]*\)", re.MULTILINE)
 _DECIMALS = range(5)
+Number = tuple[str, str]  # as it is written, and its unit
 
 
 @dataclass(frozen=True)
@@ -40,9 +42,9 @@ class Counted:
     """Numbers of the hand-written pages.
 
     Attributes:
-        published: Those that a published row or set has.
+        published: Results that a published row or set has.
         marked: Others, on pages that say they were measured once.
-        settings: Others, on pages of settings.
+        settings: Those of pages of settings, and single ones on other pages.
         problems: Pages with numbers that are none of these.
     """
 
@@ -59,43 +61,56 @@ def count_numbers(docs: Path, rows: Iterable[Mapping[str, Any]]) -> Counted:
         docs: Folder of the pages; README.md lies beside it.
         rows: Of the ledger.
     """
-    known = {*_of_rows(rows), *_of_sets(docs / "results")}
+    known = _known(docs, rows)
     listed = read_json(docs / LIST) if (docs / LIST).exists() else {}
-    counts, problems = {"published": 0, "marked": 0, "settings": 0}, []
+    counts = {"published": 0, "marked": 0, "settings": 0}
+    problems: list[str] = []
     for page in _pages(docs):
         text = page.read_text(encoding="utf-8")
-        settings = _SETTINGS_ON.get(page.name, set())
-        found = list(numbers_in(text))
-        others = [each for each in found if each not in known | settings]
-        counts["published"] += sum(each in known for each in found)
-        counts["settings"] += sum(each in settings - known for each in found)
-        if is_marked(text):
-            counts["marked"] += len(others)
-            problems += _not_listed(page, others, listed.get(page.name, []))
-        elif page.name in SETTINGS:
-            counts["settings"] += len(others)
-        elif others:
-            first = " ".join(others[0])
-            problems.append(
-                f"{page}: {first} is in no published row or set; say at its head that figures were {MARK!r}"
-            )
+        for number in numbers_in(text):
+            if page.name in SETTINGS or number in _SETTINGS_ON.get(page.name, ()):
+                counts["settings"] += 1
+            else:
+                counts["published" if number in known else "marked"] += 1
+        if page.name not in SETTINGS:
+            problems += _problems(page, text, known, listed.get(page.name, {}))
     return Counted(**counts, problems=tuple(problems))
 
 
-def measured_once(docs: Path, rows: Iterable[Mapping[str, Any]]) -> dict[str, list[str]]:
-    """Numbers of marked pages that no row has, by page."""
-    known, found = set(_of_rows(rows)), {}
+def list_numbers(docs: Path, rows: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, list[str]]]:
+    """Numbers by page, and whether they are published."""
+    known, found = _known(docs, rows), {}
     for page in _pages(docs):
-        text = page.read_text(encoding="utf-8")
-        if is_marked(text):
-            found[page.name] = sorted({" ".join(each) for each in numbers_in(text) if each not in known})
+        numbers = _results_on(page, page.read_text(encoding="utf-8"))
+        if numbers and page.name not in SETTINGS:
+            kinds = {"published": numbers & known, MARK: numbers - known}
+            found[page.name] = {kind: sorted(map(" ".join, each)) for kind, each in kinds.items() if each}
     return found
 
 
-def _not_listed(page: Path, others: Iterable[tuple[str, str]], listed: Iterable[str]) -> Iterator[str]:
-    wrong = sorted({" ".join(each) for each in others} - set(listed))
-    if wrong:
-        yield f"{page}: {wrong[0]} is in no published row or set, and not in {LIST}; python -m benchmarks.page_numbers writes it"
+def write_list(docs: Path, rows: Iterable[Mapping[str, Any]]) -> None:
+    """Write the list of numbers beside the pages."""
+    write_atomically(docs / LIST, json.dumps(list_numbers(docs, rows), indent=1) + "\n")
+
+
+def _problems(
+    page: Path, text: str, known: Collection[Number], listed: Mapping[str, Sequence[str]]
+) -> Iterator[str]:
+    found, published = set(map(" ".join, _results_on(page, text))), set(map(" ".join, known))
+    if wrong := sorted(found ^ {each for numbers in listed.values() for each in numbers}):
+        yield f"{page}: {wrong[0]} is not on the page or not in {LIST}; python -m benchmarks.page_numbers writes it"
+    elif wrong := sorted(set(listed.get("published", ())) - published):
+        yield f"{page}: {wrong[0]} is in no published row or set any more; correct the page, then run python -m benchmarks.page_numbers"
+    elif not is_marked(text) and (wrong := sorted(found - published)):
+        yield f"{page}: {wrong[0]} is in no published row or set; say at the head of the page that figures were {MARK!r}"
+
+
+def _results_on(page: Path, text: str) -> set[Number]:
+    return set(numbers_in(text)) - _SETTINGS_ON.get(page.name, set())
+
+
+def _known(docs: Path, rows: Iterable[Mapping[str, Any]]) -> set[Number]:
+    return {*_of_rows(rows), *_of_sets(docs / "results")}
 
 
 def _pages(docs: Path) -> Iterator[Path]:
@@ -109,13 +124,13 @@ def is_marked(text: str) -> bool:
     return MARK in " ".join(text.splitlines()[:_HEAD_LINES])
 
 
-def numbers_in(text: str) -> Iterator[tuple[str, str]]:
+def numbers_in(text: str) -> Iterator[Number]:
     """Numbers of a text with their units, code and links left out."""
     for number, unit in _NUMBER.findall(_CODE.sub(" ", text)):
         yield number.replace(",", ""), unit.replace("×", "x")  # noqa: RUF001
 
 
-def _of_rows(rows: Iterable[Mapping[str, Any]]) -> Iterator[tuple[str, str]]:
+def _of_rows(rows: Iterable[Mapping[str, Any]]) -> Iterator[Number]:
     """Numbers of the ledger as a page may write them: rounded values, and those in targets and notes."""
     for row in rows:
         yield from numbers_in(f"{row['target']}; {row['note']}; {row['value']} {row['unit']}")
@@ -124,7 +139,7 @@ def _of_rows(rows: Iterable[Mapping[str, Any]]) -> Iterator[tuple[str, str]]:
             yield from _rounded(row["value"], unit)
 
 
-def _of_sets(published: Path) -> Iterator[tuple[str, str]]:
+def _of_sets(published: Path) -> Iterator[Number]:
     """Lengths and shares of the published sets."""
     for file in sorted(published.glob("*/set/set.json")):
         data = read_json(file)
@@ -136,18 +151,17 @@ def _of_sets(published: Path) -> Iterator[tuple[str, str]]:
                     yield from _rounded(100.0 * value, "%")
 
 
-def _rounded(value: float, unit: str) -> Iterator[tuple[str, str]]:
+def _rounded(value: float, unit: str) -> Iterator[Number]:
     return ((f"{value:.{decimals}f}", unit) for decimals in _DECIMALS)
 
 
 def main() -> None:
-    """Write the list of numbers that were measured once."""
+    """Write the list of numbers."""
     from benchmarks.results import REPOSITORY, read_rows
 
     docs = REPOSITORY / "docs"
-    found = measured_once(docs, read_rows())
-    write_atomically(docs / LIST, json.dumps(found, indent=1) + "\n")
-    print(f"{docs / LIST}: {sum(map(len, found.values()))} numbers of {len(found)} pages")
+    write_list(docs, read_rows())
+    print(docs / LIST)
 
 
 if __name__ == "__main__":

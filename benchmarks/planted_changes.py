@@ -20,6 +20,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.files import sha256_of
 from advnerf_core.report.evidence.page import picture_of
 from benchmarks.kept_rows import computed_again
+from benchmarks.page_numbers import write_list
 from benchmarks.planting.detecting import find
 from benchmarks.planting.kinds import KINDS
 from benchmarks.planting.simulated import NAME, write_simulated_set
@@ -108,10 +109,10 @@ def published_world(work: Path, name: str) -> World:
     return _begun(root, name, computed_again([row["command"] for row in read_rows()]))
 
 
-def simulated_world(work: Path) -> World:
+def simulated_world(work: Path, searches: int = 6, starts: int = 5) -> World:
     """A set of simulated drives, with three rows of a ledger."""
     root = work / "repository"
-    write_simulated_set(root / "docs" / "results" / NAME)
+    write_simulated_set(root / "docs" / "results" / NAME, searches, starts)
     again = [LedgerRow("a kept row", 0.5, "m", ">= 0.4 m", True, f"python -m benchmarks.gap {NAME}")]
     once = [
         LedgerRow(
@@ -120,8 +121,7 @@ def simulated_world(work: Path) -> World:
         LedgerRow("a row", 3.0, "x", ">= 2 x", True, "python -m benchmarks.floors", "on two cores"),
     ]
     for row in (*again, *once):
-        places = {"ledger": root / "docs" / "results.json", "page": root / "docs" / "results.md"}
-        record_row(row.line, row.value, row.unit, row.target, row.met, row.command, row.note, **places)
+        row.record(root / "docs" / "results.json", root / "docs" / "results.md")
     return _begun(root, NAME, again)
 
 
@@ -132,7 +132,9 @@ def _begun(root: Path, name: str, again: Sequence[LedgerRow]) -> World:
     if not readme.exists():
         readme.write_text("# A project\n\n")
     world.write_readme()
-    write_pages(read_json(world.ledger), world.ledger.with_suffix(".md"), world.published)
+    rows = read_json(world.ledger)
+    write_pages(rows, world.ledger.with_suffix(".md"), world.published)
+    write_list(root / "docs", rows)
     world.begin()
     return world
 

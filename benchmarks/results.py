@@ -57,10 +57,9 @@ class LedgerRow:
         """The same row of another command."""
         return replace(self, command=command)
 
-    def record(self) -> None:
-        """Write it into the ledger."""
-        where = {"machine": self.machine, "date": self.date}
-        record_row(self.line, self.value, self.unit, self.target, self.met, self.command, self.note, **where)
+    def record(self, ledger: Path = LEDGER, page: Path = PAGE) -> None:
+        """Write it into a ledger."""
+        record_row(**vars(self), ledger=ledger, page=page)
 
 
 def record_row(

@@ -89,8 +89,8 @@ def stronger_drives(world: World) -> None:
         name = cell_name(data["scenario"], data["victim"], "none", 0, data.get("placement", ""))
         clean = read_json(world.folder / f"{name}.json")
         for number in range(len(data["kept"]["deployed"])):
-            drives = [poses_of(each, "deployed", number) for each in (data, clean)]
-            world.set_drive(data, "deployed", number, _turned_further(*drives, factor))
+            attacked, other = (poses_of(each, "deployed", number) for each in (data, clean))
+            world.set_drive(data, "deployed", number, _turned_further(attacked, other, factor))
         world.put(file, data)
     world.renew_all()
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from advnerf_core.driving.metrics import drive_metrics
+from advnerf_core.driving.metrics import DriveMetrics, drive_metrics
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.report.evidence.kept import KeptDrive
 from advnerf_core.report.evidence.page import film_of
@@ -148,7 +148,7 @@ def _write_cell(
 ) -> None:
     horizon = made.registration.scenarios[cell.scenario].horizon
 
-    def metrics(part: list[KeptDrive]) -> list[float]:
+    def metrics(part: list[KeptDrive]) -> list[DriveMetrics]:
         return [drive_metrics(made.path, each.poses(), horizon, each.driven_ticks) for each in part]
 
     domains = ("surrogate", "deployed")

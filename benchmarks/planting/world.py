@@ -26,6 +26,7 @@ from advnerf_core.report.evidence.verifying.digests import write_beside, write_k
 from advnerf_core.report.evidence.verifying.layout import read_set
 from advnerf_core.report.evidence.verifying.numbers import published_numbers
 from advnerf_core.report.evidence.verifying.victims import read_declared
+from benchmarks.page_numbers import write_list
 from benchmarks.results import LedgerRow, write_pages
 
 Data = dict[str, Any]
@@ -144,6 +145,7 @@ class World:
             write_page(self.published)
             self.write_readme()
             self.renew_rows(read_json(self.ledger))
+            write_list(self.root / "docs", read_json(self.ledger))
         except (AdvnerfError, ValueError, StopIteration):  # no numbers of what is damaged
             self.renew_digests()
 
