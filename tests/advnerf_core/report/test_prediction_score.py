@@ -45,7 +45,7 @@ def test_drives_are_scored_in_half_lanes(evidence: Evidence) -> None:
     assert found.held == sum(low <= value <= high for value in deployed)
     assert found.score == pytest.approx(interval_score(low, high, deployed).mean())
     differences = past_differences([evidence])
-    assert len(differences) == 2 * 6 * 5  # two methods of six searches from five starts
+    assert len(differences) == 2 * 2 * 6 * 5  # two conditions, two methods of six searches from five starts
     pairs = [one + other for one in learned for other in differences]
     assert found.trivial_band == pytest.approx(tuple(np.quantile(pairs, (0.1, 0.9))))
 
