@@ -7,11 +7,11 @@ here needs torch or a simulator. Each kind of check is a file in `verifying`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from advnerf_core.report.cells import CellError
+from advnerf_core.report.cells import CellError, CellResult
 from advnerf_core.report.evidence.publishing import page_text, write_page, write_set
 from advnerf_core.report.evidence.registration import RegistrationError, read_withdrawn
 from advnerf_core.report.evidence.results import Evidence
@@ -65,7 +65,26 @@ def verify_set(folder: Path) -> Verified:
         return Verified(folder.name, 0, 0, (str(error),))
     if not cells and not (folder / SET).exists() and folder.name not in known_digests(folder.parent):
         return Verified(folder.name, 0, 0, (), awaits_results=True)
-    evidence = Evidence(registration, cells)
+    try:
+        return _verified(folder, Evidence(registration, cells), cells, withdrawn, declared)
+    except (
+        ValueError,
+        LookupError,
+        TypeError,
+        AttributeError,
+    ) as error:  # files of the right form that make no sense
+        return Verified(
+            folder.name, 0, 0, (f"{folder}: cannot be computed again: {error!r}; restore it from git",)
+        )
+
+
+def _verified(
+    folder: Path,
+    evidence: Evidence,
+    cells: Sequence[CellResult],
+    withdrawn: Mapping[str, str],
+    declared: Mapping[str, str],
+) -> Verified:
     problems = [*file_problems(folder), *set_problems(folder, evidence, cells)]
     numbers = 0
     if not problems:  # numbers of damaged drives say nothing more

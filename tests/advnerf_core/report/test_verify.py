@@ -344,3 +344,13 @@ def test_a_car_moves_along_its_heading_and_no_further_than_it_drives(copied, ste
     file.write_text(json.dumps(data))
     found = "\n".join(drive_problems(evidence_of(copied)))
     assert (says in found) if says else (found == "")
+
+
+def test_a_registration_that_makes_no_sense_is_a_problem_and_no_crash(copied):
+    data = json.loads((copied / FILE).read_text())
+    data["scenarios"]["track"]["path"]["start_pose"][0] += 0.1
+    data["scenarios"]["track"]["path"]["segments"] = data["scenarios"]["track"]["path"]["segments"][:1]
+    (copied / FILE).write_text(json.dumps(data))
+    (problem,) = verify_set(copied).problems
+    assert "cannot be computed again" in problem
+    assert "restore it from git" in problem
