@@ -100,7 +100,14 @@ def verify_beside(published: Path) -> tuple[str, ...]:
     try:
         if not page.exists() or page.read_text(encoding="utf-8") != page_text(published):
             problems.append(f"{page}: is not the page of the published sets")
-    except (OSError, ValueError, LookupError, TypeError) as error:  # of damaged manifests there is no page
+    except (
+        OSError,
+        ValueError,
+        LookupError,
+        TypeError,
+        AttributeError,
+        StopIteration,
+    ) as error:  # of damaged manifests
         problems.append(f"{page}: cannot be made from the published sets: {error!r}")
     return tuple(problems)
 
