@@ -36,6 +36,12 @@ _COLUMNS = "| scenario | victim | object shows | driven in | searches | excess [
 
 
 def main() -> None:
+    write_atomically(PAGE, page_text())
+    print(f"wrote {Path(PAGE).relative_to(REPOSITORY)}")
+
+
+def page_text() -> str:
+    """The page in Markdown, from the published cells of sets without a registration."""
     folders = sorted(
         folder for folder in PUBLISHED.iterdir() if folder.is_dir() and any(folder.glob("*_*.json"))
     )
@@ -44,8 +50,7 @@ def main() -> None:
         if not (folder / FILE).exists():
             rows = "".join(_rows(read_cells(folder)))
             parts.append(f"\n## {folder.name}\n\n{_COLUMNS + rows if rows else _NO_TICKS}")
-    write_atomically(PAGE, "".join(parts))
-    print(f"wrote {Path(PAGE).relative_to(REPOSITORY)}")
+    return "".join(parts)
 
 
 def _rows(cells: list[CellResult]) -> Iterator[str]:

@@ -16,7 +16,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.report.conditions import style_of
 from advnerf_core.report.evidence.luck import luck_of
 from advnerf_core.report.evidence.registration import read_registration
-from benchmarks.results import REPOSITORY, record_row
+from benchmarks.results import REPOSITORY, LedgerRow
 
 PUBLISHED = REPOSITORY / "docs" / "results"
 _LEAST = 0.25
@@ -25,27 +25,41 @@ _FOREIGN = ("gap_metadrive", "gap_metadrive_unseen", "gap_duckietown", "gap_duck
 
 
 def main() -> None:
-    """Record the rows of each set."""
+    """Record the rows of each set, and over all that are named."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("sets", nargs="+", help="names of published gap sets")
-    last = []
-    for name in parser.parse_args().sets:
-        registration = read_registration(PUBLISHED / name)
-        if registration is None:
-            raise SystemExit(f"expected a published set in {PUBLISHED / name}, got none; run advnerf publish")
-        data = read_json(PUBLISHED / name / "set" / "set.json")
-        test = data["primary"][-1]
-        scenario = registration.scenario(test["test"]["scenario"])
-        assert scenario is not None, "a primary test is of a registered scenario"
-        record(name, test, data["rows"], scenario.off_track_m)
-        record_luck(name, test)
-        record_largest_loss(name, test, data.get("contrasts", []))
-        last.append((name, test))
-    if len(last) > 1:
-        record_all_luck(last)
+    names = parser.parse_args().sets
+    for each in [*names, *([" ".join(names)] if len(names) > 1 else [])]:
+        for row in ledger_rows(each):
+            row.record()
+            print(f"{row.line}: {row.value} {row.unit}; {row.note}")
 
 
-def record(name: str, test: dict[str, Any], rows: list[dict[str, Any]], half_lane_m: float) -> None:
+def ledger_rows(names: str) -> list[LedgerRow]:
+    """The rows of one set, from its published numbers; of several names with spaces between them those over all of these sets."""
+    tests = [(name, _published(name)) for name in names.split()]
+    if len(tests) > 1:
+        return all_luck_rows([(name, data["primary"][-1]) for name, data in tests])
+    ((name, data),) = tests
+    test = data["primary"][-1]
+    registration = read_registration(PUBLISHED / name)
+    scenario = registration.scenario(test["test"]["scenario"]) if registration else None
+    assert scenario is not None, "a primary test is of a registered scenario"
+    rows = [*gap_rows(name, test, data["rows"], scenario.off_track_m), luck_row(name, test)]
+    return [*rows, *largest_loss_rows(name, test, data.get("contrasts", []))]
+
+
+def _published(name: str) -> dict[str, Any]:
+    file = PUBLISHED / name / "set" / "set.json"
+    if not file.exists():
+        raise SystemExit(f"expected a published set in {PUBLISHED / name}, got none; run advnerf publish")
+    data: dict[str, Any] = read_json(file)
+    return data
+
+
+def gap_rows(
+    name: str, test: dict[str, Any], rows: list[dict[str, Any]], half_lane_m: float
+) -> list[LedgerRow]:
     """The rows of one set, from the test under its last condition."""
     command, which = f"python -m benchmarks.gap {name}", test["test"]
     said, real = (
@@ -63,15 +77,12 @@ def record(name: str, test: dict[str, Any], rows: list[dict[str, Any]], half_lan
     )
     low = (test["low_m"] or 0.0) / half_lane_m
     target, met = (f">= {_LEAST:g}", low >= _LEAST) if name in _FOREIGN else ("", None)
-    record_row(f"{name}: gradient minus the strongest random family, deployed natively, lower 95 % bound", round(low, 3), "half lanes per tick", target, met, command, note)  # fmt: skip
+    bound = LedgerRow(f"{name}: gradient minus the strongest random family, deployed natively, lower 95 % bound", round(low, 3), "half lanes per tick", target, met, command, note)  # fmt: skip
     kept = 100.0 * real["excess_m"] / said["excess_m"]
-    record_row(f"{name}: share of the surrogate's excess that is left, deployed natively", round(kept), "%", "", None, command, f"{said['excess_m']:.3f} to {real['excess_m']:.3f} m per tick")  # fmt: skip
-    print(
-        f"{name}: lower bound {low:.3f} half lanes per tick, {kept:.0f} % of the surrogate's excess left; {note}"
-    )
+    return [bound, LedgerRow(f"{name}: share of the surrogate's excess that is left, deployed natively", round(kept), "%", "", None, command, f"{said['excess_m']:.3f} to {real['excess_m']:.3f} m per tick")]  # fmt: skip
 
 
-def record_luck(name: str, test: dict[str, Any]) -> None:
+def luck_row(name: str, test: dict[str, Any]) -> LedgerRow:
     """What is left of the random search that is strongest in the surrogate, beside the others and the gradient's."""
     found, pairs = luck_of(test), test["searches"][test["baseline"]]
     best = int(np.argmax([each["surrogate_m"] for each in pairs]))
@@ -84,16 +95,15 @@ def record_luck(name: str, test: dict[str, Any]) -> None:
         f"are stronger in the surrogate than every gradient search{', and push to the other side' * found.other_side}; there the gradient adds {test['difference_surrogate_m']:+.3f} m per tick ({there})"
     )
     value = round(100.0 * found.baseline_shares[best])
-    record_row(f"{name}: share left of the random search that is strongest in the surrogate, deployed natively", value, "%", "", None, f"python -m benchmarks.gap {name}", note)  # fmt: skip
-    print(f"{name}: {value} % of the strongest random search left; {note}")
+    return LedgerRow(f"{name}: share left of the random search that is strongest in the surrogate, deployed natively", value, "%", "", None, f"python -m benchmarks.gap {name}", note)  # fmt: skip
 
 
-def record_all_luck(tests: list[tuple[str, dict[str, Any]]]) -> None:
+def all_luck_rows(tests: list[tuple[str, dict[str, Any]]]) -> list[LedgerRow]:
     """What is left of random searches that are stronger in the surrogate than every gradient search, over the sets."""
     found = [(name, luck_of(test)) for name, test in tests]
     lucky = [(name, 100.0 * share) for name, each in found for share in each.lucky_shares]
     if not lucky:
-        return
+        return []
     ours = [100.0 * share for _, each in found for share in each.method_shares]
     theirs = [100.0 * share for _, each in found for share in each.baseline_shares]
     note = (
@@ -101,22 +111,20 @@ def record_all_luck(tests: list[tuple[str, dict[str, Any]]]) -> None:
         f"{np.median(theirs):.0f} %; {len(ours)} gradient searches: {min(ours):.0f} to {max(ours):.0f} %, median {np.median(ours):.0f} %"
     )
     value = round(max(share for _, share in lucky))
-    record_row("random searches that are stronger in the surrogate than every gradient search: largest share left, deployed natively", value, "%", "", None, f"python -m benchmarks.gap {' '.join(name for name, _ in tests)}", note)  # fmt: skip
-    print(f"{value} %: {note}")
+    return [LedgerRow("random searches that are stronger in the surrogate than every gradient search: largest share left, deployed natively", value, "%", "", None, f"python -m benchmarks.gap {' '.join(name for name, _ in tests)}", note)]  # fmt: skip
 
 
-def record_largest_loss(name: str, test: dict[str, Any], contrasts: list[dict[str, Any]]) -> None:
+def largest_loss_rows(name: str, test: dict[str, Any], contrasts: list[dict[str, Any]]) -> list[LedgerRow]:
     """Which single difference takes most of the random searches' excess, and what it takes of the gradient's."""
     singles = [row for row in contrasts if not row["name"].startswith("all of it")]
     changed = {(row["name"], row["method"]): 100.0 * row["difference_m"] / row["before_m"] for row in singles}
     losses = {what: share for (what, method), share in changed.items() if method == test["baseline"]}
     if not losses:
-        return
+        return []
     what = min(losses, key=lambda each: losses[each])
     ours = changed[what, test["test"]["method"]]
     note = f"{what}; it changes the gradient's excess by {ours:+.0f} %"
-    record_row(f"{name}: largest change of the random searches' excess by a single difference", round(losses[what]), "%", "", None, f"python -m benchmarks.gap {name}", note)  # fmt: skip
-    print(f"{name}: {losses[what]:+.0f} % by {note}")
+    return [LedgerRow(f"{name}: largest change of the random searches' excess by a single difference", round(losses[what]), "%", "", None, f"python -m benchmarks.gap {name}", note)]  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -34,7 +34,7 @@ from advnerf_core.report.evidence.transfer_factor import (
     transfer_of,
 )
 from advnerf_core.report.evidence.verify import sets_in
-from benchmarks.results import REPOSITORY, record_row
+from benchmarks.results import REPOSITORY, LedgerRow
 
 PUBLISHED = REPOSITORY / "docs" / "results"
 COMMAND = "python -m benchmarks.predictions"
@@ -71,13 +71,22 @@ class Predicted:
 def main() -> None:
     """Score and record."""
     argparse.ArgumentParser(description=__doc__).parse_args()
+    for row in ledger_rows():
+        row.record()
+        print(f"{row.line}: {row.value} {row.unit}; {row.note}")
+
+
+def ledger_rows() -> list[LedgerRow]:
+    """All rows, from the published sets."""
     sets = [evidence_of(name) for name in sets_in(PUBLISHED)]
     sets = sorted((each for each in sets if each.cells), key=lambda each: each.registration.date)
+    rows: list[LedgerRow] = []
     for baseline in (False, True):
-        record_forward([made for each in sets if (made := forward(each, sets, baseline))], baseline)
+        rows += forward_rows([made for each in sets if (made := forward(each, sets, baseline))], baseline)
     for each in sets:
         for folder in ("predictions", "predictions_afterwards"):
-            record_registered(each, sets, PUBLISHED / each.registration.name / folder)
+            rows += registered_rows(each, sets, PUBLISHED / each.registration.name / folder)
+    return rows
 
 
 def evidence_of(name: str) -> Evidence:
@@ -109,14 +118,9 @@ def before(evidence: Evidence, sets: Sequence[Evidence], baseline: bool) -> list
     return [each for each in made if each is not None]
 
 
-def record_forward(found: Sequence[Predicted], baseline: bool) -> None:
-    """Print and record the rows over all sets, of the attacks or of the random families."""
+def forward_rows(found: Sequence[Predicted], baseline: bool) -> list[LedgerRow]:
+    """The rows over all sets, of the attacks or of the random families."""
     which = "random textures" if baseline else "attacks"
-    for each in found:
-        print(
-            f"{each.found.name}, {which}: factor {each.found.factor:.2f}, predicted {each.band[0]:.2f} to {each.band[1]:.2f}; "
-            f"{each.ours.held} of {each.ours.drives} drives held, rival {each.rival.held}; score {each.ours.score:.3f}, rival {each.rival.score:.3f}"
-        )
     searches = [(each, factor) for each in found for factor in each.found.factors]
     inside = sum(each.holds(each.found.factor) for each in found)
     sets = "; ".join(
@@ -124,17 +128,17 @@ def record_forward(found: Sequence[Predicted], baseline: bool) -> None:
         + (f" (the searches of {' and '.join(each.same_searches)})" if each.same_searches else "")
         for each in found
     )
-    record(f"factor of deployed excess, {which}: sets within the 80 % band from earlier sets", inside, len(found), sets + _AFTER)  # fmt: skip
-    record(
+    first = counted(f"factor of deployed excess, {which}: sets within the 80 % band from earlier sets", inside, len(found), sets + _AFTER)  # fmt: skip
+    second = counted(
         f"factor of deployed excess, {which}: searches within the 80 % band of their set",
         sum(each.holds(factor) for each, factor in searches),
         len(searches),
         "searches of a set share its factor, so that this interval is too narrow",
     )
-    record_drives(which, found, baseline)
+    return [first, second, *drive_rows(which, found, baseline)]
 
 
-def record_drives(which: str, found: Sequence[Predicted], baseline: bool) -> None:
+def drive_rows(which: str, found: Sequence[Predicted], baseline: bool) -> list[LedgerRow]:
     """Coverage of drives, and the interval score against the rival's."""
     held, theirs, drives = (
         sum(getattr(score, name) for score in scores)
@@ -150,19 +154,19 @@ def record_drives(which: str, found: Sequence[Predicted], baseline: bool) -> Non
         f"which they are not; the rival's bands hold {100 * theirs / drives:.0f} %"
     )
     good = None if baseline else _HOLD[0] <= held / drives <= _HOLD[1]
-    record_row(f"deployed drives within 80 % bands predicted from earlier sets, {which}", round(100 * held / drives), "%", "" if baseline else "65 to 95 %", good, COMMAND, note)  # fmt: skip
+    coverage = LedgerRow(f"deployed drives within 80 % bands predicted from earlier sets, {which}", round(100 * held / drives), "%", "" if baseline else "65 to 95 %", good, COMMAND, note)  # fmt: skip
     ours, rival = (float(np.mean([score.score for score in scores])) for scores in zip(*((each.ours, each.rival) for each in found), strict=True))  # fmt: skip
     worse = sum(each.ours.score > each.rival.score for each in found)
     note = f"mean over {len(found)} sets, each under its last condition; {ours:.3f} against {rival:.3f} half lanes per tick; the rival is better in {worse} of them{_AFTER}"
-    record_row(f"interval score predicted from earlier sets against their ratios x surrogate, {which}", ours / rival, "x", "" if baseline else "<= 1", None if baseline else ours <= rival, COMMAND, note)  # fmt: skip
+    return [coverage, LedgerRow(f"interval score predicted from earlier sets against their ratios x surrogate, {which}", ours / rival, "x", "" if baseline else "<= 1", None if baseline else ours <= rival, COMMAND, note)]  # fmt: skip
 
 
-def record_registered(evidence: Evidence, sets: Sequence[Evidence], folder: Path) -> None:
+def registered_rows(evidence: Evidence, sets: Sequence[Evidence], folder: Path) -> list[LedgerRow]:
     """Score predictions that were written before the deployed drives, or afterwards, against the rival; none without such files."""
     found, earlier = transfer_of(evidence), before(evidence, sets, False)
     said = {file.stem: read_json(file) for file in folder.glob("*.json")}
     if found is None or not said:
-        return
+        return []
     bands = registered_bands(found, said, evidence.scenario_of(evidence.cells[found.cells[0]]).off_track_m)
     if bands is None:
         raise SystemExit(f"expected a prediction of each of {', '.join(found.cells)} in {folder}")
@@ -172,16 +176,13 @@ def record_registered(evidence: Evidence, sets: Sequence[Evidence], folder: Path
     which = f"{name}, predicted afterwards" if afterwards else name
     note = f"{len(found.cells)} attacks, {ours.drives} deployed drives of the set {name}, one observation of its factor"
     note += "; the predictor reads no attacked drive, but these were made after them" if afterwards else ""
-    print(
-        f"{which}: {ours.held} of {ours.drives} drives held; score {ours.score:.3f}, rival {rival.score:.3f}"
-    )
-    record_row(f"deployed drives within their predicted 80 % bands, {which}", round(100 * share), "%", "65 to 95 %", None if afterwards else _HOLD[0] <= share <= _HOLD[1], COMMAND, note)  # fmt: skip
-    record_row(f"interval score of predicted excess against ratios of earlier sets x surrogate, {which}", ours.score / rival.score, "x", "< 1", None if afterwards else ours.score < rival.score, COMMAND, f"{note}; {ours.score:.3f} against {rival.score:.3f} half lanes per tick")  # fmt: skip
+    coverage = LedgerRow(f"deployed drives within their predicted 80 % bands, {which}", round(100 * share), "%", "65 to 95 %", None if afterwards else _HOLD[0] <= share <= _HOLD[1], COMMAND, note)  # fmt: skip
+    return [coverage, LedgerRow(f"interval score of predicted excess against ratios of earlier sets x surrogate, {which}", ours.score / rival.score, "x", "< 1", None if afterwards else ours.score < rival.score, COMMAND, f"{note}; {ours.score:.3f} against {rival.score:.3f} half lanes per tick")]  # fmt: skip
 
 
-def record(line: str, held: int, count: int, note: str) -> None:
-    """Record a share with its binomial interval."""
-    record_row(line, f"{held} of {count}", "", "", None, COMMAND, f"Clopper-Pearson 95 % interval {_interval(held, count)}; {note}")  # fmt: skip
+def counted(line: str, held: int, count: int, note: str) -> LedgerRow:
+    """A share with its binomial interval."""
+    return LedgerRow(line, f"{held} of {count}", "", "", None, COMMAND, f"Clopper-Pearson 95 % interval {_interval(held, count)}; {note}")  # fmt: skip
 
 
 def _interval(held: int, count: int) -> str:

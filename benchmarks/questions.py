@@ -82,8 +82,8 @@ QUESTIONS = (
     Question(
         "statistics",
         "Are the intervals and tests right?",
-        "Coverage of intervals and error rates of tests on simulated drives whose true effect is known.",
-        ("coverage", "anytime", "planted_changes"),
+        "Coverage of intervals and error rates of tests on simulated drives whose true effect is known, and what verifying finds.",
+        ("coverage", "anytime", "planted_changes", "verify_time"),
     ),
     Question(
         "hardened",

@@ -14,6 +14,7 @@ import platform
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from typing import Any
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from benchmarks.answers import Answer, answers, sets_table, table
+from benchmarks.kept_commands import NOT_KEPT, kept_by
 from benchmarks.questions import LOST, OTHER, QUESTIONS, Question, question_of
 from nodes.runtime.machine import memory_gib, processor_name
 
@@ -51,6 +53,29 @@ def machine_description() -> str:
     return f"{processor_name()}, {len(os.sched_getaffinity(0))} cores, {memory_gib():.0f} GiB, Python {platform.python_version()}"
 
 
+@dataclass(frozen=True)
+class LedgerRow:
+    """One measured claim; see `record_row`."""
+
+    line: str
+    value: float | str
+    unit: str
+    target: str
+    met: bool | None
+    command: str
+    note: str = ""
+    machine: str = ""
+    date: str = ""
+
+    def with_command(self, command: str) -> LedgerRow:
+        """The same row of another command."""
+        return replace(self, command=command)
+
+    def record(self, ledger: Path = LEDGER, page: Path = PAGE) -> None:
+        """Write it into a ledger."""
+        record_row(**vars(self), ledger=ledger, page=page)
+
+
 def record_row(
     line: str,
     value: float | str,
@@ -76,7 +101,7 @@ def record_row(
         command: The command that measured it, runnable from the project root.
         note: The reason for a miss, or what the reader must know.
         machine: Where it was measured; this machine if it is not said.
-        date: When, ISO; today if it is not said.
+        date: When, ISO; now if it is not said.
         ledger: Where the ledger is kept.
         page: Where the index of the pages is written; the questions lie beside it in ``results/``.
     """
@@ -93,7 +118,8 @@ def record_row(
         "command": command,
         "note": note,
         "machine": machine or machine_description(),
-        "date": date or datetime.now(timezone.utc).date().isoformat(),
+        # To the second: it names one measurement, so that a changed value is told from one that was measured again.
+        "date": date or datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }
     with _locked(ledger):
         rows = [r for r in read_rows(ledger) if r["line"] != line]
@@ -137,7 +163,8 @@ def _index_page(answered: dict[Question, list[dict[str, Any]]], found: list[Answ
         "# Measured results\n\n"
         + (_PICTURE if sets else "")
         + "Each figure was written by the command beside it, on the machine and day that its row names. `python -m benchmarks.results` makes these "
-        "pages from `results.json`.\n\n## In short\n\n"
+        "pages from `results.json`. `advnerf verify` computes rows of kept drives again; the others were measured once, and what they were "
+        "measured from is not kept.\n\n## In short\n\n"
         + table(found)
         + (sets and f"\n{sets}")
         + "\n## All rows\n\nA row that misses its target stays, with the reason: [missed targets](results/missed.md).\n\n"
@@ -171,7 +198,8 @@ def _question_page(question: Question, rows: list[dict[str, Any]]) -> str:
     text += f"![{question.title}]({question.picture})\n\n" if question.picture else ""
     text += f"{question.answers} [All questions](../results.md).\n"
     for command in dict.fromkeys(row["command"] for row in rows):
-        text += f"\n## `{command}`\n\n| measured | value | target | met | note | machine, date |\n|---|---|---|---|---|---|\n"
+        kept = "Computed again by `advnerf verify`." if kept_by(command) else NOT_KEPT
+        text += f"\n## `{command}`\n\n{kept}\n\n| measured | value | target | met | note | machine, date |\n|---|---|---|---|---|---|\n"
         text += "".join(_render_row(row) for row in rows if row["command"] == command)
     return text
 
@@ -184,7 +212,7 @@ def _value(row: dict[str, Any]) -> str:
 def _render_row(row: dict[str, Any]) -> str:
     met = {True: "yes", False: "**no**", None: "-"}[row["met"]]
     named = (row["line"], _value(row), row["target"], met, row["note"])
-    cells = [*map(_renamed, named), f"{row['machine']}, {row['date']}"]
+    cells = [*map(_renamed, named), f"{row['machine']}, {row['date'][:10]}"]
     return "| " + " | ".join(map(_escaped, cells)) + " |\n"
 
 

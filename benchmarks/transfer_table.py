@@ -20,7 +20,7 @@ from advnerf_core.report.transfer import DOMAINS, Domain, TableRow, TransferTabl
 from advnerf_core.report.transfer_page import ran_into_something
 from advnerf_core.report.transfer_prediction import skill_of, skill_text
 from advnerf_core.report.transfer_targets import VICTIM, TableTarget, table_targets
-from benchmarks.results import record_row
+from benchmarks.results import LedgerRow
 from nodes.experiment.campaign.admission import gate_file, gate_key
 from nodes.experiment.campaign.config import load_campaign
 from nodes.experiment.campaign.plan import PUBLISHED
@@ -227,6 +227,56 @@ def skill_rows(
     ]
 
 
+def ledger_rows(file: Path, folder: Path | None = None) -> list[LedgerRow]:
+    """Rows of the ledger for a campaign's published table, its other targets, its gate and its predictions.
+
+    Args:
+        file: Of the campaign, relative to the project: which lines and seeds there should be.
+        folder: Of the published cells; ``docs/results/NAME`` if it is not given.
+    """
+    campaign = load_campaign(file)
+    folder = folder or PUBLISHED / campaign.name
+    table, run = published_table(folder, campaign), f"advnerf experiment {file}"
+    found = []
+    for row, target in rows_of(table):
+        cells = table.cells_of(row)
+        note = note_of(row, cells) + why_missed(target, row, cells)
+        note += how_far(cells) if row.domain == "deployed" else ""
+        limit, met = (f"{target.target} x", target.met) if target else ("", None)
+        line = line_of(row, cells)
+        found.append(
+            LedgerRow(line, row.ratio or 0.0, "x no attack", limit, met, run, note, **measured_where(cells))
+        )
+    found += _other_targets(table, run)
+    for key, told in gate_rows(folder, sorted({gate_key(cell) for cell in campaign.cells})):
+        where = measured_where([cell for cell in table.cells.values() if gate_key(cell) == key])
+        line, psnr_db, unit, passes, passed, note = told
+        found.append(LedgerRow(line, psnr_db, unit, passes, passed, run, note, **where))
+    predicted_cells = [cell for cell in table.cells.values() if prediction_file(folder, cell.name).exists()]
+    for line, factor, unit, no_target, none, note, command in skill_rows(folder, predicted_cells, str(file)):
+        found.append(
+            LedgerRow(line, factor, unit, no_target, none, command, note, **measured_where(predicted_cells))
+        )
+    return found
+
+
+def _other_targets(table: TransferTable, run: str) -> list[LedgerRow]:
+    """Rows of targets that are not on a ratio."""
+    found = []
+    for target in table_targets(table):
+        if target.what == "ratio to no attack" or target.value is None:
+            continue
+        line = f"{target.scenario}, {style_of(target.method).title}, {target.domain}: {target.what}"
+        row = table.find(target.scenario, target.victim, target.method, target.domain)
+        cells = table.cells_of(row) if row else []
+        note = f"{target.seeds} seeds" + (how_far(cells) if "off the track" in target.what else "")
+        note += why_missed(target, row, cells) if row else ""
+        found.append(
+            LedgerRow(line, target.value, "", target.target, target.met, run, note, **measured_where(cells))
+        )
+    return found
+
+
 def main() -> None:
     """Record the rows of the published table, and its other targets."""
     parser = argparse.ArgumentParser(description=main.__doc__)
@@ -236,50 +286,10 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, help="of the published cells; docs/results/NAME if not given")
     parser.add_argument("--dry", action="store_true", help="print only")
     arguments = parser.parse_args()
-    campaign = load_campaign(arguments.campaign)
-    folder = arguments.folder or PUBLISHED / campaign.name
-    table = published_table(folder, campaign)
-    run = f"advnerf experiment {arguments.campaign}"
-
-    def record(
-        line: str,
-        value: float,
-        unit: str,
-        target: str,
-        met: bool | None,
-        note: str,
-        command: str = run,
-        cells: Sequence[CellResult] = (),
-    ) -> None:
-        print(f"{line}: {value:.3g} {unit} (target {target or '-'}): {met}; {note}")
+    for row in ledger_rows(arguments.campaign, arguments.folder):
+        print(f"{row.line}: {row.value:.3g} {row.unit} (target {row.target or '-'}): {row.met}; {row.note}")
         if not arguments.dry:
-            record_row(line, value, unit, target, met, command, note, **measured_where(cells))
-
-    for row, target in rows_of(table):
-        record(
-            line_of(row, table.cells_of(row)),
-            row.ratio or 0.0,
-            "x no attack",
-            f"{target.target} x" if target else "",
-            target.met if target else None,
-            note_of(row, cells := table.cells_of(row))
-            + why_missed(target, row, cells)
-            + (how_far(cells) if row.domain == "deployed" else ""),
-            cells=cells,
-        )
-    for target in table_targets(table):
-        if target.what != "ratio to no attack" and target.value is not None:
-            line = f"{target.scenario}, {style_of(target.method).title}, {target.domain}: {target.what}"
-            row_of_target = table.find(target.scenario, target.victim, target.method, target.domain)
-            cells = table.cells_of(row_of_target) if row_of_target else []
-            note = f"{target.seeds} seeds" + (how_far(cells) if "off the track" in target.what else "")
-            note += why_missed(target, row_of_target, cells) if row_of_target else ""
-            record(line, target.value, "", target.target, target.met, note, cells=cells)
-    for key, told in gate_rows(folder, sorted({gate_key(cell) for cell in campaign.cells})):
-        record(*told, cells=[cell for cell in table.cells.values() if gate_key(cell) == key])
-    foretold = [cell for cell in table.cells.values() if prediction_file(folder, cell.name).exists()]
-    for skill in skill_rows(folder, foretold, str(arguments.campaign)):
-        record(*skill, cells=foretold)
+            row.record()
 
 
 if __name__ == "__main__":

@@ -4,9 +4,16 @@ from pathlib import Path
 
 import pytest
 
-from advnerf_core.report.evidence.verify import sets_in, verify_set
+from advnerf_core.report.evidence.verify import sets_in, verify_beside, verify_set
+from advnerf_core.report.evidence.verifying.history import verify_history
+from benchmarks.kept_commands import kept_by
+from benchmarks.kept_rows import computed_again, row_problems
+from benchmarks.page_numbers import count_numbers
+from benchmarks.published_check import gate_problems, page_problems, target_problems
+from benchmarks.results import read_rows
 
-PUBLISHED = Path(__file__).parents[1] / "docs" / "results"
+DOCS = Path(__file__).parents[1] / "docs"
+PUBLISHED = DOCS / "results"
 
 
 def test_something_is_published():
@@ -18,3 +25,36 @@ def test_a_published_set_verifies(name):
     found = verify_set(PUBLISHED / name)
     assert found.problems == ()
     assert found.numbers > 0 or found.awaits_results
+
+
+def test_pictures_films_and_the_reference_build_are_as_published():
+    assert verify_beside(PUBLISHED) == ()
+
+
+def test_the_history_of_the_repository_agrees_where_there_is_one():
+    assert verify_history(PUBLISHED).problems == ()
+
+
+def test_numbers_on_pages_are_published_or_marked():
+    found = count_numbers(DOCS, read_rows())
+    assert found.problems == ()
+    assert found.published > 100
+
+
+def test_pages_are_those_of_their_rows_and_verdicts_those_of_their_targets():
+    rows = read_rows()
+    assert [*target_problems(rows), *page_problems(rows)] == []
+
+
+def test_rows_of_gap_sets_are_computed_again():
+    rows = [row for row in read_rows() if row["command"].startswith("python -m benchmarks.gap")]
+    assert len(rows) >= 12
+    assert list(row_problems(rows, computed_again([row["command"] for row in rows]))) == []
+
+
+@pytest.mark.slow
+def test_all_rows_of_kept_data_and_verdicts_of_the_gate_are_computed_again():
+    rows = read_rows()
+    assert sum(kept_by(row["command"]) is not None for row in rows) >= 171
+    assert list(row_problems(rows, computed_again([row["command"] for row in rows]))) == []
+    assert list(gate_problems()) == []

@@ -57,7 +57,7 @@ HEADERS = {  # text in the header of a tensor file or archive that our own write
 }
 OWN = {  # text that the same function has just written, or already read as a whole
     "advnerf_core/learning/retrain.py": 1,
-    "advnerf_core/report/evidence/verify.py": 1,
+    "advnerf_core/report/evidence/verifying/numbers.py": 1,
     "benchmarks/retraining.py": 1,
     "nodes/experiment/campaign/published.py": 1,
     "nodes/experiment/cell_kind.py": 1,

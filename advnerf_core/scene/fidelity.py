@@ -8,7 +8,7 @@ transfer, see `advnerf_core/attack/transfer.py`. Nothing here has seen a deploye
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -120,7 +120,13 @@ def judge(found: Agreement, limits: GateLimits, of: str = "held-out views") -> V
         limits: What must be reached.
         of: What was compared, for the reasons.
     """
-    n = found.summary()
+    numbers = found.summary()
+    reasons = reasons_against(numbers, limits, of)
+    return Verdict(not reasons, reasons, numbers)
+
+
+def reasons_against(n: Mapping[str, float | int], limits: GateLimits, of: str) -> tuple[str, ...]:
+    """What a comparison's numbers, as `Agreement.summary` gives them, do not reach, in words."""
     checks = (
         (n["views"] >= limits.views, f"{n['views']} pictures, at least {limits.views} needed"),
         (
@@ -137,8 +143,7 @@ def judge(found: Agreement, limits: GateLimits, of: str = "held-out views") -> V
             f"correlation of the steering {n['correlation']:.3f}, at least {limits.correlation:g} needed",
         ),
     )
-    reasons = tuple(f"{of}: {text}" for good, text in checks if not good)
-    return Verdict(not reasons, reasons, n)
+    return tuple(f"{of}: {text}" for good, text in checks if not good)
 
 
 @dataclass(frozen=True, eq=False)

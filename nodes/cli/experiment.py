@@ -434,12 +434,22 @@ def publish(
             help="Give a registered scenario up of which nothing was published; the page says so, and why.",
         ),
     ] = None,
+    declare: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--declare",
+            metavar="SCENARIO.VICTIM=REASON",
+            help="Say that a victim breaks the registered rule of what drives well, and why it is shown; the page says so.",
+        ),
+    ] = None,
     overrides: Overrides = None,
 ) -> None:
     """Copy the finished cells, and the scenes, victims and objects that they were run with, to where they are kept with the code."""
     from advnerf_core.report.evidence import registration
     from advnerf_core.report.evidence.above import write_above_of
-    from advnerf_core.report.evidence.verify import write_page, write_set
+    from advnerf_core.report.evidence.publishing import write_page, write_set
+    from advnerf_core.report.evidence.verifying import victims
+    from advnerf_core.report.evidence.verifying.digests import write_beside
     from nodes.experiment.campaign.plan import statuses
     from nodes.experiment.campaign.published import publish as copy_cells
     from nodes.experiment.campaign.published import publish_build
@@ -465,6 +475,8 @@ def publish(
         print(f"{to / campaign.name / name}.json")
     if withdraw:
         registration.withdraw(to / campaign.name, dict(_scenario_and_reason(each) for each in withdraw))
+    if declare:
+        victims.declare(to / campaign.name, dict(_scenario_and_reason(each) for each in declare))
     if build:  # before the page, which says whether the set can be driven again
         _say_build(publish_build(campaign, cells, to, prune))
     if registered:
@@ -473,6 +485,7 @@ def publish(
             print(film)
             print(write_above_of(to / campaign.name))  # with frames of the film
         print(write_page(to))
+    write_beside(to)
     unfinished = len(cells) - len(found.written) - len(found.same)
     print(f"{len(found.written)} cells written, {len(found.same)} were there, {unfinished} are not finished")
     if found.stale:

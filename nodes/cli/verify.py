@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -9,6 +12,7 @@ from typing import Annotated
 
 import typer
 
+from advnerf_core.documents import parse_json
 from nodes.cli.experiment import File, Folder, Only, Setting, load_cells
 from nodes.runtime.terminal import Overrides, say_error
 
@@ -56,9 +60,10 @@ def verify(
     ] = 0,
     seed: Annotated[int, typer.Option("--seed", help="Which cells are drawn for that.")] = 0,
 ) -> None:
-    """Compute every published number again from the kept drives, and check digests, registration and completeness."""
+    """Compute every published number again from the kept drives, and check digests, registration, completeness and the history in git."""
     from advnerf_core.report.evidence.kept_build import LOST, is_kept
-    from advnerf_core.report.evidence.verify import SetError, sets_in, verify_set
+    from advnerf_core.report.evidence.verify import SetError, sets_in, verify_beside, verify_set
+    from advnerf_core.report.evidence.verifying.pictures import picture_problems
     from nodes.experiment.campaign.kept_attacks import with_attacks
 
     known = sets_in(published)
@@ -69,21 +74,66 @@ def verify(
     wrong = 0
     for each in [name] if name is not None else known:
         found = with_attacks(verify_set(published / each), published / each)
-        wrong += len(found.problems)
         if found.awaits_results:
             print(f"{found.name}: registered, nothing published yet")
             continue
-        verdict = "all as published" if not found.problems else f"{len(found.problems)} problems"
-        print(f"{found.name}: {found.numbers} numbers from {found.drives} drives: {verdict}")
-        for problem in found.problems:
-            say_error(problem)
+        wrong += _say(f"{found.name}: {found.numbers} numbers from {found.drives} drives", found.problems)
+        for finding in found.findings:
+            print(f"  declared: {finding}")
+        if not found.problems:
+            wrong += _say_problems(list(picture_problems(published / each)))
         if again and not found.problems:
             if not is_kept(published / each):
                 print(f"{each} {LOST}")
                 continue
             wrong += _redrive(published / each, again, seed)
+    wrong += _say("page, pictures, films and reference build", verify_beside(published))
+    wrong += _history(published)
+    wrong += 0 if name else _ledger(published)
     if wrong:
         raise typer.Exit(_FAILURE_EXIT)
+
+
+def _say(what: str, problems: Sequence[str]) -> int:
+    """Print a verdict and its problems; returns how many there are."""
+    print(f"{what}: {f'{len(problems)} problems' if problems else 'all as published'}")
+    return _say_problems(problems)
+
+
+def _say_problems(problems: Sequence[str]) -> int:
+    for problem in problems:
+        say_error(problem)
+    return len(problems)
+
+
+def _history(published: Path) -> int:
+    """Hold everything against the history of the repository; how many problems there are."""
+    from advnerf_core.report.evidence.verifying.history import verify_history
+
+    found = verify_history(published)
+    if found.not_checked:
+        print(f"history not checked: {found.not_checked}")
+        return 0
+    return _say(f"history of {found.files} files, {found.removed} removals logged", found.problems)
+
+
+def _ledger(published: Path) -> int:
+    """Let the benchmarks of the checkout that this is run in check rows and pages; how many problems there are."""
+    root = published.resolve().parents[1]
+    if root != Path.cwd() or not (root / "benchmarks" / "published_check.py").exists():
+        print("rows and pages not checked: run it in the checkout, whose benchmarks compute them again")
+        return 0
+    command = [sys.executable, "-m", "benchmarks.published_check"]
+    ended = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
+    if ended.returncode:
+        return _say("rows and pages", (ended.stderr.strip().splitlines() or [f"{command} failed"])[-1:])
+    found = parse_json(ended.stdout, " ".join(command[1:]))
+    numbers = found["numbers"]
+    what = (
+        f"{found['rows']} rows computed again, {found['not_kept']} measured once; numbers on pages: {numbers['published']} of rows and sets, "
+        f"{numbers['marked']} marked as measured once, {numbers['settings']} settings"
+    )
+    return _say(what, found["problems"])
 
 
 def _redrive(folder: Path, count: int, seed: int) -> int:

@@ -114,6 +114,7 @@ def _section(name: str, sets: Mapping[str, Mapping[str, Any]]) -> str:
         _where(data["deployed_through"]),
         *data.get("notes", ()),
         *_withdrawn(data),
+        *_drives_badly(data),
     ]
     if data["primary"]:
         told = data["primary"][-1]
@@ -183,6 +184,15 @@ def _withdrawn(data: Mapping[str, Any]) -> list[str]:
             f"p = 1 in Holm's adjustment. {reason}\n"
         )
     return sentences
+
+
+def _drives_badly(data: Mapping[str, Any]) -> list[str]:
+    """Sentences about victims that break the registered rule of what drives well."""
+    return [
+        f"**Does not drive well:** past the plain object, the {row['victim']} victim has a mean abs. CTE of {row['mean_cte_m']:.4f} m {row['domain']} in "
+        f"{place_of(row)}, and {row['off_track']} drives leave the track. Registered were at most {row['limit_m']:.4f} m, and none. {row['reason']}\n"
+        for row in data.get("does_not_drive_well", [])
+    ]
 
 
 def _tests(tests: Sequence[Mapping[str, Any]]) -> str:

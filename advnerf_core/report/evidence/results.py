@@ -149,7 +149,7 @@ class Evidence:
             and not cell.not_driven_live
             and registration.scenario(cell.scenario, cell.placement) is not None
         }
-        self._named = {cell.name for cell in registration.cells}
+        self._named, self._digest = {cell.name for cell in registration.cells}, registration.digest
         self._paths = {name: each.reference_path() for name, each in registration.scenarios.items()}
         self._metrics: dict[tuple[str, Domain], list[DriveMetrics]] = {}
 
@@ -161,7 +161,7 @@ class Evidence:
 
     def is_registered(self, cell: CellResult) -> bool:
         """Whether a cell was registered, and run under this registration."""
-        return cell.name in self._named and cell.registration == self.registration.digest
+        return cell.name in self._named and cell.registration == self._digest
 
     def metrics(self, cell: CellResult, domain: Domain) -> list[DriveMetrics]:
         """Metrics of the drives of a cell, computed from what is kept."""

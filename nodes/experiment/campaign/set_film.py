@@ -18,7 +18,7 @@ from advnerf_core.report.conditions import NONE
 from advnerf_core.report.evidence.page import film_of
 from advnerf_core.report.evidence.registration import read_registration
 from advnerf_core.report.evidence.results import Evidence
-from advnerf_core.report.evidence.verify import SET
+from advnerf_core.report.evidence.verifying.layout import SET
 from nodes.experiment.campaign.config import Campaign
 
 MOST_BYTES = 250_000

@@ -29,8 +29,10 @@ def evidence(tmp_path_factory: pytest.TempPathFactory) -> Evidence:
     """A set of which the second condition has the drives of the first, but those of its gradient are in the other domain."""
     folder = tmp_path_factory.mktemp("published") / "simulated"
     write_simulated_set(folder)
-    registration, cells = read_registration(folder), read_cells(folder)
+    registration = read_registration(folder)
     assert registration is not None
+    cells = [cell for cell in read_cells(folder) if cell.scenario == "track"]
+    registered = [cell for cell in registration.cells if cell.scenario == "track"]
     copies = [
         replace(
             cell,
@@ -43,11 +45,8 @@ def evidence(tmp_path_factory: pytest.TempPathFactory) -> Evidence:
         update={
             "scenarios": {**registration.scenarios, "native": registration.scenarios["track"]},
             "cells": (
-                *registration.cells,
-                *(
-                    RegisteredCell(**{**cell.model_dump(), "scenario": "native"})
-                    for cell in registration.cells
-                ),
+                *registered,
+                *(RegisteredCell(**{**cell.model_dump(), "scenario": "native"}) for cell in registered),
             ),
             "contrasts": (LEARNED, RENDERER),
         }

@@ -8,6 +8,7 @@ import sys
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy import stats
 from typer.testing import CliRunner
 
@@ -15,14 +16,28 @@ from advnerf_core.report.cells import read_cells
 from advnerf_core.report.evidence.registration import (
     FILE,
     WITHDRAWN,
-    Registration,
     RegistrationError,
     read_registration,
     withdraw,
 )
 from advnerf_core.report.evidence.results import Evidence, primary_tests, rows
-from advnerf_core.report.evidence.verify import DIGESTS, PAGE, SET, SetError, sets_in, verify_set, write_set
-from benchmarks.planted_changes import CHANGES, write_simulated_set
+from advnerf_core.report.evidence.verify import (
+    BESIDE,
+    DIGESTS,
+    PAGE,
+    SET,
+    SetError,
+    sets_in,
+    verify_beside,
+    verify_set,
+    write_page,
+    write_set,
+)
+from advnerf_core.report.evidence.verifying.drives import drive_problems
+from advnerf_core.report.evidence.verifying.pictures import picture_problems
+from advnerf_core.report.evidence.verifying.victims import DECLARED, declare
+from benchmarks.planting.simulated import write_simulated_set
+from benchmarks.planting.world import World, poses_of
 from nodes.cli.main import app
 
 
@@ -35,10 +50,7 @@ def original(tmp_path_factory):
 
 @pytest.fixture
 def copied(original, tmp_path):
-    shutil.copytree(original, tmp_path / "simulated")
-    for beside in (DIGESTS, PAGE, "simulated_excess.png"):
-        shutil.copy(original.parent / beside, tmp_path / beside)
-    return tmp_path / "simulated"
+    return shutil.copytree(original.parent, tmp_path / "docs" / "results") / "simulated"
 
 
 def evidence_of(folder):
@@ -48,7 +60,9 @@ def evidence_of(folder):
 def test_a_set_as_it_was_published_has_no_problem(original):
     found = verify_set(original)
     assert found.problems == ()
-    assert found.drives == 13 * 2 * 5  # none and two methods of six searches, two domains, five starts
+    # Two conditions, none and two methods of six searches, two domains, five starts.
+    assert found.drives == 2 * 13 * 2 * 5
+    assert verify_beside(original.parent) == ()
     assert found.numbers > 50
 
 
@@ -70,13 +84,6 @@ def test_a_cell_cannot_be_driven_live_and_not(copied):
     assert "expected no deployed drives in a cell that was not driven live" in verify_set(copied).problems[0]
 
 
-@pytest.mark.parametrize("kind", CHANGES)
-@pytest.mark.parametrize("seed", range(3))
-def test_every_kind_of_change_is_found(copied, kind, seed):
-    CHANGES[kind](copied, random.Random(seed))
-    assert verify_set(copied).problems
-
-
 def test_a_missing_cell_and_a_strange_file_are_named(copied):
     (copied / "track_hardened_gradient_3.json").unlink()
     (copied / "track_hardened_gradient_4.json").rename(copied / "track_hardened_other_4.json")
@@ -87,23 +94,24 @@ def test_a_missing_cell_and_a_strange_file_are_named(copied):
 
 def test_rows_are_metres_per_tick_over_the_same_starts(original):
     evidence = evidence_of(original)
-    (row,) = [each for each in rows(evidence) if (each.method, each.domain) == ("gradient", "deployed")]
+    shown = {(each.scenario, each.method, each.domain): each for each in rows(evidence)}
+    row = shown["track", "gradient", "deployed"]
     totals = [
         (cell.deployed.total_cte_m, cell.deployed.none_total_cte_m)
         for cell in read_cells(original)
-        if cell.method == "gradient"
+        if (cell.scenario, cell.method) == ("track", "gradient")
     ]
     expected = np.mean([np.subtract(attacked, none) / 60 for attacked, none in totals])
     assert row.excess_m == pytest.approx(expected, abs=1e-5)
     assert row.low_m < row.excess_m < row.high_m
     assert row.registered
-    (none,) = [each for each in rows(evidence) if (each.method, each.domain) == ("none", "deployed")]
+    none = shown["track", "none", "deployed"]
     assert none.excess_m == pytest.approx(np.mean(totals[0][1]) / 60, abs=1e-5)
 
 
 def test_the_primary_test_is_that_of_scipy(original):
     evidence = evidence_of(original)
-    (found,) = primary_tests(evidence)
+    found, own = primary_tests(evidence)
     ours, theirs = (
         [
             np.mean([outcome.excess_cte_m_per_tick for outcome in evidence.outcomes(cell, "deployed")])
@@ -115,7 +123,10 @@ def test_the_primary_test_is_that_of_scipy(original):
         (ours, theirs), lambda a, b, axis: a.mean(axis) - b.mean(axis), alternative="greater", vectorized=True
     )
     assert found.p == pytest.approx(expected.pvalue)
-    assert found.p_holm == found.p == pytest.approx(1 / 924)
+    assert found.p == own.p == pytest.approx(1 / 924)
+    assert found.p_holm == pytest.approx(
+        3 / 924
+    )  # over three tests, one of which was given up and counts as 1
     assert found.baseline == "random"
     assert len(found.mcnemar) == 6
     # Where they search, it is the same test, and each search is kept in both domains.
@@ -146,15 +157,17 @@ def test_the_page_says_it_in_two_sentences_and_a_changed_page_is_found(copied):
     page = copied.parent / PAGE
     text = page.read_text()
     assert "of 30 drives leave the track" in text
-    assert "p = 0.0011 after Holm's adjustment" in text
+    assert "p = 0.0032 after Holm's adjustment" in text
     assert (copied.parent / "simulated_excess.png").stat().st_size > 10_000
     page.write_text(text.replace("of 30 drives", "of 29 drives"))
-    assert verify_set(copied).problems == (f"{page}: is not the page of the published sets",)
+    assert verify_beside(copied.parent) == (f"{page}: is not the page of the published sets",)
 
 
 def test_what_was_not_registered_is_exploration(copied):
     extra = json.loads((copied / "track_hardened_gradient_0.json").read_text())
-    extra |= {"method": "cem", "registration": ""}
+    extra |= {"method": "cem", "registration": "", "attack_id": "c0ffee"}
+    for domain, drives in extra["kept"].items():  # of a search of its own
+        extra["kept"][domain] = [{**each, "x_m": each["x_m"] + "0"} for each in drives]
     (copied / "track_hardened_cem_0.json").write_text(json.dumps(extra))
     write_set(copied)
     assert verify_set(copied).problems == ()
@@ -194,10 +207,13 @@ def test_the_command_verifies_all_sets_and_fails_where_one_is_wrong(copied):
 
 
 def test_what_is_only_registered_awaits_its_results_and_what_vanished_does_not(copied):
-    for file in (*copied.glob("*.json"), copied / SET):
+    for file in [*copied.glob("*.json"), copied / SET]:
         file.unlink()
+    for part in ("predictions", "gate"):
+        shutil.rmtree(copied / part)
     assert "cannot be read" in verify_set(copied).problems[0]
     (copied.parent / DIGESTS).write_text("{}")
+    write_page(copied.parent)
     found = verify_set(copied)
     assert found.problems == ()
     assert found.awaits_results
@@ -209,7 +225,7 @@ def test_what_is_only_registered_awaits_its_results_and_what_vanished_does_not(c
 def test_too_few_searches_for_any_test_leave_the_interval(copied):
     whole = evidence_of(copied)
     few = {name: cell for name, cell in whole.cells.items() if cell.seed < 5}
-    (test,) = primary_tests(Evidence(whole.registration, list(few.values())))
+    test, _ = primary_tests(Evidence(whole.registration, list(few.values())))
     assert test.p is None
     assert test.p_holm is None
     assert test.low_m <= test.difference_m <= test.high_m
@@ -226,36 +242,22 @@ def test_verifying_needs_no_torch(original):
 
 @pytest.fixture
 def half_run(copied):
-    """The simulated set, with a second scenario registered of which nothing was run."""
-    registration = read_registration(copied)
-    data = registration.model_dump(mode="json")
-    data["scenarios"]["other"] = data["scenarios"]["track"]
-    for part in ("cells", "primary"):
-        data[part] += [{**each, "scenario": "other"} for each in data[part]]
-    other = Registration.model_validate(data)
-    (copied / FILE).write_text(other.model_dump_json(indent=1))
-    for file in copied.glob("*.json"):
-        cell = json.loads(file.read_text())
-        file.write_text(json.dumps({**cell, "registration": other.digest}))
+    """The simulated set before one of its scenarios was given up, of which nothing was run."""
+    (copied / WITHDRAWN).unlink()
     return copied
 
 
-def test_a_scenario_that_was_given_up_is_told_with_its_reason_and_counts_against_the_others(
-    half_run, original
-):
-    with pytest.raises(SetError, match="other_hardened_none_0: was registered, and is not there"):
+def test_a_scenario_that_was_given_up_is_told_with_its_reason_and_counts_against_the_others(half_run):
+    with pytest.raises(SetError, match="later_hardened_none_0: was registered, and is not there"):
         write_set(half_run)
-    withdraw(half_run, {"other": "It would have taken two days."})
+    withdraw(half_run, {"later": "It would have taken two days."})
     write_set(half_run)
     assert verify_set(half_run).problems == ()
     page = (half_run.parent / PAGE).read_text()
-    assert "**Registered, and not run:** other, with 13 cells and 1 of the primary tests" in page
+    assert "**Registered, and not run:** later, with 13 cells and 1 of the primary tests" in page
     assert "It would have taken two days." in page
-    (alone,), (beside,) = (primary_tests(evidence_of(folder)) for folder in (original, half_run))
-    assert beside.p == alone.p
-    assert beside.p_holm == pytest.approx(min(1.0, 2.0 * alone.p))
     # The reason cannot be changed or dropped unnoticed.
-    (half_run / WITHDRAWN).write_text(json.dumps({"other": "No matter."}))
+    (half_run / WITHDRAWN).write_text(json.dumps({"later": "No matter."}))
     assert any(WITHDRAWN in each for each in verify_set(half_run).problems)
     (half_run / WITHDRAWN).unlink()
     assert any("is not there" in each for each in verify_set(half_run).problems)
@@ -264,8 +266,8 @@ def test_a_scenario_that_was_given_up_is_told_with_its_reason_and_counts_against
 @pytest.mark.parametrize(
     ("scenarios", "says"),
     [
-        ({"third": "why not"}, "expected a registered scenario to withdraw (other, track), got 'third'"),
-        ({"other": " "}, "expected a reason for withdrawing other"),
+        ({"third": "why not"}, "expected a registered scenario to withdraw (later, own, track), got 'third'"),
+        ({"later": " "}, "expected a reason for withdrawing later"),
         (
             {"track": "It did not come out well."},
             "track cannot be withdrawn, as track_hardened_",
@@ -277,3 +279,100 @@ def test_results_and_strangers_cannot_be_withdrawn(half_run, scenarios, says):
         withdraw(half_run, scenarios)
     assert says in str(error.value)
     assert not (half_run / WITHDRAWN).exists()
+
+
+def weave(folder, amplitude_m):
+    """Give the victim other drives without attack, that swing about those that it had; all cells tell their totals."""
+    world = World(folder.parents[2], folder.name, random.Random(0))
+    file = folder / "own_hardened_none_0.json"
+    data = json.loads(file.read_text())
+    for number in range(5):
+        poses = poses_of(data, "deployed", number)
+        swing = amplitude_m * np.sin(np.linspace(0.0, 4.0 * np.pi, len(poses)))
+        poses[:, 0] -= np.sin(poses[:, 2]) * swing
+        poses[:, 1] += np.cos(poses[:, 2]) * swing
+        steps = np.diff(poses[:, :2], axis=0)
+        poses[1:, 2] = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
+        world.set_drive(data, "deployed", number, poses)
+    file.write_text(json.dumps(data))
+    for each in folder.glob("own_*.json"):
+        cell = json.loads(each.read_text())
+        cell["deployed"]["none_total_cte_m"] = data["deployed"]["total_cte_m"]
+        each.write_text(json.dumps(cell))
+
+
+def test_a_victim_that_does_not_drive_well_is_published_only_if_that_is_declared(copied):
+    folder = copied
+    weave(folder, 0.2)
+    with pytest.raises(SetError, match=r"own\.hardened: does not drive well: mean \|CTE\| 0\.1"):
+        write_set(folder)
+    with pytest.raises(RegistrationError, match="expected a reason"):
+        declare(folder, {"own.hardened": " "})
+    declare(folder, {"own.hardened": "Its car swings by itself."})
+    write_set(folder)
+    found = verify_set(folder)
+    assert found.problems == ()
+    assert "own hardened does not drive well deployed" in found.findings[0]
+    page = (folder.parent / PAGE).read_text()
+    assert "**Does not drive well:** without attack, the hardened victim has a mean abs. CTE of 0.1" in page
+    assert "Its car swings by itself." in page
+    (folder / DECLARED).unlink()
+    assert any("publish with --declare own.hardened=REASON" in each for each in verify_set(folder).problems)
+
+
+def test_who_drives_well_is_not_declared_otherwise(copied):
+    declare(copied, {"own.hardened": "To be safe."})
+    with pytest.raises(SetError, match=r"own\.hardened: is declared not to drive well, and does"):
+        write_set(copied)
+
+
+def test_pictures_films_and_the_reference_build_are_those_of_their_manifest(copied):
+    published = copied.parent
+    for name in ("simulated_excess.png", "simulated_drives.webp", "reference/scene_0/weights.json"):
+        file = published / name
+        data = file.read_bytes()
+        file.write_bytes(data + b" ")
+        assert verify_beside(published) == (f"{file}: its digest is not the one in {BESIDE}",)
+        file.write_bytes(data)
+    (published / BESIDE).unlink()
+    assert "advnerf publish writes it" in verify_beside(published)[0]
+
+
+def test_a_picture_of_something_else_is_found_by_drawing_it_again(copied):
+    assert list(picture_problems(copied)) == []
+    file = copied.parent / "simulated_excess.png"
+    with Image.open(file) as picture:
+        picture.transpose(Image.Transpose.FLIP_LEFT_RIGHT).save(file)
+    (problem,) = picture_problems(copied)
+    assert "shows something else than its drives" in problem
+
+
+@pytest.mark.parametrize(
+    ("steps_m", "sideways_m", "says"),
+    [(1.5, 0.0, "a step of 0."), (1.0, 0.005, "rad off its heading"), (1.0, 0.0, "")],
+)
+def test_a_car_moves_along_its_heading_and_no_further_than_it_drives(copied, steps_m, sideways_m, says):
+    """The pose of one tick is moved: along the car by half a step, or aside by 5 mm (4 degrees of a step of 0.07 m)."""
+    world = World(copied.parents[2], copied.name, random.Random(0))
+    file = copied / "own_hardened_gradient_2.json"
+    data = json.loads(file.read_text())
+    poses = poses_of(data, "surrogate", 1)
+    along, aside = (
+        np.array([np.cos(poses[30, 2]), np.sin(poses[30, 2])]) @ turn
+        for turn in (np.eye(2), [[0, 1], [-1, 0]])
+    )
+    poses[30, :2] += (steps_m - 1.0) * 0.07 * along + sideways_m * aside
+    world.set_drive(data, "surrogate", 1, poses)
+    file.write_text(json.dumps(data))
+    found = "\n".join(drive_problems(evidence_of(copied)))
+    assert (says in found) if says else (found == "")
+
+
+def test_a_registration_that_makes_no_sense_is_a_problem_and_no_crash(copied):
+    data = json.loads((copied / FILE).read_text())
+    data["scenarios"]["track"]["path"]["start_pose"][0] += 0.1
+    data["scenarios"]["track"]["path"]["segments"] = data["scenarios"]["track"]["path"]["segments"][:1]
+    (copied / FILE).write_text(json.dumps(data))
+    (problem,) = verify_set(copied).problems
+    assert "cannot be computed again" in problem
+    assert "restore it from git" in problem

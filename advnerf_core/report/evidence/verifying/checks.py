@@ -1,0 +1,30 @@
+"""All checks of one set, apart from digests and published numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from advnerf_core.report.cells import CellResult
+from advnerf_core.report.evidence.registration import read_withdrawn
+from advnerf_core.report.evidence.results import Evidence
+from advnerf_core.report.evidence.verifying.besides import gate_problems, prediction_problems
+from advnerf_core.report.evidence.verifying.drives import drive_problems
+from advnerf_core.report.evidence.verifying.registered import build_problems, cell_problems
+from advnerf_core.report.evidence.verifying.searches import search_problems
+from advnerf_core.report.evidence.verifying.victims import declaration_problems, read_declared
+
+
+def set_problems(folder: Path, evidence: Evidence, cells: Sequence[CellResult]) -> Iterator[str]:
+    """What is wrong with the cells of a set and with what lies beside them."""
+    damaged = False
+    for check in (cell_problems(evidence, cells, read_withdrawn(folder)), drive_problems(evidence)):
+        for problem in check:
+            damaged = True
+            yield problem
+    yield from build_problems(evidence)
+    yield from search_problems(evidence)
+    yield from prediction_problems(folder, evidence)
+    yield from gate_problems(folder, evidence)
+    if not damaged:
+        yield from declaration_problems(evidence, read_declared(folder))

@@ -1,0 +1,98 @@
+"""Whether every published file is the one that was published: manifests with the digest of each file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+from advnerf_core.documents import read_json
+from advnerf_core.files import sha256_of, write_atomically
+from advnerf_core.report.evidence.verifying.layout import BESIDE, DIGESTS, SET, sets_in
+
+# Its pages are computed again from what is listed, and the log of what was removed only ever grows.
+_NOT_LISTED = (BESIDE, DIGESTS, "removed.json")
+
+
+def digests_of(folder: Path) -> dict[str, str]:
+    """SHA-256 of every file below the folder of a set but its manifest, by path."""
+    return _digests(folder, lambda name: name != SET)
+
+
+def digests_beside(published: Path) -> dict[str, str]:
+    """SHA-256 of every published file that is in no registered set and is no page, by path."""
+    sets = set(sets_in(published))
+
+    def listed(name: str) -> bool:
+        return name.split("/")[0] not in sets and name not in _NOT_LISTED and not name.endswith(".md")
+
+    return _digests(published, listed)
+
+
+def known_digests(published: Path) -> dict[str, str]:
+    """Digest of each set's manifest, by name of the set."""
+    file = published / DIGESTS
+    if not file.exists():
+        return {}
+    known: dict[str, str] = read_json(file)
+    return known
+
+
+def write_known_digest(folder: Path) -> None:
+    """Put the digest of a set's manifest beside the folders of all sets."""
+    known = known_digests(folder.parent)
+    known[folder.name] = sha256_of(folder / SET)
+    _write(folder.parent / DIGESTS, known)
+
+
+def write_beside(published: Path) -> None:
+    """Write the manifest of everything that is in no registered set."""
+    _write(published / BESIDE, digests_beside(published))
+
+
+def file_problems(folder: Path) -> Iterator[str]:
+    """Whether the files of a set are those of its manifest, and the manifest is the one that was published."""
+    file = folder / SET
+    try:
+        listed = read_json(file)["files"]
+        known = known_digests(folder.parent).get(folder.name)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        yield f"{file}: cannot be read: {error}"
+        return
+    if known != sha256_of(file):
+        yield f"{file}: its digest is not the one in {folder.parent / DIGESTS}"
+    yield from _compared(folder, SET, listed, digests_of(folder))
+
+
+def beside_problems(published: Path) -> Iterator[str]:
+    """Whether pictures, films, the reference build and sets without a registration are those of their manifest."""
+    try:
+        listed = read_json(published / BESIDE)
+        missing = sorted(known_digests(published).keys() - sets_in(published))
+    except (OSError, ValueError) as error:
+        yield f"{published / BESIDE}: cannot be read: {error}; advnerf publish writes it"
+        return
+    yield from (f"{published / name}: is listed in {DIGESTS}, and has no registration" for name in missing)
+    yield from _compared(published, BESIDE, listed, digests_beside(published))
+
+
+def _compared(
+    folder: Path, manifest: str, listed: Mapping[str, str], found: Mapping[str, str]
+) -> Iterator[str]:
+    for name in sorted(listed.keys() | found.keys()):
+        if name not in found:
+            yield f"{folder / name}: is listed in {manifest}, and is not there"
+        elif name not in listed:
+            yield f"{folder / name}: is not listed in {manifest}"
+        elif listed[name] != found[name]:
+            yield f"{folder / name}: its digest is not the one in {manifest}"
+
+
+def _digests(folder: Path, listed: Callable[[str], bool]) -> dict[str, str]:
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    names = ((file.relative_to(folder).as_posix(), file) for file in files)
+    return {name: sha256_of(file) for name, file in names if listed(name)}
+
+
+def _write(file: Path, digests: Mapping[str, str]) -> None:
+    write_atomically(file, json.dumps(digests, indent=1, sort_keys=True) + "\n")

@@ -1,0 +1,43 @@
+"""Where the files of published sets are, and how a set is read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from advnerf_core.errors import AdvnerfError
+from advnerf_core.report.cells import CellResult, read_cell
+from advnerf_core.report.evidence.registration import FILE, Registration, read_registration
+
+SET, DIGESTS, PAGE, FORMAT = "set/set.json", "sets.json", "transfer.md", "advnerf-set-1"
+# Digests of everything else below the folder of all sets: pictures, films, the reference build, sets without a registration.
+BESIDE = "files.json"
+# Folder of the reference build: scenes, victims and objects.
+BUILD = "reference"
+
+
+class SetError(AdvnerfError, ValueError):
+    """A folder is no set of results."""
+
+
+def sets_in(published: Path) -> list[str]:
+    """Names of the registered sets in the folder of all that is published."""
+    return sorted(file.parents[1].name for file in published.glob(f"*/{FILE}"))
+
+
+def cell_files(folder: Path) -> list[Path]:
+    """Files of the cells of a set, by name."""
+    return sorted(folder.glob("*.json"))
+
+
+def read_set(folder: Path) -> tuple[Registration, list[CellResult]]:
+    """The registration and the cells of a set.
+
+    Raises:
+        SetError: Nothing was registered there.
+        RegistrationError: The registration is damaged.
+        CellError: A cell is damaged.
+    """
+    registration = read_registration(folder)
+    if registration is None:
+        raise SetError(f"{folder}: expected {FILE}, which advnerf register writes, got none")
+    return registration, [read_cell(file) for file in cell_files(folder)]

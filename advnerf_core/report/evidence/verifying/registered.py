@@ -1,0 +1,82 @@
+"""Whether the cells of a set are what was registered: which, with what search, when, and of one build."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from datetime import datetime
+
+from advnerf_core.report.cells import CellResult
+from advnerf_core.report.conditions import CONTROLS
+from advnerf_core.report.evidence.results import Evidence
+
+
+def cell_problems(
+    evidence: Evidence, cells: Sequence[CellResult], withdrawn: Collection[str]
+) -> Iterator[str]:
+    """Whether all that was registered and not withdrawn is there, and nothing else passes for registered."""
+    there = {cell.name for cell in cells}
+    for wanted in evidence.registration.cells:
+        name = wanted.name
+        if wanted.scenario in withdrawn:
+            if name in there:
+                yield f"{name}: is there, and its scenario was withdrawn"
+        elif name not in there:
+            yield f"{name}: was registered, and is not there"
+        elif name in evidence.cells and not evidence.is_registered(evidence.cells[name]):
+            yield f"{name}: was registered, and was not run under this registration"
+    for cell in cells:
+        if cell.not_driven_live:
+            yield f"{cell.name}: was not driven live and is no evidence: {cell.not_driven_live}"
+        elif cell.name not in evidence.cells:
+            yield f"{cell.name}: expected a cell of a registered scenario with its drives kept"
+        elif not evidence.is_registered(cell) and cell.registration:
+            yield f"{cell.name}: says that it was registered, and was not"
+        elif evidence.is_registered(cell):
+            yield from _as_registered(evidence, cell)
+
+
+def _as_registered(evidence: Evidence, cell: CellResult) -> Iterator[str]:
+    """Whether a cell's own notes on its search and limits are those of the registration, and it is no older than that."""
+    scenario = evidence.scenario_of(cell)
+    evaluations = 0 if cell.method in CONTROLS else scenario.evaluations
+    wanted = {
+        "evaluations": evaluations,
+        "space": scenario.space,
+        "horizon": scenario.ticks,
+        "off_track_m": scenario.off_track_m,
+    }
+    for key, value in wanted.items():
+        if (found := cell.extra.get(key, value)) != value:  # a cell from before it was kept does not say
+            yield f"{cell.name}: expected {key} {value} as registered, got {found}"
+    clip = str(cell.extra.get("clip") or cell.name)
+    if not clip.startswith(cell.name):
+        yield f"{cell.name}: names the clip of another cell, {clip}"
+    registered = evidence.registration.date
+    if not _not_before(cell.date, registered):
+        yield f"{cell.name}: expected a date from {registered} on, when it was registered, got {cell.date}"
+
+
+def _not_before(date: str, other: str) -> bool:
+    try:
+        return datetime.fromisoformat(date) >= datetime.fromisoformat(other)
+    except (ValueError, TypeError):  # no date, or one without a time zone
+        return False
+
+
+def build_problems(evidence: Evidence) -> Iterator[str]:
+    """Whether all cells of a scenario are of the same stages, and each victim is one policy."""
+    stages: dict[tuple[str, str], dict[str, str]] = {}
+    policies: dict[tuple[str, str, str], str] = {}
+    for cell in evidence.cells.values():
+        place = (cell.scenario, cell.placement)
+        if cell.stages != stages.setdefault(place, cell.stages):
+            yield f"{cell.name}: was run with other stages than the cells before it"
+        victim = (*place, cell.victim)
+        if cell.policy_sha256 != policies.setdefault(victim, cell.policy_sha256):
+            yield f"{cell.name}: was run against another policy than the other cells of this victim"
+    by_place: dict[tuple[str, str], list[str]] = {}
+    for (scenario, placement, _), digest in policies.items():
+        by_place.setdefault((scenario, placement), []).append(digest)
+    for (scenario, placement), found in by_place.items():
+        if len(set(found)) != len(found):
+            yield f"{scenario} {placement}: two victims are one policy"

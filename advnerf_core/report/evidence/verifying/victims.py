@@ -1,0 +1,100 @@
+"""The registered rule of what drives well, and which victims of a set fail it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from advnerf_core.documents import read_json
+from advnerf_core.files import write_atomically
+from advnerf_core.report.conditions import NONE
+from advnerf_core.report.evidence.registration import RegistrationError, scenario_key
+from advnerf_core.report.evidence.results import DOMAINS, Evidence
+
+# In the folder of a set: victims that fail the rule, each with what its authors say about it.
+DECLARED = "set/does_not_drive_well.json"
+
+
+def drives_badly(evidence: Evidence) -> list[dict[str, Any]]:
+    """Victims whose drives without attack break the registered rule, as JSON data: a mean |CTE| above the limit, or a drive off the track."""
+    found = []
+    for cell in evidence.cells.values():
+        if cell.method != NONE or not evidence.is_registered(cell):
+            continue
+        limit_m = evidence.scenario_of(cell).drives_well_mean_cte_m
+        for domain in DOMAINS:
+            drives = evidence.metrics(cell, domain)
+            if not drives:
+                continue
+            mean_m, off = (
+                float(np.mean([each.mean_cte_m for each in drives])),
+                sum(d.off_track for d in drives),
+            )
+            if mean_m > limit_m or off:
+                where = {"scenario": cell.scenario, "placement": cell.placement, "victim": cell.victim}
+                found.append(
+                    {**where, "domain": domain, "mean_cte_m": mean_m, "limit_m": limit_m, "off_track": off}
+                )
+    return found  # fmt: skip
+
+
+def victim_key(row: Mapping[str, Any]) -> str:
+    """How a declaration names a victim, ``SCENARIO.VICTIM`` or ``SCENARIO.PLACEMENT.VICTIM``."""
+    return f"{scenario_key(row['scenario'], row['placement'])}.{row['victim']}"
+
+
+def read_declared(folder: Path) -> dict[str, str]:
+    """Victims of a set that are declared not to drive well, each with the reason why they are shown; empty without any.
+
+    Raises:
+        RegistrationError: The file does not say so.
+    """
+    file = folder / DECLARED
+    if not file.exists():
+        return {}
+    try:
+        found = read_json(file)
+        if not all(isinstance(each, str) and each.strip() for pair in found.items() for each in pair):
+            raise ValueError("expected a reason for each victim")
+    except (OSError, ValueError, AttributeError) as error:
+        raise RegistrationError(
+            f"{file}: expected victims with reasons: {error}; restore it from git"
+        ) from None
+    return dict(found)
+
+
+def declare(folder: Path, victims: Mapping[str, str]) -> None:
+    """Say of victims that they do not drive well, and why they are shown all the same.
+
+    Raises:
+        RegistrationError: One has no reason.
+    """
+    for victim, reason in victims.items():
+        if not reason.strip():
+            raise RegistrationError(f"expected a reason for showing {victim}; give {victim}=REASON")
+    text = json.dumps({**read_declared(folder), **victims}, indent=1) + "\n"
+    write_atomically(folder / DECLARED, text)
+
+
+def declaration_problems(evidence: Evidence, declared: Mapping[str, str]) -> Iterator[str]:
+    """Whether exactly the victims that break the rule are declared."""
+    badly = {victim_key(row): row for row in drives_badly(evidence)}
+    for victim, row in badly.items():
+        if victim not in declared:
+            yield (
+                f"{victim}: does not drive well: mean |CTE| {row['mean_cte_m']:.4f} m {row['domain']} without attack, at most {row['limit_m']:.4f} m "
+                f"was registered, {row['off_track']} drives off the track; publish with --declare {victim}=REASON"
+            )
+    yield from (
+        f"{victim}: is declared not to drive well, and does" for victim in declared if victim not in badly
+    )
+
+
+def declared_data(evidence: Evidence, declared: Mapping[str, str]) -> dict[str, Any]:
+    """What ``set.json`` and the page say of such victims; empty without any."""
+    rows = [{**row, "reason": declared.get(victim_key(row), "")} for row in drives_badly(evidence)]
+    return {"does_not_drive_well": rows} if rows else {}

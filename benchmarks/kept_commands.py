@@ -1,0 +1,27 @@
+"""Which rows of the ledger can be computed again from what is kept with the code, by the command that wrote them.
+
+`benchmarks.kept_rows` computes them. All other rows were measured once, and what they were measured from is not kept.
+"""
+
+from __future__ import annotations
+
+import re
+
+# Name of what computes the rows again, and the commands; groups are its arguments.
+KEPT_COMMANDS: dict[str, re.Pattern[str]] = {
+    "campaign": re.compile(r"advnerf (?:experiment|predict) (launch/(?:paper|meshes|poses)\.campaign\.yaml)"),
+    "retraining": re.compile(
+        r"advnerf experiment (launch/junction\.experiment\.yaml) --setting (retrain) --run-folder (\S+)"
+    ),
+    "gap": re.compile(r"python -m benchmarks\.gap ([\w ]+)"),
+    "predictions": re.compile(r"python -m benchmarks\.predictions"),
+}
+NOT_KEPT = "Measured once, not kept."
+
+
+def kept_by(command: str) -> tuple[str, tuple[str, ...]] | None:
+    """What computes the rows of a command again, with its arguments; None where what they were measured from is not kept."""
+    for name, pattern in KEPT_COMMANDS.items():
+        if found := pattern.fullmatch(command):
+            return name, tuple(each or "" for each in found.groups())
+    return None

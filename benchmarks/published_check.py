@@ -1,0 +1,97 @@
+"""What the benchmarks know of the published results, for ``advnerf verify``: ``python -m benchmarks.published_check``.
+
+Computes the rows of the ledger again where what they were measured from is kept, and the verdicts of the fidelity gate; holds every
+verdict of a row against its target, the pages against their rows, and the numbers of hand-written pages against rows and sets. Prints
+one JSON object, which `nodes.cli.verify` reads.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from advnerf_core.documents import read_json
+from advnerf_core.scene.fidelity import reasons_against
+from benchmarks.first_build import PAGE as FIRST_BUILD
+from benchmarks.first_build import page_text
+from benchmarks.kept_rows import computed_again, counts, row_problems
+from benchmarks.page_numbers import count_numbers
+from benchmarks.results import PAGE, REPOSITORY, read_rows, write_pages
+from nodes.experiment.campaign.admission import gate_file, gate_key
+from nodes.experiment.campaign.config import Campaign, load_campaign
+
+PUBLISHED = REPOSITORY / "docs" / "results"
+_TARGET = re.compile(r"(>=|<=|>|<) ?(\d[\d,]*(?:\.\d+)?)(?![\d^])")
+
+
+def main() -> None:
+    """Check and print."""
+    rows = read_rows()
+    kept, numbers = counts(rows), count_numbers(REPOSITORY / "docs", rows)
+    again = computed_again([row["command"] for row in rows])
+    problems = [*row_problems(rows, again), *target_problems(rows), *gate_problems(), *page_problems(rows)]
+    found = {"rows": kept[True], "not_kept": kept[False], "numbers": vars(numbers)}
+    print(json.dumps({**found, "problems": [*problems, *numbers.problems]}))
+
+
+def target_problems(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Rows that say they met a target whose first limit their value breaks, or missed one that has no other."""
+    for row in rows:
+        limit, value = _TARGET.match(row["target"]), row["value"]
+        if row["met"] is None or limit is None or not isinstance(value, int | float):
+            continue
+        bound = float(limit[2].replace(",", ""))
+        holds = {">=": value >= bound, "<=": value <= bound, ">": value > bound, "<": value < bound}[limit[1]]
+        alone = not re.search(r"[,;(]| and ", row["target"])
+        if row["met"] and not holds:
+            yield f"{row['line']!r}: says that {value:g} met {row['target']}"
+        elif alone and holds and not row["met"]:
+            yield f"{row['line']!r}: says that {value:g} missed {row['target']}"
+
+
+def page_problems(rows: list[dict[str, Any]]) -> Iterator[str]:
+    """Pages that are not those of the rows and of the first build's cells."""
+    yield from row_page_problems(rows, PAGE)
+    if FIRST_BUILD.read_text("utf-8") != page_text():
+        yield f"{FIRST_BUILD}: is not the page of its cells; python -m benchmarks.first_build writes it"
+
+
+def row_page_problems(rows: list[dict[str, Any]], page: Path) -> Iterator[str]:
+    """Pages that are not those of the rows, beside the index ``page`` too."""
+    with TemporaryDirectory() as work:
+        made = Path(work) / page.name
+        write_pages(rows, made, page.parent / "results")
+        for file in [made, *sorted((made.parent / "results").iterdir())]:
+            published = page.parent / file.relative_to(made.parent)
+            if not published.exists() or published.read_text("utf-8") != file.read_text("utf-8"):
+                yield f"{published}: is not the page of the rows; python -m benchmarks.results writes it"
+
+
+def gate_problems() -> Iterator[str]:
+    """Verdicts of the fidelity gate that do not follow from their numbers and the limits of the campaign."""
+    for file in sorted((REPOSITORY / "launch").glob("*.campaign.yaml")):
+        folder = PUBLISHED / file.name.split(".")[0]
+        if (folder / "gate").exists():
+            yield from _verdicts(load_campaign(file), folder)
+
+
+def _verdicts(campaign: Campaign, folder: Path) -> Iterator[str]:
+    cells = {gate_key(cell): cell for cell in campaign.cells}
+    for key, cell in sorted(cells.items()):
+        limits = campaign.scenario(cell).gate or campaign.gate
+        for drive, of in ((False, "held-out views"), (True, "drive without attack")):
+            file = gate_file(folder, key, drive)
+            if limits is None or not file.exists():
+                continue
+            said = read_json(file)
+            reasons = list(reasons_against(said["numbers"], limits, of))
+            if reasons != said["reasons"] or said["passed"] is bool(reasons):
+                yield f"{file.relative_to(REPOSITORY)}: expected reasons {reasons} of its numbers, got {said['reasons']}, passed: {said['passed']}"
+
+
+if __name__ == "__main__":
+    main()
