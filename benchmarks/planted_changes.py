@@ -104,7 +104,7 @@ def planted(world: World, count: int, seed: int = 0) -> Counts:
         counts.missed[kind] += not found
         world.restore()
         if not (number + 1) % 100:
-            print(f"{number + 1} of {count}", flush=True)
+            print(f"{number + 1} of {count}, missed: {dict(+counts.missed) or None}", flush=True)
     return counts
 
 
