@@ -255,7 +255,11 @@ def with_titles(folder: Path, data: Mapping[str, Any]) -> dict[str, Any]:
         **data,
         "rows": [titled(row) for row in data["rows"]],
         "primary": [{**test, "test": titled(test["test"])} for test in data["primary"]],
-        **({"contrasts": [titled(row) for row in data["contrasts"]]} if "contrasts" in data else {}),
+        **{
+            part: [titled(row) for row in data[part]]
+            for part in ("contrasts", "does_not_drive_well")
+            if part in data
+        },
     }
 
 

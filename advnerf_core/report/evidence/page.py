@@ -189,7 +189,7 @@ def _withdrawn(data: Mapping[str, Any]) -> list[str]:
 def _drives_badly(data: Mapping[str, Any]) -> list[str]:
     """Sentences about victims that break the registered rule of what drives well."""
     return [
-        f"**Does not drive well:** past the plain object, the {row['victim']} victim has a mean abs. CTE of {row['mean_cte_m']:.4f} m {row['domain']} in "
+        f"**Does not drive well:** past the plain object, the victim {row['victim']} has a mean abs. CTE of {row['mean_cte_m']:.4f} m {row['domain']} in "
         f"{place_of(row)}, and {row['off_track']} drives leave the track. Registered were at most {row['limit_m']:.4f} m, and none. {row['reason']}\n"
         for row in data.get("does_not_drive_well", [])
     ]

@@ -142,7 +142,8 @@ def test_places_are_searched_and_the_file_says_where_things_stand(
     restored = space.restored(file)
     _, _, scores = attack.learned_drives(experiment, attack.past(problem, space, restored), restored.colours)
     assert np.mean([score.total_cte_m for score in scores]) == pytest.approx(
-        file.predicted_total_cte_m, rel=1e-6
+        file.predicted_total_cte_m,
+        rel=1e-5,  # before it was rounded to half precision
     )
     plain = json.loads((tmp_path / "clean" / DRIVES).read_text())
     assert plain["total_cte_m"] == data["deployed"]["none_total_cte_m"]
@@ -301,7 +302,7 @@ def test_maps_are_of_what_the_cell_found(
     rows = json.loads((tmp_path / f"robustness_{trained.objects[1].name}.json").read_text())["cells"]
     # The first start past objects that nobody has moved is the drive that was searched.
     assert rows["0"][0][0] == pytest.approx(
-        load_attack(tmp_path / attack.ATTACK).predicted_total_cte_m, rel=1e-6
+        load_attack(tmp_path / attack.ATTACK).predicted_total_cte_m, rel=1e-5
     )
     assert len(rows) == 2
     kept = pictures[0].with_suffix(".json").stat().st_mtime_ns
