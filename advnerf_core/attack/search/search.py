@@ -184,7 +184,7 @@ def without_gradient(problem: AttackProblem, theta: Tensor, number: int) -> tupl
         SearchDivergedError: The loss is not finite.
     """
     _, totals = evaluate(problem.at_draw(number), theta)
-    loss_m = -float(totals.total_cte_m.mean())
+    loss_m = float(totals.losses.mean())
     if problem.regulariser is not None:
         loss_m += problem.regulariser(theta)[0]
     if not math.isfinite(loss_m):
