@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -134,7 +134,7 @@ class AttackProblem:
     disturbances: Disturbances | None = None
     draw: int = 0
     regulariser: Regulariser | None = None
-    objective: Objective = CrossTrackError()
+    objective: Objective = field(default_factory=CrossTrackError)
     solids: Solids | None = None
 
     def __post_init__(self) -> None:
