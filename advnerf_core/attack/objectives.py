@@ -31,6 +31,8 @@ _WHAT, _MODULE = "objective", "advnerf_core.attack.objective"
 OBJECTIVES: Mapping[str, str] = MappingProxyType(
     {CTE: "CrossTrackError", "peak": "Peak", "time_off_track": "TimeOffTrack", "collision": "Collision"}
 )
+# These depend on states and the path alone, not on what the car can hit.
+ON_THE_PATH = (CTE, "peak", "time_off_track")
 
 
 def load_objective(reference: str, folder: Path | None = None) -> Objective:
@@ -88,6 +90,19 @@ def objective_key(reference: str) -> str | list[str]:
     """What a result depends on: the name of a built-in objective; name and digest of a user's, wherever its file lies."""
     code = code_sha256(reference, OBJECTIVES, GROUP)[:16]
     return [objective_name(reference), code] if code else reference
+
+
+def name_objective(section: dict[str, Any]) -> None:
+    """Put the key of a section's objective in the place of its reference, which may be a path; nothing happens where it has none."""
+    if "objective" in section:
+        section["objective"] = objective_key(section["objective"])
+
+
+def objective_entry(reference: str, objective: Objective, value: float) -> dict[str, Any]:
+    """What an attack file says of its objective: name, unit and value. Nothing for ``cte``, whose value is the predicted total CTE."""
+    if reference == CTE:
+        return {}
+    return {"objective": {"name": objective_name(reference), "unit": objective.unit, "value": value}}
 
 
 def objective_names() -> tuple[str, ...]:

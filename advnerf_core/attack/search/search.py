@@ -246,8 +246,11 @@ def random_spread(problem: AttackProblem, settings: SearchSettings) -> float:
 
 def evaluation_from_json(entry: dict[str, Any]) -> Evaluation:
     """The evaluation that ``dataclasses.asdict`` and JSON made this of; state files without values are of ``cte``."""
-    entry = {"values": entry["protocol_cte_m"], **entry}
-    return Evaluation(**{key: tuple(each) if isinstance(each, list) else each for key, each in entry.items()})
+    values: dict[str, Any] = {
+        key: tuple(value) if isinstance(value, list) else value for key, value in entry.items()
+    }
+    values.setdefault("values", values["protocol_cte_m"])
+    return Evaluation(**values)
 
 
 def search_fingerprint(problem: AttackProblem, theta_shape: tuple[int, ...], **settings: Any) -> str:

@@ -144,7 +144,7 @@ def work(folder: Path, stream: BinaryIO) -> None:
     speaker = Speaker(stream, folder)
     files = run_attack(request, folder, speaker, speaker.told, speaker.prepared)
     attacks = [load_attack(file) for file in files]
-    best = max(range(len(files)), key=lambda k: attacks[k].predicted_total_cte_m or 0.0)
+    best = max(range(len(files)), key=lambda k: attacks[k].value or 0.0)
     found = attacks[best]
     speaker.say(
         "done",
