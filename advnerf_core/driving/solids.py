@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -38,9 +35,6 @@ class Rectangle:
 class Solids:
     """Rectangles that a car can hit, and the car's body.
 
-    The body is covered by equal discs along its length (Ziegler and Stiller 2010, "Fast collision checking for intelligent vehicle
-    motion planning"), two for each width of the car. The discs reach beyond the body by at most 6 % of its width.
-
     Attributes:
         rectangles: What cannot be driven through; at least one.
         body: The car's body where its state is zero: the x axis points forward.
@@ -54,9 +48,10 @@ class Solids:
             raise ValueError("expected at least one solid rectangle, got none")
 
     def clearances_m(self, states: Tensor) -> Tensor:
-        """Distance between the car and each rectangle [m], negative where they overlap.
+        """Signed distance between the car's body and each rectangle [m].
 
-        The distance of a disc's centre ``p`` to a rectangle is ``|max(q, 0)| + min(max(q), 0)`` with ``q = |R^T (p - c)| - h``.
+        Apart, it is the distance from the nearest corner of one to the other. Where they overlap, it is minus the depth of penetration: the
+        shortest way that separates them, by the separating axis theorem.
 
         Args:
             states: ``[..., n]`` with x [m], y [m], yaw [rad] first.
@@ -64,34 +59,50 @@ class Solids:
         Returns:
             ``[..., K]`` for K rectangles, with gradients with respect to states.
         """
-        centres, radius_m = self._discs(states)
-        c_x, c_y, length, width, yaw = torch.tensor(
+        x, y, yaw, *car = self._body_at(states)
+        rows = [(r.x_m, r.y_m, r.yaw_rad, r.half_length_m, r.half_width_m) for r in self.rectangles]
+        x_k, y_k, yaw_k, *box = torch.tensor(rows, dtype=states.dtype).T
+        half_car, half_box = torch.stack(torch.broadcast_tensors(*car), -1), torch.stack(box, -1)
+        turn = yaw_k - yaw
+        from_car = _turned(torch.stack([x_k - x, y_k - y], dim=-1), -yaw)
+        from_box = _turned(torch.stack([x - x_k, y - y_k], dim=-1), -yaw_k)
+        gap = torch.cat(
             [
-                (each.x_m, each.y_m, each.half_length_m, each.half_width_m, each.yaw_rad)
-                for each in self.rectangles
+                from_car.abs() - half_car - _extent(half_box, turn),
+                from_box.abs() - half_box - _extent(half_car, turn),
             ],
-            dtype=states.dtype,
-        ).T
-        d_x, d_y = centres[..., 0, None] - c_x, centres[..., 1, None] - c_y
-        along, across = d_x * yaw.cos() + d_y * yaw.sin(), d_y * yaw.cos() - d_x * yaw.sin()
-        q = torch.stack([along.abs() - length, across.abs() - width], dim=-1)
-        distance = torch.linalg.vector_norm(q.clamp(min=0.0), dim=-1) + q.amax(-1).clamp(max=0.0)
-        return (distance - radius_m).amin(-2)
+            dim=-1,
+        ).amax(-1)
+        nearest = torch.minimum(
+            _nearest_corner(from_car, half_box, turn, half_car),
+            _nearest_corner(from_box, half_car, -turn, half_box),
+        )
+        return torch.where(gap > 0.0, nearest, gap)
 
-    def _discs(self, states: Tensor) -> tuple[Tensor, float]:
-        """Centres ``[..., D, 2]`` [m] of the discs that cover the body, and their radius [m]."""
-        offsets, radius_m = self._cover
-        yaw = states[..., 2, None] + self.body.yaw_rad
-        ahead = self.body.x_m + states.new_tensor(offsets)
-        x = states[..., 0, None] + ahead * yaw.cos() - self.body.y_m * yaw.sin()
-        y = states[..., 1, None] + ahead * yaw.sin() + self.body.y_m * yaw.cos()
-        return torch.stack([x, y], dim=-1), radius_m
+    def _body_at(self, states: Tensor) -> tuple[Tensor, ...]:
+        """Centre x and y [m], yaw [rad], ``[..., 1]``, and half extents [m] of the body at states."""
+        body, heading = self.body, states[..., 2, None]
+        offset = states.new_tensor([body.x_m, body.y_m])
+        centre = states[..., None, :2] + _turned(offset, heading)
+        half = states.new_tensor([body.half_length_m, body.half_width_m])
+        return centre[..., 0], centre[..., 1], heading + body.yaw_rad, half[0], half[1]
 
-    @cached_property
-    def _cover(self) -> tuple[Sequence[float], float]:
-        """Where the discs are along the body [m], and their radius [m]."""
-        half_length, half_width = self.body.half_length_m, self.body.half_width_m
-        count = math.ceil(2.0 * half_length / half_width)
-        spacing = 2.0 * half_length / count
-        offsets = [(k + 0.5) * spacing - half_length for k in range(count)]
-        return offsets, math.hypot(0.5 * spacing, half_width)
+
+def _turned(points: Tensor, angle: Tensor) -> Tensor:
+    """Points ``[..., 2]`` turned by angles ``[...]``, left positive."""
+    c, s, x, y = angle.cos(), angle.sin(), points[..., 0], points[..., 1]
+    return torch.stack([c * x - s * y, s * x + c * y], dim=-1)
+
+
+def _extent(half: Tensor, turn: Tensor) -> Tensor:
+    """Half extents ``[..., 2]`` along the axes of a frame of a rectangle that is turned in it."""
+    c, s = turn.cos().abs(), turn.sin().abs()
+    return torch.stack([half[..., 0] * c + half[..., 1] * s, half[..., 0] * s + half[..., 1] * c], dim=-1)
+
+
+def _nearest_corner(centre: Tensor, half: Tensor, turn: Tensor, other_half: Tensor) -> Tensor:
+    """Distance from a rectangle, in its own frame and of half extents ``other_half``, to the nearest corner of another one; 0 inside."""
+    signs = half.new_tensor([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
+    corners = centre[..., None, :] + _turned(signs * half[..., None, :], turn[..., None])
+    outside = (corners.abs() - other_half[..., None, :]).clamp(min=0.0)
+    return torch.linalg.vector_norm(outside, dim=-1).amin(-1)
