@@ -32,16 +32,16 @@ def frozen_frames(problem: AttackProblem, rollout: Rollout) -> list[Frames]:
 def backpropagated_gradient(problem: AttackProblem, theta: Tensor, rollout: Rollout) -> tuple[float, Tensor]:
     """Loss and gradient by plain back-propagation through the whole unrolled loop, images as dense autograd expressions."""
     theta = theta.clone().requires_grad_()
-    states, loss = problem.start_states, torch.zeros((), dtype=theta.dtype)
-    memory = None if problem.policy.stateless else problem.policy.initial_memory(len(states))
+    states = [problem.start_states]
+    memory = None if problem.policy.stateless else problem.policy.initial_memory(len(states[0]))
     for frames in frozen_frames(problem, rollout):
         images = _differentiable_images(frames, theta)
         if memory is None:
             controls = problem.policy(images, problem.goals)
         else:
             controls, memory = problem.policy(images, problem.goals, memory)
-        states = problem.dynamics.step(states, controls)
-        loss = loss + problem.cost(states).mean()
+        states.append(problem.dynamics.step(states[-1], controls))
+    loss = problem.losses(torch.stack(states)).mean()
     (gradient,) = torch.autograd.grad(loss, theta)
     return float(loss.detach()), gradient
 
@@ -58,13 +58,11 @@ def _differentiable_images(frames: Frames, theta: Tensor) -> Tensor:
 def frozen_loss(problem: AttackProblem, theta: Tensor, frames: list[Frames]) -> float:
     """Loss of the rollout for ``theta`` with the images taken at the nominal poses."""
     with torch.no_grad():
-        states, loss = problem.start_states, 0.0
+        states = [problem.start_states]
         for nominal in frames:
-            states = problem.dynamics.step(
-                states, problem.policy(nominal.render(theta).images, problem.goals)
-            )
-            loss += float(problem.cost(states).mean())
-    return loss
+            controls = problem.policy(nominal.render(theta).images, problem.goals)
+            states.append(problem.dynamics.step(states[-1], controls))
+        return float(problem.losses(torch.stack(states)).mean())
 
 
 def finite_difference(

@@ -51,11 +51,12 @@ class _Render(torch.autograd.Function):
 def unrolled_gradient(problem: AttackProblem, theta: Tensor) -> tuple[float, Tensor]:
     """Loss and gradient by back-propagation through the unrolled loop, camera poses detached as they are met."""
     theta = theta.clone().requires_grad_()
-    states, loss = problem.start_states, torch.zeros((), dtype=problem.start_states.dtype)
+    states = [problem.start_states]
     for _ in range(problem.steps):
-        images = _Render.apply(theta, problem, states.detach())
-        states = problem.dynamics.step(states, problem.policy(images, problem.goals).to(states.dtype))
-        loss = loss + problem.cost(states).mean()
+        images = _Render.apply(theta, problem, states[-1].detach())
+        controls = problem.policy(images, problem.goals)
+        states.append(problem.dynamics.step(states[-1], controls.to(states[-1].dtype)))
+    loss = problem.losses(torch.stack(states)).mean()
     (gradient,) = torch.autograd.grad(loss, theta)
     return float(loss.detach()), gradient
 
@@ -68,10 +69,10 @@ def checkpointed_gradient(problem: AttackProblem, theta: Tensor) -> tuple[float,
         images = _Render.apply(theta, problem, states.detach())
         return problem.dynamics.step(states, problem.policy(images, problem.goals).to(states.dtype))
 
-    states, loss = problem.start_states, torch.zeros((), dtype=problem.start_states.dtype)
+    states = [problem.start_states]
     for _ in range(problem.steps):
-        states = checkpoint(step, theta, states, use_reentrant=False)
-        loss = loss + problem.cost(states).mean()
+        states.append(checkpoint(step, theta, states[-1], use_reentrant=False))
+    loss = problem.losses(torch.stack(states)).mean()
     (gradient,) = torch.autograd.grad(loss, theta)
     return float(loss.detach()), gradient
 

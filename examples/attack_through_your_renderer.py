@@ -56,11 +56,11 @@ class SteersToTheLight:
 
 def held_loss(problem: adv.AttackProblem, theta: Tensor, held: Tensor) -> float:
     """Loss [m] of a drive with ``theta`` (``theta_shape``) whose images are taken at the states ``held [T + 1, B, 3]``."""
-    states, loss_m = problem.start_states, 0.0
+    states = [problem.start_states]
     for seen_from in held[:-1]:
-        states = problem.dynamics.step(states, problem.policy(problem.sensor.sense(seen_from, theta).images))
-        loss_m += float(problem.cost(states).mean())
-    return loss_m
+        images = problem.sensor.sense(seen_from, theta).images
+        states.append(problem.dynamics.step(states[-1], problem.policy(images)))
+    return float(problem.losses(torch.stack(states)).mean())
 
 
 if __name__ == "__main__":

@@ -125,6 +125,13 @@ def test_a_method_of_ones_own_runs_beside_the_built_in_ones(capsys):
     assert spiral_m > 0.0
 
 
+def test_an_objective_of_ones_own_pulls_the_car_to_the_other_side(capsys):
+    value_m, total_m, end_m, left_m, _, left_end_m = figures(run_here("left_objective.py", capsys))
+    assert value_m == total_m
+    assert end_m < 0.0 < left_end_m
+    assert left_m > 0.0
+
+
 def test_a_bag_that_the_example_writes_itself():
     printed = run("examples/read_a_bag.py")
     assert "302 messages in 5.00 s" in printed

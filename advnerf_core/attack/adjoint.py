@@ -1,9 +1,10 @@
 """The discrete adjoint of a closed loop whose camera poses are detached.
 
 The loop is ``o_t = h(stop_gradient(x_t), theta)``, ``u_t = pi(o_t)``, ``x_{t+1} = f(x_t, u_t)`` with loss
-``J = sum_{t=1..T} C(x_t)``, averaged over start poses. Its adjoint (Lagrange multipliers of the dynamics) is::
+``J(x_0, ..., x_T)`` of an objective (`advnerf_core.attack.objective`), averaged over start poses. Its adjoint (Lagrange multipliers of the
+dynamics) is::
 
-    lambda_T = dC/dx(x_T),   lambda_t = dC/dx(x_t) + (df/dx)^T lambda_{t+1}
+    lambda_T = dJ/dx_T,   lambda_t = dJ/dx_t + (df/dx)^T lambda_{t+1}
     dJ/dtheta = sum_{t=0..T-1} (do_t/dtheta)^T (dpi/do)^T (df/du)^T lambda_{t+1}
 
 This is the exact derivative of the rollout with every camera pose frozen at its nominal value while the states still move. It
@@ -22,6 +23,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from advnerf_core.attack.objective import loss_slopes
 from advnerf_core.attack.problem import (
     AttackProblem,
     BlackBoxError,
@@ -29,7 +31,6 @@ from advnerf_core.attack.problem import (
     SearchDivergedError,
     Sensor,
     Totals,
-    drive_scores,
 )
 from advnerf_core.driving.dynamics import Dynamics
 from advnerf_core.driving.rollout import Rollout, drive
@@ -46,11 +47,11 @@ class AdjointResult:
     """A loss with its gradient.
 
     Attributes:
-        loss: ``mean_b sum_t C(x_t)`` [m], and the regulariser's part; lower is a stronger attack.
+        loss: Mean of the objective's losses over the starts, and the regulariser's part; lower is a stronger attack.
         gradient: dJ/dtheta with camera poses frozen, ``theta_shape``.
         lambdas: Adjoint states ``[T + 1, B, n]``; ``lambdas[0]`` is the derivative with respect to the start.
         rollout: The nominal trajectory.
-        totals: Total CTE per start.
+        totals: Losses, values and total CTE per start.
         rerendered: Steps that the cache could not keep and that were rendered twice.
     """
 
@@ -130,13 +131,7 @@ class _Remembering:
 def evaluate(problem: AttackProblem, theta: Tensor) -> tuple[Rollout, Totals]:
     """One closed-loop drive with parameters ``theta`` (``theta_shape``), and what it is charged; no gradient."""
     rollout, _ = roll_out(problem, theta)
-    return rollout, _totals(problem, rollout.states)
-
-
-def _totals(problem: AttackProblem, states: Tensor) -> Totals:
-    total = -problem.cost(states[1:]).detach().sum(0)
-    protocol = [score.total_cte_m for score in drive_scores(problem, states)]
-    return Totals(total, torch.tensor(protocol, dtype=total.dtype))
+    return rollout, problem.totals(rollout.states)
 
 
 def adjoint_gradient(problem: AttackProblem, theta: Tensor) -> AdjointResult:
@@ -172,8 +167,8 @@ def gradient_pass(
         cache: Renders that were kept of it; it is emptied.
         memories: Memories ``[T + 1]`` of a policy that has one.
     """
-    loss, cost_slopes = _cost_slopes(problem, rollout.states)
-    lambdas, control_slopes = adjoint_states(problem.dynamics, rollout, cost_slopes)
+    loss, state_slopes = loss_slopes(problem.objective, problem.judged(rollout.states))
+    lambdas, control_slopes = adjoint_states(problem.dynamics, rollout, state_slopes)
     rerendered = 0
     gradient = torch.zeros_like(theta)
     batches = _batched_terms if problem.policy.stateless else _sequential_terms
@@ -183,30 +178,21 @@ def gradient_pass(
     if problem.regulariser is not None:
         extra, slope = problem.regulariser(theta)
         loss, gradient = loss + extra, gradient + slope
-    return AdjointResult(loss, gradient, lambdas, rollout, _totals(problem, rollout.states), rerendered)
+    return AdjointResult(loss, gradient, lambdas, rollout, problem.totals(rollout.states), rerendered)
 
 
-def _cost_slopes(problem: AttackProblem, states: Tensor) -> tuple[float, Tensor]:
-    """The loss, and dJ/dx_t holding all other states, ``[T + 1, B, n]`` (zero at t = 0: the start is given)."""
-    with torch.enable_grad():
-        later = states[1:].detach().requires_grad_()
-        loss = problem.cost(later).sum(0).mean()
-        (slopes,) = torch.autograd.grad(loss, later)
-    return float(loss.detach()), torch.cat([torch.zeros_like(states[:1]), slopes])
-
-
-def adjoint_states(dynamics: Dynamics, rollout: Rollout, cost_slopes: Tensor) -> tuple[Tensor, Tensor]:
+def adjoint_states(dynamics: Dynamics, rollout: Rollout, state_slopes: Tensor) -> tuple[Tensor, Tensor]:
     """Lambdas from states and controls alone, without a render.
 
     Args:
         dynamics: Vehicle model.
         rollout: Nominal trajectory.
-        cost_slopes: ``[T + 1, B, n]``.
+        state_slopes: ``dJ/dx_t`` holding all other states, ``[T + 1, B, n]``.
 
     Returns:
         Lambdas ``[T + 1, B, n]`` and ``(df/du)^T lambda_{t+1}``, the gradient with respect to each control, ``[T, B]``.
     """
-    lambdas = cost_slopes.clone()
+    lambdas = state_slopes.clone()
     control_slopes = torch.empty_like(rollout.controls)
     for t in range(len(rollout.controls) - 1, -1, -1):
         df_dx, df_du = dynamics.jacobians(rollout.states[t], rollout.controls[t])

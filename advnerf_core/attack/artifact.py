@@ -150,6 +150,12 @@ class AttackFile:
     extra: dict[str, Any] = field(default_factory=dict)
     field_total_cte_m: float | None = None
 
+    @property
+    def value(self) -> float | None:
+        """Value of the objective, averaged over starts, in its own unit; for ``cte`` it is the predicted total CTE [m]."""
+        found = self.extra.get("objective")
+        return self.predicted_total_cte_m if found is None else found["value"]
+
     def __post_init__(self) -> None:
         for name in ("method", "space"):
             value = getattr(self, name)

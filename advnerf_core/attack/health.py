@@ -84,24 +84,23 @@ def frozen_loss(problem: AttackProblem, theta: Tensor, rollout: Rollout) -> floa
     """Loss of the rollout for ``theta`` with all images taken at the poses of ``rollout``, under the same draws."""
     memory = None if problem.policy.stateless else problem.policy.initial_memory(len(problem.start_states))
     with torch.no_grad():
-        states, loss = problem.start_states, 0.0
+        states = [problem.start_states]
         for tick, nominal in enumerate(rollout.states[:-1]):
             images = problem.sense((tick,), nominal, theta).images
             if memory is None:
                 controls = problem.policy(images, problem.goals)
             else:
                 controls, memory = problem.policy(images, problem.goals, memory)
-            states = problem.dynamics.step(states, controls.to(states.dtype))
-            loss += float(problem.cost(states).mean())
+            states.append(problem.dynamics.step(states[-1], controls.to(states[-1].dtype)))
+        loss = float(problem.losses(torch.stack(states)).mean())
     return loss + (0.0 if problem.regulariser is None else problem.regulariser(theta)[0])
 
 
 def closed_loss(problem: AttackProblem, theta: Tensor) -> float:
     """Loss of the true closed loop for ``theta``, under the same draws."""
     _, totals = evaluate(problem, theta)
-    return -float(totals.total_cte_m.mean()) + (
-        0.0 if problem.regulariser is None else problem.regulariser(theta)[0]
-    )
+    loss = float(totals.losses.mean())
+    return loss + (0.0 if problem.regulariser is None else problem.regulariser(theta)[0])
 
 
 def random_directions(theta: Tensor, count: int, seed: int = 0) -> Tensor:

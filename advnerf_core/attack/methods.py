@@ -107,7 +107,7 @@ class Method:
     """A method of attack. Its name is that of its row, of its entry point, or of the attribute of its file.
 
     Attributes:
-        search: ``search(problem, settings, run)`` maximises the total cross-track error of a problem within the budget.
+        search: ``search(problem, settings, run)`` maximises the objective of a problem within the budget.
         needs_gradient: Whether it needs a policy with a gradient; else it asks the policy for answers only.
         single_images: Whether it asks about images outside a drive, which a policy with a memory cannot answer.
         reads_scale: Whether it asks the sensor for the scale of theta (`search.gradient_step`, `search.random_spread`), so that it also

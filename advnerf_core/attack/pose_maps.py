@@ -21,6 +21,7 @@ from advnerf_core.attack.adjoint import AttackProblem, evaluate
 from advnerf_core.attack.spaces.placed_sensor import PlacedSensor
 from advnerf_core.attack.spaces.placement import PoseSpace, placed
 from advnerf_core.documents import read_json
+from advnerf_core.driving.cross_track import cross_track
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array
@@ -200,7 +201,7 @@ def _drive(
     surrogate = sensor.surrogate.with_objects(placed(sensor.space.objects, placements))
     shown = (sensor.colours(theta) if colours is None else colours).to(surrogate.dtype)
     rollout, totals = evaluate(replace(problem.undisturbed(), sensor=surrogate), shown)
-    worst = problem.cost(rollout.states).abs().amax(0)
+    worst = cross_track(problem.path, rollout.states[..., :2]).abs().amax(0)
     return totals.protocol_cte_m.tolist(), worst.tolist()
 
 

@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, runtime_checkable
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from advnerf_core.attack.methods import alternatives, black_box_methods
+from advnerf_core.attack.objective import (
+    CrossTrackError,
+    JudgedDrives,
+    Objective,
+    ObjectiveError,
+    losses_of,
+    values_of,
+)
 from advnerf_core.attack.robustness import Disturbances, PosedSensor
-from advnerf_core.driving.cross_track import cross_track
 from advnerf_core.driving.dynamics import Dynamics
-from advnerf_core.driving.metrics import LAB_OFF_TRACK_M, DriveMetrics, Horizon, drive_metrics
+from advnerf_core.driving.metrics import LAB_OFF_TRACK_M, DriveMetrics, Horizon
 from advnerf_core.driving.path import Path
+from advnerf_core.driving.solids import Solids
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.scene.surrogate import Rendered
@@ -95,19 +102,21 @@ class AttackProblem:
         policy: Frozen policy in eval mode; ``stateless`` says which adjoint is used.
         sensor: Differentiable sensor, usually a ``Surrogate``.
         dynamics: Vehicle model with Jacobians.
-        path: Reference path; the cost of a state is minus its absolute cross-track error.
+        path: Reference path.
         start_states: ``[B, n]``; their dtype is that of states and lambdas.
         steps: Horizon T in control ticks.
         goals: ``[B, goal_size]`` or None.
         time_batch: Steps whose policy gradients are evaluated at once.
         cache_bytes: Budget for renders kept from the forward to the backward pass [bytes]; 0 keeps none.
         fence_m: Half side of the square |x|, |y| beyond which the car is stopped in deployment [m]; None if there is no fence.
-            It shapes the reported total only: the loss goes on driving, as its gradient would else be zero.
+            It shapes reported values only: the built-in losses go on driving, as their gradients would else be zero.
         held_cap_m: Cap of the |CTE| that a stopped car is charged per tick in the reported total [m].
         off_track_m: |CTE| beyond which the car is off the track [m]; it says whether the drive without an attack is one.
         disturbances: Random disturbances of what is seen; None changes nothing.
         draw: Which draw of the disturbances; searches count their evaluations here.
         regulariser: Added to the loss, for example `Smoothness`; None adds nothing.
+        objective: What the attack maximises.
+        solids: What the car can hit, for objectives that ask for it.
     """
 
     policy: Any
@@ -125,6 +134,8 @@ class AttackProblem:
     disturbances: Disturbances | None = None
     draw: int = 0
     regulariser: Regulariser | None = None
+    objective: Objective = field(default_factory=CrossTrackError)
+    solids: Solids | None = None
 
     def __post_init__(self) -> None:
         """Refuse what would give a wrong gradient silently."""
@@ -143,6 +154,11 @@ class AttackProblem:
         if moved and not isinstance(self.sensor, PosedSensor):
             raise ValueError(
                 "expected a sensor with camera_poses and render for camera jitter, got one without"
+            )
+        if self.objective.needs_solids and self.solids is None:
+            raise ObjectiveError(
+                f"expected a place with solids for the objective {type(self.objective).__name__}, got one that does not say what its car can "
+                "hit; choose another place, or the objective cte"
             )
 
     @property
@@ -203,22 +219,43 @@ class AttackProblem:
             return self
         return replace(self, disturbances=None, draw=0, regulariser=None)
 
-    def cost(self, states: Tensor) -> Tensor:
-        """Cost ``[...]`` of states ``[..., n]``: minus the absolute cross-track error [m]."""
-        return -cross_track(self.path, states[..., :2]).abs()
+    def judged(self, states: Tensor) -> JudgedDrives:
+        """Drives of states ``[T + 1, B, n]`` as an objective judges them."""
+        return JudgedDrives(states, self.path, horizon_of(self), self.fence_m, self.solids)
+
+    def losses(self, states: Tensor) -> Tensor:
+        """Loss ``[B]`` of each drive of states ``[T + 1, B, n]``, without the regulariser; differentiable in the states."""
+        return losses_of(self.objective, self.judged(states))
+
+    def totals(self, states: Tensor) -> Totals:
+        """Loss, value and cross-track errors of each drive of states ``[T + 1, B, n]``."""
+        drives = self.judged(states.detach())
+        protocol = drives.per_drive([each.total_cte_m for each in drives.metrics])
+        losses = losses_of(self.objective, drives).detach()
+        return Totals(drives.cte_m.abs().sum(0), protocol, losses, values_of(self.objective, drives))
 
 
 @dataclass(frozen=True, eq=False)
 class Totals:
-    """Total cross-track error of each start of a rollout.
+    """What each start of a rollout adds up to.
 
     Attributes:
-        total_cte_m: What the loss sums: |CTE| over t = 1..T, ``[B]`` [m].
+        total_cte_m: |CTE| summed over t = 1..T, ``[B]`` [m].
         protocol_cte_m: What is compared between domains (``driving/metrics``): the car stops at the fence, ``[B]`` [m].
+        losses: Loss of the problem's objective, ``[B]``.
+        values: Its value, ``[B]``.
     """
 
     total_cte_m: Tensor
     protocol_cte_m: Tensor
+    losses: Tensor
+    values: Tensor
+
+    def rows(self, chosen: slice) -> Totals:
+        """Those of some starts."""
+        return Totals(
+            self.total_cte_m[chosen], self.protocol_cte_m[chosen], self.losses[chosen], self.values[chosen]
+        )
 
 
 def horizon_of(problem: AttackProblem) -> Horizon:
@@ -228,11 +265,4 @@ def horizon_of(problem: AttackProblem) -> Horizon:
 
 def drive_scores(problem: AttackProblem, states: Tensor) -> list[DriveMetrics]:
     """The protocol's metrics of each drive of states ``[T + 1, B, n]``; the car stops at the fence."""
-    scores, horizon = [], horizon_of(problem)
-    for drive_states in states.detach().cpu().numpy().swapaxes(0, 1):
-        stopped = None
-        if problem.fence_m is not None:
-            outside = np.flatnonzero((np.abs(drive_states[:, :2]) > problem.fence_m).any(axis=1))
-            stopped = int(outside[0]) if outside.size else None
-        scores.append(drive_metrics(problem.path, drive_states, horizon, stopped))
-    return scores
+    return list(problem.judged(states).metrics)

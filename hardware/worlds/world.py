@@ -9,7 +9,7 @@ the ground under the point whose x, y and heading are its state, x forward, y le
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from types import TracebackType
 from typing import Any, Literal, Protocol, overload, runtime_checkable
@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Array, Pinhole, VehicleState
+from hardware.worlds.footprints import Footprint
 from hardware.worlds.paths import ReferencePath
 
 Rgb = NDArray[np.uint8]
@@ -391,6 +392,21 @@ class NamesObstacles(Protocol):
 
     def touches(self, x_m: float, y_m: float, yaw_rad: float, /) -> str:
         """Name of what the car stands against at a pose, such as ``wall``; empty if nothing is near."""
+        ...
+
+
+@runtime_checkable
+class HasSolids(Protocol):
+    """A world that says what its car can run into, open or not: the objective ``collision`` needs it."""
+
+    @property
+    def car_body(self) -> Footprint:
+        """The car's body where its state is x = y = yaw = 0."""
+        ...
+
+    @property
+    def solids(self) -> Sequence[Footprint]:
+        """What the car cannot drive through, walls included."""
         ...
 
 

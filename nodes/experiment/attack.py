@@ -16,6 +16,7 @@ from advnerf_core.attack.adjoint import AttackProblem, evaluate
 from advnerf_core.attack.artifact import AttackFile, load_attack, save_attack
 from advnerf_core.attack.clean import clean_drive
 from advnerf_core.attack.methods import Method, SearchRun, SearchSettings, load_method
+from advnerf_core.attack.objectives import CTE, load_objective, objective_entry, objective_key
 from advnerf_core.attack.on_device import on_chosen_device, said_of_device
 from advnerf_core.attack.search.search import SearchResult
 from advnerf_core.attack.spaces.space import Shown, Space, half_precision
@@ -84,11 +85,13 @@ def surrogate_part(
         return found
     policy = _victim(victim_file(experiment, cell.victim))
     problem = attack_problem(experiment, space, policy, cell.scenario, cell.seed)
-    attack_id, curve, seconds = None, [], 0.0
+    attack_id, curve, seconds, values = None, [], 0.0, {}
     if cell.searched:
         result = _search(experiment, space, problem, cell, folder, report)
         seconds = sum(evaluation.seconds for evaluation in result.history)
         curve = [evaluation.predicted_total_cte_m for evaluation in result.history]
+        if experiment.config.attack.objective != CTE:
+            values = {"curve_value": [evaluation.value for evaluation in result.history]}
         attack = _attack_file(experiment, space, problem, policy, cell, result)
         attack_id = save_attack(folder / ATTACK, attack)
     data = {
@@ -97,6 +100,7 @@ def surrogate_part(
         "hardness": hardness_before(folder),
         **surrogate_drives(experiment, space, cell, folder),
         "curve_total_cte_m": curve,
+        **values,
         "seconds": seconds,
     }
     write_atomically(kept, json.dumps(data) + "\n")
@@ -137,7 +141,7 @@ def attack_problem(
     attack, robustness = experiment.config.attack, experiment.config.attack.robustness
     # Drives of one start differ by what is drawn in them.
     starts = experiment.start_states(scenario, seed).repeat_interleave(robustness.repeats, dim=0)
-    goals = _goals(experiment, scenario, len(starts))
+    goals, objective = _goals(experiment, scenario, len(starts)), load_objective(attack.objective)
     return AttackProblem(
         policy.policy,
         space.sensor,
@@ -153,6 +157,8 @@ def attack_problem(
         off_track_m=experiment.world.off_track_m,
         disturbances=robustness.disturbances(seed),
         regulariser=robustness.regulariser(space.surrogate.objects),
+        objective=objective,
+        solids=experiment.solids if objective.needs_solids else None,
     )
 
 
@@ -230,10 +236,13 @@ def _search(
     report: Callable[..., None],
 ) -> SearchResult:
     wanted = experiment.config.space.model_dump(mode="json")
-    settings_hash = hash_of({**frozen_for(experiment, cell), "scenario": cell.scenario, "space": wanted})
+    wanted_of = {**frozen_for(experiment, cell), "scenario": cell.scenario, "space": wanted}
+    if (objective := experiment.config.attack.objective) != CTE:
+        wanted_of["objective"] = objective_key(objective)
+    settings_hash = hash_of(wanted_of)
     method = load_method(cell.code)
     settings = search_settings(experiment, method)
-    told = telling(method.evaluations(problem, settings), report)
+    told = telling(method.evaluations(problem, settings), report, objective=problem.objective)
     run = SearchRun(cell.seed, folder / _STATE, told, settings_hash)
     return space.search(cell.code, on_chosen_device(problem), settings, run)
 
@@ -272,6 +281,7 @@ def _attack_file(
             "scenario": cell.scenario,
             "horizon": experiment.searched_ticks,
             **said_of_device(),
+            **objective_entry(experiment.config.attack.objective, problem.objective, result.best.value),
         },
         clean_drive=clean,
     )

@@ -8,10 +8,11 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from advnerf_core.attack.methods import method_name
+from advnerf_core.attack.objectives import CTE
 from advnerf_core.scene.gate_limits import GateLimits
 from advnerf_core.strict import StrictModel
 from nodes.experiment.deploy_config import DeployConfig
-from nodes.experiment.method_names import MethodReference
+from nodes.experiment.method_names import MethodReference, ObjectiveReference
 from nodes.experiment.placed import PANEL, PlacedObject, WantedObject
 from nodes.experiment.robustness_config import RobustnessConfig
 from nodes.experiment.space_config import (
@@ -212,6 +213,11 @@ class AttackConfig(StrictModel):
         default=("random", "cem", "gradient"),
         min_length=1,
         description="Methods of attack; also file.py:Name, relative to the experiment file.",
+    )
+    objective: ObjectiveReference = Field(
+        default=CTE,
+        exclude_if=lambda objective: objective == CTE,
+        description="What is maximised: cte, peak, time_off_track, collision, or file.py:Class, relative to the experiment file.",
     )
     starts: Positive = Field(
         default=1, description="Start poses optimised together; the first of seed 0 is the nominal one."

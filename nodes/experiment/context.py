@@ -18,13 +18,22 @@ from advnerf_core.driving.dynamics import Ackermann, Dubins
 from advnerf_core.driving.expert import Expert, ExpertConfig
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.driving.path import Path
+from advnerf_core.driving.solids import Rectangle, Solids
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, Pinhole
 from advnerf_core.plugins import unknown
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.report.reference import Reference
 from hardware.worlds.paths import ReferencePath
-from hardware.worlds.world import CarDescription, NotOpenError, Traits, World, WorldDescription, traits_of
+from hardware.worlds.world import (
+    CarDescription,
+    HasSolids,
+    NotOpenError,
+    Traits,
+    World,
+    WorldDescription,
+    traits_of,
+)
 from nodes.experiment.cell import Cell
 from nodes.experiment.config import ExperimentConfig
 from nodes.experiment.placed import PlacedObject, in_a_lane
@@ -72,6 +81,18 @@ class Experiment(RunFolder[ExperimentConfig]):
     def traits(self) -> Traits:
         """What is known of the world without opening it."""
         return traits_of(self.named_world.make())
+
+    @cached_property
+    def solids(self) -> Solids | None:
+        """What the car can hit, walls included; None where the world does not say."""
+        world = self.named_world.make()
+        if not isinstance(world, HasSolids):
+            return None
+        rectangles = [
+            Rectangle(each.x_m, each.y_m, each.half_length_m, each.half_width_m, each.yaw_rad)
+            for each in (world.car_body, *world.solids)
+        ]
+        return Solids(tuple(rectangles[1:]), rectangles[0]) if rectangles[1:] else None
 
     @property
     def seen_settings(self) -> dict[str, Any]:

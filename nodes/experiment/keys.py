@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.attack.methods import require_method
+from advnerf_core.attack.objectives import name_objective
 from advnerf_core.plugins import PluginError
 from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.report.conditions import EMPTY, NONE
@@ -37,7 +38,15 @@ _FREE: Mapping[str, bool | set[str]] = {
 
 
 # What a drive without attack does not depend on besides.
-_SEARCHED_WITH = ("evaluations", "horizon", "learning_rate", "cem_population", "time_batch", "robustness")
+_SEARCHED_WITH = (
+    "objective",
+    "evaluations",
+    "horizon",
+    "learning_rate",
+    "cem_population",
+    "time_batch",
+    "robustness",
+)
 
 
 class CellError(RuntimeFault):
@@ -65,10 +74,12 @@ def cell_inputs(experiment: Experiment, cell: Cell) -> dict[str, Any]:
 
 def registered_settings(experiment: Experiment) -> dict[str, Any]:
     """Settings that all cells of an experiment depend on, known before any stage is run: what a registration fixes."""
+    config = experiment.config.model_dump(mode="json", exclude=_FREE)
+    name_objective(config["attack"])
     return {
         "version": VERSION,
         "bake": bake.VERSION,
-        "config": experiment.config.model_dump(mode="json", exclude=_FREE),
+        "config": config,
         "world": experiment.world_settings,
         **(
             {}

@@ -1,7 +1,8 @@
-"""Names of methods of attack in experiment, campaign and request files: checked where they stand, and absolute for other processes."""
+"""Names of methods and objectives in experiment, campaign and request files: checked where they stand, and absolute for other processes."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -9,26 +10,33 @@ from pydantic import AfterValidator, ValidationInfo
 from pydantic_core import PydanticCustomError
 
 from advnerf_core.attack.methods import require_method
+from advnerf_core.attack.objectives import require_objective
 from advnerf_core.plugins import PluginError, absolute_reference
 from advnerf_core.report.conditions import CONTROLS
 from advnerf_core.strict import COMPLETE
 
 
-def _checked(name: str, info: ValidationInfo) -> str:
-    folder = (info.context or {}).get("folder") or Path.cwd()
-    try:
-        require_method(name, folder)
-    except PluginError as error:
-        raise PydanticCustomError(COMPLETE, "{text}", {"text": str(error)}) from None
-    return absolute_reference(name, folder)
+def _checked(require: Callable[[str, Path], None]) -> Callable[[str, ValidationInfo], str]:
+    def checked(name: str, info: ValidationInfo) -> str:
+        folder = (info.context or {}).get("folder") or Path.cwd()
+        try:
+            require(name, folder)
+        except PluginError as error:
+            raise PydanticCustomError(COMPLETE, "{text}", {"text": str(error)}) from None
+        return absolute_reference(name, folder)
+
+    return checked
 
 
 def _checked_condition(name: str, info: ValidationInfo) -> str:
-    return name if name in CONTROLS else _checked(name, info)
+    return name if name in CONTROLS else _checked(require_method)(name, info)
 
 
-MethodReference = Annotated[str, AfterValidator(_checked)]
+MethodReference = Annotated[str, AfterValidator(_checked(require_method))]
 """A method as `advnerf_core.attack.methods.load_method` takes it; ``file.py:Name`` becomes absolute. Nothing is loaded."""
 
 ConditionReference = Annotated[str, AfterValidator(_checked_condition)]
 """The same, or a control: ``none``, ``empty``."""
+
+ObjectiveReference = Annotated[str, AfterValidator(_checked(require_objective))]
+"""An objective as `advnerf_core.attack.objectives.load_objective` takes it; ``file.py:Class`` becomes absolute. Nothing is loaded."""

@@ -11,6 +11,7 @@ from typing import Any
 from rich.console import Console
 
 from advnerf_core.attack.methods import method_digest, method_name
+from advnerf_core.attack.objectives import name_objective
 from advnerf_core.documents import Document, Key, read_yaml
 from advnerf_core.places import require_utf8
 from advnerf_core.plugins import unknown
@@ -67,6 +68,7 @@ def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: 
     read_world(document.part(("world",)), file.resolve().parent)
     experiment = Experiment(config, file.resolve(), folder.resolve(), setting)
     _check_ticks(experiment, document)
+    _check_objective(experiment, document)
     if config.deploy.live:
         lab_of(experiment)
     if experiment.is_described:
@@ -110,6 +112,15 @@ def _check_ticks(experiment: Experiment, document: Document) -> None:
         raise ConfigError(
             f"{document.place(('dt_s',))}: expected dt_s to be whole steps of the world {experiment.named_world.kind}, {step_s:g} s each, "
             f"got {dt_s:g} s"
+        )
+
+
+def _check_objective(experiment: Experiment, document: Document) -> None:
+    """The objective collision needs a world that says what its car can hit; users' objectives are asked when they are loaded."""
+    if experiment.config.attack.objective == "collision" and experiment.solids is None:
+        raise ConfigError(
+            f"{document.place(('attack', 'objective'))}: attack.objective: expected an objective that needs no solids, as the world "
+            f"{experiment.named_world.kind} does not say what its car can hit, got collision; choose cte, or add solids to the world (docs/worlds.md)"
         )
 
 
@@ -210,6 +221,7 @@ def stages_of(experiment: Experiment) -> list[Stage]:
 
     # Of users' methods the code counts, not where it is.
     searched = {**part("attack"), "methods": config.attack.method_names}
+    name_objective(searched)
     if codes := {method_name(each): code for each in config.attack.methods if (code := method_digest(each))}:
         searched["code"] = codes
     view, space = part("view"), part("space")

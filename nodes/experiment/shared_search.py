@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from advnerf_core.attack.methods import method_digest
+from advnerf_core.attack.objectives import ON_THE_PATH
 from advnerf_core.files import write_atomically
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
@@ -24,7 +25,8 @@ def search_key(experiment: Experiment, cell: Cell) -> str:
     inputs = cell_inputs(experiment, cell)
     inputs["config"].pop("deploy")
     inputs.pop("deployed_world", None)
-    inputs["world"] = experiment.seen_settings
+    if experiment.config.attack.objective in ON_THE_PATH:  # others may judge by the car's body
+        inputs["world"] = experiment.seen_settings
     which = [cell.scenario, cell.victim, cell.method, cell.seed]
     return hash_of({"cell": which, "code": method_digest(cell.code), "inputs": inputs})
 

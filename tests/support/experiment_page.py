@@ -31,7 +31,7 @@ def search_so_far(folder: Path, totals_m: list[float], seed: int = 0) -> None:
     state = SearchState({})
     for total_m in totals_m:
         theta = torch.from_numpy(np.random.default_rng(seed).normal(size=(8, 8, 3)).astype(np.float32))
-        state.record(theta, -total_m, Totals(*(torch.tensor([total_m]) for _ in range(2))), 0.1)
+        state.record(theta, -total_m, Totals(*(torch.tensor([total_m]) for _ in range(4))), 0.1)
     folder.mkdir(parents=True, exist_ok=True)
     state.save(folder / "state.safetensors", "a fingerprint")
 

@@ -139,7 +139,7 @@ def black_box_attack(
     on_evaluation: OnEvaluation | None = None,
     settings_hash: str = "",
 ) -> SearchResult:
-    """Maximise the total cross-track error by questions alone.
+    """Maximise the objective by questions alone.
 
     Args:
         problem: What is attacked; its policy is asked for steering only, also where it has a gradient.

@@ -49,7 +49,7 @@ def search(problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> 
 
     def slope_of(drawn: AttackProblem, theta: Tensor) -> Slope:
         totals = evaluate(drawn, theta)[1]
-        loss_m, gradient = -float(totals.total_cte_m.mean()), -side * frames.deviation(theta, drawn.draw)[1]
+        loss_m, gradient = float(totals.losses.mean()), -side * frames.deviation(theta, drawn.draw)[1]
         if drawn.regulariser is not None:
             extra, slope = drawn.regulariser(theta)
             loss_m, gradient = loss_m + extra, gradient + slope

@@ -48,7 +48,7 @@ def gradient_attack(
     on_evaluation: OnEvaluation | None = None,
     settings_hash: str = "",
 ) -> SearchResult:
-    """Maximise the total cross-track error by gradient descent on its negative.
+    """Maximise the objective by gradient descent on its loss.
 
     Each iteration is one evaluation: a closed-loop rollout and its gradient. Iteration 0 evaluates the start.
 
@@ -99,7 +99,7 @@ def climb(
     cells: int = 0,
     **settings: Any,
 ) -> SearchResult:
-    """Follow a gradient with Adam from the sensor's start, and keep the best theta by predicted total CTE.
+    """Follow a gradient with Adam from the sensor's start, and keep the best theta by the objective's value.
 
     Args:
         problem: What is attacked.

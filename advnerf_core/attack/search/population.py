@@ -102,7 +102,7 @@ def population_search(
     on_evaluation: OnEvaluation | None = None,
     settings_hash: str = "",
 ) -> SearchResult:
-    """Minimise the loss without its gradient, generation by generation; the best by predicted total CTE is kept.
+    """Minimise the loss without its gradient, generation by generation; the best by the objective's value is kept.
 
     Args:
         problem: What is attacked.

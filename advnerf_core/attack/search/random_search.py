@@ -43,7 +43,7 @@ def random_search(
     on_evaluation: OnEvaluation | None = None,
     settings_hash: str = "",
 ) -> SearchResult:
-    """Draw grid values from ``N(0, sigma^2)`` and keep the best by predicted total CTE.
+    """Draw grid values from ``N(0, sigma^2)`` and keep the best by the objective's value.
 
     Args:
         problem: What is attacked.

@@ -1,7 +1,7 @@
 """What every search for a texture shares: its record of evaluations, the best so far, and a state file to resume from.
 
-The closed loop is chaotic, so the last evaluation is rarely the best: every search keeps the best by predicted total CTE. A
-state file is written after every evaluation, whole or not at all; a search resumed from it gives the same bits (on one machine
+The closed loop is chaotic, so the last evaluation is rarely the best: every search keeps the best by the value of the problem's
+objective. A state file is written after every evaluation, whole or not at all; a search resumed from it gives the same bits (on one machine
 and one number of threads) as one that was never stopped.
 """
 
@@ -23,6 +23,7 @@ from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem, Totals, evaluate
 from advnerf_core.attack.methods import SearchRun, SearchSettings
+from advnerf_core.attack.objective import CrossTrackError
 from advnerf_core.attack.problem import ScaledSensor, SearchDivergedError
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
@@ -47,10 +48,11 @@ class Evaluation:
 
     Attributes:
         iteration: Its number, from 0.
-        loss_m: The loss: minus the mean over starts of the sum of |CTE| [m].
-        total_cte_m: What each start contributes to the loss [m].
+        loss_m: The objective's loss, mean over starts, with the regulariser's part; for ``cte`` in metres.
+        total_cte_m: Sum of |CTE| of each start [m].
         protocol_cte_m: Total CTE of each start by the protocol, which stops the car at the fence [m].
         seconds: Time it took, with its gradient if it had one [s].
+        values: The objective's value of each start, in the objective's unit; for ``cte`` these are ``protocol_cte_m``.
     """
 
     iteration: int
@@ -58,10 +60,16 @@ class Evaluation:
     total_cte_m: tuple[float, ...]
     protocol_cte_m: tuple[float, ...]
     seconds: float
+    values: tuple[float, ...]
+
+    @property
+    def value(self) -> float:
+        """Mean over starts of the objective's value: the best evaluation has the highest."""
+        return sum(self.values) / len(self.values)
 
     @property
     def predicted_total_cte_m(self) -> float:
-        """Mean over starts of the total CTE by the protocol [m]: what a search maximises and reports."""
+        """Mean over starts of the total CTE by the protocol [m], which is reported for all objectives."""
         return sum(self.protocol_cte_m) / len(self.protocol_cte_m)
 
 
@@ -100,7 +108,7 @@ class SearchState:
     @property
     def best(self) -> Evaluation:
         """The best evaluation so far; the first of equals."""
-        return max(self.history, key=lambda e: (e.predicted_total_cte_m, -e.iteration))
+        return max(self.history, key=lambda e: (e.value, -e.iteration))
 
     def record(self, theta: Tensor, loss_m: float, totals: Totals, seconds: float) -> Evaluation:
         """Add an evaluation of ``theta``."""
@@ -110,6 +118,7 @@ class SearchState:
             tuple(totals.total_cte_m.tolist()),
             tuple(totals.protocol_cte_m.tolist()),
             seconds,
+            tuple(totals.values.tolist()),
         )
         self.history.append(evaluation)
         if self.best is evaluation:
@@ -184,7 +193,7 @@ def without_gradient(problem: AttackProblem, theta: Tensor, number: int) -> tupl
         SearchDivergedError: The loss is not finite.
     """
     _, totals = evaluate(problem.at_draw(number), theta)
-    loss_m = -float(totals.total_cte_m.mean())
+    loss_m = float(totals.losses.mean())
     if problem.regulariser is not None:
         loss_m += problem.regulariser(theta)[0]
     if not math.isfinite(loss_m):
@@ -236,15 +245,18 @@ def random_spread(problem: AttackProblem, settings: SearchSettings) -> float:
 
 
 def evaluation_from_json(entry: dict[str, Any]) -> Evaluation:
-    """The evaluation that ``dataclasses.asdict`` and JSON made this of."""
+    """The evaluation that ``dataclasses.asdict`` and JSON made this of; state files without values are of ``cte``."""
     values: dict[str, Any] = {
         key: tuple(value) if isinstance(value, list) else value for key, value in entry.items()
     }
+    values.setdefault("values", values["protocol_cte_m"])
     return Evaluation(**values)
 
 
 def search_fingerprint(problem: AttackProblem, theta_shape: tuple[int, ...], **settings: Any) -> str:
     """Hash of what must not change between a search and its resumption (its length may)."""
+    if problem.objective != CrossTrackError():
+        settings["objective"] = type(problem.objective).__qualname__, repr(vars(problem.objective))
     text = json.dumps({"steps": problem.steps, "theta_shape": list(theta_shape), **settings}, sort_keys=True)
     digest = hashlib.sha256(text.encode())
     if problem.disturbances is not None:

@@ -150,8 +150,8 @@ def _gradients(batch: _Batch, theta: Tensor, draw: int) -> tuple[list[float], li
     losses, totals = [], []
     for k, problem in enumerate(batch.each):
         rows = slice(k * batch.starts, (k + 1) * batch.starts)
-        totals.append(Totals(result.totals.total_cte_m[rows], result.totals.protocol_cte_m[rows]))
-        losses.append(-float(totals[-1].total_cte_m.mean()))
+        totals.append(result.totals.rows(rows))
+        losses.append(float(totals[-1].losses.mean()))
         if problem.regulariser is not None:
             extra, slope = problem.regulariser(theta[k])
             losses[-1] += extra

@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from advnerf_core.geometry import Array, camera_mount, look_at, planar_pose
+from hardware.worlds.footprints import Footprint
 from hardware.worlds.junction.config import IntersectionConfig
 from hardware.worlds.junction.town import TREES, obstacles
-from hardware.worlds.lab.vehicle import Footprint
 from hardware.worlds.paths import ReferencePath
 
 DRIVEN_M = 44.0  # how far along each path photos are taken: the drive, and what a car sees that runs on

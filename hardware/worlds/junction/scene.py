@@ -8,6 +8,7 @@ from typing import ClassVar, Literal, overload
 import numpy as np
 
 from advnerf_core.geometry import Array, Pinhole, VehicleState, look_at, planar_pose
+from hardware.worlds.footprints import Footprint, touched_by
 from hardware.worlds.junction.car import DubinsCar
 from hardware.worlds.junction.config import UNSEEN_OF_A_CAR, IntersectionConfig
 from hardware.worlds.junction.ground import kerb_lines
@@ -15,7 +16,6 @@ from hardware.worlds.junction.photos import photo_poses
 from hardware.worlds.junction.town import obstacles
 from hardware.worlds.junction.world import build_model
 from hardware.worlds.lab.renderer import Renderer
-from hardware.worlds.lab.vehicle import Footprint, touched_by
 from hardware.worlds.world import Box, Depth, NotOpenError, Rgb, Traits, WorldDescription
 
 RANGE_M = (0.1, 250.0)  # from the near plane to past the farthest corner of the sky
@@ -104,6 +104,16 @@ class Intersection:
         """Name of what the car stands against at a pose; see `hardware.worlds.world.NamesObstacles`."""
         body, half_m = self._body(x_m, y_m, yaw_rad), self.config.road.half_m
         return touched_by(body, self._obstacles, half_m, "end of the world")
+
+    @property
+    def car_body(self) -> Footprint:
+        """The car's body around its reference point; see `hardware.worlds.world.HasSolids`."""
+        return self._body(0.0, 0.0, 0.0)
+
+    @property
+    def solids(self) -> list[Footprint]:
+        """Houses, trunks, hedges, boxes and posts; the attacked objects are not part of the world."""
+        return list(self._obstacles)
 
     def _body(self, x_m: float, y_m: float, yaw_rad: float) -> Footprint:
         car = self.config.car

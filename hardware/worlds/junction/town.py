@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from hardware.worlds.footprints import Footprint
 from hardware.worlds.junction.config import IntersectionConfig
 from hardware.worlds.lab.config import Colour
-from hardware.worlds.lab.vehicle import Footprint
 
 Side = Literal["north", "south", "east", "west"]
 Style = Literal["house", "shop", "flats", "hall"]

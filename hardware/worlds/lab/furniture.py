@@ -6,8 +6,9 @@ import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from hardware.worlds.footprints import Footprint
 from hardware.worlds.lab.config import Colour, LabConfig, PanelConfig
-from hardware.worlds.lab.vehicle import Footprint, TwinVehicle
+from hardware.worlds.lab.vehicle import TwinVehicle
 
 Point = tuple[float, float, float]
 
@@ -116,6 +117,13 @@ def obstacles(config: LabConfig) -> list[Footprint]:
     """Footprints of everything that the car's body can hit."""
     reach = config.car.body_height_m + 0.02
     return [s.footprint for s in furnish(config) if s.centre_m[2] - s.half_m[2] < reach]
+
+
+def walls(config: LabConfig) -> list[Footprint]:
+    """The four walls, as rectangles outside the room that are as thick as the room is wide."""
+    side, half = config.room.side_m, 0.5 * config.room.side_m
+    ways = ((1, 0), (0, 1), (-1, 0), (0, -1))
+    return [Footprint(side * x, side * y, half, half + side, math.atan2(y, x), "wall") for x, y in ways]
 
 
 def vehicle_in_room(config: LabConfig) -> TwinVehicle:

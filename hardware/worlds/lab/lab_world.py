@@ -9,8 +9,9 @@ from typing import ClassVar, Literal, overload
 import numpy as np
 
 from advnerf_core.geometry import Array, Pinhole, VehicleState
+from hardware.worlds.footprints import Footprint
 from hardware.worlds.lab.config import LabConfig
-from hardware.worlds.lab.furniture import vehicle_in_room
+from hardware.worlds.lab.furniture import obstacles, vehicle_in_room, walls
 from hardware.worlds.lab.lab import Lab
 from hardware.worlds.lab.phone import car_mounted_poses, track_pose, walk_around_poses
 from hardware.worlds.lab.world import MONITOR_PIXELS
@@ -112,6 +113,16 @@ class LabWorld:
     def touches(self, x_m: float, y_m: float, yaw_rad: float) -> str:
         """Name of what the car stands against at a pose; see `hardware.worlds.world.NamesObstacles`. The lab need not be open."""
         return vehicle_in_room(self.config).touches(x_m, y_m, yaw_rad)
+
+    @property
+    def car_body(self) -> Footprint:
+        """The car's body around its rear axle; see `hardware.worlds.world.HasSolids`."""
+        return vehicle_in_room(self.config).body_at(0.0, 0.0, 0.0)
+
+    @property
+    def solids(self) -> list[Footprint]:
+        """Furniture and walls."""
+        return [*obstacles(self.config), *walls(self.config)]
 
     def reset(self, x_m: float, y_m: float, yaw_rad: float) -> VehicleState:
         """Put the car down at rest."""

@@ -7,82 +7,14 @@ and one motor mode (speed, duty, current or brake current).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 
 from advnerf_core.geometry import VehicleState
+from hardware.worlds.footprints import Footprint, touched_by
 from hardware.worlds.lab.config import CarConfig
 
 JAMS = ("locked", "spinning")
-_REACHES_M = (0.02, 0.05, 0.1, 0.2)
 SUBSTEP_S = 0.004  # 3 mm at 0.8 m/s, and 1/15 of the fastest time constant
-
-
-@dataclass(frozen=True)
-class Footprint:
-    """An oriented rectangle on the floor: an obstacle, or the car's body.
-
-    Attributes:
-        x_m: Centre [m].
-        y_m: Centre [m].
-        half_length_m: Half of the extent along its own x axis [m].
-        half_width_m: Half of the extent along its own y axis [m].
-        yaw_rad: Heading of its x axis [rad].
-        name: What it is, for reports.
-    """
-
-    x_m: float
-    y_m: float
-    half_length_m: float
-    half_width_m: float
-    yaw_rad: float = 0.0
-    name: str = ""
-
-    def overlaps(self, other: Footprint) -> bool:
-        """Whether two rectangles share area (separating axis theorem)."""
-        dx, dy = other.x_m - self.x_m, other.y_m - self.y_m
-        reach = math.hypot(self.half_length_m, self.half_width_m) + math.hypot(
-            other.half_length_m, other.half_width_m
-        )
-        if dx * dx + dy * dy > reach * reach:
-            return False
-        c, s = math.cos(other.yaw_rad - self.yaw_rad), math.sin(other.yaw_rad - self.yaw_rad)
-        for frame, one, two in ((self.yaw_rad, self, other), (other.yaw_rad, other, self)):
-            cx, sx = math.cos(frame), math.sin(frame)
-            along, across = abs(dx * cx + dy * sx), abs(dy * cx - dx * sx)
-            if along >= one.half_length_m + two.half_length_m * abs(c) + two.half_width_m * abs(s):
-                return False
-            if across >= one.half_width_m + two.half_length_m * abs(s) + two.half_width_m * abs(c):
-                return False
-        return True
-
-    def corners(self) -> list[tuple[float, float]]:
-        """The four corners [m], counter-clockwise from the front left."""
-        c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
-        signs = ((1, 1), (-1, 1), (-1, -1), (1, -1))
-        ends = [(a * self.half_length_m, b * self.half_width_m) for a, b in signs]
-        return [(self.x_m + c * u - s * v, self.y_m + s * u + c * v) for u, v in ends]
-
-
-def touched_by(body: Footprint, obstacles: Iterable[Footprint], half_m: float, edge: str) -> str:
-    """Name of what a body stands against: the nearest thing within 0.2 m, as a car stops just before it; empty if there is none.
-
-    Args:
-        body: The car's.
-        obstacles: Named footprints.
-        half_m: The world ends at plus and minus this [m].
-        edge: Name of that end, such as wall.
-    """
-    for reach_m in _REACHES_M:
-        grown = replace(
-            body, half_length_m=body.half_length_m + reach_m, half_width_m=body.half_width_m + reach_m
-        )
-        for obstacle in obstacles:
-            if grown.overlaps(obstacle):
-                return obstacle.name
-        if any(max(abs(x), abs(y)) > half_m for x, y in grown.corners()):
-            return edge
-    return ""
 
 
 def require_jam(how: str | None) -> None:
@@ -200,11 +132,11 @@ class TwinVehicle:
     @property
     def body(self) -> Footprint:
         """Where the body stands."""
-        return self._body(self._x, self._y, self._yaw)
+        return self.body_at(self._x, self._y, self._yaw)
 
     def touches(self, x_m: float, y_m: float, yaw_rad: float) -> str:
         """Name of what the body stands against with the rear axle at this pose; empty if nothing is near."""
-        return touched_by(self._body(x_m, y_m, yaw_rad), self._obstacles, self._room_half_m, "wall")
+        return touched_by(self.body_at(x_m, y_m, yaw_rad), self._obstacles, self._room_half_m, "wall")
 
     def fits(self, x_m: float, y_m: float, yaw_rad: float) -> bool:
         """Whether the body is clear of walls and obstacles with the rear axle at this pose."""
@@ -253,14 +185,15 @@ class TwinVehicle:
         drag = abs(v) * -math.expm1(-dt_s / p.drag_stop_lag_s) + p.friction_mps2 * dt_s
         return _towards_zero(v, min(drag, limit))
 
-    def _body(self, x_m: float, y_m: float, yaw_rad: float) -> Footprint:
+    def body_at(self, x_m: float, y_m: float, yaw_rad: float) -> Footprint:
+        """The body at a pose of the rear axle."""
         p = self.params
         ahead = 0.5 * p.wheelbase_m
         x, y = x_m + ahead * math.cos(yaw_rad), y_m + ahead * math.sin(yaw_rad)
         return Footprint(x, y, 0.5 * p.body_length_m, 0.5 * p.body_width_m, yaw_rad)
 
     def _blocked(self, x_m: float, y_m: float, yaw_rad: float) -> bool:
-        body = self._body(x_m, y_m, yaw_rad)
+        body = self.body_at(x_m, y_m, yaw_rad)
         # Cheap test first: in the middle of the room no corner can reach a wall.
         if max(
             abs(body.x_m), abs(body.y_m)

@@ -166,7 +166,7 @@ def search_poses(
 ) -> SearchResult:
     """Search as the request asks: multi-start for the method gradient, random poses at as many evaluations for random."""
     problem, asked, seed = ready.problem, ready.asked, ready.prepared.seed
-    told = telling(asked.evaluations, report, clean=ready.prepared.clean_drive)
+    told = telling(asked.evaluations, report, ready.prepared.clean_drive, problem.objective)
     if ready.prepared.request.search.method == "random":
         sigma = ready.prepared.request.search.sigma or 5.0
         return random_poses(problem, asked.evaluations, sigma, seed, state_path, told, ready.settings_hash)
@@ -180,14 +180,14 @@ def pose_attack_file(ready: PreparedPoses, result: SearchResult) -> AttackFile:
     """The attack file: objects at the found poses; its prediction is made without disturbances."""
     surrogate, colours = ready.sensor.sharp(result.theta)
     moved_fields = placed(ready.sensor.space.objects, ready.sensor.placements(result.theta))
-    predicted_m = float(judge(ready.problem, result.theta).protocol_cte_m.mean())
+    totals = judge(ready.problem, result.theta)
     objects = tuple(
         replace(each, field=moved, sha256=moved.sha256)
         for each, moved in zip(ready.prepared.objects, moved_fields, strict=True)
     )
     prepared = replace(ready.prepared, surrogate=surrogate, objects=objects)
     # Without an attack the objects stand where the request has them, in their plain colours.
-    file = prepared.make_attack_file(replace(result, theta=colours), predicted_m, ready.prepared.clean_drive)
+    file = prepared.make_attack_file(replace(result, theta=colours), totals, ready.prepared.clean_drive)
     extra = {
         **file.extra,
         "colours_free": ready.asked.colours,

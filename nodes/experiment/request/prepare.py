@@ -24,7 +24,9 @@ from advnerf_core.attack.artifact import (
 )
 from advnerf_core.attack.clean import clean_drive
 from advnerf_core.attack.methods import method_digest
+from advnerf_core.attack.objectives import load_objective, name_objective, objective_entry
 from advnerf_core.attack.on_device import said_of_device
+from advnerf_core.attack.problem import Totals
 from advnerf_core.attack.search.search import SearchResult, draw_start_states
 from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.driving.actuated import ActuatedAckermann
@@ -99,13 +101,13 @@ class Prepared:
     def make_attack_file(
         self,
         result: SearchResult,
-        predicted_total_cte_m: float | None = None,
+        totals: Totals | None = None,
         clean: CleanDrive | None = None,
     ) -> AttackFile:
-        """The attack file of a search's result; the prediction is the best evaluation's own unless another is given."""
-        predicted = (
-            result.best.predicted_total_cte_m if predicted_total_cte_m is None else predicted_total_cte_m
-        )
+        """The attack file of a search's result; its predictions are the best evaluation's own unless others are given."""
+        predicted, value = result.best.predicted_total_cte_m, result.best.value
+        if totals is not None:
+            predicted, value = float(totals.protocol_cte_m.mean()), float(totals.values.mean())
         objects = self.attacked_objects(result.theta)
         extra = {
             "name": self.request.name,
@@ -113,6 +115,7 @@ class Prepared:
             "evaluations": len(result.history),
             "start_states": self.problem.start_states[:, :3].tolist(),
             "objects_sha256": self.hashes["objects"],
+            **objective_entry(self.request.search.objective, self.problem.objective, value),
         }
         if identity := self.policy.metadata.get("not_fixed"):
             extra["policy_not_fixed"] = identity
@@ -210,6 +213,7 @@ def request_hash(request: AttackRequest) -> str:
     )
     for key in ("evaluations", "cache_mib", "time_batch", "seeds", "together"):
         asked["search"].pop(key)
+    name_objective(asked["search"])
     search = request.search
     if code := method_digest(search.method):
         asked["search"]["method"] = [search.method_name, code]
@@ -296,6 +300,7 @@ def _problem(
         off_track_m=room.off_track_m,
         disturbances=request.robustness.disturbances(seed),
         regulariser=request.robustness.regulariser(surrogate.objects),
+        objective=load_objective(search.objective),
     )
 
 

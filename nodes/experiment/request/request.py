@@ -14,12 +14,13 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from advnerf_core.attack.methods import METHODS, alternatives, method_name
+from advnerf_core.attack.objectives import CTE
 from advnerf_core.documents import Document, dump_yaml, parse_yaml, read_yaml
 from advnerf_core.geometry import Array, make_transform, rotation_z
 from advnerf_core.places import expanded
 from advnerf_core.policies.load import is_factory
 from advnerf_core.strict import StrictModel, validate
-from nodes.experiment.method_names import MethodReference
+from nodes.experiment.method_names import MethodReference, ObjectiveReference
 from nodes.experiment.request.mesh_request import MeshRequest, ShapeRequest
 from nodes.experiment.request.pose_request import PosesRequest
 from nodes.experiment.robustness_config import RobustnessConfig
@@ -158,6 +159,11 @@ class SearchRequest(StrictModel):
         description="A method of attack: built in, of an installed package, or file.py:Name, relative to this file.",
     )
     options: dict[str, Any] = Field(default_factory=dict, description="What the method alone knows.")
+    objective: ObjectiveReference = Field(
+        default=CTE,
+        exclude_if=lambda objective: objective == CTE,
+        description="What is maximised: cte, peak, time_off_track, collision, or file.py:Class, relative to this file.",
+    )
     evaluations: Count = Field(
         default=50, description="Closed-loop evaluations; an iteration of the gradient is one."
     )

@@ -16,6 +16,7 @@ from advnerf_core.attack.methods import (
     black_box_methods,
     load_method,
 )
+from advnerf_core.attack.objectives import load_objective, objective_name
 from advnerf_core.attack.on_device import all_on_chosen_device, on_chosen_device
 from advnerf_core.attack.search.search import Evaluation, OnEvaluation, SearchResult
 from advnerf_core.attack.search.together import gradient_attacks
@@ -39,6 +40,11 @@ def chosen_method(request: AttackRequest) -> tuple[Method, SearchSettings]:
     """
     wanted = request.search
     method = load_method(wanted.method)
+    if load_objective(wanted.objective).needs_solids:
+        raise ConfigError(
+            f"search.objective: expected an objective that needs no solids, as a room calibration does not say what the car can hit, got "
+            f"{objective_name(wanted.objective)}; search for it in an experiment, whose world does"
+        )
     if request.shape is not None and not method.reads_scale:
         raise ConfigError(
             f"search.method: expected a method that searches shapes, such as {SHAPE_METHODS}, got {wanted.method_name}"
@@ -80,7 +86,7 @@ def finish(prepared: Prepared, result: SearchResult) -> AttackFile:
     if prepared.problem.disturbances is None:
         return prepared.make_attack_file(result)
     _, totals = evaluate(prepared.problem.undisturbed(), result.theta)
-    return prepared.make_attack_file(result, float(totals.protocol_cte_m.mean()))
+    return prepared.make_attack_file(result, totals)
 
 
 def run_attack(
@@ -155,7 +161,9 @@ def _run_seed(prepared: Prepared, folder: Path, display: Display, on_evaluation:
     name, state_path = f"seed_{prepared.seed}", folder / f"seed_{prepared.seed}.state.safetensors"
     report = display.start(name)
     report(0.0, "drive without attack")
-    told = telling(planned_evaluations(prepared), report, clean=prepared.clean_drive)
+    told = telling(
+        planned_evaluations(prepared), report, prepared.clean_drive, objective=prepared.problem.objective
+    )
     result = search(prepared, state_path, _both(told, on_evaluation))
     _keep(prepared, result, folder)
     state_path.unlink(missing_ok=True)
@@ -182,7 +190,12 @@ def _run_together(
         on_prepared(prepared)
     told = [
         _both(
-            telling(request.search.evaluations, display.start(f"seed_{one.seed}"), clean=one.clean_drive),
+            telling(
+                request.search.evaluations,
+                display.start(f"seed_{one.seed}"),
+                one.clean_drive,
+                one.problem.objective,
+            ),
             on_evaluation,
         )
         for one in each
@@ -213,6 +226,7 @@ def _keep(prepared: Prepared, result: SearchResult, folder: Path) -> None:
         "best_evaluation": result.best.iteration,
         "loss_m": [e.loss_m for e in result.history],
         "predicted_total_cte_m": [e.predicted_total_cte_m for e in result.history],
+        "value": [e.value for e in result.history],
         "seconds": [e.seconds for e in result.history],
         "clean_drive": prepared.clean_drive.to_dict(),
     }

@@ -4,23 +4,41 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from advnerf_core.attack.objective import CrossTrackError, Objective
 from advnerf_core.attack.search.search import Evaluation, OnEvaluation
 from advnerf_core.driving.clean_drive import CleanDrive
 
 
 def telling(
-    evaluations: int, report: Callable[[float, str], None], of: str = "", clean: CleanDrive | None = None
+    evaluations: int,
+    report: Callable[[float, str], None],
+    clean: CleanDrive | None = None,
+    objective: Objective | None = None,
 ) -> OnEvaluation:
-    """Evaluations as progress: the fraction done, and in words, after ``of``, the last and the best total, and that without attack."""
-    best_m, beside = 0.0, "" if clean is None else f", {clean.short}"
+    """A callback that reports evaluations as progress: the fraction done; in words the last and the best total, and that without attack.
+
+    Args:
+        evaluations: How many there will be.
+        report: Gets the fraction and the words.
+        clean: The drive without attack, if its total shall stand beside the others.
+        objective: What is maximised; the last and the best value are reported too, unless it is ``cte``.
+    """
+    best: Evaluation | None = None
+    beside = "" if clean is None else f", {clean.short}"
 
     def told(evaluation: Evaluation) -> None:
-        nonlocal best_m
-        total_m, done = evaluation.predicted_total_cte_m, evaluation.iteration + 1
-        best_m = max(best_m, total_m)
-        report(
-            done / evaluations,
-            f"{of}{done}/{evaluations}, total CTE {total_m:.1f} m, best {best_m:.1f} m{beside}",
+        nonlocal best
+        if best is None or evaluation.value > best.value:
+            best = evaluation
+        done, total_m, best_m = (
+            evaluation.iteration + 1,
+            evaluation.predicted_total_cte_m,
+            best.predicted_total_cte_m,
         )
+        text = f"total CTE {total_m:.1f} m, best {best_m:.1f} m"
+        if objective is not None and objective != CrossTrackError():
+            unit = objective.unit
+            text = f"{evaluation.value:.2f} {unit}, best {best.value:.2f} {unit}, total CTE {total_m:.1f} m"
+        report(done / evaluations, f"{done}/{evaluations}, {text}{beside}")
 
     return told

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from advnerf_core.attack.artifact import face_texture, load_attack
-from advnerf_core.attack.search.search import Evaluation
+from advnerf_core.attack.search.search import Evaluation, evaluation_from_json
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.places import open_tensors
 from advnerf_core.scene.surrogate import split_theta
@@ -36,7 +36,7 @@ class Speaker:
     def __init__(self, stream: BinaryIO, folder: Path) -> None:
         self._stream, self._folder, self._evaluations = stream, folder, 0
         self._prepared: Prepared | None = None
-        self._best_m: float | None = None
+        self._best: Evaluation | None = None
 
     def say(self, kind: str, pixels: bytes = b"", **data: Any) -> None:
         """One line, and what comes behind it."""
@@ -53,7 +53,7 @@ class Speaker:
 
     def prepared(self, prepared: Prepared) -> None:
         """A seed can be searched."""
-        done, self._best_m = _so_far(self._state(prepared))
+        done, self._best = _so_far(self._state(prepared))
         self._prepared, self._evaluations = prepared, planned_evaluations(prepared)
         self.say(
             "progress",
@@ -62,7 +62,7 @@ class Speaker:
             evaluation=done,
             evaluations=self._evaluations,
             text="",
-            total_cte_m=self._best_m or 0.0,
+            total_cte_m=0.0 if self._best is None else self._best.predicted_total_cte_m,
             clean_total_cte_m=prepared.clean_drive.mean_total_cte_m,
             clean_drives=prepared.clean_drive.drives,
         )
@@ -70,9 +70,8 @@ class Speaker:
     def told(self, evaluation: Evaluation) -> None:
         """An evaluation is done and its state is on disk."""
         assert self._prepared is not None
-        total_m = evaluation.predicted_total_cte_m
-        better = self._best_m is None or total_m > self._best_m
-        self._best_m = total_m if better else self._best_m
+        better = self._best is None or evaluation.value > self._best.value
+        self._best = evaluation if better else self._best
         self.say(
             "progress",
             state="searching",
@@ -81,7 +80,7 @@ class Speaker:
             text="",
             evaluations=self._evaluations,
             loss_m=evaluation.loss_m,
-            total_cte_m=total_m,
+            total_cte_m=evaluation.predicted_total_cte_m,
             seconds=evaluation.seconds,
         )
         if better:
@@ -110,8 +109,8 @@ class Speaker:
             histories = json.loads((handle.metadata() or {}).get("histories", "[]"))
         if not together:
             return best
-        totals = [max(sum(entry["protocol_cte_m"]) for entry in history) for history in histories]
-        return best[totals.index(max(totals))]
+        values = [max(evaluation_from_json(entry).value for entry in history) for history in histories]
+        return best[values.index(max(values))]
 
     def _state(self, prepared: Prepared) -> Path:
         return self._folder / f"seed_{prepared.seed}.state.safetensors"
@@ -121,14 +120,14 @@ class Speaker:
         self.say("image", np.ascontiguousarray(pixels).tobytes(), name=name, height=height, width=width)
 
 
-def _so_far(state: Path) -> tuple[int, float | None]:
-    """Evaluations of a search that was cut off, and its best total [m]."""
+def _so_far(state: Path) -> tuple[int, Evaluation | None]:
+    """How many evaluations a search that was cut off has made, and the best of them."""
     if not state.exists():
         return 0, None
     with open_tensors(state, "pt") as handle:
-        history = json.loads((handle.metadata() or {}).get("history", "[]"))
-    totals = [sum(entry["protocol_cte_m"]) / len(entry["protocol_cte_m"]) for entry in history]
-    return len(totals), max(totals, default=None)
+        entries = json.loads((handle.metadata() or {}).get("history", "[]"))
+    history = [evaluation_from_json(entry) for entry in entries]
+    return len(history), max(history, key=lambda each: each.value, default=None)
 
 
 def _texture(prepared: Prepared, theta: Tensor) -> NDArray[np.uint8] | None:
@@ -145,7 +144,7 @@ def work(folder: Path, stream: BinaryIO) -> None:
     speaker = Speaker(stream, folder)
     files = run_attack(request, folder, speaker, speaker.told, speaker.prepared)
     attacks = [load_attack(file) for file in files]
-    best = max(range(len(files)), key=lambda k: attacks[k].predicted_total_cte_m or 0.0)
+    best = max(range(len(files)), key=lambda k: attacks[k].value or 0.0)
     found = attacks[best]
     speaker.say(
         "done",

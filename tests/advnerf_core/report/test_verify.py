@@ -315,7 +315,7 @@ def test_a_victim_that_does_not_drive_well_is_published_only_if_that_is_declared
     assert "own hardened does not drive well deployed" in found.findings[0]
     page = (folder.parent / PAGE).read_text()
     assert (
-        "**Does not drive well:** past the plain object, the victim hardened has a mean abs. CTE of 0.1"
+        "**Does not drive well:** past the plain object, the victim trained with textures has a mean abs. CTE of 0.1"
         in page
     )
     assert "Its car swings by itself." in page

@@ -5,8 +5,9 @@ import math
 
 import pytest
 
+from hardware.worlds.footprints import Footprint
 from hardware.worlds.lab.config import CarConfig
-from hardware.worlds.lab.vehicle import Footprint, TwinVehicle
+from hardware.worlds.lab.vehicle import TwinVehicle
 
 CAR = CarConfig()
 

@@ -1,0 +1,240 @@
+"""What an attack maximises: the contract of an objective, and the built-in ones.
+
+An objective judges drives. Its ``value`` is reported, and a search keeps the theta with the highest value. Its ``loss`` is what gradients
+follow, and what searches without a gradient minimise. The loss defaults to minus the value; an objective whose value is a count or a
+maximum, or stops with the car, has a relaxation of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from advnerf_core.driving.cross_track import cross_track
+from advnerf_core.driving.metrics import DriveMetrics, Horizon, drive_metrics
+from advnerf_core.driving.path import Path
+from advnerf_core.driving.solids import Solids
+from advnerf_core.errors import AdvnerfError
+
+
+class ObjectiveError(AdvnerfError, ValueError):
+    """An objective does not suit the place, or does not keep its contract."""
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedDrives:
+    """Drives from several starts, and what an objective may need to judge them.
+
+    Attributes:
+        states: ``[T + 1, B, n]``: x [m], y [m], yaw [rad] first; ``states[0]`` are the starts. Gradients flow through them.
+        path: What the car should follow.
+        horizon: Ticks, their length, and limits of the cross-track error.
+        fence_m: Half side of the square beyond which the deployed car is stopped [m]; None without a fence.
+        solids: What the car can hit; None where the place does not say.
+    """
+
+    states: Tensor
+    path: Path
+    horizon: Horizon
+    fence_m: float | None = None
+    solids: Solids | None = None
+
+    @cached_property
+    def cte_m(self) -> Tensor:
+        """Signed cross-track error at the ticks 1..T, left positive, ``[T, B]`` [m], with gradients with respect to states."""
+        return cross_track(self.path, self.states[1:, :, :2])
+
+    @cached_property
+    def metrics(self) -> tuple[DriveMetrics, ...]:
+        """The protocol's metrics of each drive, without gradients; the car stops at the fence."""
+        found = []
+        for states in self.states.detach().cpu().numpy().swapaxes(0, 1):
+            stopped = None
+            if self.fence_m is not None:
+                outside = np.flatnonzero((np.abs(states[:, :2]) > self.fence_m).any(axis=1))
+                stopped = int(outside[0]) if outside.size else None
+            found.append(drive_metrics(self.path, states, self.horizon, stopped))
+        return tuple(found)
+
+    @cached_property
+    def clearances_m(self) -> Tensor:
+        """Distance to each of K solids at the ticks 1..T, ``[T, B, K]`` [m], with gradients with respect to states.
+
+        Raises:
+            ObjectiveError: The place has no solids.
+        """
+        if self.solids is None:
+            raise ObjectiveError(
+                "expected a place that says what its car can hit, got one without solids; use another objective"
+            )
+        return self.solids.clearances_m(self.states[1:])
+
+    def per_drive(self, values: list[float]) -> Tensor:
+        """One number for each drive, ``[B]``, of the states' type."""
+        return torch.tensor(values, dtype=self.states.dtype)
+
+
+class Objective:
+    """What an attack maximises. Derive from it, and define at least ``value``; see docs/methods.md.
+
+    Attributes:
+        unit: Of the value.
+        needs_solids: Whether it needs a place with solids.
+    """
+
+    unit: ClassVar[str] = "m"
+    needs_solids: ClassVar[bool] = False
+
+    def value(self, drives: JudgedDrives) -> Tensor:
+        """How far each drive is what the attacker wants, ``[B]``; higher is a stronger attack."""
+        raise NotImplementedError
+
+    def loss(self, drives: JudgedDrives) -> Tensor:
+        """What a search minimises, ``[B]``, differentiable in ``drives.states``; minus the value unless it is overridden."""
+        return -self.value(drives)
+
+
+@dataclass(frozen=True)
+class CrossTrackError(Objective):
+    """``cte``: the total cross-track error.
+
+    The value is that of the protocol: ``sum_t |c_t|`` over t = 1..T, where the car stops at the fence and is then charged its last
+    error, capped. The loss is ``-sum_t |c_t|`` of a car that goes on driving beyond the fence, as the gradient would be zero there.
+    """
+
+    def value(self, drives: JudgedDrives) -> Tensor:
+        """Total |CTE| of each drive by the protocol, ``[B]`` [m]."""
+        return drives.per_drive([each.total_cte_m for each in drives.metrics])
+
+    def loss(self, drives: JudgedDrives) -> Tensor:
+        """Minus the sum of |CTE|, ``[B]`` [m]."""
+        return -drives.cte_m.abs().sum(0)
+
+
+@dataclass(frozen=True)
+class Peak(Objective):
+    """``peak``: the greatest cross-track error.
+
+    The value is ``max_t |c_t|``. The loss is minus a smooth maximum, ``-w log(mean_t exp(|c_t| / w))`` with the temperature
+    ``w = temperature * off_track_m``. It lies above minus the value, by at most ``w log T``.
+
+    Attributes:
+        temperature: Share of the off-track limit.
+    """
+
+    temperature: float = 0.1
+
+    def value(self, drives: JudgedDrives) -> Tensor:
+        """Greatest |CTE| of each drive by the protocol, ``[B]`` [m]."""
+        return drives.per_drive([each.max_cte_m for each in drives.metrics])
+
+    def loss(self, drives: JudgedDrives) -> Tensor:
+        """Minus the smooth maximum, ``[B]`` [m]."""
+        width_m, ticks = self.temperature * drives.horizon.off_track_m, len(drives.cte_m)
+        return -width_m * (torch.logsumexp(drives.cte_m.abs() / width_m, 0) - math.log(ticks))
+
+
+@dataclass(frozen=True)
+class TimeOffTrack(Objective):
+    """``time_off_track``: how long the car is off the track.
+
+    The value is ``dt`` times the ticks with ``|c_t| > off_track_m``. The loss replaces each of these steps by a sigmoid:
+    ``-dt sum_t 1 / (1 + exp(-(|c_t| - off_track_m) / w))`` with ``w = width * off_track_m``.
+
+    Attributes:
+        width: Share of the off-track limit.
+    """
+
+    unit: ClassVar[str] = "s"
+    width: float = 0.25
+
+    def value(self, drives: JudgedDrives) -> Tensor:
+        """Time off the track of each drive by the protocol, ``[B]`` [s]."""
+        limit_m, dt_s = drives.horizon.off_track_m, drives.horizon.dt_s
+        return drives.per_drive(
+            [dt_s * sum(abs(cte) > limit_m for cte in each.ctes_m) for each in drives.metrics]
+        )
+
+    def loss(self, drives: JudgedDrives) -> Tensor:
+        """Minus the relaxed time off the track, ``[B]`` [s]."""
+        limit_m = drives.horizon.off_track_m
+        beyond = (drives.cte_m.abs() - limit_m) / (self.width * limit_m)
+        return -drives.horizon.dt_s * torch.sigmoid(beyond).sum(0)
+
+
+@dataclass(frozen=True)
+class Collision(Objective):
+    """``collision``: how deep the car drives into something solid.
+
+    The value is ``-min d_tk`` over ticks t and solids k, where ``d_tk`` is the signed clearance (`Solids.clearances_m`): above 0 the car
+    hits. The loss is minus the softplus of its smooth maximum, ``-w log(1 + sum_tk exp(-d_tk / w))`` with ``w = width * off_track_m``.
+    The car of the surrogate drives on through what it hits.
+
+    Attributes:
+        width: Share of the off-track limit.
+    """
+
+    needs_solids: ClassVar[bool] = True
+    width: float = 0.5
+
+    def value(self, drives: JudgedDrives) -> Tensor:
+        """Minus the smallest clearance of each drive, ``[B]`` [m]."""
+        return -drives.clearances_m.amin((0, 2))
+
+    def loss(self, drives: JudgedDrives) -> Tensor:
+        """Minus the softplus of the smooth maximum, ``[B]`` [m]."""
+        width_m = self.width * drives.horizon.off_track_m
+        nearest = torch.logsumexp(-drives.clearances_m / width_m, (0, 2))
+        return -width_m * torch.nn.functional.softplus(nearest)
+
+
+def values_of(objective: Objective, drives: JudgedDrives) -> Tensor:
+    """The value of each drive, without history.
+
+    Raises:
+        ObjectiveError: The objective does not give one number for each drive.
+    """
+    return _one_each(objective, "value", objective.value(drives), drives).detach().to(drives.states.dtype)
+
+
+def losses_of(objective: Objective, drives: JudgedDrives) -> Tensor:
+    """The loss of each drive, with its history.
+
+    Raises:
+        ObjectiveError: The objective does not give one number for each drive.
+    """
+    return _one_each(objective, "loss", objective.loss(drives), drives)
+
+
+def loss_slopes(objective: Objective, drives: JudgedDrives) -> tuple[float, Tensor]:
+    """The mean loss, and its derivative with respect to each state while all others are held, ``[T + 1, B, n]``.
+
+    Raises:
+        ObjectiveError: The loss is not differentiable in the states.
+    """
+    states = drives.states.detach().requires_grad_()
+    with torch.enable_grad():
+        loss = losses_of(objective, replace(drives, states=states)).mean()
+        if not loss.requires_grad:
+            raise ObjectiveError(
+                f"expected a loss of {type(objective).__name__} that is differentiable in drives.states, got one without a gradient; "
+                "compute it with torch from drives.states, drives.cte_m or drives.clearances_m, or search without a gradient"
+            )
+        (slopes,) = torch.autograd.grad(loss, states)
+    return float(loss.detach()), slopes
+
+
+def _one_each(objective: Objective, what: str, found: object, drives: JudgedDrives) -> Tensor:
+    count = drives.states.shape[1]
+    if not isinstance(found, Tensor) or tuple(found.shape) != (count,):
+        got = f"shape {list(found.shape)}" if isinstance(found, Tensor) else type(found).__name__
+        raise ObjectiveError(
+            f"expected {what} of {type(objective).__name__} to return a tensor [{count}], one number for each drive, got {got}"
+        )
+    return found

@@ -1,0 +1,114 @@
+"""The objectives of attacks: one table of the built-in ones, and those that users bring as an entry point or a file.
+
+An objective is a class that derives from `advnerf_core.attack.objective.Objective` and is made without arguments. A user's is an entry
+point of the group ``advnerf.objectives`` or ``file.py:Class``, see docs/methods.md. Names are known without torch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+from advnerf_core.plugins import (
+    PluginError,
+    code_sha256,
+    is_file_reference,
+    known_names,
+    require_known,
+    resolve,
+)
+
+if TYPE_CHECKING:
+    from advnerf_core.attack.objective import Objective
+
+GROUP, CTE = "advnerf.objectives", "cte"
+_WHAT, _MODULE = "objective", "advnerf_core.attack.objective"
+
+# Names of classes in `objective.py`, in the order of tables.
+OBJECTIVES: Mapping[str, str] = MappingProxyType(
+    {CTE: "CrossTrackError", "peak": "Peak", "time_off_track": "TimeOffTrack", "collision": "Collision"}
+)
+# These depend on states and the path alone, not on what the car can hit.
+ON_THE_PATH = (CTE, "peak", "time_off_track")
+
+
+def load_objective(reference: str, folder: Path | None = None) -> Objective:
+    """The objective that a reference stands for.
+
+    Args:
+        reference: A built-in name, an entry point's name, or ``file.py:Class``.
+        folder: Folder that a relative ``file.py`` is relative to; the working folder if it is not given.
+
+    Raises:
+        PluginError: There is no such objective, its code cannot be loaded, or it is none.
+    """
+    base: type[Objective] = import_module(_MODULE).Objective
+    require_objective(reference, folder)
+    found: Any = resolve(reference, _WHAT, {name: _row(name) for name in OBJECTIVES}, GROUP, folder)
+    if not (isinstance(found, type) and issubclass(found, base)):
+        got = f"the class {found.__name__}" if isinstance(found, type) else f"a {type(found).__name__}"
+        raise PluginError(
+            f"{_WHAT} {reference}: expected a class that derives from Objective ({_MODULE}), got {got}; see docs/methods.md"
+        )
+    if found.value is base.value:
+        raise PluginError(f"{_WHAT} {reference}: expected a class with a method value, got none; define it")
+    try:
+        return found()
+    except TypeError as error:
+        raise PluginError(
+            f"{_WHAT} {reference}: expected a class that is made without arguments, got {error}; give its arguments defaults"
+        ) from error
+
+
+def require_objective(reference: str, folder: Path | None = None) -> None:
+    """Refuse a reference that stands for no objective; nothing is loaded.
+
+    Args:
+        reference: As of `load_objective`.
+        folder: As of `load_objective`.
+
+    Raises:
+        PluginError: There is no such objective, or its name is that of a built-in one.
+    """
+    require_known(reference, _WHAT, OBJECTIVES, GROUP, folder)
+    name = objective_name(reference)
+    if name in OBJECTIVES and reference != name:
+        raise PluginError(
+            f"{_WHAT} {reference}: expected a name that no built-in objective has, got {name}; rename it"
+        )
+
+
+def objective_name(reference: str) -> str:
+    """What an objective is called in results: of ``file.py:Class`` it is ``Class``. Names stay as they are."""
+    return reference.rpartition(":")[2] if is_file_reference(reference) else reference
+
+
+def objective_key(reference: str) -> str | list[str]:
+    """What a result depends on: the name of a built-in objective; name and digest of a user's, wherever its file lies."""
+    code = code_sha256(reference, OBJECTIVES, GROUP)[:16]
+    return [objective_name(reference), code] if code else reference
+
+
+def name_objective(section: dict[str, Any]) -> None:
+    """Put the key of a section's objective in the place of its reference, which may be a path; nothing happens where it has none."""
+    if "objective" in section:
+        section["objective"] = objective_key(section["objective"])
+
+
+def objective_entry(reference: str, objective: Objective, value: float) -> dict[str, Any]:
+    """What an attack file says of its objective: name, unit and value. Nothing for ``cte``, whose value is the predicted total CTE."""
+    if reference == CTE:
+        return {}
+    return {"objective": {"name": objective_name(reference), "unit": objective.unit, "value": value}}
+
+
+def objective_names() -> tuple[str, ...]:
+    """Built-in objectives, then those of installed packages."""
+    return known_names(OBJECTIVES, GROUP)
+
+
+def _row(name: str) -> Callable[[], Any]:
+    return lambda: getattr(import_module(_MODULE), OBJECTIVES[name])

@@ -1,0 +1,64 @@
+"""An objective that a user brings is what a request maximises."""
+
+import json
+
+import pytest
+import torch
+
+from advnerf_core.attack.adjoint import evaluate
+from advnerf_core.attack.artifact import load_attack
+from nodes.experiment.request.prepare import prepare, request_hash
+from nodes.experiment.request.request import load_request, parse_request, request_text
+from nodes.experiment.request.search import run_attack
+from nodes.runtime.errors import ConfigError
+from nodes.runtime.progress import ProgressDisplay
+from tests.support.tiny_request import tiny_request
+
+LEFT = """
+from advnerf_core.attack.objective import Objective
+
+class Left(Objective):
+    def value(self, drives):
+        return drives.cte_m.clamp(min=0.0).sum(0)
+"""
+
+
+def test_a_request_is_chosen_by_the_objective_of_a_file_and_reports_the_total_too(tmp_path):
+    file = tiny_request(tmp_path)
+    (tmp_path / "mine.py").write_text(LEFT)
+    request = load_request(file, ["search.objective=mine.py:Left", "search.method=random"])
+    assert parse_request(request_text(request), folder=tmp_path / "elsewhere") == request
+    (found,) = run_attack(request, tmp_path / "run", ProgressDisplay())
+    attack, curve = load_attack(found), json.loads(found.with_name("seed_0.json").read_text())
+    problem = prepare(request).problem
+    rollout, totals = evaluate(problem, torch.from_numpy(attack.objects[0].theta))
+    left_m = problem.path.project(rollout.states[1:, :, :2].numpy()).cte_m.clip(min=0.0).sum(0)
+    assert attack.extra["objective"] == {"name": "Left", "unit": "m", "value": attack.value}
+    assert attack.value == pytest.approx(left_m.mean(), rel=1e-6)
+    assert attack.value == max(curve["value"])
+    assert attack.predicted_total_cte_m == pytest.approx(float(totals.protocol_cte_m.mean()), rel=1e-6)
+
+
+def test_its_hash_follows_the_code_and_cte_leaves_it_unchanged(tmp_path):
+    file, own = tiny_request(tmp_path), tmp_path / "mine.py"
+    own.write_text(LEFT)
+    plain = load_request(file)
+    assert request_hash(load_request(file, ["search.objective=cte"])) == request_hash(plain)
+    assert "objective" not in request_text(plain)
+    hashes = [request_hash(load_request(file, ["search.objective=mine.py:Left"]))]
+    own.write_text(LEFT.replace("min=0.0", "min=0.1"))
+    hashes.append(request_hash(load_request(file, ["search.objective=mine.py:Left"])))
+    hashes.append(request_hash(load_request(file, ["search.objective=peak"])))
+    assert len({request_hash(plain), *hashes}) == 4
+
+
+def test_wrong_objectives_are_one_line_before_anything_is_loaded(tmp_path):
+    file = tiny_request(tmp_path)
+    with pytest.raises(
+        ConfigError, match=r"objective.*expected an objective of cte, .*got 'tce' .did you mean cte"
+    ):
+        load_request(file, ["search.objective=tce"])
+    request = load_request(file, ["search.objective=collision"])
+    with pytest.raises(ConfigError, match="expected an objective that needs no solids"):
+        run_attack(request, tmp_path / "run", ProgressDisplay())
+    assert not (tmp_path / "run").exists()

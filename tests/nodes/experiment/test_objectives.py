@@ -1,0 +1,76 @@
+"""An experiment maximises the objective that its file names."""
+
+import json
+import shutil
+
+import pytest
+
+from advnerf_core.attack.artifact import load_attack
+from nodes.experiment.attack import ATTACK
+from nodes.experiment.cell import Cell
+from nodes.experiment.cell_kind import settings_hash
+from nodes.experiment.cells import ExperimentCells
+from nodes.experiment.keys import registered_settings
+from nodes.experiment.run import load_experiment
+from nodes.runtime.errors import ConfigError
+from tests.support.stage_versions import ROOT, TINY
+
+LEFT = """
+from advnerf_core.attack.objective import Objective
+
+class Left(Objective):
+    def value(self, drives):
+        return drives.cte_m.clamp(min=0.0).sum(0)
+"""
+FILE, RANDOM, NONE = (
+    ROOT / "launch" / "room.experiment.yaml",
+    Cell("track", "hardened", "random", 0),
+    Cell("track", "hardened", "none", 0),
+)
+
+
+def experiment_of(folder, objective):
+    return load_experiment(FILE, "demo", [*TINY, f"attack.objective={objective}"], folder)
+
+
+def test_keys_follow_the_objective_where_something_is_searched(tmp_path):
+    kind, keys = ExperimentCells(), {}
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "mine.py").write_text(LEFT)
+    own = {name: f"{tmp_path / name / 'mine.py'}:Left" for name in ("a", "b")}
+    plain = load_experiment(FILE, "demo", TINY, tmp_path / "run")
+    for name, objective in {"cte": "cte", "peak": "peak", **own}.items():
+        found = experiment_of(tmp_path / "run", objective)
+        keys[name] = registered_settings(found)["config"]["attack"].get("objective")
+        assert kind.inputs(found, NONE) == kind.inputs(plain, NONE)
+        same = settings_hash(kind, found, RANDOM) == settings_hash(kind, plain, RANDOM)
+        assert same == (name == "cte")
+    assert keys["cte"] is None
+    assert keys["peak"] == "peak"
+    assert keys["a"] == keys["b"]
+    assert keys["a"][0] == "Left"
+    assert str(tmp_path) not in json.dumps(keys)
+
+
+def test_a_cell_is_searched_for_the_objective_of_a_file_without_a_change_of_the_project(tiny_room, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(tiny_room[0], folder, ignore=shutil.ignore_patterns("cells"))
+    (tmp_path / "mine.py").write_text(LEFT)
+    experiment = experiment_of(folder, f"{tmp_path / 'mine.py'}:Left")
+    kind = ExperimentCells()
+    with kind.hold(experiment):
+        found = kind.run(experiment, RANDOM, experiment.cell_folder(RANDOM), lambda part, text="": None)
+    attack = load_attack(experiment.cell_folder(RANDOM) / ATTACK)
+    curve = json.loads((experiment.cell_folder(RANDOM) / "surrogate.json").read_text())["curve_value"]
+    assert attack.extra["objective"] == {"name": "Left", "unit": "m", "value": max(curve)}
+    assert found["surrogate"]["total_cte_m"][0] > 0.0
+
+
+def test_a_collision_needs_a_world_with_solids(tiny_room, tmp_path):
+    experiment = experiment_of(tiny_room[0], "collision")
+    assert experiment.solids is not None
+    assert len(experiment.solids.rectangles) > 20
+    warehouse = ROOT / "examples" / "warehouse.experiment.yaml"
+    with pytest.raises(ConfigError, match=r"attack.objective: expected an objective that needs no solids"):
+        load_experiment(warehouse, "demo", ["attack.objective=collision"], tmp_path / "other")
