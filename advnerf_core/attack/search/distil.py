@@ -15,7 +15,8 @@ import torch
 from torch import Tensor, nn
 
 from advnerf_core.adam import Adam
-from advnerf_core.policies.pilotnet import IMAGE_HEIGHT, IMAGE_WIDTH, PilotNet
+from advnerf_core.policies.architecture import IMAGE_HEIGHT, IMAGE_WIDTH
+from advnerf_core.policies.pilotnet import PilotNet
 
 StudentFactory = Callable[[tuple[int, ...], int, float], nn.Module]
 """``(image shape [3, H, W], goal size, bound of the steering [rad]) -> network(images, goals)``."""
