@@ -172,6 +172,27 @@ class Architecture:
         network.code_files = files
         return network
 
+    def check(self) -> None:
+        """Build a user's architecture and ask it once, so that a mistake shows before the work of hours. A built-in one needs no check.
+
+        Raises:
+            PluginError: There is no such architecture, or its code cannot be loaded.
+            ArchitectureError: A wrong setting, or it fails.
+        """
+        if self.name in ARCHITECTURES:
+            return
+        import torch
+
+        with torch.random.fork_rng(devices=[]), torch.no_grad():
+            network = self.build(2, 0.3).eval()
+            try:
+                network(torch.rand(2, 3, IMAGE_HEIGHT, IMAGE_WIDTH), torch.eye(2))
+            except Exception as error:
+                raise ArchitectureError(
+                    f"{_WHAT} {self.name}: a call with images [2, 3, {IMAGE_HEIGHT}, {IMAGE_WIDTH}] and goals [2, 2] failed: "
+                    f"{type(error).__name__}: {error}"
+                ) from error
+
     def described(self) -> dict[str, Any]:
         """Plain data that identifies the architecture on every machine: of a user's the hash of its code, not the place of its file.
 
@@ -179,11 +200,13 @@ class Architecture:
         """
         if self.name == PILOTNET:
             return plain_values(_typed(PilotNetConfiguration, self.name, self.configuration))
-        code = code_sha256(self.name, ARCHITECTURES, GROUP)
+        if self.name in ARCHITECTURES:
+            known = _typed(ARCHITECTURES[self.name].Configuration, self.name, self.configuration)
+            return {"architecture": self.name, "configuration": plain_values(known)}
         return {
             "architecture": short_name(self.name),
             "configuration": dict(self.configuration),
-            **({"code": code} if code else {}),
+            "code": code_sha256(self.name, ARCHITECTURES, GROUP),
         }
 
 
@@ -216,14 +239,14 @@ def load_architecture(reference: str) -> type[SteeringNetwork]:
 
 
 def require_architecture(
-    reference: str, configuration: Mapping[str, Any], folder: Path | None = None
+    reference: str, folder: Path | None = None, configuration: Mapping[str, Any] | None = None
 ) -> None:
     """Refuse a reference that stands for no architecture, and wrong settings of a built-in one; nothing is loaded.
 
     Args:
         reference: As of `load_architecture`.
-        configuration: Its settings.
         folder: Folder that a relative ``file.py`` is relative to; the working folder if it is not given.
+        configuration: Its settings.
 
     Raises:
         PluginError: There is no such architecture.
@@ -231,7 +254,7 @@ def require_architecture(
     """
     require_known(reference, _WHAT, ARCHITECTURES, GROUP, folder)
     if reference in ARCHITECTURES:
-        _typed(ARCHITECTURES[reference].Configuration, reference, configuration)
+        _typed(ARCHITECTURES[reference].Configuration, reference, configuration or {})
 
 
 def architecture_names() -> tuple[str, ...]:

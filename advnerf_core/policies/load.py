@@ -93,6 +93,27 @@ def load_adapted(spec: str | os.PathLike[str]) -> tuple[AdaptedPolicy, str]:
     )
 
 
+def described_policy(spec: str | os.PathLike[str]) -> tuple[AdaptedPolicy, str, dict[str, str]]:
+    """Declaration, hash and architecture of a policy, to be read and not to be called: of a ``.safetensors`` file no code is run."""
+    if is_factory(spec) or Path(spec).suffix != ".safetensors":
+        return *load_adapted(spec), {}
+    from advnerf_core.policies.adapter import AdaptedPolicy
+    from advnerf_core.policies.policy_file import described_file
+
+    settings, view, sha256 = described_file(spec)
+    contract = PolicyContract(view, goal_size=settings["goal_size"])
+    network: dict[str, str] = {
+        name: str(settings[name]) for name in ("architecture", "code") if name in settings
+    }
+    own = settings.get("configuration", {"hidden": settings.get("hidden")})
+    network |= {name: str(value) for name, value in own.items()}
+    return AdaptedPolicy(_not_built, contract), sha256, network
+
+
+def _not_built(*images: Any) -> Any:
+    raise PolicyContractError("expected a policy that was loaded, got one that was only described")
+
+
 def _from_factory(spec: str) -> tuple[AdaptedPolicy, str]:
     from advnerf_core.policies.adapter import AdaptedPolicy
 

@@ -84,7 +84,10 @@ class SteeringNetwork(nn.Module):
             if goals is None or shape != [images.shape[0], self.goal_size]:
                 raise ValueError(f"expected goals [{images.shape[0]}, {self.goal_size}], got {shape}")
             goals = goals.to(images.dtype)
-        steering: Tensor = self.max_steering_rad * torch.tanh(self.output(images, goals))
+        output = self.output(images, goals)
+        if output.ndim != 1:
+            raise ValueError(f"expected an output [B], got {list(output.shape)}")
+        steering: Tensor = self.max_steering_rad * torch.tanh(output)
         return steering
 
 

@@ -142,7 +142,7 @@ def policy_sha256(path: str | os.PathLike[str]) -> str:
     return _checked(Path(path), None)[2]
 
 
-def described_policy(path: str | os.PathLike[str]) -> tuple[dict[str, Any], PolicyView, str]:
+def described_file(path: str | os.PathLike[str]) -> tuple[dict[str, Any], PolicyView, str]:
     """Settings of the network, view and hash of a policy file. The network is not built, so no user's code is run."""
     header, _, digest = _checked(Path(path), None)
     return {"architecture": PILOTNET, **_settings(header)}, _view(header), digest

@@ -21,7 +21,7 @@ from advnerf_core.attack.search.search import SearchResult
 from advnerf_core.attack.spaces.space import Shown, Space
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
-from advnerf_core.policies.pilotnet import LoadedPolicy, load_policy
+from advnerf_core.policies.policy_file import LoadedPolicy, load_policy, policy_sha256
 from advnerf_core.report.conditions import CONTROLS, EMPTY, NONE
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
@@ -101,7 +101,7 @@ def _frozen_for(experiment: Experiment, cell: Cell) -> dict[str, str]:
 
 
 def _policy_sha256(experiment: Experiment, victim: str) -> str:
-    return load_policy(victim_file(experiment, victim)).sha256
+    return policy_sha256(victim_file(experiment, victim))
 
 
 def _frozen_place(experiment: Experiment) -> dict[str, str]:

@@ -1,7 +1,8 @@
-"""Names of methods of attack in experiment, campaign and request files: checked where they stand, and absolute for other processes."""
+"""Names of methods and architectures in experiment, campaign and request files: checked where they stand, and absolute for other processes."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -10,17 +11,26 @@ from pydantic_core import PydanticCustomError
 
 from advnerf_core.attack.methods import require_method
 from advnerf_core.plugins import PluginError, absolute_reference
+from advnerf_core.policies.architecture import require_architecture
 from advnerf_core.report.conditions import CONTROLS
 from advnerf_core.strict import COMPLETE
 
 
-def _checked(name: str, info: ValidationInfo) -> str:
+def _known(require: Callable[[str, Path], None], name: str, info: ValidationInfo) -> str:
     folder = (info.context or {}).get("folder") or Path.cwd()
     try:
-        require_method(name, folder)
+        require(name, folder)
     except PluginError as error:
         raise PydanticCustomError(COMPLETE, "{text}", {"text": str(error)}) from None
     return absolute_reference(name, folder)
+
+
+def _checked(name: str, info: ValidationInfo) -> str:
+    return _known(require_method, name, info)
+
+
+def _checked_architecture(name: str, info: ValidationInfo) -> str:
+    return _known(require_architecture, name, info)
 
 
 def _checked_condition(name: str, info: ValidationInfo) -> str:
@@ -29,6 +39,9 @@ def _checked_condition(name: str, info: ValidationInfo) -> str:
 
 MethodReference = Annotated[str, AfterValidator(_checked)]
 """A method as `advnerf_core.attack.methods.load_method` takes it; ``file.py:Name`` becomes absolute. Nothing is loaded."""
+
+ArchitectureReference = Annotated[str, AfterValidator(_checked_architecture)]
+"""An architecture as `advnerf_core.policies.architecture.load_architecture` takes it; ``file.py:Class`` becomes absolute. Nothing is loaded."""
 
 ConditionReference = Annotated[str, AfterValidator(_checked_condition)]
 """The same, or a control: ``none``, ``empty``."""
