@@ -75,7 +75,7 @@ class VisionTransformerConfiguration(StrictModel):
     patch: tuple[int, int] = Field(
         default=(11, 10), description="Height and width of a patch [px]; they divide 66 and 200."
     )
-    width: Width = Field(default=64, description="Length of a token; a multiple of heads.")
+    width: Width = Field(default=64, description="Length of a token; a multiple of 4 and of heads.")
     depth: int = Field(default=4, ge=1, le=24, description="Transformer blocks.")
     heads: int = Field(default=4, ge=1, le=64, description="Attention heads of each block.")
 
@@ -86,8 +86,8 @@ class VisionTransformerConfiguration(StrictModel):
             raise ValueError(
                 f"expected a patch whose height divides {IMAGE_HEIGHT} and whose width divides {IMAGE_WIDTH}, such as 11, 10"
             )
-        if self.width % self.heads:
-            raise ValueError("expected a width that is a multiple of heads")
+        if self.width % self.heads or self.width % 4:
+            raise ValueError("expected a width that is a multiple of 4 and of heads")
         return self
 
 

@@ -85,10 +85,20 @@ def dropping(tmp_path) -> str:
     return f"{tmp_path}/own/dropping.py:Dropping"
 
 
-@EACH
-def test_it_learns_32_images_by_heart(name: str) -> None:
-    policy, data = built(name), FrameSet([frames()], True, 1000)
-    fit(policy, data, FitConfig(steps=90, batch_size=16, learning_rate=2e-3, augment=NO_CHANGE))
+@pytest.mark.parametrize(
+    ("name", "configuration", "steps", "learning_rate"),
+    [
+        ("pilotnet", {}, 60, 1e-3),
+        ("resnet", {"widths": [8, 16, 24]}, 50, 3e-3),
+        ("vit_tiny", {"patch": [22, 10], "width": 32, "depth": 2}, 240, 3e-3),
+        (f"{EXAMPLE}:Mixer", {}, 90, 3e-3),
+    ],
+    ids=[*ARCHITECTURES, "of a user"],
+)
+def test_it_learns_32_images_by_heart(name, configuration, steps, learning_rate) -> None:
+    torch.manual_seed(0)
+    policy, data = Architecture(name, configuration).build(0, 0.3), FrameSet([frames()], True, 1000)
+    fit(policy, data, FitConfig(steps, 16, learning_rate, augment=NO_CHANGE))
     labels = frames().steering_rad
     assert mean_absolute_error(policy, data) < 0.1 * np.abs(labels - labels.mean()).mean()
 
@@ -115,8 +125,7 @@ def test_a_file_gives_the_same_steering(name: str, goal_size: int, tmp_path) -> 
     loaded = load_policy(file, digest)
     images, goals = torch.rand(4, 3, 66, 200), torch.rand(4, goal_size) if goal_size else None
     assert torch.equal(loaded.policy(images, goals), policy(images, goals))
-    assert float(policy(images, goals).std()) > 0.0
-    assert loaded.policy.configuration == policy.configuration
+    assert float(policy(images, goals).detach().std()) > 0.0
     assert loaded.view == VIEW
     again = tmp_path / "again" / "policy.safetensors"
     assert save_policy(again, loaded.policy, VIEW, {"kind": "test"}) == digest
@@ -258,7 +267,7 @@ def test_a_description_is_the_same_wherever_the_file_is(dropping: str, tmp_path)
         ("resnet", {"blocks": 0}, "configuration.blocks: input should be greater than or equal to 1, got 0"),
         ("resnet", {"hidden": "64"}, "configuration.hidden: input should be a valid integer, got '64'"),
         ("vit_tiny", {"patch": [7, 10]}, "whose height divides 66"),
-        ("vit_tiny", {"width": 30}, "multiple of heads"),
+        ("vit_tiny", {"width": 30}, "multiple of 4 and of heads"),
         ("nowhere.py:Net", {}, "expected a Python file at .*nowhere.py"),
         (f"{EXAMPLE}:Settings", {}, "expected a class derived from SteeringNetwork"),
         (f"{EXAMPLE}:Mixer", {"depth": 3}, "expected a setting of my_architecture.py:Mixer of width"),
