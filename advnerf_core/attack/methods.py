@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel
 
+from advnerf_core.attack.search.student_options import StudentOptions
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.plugins import (
     PluginError,
@@ -165,9 +166,17 @@ METHODS: Mapping[str, Method] = MappingProxyType(
         "gradient": Method(_late("gradient"), needs_gradient=True, reads_scale=True),
         "gradient_coarse": Method(_late("gradient_coarse"), needs_gradient=True),
         "frame": Method(_late("frame"), needs_gradient=True, single_images=True),
-        "guided": Method(_late("guided"), single_images=True, evaluations=_late("guided", "evaluations")),
+        "guided": Method(
+            _late("guided"),
+            single_images=True,
+            evaluations=_late("guided", "evaluations"),
+            Options=StudentOptions,
+        ),
         "distilled": Method(
-            _late("distilled"), single_images=True, evaluations=_late("distilled", "evaluations")
+            _late("distilled"),
+            single_images=True,
+            evaluations=_late("distilled", "evaluations"),
+            Options=StudentOptions,
         ),
     }
 )
