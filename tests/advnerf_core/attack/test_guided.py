@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from dataclasses import replace
+from pathlib import Path as FilePath
 
 import pytest
 import torch
@@ -255,8 +256,9 @@ def test_a_goal_reaches_victim_and_student():
 
 def test_the_student_may_be_of_any_architecture(tmp_path):
     method, problem = METHODS["distilled"], linear_problem()
-    small = {"student": "resnet", "configuration": {"widths": [4, 4], "hidden": 8}}
-    settings = SearchSettings(8, warm_pairs=8, cells=2, options=method.options(small))
+    own = FilePath(__file__).parents[3] / "examples" / "my_architecture.py"
+    small = {"student": f"{own}:Mixer", "configuration": {"width": 8}}
+    settings = SearchSettings(4, warm_pairs=2, cells=2, options=method.options(small))
     state = tmp_path / "state.safetensors"
     found = method.search(problem, settings, SearchRun(state_path=state))
     assert math.isfinite(found.best.loss_m)
