@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from advnerf_core import Pinhole, PolicyView
 from advnerf_core.learning.fit import FitConfig, fit, mean_absolute_error
@@ -34,21 +34,22 @@ class Mixer(SteeringNetwork):
 
     Configuration = Settings
 
-    def __init__(self, goal_size, max_steering_rad, configuration):
+    def __init__(self, goal_size: int, max_steering_rad: float, configuration: Settings) -> None:
         super().__init__(goal_size, max_steering_rad, configuration)
-        width = self.configuration.width
+        width = configuration.width
         self.cells = nn.Sequential(nn.AvgPool2d((11, 10)), nn.Flatten())
         self.head = nn.Sequential(nn.Linear(360 + goal_size, width), nn.SiLU(), nn.Linear(width, 1))
 
-    def output(self, images, goals):
+    def output(self, images: Tensor, goals: Tensor | None) -> Tensor:
         """Output ``[B]`` of images ``[B, 3, 66, 200]`` in 0..1 and goals ``[B, goal_size]``."""
         features = self.cells(2.0 * images - 1.0)
         if goals is not None:
             features = torch.cat([features, goals], dim=1)
-        return self.head(features)[:, 0]
+        output: Tensor = self.head(features)[:, 0]
+        return output
 
 
-def painted_frames(count):
+def painted_frames(count: int) -> Frames:
     """Grey images with a white line; the farther left it is, the farther left is the steering."""
     rng = np.random.default_rng(0)
     columns = rng.integers(20, 180, count)
