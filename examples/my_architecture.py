@@ -57,7 +57,8 @@ def painted_frames(count: int) -> Frames:
     for image, column in zip(images, columns, strict=True):
         image[30:, column - 4 : column + 4] = 250
     steering_rad = (0.25 * (100 - columns) / 80).astype(np.float32)
-    return Frames(images, np.zeros((count, 3)), steering_rad, np.zeros((count, 0)), np.zeros(count, bool))
+    goals = np.zeros((count, 0), np.float32)
+    return Frames(images, np.zeros((count, 3)), steering_rad, goals, np.zeros(count, bool))
 
 
 if __name__ == "__main__":
