@@ -5,6 +5,7 @@ Worlds, attack methods and policies are found this way, in experiments, in the w
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import hashlib
 import importlib.util
@@ -18,9 +19,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
+from pydantic import BaseModel, ValidationError
+
 from advnerf_core.code_files import entry_point_sha256, file_sha256, modules_beside
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.places import expanded
+from advnerf_core.strict import strict_validator
 
 T = TypeVar("T")
 
@@ -205,6 +209,44 @@ def _stands_for_nothing(name: str, what: str, built_in: Iterable[str], group: st
         unknown(name, what, known_names(built_in, group))
         + f"; one of your own is file.py:Name, or an entry point of {group}"
     )
+
+
+def options_of(
+    model: type[Any] | None, written: Mapping[str, Any], what: str, key: str, error: type[AdvnerfError]
+) -> Any:
+    """The options of a plug-in as its own type.
+
+    Args:
+        model: Its dataclass or pydantic model; None if it has no options.
+        written: Keys and values as a user wrote them.
+        what: What one of them is called in messages: ``option of this method``.
+        key: What stands before each key in messages.
+        error: Raised for an unknown key or a wrong value.
+
+    Returns:
+        An instance of the model; None if there is none.
+    """
+    names = _fields_of(model)
+    for name in written:
+        if name not in names:
+            raise error(f"{key}.{name}: {unknown(name, what, names)}")
+    if model is None:
+        return None
+    try:
+        return strict_validator(model).validate_python(dict(written))
+    except ValidationError as problem:
+        first = problem.errors(include_url=False)[0]
+        place = ".".join(map(str, (key, *first["loc"])))
+        message = str(first["msg"]).removeprefix("Value error, ")
+        raise error(f"{place}: {message[:1].lower()}{message[1:]}, got {first['input']!r:.80}") from None
+
+
+def _fields_of(model: type[Any] | None) -> tuple[str, ...]:
+    if model is None:
+        return ()
+    if issubclass(model, BaseModel):
+        return tuple(model.model_fields)
+    return tuple(each.name for each in dataclasses.fields(model))
 
 
 def unknown(name: str, what: str, known: Iterable[str]) -> str:

@@ -132,6 +132,11 @@ def test_an_objective_of_ones_own_pulls_the_car_to_the_other_side(capsys):
     assert left_m > 0.0
 
 
+def test_a_network_of_ones_own_learns_to_follow_the_line(capsys):
+    error_rad, _ = figures(run_here("my_architecture.py", capsys))
+    assert error_rad < 0.03  # a mean label is 0.13 rad
+
+
 def test_a_bag_that_the_example_writes_itself():
     printed = run("examples/read_a_bag.py")
     assert "302 messages in 5.00 s" in printed

@@ -18,20 +18,20 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
+from advnerf_core.attack.search.student_options import StudentOptions
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.plugins import (
     PluginError,
     code_sha256,
     is_file_reference,
     known_names,
+    options_of,
     require_known,
     resolve,
-    unknown,
 )
 from advnerf_core.report.conditions import CONDITIONS
-from advnerf_core.strict import strict_validator
 
 if TYPE_CHECKING:
     from advnerf_core.attack.problem import AttackProblem
@@ -141,31 +141,7 @@ class Method:
         Raises:
             MethodError: An unknown key, or a wrong value.
         """
-        names = _fields_of(self.Options)
-        for name in written:
-            if name not in names:
-                raise MethodError(f"{key}.{name}: {unknown(name, 'option of this method', names)}")
-        if self.Options is None:
-            return None
-        try:
-            return strict_validator(self.Options).validate_python(dict(written))
-        except ValidationError as error:
-            first = error.errors(include_url=False)[0]
-            place, message = (
-                ".".join(map(str, (key, *first["loc"]))),
-                str(first["msg"]).removeprefix("Value error, "),
-            )
-            raise MethodError(
-                f"{place}: {message[:1].lower()}{message[1:]}, got {first['input']!r:.80}"
-            ) from None
-
-
-def _fields_of(options: type[Any] | None) -> tuple[str, ...]:
-    if options is None:
-        return ()
-    if issubclass(options, BaseModel):
-        return tuple(options.model_fields)
-    return tuple(each.name for each in dataclasses.fields(options))
+        return options_of(self.Options, written, "option of this method", key, MethodError)
 
 
 def _late(module: str, function: str = "search") -> Callable[..., Any]:
@@ -190,9 +166,17 @@ METHODS: Mapping[str, Method] = MappingProxyType(
         "gradient": Method(_late("gradient"), needs_gradient=True, reads_scale=True),
         "gradient_coarse": Method(_late("gradient_coarse"), needs_gradient=True),
         "frame": Method(_late("frame"), needs_gradient=True, single_images=True),
-        "guided": Method(_late("guided"), single_images=True, evaluations=_late("guided", "evaluations")),
+        "guided": Method(
+            _late("guided"),
+            single_images=True,
+            evaluations=_late("guided", "evaluations"),
+            Options=StudentOptions,
+        ),
         "distilled": Method(
-            _late("distilled"), single_images=True, evaluations=_late("distilled", "evaluations")
+            _late("distilled"),
+            single_images=True,
+            evaluations=_late("distilled", "evaluations"),
+            Options=StudentOptions,
         ),
     }
 )

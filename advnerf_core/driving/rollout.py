@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from advnerf_core.driving.dynamics import Dynamics
-from advnerf_core.policies.pilotnet import Policy
+from advnerf_core.policies.network import Policy
 
 Observe = Callable[[Tensor], Tensor]
 """Images ``[B, 3, 66, 200]`` RGB 0..1 seen from states ``[B, n]``."""

@@ -23,7 +23,7 @@ from advnerf_core.files import with_sorted_header, write_atomically
 from advnerf_core.learning.augment import AugmentConfig, augment
 from advnerf_core.learning.frames import FrameSet, FrameStoreError
 from advnerf_core.places import open_tensors
-from advnerf_core.policies.pilotnet import PilotNet, images_to_tensor
+from advnerf_core.policies.network import SteeringNetwork, images_to_tensor
 
 EVALUATION_BATCH = 128
 
@@ -56,7 +56,7 @@ class FitConfig:
 
 
 def fit(
-    policy: PilotNet,
+    policy: SteeringNetwork,
     frames: FrameSet,
     config: FitConfig,
     checkpoint: Path | None = None,
@@ -92,7 +92,7 @@ def fit(
 
 
 @torch.no_grad()
-def mean_absolute_error(policy: PilotNet, frames: FrameSet) -> float:
+def mean_absolute_error(policy: SteeringNetwork, frames: FrameSet) -> float:
     """Mean absolute steering error [rad] on the held-out frames (on the training frames if none are held out)."""
     rows = frames.held_out if len(frames.held_out) else frames.training
     total = 0.0
@@ -103,13 +103,17 @@ def mean_absolute_error(policy: PilotNet, frames: FrameSet) -> float:
     return total / len(rows)
 
 
-def _train_step(policy: PilotNet, optimiser: Adam, frames: FrameSet, config: FitConfig, step: int) -> float:
+def _train_step(
+    policy: SteeringNetwork, optimiser: Adam, frames: FrameSet, config: FitConfig, step: int
+) -> float:
     rng = np.random.default_rng([config.seed, step])
     rows = frames.training[rng.integers(0, len(frames.training), config.batch_size)]
     images, labels, goals = frames.batch(rows)
     inputs = torch.from_numpy(augment(images, config.augment, rng)).permute(0, 3, 1, 2)  # stays channels-last
     target = torch.from_numpy(labels)
-    output: Tensor = policy(inputs, torch.from_numpy(goals) if policy.goal_size else None)
+    with torch.random.fork_rng(devices=[]):  # a dropout's draws; everything after is independent of them
+        torch.manual_seed(int(np.random.default_rng([config.seed, step, 1]).integers(2**31)))
+        output: Tensor = policy(inputs, torch.from_numpy(goals) if policy.goal_size else None)
     loss = F.huber_loss(output, target, delta=config.huber_rad) / config.huber_rad**2
     loss.backward()
     optimiser.step(_learning_rate(config, step))
@@ -123,16 +127,19 @@ def _learning_rate(config: FitConfig, step: int) -> float:
     return config.learning_rate * (0.01 + 0.99 * 0.5 * (1.0 + cos(pi * share)))
 
 
-def _write(path: Path, policy: PilotNet, optimiser: Adam, step: int, config: FitConfig) -> None:
+def _write(path: Path, policy: SteeringNetwork, optimiser: Adam, step: int, config: FitConfig) -> None:
     tensors = {f"weight.{name}": value.detach() for name, value in policy.state_dict().items()}
     for name, moments in optimiser.moments.items():
         tensors[f"first.{name}"], tensors[f"second.{name}"] = moments["exp_avg"], moments["exp_avg_sq"]
-    contiguous = {name: value.contiguous() for name, value in tensors.items()}
+    # Copies, because the file holds each tensor of tied weights.
+    contiguous = {name: value.contiguous().clone() for name, value in tensors.items()}
     header = {"step": str(step), "config": repr(asdict(config))}
     write_atomically(path, with_sorted_header(save(contiguous, header)))
 
 
-def _resume(path: Path, policy: PilotNet, config: FitConfig) -> tuple[int, dict[str, dict[str, Tensor]]]:
+def _resume(
+    path: Path, policy: SteeringNetwork, config: FitConfig
+) -> tuple[int, dict[str, dict[str, Tensor]]]:
     """Load the checkpoint if there is one; returns the number of finished steps, and Adam's moments after them."""
     if not path.is_file():
         return 0, {}

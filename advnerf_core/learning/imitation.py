@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple, Protocol
 
@@ -26,7 +25,8 @@ from advnerf_core.learning.fit import FitConfig, fit, mean_absolute_error
 from advnerf_core.learning.frames import Frames, FrameSet, FrameStore, FrameStoreError
 from advnerf_core.learning.recipe import ImitationConfig, SourcePlan, TrainedPolicy, recovery_states
 from advnerf_core.learning.sources import KeepDriving, Seen, steer_with
-from advnerf_core.policies.pilotnet import PilotNet, save_policy
+from advnerf_core.policies.network import SteeringNetwork
+from advnerf_core.policies.policy_file import save_policy
 from advnerf_core.policies.view import PolicyView
 
 __all__ = [
@@ -115,7 +115,7 @@ class _Recipe:
         self._claim_folder()
         config = self.config
         torch.manual_seed(config.seed)
-        policy = PilotNet(self._goal_size, config.max_steering_rad, config.hidden)
+        policy = config.architecture.build(self._goal_size, config.max_steering_rad)
         for number, plan in enumerate(self.plans):
             self._collect(f"stills-{plan.source.name}", plan, plan.stills, self._stills(plan, number))
         self._train(policy, "clone", config.first_steps, config.learning_rate)
@@ -145,7 +145,7 @@ class _Recipe:
         """A policy from the plain frames only, drives included."""
         torch.manual_seed(self.config.seed)
         self._steps = 0
-        policy = PilotNet(self._goal_size, self.config.max_steering_rad, self.config.hidden)
+        policy = self.config.architecture.build(self._goal_size, self.config.max_steering_rad)
         self._train(policy, "naive", self.config.naive_steps, self.config.learning_rate, textured=False)
         mae = mean_absolute_error(policy, self._frames(textured=False))
         return (
@@ -172,7 +172,9 @@ class _Recipe:
 
         return collect
 
-    def _drives(self, plan: SourcePlan, policy: PilotNet, turn: int, number: int) -> Callable[[], list[Seen]]:
+    def _drives(
+        self, plan: SourcePlan, policy: SteeringNetwork, turn: int, number: int
+    ) -> Callable[[], list[Seen]]:
         def collect() -> list[Seen]:
             config = self.config
             rng = np.random.default_rng([config.seed, 1 + turn, number])
@@ -226,7 +228,7 @@ class _Recipe:
         return FrameSet(shards, textured, self.config.holdout_every)
 
     def _train(
-        self, policy: PilotNet, stage: str, steps: int, learning_rate: float, textured: bool = True
+        self, policy: SteeringNetwork, stage: str, steps: int, learning_rate: float, textured: bool = True
     ) -> None:
         start = time.perf_counter()
         config = self.config
@@ -261,7 +263,7 @@ class _Recipe:
         write_atomically(record, json.dumps(names))
         return names
 
-    def _save(self, name: str, policy: PilotNet, mae: float, textured: bool) -> str:
+    def _save(self, name: str, policy: SteeringNetwork, mae: float, textured: bool) -> str:
         metadata = {
             "settings": self._settings(),
             "expert": self.expert.to_dict(),
@@ -273,7 +275,7 @@ class _Recipe:
 
     def _settings(self) -> dict[str, Any]:
         plans = [plan.settings() for plan in self.plans]
-        return {**asdict(self.config), "plans": plans}
+        return {**self.config.settings(), "plans": plans}
 
     def _claim_folder(self) -> None:
         """Frames of other settings must not be mixed in."""

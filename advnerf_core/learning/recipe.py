@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -12,6 +12,7 @@ from advnerf_core.driving.expert import Expert
 from advnerf_core.driving.path import Array, Path
 from advnerf_core.learning.augment import AugmentConfig
 from advnerf_core.learning.sources import FrameSource
+from advnerf_core.policies.architecture import Architecture
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ class ImitationConfig:
         drive_heading_rad: And turned up to this much [rad].
         give_up_m: A drive ends when |CTE| exceeds this [m]; frames from further away teach little.
         max_steering_rad: Bound of the policy's output [rad].
-        hidden: Widths of the policy's linear layers.
+        architecture: Architecture of the policy, with its settings.
         augment: Image augmentation.
         holdout_every: One block in so many is kept for validation.
     """
@@ -91,9 +92,15 @@ class ImitationConfig:
     drive_heading_rad: float = 0.25
     give_up_m: float = 0.7
     max_steering_rad: float = 0.30
-    hidden: tuple[int, int, int] = (100, 50, 10)
+    architecture: Architecture = field(default_factory=Architecture)
     augment: AugmentConfig = field(default_factory=AugmentConfig)
     holdout_every: int = 20
+
+    def settings(self) -> dict[str, Any]:
+        """As plain data, which is the same on every machine: it stands in policy files."""
+        values = asdict(self)
+        del values["architecture"]
+        return {**values, **self.architecture.described()}
 
 
 @dataclass(frozen=True)

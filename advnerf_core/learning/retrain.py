@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from advnerf_core.learning.augment import AugmentConfig
 from advnerf_core.learning.fit import FitConfig, fit, mean_absolute_error
 from advnerf_core.learning.frames import Frames, FrameSet, FrameStoreError
-from advnerf_core.policies.pilotnet import LoadedPolicy, PilotNet, save_policy
+from advnerf_core.policies.network import SteeringNetwork
+from advnerf_core.policies.policy_file import LoadedPolicy, architecture_of, save_policy
 
 
 @dataclass(frozen=True)
@@ -122,14 +123,14 @@ def fine_tune(
 
     Raises:
         FrameStoreError: No frames of one kind, goals of another size, or a checkpoint of other settings.
+        PolicyFileError: The policy is not of an architecture that is trained here.
     """
     frames = MixedFrames(old, new, config.new_share, config.holdout_every)
     if frames.goal_size != policy.policy.goal_size:
         raise FrameStoreError(
             f"expected frames with goals of size {policy.policy.goal_size} for this policy, got {frames.goal_size}"
         )
-    settings = policy.policy.settings()
-    network = PilotNet(settings["goal_size"], settings["max_steering_rad"], tuple(settings["hidden"]))
+    network = architecture_of(policy.policy).build(policy.policy.goal_size, policy.policy.max_steering_rad)
     network.load_state_dict(policy.policy.state_dict())
     before = _errors(network, frames)
     fitting = FitConfig(
@@ -149,7 +150,7 @@ def fine_tune(
     return Retrained(out_file, digest, (before[0], after[0]), (before[1], after[1]))
 
 
-def _errors(network: PilotNet, frames: MixedFrames) -> tuple[float, float]:
+def _errors(network: SteeringNetwork, frames: MixedFrames) -> tuple[float, float]:
     """Mean absolute error [rad] on held-out old and new frames; NaN where none are held out."""
     network.eval()
     errors = []

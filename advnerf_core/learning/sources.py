@@ -18,7 +18,7 @@ from torch import Tensor
 from advnerf_core.driving.dynamics import Dynamics
 from advnerf_core.driving.path import Array
 from advnerf_core.geometry import VehicleState
-from advnerf_core.policies.pilotnet import images_to_tensor
+from advnerf_core.policies.network import images_to_tensor
 from advnerf_core.policies.view import Image, PolicyView
 
 Steer = Callable[[Image], Array]

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from advnerf_core.policies.adapter import AdaptedPolicy
 from advnerf_core.policies.contract import PolicyContractError
 from advnerf_core.policies.hypotheses import USEFUL_ERROR, Array, judge, steering_of
-from advnerf_core.policies.pilotnet import images_to_tensor
+from advnerf_core.policies.network import images_to_tensor
 
 Verdict = Literal["ok", "warning", "failure"]
 OK: Final = "ok"

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from advnerf_core.policies.adapter import AdaptedPolicy
 from advnerf_core.policies.contract import ColourSpace, PolicyContract
-from advnerf_core.policies.pilotnet import images_to_tensor
+from advnerf_core.policies.network import images_to_tensor
 
 Array = NDArray[np.float64]
 

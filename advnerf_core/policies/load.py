@@ -1,6 +1,6 @@
 """One door for policies of any origin. Imports torch only for what needs it.
 
-A policy is named by a file (``.safetensors``: a PilotNet as we train it; ``.onnx``; ``.pt2``) or by ``package.module:factory``, a
+A policy is named by a file (``.safetensors``: a network that was trained here; ``.onnx``; ``.pt2``) or by ``package.module:factory``, a
 function without arguments that returns ``adapt(network, contract)``.
 """
 
@@ -27,7 +27,7 @@ from advnerf_core.run_module import search_working_folder_last
 
 if TYPE_CHECKING:
     from advnerf_core.policies.adapter import AdaptedPolicy
-    from advnerf_core.policies.pilotnet import LoadedPolicy
+    from advnerf_core.policies.policy_file import LoadedPolicy
 
 _FACTORY = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 _SUFFIXES = (".safetensors", ".onnx", ".pt2")
@@ -45,7 +45,7 @@ def load_any_policy(spec: str | os.PathLike[str], expected_sha256: str | None = 
     Raises:
         AdvnerfError: It cannot be loaded, is left in training mode, or is not the one that was expected.
     """
-    from advnerf_core.policies.pilotnet import LoadedPolicy, load_policy
+    from advnerf_core.policies.policy_file import LoadedPolicy, load_policy
 
     suffix = "" if is_factory(spec) else Path(spec).suffix
     if suffix == ".safetensors":
@@ -82,7 +82,7 @@ def load_adapted(spec: str | os.PathLike[str]) -> tuple[AdaptedPolicy, str]:
         program, contract, sha256 = load_program(path)
         return AdaptedPolicy(program, contract), sha256
     if path.suffix == ".safetensors":
-        from advnerf_core.policies.pilotnet import load_policy
+        from advnerf_core.policies.policy_file import load_policy
 
         loaded = load_policy(path)
         return AdaptedPolicy(
@@ -91,6 +91,27 @@ def load_adapted(spec: str | os.PathLike[str]) -> tuple[AdaptedPolicy, str]:
     raise PolicyContractError(
         f"expected a file of {', '.join(_SUFFIXES)} or package.module:factory, got {spec}"
     )
+
+
+def described_policy(spec: str | os.PathLike[str]) -> tuple[AdaptedPolicy, str, dict[str, str]]:
+    """Declaration, hash and architecture of a policy, to be read and not to be called: of a ``.safetensors`` file no code is run."""
+    if is_factory(spec) or Path(spec).suffix != ".safetensors":
+        return *load_adapted(spec), {}
+    from advnerf_core.policies.adapter import AdaptedPolicy
+    from advnerf_core.policies.policy_file import described_file
+
+    settings, view, sha256 = described_file(spec)
+    contract = PolicyContract(view, goal_size=settings["goal_size"])
+    network: dict[str, str] = {
+        name: str(settings[name]) for name in ("architecture", "code") if name in settings
+    }
+    own = settings.get("configuration", {"hidden": settings.get("hidden")})
+    network |= {name: str(value) for name, value in own.items()}
+    return AdaptedPolicy(_not_built, contract), sha256, network
+
+
+def _not_built(*images: Any) -> Any:
+    raise PolicyContractError("expected a policy that was loaded, got one that was only described")
 
 
 def _from_factory(spec: str) -> tuple[AdaptedPolicy, str]:

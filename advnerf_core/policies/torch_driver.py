@@ -7,7 +7,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from advnerf_core.policies.pilotnet import LoadedPolicy, images_to_tensor
+from advnerf_core.policies.network import images_to_tensor
+from advnerf_core.policies.policy_file import LoadedPolicy
 
 
 class TorchDriver:

@@ -153,13 +153,15 @@ def policy_export(
 
 @app.command("info")
 def policy_info(policy: PolicyName) -> None:
-    """Show a policy's inputs and outputs, its declaration and its hash."""
-    from advnerf_core.policies.load import load_adapted
+    """Show a policy's inputs and outputs, its declaration, its architecture and its hash."""
+    from advnerf_core.policies.load import described_policy
 
-    adapted, sha256 = load_adapted(policy)
+    adapted, sha256, network = described_policy(policy)
     contract = adapted.contract
     rows = table("what", "value")
     for name, value in adapted.described_tensors():
+        rows.add_row(name, value.replace("[", r"\["))
+    for name, value in network.items():
         rows.add_row(name, value.replace("[", r"\["))
     for name, value in contract.to_dict().items():
         if name != "view":

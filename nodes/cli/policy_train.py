@@ -13,6 +13,7 @@ from nodes.runtime.terminal import PolicyName, experiment_argument, print_table,
 if TYPE_CHECKING:
     from advnerf_core.driving.expert import Expert
     from advnerf_core.learning.imitation import SourcePlan
+    from advnerf_core.policies.architecture import Architecture
     from advnerf_core.policies.view import PolicyView
     from nodes.lab.policy_data.train import Part
 
@@ -102,6 +103,17 @@ def train(
     setting: Annotated[str, typer.Option("--setting", help="Setting of that run.")] = "demo",
     steps: Annotated[int, typer.Option("--steps", min=1, help="Optimiser steps.")] = 800,
     seed: Annotated[int, typer.Option("--seed")] = 0,
+    architecture: Annotated[
+        str, typer.Option("--architecture", help="pilotnet, resnet, vit_tiny, or file.py:Class of your own.")
+    ] = "pilotnet",
+    configuration: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--configuration",
+            metavar="KEY=VALUE",
+            help="Setting of the architecture, for example 'widths=[16, 32]'; may be repeated.",
+        ),
+    ] = None,
     speed_mps: Speed = 0.8,
     delay_s: Delay = 0.16,
     stiffness_1pm: Stiffness = 1.0,
@@ -119,12 +131,17 @@ def train(
         raise ConfigError(
             "expected --bags BAG or --log FILE.csv, got neither. Give at least one recording; see docs/driving.md"
         )
+    network = _architecture(architecture, configuration or [])
     options = (bags, logs, labels, image_topic, log_columns, log_scale)
     view = _view(camera, bags, logs, log_columns, log_scale)
     expert = _expert(room, bags, speed_mps, delay_s, stiffness_1pm, needed=labels == "expert" and bool(bags))
     parts = _parts(view, expert, *options)
     config = ImitationConfig(
-        seed=seed, dagger_rounds=1 if surrogate else 0, first_steps=steps, round_steps=max(steps // 3, 1)
+        seed=seed,
+        dagger_rounds=1 if surrogate else 0,
+        first_steps=steps,
+        round_steps=max(steps // 3, 1),
+        architecture=network,
     )
     plan = None if surrogate is None else _surrogate(surrogate, experiment, setting, view)
     with ProgressDisplay() as display:
@@ -244,6 +261,26 @@ def _parts(
             Part(str(log), (log,), options, partial(_own_view, frames_of_log, log, view, columns, scale))
         )
     return parts
+
+
+def _architecture(name: str, configuration: list[str]) -> Architecture:
+    """The architecture with its settings, checked before recordings are read."""
+    from advnerf_core.documents import parse_yaml
+    from advnerf_core.policies.architecture import Architecture, require_architecture
+    from nodes.runtime.errors import ConfigError
+
+    settings = {}
+    for text in configuration:
+        key, separator, value = text.partition("=")
+        if not separator:
+            raise ConfigError(
+                f"--configuration {text}: expected KEY=VALUE, for example --configuration 'widths=[16, 32]'"
+            )
+        settings[key.strip()] = parse_yaml(value, f"--configuration {text}").data
+    require_architecture(name, None, settings)
+    found = Architecture(name, settings)
+    found.check()
+    return found
 
 
 def _own_view(read: Any, log: Path, view: PolicyView, columns: tuple[str, str], scale: float) -> Any:

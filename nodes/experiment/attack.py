@@ -22,7 +22,7 @@ from advnerf_core.attack.search.search import SearchResult
 from advnerf_core.attack.spaces.space import Shown, Space, half_precision
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
-from advnerf_core.policies.pilotnet import LoadedPolicy, load_policy
+from advnerf_core.policies.policy_file import LoadedPolicy, load_policy
 from advnerf_core.report.conditions import CONTROLS, EMPTY, NONE
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment

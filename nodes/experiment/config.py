@@ -9,10 +9,11 @@ from pydantic import Field, model_validator
 
 from advnerf_core.attack.methods import method_name
 from advnerf_core.attack.objectives import CTE
+from advnerf_core.policies.architecture import PILOTNET, Architecture, require_architecture
 from advnerf_core.scene.gate_limits import GateLimits
 from advnerf_core.strict import StrictModel
 from nodes.experiment.deploy_config import DeployConfig
-from nodes.experiment.method_names import MethodReference, ObjectiveReference
+from nodes.experiment.method_names import ArchitectureReference, MethodReference, ObjectiveReference
 from nodes.experiment.placed import PANEL, PlacedObject, WantedObject
 from nodes.experiment.robustness_config import RobustnessConfig
 from nodes.experiment.space_config import (
@@ -163,9 +164,44 @@ class PolicyConfig(StrictModel):
         description="Optimiser steps of the victim that never sees a random texture, as many as the hardened one's in all; 0: none.",
     )
     hidden: tuple[int, int, int] = Field(
-        default=(200, 100, 20), description="Widths of the policy's linear layers."
+        default=(200, 100, 20),
+        description="Widths of PilotNet's linear layers; other architectures do not read them.",
+    )
+    architecture: ArchitectureReference = Field(
+        default=PILOTNET,
+        exclude_if=lambda name: name == PILOTNET,
+        description="pilotnet, resnet, vit_tiny, an installed package's, or file.py:Class relative to the experiment file.",
+    )
+    configuration: dict[str, Any] = Field(
+        default={},
+        exclude_if=lambda settings: not settings,
+        description="Settings of the architecture; those of pilotnet are the key hidden.",
     )
     seed: int = 0
+
+    @model_validator(mode="after")
+    def _fits_the_architecture(self) -> PolicyConfig:
+        if self.architecture == PILOTNET and self.configuration:
+            raise ValueError(
+                f"expected no policy.configuration with the architecture pilotnet, got {', '.join(self.configuration)}; set policy.hidden"
+            )
+        require_architecture(self.architecture, None, self.configuration)
+        return self
+
+    @property
+    def network(self) -> Architecture:
+        """The architecture with its settings."""
+        own = {"hidden": self.hidden} if self.architecture == PILOTNET else self.configuration
+        return Architecture(self.architecture, own)
+
+    def key(self) -> dict[str, Any]:
+        """What a trained policy depends on, as JSON data: of a user's architecture its code, not the place of its file."""
+        values = self.model_dump(mode="json")
+        if self.architecture == PILOTNET:
+            return values
+        for name in ("architecture", "configuration", "hidden"):
+            values.pop(name, None)
+        return values | self.network.described()
 
 
 class ObjectConfig(StrictModel):

@@ -9,7 +9,7 @@ from typing import Any
 from advnerf_core.attack.methods import require_method
 from advnerf_core.attack.objectives import name_objective
 from advnerf_core.plugins import PluginError
-from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.policies.policy_file import policy_sha256
 from advnerf_core.report.conditions import EMPTY, NONE
 from nodes.experiment import bake
 from nodes.experiment.cell import Cell
@@ -69,12 +69,13 @@ def cell_inputs(experiment: Experiment, cell: Cell) -> dict[str, Any]:
     if cell.victim != RETRAINED:
         return inputs
     file = victim_file(experiment, cell.victim)
-    return {**inputs, "victim": load_policy(file).sha256 if file.exists() else None}
+    return {**inputs, "victim": policy_sha256(file) if file.exists() else None}
 
 
 def registered_settings(experiment: Experiment) -> dict[str, Any]:
     """Settings that all cells of an experiment depend on, known before any stage is run: what a registration fixes."""
     config = experiment.config.model_dump(mode="json", exclude=_FREE)
+    config["policy"] = experiment.config.policy.key()
     name_objective(config["attack"])
     return {
         "version": VERSION,

@@ -15,7 +15,7 @@ import numpy as np
 
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.driving.metrics import DriveMetrics, Horizon, first_still_tick
-from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.policies.policy_file import policy_sha256
 from hardware.worlds.lab.config import LabConfig
 from hardware.worlds.world import collided_with
 from nodes.control.stop_causes import is_stall
@@ -175,7 +175,7 @@ def live_overrides(experiment: Experiment, live: LiveRun) -> list[str]:
         f"params.calibration={experiment.calibration_folder}",
         f"params.policy={policy}",
         f"params.vicon_port={_free_udp_port()}",
-        f"policy.sha256={load_policy(policy).sha256}",
+        f"policy.sha256={policy_sha256(policy)}",
         f"twin.lab={json.dumps(lab_of(experiment).model_dump(mode='json'))}",
     ]
     if not (effects := experiment.config.deploy.camera).ideal:

@@ -1,4 +1,4 @@
-"""Names of methods and objectives in experiment, campaign and request files: checked where they stand, and absolute for other processes."""
+"""Names of methods, objectives and architectures in experiment, campaign and request files: checked where they stand, and absolute for other processes."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from pydantic_core import PydanticCustomError
 from advnerf_core.attack.methods import require_method
 from advnerf_core.attack.objectives import require_objective
 from advnerf_core.plugins import PluginError, absolute_reference
+from advnerf_core.policies.architecture import require_architecture
 from advnerf_core.report.conditions import CONTROLS
 from advnerf_core.strict import COMPLETE
 
@@ -34,6 +35,9 @@ def _checked_condition(name: str, info: ValidationInfo) -> str:
 
 MethodReference = Annotated[str, AfterValidator(_checked(require_method))]
 """A method as `advnerf_core.attack.methods.load_method` takes it; ``file.py:Name`` becomes absolute. Nothing is loaded."""
+
+ArchitectureReference = Annotated[str, AfterValidator(_checked(require_architecture))]
+"""An architecture as `advnerf_core.policies.architecture.load_architecture` takes it; ``file.py:Class`` becomes absolute. Nothing is loaded."""
 
 ConditionReference = Annotated[str, AfterValidator(_checked_condition)]
 """The same, or a control: ``none``, ``empty``."""

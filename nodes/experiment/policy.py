@@ -57,7 +57,7 @@ def run(experiment: Experiment, folder: Path, report: MeasuringReport) -> None:
         first_steps=config.first_steps,
         round_steps=config.round_steps,
         naive_steps=config.naive_steps,
-        hidden=config.hidden,
+        architecture=config.network,
         lateral_m=experiment.across_m(_STILLS_M),
         heading_rad=config.stills_heading_rad,
         drive_lateral_m=experiment.across_m(_DRIVES_M),

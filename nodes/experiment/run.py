@@ -156,8 +156,13 @@ def make_ready(
     anew: bool = False,
     watcher: Display | None = None,
 ) -> dict[str, StageRecord]:
-    """Run the stages that are not there yet: what cells need. Those that are kept with the code are there, unless all is to be made ``anew``."""
+    """Run the stages that are not there yet: what cells need. Those that are kept with the code are there, unless all is to be made ``anew``.
+
+    Raises:
+        AdvnerfError: A stage failed, or the policy's architecture cannot be built.
+    """
     reference = None if anew else REFERENCE
+    experiment.config.policy.network.check()
     return run_to_end(experiment, stages_of(experiment), _LIBRARIES, until, console, reference, watcher)
 
 
@@ -261,7 +266,7 @@ def stages_of(experiment: Experiment) -> list[Stage]:
             {
                 **driven,
                 **face,
-                "policy": part("policy"),
+                "policy": config.policy.key(),
                 "sigma": config.attack.random_sigma,
                 "bake": bake.VERSION,
             },

@@ -18,7 +18,7 @@ from advnerf_core.driving.expert import Expert
 from advnerf_core.geometry import invert_transform, yaw_of
 from advnerf_core.policies.adapter import AdaptedPolicy
 from advnerf_core.policies.conformance import FAILURE, OK, WARNING, Finding, Verdict
-from advnerf_core.policies.pilotnet import images_to_tensor
+from advnerf_core.policies.network import images_to_tensor
 from advnerf_core.policies.view import PolicyView
 from calibration.schema import CameraCalibration, RoomCalibration, VehicleCalibration, load_calibration
 from nodes.bags.images import image_messages, image_topic

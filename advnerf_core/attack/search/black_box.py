@@ -33,6 +33,7 @@ from advnerf_core.attack.adjoint import AdjointResult, gradient_pass
 from advnerf_core.attack.methods import SearchRun, SearchSettings
 from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.attack.search.distil import (
+    ArchitectureStudent,
     Distillation,
     Lessons,
     Student,
@@ -51,6 +52,7 @@ from advnerf_core.attack.search.search import (
     begin,
     search_fingerprint,
 )
+from advnerf_core.attack.search.student_options import StudentOptions
 from advnerf_core.attack.search.visited import Visited, VisitedDrive
 from advnerf_core.errors import AdvnerfError
 
@@ -126,7 +128,11 @@ class BlackBoxSearch:
 
     def settings(self) -> str:
         """What must not change between a search and its resumption."""
-        name = getattr(self.student, "__qualname__", type(self.student).__name__)
+        student = self.student
+        if isinstance(student, ArchitectureStudent):
+            name = student.name
+        else:
+            name = getattr(student, "__qualname__", type(student).__name__)
         return repr(replace(self, student=pilotnet_student)).replace(repr(pilotnet_student), name)
 
 
@@ -200,8 +206,16 @@ def planned_evaluations(method: Method, problem: AttackProblem, settings: Search
 
 def _asked(method: Method, settings: SearchSettings) -> BlackBoxSearch:
     lessons = Distillation() if settings.warm_pairs is None else Distillation(warm_pairs=settings.warm_pairs)
+    options = settings.options or StudentOptions()
+    # The default keeps the name that stands in the state files of interrupted searches.
+    default = options == StudentOptions()
     return BlackBoxSearch.usual(
-        method, settings.learning_rate, settings.probes, cells=settings.cells, distillation=lessons
+        method,
+        settings.learning_rate,
+        settings.probes,
+        cells=settings.cells,
+        distillation=lessons,
+        student=pilotnet_student if default else ArchitectureStudent(options.architecture),
     )
 
 

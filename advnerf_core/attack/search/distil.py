@@ -7,6 +7,7 @@ with two textures, and the student is charged for the error of the difference to
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,7 +16,9 @@ import torch
 from torch import Tensor, nn
 
 from advnerf_core.adam import Adam
-from advnerf_core.policies.pilotnet import IMAGE_HEIGHT, IMAGE_WIDTH, PilotNet
+from advnerf_core.policies.architecture import IMAGE_HEIGHT, IMAGE_WIDTH, Architecture
+from advnerf_core.policies.network import SteeringNetwork
+from advnerf_core.policies.pilotnet import PilotNet
 
 StudentFactory = Callable[[tuple[int, ...], int, float], nn.Module]
 """``(image shape [3, H, W], goal size, bound of the steering [rad]) -> network(images, goals)``."""
@@ -72,9 +75,9 @@ class Distillation:
 
 
 class Resized(nn.Module):
-    """A `PilotNet` for images of any size."""
+    """A network of 200 x 66 pixels for images of any size."""
 
-    def __init__(self, network: PilotNet) -> None:
+    def __init__(self, network: SteeringNetwork) -> None:
         super().__init__()
         self.network = network
 
@@ -85,6 +88,27 @@ class Resized(nn.Module):
             images = nn.functional.interpolate(images, size, mode="bilinear", antialias=True)
         steering: Tensor = self.network(images, goals)
         return steering
+
+
+@dataclass(frozen=True)
+class ArchitectureStudent:
+    """Makes students of any architecture.
+
+    Attributes:
+        architecture: The architecture with its settings.
+    """
+
+    architecture: Architecture
+
+    @property
+    def name(self) -> str:
+        """What must not change between a search and its resumption."""
+        return json.dumps(self.architecture.described(), sort_keys=True)
+
+    def __call__(self, image_shape: tuple[int, ...], goal_size: int, bound_rad: float) -> nn.Module:
+        """A network for images of any size ``[3, H, W]``."""
+        del image_shape
+        return Resized(self.architecture.build(goal_size, bound_rad))
 
 
 def pilotnet_student(image_shape: tuple[int, ...], goal_size: int, bound_rad: float) -> nn.Module:

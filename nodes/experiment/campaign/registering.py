@@ -117,7 +117,7 @@ def _scenario(experiment: Experiment, name: str) -> RegisteredScenario:
         deployed_starts=deployed,
         evaluations=planned_evaluations(experiment),
         space=config.space.model_dump(mode="json"),
-        victims=config.policy.model_dump(mode="json"),
+        victims=config.policy.key(),
         drives_well_mean_cte_m=mean_cte_limit_m(limits.off_track_m),
     )
 

@@ -19,7 +19,7 @@ from advnerf_core.learning.fit import FitConfig, fit, mean_absolute_error
 from advnerf_core.learning.frames import FrameSet, FrameStore
 from advnerf_core.learning.imitation import ImitationConfig, Progress, SourcePlan, train_policy
 from advnerf_core.places import require_utf8
-from advnerf_core.policies.pilotnet import PilotNet, save_policy
+from advnerf_core.policies.policy_file import copy_policy, save_policy
 from advnerf_core.policies.view import PolicyView
 from nodes.lab.policy_data.frames import Recording
 from nodes.runtime.progress import Report
@@ -92,7 +92,7 @@ def train_from_recordings(
         "parts": {part.name: part.digest for part in parts},
         "view": view.to_dict(),
         "expert": expert.to_dict(),
-        "config": asdict(config),
+        "config": config.settings(),
         "surrogate": None
         if surrogate is None
         else [surrogate.source.name, surrogate.stills, surrogate.drives],
@@ -107,7 +107,7 @@ def train_from_recordings(
         bare: Progress = lambda share, text, learned=None: report(share, text)  # noqa: E731 - typed
         trained = train_policy(config, [surrogate], expert, view, work, bare)
         sha256, mae = trained.sha256, trained.validation_mae_rad
-    write_atomically(out / POLICY, (work / POLICY).read_bytes())
+    copy_policy(work / POLICY, out / POLICY)
     frames = {name: len(store.load(name)) for name in store.names()}
     named = {part.name: frames.pop(_shard(part)) for part in parts}
     unchecked = {part.name: part.unchecked for part in parts if part.unchecked}
@@ -142,7 +142,7 @@ def _clone(
     report: Report,
 ) -> tuple[str, float]:
     torch.manual_seed(config.seed)
-    policy = PilotNet(0, config.max_steering_rad, config.hidden)
+    policy = config.architecture.build(0, config.max_steering_rad)
     frames = FrameSet([store.load(name) for name in store.names()], True, config.holdout_every)
     settings = FitConfig(
         steps=config.first_steps,
@@ -160,7 +160,12 @@ def _clone(
 
     fit(policy, frames, settings, work / "clone.checkpoint.safetensors", tell)
     mae = mean_absolute_error(policy, frames)
-    details = {**metadata, "settings": asdict(config), "expert": expert.to_dict(), "validation_mae_rad": mae}
+    details = {
+        **metadata,
+        "settings": config.settings(),
+        "expert": expert.to_dict(),
+        "validation_mae_rad": mae,
+    }
     return save_policy(work / POLICY, policy, view, details), mae
 
 

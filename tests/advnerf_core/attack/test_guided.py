@@ -3,12 +3,14 @@
 import dataclasses
 import math
 from dataclasses import replace
+from pathlib import Path as FilePath
 
 import pytest
 import torch
 from torch import nn
 
 from advnerf_core.attack.adjoint import AttackProblem, BlackBoxError, adjoint_gradient, evaluate
+from advnerf_core.attack.methods import METHODS, MethodError, SearchRun, SearchSettings
 from advnerf_core.attack.robustness import Disturbances
 from advnerf_core.attack.search.black_box import BlackBoxSearch, BudgetError, black_box_attack
 from advnerf_core.attack.search.distil import Distillation, Lessons, Student
@@ -250,6 +252,24 @@ def test_a_goal_reaches_victim_and_student():
     problem = replace(problem, policy=victim)
     result = black_box_attack(problem, search, least_calls(search, problem, 2))
     assert math.isfinite(result.best.loss_m)
+
+
+def test_the_student_may_be_of_any_architecture(tmp_path):
+    method, problem = METHODS["distilled"], linear_problem()
+    own = FilePath(__file__).parents[3] / "examples" / "my_architecture.py"
+    small = {"student": f"{own}:Mixer", "configuration": {"width": 8}}
+    settings = SearchSettings(4, warm_pairs=2, cells=2, options=method.options(small))
+    state = tmp_path / "state.safetensors"
+    found = method.search(problem, settings, SearchRun(state_path=state))
+    assert math.isfinite(found.best.loss_m)
+    again = method.search(problem, settings, SearchRun(state_path=state))
+    assert torch.equal(again.theta, found.theta)
+    with pytest.raises(SearchStateError, match="other settings"):
+        method.search(problem, replace(settings, options=None), SearchRun(state_path=state))
+    with pytest.raises(MethodError, match=r"expected an architecture of pilotnet, .* got 'resnt'"):
+        method.options({"student": "resnt"})
+    with pytest.raises(MethodError, match=r"expected a setting of resnet of widths"):
+        method.options({"student": "resnet", "configuration": {"depth": 3}})
 
 
 def test_a_policy_with_memory_and_bad_settings_are_refused():

@@ -16,6 +16,7 @@ from advnerf_core.geometry import Pinhole
 from advnerf_core.learning.frames import FrameStore
 from advnerf_core.learning.imitation import ImitationConfig, SourcePlan, recovery_states, train_policy
 from advnerf_core.learning.sources import RenderedSource
+from advnerf_core.policies.architecture import Architecture
 from advnerf_core.policies.pilotnet import PilotNet, load_policy
 from advnerf_core.policies.view import PolicyView
 
@@ -41,7 +42,7 @@ CONFIG = ImitationConfig(
     dagger_rounds=1,
     batch_size=8,
     max_steering_rad=1.2,
-    hidden=(32, 16, 8),
+    architecture=Architecture(configuration={"hidden": (32, 16, 8)}),
     lateral_m=0.5,
     heading_rad=0.1,
     drive_lateral_m=0.3,
@@ -117,7 +118,7 @@ def test_each_goal_is_taught_by_its_own_expert(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_one_policy_learns_both_turns(tmp_path: Path) -> None:
-    learning = replace(CONFIG, first_steps=200, dagger_rounds=0, batch_size=32, hidden=(100, 50, 10))
+    learning = replace(CONFIG, first_steps=200, dagger_rounds=0, batch_size=32, architecture=Architecture())
     policy = load_policy(train_policy(learning, plans(128), LEFT, VIEW, tmp_path).path).policy
     image = prepare(np.array([[7.0, 0.0, 0.0]]))(None)
     with torch.no_grad():

@@ -1,3 +1,4 @@
+import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -17,9 +18,11 @@ from advnerf_core.learning.fit import FitConfig, fit, mean_absolute_error
 from advnerf_core.learning.frames import Frames, FrameSet, FrameStore, FrameStoreError
 from advnerf_core.learning.imitation import ImitationConfig, SourcePlan, recovery_states, train_policy
 from advnerf_core.learning.sources import RenderedSource, SceneSource, steer_with
+from advnerf_core.policies.architecture import Architecture
 from advnerf_core.policies.pilotnet import PilotNet, load_policy
 from advnerf_core.policies.view import PolicyView
 
+EXAMPLE = Path(__file__).parents[3] / "examples" / "my_architecture.py"
 TRACK = Track.rounded_square(4.0, 1.1)
 VIEW = PolicyView(Pinhole(336, 188, 173.97, 173.97, 168.0, 94.0))
 T_CAR_FROM_CAMERA = camera_mount(0.30, 0.0, 0.20, np.deg2rad(10.0))
@@ -258,3 +261,19 @@ def test_learned_policy_drives_three_laps(tmp_path: Path) -> None:
 
 def test_steer_with_runs_on_uint8_images() -> None:
     assert steer_with(PilotNet())(np.zeros((2, 66, 200, 3), np.uint8)).shape == (2,)
+
+
+@pytest.mark.parametrize(
+    "name", ["resnet", "vit_tiny", f"{EXAMPLE}:Mixer"], ids=["resnet", "vit", "of a user"]
+)
+def test_the_recipe_trains_any_architecture(name: str, tmp_path: Path) -> None:
+    config = replace(TINY, architecture=Architecture(name))
+    done = train_policy(config, _plans(), EXPERT, VIEW, tmp_path / "a")
+    loaded = load_policy(done.path)
+    assert type(loaded.policy).__name__ == {"resnet": "ResNet", "vit_tiny": "VisionTransformer"}.get(
+        name, "Mixer"
+    )
+    assert str(EXAMPLE.parent) not in json.dumps(loaded.metadata)  # the same file on every machine
+    assert train_policy(config, _plans(), EXPERT, VIEW, tmp_path / "a").sha256 == done.sha256
+    with pytest.raises(FrameStoreError, match="same settings"):
+        train_policy(TINY, _plans(), EXPERT, VIEW, tmp_path / "a")

@@ -10,6 +10,7 @@ from advnerf_core.geometry import Pinhole
 from advnerf_core.learning.augment import AugmentConfig
 from advnerf_core.learning.frames import Frames, FrameStoreError
 from advnerf_core.learning.retrain import MixedFrames, RetrainConfig, fine_tune
+from advnerf_core.policies.architecture import PilotNetConfiguration
 from advnerf_core.policies.pilotnet import PilotNet, images_to_tensor, load_policy, save_policy
 from advnerf_core.policies.view import PolicyView
 
@@ -34,7 +35,12 @@ def frames(count, red, steering_rad, goals=0, seed=0):
 @pytest.fixture
 def policy(tmp_path):
     torch.manual_seed(0)
-    save_policy(tmp_path / "old.safetensors", PilotNet(hidden=(16, 8, 4)), VIEW, {"kind": "test"})
+    save_policy(
+        tmp_path / "old.safetensors",
+        PilotNet(configuration=PilotNetConfiguration(hidden=(16, 8, 4))),
+        VIEW,
+        {"kind": "test"},
+    )
     return load_policy(tmp_path / "old.safetensors")
 
 

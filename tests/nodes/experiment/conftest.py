@@ -11,6 +11,7 @@ import yaml
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.geometry import Array, Pinhole, VehicleState, planar_pose
 from advnerf_core.objects.voxel.model import save_object
+from advnerf_core.policies.architecture import PilotNetConfiguration
 from advnerf_core.policies.pilotnet import PilotNet, save_policy
 from advnerf_core.scene.field import SceneField, SceneFieldConfig, save_scene
 from hardware.worlds.junction.car import DubinsCar
@@ -64,7 +65,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
     for kind in ("small_car", "hydrant"):
         save_object(object_file(experiment, kind), build(experiment, kind))
     for victim in (HARDENED, NAIVE):
-        policy = PilotNet(3, 1.2, (16, 8, 4)).eval()
+        policy = PilotNet(3, 1.2, PilotNetConfiguration(hidden=(16, 8, 4))).eval()
         save_policy(victim_file(experiment, victim), policy, experiment.view, {"victim": victim})
     return experiment
 

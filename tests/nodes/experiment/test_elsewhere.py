@@ -10,6 +10,7 @@ import yaml
 
 from advnerf_core.driving.expert import Expert
 from advnerf_core.learning.imitation import ImitationConfig, SourcePlan, train_policy
+from advnerf_core.policies.architecture import Architecture
 from nodes.experiment.context import Experiment
 from nodes.experiment.elsewhere import plans_elsewhere
 from nodes.experiment.run import load_experiment
@@ -83,7 +84,12 @@ def test_each_place_is_seen_bare_and_with_the_panel_in_random_colours(
 def test_a_policy_learns_from_all_of_them(flat: tuple[Experiment, list[SourcePlan]], tmp_path: Path) -> None:
     experiment, plans = flat
     config = ImitationConfig(
-        dagger_rounds=1, first_steps=3, round_steps=2, hidden=(8, 8, 4), naive_steps=0, max_steering_rad=0.5
+        dagger_rounds=1,
+        first_steps=3,
+        round_steps=2,
+        architecture=Architecture(configuration={"hidden": (8, 8, 4)}),
+        naive_steps=0,
+        max_steering_rad=0.5,
     )
     assert plans[0].expert is not None
     trained = train_policy(config, plans, plans[0].expert, experiment.view, tmp_path / "policy")
