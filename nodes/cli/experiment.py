@@ -83,6 +83,27 @@ def load_cells(
     return campaign, select(campaign.cells, only)
 
 
+def _say_code(file: Path, setting: str, folder: Path | None, overrides: Sequence[str]) -> None:
+    """Print the code that a run of a file will execute; nothing is executed for it."""
+    from nodes.experiment.campaign.config import is_campaign, load_campaign
+    from nodes.experiment.run import read_setting
+    from nodes.lab.plugin_tables import say_code
+    from nodes.runtime.named_code import with_absolute_code
+
+    if not is_campaign(file):
+        say_code(read_setting(file, setting, overrides).data, file.resolve().parent)
+        return
+    campaign = load_campaign(file, folder, tuple(overrides))
+    named: list[Any] = [{"methods": [cell.code for cell in campaign.cells]}]
+    for scenario in campaign.scenarios.values():
+        inner = (file.parent / scenario.experiment).resolve()
+        # Of the methods only those of the campaign are run.
+        data = read_setting(inner, scenario.setting, scenario.set).data
+        worlds = {key: data[key] for key in ("world", "deploy") if key in data}
+        named += [{"kind": scenario.kind}, with_absolute_code(worlds, inner.parent)]
+    say_code(named, file.resolve().parent)
+
+
 def experiment(
     file: File,
     setting: Setting = "demo",
@@ -161,6 +182,7 @@ def experiment(
 
     use_device(device)
     many = is_campaign(file)
+    _say_code(file, setting, folder, overrides or [])
     address = "" if cluster in (None, "auto") else str(cluster)
     backend: Literal["local", "ray"] = "local" if cluster is None else "ray"
     here = not many and jobs is None and cluster is None
