@@ -65,7 +65,9 @@ def camera_check(
     overrides: Overrides = None,
     shows: Annotated[
         Literal["red", "green", "blue"] | None,
-        typer.Option("--shows", help="Colour of what is held before the camera; checks the order of colours."),
+        typer.Option(
+            "--shows", help="Colour of what is held before the camera; checks the order of colours."
+        ),
     ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", help="Save the last image here (.png, .jpg): look at it.")

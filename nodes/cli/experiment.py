@@ -80,7 +80,15 @@ def load_cells(
 
         experiment = load_experiment(file, setting, overrides or [], folder or Path("runs") / setting)
         campaign = campaign_of(experiment, overrides or [], cells(experiment))
+    _know_methods(campaign)
     return campaign, select(campaign.cells, only)
+
+
+def _know_methods(campaign: Campaign) -> None:
+    from nodes.experiment.context import CELLS
+    from nodes.experiment.method_names import know_methods_of
+
+    know_methods_of(campaign.folder / CELLS, {cell.method for cell in campaign.cells})
 
 
 def _say_code(file: Path, setting: str, folder: Path | None, overrides: Sequence[str]) -> None:
@@ -340,6 +348,7 @@ def _show_table(campaign: Campaign, cells: Sequence[Cell], output: Path | None) 
     from nodes.experiment.campaign.plan import statuses
     from nodes.experiment.campaign.published import campaign_table
 
+    _know_methods(campaign)  # titles are kept since cells were run
     found = statuses(campaign, cells)
     full = campaign_table(campaign, found)
     page = _write_and_print(full, campaign.folder, campaign.folder / "cells", output)

@@ -13,7 +13,10 @@ _FAILURE_EXIT = 1
 
 def list_command(
     what: Annotated[
-        str, typer.Argument(metavar="WHAT", help="methods, policies, worlds, cameras, ...; see the error of a wrong one.")
+        str,
+        typer.Argument(
+            metavar="WHAT", help="methods, policies, worlds, cameras, ...; see the error of a wrong one."
+        ),
     ],
 ) -> None:
     """List what can be named: built in, and of installed packages, with one line each and where it comes from.

@@ -22,7 +22,9 @@ def _group() -> None:
 def method_check(
     methods: Annotated[
         list[str],
-        typer.Argument(metavar="METHOD...", help="A method of `advnerf list methods`, or file.py:Name of your own."),
+        typer.Argument(
+            metavar="METHOD...", help="A method of `advnerf list methods`, or file.py:Name of your own."
+        ),
     ],
     overrides: Overrides = None,
 ) -> None:

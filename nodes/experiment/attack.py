@@ -28,6 +28,7 @@ from nodes.experiment.context import Experiment
 from nodes.experiment.drives import learned_drives, totals
 from nodes.experiment.faces import has_face, panel_of
 from nodes.experiment.learned_scene import baked_file, load_field, scene_sha256
+from nodes.experiment.method_names import keep_title
 from nodes.experiment.policy import HARDENED, victim_file, victims
 from nodes.experiment.request.telling import telling
 from nodes.experiment.space_config import (
@@ -286,6 +287,7 @@ def _search(
     wanted = experiment.config.space.model_dump(mode="json")
     settings_hash = hash_of({**_frozen_for(experiment, cell), "scenario": cell.scenario, "space": wanted})
     method = load_method(cell.code)
+    keep_title(folder.parent, cell.method, method.title)
     settings = search_settings(experiment, method)
     told = telling(method.evaluations(problem, settings), report)
     run = SearchRun(cell.seed, folder / _STATE, told, settings_hash)

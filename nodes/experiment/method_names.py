@@ -1,7 +1,11 @@
-"""Names of methods of attack in experiment, campaign and request files: checked where they stand, and absolute for other processes."""
+"""Names of methods of attack in experiment, campaign and request files: checked where they stand, and absolute for other processes.
+
+The title that a user's method brings is kept beside the cells that it searched: pages show it without executing the method.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -9,8 +13,9 @@ from pydantic import AfterValidator, ValidationInfo
 from pydantic_core import PydanticCustomError
 
 from advnerf_core.attack.methods import require_method
+from advnerf_core.files import write_atomically
 from advnerf_core.plugins import PluginError, absolute_reference
-from advnerf_core.report.conditions import CONTROLS
+from advnerf_core.report.conditions import CONTROLS, know_methods
 from advnerf_core.strict import COMPLETE
 
 
@@ -32,3 +37,17 @@ MethodReference = Annotated[str, AfterValidator(_checked)]
 
 ConditionReference = Annotated[str, AfterValidator(_checked_condition)]
 """The same, or a control: ``none``, ``empty``."""
+
+_TITLES = "titles"
+
+
+def keep_title(cells_folder: Path, name: str, title: str) -> None:
+    """Write down what readers call a method; nothing if it has no title."""
+    if title:
+        write_atomically(cells_folder / _TITLES / name, title)
+
+
+def know_methods_of(cells_folder: Path, names: Iterable[str]) -> None:
+    """Give methods of one table colours of their own, and the titles that are kept beside its cells."""
+    kept = sorted((cells_folder / _TITLES).glob("*"))
+    know_methods(names, {file.name: file.read_text(encoding="utf-8") for file in kept})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 import tempfile
@@ -127,7 +128,9 @@ def keeps_to_its_budget(bench: MethodBench) -> str:
     if count != planned:
         raise NotMet(f"expected {planned} evaluations, as Method.evaluations says, got {count}")
     if len(told) != count:
-        raise NotMet(f"expected run.on_evaluation to be called after each of {count} evaluations, got {len(told)} calls")
+        raise NotMet(
+            f"expected run.on_evaluation to be called after each of {count} evaluations, got {len(told)} calls"
+        )
     if [each.iteration for each in result.history] != list(range(count)):
         raise NotMet("expected evaluations numbered from 0 in their order")
     return f"{count} evaluations of {_EVALUATIONS}; the policy was asked about {problem.policy.asked} images"
@@ -151,9 +154,13 @@ def depends_on_the_seed(bench: MethodBench) -> str:
     """One seed gives the same bytes twice; another seed gives another start."""
     first, again, other = bench.search()[0], bench.search()[0], bench.search(_OTHER_SEED)[0]
     if not _same(first, again):
-        raise NotMet("expected the same bytes from the same seed, got others; draw from a generator with run.seed")
+        raise NotMet(
+            "expected the same bytes from the same seed, got others; draw from a generator with run.seed"
+        )
     if torch.equal(first.theta, other.theta) and _losses(first) == _losses(other):
-        raise NotMet(f"expected other textures from seed {_OTHER_SEED} than from {_SEED}, got the same; use run.seed")
+        raise NotMet(
+            f"expected other textures from seed {_OTHER_SEED} than from {_SEED}, got the same; use run.seed"
+        )
     return "the same bytes from one seed, other textures from another"
 
 
@@ -163,10 +170,8 @@ def resumes_to_the_bit(bench: MethodBench) -> str:
     stops = [each for each in (1, _STOPPED_AFTER) if each < len(whole.history)]
     for stop_after in stops:
         name = f"resumed{stop_after}.state"
-        try:
+        with contextlib.suppress(_Stopped):
             bench.search(state=name, stop_after=stop_after)
-        except _Stopped:
-            pass
         if not (bench.folder / name).is_file():
             raise NotMet(
                 f"expected a state file after evaluation {stop_after}, got none; write run.state_path before run.on_evaluation"
@@ -216,11 +221,11 @@ def writes_only_its_state(bench: MethodBench) -> str:
     with _watched() as written:
         bench.search(state="written.state")
     # Compiled kernels and byte code are no results.
-    outside = [
-        path for path in written if not path.is_relative_to(bench.folder) and not _is_cache(path)
-    ]
+    outside = [path for path in written if not path.is_relative_to(bench.folder) and not _is_cache(path)]
     if outside:
-        raise NotMet(f"expected no files but the state file, got {outside[0]}; keep what you need in state.tensors")
+        raise NotMet(
+            f"expected no files but the state file, got {outside[0]}; keep what you need in state.tensors"
+        )
     return "its state file alone"
 
 

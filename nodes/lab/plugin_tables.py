@@ -162,7 +162,9 @@ def _line_of_code(key: str, text: str, folder: Path) -> str:
         file = Path(named.rpartition(":")[0])
         return f"{named} (sha256 {file_sha256(file)[:_DIGITS]})" if file.is_file() else ""
     module = text.partition(":")[0]
-    is_module = (key == "policy" and is_factory(text)) or (key == "module" and text.replace(".", "_").isidentifier())
+    is_module = (key == "policy" and is_factory(text)) or (
+        key == "module" and text.replace(".", "_").isidentifier()
+    )
     if is_module and module.partition(".")[0] not in _OURS:
         return f"{text} (sha256 {module_sha256(module)[:_DIGITS]})"
     for table in TABLES.values():

@@ -122,7 +122,9 @@ def command(*arguments: object) -> tuple[int, str]:
 
 
 def test_its_keys_stand_beside_those_of_every_source(generator: Path) -> None:
-    source = parse_source(f"{{kind: {generator}:Generator, width: 6, rate_hz: 0.5, stall_s: 2.0, repeats: 3}}")
+    source = parse_source(
+        f"{{kind: {generator}:Generator, width: 6, rate_hz: 0.5, stall_s: 2.0, repeats: 3}}"
+    )
     assert (source.config.width, source.stall_s, source.repeats) == (6, 2.0, 3)
     assert source.period_s() == 2.0
     assert source.steady()._stall_s == 6.0  # three periods
@@ -132,7 +134,10 @@ def test_its_keys_stand_beside_those_of_every_source(generator: Path) -> None:
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ("widht: 6", r"widht: unknown key of this camera; valid keys here: kind, rate_hz, repeats, stall_s, width$"),
+        (
+            "widht: 6",
+            r"widht: unknown key of this camera; valid keys here: kind, rate_hz, repeats, stall_s, width$",
+        ),
         ("width: a", "width: input should be a valid integer, got 'a'"),
         ("rate_hz: 3.0", "width is missing; add it"),
         ("width: 6, stall_s: -1.0", "stall_s: input should be greater than 0"),
@@ -147,7 +152,10 @@ def test_a_wrong_key_is_one_line(generator: Path, keys: str, message: str) -> No
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        ("webcam", r"kind: expected a camera of v4l2, .*folder; got 'webcam'; one of your own is file.py:Name"),
+        (
+            "webcam",
+            r"kind: expected a camera of v4l2, .*folder; got 'webcam'; one of your own is file.py:Name",
+        ),
         ("mine.py:Missing", "kind: camera .*: expected a name in mine.py"),
         ("mine.py:Frame", "expected a class that derives from Camera and has an attribute Config"),
         ("other.py:Generator", "expected a Python file at .*other.py, found none"),
@@ -209,11 +217,13 @@ def test_the_check_tells_bgr_from_rgb(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "0.png"), np.full((4, 6, 3), RED[::-1], np.uint8))
     camera = parse_source(f"{{kind: folder, folder: {tmp_path}}}").camera()
     assert CHECKS["colours"](CameraBench(camera, shows="red")) == "red is red"
-    with pytest.raises(NotMet, match="expected most of blue .* OpenCV's images are BGR"):
+    with pytest.raises(NotMet, match=r"expected most of blue .* OpenCV's images are BGR"):
         CHECKS["colours"](CameraBench(camera, shows="blue"))
 
 
-def test_a_relative_file_is_relative_to_the_launch_file_that_names_it(generator: Path, tmp_path: Path) -> None:
+def test_a_relative_file_is_relative_to_the_launch_file_that_names_it(
+    generator: Path, tmp_path: Path
+) -> None:
     below = tmp_path / "below"
     below.mkdir()
     source = {"kind": "../mine.py:Generator", "width": 336}
@@ -228,12 +238,16 @@ def test_a_relative_file_is_relative_to_the_launch_file_that_names_it(generator:
     code, printed = command("launch", top, "--check")
     assert (code, f"executes {generator}:Generator (sha256 " in printed) == (0, True)
     plain = tmp_path / "camera.yaml"
-    plain.write_text(dump_yaml({"calibration": str(TWIN), "source": {"kind": "mine.py:Generator", "width": 336}}))
+    plain.write_text(
+        dump_yaml({"calibration": str(TWIN), "source": {"kind": "mine.py:Generator", "width": 336}})
+    )
     assert load_node_config(CameraConfig, "camera", plain).source.config.width == 336
 
 
 def test_the_example_is_a_camera(stream: str) -> None:
-    code, printed = command("camera", "check", f"{EXAMPLE}:HttpCamera", "--set", f"url={stream}", "--shows", "red")
+    code, printed = command(
+        "camera", "check", f"{EXAMPLE}:HttpCamera", "--set", f"url={stream}", "--shows", "red"
+    )
     assert code == 0, printed
     assert "336 x 188" in printed
 

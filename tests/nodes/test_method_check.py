@@ -23,7 +23,9 @@ def test_a_built_in_method_keeps_the_contract(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in METHODS if name not in ("random", "cem", "gradient", *SLOW)])
+@pytest.mark.parametrize(
+    "name", [name for name in METHODS if name not in ("random", "cem", "gradient", *SLOW)]
+)
 def test_every_built_in_method_keeps_the_contract(name: str) -> None:
     assert [finding for finding in check_method(name) if not finding.met] == []
 

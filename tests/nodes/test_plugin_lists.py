@@ -25,9 +25,7 @@ def command(*arguments: object) -> tuple[int, str]:
     return done.exit_code, done.output
 
 
-@pytest.mark.parametrize(
-    ("what", "names"), [("methods", METHODS), ("worlds", WORLDS), ("cameras", CAMERAS)]
-)
+@pytest.mark.parametrize(("what", "names"), [("methods", METHODS), ("worlds", WORLDS), ("cameras", CAMERAS)])
 def test_everything_that_is_built_in_has_a_line(what: str, names: dict[str, object]) -> None:
     rows = [row for row in rows_of(TABLES[what]) if row.origin == "built in"]
     assert [row.name for row in rows] == list(names)
@@ -35,7 +33,9 @@ def test_everything_that_is_built_in_has_a_line(what: str, names: dict[str, obje
     assert len({row.line for row in rows}) == len(rows)
 
 
-def test_a_package_is_listed_with_its_version_and_title(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_package_is_listed_with_its_version_and_title(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     titled = spiral_code().replace("Options=Options)", 'Options=Options, title="along a spiral")')
     install_method(tmp_path, monkeypatch, titled)
     code, printed = command("list", "methods")
@@ -44,14 +44,18 @@ def test_a_package_is_listed_with_its_version_and_title(tmp_path: Path, monkeypa
     assert line.split() == ["spiral", "stranger-methods", "1.0", "along", "a", "spiral"]
 
 
-def test_a_package_that_is_broken_is_listed_with_its_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_package_that_is_broken_is_listed_with_its_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     install_method(tmp_path, monkeypatch, "import a_package_that_is_not_there\n")
     code, printed = command("list", "methods")
     assert code == 0
     assert "cannot be loaded: ModuleNotFoundError: No module named 'a_package_that_is_not_there'" in printed
 
 
-def test_a_name_that_two_things_have_is_an_error_of_the_list(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_name_that_two_things_have_is_an_error_of_the_list(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     install_method(tmp_path, monkeypatch, spiral_code(), "gradient")
     code, printed = command("list", "methods")
     assert code == 1
