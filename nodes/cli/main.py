@@ -132,8 +132,8 @@ def launch(
     ] = False,
 ) -> None:
     """Start the nodes of a launch file and supervise them. Ctrl-C stops them; a second Ctrl-C kills them."""
-    from nodes.launching.launch import Launch
     from nodes.lab.plugin_tables import say_code
+    from nodes.launching.launch import Launch
     from nodes.launching.launch_file import load_launch
 
     plan = load_launch(file, overrides or [], host=host)
