@@ -60,7 +60,10 @@ class HttpCamera(Camera):
             self._bytes += received
         begin = self._bytes.rfind(BEGIN, 0, end)
         jpeg, self._bytes = self._bytes[begin : end + 2], self._bytes[end + 2 :]
-        rgb = np.ascontiguousarray(cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1])
+        bgr = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+        if bgr is None:
+            raise LinkLost(f"{self._url.geturl()} sent a damaged picture")
+        rgb = np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8)
         rgb.flags.writeable = False
         self._sequence += 1
         return Frame(rgb, time.time_ns(), time.monotonic_ns(), self._sequence)
