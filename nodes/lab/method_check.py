@@ -292,7 +292,8 @@ def _watched() -> Iterator[list[Path]]:
     if not _hooked:
         sys.addaudithook(_on_audit)  # hooks cannot be removed
         _hooked = True
-    _watching = written = []
+    written: list[Path] = []
+    _watching = written
     try:
         yield written
     finally:
