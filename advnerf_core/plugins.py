@@ -10,7 +10,7 @@ import difflib
 import hashlib
 import importlib.util
 import sys
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder
@@ -46,22 +46,22 @@ def resolve(
         folder: Folder that a relative ``file.py`` is relative to; the working folder if it is not given.
 
     Raises:
-        PluginError: There is no such name, or what it names fails to load. Other plug-ins are not loaded, so they cannot fail.
+        PluginError: There is no such name, two things have it, or what it names fails to load. Other plug-ins are not loaded, so
+            they cannot fail.
     """
+    require_known(name, what, built_in, group, folder)
     if name in built_in:
         return built_in[name]()
     if is_file_reference(name):
         return load_from_file(name, what, folder)
-    found = {each.name: each for each in entry_points(group=group)}
-    if name in found:
-        return _load_entry_point(found[name], what)
-    raise PluginError(_stands_for_nothing(name, what, built_in, group))
+    (entry,) = _entries(name, group)
+    return _load_entry_point(entry, what)
 
 
 def require_known(
-    name: str, what: str, built_in: Iterable[str], group: str, folder: Path | None = None
+    name: str, what: str, built_in: Collection[str], group: str, folder: Path | None = None
 ) -> None:
-    """Refuse a name that stands for nothing. No code is loaded: what the name stands for may still be broken.
+    """Refuse a name that stands for nothing or for two things. No code is loaded: what the name stands for may still be broken.
 
     Args:
         name: As of `resolve`, like the other arguments.
@@ -71,11 +71,18 @@ def require_known(
         folder: Folder that a relative ``file.py`` is relative to; the working folder if it is not given.
 
     Raises:
-        PluginError: There is no such name, or no such file.
+        PluginError: There is no such name, two things have it, or there is no such file.
     """
     if is_file_reference(name):
         _file_of(name, what, folder)
-    elif name not in known_names(built_in, group):
+        return
+    owners = [*(["advnerf"] if name in built_in else []), *map(origin_of, _entries(name, group))]
+    if len(owners) > 1:
+        raise PluginError(
+            f"{what} {name}: expected one {what} of this name, got {len(owners)}: of {' and of '.join(owners)}; remove one of these "
+            "packages, or ask its author for another name"
+        )
+    if not owners:
         raise PluginError(_stands_for_nothing(name, what, built_in, group))
 
 
@@ -95,14 +102,27 @@ def code_sha256(name: str, built_in: Container[str], group: str, folder: Path | 
         return ""
     if is_file_reference(name):
         return file_sha256(Path(absolute_reference(name, folder or Path.cwd()).rpartition(":")[0]))
-    entry = next((each for each in entry_points(group=group) if each.name == name), None)
+    entry = next(iter(_entries(name, group)), None)
     return "" if entry is None else entry_point_sha256(entry)
 
 
 def known_names(built_in: Iterable[str], group: str) -> tuple[str, ...]:
-    """Built-in names, then those of installed packages; nothing is loaded."""
+    """Built-in names, then those of installed packages, each once; nothing is loaded."""
     own = tuple(built_in)
     return (*own, *sorted({each.name for each in entry_points(group=group)} - set(own)))
+
+
+def _entries(name: str, group: str) -> list[EntryPoint]:
+    return [each for each in entry_points(group=group) if each.name == name]
+
+
+def origin_of(entry: EntryPoint) -> str:
+    """The package that brings an entry point, with its version: ``package 1.0``."""
+    return (
+        f"{entry.dist.name} {entry.dist.version}"
+        if entry.dist is not None
+        else f"a package with {entry.value}"
+    )
 
 
 def is_file_reference(name: str) -> bool:

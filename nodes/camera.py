@@ -57,7 +57,8 @@ class CameraConfig(StrictModel):
     """Configuration of the camera node.
 
     Attributes:
-        source: Device with ``kind`` v4l2, zed, oak, socket, file or folder; see `hardware.cameras.sources`.
+        source: Device with ``kind`` v4l2, zed, oak, socket, file, folder, an entry point or ``file.py:Class``; see
+            `hardware.cameras.sources` and `hardware.cameras.foreign`.
         calibration: Camera calibration file. Frames of another size are refused.
         max_age_s: Largest age of a frame on arrival; older frames are not published [s].
         silence_s: Time without a frame after which the node reports a fault [s].

@@ -114,6 +114,7 @@ class Method:
             searches shapes; else theta must be colours.
         evaluations: ``evaluations(problem, settings)``: how many drives the budget allows it, for the progress.
         Options: Dataclass or pydantic model of options that only this method has; None if it has none.
+        title: What readers call it, in a few words; empty for its name.
     """
 
     search: Search
@@ -122,6 +123,7 @@ class Method:
     reads_scale: bool = False
     evaluations: Planned = _all_evaluations
     Options: type[Any] | None = None
+    title: str = ""
 
     def __post_init__(self) -> None:
         own = self.Options
@@ -217,8 +219,8 @@ def require_method(reference: str, folder: Path | None = None) -> None:
         raise PluginError(
             f"{_WHAT} {reference}: expected a name of letters, digits, - and _, as it becomes part of file names, got {name!r}; rename it"
         )
-    taken = tuple(dict.fromkeys((*CONDITIONS, *METHODS)))
-    if name in taken and reference not in METHODS:
+    taken = tuple(dict.fromkeys((*CONDITIONS, *method_names())))
+    if name in taken and reference not in method_names():
         raise PluginError(
             f"{_WHAT} {reference}: expected a name that no other condition has, got {name} of {', '.join(taken)}; rename it"
         )

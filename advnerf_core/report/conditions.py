@@ -1,15 +1,17 @@
 """What an attacked drive is compared by: the conditions, what they are called, and how they are drawn. The one table of both.
 
 A condition says what the objects show: nothing but their own colours (``none``), what a method of attack found (named by the
-method), or a special drive (``empty``, ``laps``). A method that is not in the table is called by its name and gets a spare style, always
-the same one.
+method), or a special drive (``empty``, ``laps``). A method that is not in the table is called by its title or name and gets a spare
+style: always the same one, unless two such methods of one table would share it (`know_methods`).
 """
 
 from __future__ import annotations
 
+import colorsys
 import zlib
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from contextvars import ContextVar
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 NONE = "none"
@@ -61,8 +63,20 @@ CONDITIONS: Mapping[str, Style] = _rows(
     Style("no object", EMPTY, "#7d848d", "#8f98a3", "D"),
     Style("laps without attack", "laps", "#232c66", "#c3caff", "p"),
 )
-# Of methods that the table does not have; the titles stand for their names.
-SPARE: Mapping[str, Style] = _rows(
+
+
+def _generated(number: int) -> Style:
+    """A spare style of its own for each number; hues go round by the golden angle."""
+    hue = 0.618034 * number % 1.0
+    light, dark = (
+        "#" + "".join(f"{round(255 * part):02x}" for part in colorsys.hls_to_rgb(hue, lightness, 0.55))
+        for lightness in (0.30, 0.76)
+    )
+    return Style("", f"spare-{number}", light, dark, (3 + number, 1, 15))
+
+
+# Of methods that the table does not have; the titles stand for their names. The first ones are told apart best.
+_PREFERRED = _rows(
     Style("", "spare-1", "#5c7a00", "#b6d957", "<"),
     Style("", "spare-2", "#a63d00", "#ff9466", ">"),
     Style("", "spare-3", "#00587a", "#5fc3e8", "h"),
@@ -70,14 +84,45 @@ SPARE: Mapping[str, Style] = _rows(
     Style("", "spare-5", "#8f7a00", "#d8c84a", "H"),
     Style("", "spare-6", "#4b3fb5", "#a99cff", "8"),
 )
+_MOST = 24
+SPARE: Mapping[str, Style] = MappingProxyType(
+    {**_PREFERRED, **_rows(*(_generated(number) for number in range(len(_PREFERRED) + 1, _MOST + 1)))}
+)
+# Styles of the methods that `know_methods` was told of.
+_known: ContextVar[Mapping[str, Style]] = ContextVar("_known", default=MappingProxyType({}))
+
+
+def know_methods(names: Iterable[str], titles: Mapping[str, str] | None = None) -> None:
+    """Give methods that stand in one table colours of their own, from here on in this context.
+
+    The colours depend on all names that were given, not on their order. Above 24 methods that are not in the table, colours repeat.
+
+    Args:
+        names: Conditions of the table; those of `CONDITIONS` keep their style.
+        titles: What readers call them; others are called by their names.
+    """
+    known = _known.get()
+    styles: dict[str, Style] = {}
+    taken: set[str] = set()
+    for name in sorted({*names, *known} - set(CONDITIONS)):
+        first = _preferred(name)
+        free = [each for each in (first, *SPARE.values()) if each.key not in taken]
+        chosen = free[0] if free else first
+        taken.add(chosen.key)
+        title = (titles or {}).get(name) or (known[name].title if name in known else name)
+        styles[name] = replace(chosen, title=title)
+    _known.set(MappingProxyType(styles))
+
+
+def _preferred(name: str) -> Style:
+    return tuple(_PREFERRED.values())[zlib.crc32(name.encode()) % len(_PREFERRED)]
 
 
 def style_of(name: str) -> Style:
-    """The style of a condition; one that is not in the table has its name as title and a spare colour that depends on the name only."""
+    """The style of a condition; one that is in no table has its name as title and a spare colour that depends on the name only."""
     if name in CONDITIONS:
         return CONDITIONS[name]
-    spare = tuple(SPARE.values())[zlib.crc32(name.encode()) % len(SPARE)]
-    return Style(name, spare.key, spare.light, spare.dark, spare.marker)
+    return _known.get().get(name) or replace(_preferred(name), title=name)
 
 
 def order_of(name: str) -> tuple[int, str]:

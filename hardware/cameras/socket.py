@@ -57,7 +57,7 @@ class SocketCamera(Camera):
         """Disconnect."""
         if self._socket is not None:
             self._socket.close()
-            self._socket = None
+            self._socket, self._asked = None, False
 
     def __enter__(self) -> SocketCamera:
         self.open()

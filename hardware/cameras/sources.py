@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from types import MappingProxyType
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationInfo, ValidatorFunctionWrapHandler, WrapValidator, model_validator
 
-from advnerf_core.strict import StrictModel
 from hardware.cameras.file import FileCamera
-from hardware.cameras.interface import Camera
+from hardware.cameras.foreign import foreign_source
 from hardware.cameras.oak import OakCamera, OakSettings
 from hardware.cameras.pixels import PIXEL_FORMATS
 from hardware.cameras.socket import SocketCamera
-from hardware.cameras.steady import SteadyCamera
+from hardware.cameras.source import Source
 from hardware.cameras.v4l2.controls import Controls
 from hardware.cameras.v4l2.driver import V4l2Camera
 from hardware.cameras.v4l2.negotiation import Mode
@@ -26,32 +26,7 @@ from hardware.cameras.zed.exposure import ZedExposure, exposure_lines
 Positive = Annotated[int, Field(gt=0)]
 
 
-class _Source(StrictModel, ABC):
-    """Settings that all sources have.
-
-    Attributes:
-        stall_s: Time without a frame after which the device is reopened [s].
-        repeats: Number of identical images in a row that count as a stall; 0 for never.
-    """
-
-    stall_s: float = Field(default=1.0, gt=0.0)
-    repeats: int = Field(default=0, ge=0)
-
-    @abstractmethod
-    def camera(self) -> Camera:
-        """Make the camera."""
-
-    def steady(self) -> SteadyCamera:
-        """Make the camera with automatic reconnection."""
-        stall_s = max(self.stall_s, 3.0 * self.period_s())
-        return SteadyCamera(self.camera(), stall_s, max(5.0, stall_s), self.repeats)
-
-    def period_s(self) -> float:
-        """Time between two frames if the configuration has a rate, so that a slow rate is not a stall [s]."""
-        return 0.0
-
-
-class _ControlledSource(_Source):
+class _ControlledSource(Source):
     """A device with the standard controls of video devices.
 
     Attributes:
@@ -171,7 +146,7 @@ class ZedSource(_ControlledSource):
         )
 
 
-class OakSource(_Source):
+class OakSource(Source):
     """An OAK camera (depthai 3), undistorted by the device.
 
     Attributes:
@@ -213,7 +188,7 @@ class OakSource(_Source):
         return OakCamera(OakSettings(**self.model_dump(exclude={"kind", "stall_s", "repeats"})))
 
 
-class SocketSource(_Source):
+class SocketSource(Source):
     """Frames from a Unix socket, of the twin or of your own camera server.
 
     Attributes:
@@ -229,7 +204,7 @@ class SocketSource(_Source):
         return SocketCamera(self.path)
 
 
-class FileSource(_Source):
+class FileSource(Source):
     """A recorded video.
 
     Attributes:
@@ -253,7 +228,7 @@ class FileSource(_Source):
         return VideoCamera(self.path, self.rate_hz, self.loop)
 
 
-class FolderSource(_Source):
+class FolderSource(Source):
     """Recorded images.
 
     Attributes:
@@ -277,6 +252,31 @@ class FolderSource(_Source):
         return FileCamera(self.folder, self.rate_hz, self.loop)
 
 
+CAMERAS: Mapping[str, type[Source]] = MappingProxyType(
+    {
+        "v4l2": V4l2Source,
+        "zed": ZedSource,
+        "oak": OakSource,
+        "socket": SocketSource,
+        "file": FileSource,
+        "folder": FolderSource,
+    }
+)
+"""Settings of the cameras that this project brings, by their ``kind``."""
+
+
+def _of_any_kind(value: Any, handler: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
+    kind = value.get("kind") if isinstance(value, Mapping) else None
+    if not isinstance(kind, str):
+        return handler(value)
+    folder = (info.context or {}).get("folder")
+    own = foreign_source(value, CAMERAS, folder)
+    return handler(value) if own is None else own
+
+
 CameraSource = Annotated[
-    V4l2Source | ZedSource | OakSource | SocketSource | FileSource | FolderSource, Field(discriminator="kind")
+    V4l2Source | ZedSource | OakSource | SocketSource | FileSource | FolderSource,
+    Field(discriminator="kind"),
+    WrapValidator(_of_any_kind),
 ]
+"""One of `CAMERAS`, or `hardware.cameras.foreign.ForeignSource` for an entry point or ``file.py:Class``."""

@@ -24,6 +24,7 @@ class SteadyCamera:
 
     Attributes:
         error: Current error; empty while frames arrive.
+        is_open: Whether the device is open.
     """
 
     def __init__(
@@ -40,7 +41,7 @@ class SteadyCamera:
         self.error = "not connected yet"
         self._stall_s, self._first_frame_s, self._repeats = stall_s, first_frame_s, repeats
         self._pauses_s, self._now_s, self._sleep = pauses_s, now_s, sleep
-        self._is_open = False
+        self.is_open = False
         self._pause_s = pauses_s[0]
         self._try_s = -1.0
         self._deadline_s = 0.0
@@ -53,7 +54,7 @@ class SteadyCamera:
             self._sleep(min(wait_s, timeout_s))
             return None
         try:
-            if not self._is_open:
+            if not self.is_open:
                 self._open()
             frame = self.camera.read(timeout_s)
             self._watch(frame)
@@ -65,7 +66,7 @@ class SteadyCamera:
     def close(self) -> None:
         """Stop the device."""
         self.camera.close()
-        self._is_open = False
+        self.is_open = False
 
     def counters(self) -> dict[str, float]:
         """Counts of reopenings and stalls, and the counters of the driver."""
@@ -74,7 +75,7 @@ class SteadyCamera:
 
     def _open(self) -> None:
         self.camera.open()
-        self._is_open = True
+        self.is_open = True
         self._opened += 1
         self._same = 0
         self._deadline_s = self._now_s() + self._first_frame_s
@@ -105,6 +106,6 @@ class SteadyCamera:
 
     def _give_up(self, error: str) -> None:
         self.camera.close()
-        self._is_open, self.error = False, error
+        self.is_open, self.error = False, error
         self._try_s = self._now_s() + self._pause_s
         self._pause_s = min(2.0 * self._pause_s, self._pauses_s[1])

@@ -29,9 +29,11 @@ def attack_run(
     """Search as a request asks, for each of its seeds; ends in one attack file per seed."""
     from advnerf_core.attack.device import use_device
     from nodes.experiment.request.request import load_request
+    from nodes.lab.plugin_tables import say_code
 
     use_device(device)
     request = load_request(file, overrides or [])
+    say_code(request.model_dump(mode="json"), file.parent)
     _run(output or Path("runs") / request.name, request)
 
 
@@ -43,9 +45,12 @@ def attack_resume(
     """Go on with a search that was stopped or killed; on the same device to the bit."""
     from advnerf_core.attack.device import use_device
     from nodes.experiment.request.search import kept_request
+    from nodes.lab.plugin_tables import say_code
 
     use_device(device)
-    _run(folder, kept_request(folder))
+    request = kept_request(folder)
+    say_code(request.model_dump(mode="json"), folder)
+    _run(folder, request)
 
 
 def _run(folder: Path, request: object) -> None:
@@ -179,9 +184,11 @@ def attack_check(
     """Say whether the gradient can be trusted for this scene, policy and objects; exit code 1 if it cannot."""
     from nodes.experiment.request.check import check, write_check
     from nodes.experiment.request.request import load_request
+    from nodes.lab.plugin_tables import say_code
     from nodes.runtime.progress import ProgressDisplay
 
     request = load_request(file, overrides or [])
+    say_code(request.model_dump(mode="json"), file.parent)
     folder = output or Path("runs") / request.name
     with ProgressDisplay() as display:
         report = display.start("check")

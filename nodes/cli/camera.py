@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
+from nodes.runtime.terminal import Overrides, print_findings
+
+_FAILURE_EXIT = 1
 app = typer.Typer(
     no_args_is_help=True, help="Find cameras, test them, and import the factory calibration of a ZED."
 )
@@ -36,10 +39,7 @@ def camera_try(
     ] = 15.0,
 ) -> None:
     """Read a source as the camera node does; print rate, missed frames, age of the stamps and brightness."""
-    import cv2
-
-    from advnerf_core.files import write_atomically
-    from nodes.lab.camera_tools import CameraToolError, parse_source, try_source
+    from nodes.lab.camera_tools import parse_source, save_picture, try_source
 
     trial = try_source(parse_source(source), frames, timeout_s)
     height, width = trial.picture.shape[:2]
@@ -49,14 +49,52 @@ def camera_try(
     if counted := ", ".join(f"{name} {value:g}" for name, value in trial.counters.items() if value):
         print(f"counters: {counted}")
     if out is not None:
-        try:
-            done, data = cv2.imencode(out.suffix, trial.picture[:, :, ::-1])
-        except cv2.error:
-            done = False
-        if not done:
-            raise CameraToolError(f"expected a file name that ends in .png or .jpg; got {out}")
-        write_atomically(out, data.tobytes())
+        save_picture(trial.picture, out)
         print(f"saved {out}")
+
+
+@app.command("check")
+def camera_check(
+    sources: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="KIND|SOURCE...",
+            help="A kind (v4l2, folder, file.py:Class of your own, ...) with its keys as --set, or a source as in a launch file.",
+        ),
+    ],
+    overrides: Overrides = None,
+    shows: Annotated[
+        Literal["red", "green", "blue"] | None,
+        typer.Option(
+            "--shows", help="Colour of what is held before the camera; checks the order of colours."
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Save the last image here (.png, .jpg): look at it.")
+    ] = None,
+) -> None:
+    """Hold cameras against the contract: form of the images, stamps, reopening, timeouts, stalls.
+
+    Exit code 1 if a part of it is not met.
+    """
+    from nodes.lab.camera_check import CameraBench, check_camera
+    from nodes.lab.camera_tools import parse_source, save_picture, source_document
+    from nodes.lab.plugin_tables import say_code
+
+    met = True
+    for text in sources:
+        say_code(source_document(text, overrides or []).data, Path.cwd())
+        source = parse_source(text, overrides or [])
+        bench = CameraBench(source.camera(), shows=shows or "")
+        print(f"{source.kind}:")
+        findings = check_camera(bench)
+        print_findings(findings)
+        met &= all(finding.met for finding in findings)
+        if out is not None and bench.seen:
+            save_picture(bench.seen[-1].rgb, out)
+            print(f"saved {out}")
+    if not met:
+        raise typer.Exit(_FAILURE_EXIT)
 
 
 @app.command("factory")

@@ -80,7 +80,36 @@ def load_cells(
 
         experiment = load_experiment(file, setting, overrides or [], folder or Path("runs") / setting)
         campaign = campaign_of(experiment, overrides or [], cells(experiment))
+    _know_methods(campaign)
     return campaign, select(campaign.cells, only)
+
+
+def _know_methods(campaign: Campaign) -> None:
+    from nodes.experiment.context import CELLS
+    from nodes.experiment.method_names import know_methods_of
+
+    know_methods_of(campaign.folder / CELLS, {cell.method for cell in campaign.cells})
+
+
+def _say_code(file: Path, setting: str, folder: Path | None, overrides: Sequence[str]) -> None:
+    """Print the code that a run of a file will execute; nothing is executed for it."""
+    from nodes.experiment.campaign.config import is_campaign, load_campaign
+    from nodes.experiment.run import read_setting
+    from nodes.lab.plugin_tables import say_code
+    from nodes.runtime.named_code import with_absolute_code
+
+    if not is_campaign(file):
+        say_code(read_setting(file, setting, overrides).data, file.resolve().parent)
+        return
+    campaign = load_campaign(file, folder, tuple(overrides))
+    named: list[Any] = [{"methods": [cell.code for cell in campaign.cells]}]
+    for scenario in campaign.scenarios.values():
+        inner = (file.parent / scenario.experiment).resolve()
+        # Of the methods only those of the campaign are run.
+        data = read_setting(inner, scenario.setting, scenario.set).data
+        worlds = {key: data[key] for key in ("world", "deploy") if key in data}
+        named += [{"kind": scenario.kind}, with_absolute_code(worlds, inner.parent)]
+    say_code(named, file.resolve().parent)
 
 
 def experiment(
@@ -161,6 +190,7 @@ def experiment(
 
     use_device(device)
     many = is_campaign(file)
+    _say_code(file, setting, folder, overrides or [])
     address = "" if cluster in (None, "auto") else str(cluster)
     backend: Literal["local", "ray"] = "local" if cluster is None else "ray"
     here = not many and jobs is None and cluster is None
@@ -318,6 +348,7 @@ def _show_table(campaign: Campaign, cells: Sequence[Cell], output: Path | None) 
     from nodes.experiment.campaign.plan import statuses
     from nodes.experiment.campaign.published import campaign_table
 
+    _know_methods(campaign)  # titles are kept since cells were run
     found = statuses(campaign, cells)
     full = campaign_table(campaign, found)
     page = _write_and_print(full, campaign.folder, campaign.folder / "cells", output)

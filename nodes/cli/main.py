@@ -25,6 +25,8 @@ from nodes.cli import carla as cli_carla
 from nodes.cli import doctor as cli_doctor
 from nodes.cli import experiment as cli_experiment
 from nodes.cli import keys as cli_keys
+from nodes.cli import lists as cli_lists
+from nodes.cli import method as cli_method
 from nodes.cli import motor as cli_motor
 from nodes.cli import node as cli_node
 from nodes.cli import object as cli_object
@@ -66,6 +68,7 @@ app.add_typer(cli_camera.app, name="camera")
 cli_attack_node.add_to(cli_attack.app)
 cli_attack_poses.add_to(cli_attack.app)
 app.add_typer(cli_attack.app, name="attack")
+app.add_typer(cli_method.app, name="method")
 app.add_typer(cli_object.app, name="object")
 app.add_typer(cli_policy.app, name="policy")
 app.add_typer(cli_scene.app, name="scene")
@@ -76,6 +79,7 @@ cli_start.add_to(app)
 cli_arm.add_to(app)
 cli_doctor.add_to(app)
 cli_experiment.add_to(app)
+cli_lists.add_to(app)
 cli_verify.add_to(app)
 cli_page.add_to(app)
 cli_replay.add_to(app)
@@ -128,10 +132,12 @@ def launch(
     ] = False,
 ) -> None:
     """Start the nodes of a launch file and supervise them. Ctrl-C stops them; a second Ctrl-C kills them."""
+    from nodes.lab.plugin_tables import say_code
     from nodes.launching.launch import Launch
     from nodes.launching.launch_file import load_launch
 
     plan = load_launch(file, overrides or [], host=host)
+    say_code(plan.resolved, file.parent)
     if check:
         _print_plan(plan)
         _say_problems(plan)

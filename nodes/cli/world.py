@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from nodes.runtime.terminal import Overrides, print_table, table
+from nodes.runtime.terminal import Overrides, print_findings, print_table, table
 from nodes.runtime.termination import ends_in_order
 
 app = typer.Typer(
@@ -38,19 +38,17 @@ def world_check(
     Exit code 1 if a part of it is not met.
     """
     from advnerf_core.documents import Document
+    from nodes.lab.plugin_tables import say_code
     from nodes.lab.worlds.check import check_world
     from nodes.lab.worlds.named import read_world
     from nodes.runtime.config import apply_overrides
 
     document = Document({"kind": world}, "command line")
     apply_overrides(document, overrides or [])
+    say_code({"world": document.data}, Path.cwd())
     with ends_in_order():
         findings = check_world(read_world(document, Path.cwd()), pictures, only or [])
-    rows = table("part", "state", "found")
-    for finding in findings:
-        state = "[green]met[/]" if finding.met else "[red]not met[/]"
-        rows.add_row(finding.name, state, finding.text.replace("[", r"\["))
-    print_table(rows)
+    print_findings(findings)
     if not all(finding.met for finding in findings):
         raise typer.Exit(_FAILURE_EXIT)
 

@@ -29,6 +29,7 @@ from nodes.experiment.context import Experiment
 from nodes.experiment.drives import learned_drives, totals
 from nodes.experiment.frozen import frozen_for, hardness_before
 from nodes.experiment.learned_scene import baked_file, load_field, scene_sha256
+from nodes.experiment.method_names import keep_title
 from nodes.experiment.policy import HARDENED, victim_file, victims
 from nodes.experiment.request.telling import telling
 from nodes.experiment.search_files import ATTACK, SEARCHED
@@ -241,6 +242,7 @@ def _search(
         wanted_of["objective"] = objective_key(objective)
     settings_hash = hash_of(wanted_of)
     method = load_method(cell.code)
+    keep_title(folder.parent, cell.method, method.title)
     settings = search_settings(experiment, method)
     told = telling(method.evaluations(problem, settings), report, objective=problem.objective)
     run = SearchRun(cell.seed, folder / _STATE, told, settings_hash)

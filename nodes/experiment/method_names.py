@@ -1,8 +1,11 @@
-"""Names of methods, objectives and architectures in experiment, campaign and request files: checked where they stand, and absolute for other processes."""
+"""Names of methods, objectives and architectures in experiment, campaign and request files: checked where they stand, and absolute for other processes.
+
+The title that a user's method brings is kept beside the cells that it searched: pages show it without executing the method.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -11,9 +14,10 @@ from pydantic_core import PydanticCustomError
 
 from advnerf_core.attack.methods import require_method
 from advnerf_core.attack.objectives import require_objective
+from advnerf_core.files import write_atomically
 from advnerf_core.plugins import PluginError, absolute_reference
 from advnerf_core.policies.architecture import require_architecture
-from advnerf_core.report.conditions import CONTROLS
+from advnerf_core.report.conditions import CONTROLS, know_methods
 from advnerf_core.strict import COMPLETE
 
 
@@ -44,3 +48,17 @@ ConditionReference = Annotated[str, AfterValidator(_checked_condition)]
 
 ObjectiveReference = Annotated[str, AfterValidator(_checked(require_objective))]
 """An objective as `advnerf_core.attack.objectives.load_objective` takes it; ``file.py:Class`` becomes absolute. Nothing is loaded."""
+
+_TITLES = "titles"
+
+
+def keep_title(cells_folder: Path, name: str, title: str) -> None:
+    """Write down what readers call a method; nothing if it has no title."""
+    if title:
+        write_atomically(cells_folder / _TITLES / name, title)
+
+
+def know_methods_of(cells_folder: Path, names: Iterable[str]) -> None:
+    """Give methods of one table colours of their own, and the titles that are kept beside its cells."""
+    kept = sorted((cells_folder / _TITLES).glob("*"))
+    know_methods(names, {file.name: file.read_text(encoding="utf-8") for file in kept})

@@ -21,6 +21,7 @@ from nodes.experiment.attack import cells, load_found, load_shown
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import CELLS, Experiment
 from nodes.experiment.keys import driven_folder
+from nodes.experiment.method_names import know_methods_of
 from nodes.experiment.overview import from_above
 from nodes.experiment.policy import HARDENED
 from nodes.experiment.spaces import dress, make_space, shown_there
@@ -42,6 +43,7 @@ def run(experiment: Experiment, folder: Path, report: Report, notes: Sequence[st
         report: Progress callback.
         notes: Paragraphs at the top of the page, such as what is left out.
     """
+    know_methods_of(experiment.folder / CELLS, experiment.config.attack.method_names)
     if experiment.config.deploy.live:
         parts = live_report.make_parts(experiment, folder, report)
         _write(experiment, folder, parts.sections, (*notes, *parts.lead), parts.targets)

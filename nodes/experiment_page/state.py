@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.report.conditions import style_of
+from nodes.experiment.method_names import know_methods_of
 from nodes.experiment.progress_record import read_progress
 from nodes.experiment_page import shown_files
 from nodes.experiment_page.cells import cell_part
@@ -27,6 +28,7 @@ def read_state(folder: Path, now_s: float) -> dict[str, Any]:
     record = read_progress(folder)
     if not record:
         return {"name": folder.name, "phase": "waiting", "parts": [], "curves": [], "searches": []}
+    know_methods_of(folder / _CELLS, {cell["method"] for cell in record["cells"]})
     stages, cells = _stages(record), _cells(folder, record)
     phase = _phase(record)
     left_s, known = all_left_s(stages, cells, now_s)

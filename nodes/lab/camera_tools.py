@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import datetime
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from advnerf_core.documents import parse_yaml
+from advnerf_core.documents import Document, parse_yaml
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.files import write_atomically
 from advnerf_core.strict import parse_value
 from calibration.schema import CameraCalibration, load_calibration
 from hardware.cameras.interface import Frame
@@ -24,6 +26,7 @@ from hardware.cameras.v4l2.port import KernelPort, VideoPort, open_device
 from hardware.cameras.zed.calibration import Rectifier, load_factory_calibration
 from hardware.cameras.zed.exposure import ExtensionUnit, automatic_is_on, read_exposure_lines, read_gain
 from hardware.errors import HardwareError
+from nodes.runtime.config import apply_overrides
 from nodes.runtime.errors import ConfigError
 
 
@@ -90,13 +93,41 @@ class Trial:
     picture: NDArray[np.uint8]
 
 
-def parse_source(text: str) -> Any:
-    """Parse a camera source in YAML, as in a launch file."""
+def source_document(text: str, overrides: Sequence[str] = ()) -> Document:
+    """A camera source in YAML, as in a launch file, or a kind alone.
+
+    Args:
+        text: ``{kind: ..., key: value}``, or ``KIND``.
+        overrides: ``key=value`` texts.
+    """
     try:
         document = parse_yaml(text, "source")
     except ConfigError as error:
         raise ConfigError(f"expected YAML such as '{{kind: v4l2, device: ...}}': {error}") from None
-    return parse_value(CameraSource, document)
+    if isinstance(document.data, str):
+        document.data = {"kind": document.data}
+    apply_overrides(document, overrides)
+    return document
+
+
+def parse_source(text: str, overrides: Sequence[str] = ()) -> Any:
+    """The settings of a camera source; arguments as of `source_document`."""
+    return parse_value(CameraSource, source_document(text, overrides))
+
+
+def save_picture(rgb: NDArray[np.uint8], file: Path) -> None:
+    """Write an image ``[H, W, 3]``.
+
+    Raises:
+        CameraToolError: The file name does not end as one of an image does.
+    """
+    try:
+        done, data = cv2.imencode(file.suffix, rgb[:, :, ::-1])
+    except cv2.error:
+        done = False
+    if not done:
+        raise CameraToolError(f"expected a file name that ends in .png or .jpg; got {file}")
+    write_atomically(file, data.tobytes())
 
 
 def try_source(source: Any, frames: int = 50, timeout_s: float = 10.0) -> Trial:

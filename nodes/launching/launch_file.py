@@ -16,6 +16,7 @@ from nodes.launching.launch_hosts import choose_host
 from nodes.launching.launch_schema import LaunchFile, NodeEntry, RecordEntry
 from nodes.runtime.config import apply_overrides
 from nodes.runtime.errors import ConfigError, TopicError
+from nodes.runtime.named_code import with_absolute_code
 from nodes.runtime.paths import bus_folder, shipped
 from nodes.runtime.topics import status_topic
 
@@ -72,7 +73,7 @@ def load_launch(
     twin = shipped("calibration/twin") if twin_calibration is None else twin_calibration
     own = {"run_dir": str(run_dir), "socket_dir": socket_dir, "twin_calibration": str(twin)}
     params = {**(document.data.get("params") or {}), **own}
-    document.data = _substitute(document.data, params, document, ())
+    document.data = with_absolute_code(_substitute(document.data, params, document, ()), file.parent)
     launch = validate(LaunchFile, document)
     if launch.record is not False:
         _add_recorder(document, launch)
@@ -105,7 +106,7 @@ def _read_with_includes(file: Path, above: tuple[Path, ...]) -> Document:
         included = _read_with_includes(file.parent / entry, (*above, file.resolve()))
         base.data = _merge(base.data, included.data)
         base.places |= included.places
-    base.data = _merge(base.data, document.data)
+    base.data = _merge(base.data, with_absolute_code(document.data, file.parent))
     base.places |= document.places
     return base
 

@@ -61,7 +61,7 @@ def load_node_config(model: type[M], node: str, path: Path | None, overrides: Se
         }
         document = Document(document.data["config"], document.source, typing.cast("dict[Key, str]", places))
     apply_overrides(document, overrides)
-    return validate(model, document)
+    return validate(model, document, None if path is None else Path(path).parent)
 
 
 def node_document(document: Document) -> dict[str, Any]:

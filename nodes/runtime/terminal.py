@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, Protocol
 
 import typer
 
@@ -72,6 +73,22 @@ Topics = Annotated[
 ]
 
 
+class ContractFinding(Protocol):
+    """One line of the report of a check, as `nodes.lab.findings.Finding`."""
+
+    @property
+    def name(self) -> str:
+        """Part of the contract."""
+
+    @property
+    def met(self) -> bool:
+        """Whether it is met."""
+
+    @property
+    def text(self) -> str:
+        """What was found."""
+
+
 def table(*columns: str) -> Table:
     """Make an empty table without lines."""
     from rich.table import Table
@@ -92,3 +109,12 @@ def print_table(full: Table) -> None:
 def say_error(text: str) -> None:
     """Print an error as one line."""
     print(f"error: {' '.join(text.split())}", file=sys.stderr, flush=True)
+
+
+def print_findings(findings: Sequence[ContractFinding]) -> None:
+    """Print what a check of a plug-in found, a line for each part of its contract."""
+    rows = table("part", "state", "found")
+    for finding in findings:
+        state = "[green]met[/]" if finding.met else "[red]not met[/]"
+        rows.add_row(finding.name, state, finding.text.replace("[", r"\["))
+    print_table(rows)

@@ -7,25 +7,60 @@ from pathlib import Path
 
 import pytest
 
-from advnerf_core.plugins import PluginError, absolute_reference, is_file_reference, known_names, resolve
+from advnerf_core.plugins import (
+    PluginError,
+    absolute_reference,
+    is_file_reference,
+    known_names,
+    require_known,
+    resolve,
+)
 
 GROUP = "advnerf.test_things"
 BUILT_IN = {"gradient": lambda: "the gradient", "random": lambda: "the random one"}
 
 
-def install(folder: Path, monkeypatch: pytest.MonkeyPatch, value: str, body: str) -> None:
+def install(
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    value: str,
+    body: str,
+    name: str = "spiral",
+    package: str = "stranger-things",
+) -> None:
     """A package with one entry point, as pip leaves it behind."""
     (folder / "stranger_things.py").write_text(body)
-    info = folder / "stranger_things-1.0.dist-info"
+    info = folder / f"{package.replace('-', '_')}-1.0.dist-info"
     info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger-things\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(f"[{GROUP}]\nspiral = {value}\n")
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[{GROUP}]\n{name} = {value}\n")
     monkeypatch.syspath_prepend(str(folder))
     monkeypatch.delitem(sys.modules, "stranger_things", raising=False)
 
 
-def test_a_built_in_name_wins(tmp_path: Path) -> None:
+def test_a_built_in_name_is_loaded() -> None:
     assert resolve("gradient", "attack method", BUILT_IN, GROUP) == "the gradient"
+
+
+def test_a_package_cannot_take_a_built_in_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    install(tmp_path, monkeypatch, "stranger_things:SPIRAL", "raise SystemError\n", name="gradient")
+    message = "gradient: expected one attack method of this name, got 2: of advnerf and of stranger-things 1.0; remove"
+    with pytest.raises(PluginError, match=message):
+        resolve("gradient", "attack method", BUILT_IN, GROUP)
+    with pytest.raises(PluginError, match=message):
+        require_known("gradient", "attack method", BUILT_IN, GROUP)
+    assert resolve("random", "attack method", BUILT_IN, GROUP) == "the random one"
+    assert known_names(BUILT_IN, GROUP) == ("gradient", "random")
+
+
+def test_two_packages_cannot_have_one_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for package in ("stranger-things", "other-things"):
+        install(tmp_path, monkeypatch, "stranger_things:SPIRAL", "raise SystemError\n", package=package)
+    with pytest.raises(
+        PluginError,
+        match=r"spiral: expected one .* got 2: of (other-things 1.0 and of stranger|stranger-things 1.0 and of other)-things 1.0",
+    ):
+        resolve("spiral", "attack method", BUILT_IN, GROUP)
 
 
 def test_an_unknown_name_gets_the_valid_ones_and_the_nearest() -> None:

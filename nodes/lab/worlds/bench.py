@@ -18,25 +18,6 @@ TICK_S = 0.1
 DRIVEN_S = 6.0
 
 
-class NotMet(Exception):
-    """A world does not keep a part of the contract; the text says what was expected, what was found, and what to change."""
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One line of the report.
-
-    Attributes:
-        name: What was looked at.
-        met: Whether the world keeps this part of the contract.
-        text: What was found, with numbers; if it is not met what to change.
-    """
-
-    name: str
-    met: bool
-    text: str
-
-
 @dataclass(frozen=True)
 class Bench:
     """An open world under test.

@@ -14,7 +14,8 @@ from advnerf_core.files import write_atomically
 from advnerf_core.geometry import planar_pose
 from advnerf_core.plugins import unknown
 from hardware.worlds.world import NativePanels, NotOpenError, World, WorldDescription, traits_of
-from nodes.lab.worlds.bench import Bench, Check, Finding, NotMet
+from nodes.lab.findings import Finding, NotMet, look
+from nodes.lab.worlds.bench import Bench, Check
 from nodes.lab.worlds.driving import (
     expert_keeps_its_lane,
     is_put_down,
@@ -44,6 +45,8 @@ _CHECKS: tuple[tuple[str, Check], ...] = (
     ("paths", paths_are_drivable),
     ("expert", expert_keeps_its_lane),
 )
+# What a world says itself, such as that its server is gone.
+_OF_THE_WORLD = (AdvnerfError,)
 # Of worlds that take panels into their own scene.
 _PANELS: tuple[str, Check] = ("panels", panels_are_native)
 
@@ -72,21 +75,24 @@ def check_world(named: NamedWorld, pictures: Path | None = None, only: Collectio
     with named.make() as world:
         described = world.describe()
         findings.append(
-            _look(
+            look(
                 _DESCRIPTION,
                 lambda bench: _is_consistent(bench, closed),
                 Bench(named, world, described, None),
+                _OF_THE_WORLD,
             )
         )
         bench = Bench(named, world, described, traits_of(world).step_s)
         for name, check in _FIRST:
-            findings.append(_look(name, check, bench))
+            findings.append(look(name, check, bench, _OF_THE_WORLD))
             if not findings[-1].met:
                 return findings
         if pictures is not None:
             _write_pictures(bench, pictures)
         wanted = (*_CHECKS, _PANELS) if isinstance(world, NativePanels) else _CHECKS
-        findings += [_look(name, check, bench) for name, check in wanted if not only or name in only]
+        findings += [
+            look(name, check, bench, _OF_THE_WORLD) for name, check in wanted if not only or name in only
+        ]
     return findings
 
 
@@ -96,17 +102,6 @@ def _described(world: World) -> WorldDescription | None:
         return world.describe()
     except NotOpenError:
         return None
-
-
-def _look(name: str, check: Check, bench: Bench) -> Finding:
-    try:
-        return Finding(name, True, check(bench))
-    except NotMet as reason:
-        return Finding(name, False, str(reason))
-    except AdvnerfError:
-        raise  # a server that is gone, and what else a world says itself
-    except Exception as error:  # whatever a stranger's world raises
-        return Finding(name, False, f"raised {type(error).__name__}: {' '.join(str(error).split()):.200}")
 
 
 def _is_consistent(bench: Bench, closed: WorldDescription | None) -> str:

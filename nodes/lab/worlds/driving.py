@@ -10,7 +10,8 @@ import numpy as np
 from advnerf_core.geometry import Array, wrap_angle
 from hardware.worlds.paths import ReferencePath
 from hardware.worlds.world import CarDescription
-from nodes.lab.worlds.bench import Bench, NotMet, pose_of
+from nodes.lab.findings import NotMet
+from nodes.lab.worlds.bench import Bench, pose_of
 from nodes.lab.worlds.expert_drive import as_path, drive_expert, lane_expert
 
 _RESET_TOLERANCE = 1e-4

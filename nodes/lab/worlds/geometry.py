@@ -24,7 +24,8 @@ from advnerf_core.geometry import (
 )
 from hardware.worlds.paths import Pose
 from hardware.worlds.world import Depth
-from nodes.lab.worlds.bench import Bench, NotMet
+from nodes.lab.findings import NotMet
+from nodes.lab.worlds.bench import Bench
 
 # Predicted depth may be off by this share, and colour by so much [grey levels, and of the picture's spread]; points on edges and behind others are.
 _SAME_DEPTH, _LEAST_AGREEMENT, _BETTER_BY = 0.02, 0.75, 0.1

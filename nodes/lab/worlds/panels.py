@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from advnerf_core.geometry import Array, invert_transform, make_transform, planar_pose, rotation_z
 from hardware.worlds.paths import Pose
 from hardware.worlds.world import NativePanels, Panel, Rgb
-from nodes.lab.worlds.bench import Bench, NotMet
+from nodes.lab.findings import NotMet
+from nodes.lab.worlds.bench import Bench
 
 # The panel stands so far ahead of the car, and is so wide and high, in half lanes.
 _AHEAD, _WIDE, _HIGH = 4.0, 1.6, 1.0

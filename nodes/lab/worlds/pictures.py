@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from advnerf_core.geometry import Array, Pinhole, planar_pose
 from hardware.worlds.world import Rgb, traits_of
-from nodes.lab.worlds.bench import Bench, NotMet, pose_of
+from nodes.lab.findings import NotMet
+from nodes.lab.worlds.bench import Bench, pose_of
 
 # A picture of one colour is no picture [grey levels].
 _LEAST_SPREAD = 1.0

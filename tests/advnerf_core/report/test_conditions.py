@@ -2,10 +2,11 @@
 
 import subprocess
 import sys
+from contextvars import copy_context
 from pathlib import Path
 
 from advnerf_core.report import plots
-from advnerf_core.report.conditions import CONDITIONS, SPARE, order_of, style_of
+from advnerf_core.report.conditions import CONDITIONS, SPARE, know_methods, order_of, style_of
 from advnerf_core.report.data import LossCurve, ReportData
 from advnerf_core.report.live_parts import live_parts
 from advnerf_core.report.palette import DARK, LIGHT
@@ -33,7 +34,40 @@ def test_a_stranger_is_called_by_its_name_and_keeps_its_colour_in_every_process(
         [sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd=ROOT, timeout=600
     )
     assert done.stdout.strip() == style.key
-    assert len({style_of(f"method{k}").key for k in range(100)}) == len(SPARE)
+    assert len({style_of(f"method{k}").key for k in range(100)}) == 6
+
+
+def test_strangers_of_one_table_never_share_a_colour_and_keep_it_in_any_order():
+    names = [f"method{k}" for k in range(len(SPARE))]
+    assert len({style_of(name).light for name in names}) < len(names)
+
+    def shown(order, titles=None):
+        know_methods((*order, "gradient"), titles)
+        return {name: style_of(name) for name in names}
+
+    styles = copy_context().run(shown, names)
+    for values in zip(
+        *((each.light, each.dark, each.marker, each.key) for each in styles.values()), strict=True
+    ):
+        assert len(set(values)) == len(names)
+    assert copy_context().run(shown, names[::-1]) == styles
+    titled = copy_context().run(shown, names, {"method3": "my best"})
+    assert [titled[name].title for name in names[2:5]] == ["method2", "my best", "method4"]
+    assert style_of("gradient") is CONDITIONS["gradient"]
+    assert style_of("method3").title == "method3"  # outside of that context
+
+
+def test_a_smaller_part_of_a_known_table_changes_no_colour():
+    names = [f"method{k}" for k in range(12)]
+
+    def shown():
+        know_methods(names)
+        before = [style_of(name) for name in names]
+        know_methods(names[5:])
+        return before, [style_of(name) for name in names]
+
+    before, after = copy_context().run(shown)
+    assert before == after
 
 
 def test_tables_have_built_in_methods_first_then_strangers_by_name_then_special_drives():

@@ -9,7 +9,7 @@ import pytest
 from hardware.cameras.interface import Camera
 from hardware.cameras.steady import SteadyCamera
 from hardware.errors import DeviceNotFound, LinkLost
-from nodes.runtime.inbox import Inbox, ReaderThread
+from nodes.lab.camera_check import CHECKS, CameraBench
 from tests.support.camera_rigs import RIGS
 
 DRIVEN = [name for name, kind in RIGS.items() if kind.driven]
@@ -45,6 +45,20 @@ def first_frame(rig, read):
     raise AssertionError("no frame")
 
 
+@pytest.mark.parametrize("check", CHECKS)
+@every()
+def test_every_driver_keeps_the_contract(rig, check):
+    bench = CameraBench(rig.camera, rig.produce)
+    assert CHECKS[check](bench)
+    with pytest.raises(LinkLost, match=r"call open\(\) first"):
+        rig.camera.read(0.01)
+
+
+@every()
+def test_drivers_derive_from_the_interface(rig):
+    assert Camera in type(rig.camera).__mro__
+
+
 @every()
 def test_missing_device_is_one_clear_error(rig, tmp_path):
     camera = rig.missing(tmp_path)
@@ -53,24 +67,6 @@ def test_missing_device_is_one_clear_error(rig, tmp_path):
     assert len(str(caught.value)) > 20
     assert "\n" not in str(caught.value)
     camera.close()
-
-
-@every()
-def test_reading_what_is_not_open(rig):
-    with pytest.raises(LinkLost, match=r"call open\(\) first"):
-        rig.camera.read(0.01)
-    rig.camera.open()
-    rig.camera.close()
-    with pytest.raises(LinkLost, match=r"call open\(\) first"):
-        rig.camera.read(0.01)
-
-
-@every()
-def test_closing_is_harmless_at_any_time(rig):
-    rig.camera.close()
-    rig.camera.open()
-    rig.camera.close()
-    rig.camera.close()
 
 
 @every()
@@ -84,19 +80,12 @@ def test_opening_twice_begins_anew(rig):
 
 
 @every()
-def test_frames_have_their_shape_and_stamps_that_rise_on_both_clocks(rig):
+def test_frames_have_their_size_no_gaps_and_new_pixels(rig):
     rig.camera.open()
     frames = [next_frame(rig) for _ in range(4)]
-    now_real, now_mono = time.time_ns(), time.monotonic_ns()
     for frame in frames:
         assert (frame.rgb.shape, frame.rgb.dtype) == (rig.shape, np.uint8)
-        assert frame.rgb.flags.c_contiguous
-        assert not frame.rgb.flags.writeable
-        assert abs((frame.stamp_realtime_ns - frame.stamp_mono_ns) - (now_real - now_mono)) < 20_000_000
-        assert 0 <= now_mono - frame.stamp_mono_ns < 1_000_000_000
     for before, after in itertools.pairwise(frames):
-        assert after.stamp_mono_ns > before.stamp_mono_ns
-        assert after.stamp_realtime_ns > before.stamp_realtime_ns
         assert after.sequence == before.sequence + 1
         assert after.rgb.mean() != before.rgb.mean()
 
@@ -121,14 +110,6 @@ def test_slow_consumer_of_a_recording_gets_no_burst(rig):
     while time.monotonic() - begin < 0.05:
         count += rig.camera.read(0.005) is not None
     assert 1 <= count <= (time.monotonic() - begin) * rig.rate_hz + 2
-
-
-@every(DRIVEN)
-def test_read_gives_up_in_time(rig):
-    rig.camera.open()
-    begin = time.monotonic()
-    assert rig.camera.read(0.03) is None
-    assert 0.02 < time.monotonic() - begin < 10.0
 
 
 def read_often(camera):
@@ -208,35 +189,6 @@ def test_unplugged_device_is_tried_again_with_growing_pauses_until_it_is_back(ri
     assert first_frame(rig, camera.read)
     assert camera.error == ""
     camera.close()
-
-
-@every()
-def test_one_read_thread_carries_every_driver(rig):
-    inbox: Inbox = Inbox(capacity=2)
-    camera = SteadyCamera(rig.camera)
-    reader = ReaderThread(lambda: camera.read(0.02), inbox, "camera")
-    reader.start()
-    got, deadline = [], time.monotonic() + 60.0
-    while len(got) < 3 and time.monotonic() < deadline:
-        if camera.counters()["camera_reopened"] == 0 and camera._is_open:
-            rig.produce()
-        got += inbox.take()
-        time.sleep(0.005)
-    reader.stop()
-    camera.close()
-    inbox.close()
-    assert len(got) >= 3
-    assert [frame.stamp_mono_ns for frame in got] == sorted({frame.stamp_mono_ns for frame in got})
-
-
-@every()
-def test_drivers_fulfil_the_whole_contract(rig):
-    assert Camera in type(rig.camera).__mro__
-    rig.camera.open()
-    next_frame(rig)
-    assert all(isinstance(value, int | float) for value in rig.camera.counters().values())
-    pinhole = rig.camera.pinhole
-    assert pinhole is None or (pinhole.height, pinhole.width) == rig.shape[:2]
 
 
 def test_picture_that_repeats_itself_is_a_stall(tmp_path):

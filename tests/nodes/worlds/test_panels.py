@@ -7,7 +7,8 @@ import pytest
 
 from advnerf_core.geometry import make_transform, rotation_y, rotation_z
 from hardware.worlds.world import NativePanels, Panel, Rgb
-from nodes.lab.worlds.bench import Bench, NotMet
+from nodes.lab.findings import NotMet
+from nodes.lab.worlds.bench import Bench
 from nodes.lab.worlds.named import NamedWorld
 from nodes.lab.worlds.panels import panels_are_native
 from tests.support.remote.flat_world import FlatConfig, FlatWorld

@@ -1,0 +1,113 @@
+"""Cameras that users bring: an entry point of the group ``advnerf.cameras``, or ``file.py:Class``.
+
+The class derives from `hardware.cameras.interface.Camera`. Its attribute ``Config``, a pydantic model or a dataclass, holds the keys
+that stand beside ``kind``; the class is called with it. See docs/cameras.md.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any, NoReturn
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from advnerf_core.plugins import PluginError, require_known, resolve
+from advnerf_core.strict import COMPLETE, strict_validator
+from hardware.cameras.interface import Camera
+from hardware.cameras.source import Source
+
+GROUP = "advnerf.cameras"
+_PAGE = "docs/cameras.md"
+
+
+class ForeignSource(Source):
+    """A camera that is not one of ours.
+
+    Attributes:
+        kind: Entry point or ``file.py:Class``, as the user wrote it.
+        camera_class: What it stands for.
+        config: Its checked ``Config``.
+    """
+
+    kind: str
+    camera_class: Any
+    config: Any
+
+    def camera(self) -> Camera:
+        """Make the camera."""
+        made: Camera = self.camera_class(self.config)
+        return made
+
+    def period_s(self) -> float:
+        """Time between two frames by the key ``rate_hz``, if the camera has one [s]."""
+        rate_hz = getattr(self.config, "rate_hz", None)
+        return 1.0 / rate_hz if rate_hz else 0.0
+
+
+def foreign_source(
+    written: Mapping[str, Any], built_in: Collection[str], folder: Path | None = None
+) -> ForeignSource | None:
+    """The settings of a camera that is not one of ours.
+
+    Args:
+        written: The section ``source``: ``kind``, the camera's own keys, and those of every source.
+        built_in: Kinds that this project brings.
+        folder: Folder that a relative ``file.py`` is relative to; the working folder if it is not given.
+
+    Returns:
+        The settings; None for a built-in kind.
+
+    Raises:
+        ValidationError: There is no such camera, it cannot be loaded, or one of its keys is unknown or wrong.
+    """
+    kind = written["kind"]
+    try:
+        require_known(kind, "camera", built_in, GROUP, folder)
+        if kind in built_in:
+            return None
+        found = find_camera(kind, folder)
+    except PluginError as error:
+        _refuse("kind", str(error), kind)
+    common = {name: value for name, value in written.items() if name in Source.model_fields}
+    own = {name: value for name, value in written.items() if name not in (*common, "kind")}
+    names = _keys_of(found.Config)
+    for name, value in own.items():
+        if name not in names:
+            known = sorted((*names, "kind", *Source.model_fields))
+            _refuse(name, f"unknown key of this camera; valid keys here: {', '.join(known)}", value)
+    config = strict_validator(found.Config).validate_python(own, context={"folder": folder})
+    return ForeignSource(kind=kind, camera_class=found, config=config, **common)
+
+
+def find_camera(name: str, folder: Path | None = None) -> Any:
+    """The class that a camera's name stands for.
+
+    Raises:
+        PluginError: There is none, it cannot be loaded, or it is no class with a ``Config``.
+    """
+    found: Any = resolve(name, "camera", {}, GROUP, folder)
+    config = getattr(found, "Config", None)
+    is_model = inspect.isclass(config) and (issubclass(config, BaseModel) or dataclasses.is_dataclass(config))
+    if not inspect.isclass(found) or Camera not in found.__mro__ or not is_model:
+        raise PluginError(
+            f"camera {name}: expected a class that derives from Camera and has an attribute Config, a pydantic model or a dataclass;"
+            f" got {found!r:.80}; see {_PAGE}"
+        )
+    return found
+
+
+def _keys_of(config: Any) -> list[str]:
+    if issubclass(config, BaseModel):
+        return [each.alias or name for name, each in config.model_fields.items()]
+    return [each.name for each in dataclasses.fields(config) if each.init]
+
+
+def _refuse(key: str, message: str, value: Any) -> NoReturn:
+    problem = PydanticCustomError(COMPLETE, "{text}", {"text": message})
+    raise ValidationError.from_exception_data(
+        "source", [InitErrorDetails(type=problem, loc=(key,), input=value)]
+    )

@@ -1,0 +1,45 @@
+"""The command ``advnerf list``: what can be named in files and commands."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from nodes.runtime.terminal import print_table, say_error, table
+
+_FAILURE_EXIT = 1
+
+
+def list_command(
+    what: Annotated[
+        str,
+        typer.Argument(
+            metavar="WHAT", help="methods, policies, worlds, cameras, ...; see the error of a wrong one."
+        ),
+    ],
+) -> None:
+    """List what can be named: built in, and of installed packages, with one line each and where it comes from.
+
+    Exit code 1 if two things have one name.
+    """
+    from advnerf_core.plugins import PluginError, unknown
+    from nodes.lab.plugin_tables import TABLES, names_twice, rows_of
+
+    if what not in TABLES:
+        raise PluginError(unknown(what, "list", TABLES))
+    found = rows_of(TABLES[what])
+    rows = table("name", "from", "what it is")
+    for row in found:
+        rows.add_row(row.name, row.origin, row.line.replace("[", r"\["))
+    print_table(rows)
+    problems = names_twice(found)
+    for problem in problems:
+        say_error(problem)
+    if problems:
+        raise typer.Exit(_FAILURE_EXIT)
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("list")(list_command)

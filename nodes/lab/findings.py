@@ -1,0 +1,49 @@
+"""What a check of a plug-in against its contract reports: one finding for each part of the contract."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
+
+T = TypeVar("T")
+
+
+class NotMet(Exception):
+    """A part of the contract is not met; the text says what was expected, what was found, and what to change."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report.
+
+    Attributes:
+        name: Part of the contract.
+        met: Whether it is met.
+        text: What was found, with numbers; if it is not met what to change.
+    """
+
+    name: str
+    met: bool
+    text: str
+
+
+def look(
+    name: str, check: Callable[[T], str], bench: T, lets_through: tuple[type[Exception], ...] = ()
+) -> Finding:
+    """The finding of one check.
+
+    Args:
+        name: Part of the contract.
+        check: Returns what was found, or raises `NotMet`.
+        bench: What it looks at.
+        lets_through: Errors that end the whole report. Any other error is a part that is not met.
+    """
+    try:
+        return Finding(name, True, check(bench))
+    except NotMet as reason:
+        return Finding(name, False, str(reason))
+    except lets_through:
+        raise
+    except Exception as error:  # a plug-in may raise anything
+        return Finding(name, False, f"raised {type(error).__name__}: {' '.join(str(error).split()):.200}")

@@ -1,0 +1,68 @@
+"""`advnerf method check`: what a method promises, met by ours and by the page's, and what is wrong is found."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from advnerf_core.attack.methods import METHODS, MethodError
+from nodes.cli.main import app
+from nodes.lab.method_check import CHECKS, check_method
+from tests.support.strangers import spiral_code
+
+SLOW = ("guided", "distilled")
+
+
+@pytest.mark.parametrize("name", ["random", "cem", "gradient"])
+def test_a_built_in_method_keeps_the_contract(name: str) -> None:
+    findings = check_method(name)
+    assert [finding.name for finding in findings] == list(CHECKS)
+    assert [finding for finding in findings if not finding.met] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", [name for name in METHODS if name not in ("random", "cem", "gradient", *SLOW)]
+)
+def test_every_built_in_method_keeps_the_contract(name: str) -> None:
+    assert [finding for finding in check_method(name) if not finding.met] == []
+
+
+def test_the_command_says_what_it_executes_and_takes_options(tmp_path: Path) -> None:
+    file = tmp_path / "spiral.py"
+    file.write_text(spiral_code())
+    done = CliRunner().invoke(app, ["method", "check", f"{file}:Spiral", "--set", "turns=0.3"])
+    assert done.exit_code == 0, done.output
+    assert f"executes {file}:Spiral (sha256 " in done.output
+    assert done.output.count(" met ") == len(CHECKS)
+    with pytest.raises(MethodError, match=r"options.turn: expected .* of turns, growth; got 'turn'"):
+        check_method(f"{file}:Spiral", {"turn": 1.0})
+
+
+@pytest.mark.parametrize(
+    ("part", "before", "after", "message"),
+    [
+        ("budget", "< settings.evaluations", "<= settings.evaluations", "expected 6 evaluations, as Method.evaluations says, got 7"),
+        ("budget", "return state.result()", "raise KeyError('x')", "raised KeyError: 'x'"),
+        ("result", "return state.result()", "r = state.result(); return type(r)(r.theta, r.history[0], r.history)", "expected the best evaluation"),
+        ("seeds", ".manual_seed(run.seed)", ".manual_seed(0)", "expected other textures from seed 4"),
+        ("seeds", ", generator=torch.Generator().manual_seed(run.seed)", "", "the same bytes from the same seed"),
+        ("resuming", "begin(run.state_path, fingerprint, dict)", "begin(None, fingerprint, dict)", "expected 5 evaluations after 1, got 6"),
+        ("state file", "seed=run.seed, ", "", "another seed"),
+        ("state file", ", hash=run.settings_hash", "", "another settings_hash"),
+        ("needs", "evaluate_theta(problem", "adjoint_gradient(problem, theta); evaluate_theta(problem", "needs_gradient=True"),
+        ("writes", "return state.result()", "open('/tmp/h8_left_behind', 'w').close(); return state.result()", "got /tmp/h8_left_behind"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_found(tmp_path: Path, part: str, before: str, after: str, message: str) -> None:
+    code = spiral_code()
+    assert before in code
+    left = tmp_path.parent / "left_behind"
+    code = code.replace(before, after).replace("/tmp/h8_left_behind", str(left))
+    file = tmp_path / "spiral.py"
+    file.write_text("from advnerf_core.attack.adjoint import adjoint_gradient\n" + code)
+    (found,) = [finding for finding in check_method(f"{file}:Spiral") if finding.name == part]
+    assert not found.met
+    assert message.replace("/tmp/h8_left_behind", str(left)) in found.text
