@@ -38,13 +38,13 @@ from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.scene.bake import bake
 from advnerf_core.scene.surrogate import BackgroundRenderer
 from benchmarks.results import REPOSITORY, record_row
-from nodes.experiment import bake as bake_stage
-from nodes.experiment.attack import attack_problem, search_settings
-from nodes.experiment.context import Experiment
-from nodes.experiment.drives import deployed_drives
-from nodes.experiment.faces import PaintedScene, face_space
-from nodes.experiment.learned_scene import load_background, load_field
-from nodes.experiment.policy import HARDENED, NAIVE, victim_file
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.drives import deployed_drives
+from nodes.experiment.show.faces import PaintedScene, face_space
+from nodes.experiment.show.learned_scene import load_background, load_field
+from nodes.experiment.steps import bake as bake_stage
+from nodes.experiment.steps.attack import attack_problem, search_settings
+from nodes.experiment.steps.policy import HARDENED, NAIVE, victim_file
 
 COMMAND = "python -m benchmarks.baked_scene"
 _VIEWS, _EXCESS_M, _MOST_EVALUATIONS, _ITERATIONS, _SEEDS = 200, 0.15, 60, 50, 3

@@ -30,7 +30,7 @@ from hardware.worlds.lab.config import CarConfig, LabConfig, MonitorOpticsConfig
 from hardware.worlds.lab.lab import Lab
 from hardware.worlds.lab.lab_world import LabWorld
 from hardware.worlds.lab.vehicle import TwinVehicle
-from nodes.experiment import screen
+from nodes.experiment.show import screen
 
 COMMAND = "python -m benchmarks.calibrations"
 MOCAP_M, MOCAP_RAD, PIXEL_STDDEV = 0.0005, 0.001, 1.5

@@ -15,8 +15,8 @@ from pathlib import Path
 from statistics import median
 
 from benchmarks.results import record_row
-from nodes.experiment.campaign.config import load_campaign
-from nodes.experiment.campaign.run import Options, run_campaign
+from nodes.experiment.run.config import load_campaign
+from nodes.experiment.run.run import Options, run_campaign
 
 COMMAND = "python -m benchmarks.campaign_scaling runs/full"
 _FILE = """name: scaling

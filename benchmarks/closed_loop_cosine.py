@@ -24,9 +24,9 @@ from advnerf_core.attack.health import closed_loss
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from benchmarks.results import REPOSITORY, record_row
-from nodes.experiment.request.check import in_double
-from nodes.experiment.request.prepare import Prepared, prepare
-from nodes.experiment.request.request import AttackRequest, load_request
+from nodes.experiment.node.check import in_double
+from nodes.experiment.node.prepare import Prepared, prepare
+from nodes.experiment.node.request import AttackRequest, load_request
 
 COMMAND = "python -m benchmarks.closed_loop_cosine RUN_FOLDER"
 HORIZONS = (10, 20, 40, 60)

@@ -25,11 +25,11 @@ from advnerf_core.scene.surrogate import Surrogate
 from benchmarks.results import record_row
 from benchmarks.ticks import hydrants
 from benchmarks.timing import seconds_in_turns
-from nodes.experiment.attack import attack_problem
-from nodes.experiment.context import Experiment
-from nodes.experiment.faces import face_space
-from nodes.experiment.learned_scene import load_background
-from nodes.experiment.policy import HARDENED, victim_file
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.faces import face_space
+from nodes.experiment.show.learned_scene import load_background
+from nodes.experiment.steps.attack import attack_problem
+from nodes.experiment.steps.policy import HARDENED, victim_file
 
 _STEPS, _REPEATS, _DRIVES = 40, 5, (1, 16)
 _ITERATION = "attack iteration of 40 ticks on a GPU, against the processor"

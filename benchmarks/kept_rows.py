@@ -12,7 +12,7 @@ from advnerf_core.report.evidence.verifying.numbers import same
 from benchmarks import gap, predictions, retraining, transfer_table
 from benchmarks.kept_commands import kept_by
 from benchmarks.results import REPOSITORY, LedgerRow
-from nodes.experiment.run import load_experiment
+from nodes.experiment.steps.run import load_experiment
 
 PUBLISHED = REPOSITORY / "docs" / "results"
 _COMPARED = ("value", "unit", "target", "met", "note")

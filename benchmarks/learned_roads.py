@@ -19,8 +19,8 @@ from advnerf_core.driving.metrics import mean_cte_limit_m
 from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.report.cells import read_cell
 from benchmarks.results import record_row
-from nodes.experiment.context import Experiment
-from nodes.experiment.policy import HARDENED, agreement, victim_file
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.steps.policy import HARDENED, agreement, victim_file
 
 _LEAST_DB, _MOST_SHARE, _MOST_MIN = 25.0, 0.02, 60.0
 

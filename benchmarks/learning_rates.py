@@ -17,9 +17,9 @@ from advnerf_core.scene.presets import PHOTOGRAPH_BANDS, scene_preset
 from advnerf_core.scene.train import train_scene
 from benchmarks.exposure import compare
 from benchmarks.results import record_row
-from nodes.experiment import capture
-from nodes.experiment.context import Experiment
-from nodes.experiment.scene import field_config
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.steps import capture
+from nodes.experiment.steps.scene import field_config
 
 WAYS = (("exponential", 0.01), ("cosine", 0.01), ("cosine", 0.02), ("cosine", 0.03))
 _EVERY, _MOST_HELD_OUT = 8, 12

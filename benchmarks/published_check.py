@@ -21,8 +21,8 @@ from benchmarks.first_build import page_text
 from benchmarks.kept_rows import computed_again, counts, row_problems
 from benchmarks.page_numbers import count_numbers
 from benchmarks.results import PAGE, REPOSITORY, read_rows, write_pages
-from nodes.experiment.campaign.admission import gate_file, gate_key
-from nodes.experiment.campaign.config import Campaign, load_campaign
+from nodes.experiment.run.admission import gate_file, gate_key
+from nodes.experiment.run.config import Campaign, load_campaign
 
 PUBLISHED = REPOSITORY / "docs" / "results"
 _TARGET = re.compile(r"(>=|<=|>|<) ?(\d[\d,]*(?:\.\d+)?)(?![\d^])")

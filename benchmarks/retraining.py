@@ -14,9 +14,9 @@ from typing import Any
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from benchmarks.results import REPOSITORY, record_row
-from nodes.experiment import retrain_plot
-from nodes.experiment.context import Experiment
-from nodes.experiment.run import load_experiment
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.steps import retrain_plot
+from nodes.experiment.steps.run import load_experiment
 
 _TARGET = 1.1
 

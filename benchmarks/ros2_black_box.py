@@ -28,7 +28,7 @@ from benchmarks.rclpy_peer import RclpyPeer
 from benchmarks.results import REPOSITORY, record_row
 from calibration.schema import RoomCalibration, load_calibration
 from hardware.worlds.lab.lab_world import LabWorld
-from nodes.experiment.deployed import DressedScene, SelfDriving, drive_deployed
+from nodes.experiment.show.deployed import DressedScene, SelfDriving, drive_deployed
 from nodes.lab.ros2_policy import ros2_policy
 
 COMMAND = "python -m benchmarks.ros2_black_box RUN_FOLDER ATTACK_FILE ONNX_FILE"

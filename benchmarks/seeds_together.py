@@ -22,10 +22,10 @@ from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.search.together import gradient_attacks
 from advnerf_core.policies.pilotnet import load_policy
 from benchmarks.results import record_row
-from nodes.experiment.attack import attack_problem
-from nodes.experiment.context import Experiment
-from nodes.experiment.faces import face_space
-from nodes.experiment.policy import HARDENED, victim_file
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.faces import face_space
+from nodes.experiment.steps.attack import attack_problem
+from nodes.experiment.steps.policy import HARDENED, victim_file
 
 _ITERATIONS, _REPEATS = 6, 3
 _BATCH, _IN_A_ROW, _BESIDE = "one batch", "one after the other", "beside each other"

@@ -27,13 +27,13 @@ from advnerf_core.objects.voxel.mesh import stand
 from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.scene.surrogate import Surrogate
 from benchmarks.timing import seconds_in_turns
-from nodes.experiment.attack import attack_problem
-from nodes.experiment.config import ExperimentConfig
-from nodes.experiment.context import Experiment
-from nodes.experiment.learned_scene import load_background
-from nodes.experiment.policy import HARDENED, victim_file
-from nodes.experiment.space_config import FaceConfig
-from nodes.experiment.spaces import make_space
+from nodes.experiment.plan.config import ExperimentConfig
+from nodes.experiment.plan.space_config import FaceConfig
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.learned_scene import load_background
+from nodes.experiment.show.spaces import make_space
+from nodes.experiment.steps.attack import attack_problem
+from nodes.experiment.steps.policy import HARDENED, victim_file
 
 STEPS, OBJECTS = 40, (1, 5)
 

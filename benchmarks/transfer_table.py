@@ -21,11 +21,11 @@ from advnerf_core.report.transfer_page import ran_into_something
 from advnerf_core.report.transfer_prediction import skill_of, skill_text
 from advnerf_core.report.transfer_targets import VICTIM, TableTarget, table_targets
 from benchmarks.results import LedgerRow
-from nodes.experiment.campaign.admission import gate_file, gate_key
-from nodes.experiment.campaign.config import load_campaign
-from nodes.experiment.campaign.plan import PUBLISHED
-from nodes.experiment.campaign.predictions import predicted, prediction_file
-from nodes.experiment.campaign.published import published_table
+from nodes.experiment.run.admission import gate_file, gate_key
+from nodes.experiment.run.config import load_campaign
+from nodes.experiment.run.plan import PUBLISHED
+from nodes.experiment.run.predictions import predicted, prediction_file
+from nodes.experiment.run.published import published_table
 
 CAMPAIGN = Path("launch/paper.campaign.yaml")
 # Of targets that are missed: what was tried, and what it points to.

@@ -17,14 +17,14 @@ import numpy as np
 from advnerf_core.driving.metrics import drives, mean_cte_limit_m
 from advnerf_core.policies.pilotnet import Policy, load_policy
 from benchmarks.results import REPOSITORY, record_row
-from nodes.experiment.context import Experiment
-from nodes.experiment.deployed import Dressed
-from nodes.experiment.drives import deployed_drives
-from nodes.experiment.elsewhere import place_elsewhere
-from nodes.experiment.native import stand_in
-from nodes.experiment.objects import placed_objects
-from nodes.experiment.policy import HARDENED, victim_file
-from nodes.experiment.run import load_experiment
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.deployed import Dressed
+from nodes.experiment.show.drives import deployed_drives
+from nodes.experiment.show.native import stand_in
+from nodes.experiment.show.objects import placed_objects
+from nodes.experiment.steps.elsewhere import place_elsewhere
+from nodes.experiment.steps.policy import HARDENED, victim_file
+from nodes.experiment.steps.run import load_experiment
 
 ROADS = (("CS", 201), ("SC", 202), ("CC", 203), ("CSC", 204), ("SCS", 205))
 _FILE = REPOSITORY / "launch" / "metadrive.experiment.yaml"

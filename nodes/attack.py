@@ -22,8 +22,8 @@ from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
 from advnerf_core.strict import StrictModel
-from nodes.experiment.request.job import REQUEST, Job, Said, is_begun
-from nodes.experiment.request.request import parse_request, request_text
+from nodes.experiment.node.job import REQUEST, Job, Said, is_begun
+from nodes.experiment.node.request import parse_request, request_text
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.messages import header, image_message, types
 from nodes.runtime.node import ACTIVE, READY, Inbox, MessageInfo, Node, NodeContext, Now, Out

@@ -22,8 +22,8 @@ WIRE = {
     "hardware/worlds/remote.py": 1,  # replies of a world's server
     "hardware/worlds/servers/serve.py": 1,  # runs in the server's own environment
     "calibration/colmap_messages.py": 2,  # lines of our COLMAP process
-    "nodes/experiment/campaign/worker.py": 1,  # a job on standard input
-    "nodes/experiment/request/job.py": 1,  # lines of a search process
+    "nodes/experiment/run/worker.py": 1,  # a job on standard input
+    "nodes/experiment/node/job.py": 1,  # lines of a search process
     "nodes/lab/doctor/check.py": 1,  # a probe's answer
     "nodes/lab/doctor/priority.py": 1,  # a child's answer
     "nodes/lab/doctor/probes.py": 1,  # a probe's arguments
@@ -51,7 +51,7 @@ HEADERS = {  # text in the header of a tensor file or archive that our own write
     "advnerf_core/scene/baked.py": 3,
     "advnerf_core/scene/field.py": 3,
     "advnerf_core/scene/train.py": 1,
-    "nodes/experiment/request/worker.py": 2,
+    "nodes/experiment/node/worker.py": 2,
     "nodes/experiment_page/searches.py": 1,
     "nodes/operator_page/pictures.py": 1,
 }
@@ -59,11 +59,11 @@ OWN = {  # text that the same function has just written, or already read as a wh
     "advnerf_core/learning/retrain.py": 1,
     "advnerf_core/report/evidence/verifying/numbers.py": 1,
     "benchmarks/retraining.py": 1,
-    "nodes/experiment/campaign/published.py": 1,
-    "nodes/experiment/cell_kind.py": 1,
-    "nodes/experiment/context.py": 1,
-    "nodes/experiment/run.py": 1,
-    "nodes/experiment/stages.py": 1,
+    "nodes/experiment/run/published.py": 1,
+    "nodes/experiment/run/cell_kind.py": 1,
+    "nodes/experiment/show/context.py": 1,
+    "nodes/experiment/steps/run.py": 1,
+    "nodes/experiment/engine/stages.py": 1,
     "nodes/lab/carla/capture.py": 1,
     "nodes/lab/trials/plan.py": 1,
     "nodes/lab/worlds/check.py": 2,

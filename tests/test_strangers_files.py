@@ -11,7 +11,7 @@ from advnerf_core.errors import ConfigError
 from advnerf_core.policies.contract import PolicyContractError, declaration_beside
 from advnerf_core.strict import validate
 from calibration.schema import CalibrationError, RoomCalibration, VehicleCalibration, load_calibration
-from nodes.experiment.request.request import parse_request
+from nodes.experiment.node.request import parse_request
 from nodes.lab.policy_data.frames import frames_of_log
 from nodes.policy import PolicyConfig
 

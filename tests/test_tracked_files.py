@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from nodes.experiment.campaign.set_film import MOST_BYTES
+from nodes.experiment.run.set_film import MOST_BYTES
 
 ROOT = Path(__file__).parents[1]
 MOST_TRACKED_BYTES = 70_000_000

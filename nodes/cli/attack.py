@@ -28,7 +28,7 @@ def attack_run(
 ) -> None:
     """Search as a request asks, for each of its seeds; ends in one attack file per seed."""
     from advnerf_core.attack.device import use_device
-    from nodes.experiment.request.request import load_request
+    from nodes.experiment.node.request import load_request
     from nodes.lab.plugin_tables import say_code
 
     use_device(device)
@@ -44,7 +44,7 @@ def attack_resume(
 ) -> None:
     """Go on with a search that was stopped or killed; on the same device to the bit."""
     from advnerf_core.attack.device import use_device
-    from nodes.experiment.request.search import kept_request
+    from nodes.experiment.node.search import kept_request
     from nodes.lab.plugin_tables import say_code
 
     use_device(device)
@@ -54,9 +54,9 @@ def attack_resume(
 
 
 def _run(folder: Path, request: object) -> None:
-    from nodes.experiment.request.printed import print_attacks
-    from nodes.experiment.request.request import AttackRequest
-    from nodes.experiment.request.search import run_attack
+    from nodes.experiment.node.printed import print_attacks
+    from nodes.experiment.node.request import AttackRequest
+    from nodes.experiment.node.search import run_attack
     from nodes.runtime.errors import ConfigError
     from nodes.runtime.locks import HeldError, hold
     from nodes.runtime.progress import ProgressDisplay
@@ -82,7 +82,7 @@ def attack_show(
 ) -> None:
     """Say what an attack file holds; write the face's texture as PNG and found meshes as GLB."""
     from advnerf_core.attack.artifact import load_attack
-    from nodes.experiment.request.printed import export_attack
+    from nodes.experiment.node.printed import export_attack
 
     attack = load_attack(file)
     total, clean, face = attack.predicted_total_cte_m, attack.clean_drive, attack.face
@@ -159,7 +159,7 @@ def attack_print(
     """Write a face's or panel's texture at its true size: a PDF in tiles with marks to cut and glue, or one PNG."""
     from advnerf_core.attack.artifact import load_attack
     from advnerf_core.attack.printing.poster import poster_of
-    from nodes.experiment.request.printed import write_poster
+    from nodes.experiment.node.printed import write_poster
 
     poster = poster_of(load_attack(file), name, size_m)
     target = output or file.with_name(f"{file.name.partition('.')[0]}.poster.pdf")
@@ -182,8 +182,8 @@ def attack_check(
     overrides: Overrides = None,
 ) -> None:
     """Say whether the gradient can be trusted for this scene, policy and objects; exit code 1 if it cannot."""
-    from nodes.experiment.request.check import check, write_check
-    from nodes.experiment.request.request import load_request
+    from nodes.experiment.node.check import check, write_check
+    from nodes.experiment.node.request import load_request
     from nodes.lab.plugin_tables import say_code
     from nodes.runtime.progress import ProgressDisplay
 

@@ -32,8 +32,8 @@ def attack_request(
     overrides: Overrides = None,
 ) -> None:
     """Ask the attack node of a running launch for an attack; the compositor takes it over when it is found."""
-    from nodes.experiment.request.client import ask_for_attack, new_request_id
-    from nodes.experiment.request.request import load_request
+    from nodes.experiment.node.client import ask_for_attack, new_request_id
+    from nodes.experiment.node.request import load_request
     from nodes.launching.watching import find_run_dir
 
     request = load_request(file, overrides or [])
@@ -60,7 +60,7 @@ def attack_cancel(
     reason: Annotated[str, typer.Option("--reason", help="Why, for the record.")] = "",
 ) -> None:
     """End the search of a running attack node; what was found so far stays in its folder."""
-    from nodes.experiment.request.client import cancel_attack
+    from nodes.experiment.node.client import cancel_attack
     from nodes.launching.watching import find_run_dir
 
     print(in_words(cancel_attack(find_run_dir(run_dir), request_id, reason)))

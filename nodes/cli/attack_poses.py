@@ -29,9 +29,9 @@ FoundAttack = Annotated[
 def attack_poses(file: RequestFile, output: Output = None, overrides: Overrides = None) -> None:
     """Search for where objects should stand, alone or with their colours; the same command goes on after a kill."""
     from advnerf_core.attack.artifact import load_attack
-    from nodes.experiment.request.poses import run_poses
-    from nodes.experiment.request.printed import print_attacks
-    from nodes.experiment.request.request import load_request
+    from nodes.experiment.node.poses import run_poses
+    from nodes.experiment.node.printed import print_attacks
+    from nodes.experiment.node.request import load_request
     from nodes.runtime.progress import ProgressDisplay
 
     request = load_request(file, overrides or [])
@@ -56,8 +56,8 @@ def attack_landscape(
     """Map the total CTE over where one object stands: landscape.json and landscape.png; goes on after a kill."""
     import numpy as np
 
-    from nodes.experiment.request.pose_maps import make_landscape
-    from nodes.experiment.request.request import load_request
+    from nodes.experiment.node.pose_maps import make_landscape
+    from nodes.experiment.node.request import load_request
     from nodes.runtime.progress import ProgressDisplay
 
     request = load_request(file, overrides or [])
@@ -82,8 +82,8 @@ def attack_robustness(
     """Map what an attack does from other starts and with an object moved: robustness.json and .png; goes on after a kill."""
     import numpy as np
 
-    from nodes.experiment.request.pose_maps import make_robustness
-    from nodes.experiment.request.request import load_request
+    from nodes.experiment.node.pose_maps import make_robustness
+    from nodes.experiment.node.request import load_request
     from nodes.runtime.progress import ProgressDisplay
 
     request = load_request(file, overrides or [])

@@ -18,12 +18,12 @@ from nodes.runtime.termination import ends_in_order
 
 if TYPE_CHECKING:
     from advnerf_core.report.transfer import TransferTable
-    from nodes.experiment.campaign.config import Campaign
-    from nodes.experiment.campaign.published import PublishedBuild
-    from nodes.experiment.campaign.run import Options
-    from nodes.experiment.campaign.worker import Ended
-    from nodes.experiment.cell import Cell
-    from nodes.experiment.progress_record import ProgressRecord
+    from nodes.experiment.engine.progress_record import ProgressRecord
+    from nodes.experiment.plan.cell import Cell
+    from nodes.experiment.run.config import Campaign
+    from nodes.experiment.run.published import PublishedBuild
+    from nodes.experiment.run.run import Options
+    from nodes.experiment.run.worker import Ended
 
 File = Annotated[
     Path,
@@ -69,14 +69,14 @@ def load_cells(
 ) -> tuple[Campaign, list[Cell]]:
     """The cells of a file, all and those that are wanted."""
     os.environ.setdefault("MUJOCO_GL", "egl")
-    from nodes.experiment.campaign.config import campaign_of, is_campaign, load_campaign
-    from nodes.experiment.cell import select
+    from nodes.experiment.plan.cell import select
+    from nodes.experiment.run.config import campaign_of, is_campaign, load_campaign
 
     if is_campaign(file):
         campaign = load_campaign(file, folder, tuple(overrides or ()))
     else:
-        from nodes.experiment.attack import cells
-        from nodes.experiment.run import load_experiment
+        from nodes.experiment.steps.attack import cells
+        from nodes.experiment.steps.run import load_experiment
 
         experiment = load_experiment(file, setting, overrides or [], folder or Path("runs") / setting)
         campaign = campaign_of(experiment, overrides or [], cells(experiment))
@@ -85,16 +85,16 @@ def load_cells(
 
 
 def _know_methods(campaign: Campaign) -> None:
-    from nodes.experiment.context import CELLS
-    from nodes.experiment.method_names import know_methods_of
+    from nodes.experiment.plan.method_names import know_methods_of
+    from nodes.experiment.show.context import CELLS
 
     know_methods_of(campaign.folder / CELLS, {cell.method for cell in campaign.cells})
 
 
 def _say_code(file: Path, setting: str, folder: Path | None, overrides: Sequence[str]) -> None:
     """Print the code that a run of a file will execute; nothing is executed for it."""
-    from nodes.experiment.campaign.config import is_campaign, load_campaign
-    from nodes.experiment.run import read_setting
+    from nodes.experiment.run.config import is_campaign, load_campaign
+    from nodes.experiment.steps.run import read_setting
     from nodes.lab.plugin_tables import say_code
     from nodes.runtime.named_code import with_absolute_code
 
@@ -184,8 +184,8 @@ def experiment(
     """Run an experiment, from the photographs to the report: every stage and every cell that is not there yet. It may be stopped at any time."""
     os.environ.setdefault("MUJOCO_GL", "egl")
     from advnerf_core.attack.device import use_device
-    from nodes.experiment.campaign.config import is_campaign
-    from nodes.experiment.campaign.run import Options
+    from nodes.experiment.run.config import is_campaign
+    from nodes.experiment.run.run import Options
     from nodes.runtime.errors import ConfigError
 
     use_device(device)
@@ -219,8 +219,8 @@ def _run_one(
     anew: bool,
     port: int | None,
 ) -> None:
-    from nodes.experiment.run import load_experiment
-    from nodes.experiment.whole import run_experiment
+    from nodes.experiment.run.whole import run_experiment
+    from nodes.experiment.steps.run import load_experiment
 
     with ends_in_order():
         loaded = load_experiment(file, setting, overrides, folder)
@@ -243,7 +243,7 @@ def _run_one(
 def _run_many(
     file: Path, folder: Path | None, only: str, options: Options, overrides: list[str] | None
 ) -> None:
-    from nodes.experiment.campaign.run import run_campaign
+    from nodes.experiment.run.run import run_campaign
 
     campaign, cells = load_cells(file, "", folder, overrides, only)
     with ends_in_order():
@@ -269,7 +269,7 @@ def status(
     overrides: Overrides = None,
 ) -> None:
     """Say which cells are done, running, failed (and why), made with other settings, or missing."""
-    from nodes.experiment.campaign.plan import statuses
+    from nodes.experiment.run.plan import statuses
 
     campaign, cells = load_cells(file, setting, folder, overrides, only)
     found = statuses(campaign, cells)
@@ -345,8 +345,8 @@ def _page_folder(campaign: Campaign) -> Path:
 
 
 def _show_table(campaign: Campaign, cells: Sequence[Cell], output: Path | None) -> None:
-    from nodes.experiment.campaign.plan import statuses
-    from nodes.experiment.campaign.published import campaign_table
+    from nodes.experiment.run.plan import statuses
+    from nodes.experiment.run.published import campaign_table
 
     _know_methods(campaign)  # titles are kept since cells were run
     found = statuses(campaign, cells)
@@ -359,7 +359,7 @@ def _show_table(campaign: Campaign, cells: Sequence[Cell], output: Path | None) 
 
 
 def _show_published(campaign: Campaign, cells: Sequence[Cell], output: Path | None, folder: Path) -> None:
-    from nodes.experiment.campaign.published import published_table
+    from nodes.experiment.run.published import published_table
 
     full = published_table(folder, campaign, list(cells))
     # Films are not published; those of the campaign's own cells may be of other drives.
@@ -376,8 +376,8 @@ def _write_and_print(
     from advnerf_core.report.transfer_page import target_table, text_table
     from advnerf_core.report.transfer_prediction import prediction_section, prediction_table, skill_text
     from advnerf_core.report.transfer_targets import table_targets
-    from nodes.experiment.campaign.predictions import predicted
-    from nodes.experiment.table import write_table
+    from nodes.experiment.pages.table import write_table
+    from nodes.experiment.run.predictions import predicted
 
     pairs = predicted(folder, list(full.cells.values()))
     page = None
@@ -415,7 +415,7 @@ def predict(
 ) -> None:
     """Predict how the attacks transfer from pictures without a deployed drive with them; the table then says how good that was."""
     os.environ.setdefault("MUJOCO_GL", "egl")
-    from nodes.experiment.campaign.predictions import predict_campaign
+    from nodes.experiment.run.predictions import predict_campaign
 
     campaign, cells = load_cells(file, setting, folder, overrides, only)
     with ends_in_order():
@@ -433,7 +433,7 @@ def maps(
 ) -> None:
     """Draw the loss landscape and the robustness map (starts x moves of an object) of finished cells that have placed objects."""
     os.environ.setdefault("MUJOCO_GL", "egl")
-    from nodes.experiment.campaign.maps import map_cells
+    from nodes.experiment.run.maps import map_cells
 
     campaign, cells = load_cells(file, setting, folder, overrides, only)
     for picture in map_cells(campaign, cells, number):
@@ -481,11 +481,11 @@ def publish(
     from advnerf_core.report.evidence.publishing import write_page, write_set
     from advnerf_core.report.evidence.verifying import victims
     from advnerf_core.report.evidence.verifying.digests import write_beside
-    from nodes.experiment.campaign.plan import statuses
-    from nodes.experiment.campaign.published import publish as copy_cells
-    from nodes.experiment.campaign.published import publish_build
-    from nodes.experiment.campaign.set_film import write_film
-    from nodes.experiment.campaign.store import NOT_DRIVEN
+    from nodes.experiment.run.plan import statuses
+    from nodes.experiment.run.published import publish as copy_cells
+    from nodes.experiment.run.published import publish_build
+    from nodes.experiment.run.set_film import write_film
+    from nodes.experiment.run.store import NOT_DRIVEN
     from nodes.runtime.errors import ConfigError
 
     campaign, cells = load_cells(file, setting, folder, overrides, only)

@@ -341,8 +341,8 @@ def _calibration(model: Any, given: Path | None, bags: list[Path], name: str) ->
 
 
 def _surrogate(folder: Path, file: Path, setting: str, view: PolicyView) -> SourcePlan:
-    from nodes.experiment.policy import surrogate_plan
-    from nodes.experiment.run import load_experiment
+    from nodes.experiment.steps.policy import surrogate_plan
+    from nodes.experiment.steps.run import load_experiment
     from nodes.runtime.errors import ConfigError
 
     run = load_experiment(file, setting, [], folder)

@@ -53,9 +53,9 @@ def gate(
     os.environ.setdefault("MUJOCO_GL", "egl")
     from advnerf_core.report.conditions import NONE
     from advnerf_core.scene.gate_limits import GateLimits
-    from nodes.experiment.campaign.gate import judge_scene
-    from nodes.experiment.cell import Cell
-    from nodes.experiment.kinds import load_kind
+    from nodes.experiment.plan.cell import Cell
+    from nodes.experiment.run.gate import judge_scene
+    from nodes.experiment.run.kinds import load_kind
 
     found = load_kind(kind)
     experiment = found.load(file, setting, overrides or [], run_folder or Path("runs") / setting)

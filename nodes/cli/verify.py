@@ -32,8 +32,8 @@ def register(
 ) -> None:
     """Write down what an experiment will run, and which tests will be claimed, before anything is run."""
     from advnerf_core.report.evidence.registration import FILE
-    from nodes.experiment.campaign.config import is_campaign
-    from nodes.experiment.campaign.registering import register as write_registration
+    from nodes.experiment.run.config import is_campaign
+    from nodes.experiment.run.registering import register as write_registration
 
     campaign, cells = load_cells(file, setting, folder, overrides, only)
     shown = "" if is_campaign(file) else setting
@@ -64,7 +64,7 @@ def verify(
     from advnerf_core.report.evidence.kept_build import LOST, is_kept
     from advnerf_core.report.evidence.verify import SetError, sets_in, verify_beside, verify_set
     from advnerf_core.report.evidence.verifying.pictures import picture_problems
-    from nodes.experiment.campaign.kept_attacks import with_attacks
+    from nodes.experiment.run.kept_attacks import with_attacks
 
     known = sets_in(published)
     if name is not None and name not in known:
@@ -139,7 +139,7 @@ def _ledger(published: Path) -> int:
 def _redrive(folder: Path, count: int, seed: int) -> int:
     """Drive some cells of a set again; how many came out otherwise."""
     from advnerf_core.report.evidence.registration import read_registration
-    from nodes.experiment.campaign.redrive import TOLERANCE_M, redrive
+    from nodes.experiment.run.redrive import TOLERANCE_M, redrive
 
     registration = read_registration(folder)
     assert registration is not None, "the set was verified"

@@ -10,9 +10,9 @@ from types import TracebackType
 from typing import TypeVar
 
 from advnerf_core.run_module import module_command
-from nodes.experiment.attack import planned_evaluations
-from nodes.experiment.context import Experiment
-from nodes.experiment.progress_record import ProgressRecord
+from nodes.experiment.engine.progress_record import ProgressRecord
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.steps.attack import planned_evaluations
 from nodes.experiment_page.server import HOST, PACKAGES
 from nodes.operator_page.listening import bound_socket, require_packages
 

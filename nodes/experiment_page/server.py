@@ -18,7 +18,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from nodes.experiment.progress_record import read_progress
+from nodes.experiment.engine.progress_record import read_progress
 from nodes.experiment_page import shown_files
 from nodes.experiment_page.searches import has_texture, read_search, texture_png
 from nodes.experiment_page.state import cell_names, read_state, report_is_shown

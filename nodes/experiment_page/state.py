@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.report.conditions import style_of
-from nodes.experiment.method_names import know_methods_of
-from nodes.experiment.progress_record import read_progress
+from nodes.experiment.engine.progress_record import read_progress
+from nodes.experiment.plan.method_names import know_methods_of
 from nodes.experiment_page import shown_files
 from nodes.experiment_page.cells import cell_part
 from nodes.experiment_page.searches import Search, has_texture, read_search

@@ -14,9 +14,9 @@ from advnerf_core.attack.artifact import attack_from_bytes, load_attack
 from advnerf_core.geometry import make_transform, planar_pose, rotation_z
 from nodes.attack import AttackConfig, AttackNode, Sender
 from nodes.cli.attack_node import in_words
-from nodes.experiment.request import job, search
-from nodes.experiment.request.client import ask_for_attack, cancel_attack, new_request_id
-from nodes.experiment.request.request import load_request, request_text
+from nodes.experiment.node import job, search
+from nodes.experiment.node.client import ask_for_attack, cancel_attack, new_request_id
+from nodes.experiment.node.request import load_request, request_text
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import ManualClock, Now, SystemClock
 from nodes.runtime.errors import LaunchError
@@ -320,7 +320,7 @@ def _wait(bus, condition, timeout_s=300.0):
 
 
 def test_without_a_node_the_commands_say_so_whoever_else_listens(tmp_path, monkeypatch):
-    monkeypatch.setattr("nodes.experiment.request.client._ANSWER_S", 0.3)
+    monkeypatch.setattr("nodes.experiment.node.client._ANSWER_S", 0.3)
     with pytest.raises(LaunchError, match=r"the attack node did not answer within 0\.3 s"):
         cancel_attack(tmp_path, "", "")
     with Bus(tmp_path) as recorder:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from nodes.experiment.context import Experiment
+    from nodes.experiment.show.context import Experiment
 
 ROOT = Path(__file__).parents[2]
 RECORDED = ROOT / "tests" / "nodes" / "experiment" / "versions.json"
@@ -41,10 +41,11 @@ def measured(folder: Path) -> dict[str, dict[str, Any]]:
     from advnerf_core.objects.voxel.build import build_from_mesh
     from advnerf_core.objects.voxel.generators import GENERATORS
     from advnerf_core.objects.voxel.mesh import stand
-    from nodes.experiment import keys, objects
-    from nodes.experiment.cell import Cell
-    from nodes.experiment.cells import ExperimentCells
-    from nodes.experiment.run import VERSIONS, make_ready
+    from nodes.experiment.plan.cell import Cell
+    from nodes.experiment.run.cells import ExperimentCells
+    from nodes.experiment.show import objects
+    from nodes.experiment.steps import keys
+    from nodes.experiment.steps.run import VERSIONS, make_ready
 
     experiment = tiny_experiment(folder)
     make_ready(experiment)
@@ -82,7 +83,7 @@ def tiny_experiment(folder: Path, changes: Sequence[str] = ()) -> Experiment:
         folder: The run folder.
         changes: More ``key=value`` texts.
     """
-    from nodes.experiment.run import load_experiment
+    from nodes.experiment.steps.run import load_experiment
 
     return load_experiment(ROOT / "launch" / "room.experiment.yaml", "demo", [*TINY, *changes], folder)
 

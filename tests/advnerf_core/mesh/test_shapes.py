@@ -177,7 +177,7 @@ def problem():
     return AttackProblem(_Wheel().eval(), sensor, Ackermann(0.3, 1.0, 0.1, (-0.4, 0.4)), path, starts, 8)
 
 
-@pytest.mark.slow  # its parts are in the other tests here, and nodes/experiment/request resumes shapes by default
+@pytest.mark.slow  # its parts are in the other tests here, and nodes/experiment/node resumes shapes by default
 def test_an_attack_on_shapes_gains_and_resumes_to_the_bit(problem, tmp_path, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "2")  # sums over samples keep their order all the same
     rate = problem.sensor.limits.learning_rate

@@ -9,8 +9,8 @@ from advnerf_core.driving.path import Path
 from advnerf_core.objects.voxel.build import build_from_mesh
 from advnerf_core.objects.voxel.generators import GENERATORS
 from hardware.worlds.lab.config import LabConfig
-from nodes.experiment.faces import FACE_OFFSET_M
-from nodes.experiment.request.request import load_request
+from nodes.experiment.node.request import load_request
+from nodes.experiment.show.faces import FACE_OFFSET_M
 
 EXAMPLE = pathlib.Path(__file__).parents[3] / "launch" / "corner.attack.yaml"
 

@@ -12,11 +12,11 @@ from advnerf_core.data.image_files import write_image
 from advnerf_core.objects.mesh.engine import MeshEngineError, engine
 from advnerf_core.objects.mesh.glb import read_glb
 from nodes.cli import main as cli
-from nodes.experiment.request.check import check
-from nodes.experiment.request.prepare import prepare
-from nodes.experiment.request.printed import export_attack
-from nodes.experiment.request.request import load_request
-from nodes.experiment.request.search import run_attack
+from nodes.experiment.node.check import check
+from nodes.experiment.node.prepare import prepare
+from nodes.experiment.node.printed import export_attack
+from nodes.experiment.node.request import load_request
+from nodes.experiment.node.search import run_attack
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
 from tests.support.strangers import write_spiral

@@ -10,10 +10,10 @@ from advnerf_core.attack.artifact import load_attack
 from advnerf_core.attack.methods import MethodError
 from advnerf_core.attack.search.search import SearchStateError
 from nodes.cli import main as cli
-from nodes.experiment.request.prepare import prepare
-from nodes.experiment.request.request import load_request, parse_request, request_text
-from nodes.experiment.request.search import run_attack
-from nodes.experiment.request.worker import work
+from nodes.experiment.node.prepare import prepare
+from nodes.experiment.node.request import load_request, parse_request, request_text
+from nodes.experiment.node.search import run_attack
+from nodes.experiment.node.worker import work
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
 from tests.support.strangers import install_method, spiral_code, spiral_theta, write_spiral

@@ -7,9 +7,9 @@ import torch
 
 from advnerf_core.attack.adjoint import evaluate
 from advnerf_core.attack.artifact import load_attack
-from nodes.experiment.request.prepare import prepare, request_hash
-from nodes.experiment.request.request import load_request, parse_request, request_text
-from nodes.experiment.request.search import run_attack
+from nodes.experiment.node.prepare import prepare, request_hash
+from nodes.experiment.node.request import load_request, parse_request, request_text
+from nodes.experiment.node.search import run_attack
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
 from tests.support.tiny_request import tiny_request

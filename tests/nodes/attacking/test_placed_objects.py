@@ -6,8 +6,8 @@ import pytest
 from advnerf_core.objects.voxel.generators import hydrant
 from advnerf_core.objects.voxel.model import ObjectModel, save_object
 from advnerf_core.objects.voxel.voxelise import voxelise
-from nodes.experiment.request.objects import place
-from nodes.experiment.request.request import ObjectRequest
+from nodes.experiment.node.objects import place
+from nodes.experiment.node.request import ObjectRequest
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,9 @@ import pytest
 
 from advnerf_core.attack.artifact import load_attack
 from nodes.cli import main as cli
-from nodes.experiment.request.poses import prepare_poses, run_poses
-from nodes.experiment.request.prepare import prepare
-from nodes.experiment.request.request import load_request, request_text
+from nodes.experiment.node.poses import prepare_poses, run_poses
+from nodes.experiment.node.prepare import prepare
+from nodes.experiment.node.request import load_request, request_text
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
 from tests.support.tiny_request import tiny_request
@@ -136,7 +136,7 @@ def test_the_request_says_the_same_again_and_its_hash_knows_the_bounds_but_not_t
     ],
 )
 def test_a_request_that_cannot_be_is_refused(tmp_path, changes, what):
-    from nodes.experiment.request.pose_maps import make_landscape
+    from nodes.experiment.node.pose_maps import make_landscape
 
     if what is None:
         with pytest.raises(ConfigError, match=r"poses.landscape.object: expected 0..0, got 3"):

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from nodes.experiment.request.request import load_request, parse_request, request_text
+from nodes.experiment.node.request import load_request, parse_request, request_text
 from nodes.runtime.errors import ConfigError
 
 LEAST = """\

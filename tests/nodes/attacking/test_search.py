@@ -18,10 +18,10 @@ from advnerf_core.policies.pilotnet import load_policy
 from calibration.display_colour import DisplayCalibration
 from calibration.schema import save_calibration
 from nodes.cli import main as cli
-from nodes.experiment.request.check import check
-from nodes.experiment.request.prepare import prepare
-from nodes.experiment.request.request import load_request
-from nodes.experiment.request.search import attack_file, run_attack
+from nodes.experiment.node.check import check
+from nodes.experiment.node.prepare import prepare
+from nodes.experiment.node.request import load_request
+from nodes.experiment.node.search import attack_file, run_attack
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
 from tests.support.tiny_request import tiny_request

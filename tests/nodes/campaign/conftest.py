@@ -11,7 +11,7 @@ CELLS = """
 import os, time
 from pathlib import Path
 from types import SimpleNamespace
-from nodes.experiment.cell_kind import CellKind
+from nodes.experiment.run.cell_kind import CellKind
 from advnerf_core.documents import read_yaml
 
 def _note(folder, text):

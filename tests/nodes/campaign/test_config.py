@@ -5,10 +5,10 @@ import pytest
 from typer.testing import CliRunner
 
 from nodes.cli.main import app
-from nodes.experiment.campaign.config import load_campaign
-from nodes.experiment.campaign.run import _refuse_two_in_one_folder
-from nodes.experiment.cell import select
-from nodes.experiment.kinds import load_kind
+from nodes.experiment.plan.cell import select
+from nodes.experiment.run.config import load_campaign
+from nodes.experiment.run.kinds import load_kind
+from nodes.experiment.run.run import _refuse_two_in_one_folder
 from nodes.runtime.errors import ConfigError
 
 ROOT = Path(__file__).parents[3]

@@ -16,14 +16,14 @@ from advnerf_core.driving.rollout import drive
 from advnerf_core.scene.gate_limits import GateLimits
 from nodes.cli.experiment import predict
 from nodes.cli.main import app
-from nodes.experiment.campaign.config import load_campaign
-from nodes.experiment.campaign.gate import judge_scene
-from nodes.experiment.campaign.plan import statuses
-from nodes.experiment.campaign.predictions import predict_campaign, predicted
-from nodes.experiment.campaign.run import Options, run_campaign
-from nodes.experiment.cell import Cell
-from nodes.experiment.cell_kind import NoPicturesError
-from nodes.experiment.kinds import load_kind
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.run.cell_kind import NoPicturesError
+from nodes.experiment.run.config import load_campaign
+from nodes.experiment.run.gate import judge_scene
+from nodes.experiment.run.kinds import load_kind
+from nodes.experiment.run.plan import statuses
+from nodes.experiment.run.predictions import predict_campaign, predicted
+from nodes.experiment.run.run import Options, run_campaign
 from nodes.runtime.errors import ConfigError
 
 HEAD = "seeds: [0]\nmethods: [gradient, none]\nvictims: [hardened]\n"

@@ -7,11 +7,11 @@ import torch
 
 from advnerf_core.report.transfer_page import text_table
 from benchmarks.attack_toy import toy_problem
-from nodes.experiment.campaign.config import load_campaign
-from nodes.experiment.campaign.plan import statuses
-from nodes.experiment.campaign.published import campaign_table
-from nodes.experiment.campaign.run import Options, run_campaign
-from nodes.experiment.cell import select
+from nodes.experiment.plan.cell import select
+from nodes.experiment.run.config import load_campaign
+from nodes.experiment.run.plan import statuses
+from nodes.experiment.run.published import campaign_table
+from nodes.experiment.run.run import Options, run_campaign
 from nodes.runtime.errors import ConfigError
 from tests.support.strangers import install_method, spiral_code, spiral_theta, write_spiral
 

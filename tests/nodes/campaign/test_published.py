@@ -9,20 +9,20 @@ from typer.testing import CliRunner
 
 from advnerf_core.report.evidence.registration import RegistrationError
 from nodes.cli.main import app
-from nodes.experiment.campaign.config import load_campaign
-from nodes.experiment.campaign.plan import elsewhere, plan_cells, statuses
-from nodes.experiment.campaign.published import (
+from nodes.experiment.engine.reference import BUILD
+from nodes.experiment.pages.table import write_table
+from nodes.experiment.plan.cell import select
+from nodes.experiment.run.config import load_campaign
+from nodes.experiment.run.plan import elsewhere, plan_cells, statuses
+from nodes.experiment.run.published import (
     Published,
     campaign_table,
     publish,
     publish_build,
     published_table,
 )
-from nodes.experiment.campaign.registering import _refuse_late
-from nodes.experiment.campaign.run import Options, run_campaign
-from nodes.experiment.cell import select
-from nodes.experiment.reference import BUILD
-from nodes.experiment.table import write_table
+from nodes.experiment.run.registering import _refuse_late
+from nodes.experiment.run.run import Options, run_campaign
 from nodes.runtime.errors import ConfigError
 
 

@@ -9,11 +9,11 @@ import time
 
 import pytest
 
-from nodes.experiment.campaign.config import load_campaign
-from nodes.experiment.campaign.plan import statuses
-from nodes.experiment.campaign.run import Options, _shares, run_campaign
-from nodes.experiment.campaign.store import Store
-from nodes.experiment.campaign.worker import take_cell
+from nodes.experiment.run.config import load_campaign
+from nodes.experiment.run.plan import statuses
+from nodes.experiment.run.run import Options, _shares, run_campaign
+from nodes.experiment.run.store import Store
+from nodes.experiment.run.worker import take_cell
 from nodes.runtime.locks import hold
 from tests.support.waiting import wait_for
 

@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image
 
 from advnerf_core.report.clips import ClipTrack, write_clip
-from nodes.experiment.campaign.set_film import MOST_BYTES, write_film
+from nodes.experiment.run.set_film import MOST_BYTES, write_film
 
 # Its searches have the seeds 6 to 11.
 PUBLISHED = Path(__file__).parents[3] / "docs" / "results" / "gap_duckietown_robust"

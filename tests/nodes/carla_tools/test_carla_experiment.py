@@ -8,11 +8,11 @@ import yaml
 
 from advnerf_core.data.dataset import load_transforms
 from advnerf_core.report.clips import read_clip
-from nodes.experiment.cell import Cell
-from nodes.experiment.cell_kind import settings_hash
-from nodes.experiment.kinds import load_kind
-from nodes.experiment.run import load_experiment
-from nodes.experiment.whole import run_experiment
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.run.cell_kind import settings_hash
+from nodes.experiment.run.kinds import load_kind
+from nodes.experiment.run.whole import run_experiment
+from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError
 
 TINY = {

@@ -18,11 +18,11 @@ from hardware.worlds.junction.car import DubinsCar
 from hardware.worlds.junction.config import DubinsConfig, IntersectionConfig
 from hardware.worlds.junction.scene import Intersection
 from hardware.worlds.world import World, WorldDescription
-from nodes.experiment.context import Experiment
-from nodes.experiment.learned_scene import scene_file
-from nodes.experiment.objects import build, object_file
-from nodes.experiment.policy import HARDENED, NAIVE, victim_file
-from nodes.experiment.run import load_experiment
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.learned_scene import scene_file
+from nodes.experiment.show.objects import build, object_file
+from nodes.experiment.steps.policy import HARDENED, NAIVE, victim_file
+from nodes.experiment.steps.run import load_experiment
 from tests.support.stage_versions import measured
 
 LAUNCH = Path(__file__).parents[3] / "launch" / "junction.experiment.yaml"

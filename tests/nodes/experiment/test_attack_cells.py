@@ -20,21 +20,22 @@ from advnerf_core.policies.pilotnet import images_to_tensor, load_policy
 from advnerf_core.report.transfer_page import text_table
 from advnerf_core.scene.surrogate import Surrogate
 from hardware.cameras.effects import CameraEffects
-from nodes.experiment import attack, frozen, page, report, run
-from nodes.experiment.attack import cells, load_shown, surrogate_part
-from nodes.experiment.cell import Cell
-from nodes.experiment.cell_kind import settings_hash
-from nodes.experiment.cells import run_cell, search_cell
-from nodes.experiment.context import Experiment
-from nodes.experiment.deploy import DRIVES, ThroughWorld, cell_data
-from nodes.experiment.films import film_cell
-from nodes.experiment.keys import CellError, cell_inputs, clean_folder
-from nodes.experiment.kinds import load_kind
-from nodes.experiment.learned_scene import load_field
-from nodes.experiment.policy import NAIVE, victim_file
-from nodes.experiment.robustness_config import RobustnessConfig
-from nodes.experiment.shared_search import search_key, take_search
-from nodes.experiment.spaces import colour_space
+from nodes.experiment.pages import page, report
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.plan.robustness_config import RobustnessConfig
+from nodes.experiment.run.cell_kind import settings_hash
+from nodes.experiment.run.cells import run_cell, search_cell
+from nodes.experiment.run.kinds import load_kind
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.learned_scene import load_field
+from nodes.experiment.show.spaces import colour_space
+from nodes.experiment.steps import attack, frozen, run
+from nodes.experiment.steps.attack import cells, load_shown, surrogate_part
+from nodes.experiment.steps.deploy import DRIVES, ThroughWorld, cell_data
+from nodes.experiment.steps.films import film_cell
+from nodes.experiment.steps.keys import CellError, cell_inputs, clean_folder
+from nodes.experiment.steps.policy import NAIVE, victim_file
+from nodes.experiment.steps.shared_search import search_key, take_search
 from nodes.runtime.errors import ConfigError
 from tests.support.strangers import spiral_code, spiral_theta, write_spiral
 

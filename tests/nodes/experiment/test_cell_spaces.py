@@ -17,27 +17,28 @@ from advnerf_core.objects.mesh.engine import MeshEngineError, engine
 from advnerf_core.objects.mesh.glb import mesh_from_glb
 from advnerf_core.report.cells import cell_from
 from advnerf_core.report.clips import ClipTrack, read_clip
-from nodes.experiment import attack, cells, films, pose_maps, run
-from nodes.experiment.attack import surrogate_part
-from nodes.experiment.cell import Cell
-from nodes.experiment.cell_kind import settings_hash
-from nodes.experiment.cells import run_cell
-from nodes.experiment.config import RetrainConfig
-from nodes.experiment.context import Experiment
-from nodes.experiment.deploy import DRIVES, ThroughWorld, cell_data
-from nodes.experiment.keys import CellError
-from nodes.experiment.kinds import load_kind
-from nodes.experiment.page import opening
-from nodes.experiment.policy import victim_file
-from nodes.experiment.pose_maps import PoseMapSettings
-from nodes.experiment.run import load_experiment
-from nodes.experiment.space_config import (
+from nodes.experiment.pages.page import opening
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.plan.config import RetrainConfig
+from nodes.experiment.plan.space_config import (
     ColoursConfig,
     MeshShapeConfig,
     MeshTextureConfig,
     PlacesConfig,
 )
-from nodes.experiment.spaces import make_space, mesh_objects
+from nodes.experiment.run import cells
+from nodes.experiment.run.cell_kind import settings_hash
+from nodes.experiment.run.cells import run_cell
+from nodes.experiment.run.kinds import load_kind
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.spaces import make_space, mesh_objects
+from nodes.experiment.steps import attack, films, pose_maps, run
+from nodes.experiment.steps.attack import surrogate_part
+from nodes.experiment.steps.deploy import DRIVES, ThroughWorld, cell_data
+from nodes.experiment.steps.keys import CellError
+from nodes.experiment.steps.policy import victim_file
+from nodes.experiment.steps.pose_maps import PoseMapSettings
+from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError
 
 PLACES = Cell("right", "hardened", "random", 0)

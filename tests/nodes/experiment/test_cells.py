@@ -3,11 +3,11 @@
 from pathlib import Path
 
 from advnerf_core.attack.methods import METHODS, load_method, method_name
-from nodes.experiment.attack import search_settings
-from nodes.experiment.cell import Cell
-from nodes.experiment.cells import ExperimentCells
-from nodes.experiment.keys import cell_inputs, clean_folder
-from nodes.experiment.run import load_experiment
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.run.cells import ExperimentCells
+from nodes.experiment.steps.attack import search_settings
+from nodes.experiment.steps.keys import cell_inputs, clean_folder
+from nodes.experiment.steps.run import load_experiment
 from tests.support.strangers import write_spiral
 
 LAUNCH = Path(__file__).parents[3] / "launch"

@@ -15,9 +15,9 @@ from advnerf_core.geometry import make_transform
 from advnerf_core.objects.voxel.model import load_object
 from advnerf_core.policies.pilotnet import images_to_tensor
 from advnerf_core.policies.view import PolicyView
-from nodes.experiment.context import Experiment
-from nodes.experiment.deployed import DressedScene, IdealDriving, SelfDriving, drive_deployed
-from nodes.experiment.objects import object_file
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.deployed import DressedScene, IdealDriving, SelfDriving, drive_deployed
+from nodes.experiment.show.objects import object_file
 
 STRAIGHT = Path.from_segments((0.0, 0.0, 0.0), [Line(60.0)], closed=False)
 

@@ -11,9 +11,9 @@ import yaml
 from advnerf_core.driving.expert import Expert
 from advnerf_core.learning.imitation import ImitationConfig, SourcePlan, train_policy
 from advnerf_core.policies.architecture import Architecture
-from nodes.experiment.context import Experiment
-from nodes.experiment.elsewhere import plans_elsewhere
-from nodes.experiment.run import load_experiment
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.steps.elsewhere import plans_elsewhere
+from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError
 from tests.support.remote.flat_world import FlatConfig, FlatWorld
 

@@ -14,9 +14,9 @@ import pytest
 
 from advnerf_core.attack.artifact import load_attack
 from benchmarks.page_client import request
-from nodes.experiment import whole
-from nodes.experiment.cell import Cell
-from nodes.experiment.progress_record import read_progress
+from nodes.experiment.engine.progress_record import read_progress
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.run import whole
 from nodes.experiment_page.page import ExperimentPage, run_with_page
 from nodes.experiment_page.time_left import all_left_s
 from nodes.runtime.errors import BusError

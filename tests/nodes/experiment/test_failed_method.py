@@ -5,8 +5,8 @@ import shutil
 
 from rich.console import Console
 
-from nodes.experiment import whole
-from nodes.experiment.run import load_experiment
+from nodes.experiment.run import whole
+from nodes.experiment.steps.run import load_experiment
 from tests.support.stage_versions import ROOT, TINY
 
 BROKEN = """

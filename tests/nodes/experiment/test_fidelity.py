@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nodes.experiment.campaign.gate import predict_cell
-from nodes.experiment.cell import Cell
-from nodes.experiment.cells import run_cell, search_cell
-from nodes.experiment.context import Experiment
-from nodes.experiment.deployed import DressedScene
-from nodes.experiment.drives import deployed_drives
-from nodes.experiment.kinds import load_kind
-from nodes.experiment.objects import placed_objects
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.run.cells import run_cell, search_cell
+from nodes.experiment.run.gate import predict_cell
+from nodes.experiment.run.kinds import load_kind
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.deployed import DressedScene
+from nodes.experiment.show.drives import deployed_drives
+from nodes.experiment.show.objects import placed_objects
 
 WHICH = Cell("right", "hardened", "random", 0)
 KIND = load_kind("experiment")

@@ -21,17 +21,17 @@ from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.report.clips import read_clip
 from hardware.worlds.junction.config import DubinsConfig
 from hardware.worlds.world import World
-from nodes.experiment.attack import attack_problem, surrogate_part
-from nodes.experiment.cell import Cell
-from nodes.experiment.context import Experiment
-from nodes.experiment.deploy import DRIVES, ThroughWorld, cell_data
-from nodes.experiment.deployed import SelfDriving
-from nodes.experiment.films import film_cell, filmed
-from nodes.experiment.objects import placed_objects, surrogate_of
-from nodes.experiment.policy import HARDENED, victim_file
-from nodes.experiment.run import load_experiment
-from nodes.experiment.search_files import SEARCHED
-from nodes.experiment.spaces import colour_space
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.deployed import SelfDriving
+from nodes.experiment.show.objects import placed_objects, surrogate_of
+from nodes.experiment.show.spaces import colour_space
+from nodes.experiment.steps.attack import attack_problem, surrogate_part
+from nodes.experiment.steps.deploy import DRIVES, ThroughWorld, cell_data
+from nodes.experiment.steps.films import film_cell, filmed
+from nodes.experiment.steps.policy import HARDENED, victim_file
+from nodes.experiment.steps.run import load_experiment
+from nodes.experiment.steps.search_files import SEARCHED
 
 LAUNCH = Path(__file__).parents[3] / "launch" / "junction.experiment.yaml"
 SECONDS, TICKS_S = 2.0, (0.1, 0.01)

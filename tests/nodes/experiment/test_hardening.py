@@ -12,13 +12,13 @@ from advnerf_core.attack.search import textures
 from advnerf_core.fields.colour_grid import colour_grid
 from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.report.evidence.hardness import FILE, HardnessError, read_hardness
-from nodes.experiment.attack import attack_problem, from_measured_starts, past
-from nodes.experiment.cell import Cell
-from nodes.experiment.cells import search_cell
-from nodes.experiment.hardening import judge, margin_m
-from nodes.experiment.policy import HARDENED, victim_file
-from nodes.experiment.search_files import SEARCHED
-from nodes.experiment.spaces import make_space
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.run.cells import search_cell
+from nodes.experiment.show.spaces import make_space
+from nodes.experiment.steps.attack import attack_problem, from_measured_starts, past
+from nodes.experiment.steps.hardening import judge, margin_m
+from nodes.experiment.steps.policy import HARDENED, victim_file
+from nodes.experiment.steps.search_files import SEARCHED
 
 STARTS, TEXTURES = 3, 2
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from nodes.cli.main import main
-from nodes.experiment import run
-from nodes.experiment.context import Experiment
-from nodes.experiment.run import load_experiment, stages_of
-from nodes.experiment.stages import run_stages
+from nodes.experiment.engine.stages import run_stages
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.steps import run
+from nodes.experiment.steps.run import load_experiment, stages_of
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import Report
 

@@ -10,17 +10,17 @@ from advnerf_core.report.cells import read_cells
 from advnerf_core.report.evidence.hardness import PUBLISHED_FILE
 from advnerf_core.report.evidence.kept_build import LOST
 from advnerf_core.report.evidence.verify import verify_set, write_set
-from nodes.experiment import run
-from nodes.experiment.attack import cells
-from nodes.experiment.campaign.config import campaign_of
-from nodes.experiment.campaign.kept_attacks import attack_problems, with_attacks
-from nodes.experiment.campaign.plan import statuses
-from nodes.experiment.campaign.published import publish, publish_build
-from nodes.experiment.campaign.redrive import RedriveError, redrive
-from nodes.experiment.campaign.registering import register
-from nodes.experiment.campaign.run import Options, run_campaign
-from nodes.experiment.cells import ExperimentCells
-from nodes.experiment.reference import BUILD, ReferenceBuild
+from nodes.experiment.engine.reference import BUILD, ReferenceBuild
+from nodes.experiment.run.cells import ExperimentCells
+from nodes.experiment.run.config import campaign_of
+from nodes.experiment.run.kept_attacks import attack_problems, with_attacks
+from nodes.experiment.run.plan import statuses
+from nodes.experiment.run.published import publish, publish_build
+from nodes.experiment.run.redrive import RedriveError, redrive
+from nodes.experiment.run.registering import register
+from nodes.experiment.run.run import Options, run_campaign
+from nodes.experiment.steps import run
+from nodes.experiment.steps.attack import cells
 from tests.support.stage_versions import TINY, tiny_experiment
 
 CHANGES = ("attack.methods=[gradient]", "attack.seeds=[0,1]", "measure.starts=2", "deploy.starts=1")

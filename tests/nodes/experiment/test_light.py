@@ -13,11 +13,11 @@ from advnerf_core.geometry import planar_pose
 from advnerf_core.scene.surrogate import Surrogate
 from hardware.worlds.lab.lab_world import LabWorld
 from hardware.worlds.lab.world import shading
-from nodes.experiment.deployed import DressedScene
-from nodes.experiment.light import measure_light
-from nodes.experiment.native import NativeScene
-from nodes.experiment.objects import placed_objects
-from nodes.experiment.run import load_experiment, stages_of
+from nodes.experiment.show.deployed import DressedScene
+from nodes.experiment.show.light import measure_light
+from nodes.experiment.show.native import NativeScene
+from nodes.experiment.show.objects import placed_objects
+from nodes.experiment.steps.run import load_experiment, stages_of
 from nodes.runtime.errors import ConfigError
 
 LAUNCH = Path(__file__).parents[3] / "launch"
@@ -104,7 +104,7 @@ def test_light_needs_a_panel_and_a_world_that_takes_it(tmp_path: Path) -> None:
 
 
 def test_the_region_is_where_the_camera_sees_the_panel(measured) -> None:
-    from nodes.experiment.light import _region
+    from nodes.experiment.show.light import _region
 
     experiment, _, _ = measured
     thing, pose = experiment.objects[0], (0.0, -2.0, 0.0)

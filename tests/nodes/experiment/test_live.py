@@ -9,8 +9,8 @@ import pytest
 
 from advnerf_core.driving.metrics import Horizon, drive_metrics
 from advnerf_core.driving.path import Path as DrivingPath
-from nodes.experiment import live
-from nodes.experiment.run import load_experiment
+from nodes.experiment.steps import live
+from nodes.experiment.steps.run import load_experiment
 from nodes.lab.trials.trial import SpoiledError
 from nodes.runtime.errors import ConfigError
 

@@ -12,7 +12,7 @@ def test_it_is_that_of_one_start_however_many_are_attacked(tiny_room, tmp_path):
     for stage in ("capture", "scene", "bake", "policy", "object"):
         (tmp_path / stage).symlink_to(tiny_room[0] / stage)
     (tmp_path / "manifest.json").write_text(json.dumps(manifest))
-    command = [sys.executable, "-m", "nodes.experiment.memory", str(tmp_path), "2"]
+    command = [sys.executable, "-m", "nodes.experiment.steps.memory", str(tmp_path), "2"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert 0.0 <= float(done.stdout.split()[-1]) < 200.0

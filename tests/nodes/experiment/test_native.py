@@ -13,11 +13,11 @@ from advnerf_core.fields.voxel_grid import cube_face_object
 from advnerf_core.geometry import make_transform, rotation_z
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.surrogate import Surrogate
-from nodes.experiment.deployed import DressedScene
-from nodes.experiment.native import NativeScene
-from nodes.experiment.objects import placed_objects
-from nodes.experiment.placed import PlacedObject
-from nodes.experiment.run import load_experiment
+from nodes.experiment.plan.placed import PlacedObject
+from nodes.experiment.show.deployed import DressedScene
+from nodes.experiment.show.native import NativeScene
+from nodes.experiment.show.objects import placed_objects
+from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError
 from tests.support.remote.flat_world import FlatConfig, FlatWorld
 

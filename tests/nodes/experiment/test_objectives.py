@@ -6,12 +6,12 @@ import shutil
 import pytest
 
 from advnerf_core.attack.artifact import load_attack
-from nodes.experiment.attack import ATTACK
-from nodes.experiment.cell import Cell
-from nodes.experiment.cell_kind import settings_hash
-from nodes.experiment.cells import ExperimentCells
-from nodes.experiment.keys import registered_settings
-from nodes.experiment.run import load_experiment
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.run.cell_kind import settings_hash
+from nodes.experiment.run.cells import ExperimentCells
+from nodes.experiment.steps.attack import ATTACK
+from nodes.experiment.steps.keys import registered_settings
+from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError
 from tests.support.stage_versions import ROOT, TINY
 

@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from hardware.worlds.lab.lab_world import LabWorld
-from nodes.experiment.context import PLACED, Experiment
-from nodes.experiment.deployed import DressedScene
-from nodes.experiment.objects import placed_objects
-from nodes.experiment.placed import PlacedObject
-from nodes.experiment.placing import as_text, place_by_rule
-from nodes.experiment.run import load_experiment, stages_of
+from nodes.experiment.plan.placed import PlacedObject
+from nodes.experiment.show.context import PLACED, Experiment
+from nodes.experiment.show.deployed import DressedScene
+from nodes.experiment.show.objects import placed_objects
+from nodes.experiment.show.placing import as_text, place_by_rule
+from nodes.experiment.steps.run import load_experiment, stages_of
 from nodes.runtime.errors import ConfigError
 
 ROOM = Path(__file__).parents[3] / "launch" / "room.experiment.yaml"

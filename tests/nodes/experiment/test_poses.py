@@ -6,9 +6,9 @@ import pytest
 from advnerf_core.attack.spaces.placement import footprint
 from advnerf_core.geometry import rotation_z, yaw_of
 from hardware.worlds.junction.config import IntersectionConfig
-from nodes.experiment.context import Experiment
-from nodes.experiment.space_config import PlacesConfig
-from nodes.experiment.spaces import bounds_of, lanes_of, random_placements
+from nodes.experiment.plan.space_config import PlacesConfig
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.spaces import bounds_of, lanes_of, random_placements
 
 
 def test_objects_move_about_their_places_and_off_the_lanes(trained: Experiment) -> None:

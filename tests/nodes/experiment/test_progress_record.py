@@ -5,8 +5,8 @@ import threading
 
 import pytest
 
-from nodes.experiment.cell import Cell
-from nodes.experiment.progress_record import FILE, ProgressRecord, read_progress
+from nodes.experiment.engine.progress_record import FILE, ProgressRecord, read_progress
+from nodes.experiment.plan.cell import Cell
 from nodes.runtime.progress import Point
 
 CELL = Cell("track", "hardened", "random", 0)

@@ -4,9 +4,16 @@ import json
 import subprocess
 from pathlib import Path
 
-from nodes.experiment.reference import BUILD, PUBLISHED, ReferenceBuild
-from nodes.experiment.run import load_experiment
-from nodes.experiment.stage_record import RECORD, Stage, StageRecord, digest_of, read_record, write_record
+from nodes.experiment.engine.reference import BUILD, PUBLISHED, ReferenceBuild
+from nodes.experiment.engine.stage_record import (
+    RECORD,
+    Stage,
+    StageRecord,
+    digest_of,
+    read_record,
+    write_record,
+)
+from nodes.experiment.steps.run import load_experiment
 
 ROOT = Path(__file__).parents[3]
 KEPT = ROOT / PUBLISHED / BUILD

@@ -6,12 +6,12 @@ from dataclasses import replace
 import pytest
 
 from advnerf_core.report.evidence.registration import FILE, RegistrationError, read_registration
-from nodes.experiment.attack import cells
-from nodes.experiment.campaign.config import campaign_of
-from nodes.experiment.campaign.plan import plan_cells
-from nodes.experiment.campaign.registering import primary_tests, register
-from nodes.experiment.keys import registered_settings
-from nodes.experiment.registered import registered_under
+from nodes.experiment.run.config import campaign_of
+from nodes.experiment.run.plan import plan_cells
+from nodes.experiment.run.registered import registered_under
+from nodes.experiment.run.registering import primary_tests, register
+from nodes.experiment.steps.attack import cells
+from nodes.experiment.steps.keys import registered_settings
 from tests.support.stage_versions import TINY, tiny_experiment
 
 GRADIENT = "right_hardened_gradient_0"
@@ -112,7 +112,7 @@ def test_cells_of_the_registered_settings_are_run_under_it_and_no_others(campaig
 
 def test_a_cell_keeps_its_drives(trained, tmp_path):
     from advnerf_core.report.cells import cell_from
-    from nodes.experiment.cells import run_cell
+    from nodes.experiment.run.cells import run_cell
 
     cell = next(each for each in cells(trained) if each.name == "right_hardened_random_0")
     data = run_cell(trained, cell, tmp_path / cell.name, lambda fraction, text="": None)

@@ -12,11 +12,11 @@ import pytest
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.learning.frames import Frames, FrameStore
 from advnerf_core.policies.pilotnet import load_policy
-from nodes.experiment import attack, retrain
-from nodes.experiment.cell import Cell
-from nodes.experiment.config import RetrainConfig
-from nodes.experiment.context import Experiment
-from nodes.experiment.policy import HARDENED, RETRAINED, victim_file
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.plan.config import RetrainConfig
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.steps import attack, retrain
+from nodes.experiment.steps.policy import HARDENED, RETRAINED, victim_file
 
 SMALL = RetrainConfig(rounds=1, pays_ratio=1e-6, stills=2, drives=1, drive_steps=2, placements=1, steps=2)
 

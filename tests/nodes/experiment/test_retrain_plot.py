@@ -1,7 +1,7 @@
 import cv2
 import numpy as np
 
-from nodes.experiment.retrain_plot import curve, draw
+from nodes.experiment.steps.retrain_plot import curve, draw
 
 
 def test_every_round_of_every_drive_is_seen_and_where_the_loop_ends(tmp_path):

@@ -3,11 +3,11 @@ from pathlib import Path
 
 import pytest
 
-from nodes.experiment.attack import cells
-from nodes.experiment.cell import Cell
-from nodes.experiment.run import load_experiment, stages_of
-from nodes.experiment.stages import StageError
-from nodes.experiment.whole import run_experiment
+from nodes.experiment.engine.stages import StageError
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.run.whole import run_experiment
+from nodes.experiment.steps.attack import cells
+from nodes.experiment.steps.run import load_experiment, stages_of
 from nodes.runtime.errors import ConfigError
 
 ROOM = Path(__file__).parents[3] / "launch" / "room.experiment.yaml"

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from nodes.experiment.run_folder import RunFolder, run_to_end
-from nodes.experiment.stage_record import Stage
+from nodes.experiment.engine.run_folder import RunFolder, run_to_end
+from nodes.experiment.engine.stage_record import Stage
 from nodes.runtime.errors import ConfigError
 
 

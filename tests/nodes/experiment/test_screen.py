@@ -15,8 +15,8 @@ from calibration.panel import centre_square
 from calibration.schema import CalibrationError, save_calibration
 from hardware.worlds.lab.config import MonitorOpticsConfig
 from hardware.worlds.lab.world import MONITOR_PIXELS
-from nodes.experiment import faces, screen
-from nodes.experiment.run import load_experiment
+from nodes.experiment.show import faces, screen
+from nodes.experiment.steps.run import load_experiment
 
 LAUNCH = Path(__file__).parents[3] / "launch"
 # A dim and reddish monitor in a lit room.

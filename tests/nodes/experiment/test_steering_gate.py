@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from nodes.experiment import whole
-from nodes.experiment.campaign.config import campaign_of
-from nodes.experiment.campaign.run import Options
-from nodes.experiment.run import load_experiment
-from nodes.experiment.steering_gate import other_steering
+from nodes.experiment.run import whole
+from nodes.experiment.run.config import campaign_of
+from nodes.experiment.run.run import Options
+from nodes.experiment.steps.run import load_experiment
+from nodes.experiment.steps.steering_gate import other_steering
 from nodes.runtime.errors import RuntimeFault
 from tests.support.stage_versions import ROOT, TINY
 

@@ -4,11 +4,11 @@ import json
 
 import pytest
 
-from nodes.experiment import run
-from nodes.experiment.cell import Cell
-from nodes.experiment.cell_kind import settings_hash
-from nodes.experiment.cells import ExperimentCells
-from nodes.experiment.reference import ReferenceBuild
+from nodes.experiment.engine.reference import ReferenceBuild
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.run.cell_kind import settings_hash
+from nodes.experiment.run.cells import ExperimentCells
+from nodes.experiment.steps import run
 from tests.support.stage_versions import RECORDED, tiny_experiment
 
 # Between processors sums are taken in another order; a change of what is computed is larger.
@@ -21,7 +21,7 @@ def test_what_stages_and_cells_make_is_of_their_versions(tiny_room):
     for name, each in found.items():
         how = (
             f"{name}: record it with python -m tests.support.stage_versions, if that was meant, and raise its version "
-            "(VERSIONS in nodes/experiment/run.py, VERSION in keys.py)"
+            "(VERSIONS in nodes/experiment/steps/run.py, VERSION in keys.py)"
         )
         assert each["version"] == recorded[name]["version"], how
         assert each["numbers"] == pytest.approx(recorded[name]["numbers"], rel=_RELATIVE), how

@@ -11,15 +11,15 @@ import pytest
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.driving.metrics import drive_metrics
 from advnerf_core.report.results import read_results
-from nodes.experiment import films, live
-from nodes.experiment.campaign.gate import predict_cell
-from nodes.experiment.campaign.run import Options
-from nodes.experiment.cell import Cell
-from nodes.experiment.cells import run_cell
-from nodes.experiment.keys import driven_folder
-from nodes.experiment.kinds import load_kind
-from nodes.experiment.run import load_experiment, make_ready
-from nodes.experiment.whole import run_experiment
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.run.cells import run_cell
+from nodes.experiment.run.gate import predict_cell
+from nodes.experiment.run.kinds import load_kind
+from nodes.experiment.run.run import Options
+from nodes.experiment.run.whole import run_experiment
+from nodes.experiment.steps import films, live
+from nodes.experiment.steps.keys import driven_folder
+from nodes.experiment.steps.run import load_experiment, make_ready
 from nodes.lab.trials.evaluation import HOPS
 from nodes.lab.trials.trial import SpoiledError
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from advnerf_core.report.clips import read_clip
-from nodes.experiment import report
-from nodes.experiment.attack import cells
-from nodes.experiment.cells import ExperimentCells
-from nodes.experiment.context import Experiment
+from nodes.experiment.pages import report
+from nodes.experiment.run.cells import ExperimentCells
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.steps.attack import cells
 
 
 def silent(fraction: float, text: str = "") -> None:

@@ -3,9 +3,9 @@ import os
 import pytest
 
 from advnerf_core.files import write_atomically
-from nodes.experiment.reference import ReferenceBuild, ReferenceBuildError
-from nodes.experiment.stage_record import Stage, digest_of, read_record
-from nodes.experiment.stages import StageError, begun_with, keep_stages, run_stages
+from nodes.experiment.engine.reference import ReferenceBuild, ReferenceBuildError
+from nodes.experiment.engine.stage_record import Stage, digest_of, read_record
+from nodes.experiment.engine.stages import StageError, begun_with, keep_stages, run_stages
 from nodes.runtime.locks import hold
 
 pytestmark = pytest.mark.live

@@ -1,0 +1,1 @@
+"""Steps are kept, resumed, and their progress told."""

@@ -1,0 +1,117 @@
+"""A resolved experiment of any kind in its run folder: its manifest, and its stages run to the end."""
+
+from __future__ import annotations
+
+import json
+import platform
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from rich.console import Console
+
+from advnerf_core.documents import read_json
+from advnerf_core.files import write_atomically
+from nodes.experiment.engine.reference import ReferenceBuild
+from nodes.experiment.engine.stage_record import Stage, StageRecord
+from nodes.experiment.engine.stages import check_until, run_stages
+from nodes.runtime.errors import ConfigError
+from nodes.runtime.progress import Display, ProgressDisplay
+
+Config = TypeVar("Config")
+_MANIFEST = "manifest.json"
+
+
+@dataclass(frozen=True)
+class RunFolder(Generic[Config]):
+    """One resolved experiment.
+
+    Attributes:
+        config: The resolved configuration.
+        file: The experiment file.
+        folder: The run folder.
+        setting: Name of the setting, e.g. ``demo``.
+    """
+
+    config: Config
+    file: Path
+    folder: Path
+    setting: str
+
+    def stage_folder(self, stage: str) -> Path:
+        """Where a stage writes."""
+        return self.folder / stage
+
+
+def run_to_end(
+    experiment: RunFolder[Any],
+    stages: Sequence[Stage],
+    libraries: Sequence[str],
+    until: str | None = None,
+    console: Console | None = None,
+    reference: ReferenceBuild | None = None,
+    watcher: Display | None = None,
+) -> dict[str, StageRecord]:
+    """Run the stages that are not there yet.
+
+    Args:
+        experiment: The experiment.
+        stages: Its stages in order.
+        libraries: Whose versions the manifest names, of those that are installed.
+        until: Last stage to run; None for all.
+        console: Where to print.
+        reference: Where results of stages may be besides.
+        watcher: Receives the progress too.
+
+    Raises:
+        ConfigError: The folder has the stages of another experiment, which would be replaced.
+    """
+    console = console or Console()
+    check_until(stages, until)
+    require_own_folder(experiment)
+    experiment.folder.mkdir(parents=True, exist_ok=True)
+    _write_manifest(experiment, libraries)
+    with ProgressDisplay(console, watcher) as display:
+        return run_stages(stages, experiment.folder, display, until, reference)
+
+
+def require_own_folder(experiment: RunFolder[Any]) -> None:
+    """Refuse a run folder of another experiment: stages with the same names and other keys would empty each other's folders.
+
+    Raises:
+        ConfigError: It is one of another experiment.
+    """
+    manifest = experiment.folder / _MANIFEST
+    try:
+        there = read_json(manifest)["experiment"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return
+    if there != experiment.config.name:
+        raise ConfigError(
+            f"expected a run folder of experiment {experiment.config.name!r} or a new one, got {experiment.folder} of {there!r}; name another one "
+            f"with --run-folder (in a campaign run_folder), or remove {manifest} to have its stages replaced where they differ"
+        )
+
+
+def _installed(library: str) -> str:
+    """Version of a library; empty where it is not installed, as MuJoCo for a world that does without."""
+    try:
+        return version(library)
+    except PackageNotFoundError:
+        return ""
+
+
+def _write_manifest(experiment: RunFolder[Any], libraries: Sequence[str]) -> None:
+    manifest = {
+        "experiment": experiment.config.name,
+        "setting": experiment.setting,
+        "file": str(experiment.file),
+        "command": " ".join(["advnerf", *sys.argv[1:]]),
+        "config": experiment.config.model_dump(mode="json"),
+        "versions": {"advnerf": version("advnerf"), "python": platform.python_version()}
+        | {name: found for name in libraries if (found := _installed(name))},
+    }
+    write_atomically(experiment.folder / _MANIFEST, json.dumps(manifest, indent=1) + "\n")

@@ -1,0 +1,217 @@
+"""Stages of a long job: run once, cached by their inputs, resumed where they were stopped.
+
+A run folder holds one sub-folder per stage. A stage is finished when its ``stage.json`` says so *and* the key in it equals the
+key of what would be run now. The key is a hash over the stage's configuration, its code version and the digests of what the
+stages before it wrote, so a changed setting runs exactly what depends on it. An interrupted stage keeps its folder: with an
+unchanged key it finds its own partial work there, otherwise the folder is emptied first. A stage whose key a reference build has is
+copied from there. What a stage *does* is not known here.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from advnerf_core.errors import AdvnerfError
+from nodes.experiment.engine.reference import ReferenceBuild
+from nodes.experiment.engine.stage_record import (
+    RECORD,
+    Stage,
+    StageRecord,
+    digest_of,
+    key_of,
+    read_record,
+    write_record,
+)
+from nodes.runtime.locks import HeldError, hold
+from nodes.runtime.progress import Display
+
+
+class StageError(AdvnerfError):
+    """A stage was asked for that does not exist, or whose inputs are not there."""
+
+
+def run_stages(
+    stages: Sequence[Stage],
+    folder: Path,
+    display: Display,
+    until: str | None = None,
+    reference: ReferenceBuild | None = None,
+) -> dict[str, StageRecord]:
+    """Run the stages in order, skipping those whose result is there and still fits.
+
+    Args:
+        stages: The stages, each after those it names in ``after``.
+        folder: The run folder.
+        display: Told of starts, progress and ends.
+        until: Name of the last stage wanted; None runs all.
+        reference: Where results may be besides.
+
+    Returns:
+        The record of every stage that was considered, by name.
+
+    Raises:
+        StageError: ``until`` or an ``after`` names no stage before it.
+    """
+    check_until(stages, until)
+    wanted = stages if until is None else stages[: [stage.name for stage in stages].index(until) + 1]
+    whole = _read_whole(wanted, folder, reference)
+    records: dict[str, StageRecord] = {}
+    for stage in wanted:
+        at = _Place(folder / stage.name, reference, stage.name in whole)
+        records[stage.name] = _run_or_reuse(stage, at, records, display)
+    return records
+
+
+def _read_whole(stages: Sequence[Stage], folder: Path, reference: ReferenceBuild | None) -> set[str]:
+    """Stages whose bulk will be read, as one that reads it has to be run."""
+    there, whole = _current(stages, folder, reference), set()
+    # From the last to the first: a stage that is run for its bulk reads that of others.
+    for stage in reversed(stages):
+        if stage.name not in there or (stage.name in whole and there[stage.name].kept is not None):
+            whole |= set(stage.reads_bulk_of)
+    return whole
+
+
+def check_until(stages: Sequence[Stage], until: str | None) -> None:
+    """Refuse a last stage that does not exist, before anything is written."""
+    if until is not None and until not in [stage.name for stage in stages]:
+        raise StageError(f"expected one of the stages {', '.join(s.name for s in stages)}; got '{until}'")
+
+
+def _current(
+    stages: Sequence[Stage], folder: Path, reference: ReferenceBuild | None = None
+) -> dict[str, StageRecord]:
+    """Stages that are finished, as are all that they build on, and are what would be run now."""
+    records: dict[str, StageRecord] = {}
+    for stage in stages:
+        if any(earlier not in records for earlier in stage.after):
+            continue
+        record, key = read_record(folder / stage.name), key_of(stage, records)
+        if record is None or record.digest is None or record.key != key:
+            record = None if reference is None else reference.record(stage, key)
+        if record is not None:
+            records[stage.name] = record
+    return records
+
+
+def begun_with(stages: Sequence[Stage], folder: Path, name: str) -> Mapping[str, Any] | None:
+    """The settings that a stage's folder was begun with, if running the stage now would go on from there; None if it would not."""
+    records = _current(stages, folder)
+    stage = next(each for each in stages if each.name == name)
+    record = read_record(folder / name)
+    if record is None or any(earlier not in records for earlier in stage.after):
+        return None
+    known = (stage.settings, *stage.goes_on_from)
+    return next(
+        (each for each in known if record.key == key_of(replace(stage, settings=each), records)), None
+    )
+
+
+def keep_stages(stages: Sequence[Stage], folder: Path, reference: ReferenceBuild) -> list[Path]:
+    """Copy stages that are finished and current from a run folder into a reference build; returns what is new there."""
+    records = _current(stages, folder)
+    found = [
+        reference.keep(stage, records[stage.name].key, folder / stage.name)
+        for stage in stages
+        if stage.name in records
+    ]
+    return [each for each in found if each is not None]
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where a stage writes, where its result may be besides, and whether its bulk is wanted too."""
+
+    folder: Path
+    reference: ReferenceBuild | None
+    whole: bool
+
+
+def _run_or_reuse(
+    stage: Stage, at: _Place, records: Mapping[str, StageRecord], display: Display
+) -> StageRecord:
+    missing = [name for name in stage.after if name not in records]
+    if missing:
+        raise StageError(f"stage '{stage.name}' needs {', '.join(missing)} to run before it")
+    key = key_of(stage, records)
+    if (old := _finished(at, key, display)) is not None:
+        return old
+    with _alone(at.folder):
+        # Whoever held it may have made just this.
+        if (old := _finished(at, key, display)) is not None:
+            return old
+        return _go_on_or_begin(stage, at, key, records, display)
+
+
+def _finished(at: _Place, key: str, display: Display) -> StageRecord | None:
+    record = read_record(at.folder)
+    if record is None or record.key != key or record.digest is None:
+        return None
+    if at.whole and record.kept is not None:
+        return None
+    display.finish(at.folder.name, record.seconds, cached=True)
+    return record
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Two processes in one stage's folder would write each other's files."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        lock = hold(folder.parent / f".{folder.name}.lock")
+    except HeldError as held:
+        raise StageError(
+            f"expected {folder} for this process alone, but process {held.owner} is at work there; wait for it, or name another run folder"
+        ) from None
+    with lock:
+        yield
+
+
+def _go_on_or_begin(
+    stage: Stage, at: _Place, key: str, records: Mapping[str, StageRecord], display: Display
+) -> StageRecord:
+    folder, old = at.folder, read_record(at.folder)
+    parts = [key_of(replace(stage, settings=settings), records) for settings in stage.goes_on_from]
+    resumed = old is not None and old.kept is None and old.key in (key, *parts)
+    if at.reference is not None and not at.whole and at.reference.record(stage, key) is not None:
+        _require_ours(folder)
+        if (taken := at.reference.take(stage, key, folder)) is not None:
+            display.finish(stage.name, taken.seconds, cached=True)
+            return taken
+    if not resumed and folder.exists():
+        _require_ours(folder)
+        shutil.rmtree(folder)
+    earlier_s = old.seconds if resumed and old is not None else 0.0
+    return _run(stage, folder, key, earlier_s, display)
+
+
+def _require_ours(folder: Path) -> None:
+    """Refuse to replace files that no stage wrote."""
+    if folder.exists() and not (folder / RECORD).exists() and any(folder.iterdir()):
+        raise StageError(
+            f"expected {folder} to be a stage's folder, got files that no stage wrote; move them, or name another run folder"
+        )
+
+
+def _run(stage: Stage, folder: Path, key: str, earlier_s: float, display: Display) -> StageRecord:
+    folder.mkdir(parents=True, exist_ok=True)
+    settings = json.loads(json.dumps(stage.settings))
+    write_record(folder, StageRecord(key, None, earlier_s, settings))
+    report = display.start(stage.name)
+    begin = time.monotonic()
+    try:
+        stage.run(folder, report)
+    except BaseException:
+        write_record(folder, StageRecord(key, None, earlier_s + time.monotonic() - begin, settings))
+        raise
+    record = StageRecord(key, digest_of(folder), earlier_s + time.monotonic() - begin, settings)
+    write_record(folder, record)
+    display.finish(stage.name, record.seconds, cached=False)
+    return record

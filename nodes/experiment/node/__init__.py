@@ -1,0 +1,1 @@
+"""What the attack node needs."""

@@ -1,0 +1,171 @@
+"""The search of the attack node, in a process of its own: ``python -m nodes.experiment.node.worker FOLDER``.
+
+It reads the request in the folder, goes on with its state if there is one, and speaks to the node on its standard output: lines
+of JSON, an image's pixels behind the line that announces it. Whatever else writes there is led to standard error.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from advnerf_core.attack.artifact import face_texture, load_attack
+from advnerf_core.attack.search.search import Evaluation, evaluation_from_json
+from advnerf_core.errors import AdvnerfError
+from advnerf_core.places import open_tensors
+from advnerf_core.scene.surrogate import split_theta
+from nodes.experiment.node.job import TOGETHER_STATE
+from nodes.experiment.node.prepare import Prepared
+from nodes.experiment.node.search import kept_request, planned_evaluations, run_attack
+from nodes.runtime.progress import MeasuringReport
+
+TEXTURE, PREVIEW = "texture", "preview"
+_PREVIEW_SCALE = 2
+
+
+class Speaker:
+    """Tells the node what happens; stands in for the display of a command."""
+
+    def __init__(self, stream: BinaryIO, folder: Path) -> None:
+        self._stream, self._folder, self._evaluations = stream, folder, 0
+        self._prepared: Prepared | None = None
+        self._best: Evaluation | None = None
+
+    def say(self, kind: str, pixels: bytes = b"", **data: Any) -> None:
+        """One line, and what comes behind it."""
+        self._stream.write(json.dumps({"kind": kind, "bytes": len(pixels), **data}).encode() + b"\n" + pixels)
+        self._stream.flush()
+
+    def start(self, stage: str) -> MeasuringReport:
+        """A seed begins; its progress is told with its evaluations."""
+        del stage
+        return lambda fraction, text="", point=None: None
+
+    def finish(self, stage: str, seconds: float, cached: bool) -> None:
+        """A seed has ended; told with its file."""
+
+    def prepared(self, prepared: Prepared) -> None:
+        """A seed can be searched."""
+        done, self._best = _so_far(self._state(prepared))
+        self._prepared, self._evaluations = prepared, planned_evaluations(prepared)
+        self.say(
+            "progress",
+            state="searching",
+            seed=prepared.seed,
+            evaluation=done,
+            evaluations=self._evaluations,
+            text="",
+            total_cte_m=0.0 if self._best is None else self._best.predicted_total_cte_m,
+            clean_total_cte_m=prepared.clean_drive.mean_total_cte_m,
+            clean_drives=prepared.clean_drive.drives,
+        )
+
+    def told(self, evaluation: Evaluation) -> None:
+        """An evaluation is done and its state is on disk."""
+        assert self._prepared is not None
+        better = self._best is None or evaluation.value > self._best.value
+        self._best = evaluation if better else self._best
+        self.say(
+            "progress",
+            state="searching",
+            seed=self._prepared.seed,
+            evaluation=evaluation.iteration + 1,
+            text="",
+            evaluations=self._evaluations,
+            loss_m=evaluation.loss_m,
+            total_cte_m=evaluation.predicted_total_cte_m,
+            seconds=evaluation.seconds,
+        )
+        if better:
+            self._show(self._prepared)
+
+    def _show(self, prepared: Prepared) -> None:
+        """The best texture so far, and what the policy sees of it from the first start."""
+        theta = self._best_theta(prepared)
+        if theta is None:  # the method keeps no state
+            return
+        texture = _texture(prepared, theta)
+        if texture is not None:
+            self._image(TEXTURE, texture)
+        seen = prepared.problem.sensor.sense(prepared.problem.start_states[:1], theta).images[0]
+        pixels = np.round(255.0 * seen.detach().permute(1, 2, 0).clamp(0.0, 1.0).numpy()).astype(np.uint8)
+        self._image(PREVIEW, pixels.repeat(_PREVIEW_SCALE, 0).repeat(_PREVIEW_SCALE, 1))
+
+    def _best_theta(self, prepared: Prepared) -> Tensor | None:
+        """Of the seed at work; of the best, where all are searched together; None without a state file."""
+        together = prepared.request.search.together
+        state = self._folder / TOGETHER_STATE if together else self._state(prepared)
+        if not state.exists():
+            return None
+        with open_tensors(state, "pt") as handle:
+            best: Tensor = handle.get_tensor("best_theta")
+            histories = json.loads((handle.metadata() or {}).get("histories", "[]"))
+        if not together:
+            return best
+        values = [max(evaluation_from_json(entry).value for entry in history) for history in histories]
+        return best[values.index(max(values))]
+
+    def _state(self, prepared: Prepared) -> Path:
+        return self._folder / f"seed_{prepared.seed}.state.safetensors"
+
+    def _image(self, name: str, pixels: NDArray[np.uint8]) -> None:
+        height, width = pixels.shape[:2]
+        self.say("image", np.ascontiguousarray(pixels).tobytes(), name=name, height=height, width=width)
+
+
+def _so_far(state: Path) -> tuple[int, Evaluation | None]:
+    """How many evaluations a search that was cut off has made, and the best of them."""
+    if not state.exists():
+        return 0, None
+    with open_tensors(state, "pt") as handle:
+        entries = json.loads((handle.metadata() or {}).get("history", "[]"))
+    history = [evaluation_from_json(entry) for entry in entries]
+    return len(history), max(history, key=lambda each: each.value, default=None)
+
+
+def _texture(prepared: Prepared, theta: Tensor) -> NDArray[np.uint8] | None:
+    parts = split_theta(prepared.surrogate.objects, theta)
+    for placed, part in zip(prepared.objects, parts, strict=True):
+        if placed.face is not None:
+            return face_texture(part.detach().numpy(), 256)
+    return None
+
+
+def work(folder: Path, stream: BinaryIO) -> None:
+    """Search as the folder's request asks, and say which file is the best."""
+    request = kept_request(folder)
+    speaker = Speaker(stream, folder)
+    files = run_attack(request, folder, speaker, speaker.told, speaker.prepared)
+    attacks = [load_attack(file) for file in files]
+    best = max(range(len(files)), key=lambda k: attacks[k].value or 0.0)
+    found = attacks[best]
+    speaker.say(
+        "done",
+        file=str(files[best]),
+        attack_id=found.attack_id,
+        total_cte_m=found.predicted_total_cte_m or 0.0,
+    )
+
+
+def main() -> int:
+    """Run the worker; what a person can put right is one line on standard error."""
+    # Never closed: the node takes the end of this pipe for the end of the process, whose shutdown takes seconds on a busy machine.
+    stream = os.fdopen(os.dup(1), "wb", closefd=False)
+    os.dup2(2, 1)
+    try:
+        work(Path(sys.argv[1]), stream)
+    except AdvnerfError as error:
+        print(" ".join(str(error).split()), file=sys.stderr, flush=True)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

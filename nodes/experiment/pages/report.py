@@ -1,0 +1,115 @@
+"""Stage report: the transfer table, what every drive did from above and from the driver's seat, and the textures as they were seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import NDArray
+from rich.console import Console
+
+from advnerf_core.attack.spaces.space import Space
+from advnerf_core.report.cells import read_cell
+from advnerf_core.report.conditions import NONE
+from advnerf_core.report.transfer import TransferTable, make_table
+from advnerf_core.report.transfer_page import text_table
+from hardware.worlds.world import World
+from nodes.experiment.pages import live_report, page
+from nodes.experiment.pages.table import wanted_rows, write_table
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.plan.method_names import know_methods_of
+from nodes.experiment.show.context import CELLS, Experiment
+from nodes.experiment.show.overview import from_above
+from nodes.experiment.show.spaces import dress, make_space, shown_there
+from nodes.experiment.steps import films
+from nodes.experiment.steps.attack import cells, load_found, load_shown
+from nodes.experiment.steps.keys import driven_folder
+from nodes.experiment.steps.policy import HARDENED
+from nodes.runtime.progress import Report
+
+PAGE = "report.html"
+_TABLE_WIDTH = 160
+# Where along a drive its objects are shown [m, at 6 m/s]: most of them are in view, some close.
+_SEEN_AT_M = (9.0, 14.0)
+
+
+def run(experiment: Experiment, folder: Path, report: Report, notes: Sequence[str] = ()) -> None:
+    """Write ``report.html``, ``table.json``, ``table.csv``, ``table.md`` and a film of each drive; of live drives also what their bags tell.
+
+    Args:
+        experiment: With all stages before finished, and all cells of its methods.
+        folder: Where to write.
+        report: Progress callback.
+        notes: Paragraphs at the top of the page, such as what is left out.
+    """
+    know_methods_of(experiment.folder / CELLS, experiment.config.attack.method_names)
+    if experiment.config.deploy.live:
+        parts = live_report.make_parts(experiment, folder, report)
+        _write(experiment, folder, parts.sections, (*notes, *parts.lead), parts.targets)
+        return
+    films_of: list[Path] = []
+    with experiment.open_deployed_world() as scene:
+        space = make_space(experiment, scene)
+        overview = from_above(experiment, scene)
+        for index, name in enumerate(experiment.config.scenarios):
+            report(0.1 + 0.8 * index / len(experiment.config.scenarios), f"filming {name}")
+            films_of.append(films.film_scenario(experiment, scene, space, name, folder))
+        seen: dict[str, dict[str, NDArray[np.uint8]]] = {
+            name: textures_seen(experiment, scene, space, name) for name in experiment.config.scenarios
+        }
+    report(0.95, "writing the page")
+    sections = page.sections(experiment, overview, films_of, seen)
+    _write(experiment, folder, sections, (*notes, page.opening(experiment)))
+
+
+def _write(
+    experiment: Experiment,
+    folder: Path,
+    sections: Sequence[tuple[str, Markup]],
+    lead: Sequence[str | Markup],
+    targets: Markup | None = None,
+) -> None:
+    write_table(table_of(experiment), experiment.folder / CELLS, folder, sections, lead, PAGE, targets)
+
+
+def print_summary(experiment: Experiment, console: Console) -> None:
+    """The transfer table, and where the page is."""
+    wide = Console(
+        file=console.file, width=max(console.width, _TABLE_WIDTH), force_terminal=console.is_terminal
+    )
+    wide.print(text_table(table_of(experiment)).rich())
+    if experiment.config.deploy.live:
+        wide.print(live_report.target_rows(experiment).rich())
+        if text := live_report.not_driven(experiment):
+            console.print(text, highlight=False, markup=False, soft_wrap=True)
+    console.print(f"report: {experiment.stage_folder('report') / PAGE}", highlight=False, soft_wrap=True)
+
+
+def table_of(experiment: Experiment) -> TransferTable:
+    """The table of all cells that this experiment itself has run."""
+    plan = cells(experiment)
+    files = [experiment.cell_result(cell) for cell in plan]
+    found = [read_cell(file) for file in files if file.exists()]
+    return make_table(wanted_rows(plan, experiment.config.scenarios), found, experiment.config.name)
+
+
+def textures_seen(
+    experiment: Experiment, scene: World, space: Space, scenario: str
+) -> dict[str, NDArray[np.uint8]]:
+    """The same views of the driving camera past the plain, random and attacked objects of the first seed, one row each."""
+    seed = experiment.config.attack.seeds[0]
+    reference = experiment.references[scenario]
+    states = [np.array(reference.pose_at(experiment.along_m(at))) for at in _SEEN_AT_M]
+    seen = {}
+    for method in (NONE, *experiment.config.attack.method_names):
+        cell = Cell(scenario, HARDENED, method, seed)
+        folder = driven_folder(experiment, cell)
+        shown = load_shown(space, folder, cell)
+        dressed, colours = (
+            dress(experiment, scene, shown),
+            shown_there(experiment, shown, load_found(folder, cell)),
+        )
+        seen[method] = np.concatenate([dressed.camera_image(state, colours) for state in states], axis=1)
+    return seen

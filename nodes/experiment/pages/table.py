@@ -1,0 +1,61 @@
+"""The lines of a result table, and its page."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from markupsafe import Markup
+
+from advnerf_core.files import write_atomically
+from advnerf_core.report.conditions import order_of
+from advnerf_core.report.transfer import TransferTable, Wanted
+from advnerf_core.report.transfer_page import as_csv, as_json, as_markdown, gather_clips, render_transfer_page
+from nodes.experiment.plan.cell import Cell
+
+
+def wanted_rows(cells: Sequence[Cell], scenarios: Sequence[str]) -> list[Wanted]:
+    """The lines that cells fill, in the order of their scenarios."""
+    seeds: dict[tuple[str, str, str, str], list[int]] = {}
+    for cell in cells:
+        seeds.setdefault((cell.scenario, cell.placement, cell.victim, cell.method), []).append(cell.seed)
+    # By victim before method: the reader compares the methods on one victim.
+    victims = list(dict.fromkeys(victim for _, _, victim, _ in seeds))
+    order = sorted(
+        seeds,
+        key=lambda key: (scenarios.index(key[0]), key[1], victims.index(key[2]), order_of(key[3])),
+    )
+    return [Wanted(*key, tuple(seeds[key])) for key in order]
+
+
+def write_table(
+    table: TransferTable,
+    cells_folder: Path,
+    folder: Path,
+    sections: Sequence[tuple[str, Markup]] = (),
+    lead: Sequence[str | Markup] = (),
+    page: str = "index.html",
+    targets: Markup | None = None,
+) -> Path:
+    """Write JSON, CSV, Markdown and the page with the clips beside it.
+
+    Args:
+        table: The table.
+        cells_folder: Where the cells' clips are.
+        folder: Where to write.
+        sections: Further parts of the page.
+        lead: Paragraphs before the table.
+        page: Name of the page.
+        targets: Instead of those of the table.
+
+    Returns:
+        The page.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    clips = gather_clips(table, cells_folder, folder)
+    write_atomically(folder / "table.json", json.dumps(as_json(table), indent=1, allow_nan=False) + "\n")
+    write_atomically(folder / "table.csv", as_csv(table))
+    write_atomically(folder / "table.md", as_markdown(table))
+    write_atomically(folder / page, render_transfer_page(table, clips, sections, lead, targets))
+    return folder / page

@@ -1,0 +1,1 @@
+"""Cells: running them, registering, publishing."""

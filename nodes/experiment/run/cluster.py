@@ -1,0 +1,91 @@
+"""Cells over machines: joblib with its Ray backend. Every machine needs this package and the folders of the campaign, under the same paths."""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import joblib
+
+from nodes.experiment.run.worker import Ended, Job, run_in_process
+from nodes.runtime.errors import ConfigError
+
+_CONNECT_S = 5.0
+
+
+@contextmanager
+def ray_session(address: str, cores: int) -> Iterator[int]:
+    """Join a Ray cluster, or start one on this machine; gives the number of its cores.
+
+    Args:
+        address: ``host:port`` or ``auto``; empty takes the one in RAY_ADDRESS, or else starts one here.
+        cores: Of a cluster that is started here.
+
+    Raises:
+        ConfigError: Ray is not installed, or there is no cluster at the address.
+    """
+    try:
+        import ray
+    except ModuleNotFoundError:
+        raise ConfigError(
+            "--backend ray needs ray, which is not installed: pip install 'advnerf[cluster]'"
+        ) from None
+    joining = address or os.environ.get("RAY_ADDRESS", "")
+    _require_reachable(joining)
+    try:
+        if joining:
+            ray.init(address=joining, log_to_driver=False, logging_level=logging.ERROR)
+        else:
+            ray.init(
+                num_cpus=cores, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR
+            )
+    except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
+        raise ConfigError(
+            f"expected a Ray cluster at {joining or 'this machine'}, got {' '.join(str(error).split())}; start one with ray start --head"
+        ) from None
+    try:
+        yield int(ray.cluster_resources().get("CPU", 1))
+    finally:
+        ray.shutdown()
+
+
+def _require_reachable(address: str) -> None:
+    """Ray itself tries for minutes before it says that nobody is there."""
+    host, separator, port = address.removeprefix("ray://").rpartition(":")
+    if not separator or not port.isdigit():
+        return
+    try:
+        socket.create_connection((host, int(port)), _CONNECT_S).close()
+    except OSError as error:
+        raise ConfigError(
+            f"expected a Ray cluster at {address}, got {error}; start one with ray start --head"
+        ) from None
+
+
+def collect_on_ray(jobs: list[Job], at_a_time: int) -> list[Ended] | None:
+    """Run jobs on the cluster in force, all of them before it returns; None if a machine was lost, with which what it had told goes.
+
+    What was finished is in the campaign's folder all the same.
+
+    Raises:
+        ConfigError: A machine cannot run a job at all, as one without this package.
+    """
+    from ray.exceptions import NodeDiedError, ObjectLostError, RayActorError, RayError, WorkerCrashedError
+    from ray.util.joblib import register_ray
+
+    register_ray()
+    with joblib.parallel_config(backend="ray", n_jobs=at_a_time):
+        # This backend of joblib can only give everything at once.
+        parallel = joblib.Parallel(batch_size=1, pre_dispatch="all")
+        try:
+            found: list[Ended] = parallel(joblib.delayed(run_in_process)(job) for job in jobs)
+        except (RayActorError, WorkerCrashedError, NodeDiedError, ObjectLostError):
+            return None
+        except RayError as error:
+            raise ConfigError(
+                f"expected every machine of the cluster to have this package and the campaign's folders, got {' '.join(str(error).split())[-500:]}"
+            ) from None
+    return found

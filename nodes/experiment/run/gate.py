@@ -1,0 +1,124 @@
+"""The fidelity gate of an experiment, and predictions of how its attacks transfer, for any kind of cells that has pictures."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from advnerf_core.attack.transfer import DEFAULT_DRAWS, TransferPrediction, predict_transfer
+from advnerf_core.documents import read_json
+from advnerf_core.files import write_atomically
+from advnerf_core.scene.fidelity import Agreement, Effect, Pictures, Verdict, agreement, judge
+from advnerf_core.scene.gate_limits import GateLimits
+from nodes.experiment.engine.stage_record import hash_of, stage_digests
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.run.cell_kind import CellKind
+from nodes.lab.policy_data.evaluate import predict
+
+
+@dataclass(frozen=True)
+class CleanDrive:
+    """What predictions of all attacks on one drive share.
+
+    Attributes:
+        agreement: How alike real and learned pictures are along the deployed drive without attack.
+        none_m: Total CTE of each draw without attack [m].
+    """
+
+    agreement: Agreement
+    none_m: tuple[float, ...]
+
+
+def agreement_on(policy: Any, goal: tuple[float, ...], pictures: Pictures) -> Agreement:
+    """How alike pictures look, and how alike the policy steers on them."""
+    steering = [predict(policy, images, goal) for images in (pictures.real, pictures.learned)]
+    return agreement(list(pictures.real), list(pictures.learned), *steering)
+
+
+def judge_scene(
+    kind: CellKind, experiment: Any, cell: Cell, limits: GateLimits, bag: Path | None = None
+) -> list[tuple[str, Verdict]]:
+    """The gate's verdicts: on held-out views, and on a driven bag if one is given.
+
+    Raises:
+        NoPicturesError: The kind has no pictures to judge by.
+    """
+    policy, goal = kind.policy_of(experiment, cell)
+    sets = [kind.held_out(experiment, cell)]
+    if bag is not None:
+        sets.append(kind.driven(experiment, cell, Path(), bag))
+    return [(each.of, judge(agreement_on(policy, goal, each), limits, each.of)) for each in sets]
+
+
+def cached_verdict(
+    kind: CellKind, experiment: Any, cell: Cell, limits: GateLimits, file: Path, drive: Path | None = None
+) -> Verdict:
+    """The verdict on held-out views, or on a drive; judged again only if scene, policy or limits changed.
+
+    Args:
+        kind: Kind of the cell.
+        experiment: Its experiment.
+        cell: The cell without attack whose drive is looked at, as the experiment names it.
+        limits: What must be reached.
+        file: Where the verdict is kept.
+        drive: Folder of the cell, if its drive is to be judged.
+
+    Raises:
+        RuntimeFault: There is no such drive yet.
+    """
+    policy, goal = kind.policy_of(experiment, cell)
+    which = [cell.scenario, cell.victim, *(["drive", cell.seed] if drive else [])]
+    stages = stage_digests(experiment.folder, list(kind.needed_settings(experiment)))
+    key = hash_of([stages, _weights_sha256(policy), limits.model_dump(mode="json"), *which])
+    try:
+        kept = read_json(file)
+        if kept["key"] == key:
+            return Verdict(kept["passed"], tuple(kept["reasons"]), kept["numbers"])
+    except (OSError, ValueError, KeyError, TypeError):
+        pass  # an unreadable verdict is judged again
+    pictures = kind.driven(experiment, cell, drive) if drive else kind.held_out(experiment, cell)
+    verdict = judge(agreement_on(policy, goal, pictures), limits, pictures.of)
+    write_atomically(file, json.dumps({"key": key, **verdict.record()}, indent=1) + "\n")
+    return verdict
+
+
+def _weights_sha256(policy: Any) -> str:
+    """Hash of a network's weights; a retrained one is of no stage that all cells need."""
+    digest = hashlib.sha256()
+    for name, weight in sorted(getattr(policy, "state_dict", dict)().items()):
+        digest.update(name.encode() + weight.detach().cpu().numpy().tobytes())
+    return digest.hexdigest()
+
+
+def predict_cell(
+    kind: CellKind,
+    experiment: Any,
+    cell: Cell,
+    folder: Path,
+    draws: int = DEFAULT_DRAWS,
+    clean: CleanDrive | None = None,
+) -> tuple[TransferPrediction, CleanDrive]:
+    """Predict the deployed drives of a cell whose search is finished, from pictures and the surrogate alone.
+
+    Args:
+        kind: Kind of the cell.
+        experiment: Its experiment.
+        cell: Which, as the experiment names it.
+        folder: The cell's folder.
+        draws: Drives per prediction.
+        clean: What an earlier prediction of the same scenario, victim, seed and draws returned of the drive without attack.
+
+    Returns:
+        The prediction, and what it says of the drive without attack.
+    """
+    policy, goal = kind.policy_of(experiment, cell)
+    without = clean.agreement if clean else agreement_on(policy, goal, kind.driven(experiment, cell, folder))
+    with_attack = agreement_on(policy, goal, kind.attacked(experiment, cell, folder))
+    effect = Effect(with_attack.learned - without.learned, with_attack.real - without.real)
+    problem, images, starts, horizon = kind.loop(experiment, cell, folder)
+    none_m = clean.none_m if clean else None
+    found = predict_transfer(problem, images, without, effect, starts, horizon, draws, cell.seed, none_m)
+    return found, CleanDrive(without, found.none_m)

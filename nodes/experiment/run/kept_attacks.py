@@ -1,0 +1,100 @@
+"""Attacks that are published with their cells: what each search found, once each, as it was driven past."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from advnerf_core.attack.artifact import AttackFileError, load_attack, save_attack
+from advnerf_core.report.cells import CellResult, read_cell
+from advnerf_core.report.evidence.verify import Verified
+from nodes.experiment.run.config import Campaign
+from nodes.experiment.run.store import CellStatus, store_of
+from nodes.experiment.steps.search_files import ATTACK, is_published_with_its_attack
+
+FOLDER = "attacks"
+
+
+def attack_file(folder: Path, attack_id: str) -> Path:
+    """Where a published set keeps an attack.
+
+    Args:
+        folder: Of the set.
+        attack_id: Short hash of the attack.
+    """
+    return folder / FOLDER / f"{attack_id}.safetensors"
+
+
+def publish_attacks(campaign: Campaign, found: Sequence[CellStatus], folder: Path) -> list[Path]:
+    """Copy the attacks of done cells, as far as this machine has them.
+
+    Args:
+        campaign: The campaign.
+        found: Where its cells are.
+        folder: Of the published set.
+
+    Returns:
+        Files that are new there.
+    """
+    written = []
+    for each in found:
+        if each.state != "done" or each.result is None or not is_published_with_its_attack(each.result):
+            continue
+        attack_id = str(each.result.attack_id)
+        target = attack_file(folder, attack_id)
+        source = next((file for file in _sources(campaign, each) if _id_of(file) == attack_id), None)
+        if source is not None and not target.exists():
+            save_attack(target, load_attack(source), small=True)
+            written.append(target)
+    return written
+
+
+def attack_problems(folder: Path) -> Iterator[str]:
+    """What is wrong with the attacks of a published set, in words.
+
+    Cells of before attacks were published have none.
+    """
+    used = set()
+    for file in sorted(folder.glob("*.json")):
+        cell = read_cell(file)
+        if is_published_with_its_attack(cell):
+            used.add(str(cell.attack_id))
+            yield from _problems_of(cell, attack_file(folder, str(cell.attack_id)))
+    for file in sorted((folder / FOLDER).glob("*")):
+        if file.stem not in used:
+            yield f"{file}: no cell was driven with this attack"
+
+
+def with_attacks(verified: Verified, folder: Path) -> Verified:
+    """What verifying a set found, with what is wrong with its attacks."""
+    if verified.problems:  # cells that cannot be read say nothing about attacks
+        return verified
+    return replace(verified, problems=tuple(attack_problems(folder)))
+
+
+def _problems_of(cell: CellResult, file: Path) -> Iterator[str]:
+    try:
+        attack = load_attack(file)
+    except AttackFileError as error:
+        yield f"{cell.name}: {error}"
+        return
+    wanted = (cell.attack_id, cell.policy_sha256, cell.method, cell.seed)
+    if wanted != (got := (attack.attack_id, attack.policy_sha256, attack.method, attack.seed)):
+        yield f"{cell.name}: expected attack, victim, method and seed {wanted} in {file}, got {got}"
+
+
+def _sources(campaign: Campaign, found: CellStatus) -> list[Path]:
+    """Files where a cell's attack may be: beside the cell's result, or in the run folder of its experiment."""
+    own = [store_of(campaign).work(found.cell.name)]
+    if found.file is not None:
+        own.append(found.file.with_suffix(""))
+    own.append(campaign.run_folder(found.cell) / "cells" / campaign.inside(found.cell).name)
+    return [folder / ATTACK for folder in own]
+
+
+def _id_of(file: Path) -> str | None:
+    try:
+        return load_attack(file).attack_id
+    except AttackFileError:
+        return None

@@ -1,0 +1,126 @@
+"""What there is to run: every cell with its settings as they are, and where its result may be."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from advnerf_core.report.evidence.registration import read_registration
+from nodes.experiment.engine.reference import PUBLISHED
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.run.cell_kind import settings_hash
+from nodes.experiment.run.config import Campaign
+from nodes.experiment.run.kinds import load_kind
+from nodes.experiment.run.registered import registered_under
+from nodes.experiment.run.store import CellStatus, store_of
+from nodes.experiment.run.worker import Job
+from nodes.runtime.errors import ConfigError, RuntimeFault
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A cell with its settings, as they are now.
+
+    Attributes:
+        cell: Which.
+        job: How it is run; without threads and phase.
+        live: Whether it drives a live graph.
+        searches: Whether it has a part that may run beside others.
+    """
+
+    cell: Cell
+    job: Job
+    live: bool
+    searches: bool
+
+
+def plan_cells(
+    campaign: Campaign, cells: Sequence[Cell], experiments: dict[tuple[str, str], Any] | None = None
+) -> list[Planned]:
+    """Settings of every cell as they are; reads experiments and digests of their stages, prepares nothing.
+
+    Args:
+        campaign: The campaign.
+        cells: Which of its cells.
+        experiments: Those that were read already, by scenario and placement; it gets what is read.
+    """
+    experiments = {} if experiments is None else experiments
+    registration = read_registration(PUBLISHED / campaign.name)
+    planned = []
+    for cell in cells:
+        kind = load_kind(campaign.kind(cell))
+        key = (cell.scenario, cell.placement)
+        if key not in experiments:
+            experiments[key] = read_experiment(campaign, cell)
+        inside = campaign.inside(cell)
+        digest = settings_hash(kind, experiments[key], inside)
+        job = Job(
+            str(campaign.folder),
+            cell.name,
+            campaign.kind(cell),
+            str(campaign.experiment_file(cell)),
+            campaign.scenario(cell).setting,
+            tuple(campaign.overrides(cell)),
+            str(campaign.run_folder(cell)),
+            inside.scenario,
+            cell.scenario,
+            cell.placement,
+            cell.victim,
+            cell.code,
+            cell.seed,
+            digest,
+            threads=1,
+            registration=registered_under(registration, cell, kind.registered_settings(experiments[key])),
+        )
+        planned.append(Planned(cell, job, kind.runs_alone(experiments[key]), kind.searches_apart))
+    return planned
+
+
+def statuses(campaign: Campaign, cells: Sequence[Cell]) -> list[CellStatus]:
+    """Where every cell is; one whose experiment cannot be read, as it is not made yet, is missing."""
+    store = store_of(campaign)
+    experiments: dict[tuple[str, str], Any] = {}
+    return [
+        store.status(cell, hash_as_it_is(campaign, cell, experiments), elsewhere(campaign, cell))
+        for cell in cells
+    ]
+
+
+def elsewhere(campaign: Campaign, cell: Cell) -> list[Path]:
+    """Files where a cell may be besides the campaign's own folder: in the run folder of its experiment, and where cells are kept with the code."""
+    run = campaign.run_folder(cell)
+    return [
+        *([run / "cells" / f"{campaign.inside(cell).name}.json"] if run != campaign.folder else []),
+        PUBLISHED / campaign.name / f"{cell.name}.json",
+    ]
+
+
+def hash_as_it_is(campaign: Campaign, cell: Cell, experiments: dict[tuple[str, str], Any]) -> str | None:
+    """Hash of everything that a cell depends on; None if it cannot be known yet, as what the cell needs is not made.
+
+    Args:
+        campaign: The campaign.
+        cell: Which of its cells.
+        experiments: As of `plan_cells`.
+
+    Raises:
+        ConfigError: Its experiment or its kind is wrong.
+    """
+    try:
+        return plan_cells(campaign, [cell], experiments)[0].job.settings_hash
+    except ConfigError:
+        raise
+    except (RuntimeFault, OSError):
+        return None
+
+
+def read_experiment(campaign: Campaign, cell: Cell) -> Any:
+    """What the kind of a cell reads from the cell's experiment file, with the campaign's settings."""
+    return load_kind(campaign.kind(cell)).load(
+        campaign.experiment_file(cell),
+        campaign.scenario(cell).setting,
+        campaign.overrides(cell),
+        campaign.run_folder(cell),
+    )

@@ -1,0 +1,209 @@
+"""Cells that are kept with the code: a cell there whose key matches is done on every machine."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from advnerf_core.documents import read_json
+from advnerf_core.files import write_atomically
+from advnerf_core.report.cells import CellResult, read_cell, read_cells
+from advnerf_core.report.evidence.hardness import FILE as HARDNESS
+from advnerf_core.report.evidence.hardness import PUBLISHED_FILE, merged, read_hardness, write_hardness
+from advnerf_core.report.transfer import TransferTable, make_table
+from nodes.experiment.engine.reference import BUILD, ReferenceBuild
+from nodes.experiment.engine.stage_record import RECORD, read_record
+from nodes.experiment.pages.table import wanted_rows
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.run.admission import gate_file, gate_key
+from nodes.experiment.run.config import Campaign
+from nodes.experiment.run.kept_attacks import publish_attacks
+from nodes.experiment.run.kinds import load_kind
+from nodes.experiment.run.plan import read_experiment
+from nodes.experiment.run.predictions import kept_prediction, prediction_file
+from nodes.experiment.run.store import FINISHED, CellStatus
+from nodes.runtime.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Published:
+    """What became of the cells that were published, by name.
+
+    Attributes:
+        written: New or changed there.
+        same: There already.
+        stale: There, but of other settings than those of now, as is what the campaign's own folder has.
+    """
+
+    written: tuple[str, ...]
+    same: tuple[str, ...]
+    stale: tuple[str, ...]
+
+
+def publish(campaign: Campaign, found: Sequence[CellStatus], folder: Path, prune: bool = False) -> Published:
+    """Copy finished cells to where they are kept with the code, with the fidelity gate's verdicts and the predictions of these cells.
+
+    What lies there of cells that are not finished here stays: they may have been run elsewhere.
+
+    Args:
+        campaign: The campaign.
+        found: Where its cells are.
+        folder: Gets one folder per campaign.
+        prune: Remove what lies there of cells whose results here are of other settings too.
+    """
+    written, same, stale = [], [], []
+    for each in found:
+        target = folder / campaign.name / f"{each.cell.name}.json"
+        if each.state == "changed" and _is_of(target, each.result):
+            stale.append(each.cell.name)
+            if prune:
+                target.unlink()
+                prediction_file(folder / campaign.name, each.cell.name).unlink(missing_ok=True)
+        if each.state != "done":
+            continue
+        text = _as_published(each)
+        if target.exists() and target.read_text(encoding="utf-8") == text:
+            same.append(each.cell.name)
+            continue
+        write_atomically(target, text)
+        written.append(each.cell.name)
+    _publish_beside(campaign, [each for each in found if each.state == "done"], folder / campaign.name)
+    publish_attacks(campaign, found, folder / campaign.name)
+    _publish_hardness(campaign, folder / campaign.name)
+    return Published(tuple(written), tuple(same), tuple(stale))
+
+
+def _as_published(found: CellStatus) -> str:
+    """A done cell's file, under the cell's names in this campaign: an experiment that ran it itself may have others."""
+    assert found.file is not None, "a done cell is somewhere"
+    cell, text = found.cell, found.file.read_text(encoding="utf-8")
+    data = json.loads(text)
+    if (data["scenario"], data.get("placement", "")) == (cell.scenario, cell.placement):
+        return text
+    return json.dumps({**data, "scenario": cell.scenario, "placement": cell.placement}, indent=1) + "\n"
+
+
+@dataclass(frozen=True)
+class PublishedBuild:
+    """The reference build after its publication.
+
+    Attributes:
+        folder: Where it is.
+        written: Folders of stages that are new there.
+        removed: Folders of stages that no published cell was run with.
+        size_bytes: Of all its files.
+    """
+
+    folder: Path
+    written: tuple[Path, ...]
+    removed: tuple[Path, ...]
+    size_bytes: int
+
+
+def publish_build(
+    campaign: Campaign, cells: Sequence[Cell], folder: Path, prune: bool = False
+) -> PublishedBuild:
+    """Copy the scenes, victims and objects of a campaign into the reference build.
+
+    Args:
+        campaign: The campaign.
+        cells: Whose.
+        folder: Of what is published.
+        prune: Remove stages there that no cell published in ``folder`` was run with.
+    """
+    reference = ReferenceBuild(folder / BUILD)
+    experiments = {(each.scenario, each.placement): each for each in cells}
+    written = [
+        path
+        for cell in experiments.values()
+        for path in load_kind(campaign.kind(cell)).keep(read_experiment(campaign, cell), reference)
+    ]
+    removed = _prune_build(reference, folder) if prune else []
+    size = sum(path.stat().st_size for path in reference.folder.rglob("*") if path.is_file())
+    return PublishedBuild(reference.folder, tuple(written), tuple(removed), size)
+
+
+def _prune_build(reference: ReferenceBuild, published: Path) -> list[Path]:
+    found = [read_json(file) for file in published.glob("*/*.json")]
+    used = {digest for each in found if "stages" in each for digest in each["stages"].values()}
+    records = {file.parent: read_record(file.parent) for file in sorted(reference.folder.glob(f"*/{RECORD}"))}
+    kept = {
+        stage: record for stage, record in records.items() if record is not None and record.digest in used
+    }
+    shared = {record.files_in for record in kept.values()}
+    removed = [stage for stage in records if stage not in kept and stage.name not in shared]
+    for stage in removed:
+        shutil.rmtree(stage)
+    return removed
+
+
+def _is_of(published: Path, result: CellResult | None) -> bool:
+    """Whether a published cell is that result, and not one of newer settings from elsewhere."""
+    return (
+        result is not None
+        and published.exists()
+        and read_cell(published).settings_hash == result.settings_hash
+    )
+
+
+def _publish_beside(campaign: Campaign, done: Sequence[CellStatus], folder: Path) -> None:
+    for each in done:
+        assert each.result is not None, "a finished cell has a result"
+        kept = kept_prediction(prediction_file(campaign.folder, each.cell.name), each.result.settings_hash)
+        if kept is not None:
+            write_atomically(prediction_file(folder, each.cell.name), json.dumps(kept, indent=1) + "\n")
+    for key in sorted({gate_key(each.cell) for each in done}):
+        for drive in (False, True):
+            if (verdict := gate_file(campaign.folder, key, drive)).exists():
+                write_atomically(gate_file(folder, key, drive), verdict.read_text(encoding="utf-8"))
+
+
+def _publish_hardness(campaign: Campaign, folder: Path) -> None:
+    """Publish every verdict of the victims, also of recipes that did not pass."""
+    runs = dict.fromkeys(campaign.run_folder(cell) for cell in campaign.cells)
+    record = merged(
+        [read_hardness(folder / PUBLISHED_FILE), *(read_hardness(run / HARDNESS) for run in runs)]
+    )
+    if record.verdicts:
+        write_hardness(folder / PUBLISHED_FILE, record)
+
+
+def published_table(folder: Path, campaign: Campaign, cells: Sequence[Cell] | None = None) -> TransferTable:
+    """The table of published cells, with all lines and seeds that are asked for.
+
+    Args:
+        folder: Of the published cells.
+        campaign: Whose they are.
+        cells: Which of them the table is of; None for all of the campaign.
+
+    Raises:
+        ConfigError: There are none.
+    """
+    found = read_cells(folder)
+    if not found:
+        raise ConfigError(f"expected published cells in {folder}, got none; run advnerf publish")
+    return make_table(
+        wanted_rows(campaign.cells if cells is None else cells, list(campaign.scenarios)),
+        found,
+        campaign.name,
+        campaign.reference,
+    )
+
+
+def campaign_table(campaign: Campaign, found: Sequence[CellStatus]) -> TransferTable:
+    """The table of the cells that are there.
+
+    Args:
+        campaign: The campaign.
+        found: Where the cells are that the table is of; only results of the settings as they are now are taken.
+    """
+    cells = [each.result for each in found if each.result is not None and each.state in FINISHED]
+    return make_table(
+        wanted_rows([each.cell for each in found], list(campaign.scenarios)),
+        cells,
+        campaign.name,
+        campaign.reference,
+    )

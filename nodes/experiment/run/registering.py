@@ -1,0 +1,181 @@
+"""Registering an experiment or a campaign: what will be run is written down before it is run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from datetime import datetime, timezone
+from importlib.metadata import version
+from pathlib import Path
+
+from advnerf_core.driving.metrics import mean_cte_limit_m
+from advnerf_core.files import write_atomically
+from advnerf_core.report.evidence.families import (
+    COARSE_BASELINES,
+    COARSE_GRADIENT,
+    GRADIENT,
+    RANDOM_FAMILIES,
+    lacking_baselines,
+)
+from advnerf_core.report.evidence.registration import (
+    FILE,
+    PrimaryTest,
+    RegisteredScenario,
+    Registration,
+    RegistrationError,
+    read_registration,
+    scenario_key,
+)
+from nodes.experiment.engine.stage_record import hash_of
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.plan.config import ExperimentConfig
+from nodes.experiment.plan.placed import PANEL
+from nodes.experiment.plan.space_config import ColoursConfig, FaceConfig
+from nodes.experiment.run.cell_kind import CellKind
+from nodes.experiment.run.config import Campaign
+from nodes.experiment.run.kinds import load_kind
+from nodes.experiment.run.plan import read_experiment, statuses
+from nodes.experiment.run.registered import registered_cell
+from nodes.experiment.run.store import FINISHED
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.steps.attack import planned_evaluations
+from nodes.experiment.steps.keys import registered_settings
+from nodes.experiment.steps.policy import HARDENED
+from nodes.experiment.steps.verdicts import TRAINED_ON, VALIDATED_ON, unseen
+
+
+def register(campaign: Campaign, setting: str, overrides: Sequence[str], published: Path) -> Registration:
+    """Write down what a campaign, or one experiment, will run.
+
+    Args:
+        campaign: The cells.
+        setting: Of the experiment file; empty for a campaign.
+        overrides: Changes on the command line.
+        published: Folder of all published sets; the file goes into a folder of the campaign's name.
+
+    Raises:
+        RegistrationError: Other things are registered under this name, cells of these settings were run already, or a test lacks baselines.
+    """
+    found = Registration(
+        name=campaign.name,
+        file=campaign.file.name,
+        setting=setting,
+        overrides=tuple(overrides),
+        date=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        software_version=version("advnerf"),
+        scenarios=_scenarios(campaign),
+        cells=tuple(registered_cell(cell) for cell in campaign.cells),
+        primary=tuple(primary_tests(campaign)),
+        contrasts=campaign.contrasts,
+    )
+    folder = published / campaign.name
+    before = read_registration(folder)
+    if before is not None and before.digest == found.digest:
+        return before
+    if before is not None:
+        raise RegistrationError(
+            f"{folder / FILE}: expected the same experiment as was registered on {before.date}, got another; remove the file, and the cells "
+            "published beside it, to register anew"
+        )
+    _refuse_late(campaign)
+    write_atomically(folder / FILE, json.dumps(found.model_dump(mode="json"), indent=1) + "\n")
+    return found
+
+
+def _scenarios(campaign: Campaign) -> dict[str, RegisteredScenario]:
+    found: dict[str, RegisteredScenario] = {}
+    for cell in campaign.cells:
+        key = scenario_key(cell.scenario, cell.placement)
+        if key not in found:
+            found[key] = _scenario(_experiment(campaign, cell), campaign.inside(cell).scenario)
+    return found
+
+
+def _experiment(campaign: Campaign, cell: Cell) -> Experiment:
+    kind: CellKind = load_kind(campaign.kind(cell))
+    experiment = read_experiment(campaign, cell)
+    if not isinstance(experiment, Experiment):
+        raise RegistrationError(
+            f"{cell.name}: expected a cell of an experiment file, got one of {type(kind).__name__}, which cannot be registered"
+        )
+    experiment.ask_world()
+    return experiment
+
+
+def _scenario(experiment: Experiment, name: str) -> RegisteredScenario:
+    config, limits = experiment.config, experiment.limits
+    starts = [(float(x), float(y), float(yaw)) for x, y, yaw in experiment.measured_starts(name).tolist()]
+    deployed = 0 if config.deploy.through == "nothing" else len(starts[: config.deploy.starts])
+    return RegisteredScenario(
+        settings_sha256=hash_of(registered_settings(experiment)),
+        path=experiment.paths[name].to_dict(),
+        ticks=limits.ticks,
+        dt_s=limits.dt_s,
+        off_track_m=limits.off_track_m,
+        held_cap_m=limits.held_cap_m,
+        starts=tuple(starts),
+        deployed_starts=deployed,
+        evaluations=planned_evaluations(experiment),
+        space=config.space.model_dump(mode="json"),
+        victims=config.policy.key(),
+        drives_well_mean_cte_m=mean_cte_limit_m(limits.off_track_m),
+    )
+
+
+def primary_tests(campaign: Campaign) -> list[PrimaryTest]:
+    """The tests on the victim trained with textures, per scenario: the gradient against all baselines, and that in coarse cells against coarse ones.
+
+    Baselines are the methods whose textures neither trained nor judged the victim. A scenario without any has no test.
+
+    Raises:
+        RegistrationError: A scenario with a baseline lacks some of those that a test needs.
+    """
+    tests = []
+    for scenario, placement in dict.fromkeys((cell.scenario, cell.placement) for cell in campaign.cells):
+        found = [each for each in campaign.cells if (each.scenario, each.placement) == (scenario, placement)]
+        methods = unseen(cell.method for cell in found if cell.victim == HARDENED and cell.searched)
+        against = [name for name in methods if name not in (GRADIENT, COARSE_GRADIENT)]
+        if GRADIENT not in methods or not against:
+            continue
+        lacking = _lacking(methods, read_experiment(campaign, found[0]).config)
+        if lacking:
+            raise RegistrationError(
+                f"{scenario_key(scenario, placement)}: expected the baselines that a test of the gradient needs, got {', '.join(against)} "
+                f"(textures of {', '.join(TRAINED_ON)} train the victim, those of {', '.join(VALIDATED_ON)} judge it); add {'; '.join(lacking)} to "
+                "the methods"
+            )
+        coarse = [name for name in against if name in COARSE_BASELINES] if COARSE_GRADIENT in methods else []
+        tests += [
+            PrimaryTest(
+                scenario=scenario, placement=placement, victim=HARDENED, method=method, against=tuple(names)
+            )
+            for method, names in ((GRADIENT, against), (COARSE_GRADIENT, coarse))
+            if names
+        ]
+    return tests
+
+
+def _lacking(methods: Sequence[str], config: ExperimentConfig) -> list[str]:
+    return lacking_baselines(methods, _coarse_cells_differ(config), unseen(RANDOM_FAMILIES))
+
+
+def _coarse_cells_differ(config: ExperimentConfig) -> bool:
+    """Whether coarse textures have other cells than the gradient's, where the gradient can have theirs: on a face, or on one panel."""
+    space = config.space
+    if isinstance(space, FaceConfig):
+        return 0 < space.cells < space.resolution
+    panel = len(config.objects) == 1 and config.objects[0].kind == PANEL
+    return isinstance(space, ColoursConfig) and panel and 0 < space.cells < config.object.panel_resolution
+
+
+def _refuse_late(campaign: Campaign) -> None:
+    done = [
+        each.cell.name
+        for each in statuses(campaign, campaign.cells)
+        if each.state in (*FINISHED, "begun", "running")
+    ]
+    if done:
+        raise RegistrationError(
+            f"expected to register before anything is run, got {len(done)} cells that are there or begun, such as {done[0]}; "
+            "name another run folder, or other seeds"
+        )

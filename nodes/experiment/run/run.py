@@ -1,0 +1,303 @@
+"""Runs a campaign: prepares its experiments, then its cells, over cores or over a cluster; what is there and fits is not run again."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from pathlib import Path
+from typing import Any, Literal
+
+import joblib
+from rich.console import Console
+
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.run.admission import past_the_gate
+from nodes.experiment.run.config import Campaign
+from nodes.experiment.run.kinds import load_kind
+from nodes.experiment.run.plan import Planned, elsewhere, plan_cells, read_experiment
+from nodes.experiment.run.store import NOT_DRIVEN, Store, store_of
+from nodes.experiment.run.worker import Ended, Job, run_here, run_in_process
+from nodes.lab.trials.tries import allow_more_tries
+from nodes.runtime.errors import ConfigError
+from nodes.runtime.progress import Display, ProgressDisplay, Report
+
+Backend = Literal["local", "ray"]
+Say = Callable[[str], None]
+# How often cells are handed out again after a whole machine of a cluster was lost.
+_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a campaign is run.
+
+    Attributes:
+        jobs: Cells at a time; 0 takes one per core, or the cores of the cluster.
+        threads: Threads per cell; 0 shares the cores among the jobs.
+        backend: ``local`` or ``ray``.
+        address: Of a running Ray cluster; empty takes the one in RAY_ADDRESS, or starts one here.
+        retry: Also run cells that failed before.
+        gate: Whether scenarios whose surrogate the fidelity gate refuses are left out; else it is only told.
+        search_only: Search, and deploy nothing: for predictions before the drives, or to choose what is worth one.
+        here: One cell after another in this process, which starts none and shares what cells of one experiment have in common.
+        ready: What cells need is there already.
+    """
+
+    jobs: int = 0
+    threads: int = 0
+    backend: Backend = "local"
+    address: str = ""
+    retry: bool = False
+    gate: bool = True
+    search_only: bool = False
+    here: bool = False
+    ready: bool = False
+
+
+def run_campaign(
+    campaign: Campaign,
+    cells: Sequence[Cell],
+    options: Options,
+    say: Say,
+    experiments: dict[tuple[str, str], Any] | None = None,
+    console: Console | None = None,
+    watcher: Display | None = None,
+) -> list[Ended]:
+    """Run the cells that are not there yet.
+
+    Args:
+        campaign: The campaign.
+        cells: Those of its cells that are wanted.
+        options: Over what, and how many at a time.
+        say: Told of every start and end.
+        experiments: As of `plan_cells`.
+        console: Where the progress of cells in this process is shown.
+        watcher: Receives the progress of cells in this process too.
+
+    Returns:
+        How every cell that was run ended, in the order of their ends.
+
+    Raises:
+        ConfigError: An experiment or a kind of scenario is wrong; nothing was run.
+    """
+    store, experiments = store_of(campaign), {} if experiments is None else experiments
+    if not options.ready:
+        _prepare(campaign, cells, say)
+    # Before the gate, so that a cell that there cannot be is told first.
+    plan = plan_cells(campaign, cells, experiments)
+    judged = past_the_gate(campaign, cells, options.gate, say)
+    wanted = [
+        each
+        for each in plan
+        if each.cell in judged and _is_wanted(store, each, elsewhere(campaign, each.cell), options, say)
+    ]
+    if not wanted:
+        there = sum(
+            store.status(each.cell, each.job.settings_hash, elsewhere(campaign, each.cell)).state == "done"
+            for each in plan
+        )
+        say(
+            f"nothing to do: {'every cell is' if there == len(plan) else f'{there} of {len(plan)} cells are'} there"
+        )
+        return []
+    _require_positive(options)
+    if options.search_only:
+        wanted = _searching(wanted, say)
+    if options.here:
+        return _run_here(store, wanted, experiments, options, say, ProgressDisplay(console, watcher))
+    jobs, threads = _shares(options)
+    if options.search_only:
+        say(f"{len(wanted)} cells to search, {_at_a_time(jobs, threads)}")
+        return _run_beside(
+            [replace(each.job, threads=threads, phase="search") for each in wanted], jobs, options, say
+        )
+    say(f"{len(wanted)} of {len(cells)} cells to run, {_at_a_time(jobs, threads)}")
+    beside = [replace(each.job, threads=threads) for each in wanted if not each.live]
+    beside += [
+        replace(each.job, threads=threads, phase="search") for each in wanted if each.live and each.searches
+    ]
+    ended = _run_beside(beside, jobs, options, say)
+    lost = {end.name for end in ended if end.how != "done"}
+    searched = {job.name for job in beside if job.phase == "search"}
+    ended = [end for end in ended if end.name not in searched or end.how != "done"]
+    # The live graphs have the machine to themselves, one after the other.
+    for each in wanted:
+        if each.live and each.cell.name not in lost:
+            ended.append(_tell(run_in_process(replace(each.job, threads=_cores())), say))
+    # Their drives without attack are there now.
+    past_the_gate(campaign, [each.cell for each in wanted if each.live], options.gate, say)
+    return ended
+
+
+def _run_here(
+    store: Store,
+    wanted: Sequence[Planned],
+    experiments: Mapping[tuple[str, str], Any],
+    options: Options,
+    say: Say,
+    display: ProgressDisplay,
+) -> list[Ended]:
+    """One cell after another in this process; those of one experiment share what it opens."""
+    ended = []
+    kinds = {each.job.kind: load_kind(each.job.kind) for each in wanted}
+    for (kind_name, key), group in groupby(
+        wanted, lambda each: (each.job.kind, (each.cell.scenario, each.cell.placement))
+    ):
+        kind, experiment = kinds[kind_name], experiments[key]
+        with display, kind.hold(experiment):
+            for each in group:
+                job = replace(each.job, threads=_cores(), phase="search" if options.search_only else "whole")
+                ended.append(run_here(job, store, kind, experiment, display))
+    for end in ended:
+        if end.how != "done" or end.text:
+            say(f"{end.name}: {end.how}: {end.text}")
+    return ended
+
+
+def _searching(wanted: Sequence[Planned], say: Say) -> list[Planned]:
+    """Those whose search can be run without their drives; the others wait."""
+    kinds = sorted({each.job.kind for each in wanted if not each.searches})
+    if found := [each for each in wanted if each.searches]:
+        for kind in kinds:
+            say(f"cells of kind {kind} search and drive in one and are left out")
+        return found
+    raise ConfigError(
+        f"expected cells whose search can be run alone, got kinds {', '.join(kinds)}; run them without --search-only"
+    )
+
+
+def _at_a_time(jobs: int, threads: int) -> str:
+    return f"{jobs or 'all the cluster has cores for'} at a time, {threads} threads each"
+
+
+def _prepare(campaign: Campaign, cells: Sequence[Cell], say: Say) -> None:
+    done: set[tuple[Path, str]] = set()
+    # All files are read before anything is made, so that a mistake in the last does not cost the hours of the first.
+    experiments = {(cell.scenario, cell.placement): (cell, read_experiment(campaign, cell)) for cell in cells}
+    _refuse_two_in_one_folder(campaign, cells)
+    for cell, experiment in experiments.values():
+        folder = campaign.run_folder(cell)
+        kind = campaign.kind(cell)  # kinds need different stages of one experiment
+        if (folder, kind) in done:
+            continue
+        done.add((folder, kind))
+        say(f"{cell.scenario}{'.' * bool(cell.placement)}{cell.placement}: {folder}")
+        load_kind(kind).prepare(experiment, _PrintedReport(say))
+
+
+def _refuse_two_in_one_folder(campaign: Campaign, cells: Sequence[Cell]) -> None:
+    """Scenarios of one run folder must need the same scene and policies, or each would run on, or remake, those of the other."""
+    folders = {campaign.run_folder(cell) for cell in cells}
+    first: dict[Path, tuple[str, dict[str, Any]]] = {}
+    for cell in {(each.scenario, each.placement): each for each in campaign.cells}.values():
+        if (folder := campaign.run_folder(cell)) not in folders:
+            continue
+        needed = load_kind(campaign.kind(cell)).needed_settings(read_experiment(campaign, cell))
+        name, others = first.setdefault(folder, (cell.scenario, needed))
+        if wrong := [stage for stage in needed.keys() & others.keys() if needed[stage] != others[stage]]:
+            raise ConfigError(
+                f"{campaign.file}: expected scenarios {name} and {cell.scenario} to have the same settings of stage {', '.join(sorted(wrong))}, as "
+                f"both are in {folder}, got different ones; give one of them a run_folder of its own"
+            )
+
+
+class _PrintedReport(Report):
+    def __init__(self, say: Say) -> None:
+        self._say, self._text = say, ""
+
+    def __call__(self, fraction: float, text: str = "") -> None:
+        """Say what is new."""
+        if text and text != self._text:
+            self._text = text
+            self._say(f"  {100 * fraction:.0f} % {text}")
+
+
+def _is_wanted(store: Store, each: Planned, elsewhere: Sequence[Path], options: Options, say: Say) -> bool:
+    status = store.status(each.cell, each.job.settings_hash, elsewhere)
+    if status.state == NOT_DRIVEN:
+        if options.retry:
+            _allow_more_tries(store, each.cell.name)
+        else:
+            say(f"{each.cell.name}: not driven live, not tried again without --retry: {status.text}")
+        return options.retry
+    if status.state == "failed" and not options.retry:
+        say(f"{each.cell.name}: failed before, not run again without --retry: {status.text}")
+        return False
+    if status.state == "running":
+        say(f"{each.cell.name}: another process runs it")
+        return False
+    return status.state != "done"
+
+
+def _allow_more_tries(store: Store, name: str) -> None:
+    """Allow three more tries of a cell's drives, and of those without attack that it is compared with."""
+    work = store.work(name)
+    for folder in (work, *(work.parent / "shared").glob("*")):
+        allow_more_tries(folder)
+
+
+def _run_beside(jobs: list[Job], at_a_time: int, options: Options, say: Say) -> list[Ended]:
+    if not jobs:
+        return []
+    if options.backend == "local":
+        with joblib.parallel_config(backend="threading", n_jobs=at_a_time):
+            return _collect(jobs, say)
+    return _run_on_ray(jobs, at_a_time, options, say)
+
+
+def _collect(jobs: list[Job], say: Say) -> list[Ended]:
+    """Hand the jobs out to joblib's backend in force; tell of each as it ends."""
+    parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="all")
+    return [_tell(end, say) for end in parallel(joblib.delayed(run_in_process)(job) for job in jobs)]
+
+
+def _run_on_ray(jobs: list[Job], at_a_time: int, options: Options, say: Say) -> list[Ended]:
+    from nodes.experiment.run.cluster import collect_on_ray, ray_session
+
+    with ray_session(options.address, at_a_time or _cores()) as cores:
+        say(f"Ray cluster with {cores} cores; advnerf status tells how far it is")
+        at_a_time = at_a_time or max(1, cores // (options.threads or 1))
+        ended: list[Ended] = []
+        left = jobs
+        for _ in range(_ROUNDS):
+            found = collect_on_ray(left, min(at_a_time, cores))
+            if found is not None:
+                return ended + [_tell(end, say) for end in found]
+            finished = [Ended(job.name, "done", "", 0.0) for job in left if _is_finished(job)]
+            ended += [_tell(end, say) for end in finished]
+            left = [job for job in left if not _is_finished(job)]
+            say(f"a machine of the cluster was lost: {len(left)} cells are handed out again")
+        text = "its machine was lost again and again; it goes on when the campaign is run again"
+        return ended + [_tell(Ended(job.name, "lost", text, 0.0), say) for job in left]
+
+
+def _is_finished(job: Job) -> bool:
+    """Whether a result of these settings is there, whoever was to tell of it; a search has none of its own and goes on from its state."""
+    result = Store(Path(job.campaign_folder)).result(job.name)
+    return result is not None and result.settings_hash == job.settings_hash
+
+
+def _tell(end: Ended, say: Say) -> Ended:
+    say(f"{end.name}: {end.how} after {end.seconds:.1f} s{': ' * bool(end.text)}{end.text}")
+    return end
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0))
+
+
+def _require_positive(options: Options) -> None:
+    if options.jobs < 0 or options.threads < 0:
+        raise ConfigError(
+            f"expected --jobs and --threads of at least 1, got {options.jobs} and {options.threads}"
+        )
+
+
+def _shares(options: Options) -> tuple[int, int]:
+    """Cells at a time, 0 for as many as a cluster has cores for, which only the cluster can tell; and threads of each."""
+    if options.backend == "ray":
+        return options.jobs, options.threads or 1
+    jobs = options.jobs or (_cores() // options.threads if options.threads else _cores()) or 1
+    return jobs, options.threads or max(1, _cores() // jobs)

@@ -1,0 +1,61 @@
+"""The film of a published set: drives without attack, past the strongest baseline, and past the attack, side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from advnerf_core.documents import read_json
+from advnerf_core.files import write_atomically
+from advnerf_core.report.cells import read_cells
+from advnerf_core.report.clips import read_clip, webp
+from advnerf_core.report.conditions import NONE
+from advnerf_core.report.evidence.page import film_of
+from advnerf_core.report.evidence.registration import read_registration
+from advnerf_core.report.evidence.results import Evidence
+from advnerf_core.report.evidence.verifying.layout import SET
+from nodes.experiment.run.config import Campaign
+
+MOST_BYTES = 250_000
+_WIDTH_PX, _FRAME_MS, _QUALITIES = 760, 200, (70, 50, 35, 20, 10)
+_EVERY = 2  # of ten frames a second
+
+
+def write_film(campaign: Campaign, published: Path) -> Path | None:
+    """Write the film of the first primary test beside the page; None if there is none, or a clip is not on this machine."""
+    primary = read_json(published / SET)["primary"]
+    clips = _clips(campaign, published, primary[0]) if primary else []
+    if not clips or not all(clip.exists() for clip in clips):
+        return None
+    frames = _side_by_side([read_clip(clip)[::_EVERY] for clip in clips])
+    for quality in _QUALITIES:
+        data = webp(frames, _FRAME_MS, quality)
+        if len(data) <= MOST_BYTES:
+            break
+    target = published.parent / film_of(published.name)
+    write_atomically(target, data)
+    return target
+
+
+def _clips(campaign: Campaign, published: Path, test: dict[str, Any]) -> list[Path]:
+    which, registration = test["test"], read_registration(published)
+    assert registration is not None, "a set was registered"
+    evidence = Evidence(registration, read_cells(published))
+    searched = [
+        evidence.searches((which["scenario"], which["placement"], which["victim"], method))[0]
+        for method in (NONE, test["baseline"], which["method"])
+    ]
+    return [campaign.folder / "cells" / str(cell.extra.get("clip", "")) for cell in searched]
+
+
+def _side_by_side(clips: Sequence[NDArray[np.uint8]]) -> list[Image.Image]:
+    """Frames with all clips; one that is over shows its last frame."""
+    count = max(len(clip) for clip in clips)
+    rows = [np.concatenate([clip[min(at, len(clip) - 1)] for clip in clips], axis=1) for at in range(count)]
+    height = round(rows[0].shape[0] * _WIDTH_PX / rows[0].shape[1])
+    return [Image.fromarray(row).resize((_WIDTH_PX, height), Image.Resampling.LANCZOS) for row in rows]

@@ -1,0 +1,165 @@
+"""Runs a whole experiment: its stages, its cells (here, over cores or over a cluster), its report. Called by ``advnerf experiment``."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+from rich.console import Console
+
+from advnerf_core.attack.methods import method_name
+from advnerf_core.files import sha256_of
+from nodes.experiment.engine.progress_record import ProgressRecord
+from nodes.experiment.engine.run_folder import require_own_folder
+from nodes.experiment.engine.stage_record import Stage
+from nodes.experiment.engine.stages import check_until, run_stages
+from nodes.experiment.pages import report
+from nodes.experiment.plan.cell import Cell, select
+from nodes.experiment.run.config import Campaign, campaign_of
+from nodes.experiment.run.plan import statuses
+from nodes.experiment.run.run import Options, run_campaign
+from nodes.experiment.run.store import FINISHED, NOT_DRIVEN
+from nodes.experiment.run.worker import Ended
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.steps.attack import cells
+from nodes.experiment.steps.run import make_ready, stages_of
+from nodes.experiment.steps.steering_gate import require_same_steering
+from nodes.runtime.progress import ProgressDisplay
+
+REPORT = "report"
+
+
+def run_experiment(
+    experiment: Experiment,
+    until: str | None = None,
+    options: Options | None = None,
+    only: str = "",
+    overrides: Sequence[str] = (),
+    console: Console | None = None,
+    anew: bool = False,
+    record: ProgressRecord | None = None,
+) -> list[Ended]:
+    """Run the stages and the cells that are not there yet, and the report; it leaves out methods of which a cell failed.
+
+    Args:
+        experiment: The experiment.
+        until: Last stage to run; None for all, and the cells.
+        options: How cells are run; None runs one after another in this process.
+        only: Which cells; see `select`.
+        overrides: ``key=value`` texts with which the experiment was read, for other processes.
+        console: Where to print.
+        anew: Whether stages are made here that are kept with the code.
+        record: Keeps the progress for the experiment page.
+
+    Returns:
+        How every cell that was run ended.
+
+    Raises:
+        StageError: ``until`` names no stage.
+        ConfigError: The folder has the stages of another experiment, or ``only`` fits no cell.
+    """
+    console, began = console or Console(), time.monotonic()
+    stages = [*stages_of(experiment), _report_stage(experiment, {})]
+    check_until(stages, until)
+    plan = cells(experiment)
+    chosen = select(plan, only)
+    if record is not None:
+        require_own_folder(experiment)
+        names = [stage.name for stage in stages]
+        until_there = names if until is None else names[: names.index(until) + 1]
+        record.plan(until_there, chosen if REPORT in until_there else [])
+    make_ready(experiment, None if until == REPORT else until, console, anew, record)
+    ended: list[Ended] = []
+    if until in (None, REPORT):
+        campaign = campaign_of(experiment, overrides, plan)
+        options = options or Options(here=True, ready=True)
+        require_same_steering(experiment, not options.gate, partial(_say, console, record))
+        ended = _run_cells(experiment, campaign, chosen, options, console, record)
+        _write_report(experiment, campaign, console, record)
+    console.print(
+        f"{experiment.config.name} ({experiment.setting}): {time.monotonic() - began:.0f} s", highlight=False
+    )
+    return ended
+
+
+def _run_cells(
+    experiment: Experiment,
+    campaign: Campaign,
+    chosen: Sequence[Cell],
+    options: Options,
+    console: Console,
+    record: ProgressRecord | None,
+) -> list[Ended]:
+    known = {(name, ""): experiment for name in campaign.scenarios}
+    if record is not None:
+        _record_cells_there(campaign, chosen, options, record)
+
+    return run_campaign(campaign, chosen, options, partial(_say, console, record), known, console, record)
+
+
+def _say(console: Console, record: ProgressRecord | None, text: str) -> None:
+    console.print(text, highlight=False, soft_wrap=True)
+    if record is not None:
+        record.say(text)
+
+
+def _record_cells_there(
+    campaign: Campaign, chosen: Sequence[Cell], options: Options, record: ProgressRecord
+) -> None:
+    """Cells that will not be run again: done, or failed before."""
+    for each in statuses(campaign, chosen):
+        if each.state in FINISHED and not (each.state == NOT_DRIVEN and options.retry):
+            record.finish(each.cell.name, 0.0, cached=True)
+        elif each.state == "failed" and not options.retry:
+            record.fail(each.cell.name, each.text)
+
+
+def _write_report(
+    experiment: Experiment, campaign: Campaign, console: Console, record: ProgressRecord | None
+) -> None:
+    """The report of the methods whose cells are all here and deployed, once no cell is left to run.
+
+    A method of which a cell failed is left out and named. What the report was made of is part of its key.
+    """
+    if experiment.config.deploy.through == "nothing":
+        return
+    found = statuses(campaign, campaign.cells)
+    failed = {each.cell.method: f"{each.cell.name}: {each.text}" for each in found if each.state == "failed"}
+    reported = _of_methods(
+        experiment, [name for name in experiment.config.attack.method_names if name not in failed]
+    )
+    done = {each.cell.name for each in found if each.state in FINISHED}
+    files = {cell.name: experiment.cell_result(cell) for cell in cells(reported)}
+    missing = [name for name, file in files.items() if name not in done or not file.exists()]
+    notes = [f"not in the report, as a cell failed: {name} ({text})" for name, text in failed.items()]
+    if missing or not reported.config.attack.methods:
+        notes = [f"no report yet: {len(found) - len(done)} of {len(found)} cells are missing"]
+    for text in notes:
+        _say(console, record, text)
+    if missing or not reported.config.attack.methods:
+        return
+    digests = {name: sha256_of(file) for name, file in files.items()}
+    with ProgressDisplay(console, record) as display:
+        run_stages([_report_stage(reported, digests, notes)], experiment.folder, display)
+    report.print_summary(reported, console)
+
+
+def _of_methods(experiment: Experiment, names: Sequence[str]) -> Experiment:
+    """The same experiment with some of its methods."""
+    attack = experiment.config.attack
+    kept = tuple(each for each in attack.methods if method_name(each) in names)
+    if kept == attack.methods:
+        return experiment
+    fewer = attack.model_copy(update={"methods": kept})
+    return replace(experiment, config=experiment.config.model_copy(update={"attack": fewer}))
+
+
+def _report_stage(experiment: Experiment, digests: dict[str, str], notes: Sequence[str] = ()) -> Stage:
+    held_to = experiment.held_to.model_dump(mode="json")
+    settings: dict[str, Any] = {"cells": digests, "setting": experiment.setting, "held_to": held_to}
+    if notes:
+        settings["notes"] = list(notes)
+    return Stage(REPORT, lambda folder, told: report.run(experiment, folder, told, notes), settings)

@@ -1,0 +1,331 @@
+"""The process of one cell: whatever happens to it, other cells do not notice. ``python -m nodes.experiment.run.worker`` reads its job from stdin.
+
+The result, or the error, is left in the campaign's folder; the exit code says which. A killed worker leaves neither, and its folder as it
+was: the next run of the campaign goes on there.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import asdict, dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any, Literal, TextIO
+
+from advnerf_core.files import write_atomically
+from advnerf_core.run_module import module_command
+from nodes.experiment.engine.stage_record import stage_digests
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.run.cell_kind import CellKind, settings_hash
+from nodes.experiment.run.kinds import load_kind
+from nodes.experiment.run.store import LOG, Store
+from nodes.runtime.errors import RuntimeFault
+from nodes.runtime.locks import HeldError, hold
+from nodes.runtime.machine import machine_name
+from nodes.runtime.progress import Display, Report
+from nodes.runtime.termination import ends_in_order
+
+Phase = Literal["search", "whole"]
+_DONE, _FAILED, _ELSEWHERE, _ASKED_TO_END = 0, 1, 3, 128 + signal.SIGTERM
+_PROGRESS_PERIOD_S = 5.0
+_LOOKED_AT_S = 1.0
+# Longer than CarlaScene waits for a server that is gone.
+_ENDING_S = 20.0
+_LIVE_LOCK = "advnerf-live.lock"
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+class ChangedError(RuntimeFault):
+    """What a cell depends on changed between the plan and the run."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One cell to run; plain data, so that it can go to another machine.
+
+    Attributes:
+        campaign_folder: Where results go; the same folder on every machine.
+        name: Name of the cell.
+        kind: Kind of its scenario.
+        experiment: Experiment file.
+        setting: Which of its settings.
+        overrides: Changes of it.
+        run_folder: Run folder of the experiment.
+        scenario: What the experiment calls the scenario.
+        shown_scenario: What the campaign calls it.
+        placement: Name of the placement.
+        victim: Which policy.
+        method: Which search: a name, or ``file.py:Name`` with an absolute path.
+        seed: Of starts and search.
+        settings_hash: Of what the result depends on, when it was planned.
+        threads: Threads that it may use.
+        phase: ``search``: only what may run beside others; ``whole``: all of it.
+        registration: Digest of the registration that it is run under; empty if there is none.
+    """
+
+    campaign_folder: str
+    name: str
+    kind: str
+    experiment: str
+    setting: str
+    overrides: tuple[str, ...]
+    run_folder: str
+    scenario: str
+    shown_scenario: str
+    placement: str
+    victim: str
+    method: str
+    seed: int
+    settings_hash: str
+    threads: int
+    phase: Phase = "whole"
+    registration: str = ""
+
+    @property
+    def cell(self) -> Cell:
+        """The cell as its experiment names it."""
+        return Cell.of(self.scenario, self.victim, self.method, self.seed)
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How the process of a cell ended.
+
+    Attributes:
+        name: Name of the cell.
+        how: ``done``, ``failed`` (the error is kept), ``elsewhere`` (another process has it), or ``lost`` (killed: it goes on when run again).
+        text: What to tell.
+        seconds: Wall time [s].
+    """
+
+    name: str
+    how: Literal["done", "failed", "elsewhere", "lost"]
+    text: str
+    seconds: float
+
+
+def run_in_process(job: Job) -> Ended:
+    """Run a cell in a process of its own and wait for it; called in a thread here, or in a worker of a cluster."""
+    began = time.monotonic()
+    store = Store(Path(job.campaign_folder))
+    environment = {
+        **os.environ,
+        "PYTHONUNBUFFERED": "1",
+        **dict.fromkeys(_THREAD_VARIABLES, str(job.threads)),
+    }
+    environment.setdefault("MUJOCO_GL", "egl")
+    process = subprocess.Popen(
+        module_command("nodes.experiment.run.worker", str(os.getpid())),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        env=environment,
+    )
+    try:
+        _, errors = process.communicate(json.dumps(asdict(job)).encode())
+    except BaseException:
+        # Asked first: a cell may have a world to put back, as a CARLA server's.
+        process.terminate()
+        try:
+            process.wait(_ENDING_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        raise
+    code, seconds = process.returncode, time.monotonic() - began
+    said = (errors.decode("utf-8", "replace").strip().splitlines() or [""])[-1]
+    if code == _DONE:
+        return Ended(job.name, "done", _not_driven(job, store), seconds)
+    if code == _ELSEWHERE:
+        return Ended(job.name, "elsewhere", said, seconds)
+    # One that was asked to end closed what it had open, and says so by the shell's exit code.
+    if code < 0 or code == _ASKED_TO_END:
+        by = signal.Signals(-code) if code < 0 else signal.SIGTERM
+        return Ended(
+            job.name, "lost", f"killed by {by.name}; it goes on when the campaign is run again", seconds
+        )
+    error = store.error(job.name, job.settings_hash)
+    if error:
+        return Ended(job.name, "failed", error, seconds)
+    # Not even the worker's own error handling was reached, as when a library cannot be loaded.
+    store.keep_error(job.name, job.settings_hash, said or f"the worker ended with exit code {code}")
+    return Ended(job.name, "failed", said, seconds)
+
+
+def run_here(job: Job, store: Store, kind: CellKind, experiment: Any, display: Display) -> Ended:
+    """Run a cell in this process; what ends it by an error is kept, and other cells go on."""
+    began = time.monotonic()
+    store.lock_file(job.name).parent.mkdir(parents=True, exist_ok=True)
+    try:
+        lock = hold(store.lock_file(job.name))
+    except HeldError as held:
+        return Ended(job.name, "elsewhere", f"{job.name} is being run by process {held.owner}", 0.0)
+    with lock:
+        work, report = store.begin(job.name, job.settings_hash), display.start(job.name)
+        try:
+            _run(job, store, work, kind, experiment, report)
+        except Exception as error:
+            text = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            store.keep_error(job.name, job.settings_hash, text)
+            (work / LOG).write_text(traceback.format_exc(), encoding="utf-8")
+            return Ended(job.name, "failed", text, time.monotonic() - began)
+    seconds = time.monotonic() - began
+    display.finish(job.name, seconds, cached=False)
+    return Ended(job.name, "done", _not_driven(job, store), seconds)
+
+
+def _not_driven(job: Job, store: Store) -> str:
+    """What to tell of a finished cell that was not driven live; empty for any other."""
+    result = store.result(job.name) if job.phase == "whole" else None
+    return (
+        f"not driven live: {result.not_driven_live}" if result is not None and result.not_driven_live else ""
+    )
+
+
+def main() -> None:
+    """Run the job on stdin."""
+    with ends_in_order():
+        _die_with(int(sys.argv[1]))
+        _run_job()
+
+
+def _run_job() -> None:
+    job = Job(**{**(data := json.loads(sys.stdin.read())), "overrides": tuple(data["overrides"])})
+    store = Store(Path(job.campaign_folder))
+    store.lock_file(job.name).parent.mkdir(parents=True, exist_ok=True)
+    with take_cell(store, job.name):
+        kind, experiment = _checked(job, store)
+        work = store.begin(job.name, job.settings_hash)
+        with open(work / LOG, "a", encoding="utf-8", buffering=1) as log:
+            os.dup2(log.fileno(), 1)
+            try:
+                _run(job, store, work, kind, experiment, _log_progress())
+            except Exception as error:
+                traceback.print_exc(file=log)
+                store.keep_error(
+                    job.name, job.settings_hash, f"{type(error).__name__}: {' '.join(str(error).split())}"
+                )
+                raise SystemExit(_FAILED) from None
+
+
+def take_cell(store: Store, name: str) -> TextIO:
+    """The cell for this process alone. Who only looks at its state holds it for an instant, which is waited for."""
+    end_s = time.monotonic() + _LOOKED_AT_S
+    while True:
+        try:
+            return hold(store.lock_file(name))
+        except HeldError as held:
+            if time.monotonic() > end_s:
+                print(f"{name} is being run by process {held.owner}", file=sys.stderr)
+                raise SystemExit(_ELSEWHERE) from None
+            time.sleep(0.05)
+
+
+def _checked(job: Job, store: Store) -> tuple[CellKind, Any]:
+    """The kind and the experiment as they are now, before anything of the cell is touched."""
+    try:
+        kind = load_kind(job.kind)
+        _use_threads(job.threads)
+        experiment = kind.load(Path(job.experiment), job.setting, job.overrides, Path(job.run_folder))
+        if settings_hash(kind, experiment, job.cell) != job.settings_hash:
+            raise ChangedError(
+                f"{job.name}: its settings or inputs changed after the campaign was started; run the campaign again"
+            )
+    except Exception as error:
+        store.keep_error(
+            job.name, job.settings_hash, f"{type(error).__name__}: {' '.join(str(error).split())}"
+        )
+        raise SystemExit(_FAILED) from None
+    return kind, experiment
+
+
+def _run(job: Job, store: Store, work: Path, kind: CellKind, experiment: Any, report: Report) -> None:
+    began = time.monotonic()
+    if job.phase == "search":
+        kind.search(experiment, job.cell, work, report)
+        _add_seconds(work, time.monotonic() - began)
+        return
+    with _alone(kind, experiment):
+        found = kind.run(experiment, job.cell, work, report)
+    ours = {
+        "scenario": job.shown_scenario,
+        "placement": job.placement,
+        "victim": job.victim,
+        "method": job.cell.method,
+        "seed": job.seed,
+        "settings_hash": job.settings_hash,
+        "registration": job.registration,
+        "stages": stage_digests(Path(job.run_folder), list(kind.needed_settings(experiment))),
+        "machine": found.get("machine") or machine_name(),
+        "date": found.get("date") or datetime.now(timezone.utc).isoformat(timespec="seconds"),
+    }
+    spent = _add_seconds(work, time.monotonic() - began)
+    seconds = found["seconds"] if found.get("seconds") is not None else spent
+    store.keep_result(job.name, {**found, **ours, "seconds": round(float(seconds), 1)})
+
+
+@contextmanager
+def _alone(kind: CellKind, experiment: Any) -> Iterator[None]:
+    """A live graph measures time: of all campaigns on this machine only one cell at a time drives one."""
+    with _wait_for_live() if kind.runs_alone(experiment) else nullcontext():
+        yield
+
+
+def _wait_for_live() -> Any:
+    path = Path(tempfile.gettempdir()) / _LIVE_LOCK
+    while True:
+        try:
+            return hold(path)
+        except HeldError:
+            time.sleep(0.5)
+
+
+def _add_seconds(work: Path, seconds: float) -> float:
+    """Computing time of a cell over all the times it was run and stopped properly [s]."""
+    file = work / "seconds"
+    total = seconds + (float(file.read_text()) if file.exists() else 0.0)
+    write_atomically(file, f"{total:.3f}\n")
+    return total
+
+
+def _log_progress() -> Any:
+    said_s = [-_PROGRESS_PERIOD_S]
+
+    def report(fraction: float, text: str = "") -> None:
+        now_s = time.monotonic()
+        if now_s - said_s[0] >= _PROGRESS_PERIOD_S:
+            said_s[0] = now_s
+            print(f"{100 * fraction:.0f} % {text}", flush=True)
+
+    return report
+
+
+def _use_threads(threads: int) -> None:
+    from advnerf_core.parallel import set_thread_count
+
+    set_thread_count(threads)
+    if "torch" in sys.modules:  # importing it takes seconds, and not every kind of cell needs it
+        sys.modules["torch"].set_num_threads(threads)
+
+
+def _die_with(parent: int) -> None:
+    """End when whoever waits for us ends, on Linux; elsewhere an orphan finishes its cell, which is a result all the same."""
+    if sys.platform == "linux":
+        import ctypes
+
+        ctypes.CDLL(None, use_errno=True).prctl(1, signal.SIGTERM)
+        if os.getppid() != parent:
+            raise SystemExit(_FAILED)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,394 @@
+"""What all stages of an experiment in a world share: the resolved configuration, the world, paths, camera, car, objects."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+import torch
+
+from advnerf_core.documents import Document, read_json
+from advnerf_core.driving.dynamics import Ackermann, Dubins
+from advnerf_core.driving.expert import Expert, ExpertConfig
+from advnerf_core.driving.metrics import Horizon
+from advnerf_core.driving.path import Path
+from advnerf_core.driving.solids import Rectangle, Solids
+from advnerf_core.files import write_atomically
+from advnerf_core.geometry import Array, Pinhole
+from advnerf_core.plugins import unknown
+from advnerf_core.policies.view import PolicyView
+from advnerf_core.report.reference import Reference
+from hardware.worlds.paths import ReferencePath
+from hardware.worlds.world import (
+    CarDescription,
+    HasSolids,
+    NotOpenError,
+    Traits,
+    World,
+    WorldDescription,
+    traits_of,
+)
+from nodes.experiment.engine.run_folder import RunFolder
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.plan.config import ExperimentConfig
+from nodes.experiment.plan.placed import PlacedObject, in_a_lane
+from nodes.lab.worlds.expert_drive import as_path
+from nodes.lab.worlds.named import NamedWorld, read_world, without
+from nodes.runtime.config import load_config
+from nodes.runtime.errors import ConfigError
+
+WORLD, PLACED, CALIBRATION, CELLS = "world.json", "objects.json", "calibration", "cells"
+# What two worlds have in common in which the same attack can be deployed.
+_SHARED = ("paths", "off_track_m", "car", "camera", "T_car_from_camera", "fence_m")
+# Distances that stages use were chosen for half a lane of this width [m] and for this speed [m/s]: those of the simulated junction.
+_HALF_LANE_M, _SPEED_MPS = 1.75, 6.0
+
+
+@dataclass(frozen=True)
+class Experiment(RunFolder[ExperimentConfig]):
+    """One resolved experiment.
+
+    Attributes:
+        kept: Digests of what its stages wrote that are kept with the code, and those of the run folder before them, when it was read.
+    """
+
+    kept: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def resolved_in(cls, folder: FilePath) -> Experiment:
+        """The experiment that a run folder is of, as its manifest resolved it."""
+        manifest = read_json(folder / "manifest.json")
+        config = ExperimentConfig.model_validate(manifest["config"])
+        return cls(config, FilePath(manifest["file"]), folder, manifest["setting"])
+
+    @cached_property
+    def named_world(self) -> NamedWorld:
+        """The world as the file names it, with its changes."""
+        return read_world(Document(self.config.world, str(self.file)), self.file.parent)
+
+    @property
+    def world_settings(self) -> dict[str, Any]:
+        """What of the world's configuration the results depend on, as JSON data."""
+        return self.named_world.settings
+
+    @cached_property
+    def traits(self) -> Traits:
+        """What is known of the world without opening it."""
+        return traits_of(self.named_world.make())
+
+    @cached_property
+    def solids(self) -> Solids | None:
+        """What the car can hit, walls included; None where the world does not say."""
+        world = self.named_world.make()
+        if not isinstance(world, HasSolids):
+            return None
+        rectangles = [
+            Rectangle(each.x_m, each.y_m, each.half_length_m, each.half_width_m, each.yaw_rad)
+            for each in (world.car_body, *world.solids)
+        ]
+        return Solids(tuple(rectangles[1:]), rectangles[0]) if rectangles[1:] else None
+
+    @property
+    def seen_settings(self) -> dict[str, Any]:
+        """What of the world's configuration its pictures and its description depend on, as JSON data."""
+        return without(self.world_settings, self.traits.unseen)
+
+    @cached_property
+    def world(self) -> WorldDescription:
+        """Paths, lanes, car and camera. A world that must be asked for them was asked by the capture stage, which has kept them.
+
+        Raises:
+            ConfigError: It must be asked, and nothing is captured yet.
+        """
+        try:
+            return self.named_world.make().describe()
+        except NotOpenError:
+            kept = self._captured()
+            if kept is None or kept["settings"] != self.seen_settings:
+                raise ConfigError(
+                    f"expected {self._kept_world} of this configuration, which the capture stage writes when the world {self.named_world.kind} is "
+                    "open; run that stage first"
+                ) from None
+            return WorldDescription.from_dict(kept["description"])
+
+    @property
+    def is_described(self) -> bool:
+        """Whether the world is known: not before the capture stage if it must be asked."""
+        try:
+            _ = self.world
+        except ConfigError:
+            return False
+        return True
+
+    def ask_world(self) -> None:
+        """Have a world that must be asked for its description say it, before the capture stage keeps it: nothing is photographed for it."""
+        if not self.is_described:
+            with self.named_world.make() as world:
+                vars(self)["world"] = world.describe()  # where the cached property keeps it
+
+    @contextmanager
+    def open_world(self) -> Iterator[World]:
+        """The world, open; closed at the end.
+
+        Raises:
+            ConfigError: It is not the world that was captured.
+        """
+        with self.named_world.make() as world:
+            kept, found = self._captured(), as_json(world.describe())
+            if kept is not None and kept["settings"] == self.seen_settings and kept["description"] != found:
+                differ = [name for name, value in found.items() if kept["description"].get(name) != value]
+                raise ConfigError(
+                    f"expected the world of {self._kept_world}, got one with other {', '.join(differ)}: open the world that was captured, or name "
+                    "another run folder"
+                )
+            yield world
+
+    @cached_property
+    def deployed_world(self) -> NamedWorld:
+        """The world where attacks are deployed."""
+        wanted = self.config.deploy.world
+        return (
+            self.named_world
+            if wanted is None
+            else read_world(Document(wanted, str(self.file)), self.file.parent)
+        )
+
+    @contextmanager
+    def open_deployed_world(self) -> Iterator[World]:
+        """The world where attacks are deployed, open; closed at the end.
+
+        Raises:
+            ConfigError: It has other paths, another camera or another car than the world that was captured.
+        """
+        if self.config.deploy.world is None:
+            with self.open_world() as world:
+                yield world
+            return
+        with self.deployed_world.make() as world:
+            captured, found = as_json(self.world), as_json(world.describe())
+            if differ := [name for name in _SHARED if captured[name] != found[name]]:
+                raise ConfigError(
+                    f"{self.file}: deploy.world: expected a world with the {', '.join(_SHARED)} of {self.named_world.kind}, got "
+                    f"{self.deployed_world.kind} with other {', '.join(differ)}"
+                )
+            yield world
+
+    def keep_world(self, world: World) -> None:
+        """Write what an open world says about itself into the capture stage's folder.
+
+        Raises:
+            ConfigError: It says something else than before.
+        """
+        found = as_json(world.describe())
+        text = json.dumps({"settings": self.seen_settings, "description": found}, indent=1)
+        write_atomically(self._kept_world, text + "\n")
+        if as_json(self.world) != found:
+            raise ConfigError(
+                f"expected the world {self.named_world.kind} to say the same about itself every time, got something else once it was open; a world "
+                "that must be asked raises NotOpenError before"
+            )
+
+    @property
+    def _kept_world(self) -> FilePath:
+        return self.stage_folder("capture") / WORLD
+
+    def _captured(self) -> dict[str, Any] | None:
+        if not self._kept_world.exists():
+            return None
+        kept: dict[str, Any] = read_json(self._kept_world)
+        return kept
+
+    @cached_property
+    def references(self) -> dict[str, ReferencePath]:
+        """The paths of the experiment by scenario.
+
+        Raises:
+            ConfigError: The world has no such path.
+        """
+        known = self.world.paths
+        for name in self.config.scenarios:
+            if name not in known:
+                raise ConfigError(f"{self.file}: scenarios: {unknown(name, 'scenario', known)}")
+        return {name: known[name] for name in self.config.scenarios}
+
+    @cached_property
+    def paths(self) -> dict[str, Path]:
+        """Reference paths by scenario.
+
+        Raises:
+            ConfigError: The world's lines and arcs are no path, as one that does not close.
+        """
+        try:
+            return {name: as_path(reference) for name, reference in self.references.items()}
+        except ValueError as error:
+            raise ConfigError(f"world {self.named_world.kind}: {error}") from error
+
+    @cached_property
+    def objects(self) -> tuple[PlacedObject, ...]:
+        """The objects of the attack, beside the lanes. Those with a rule stand where the capture stage has put them.
+
+        Raises:
+            ConfigError: One stands in a lane, or nothing is captured yet and one has a rule.
+        """
+        objects = self._objects_by_rule() if self.has_rules else self.placed_by_hand
+        if (found := in_a_lane(objects, self.world)) is not None:
+            raise ConfigError(f"{self.file}: objects.{found[0]}: {found[1]}")
+        return objects
+
+    @property
+    def placed_by_hand(self) -> tuple[PlacedObject, ...]:
+        """The objects whose places the file names."""
+        return tuple(each for each in self.config.objects if isinstance(each, PlacedObject))
+
+    @property
+    def has_rules(self) -> bool:
+        """Whether a rule places an object."""
+        return len(self.placed_by_hand) < len(self.config.objects)
+
+    def _objects_by_rule(self) -> tuple[PlacedObject, ...]:
+        file = self.stage_folder("capture") / PLACED
+        if not file.exists():
+            raise ConfigError(
+                f"expected {file}, where the capture stage writes the places of objects with a rule; run that stage first"
+            )
+        return tuple(map(PlacedObject.model_validate, read_json(file)))
+
+    def goal(self, scenario: str) -> tuple[float, ...]:
+        """What the policy is told on a path; empty where it is told nothing."""
+        return self.references[scenario].goal
+
+    def expert(self, scenario: str) -> Expert:
+        """The teacher on one path; its output is the car's control: turn rate [rad/s] or wheel angle [rad]."""
+        wanted, car = self.config.policy, self.car
+        config = ExpertConfig(
+            speed_mps=car.speed_mps,
+            delay_s=wanted.delay_s,
+            stiffness_1pm=wanted.stiffness_1pm,
+            feed_forward=wanted.feed_forward,
+            smoothing_m=wanted.smoothing_m or car.speed_mps * self.config.dt_s,
+            steering_limits_rad=car.control_limits,
+            output="turn_rate",
+        )
+        if car.wheelbase_m is not None:
+            config = replace(config, wheelbase_m=car.wheelbase_m, output="wheel_angle")
+        return Expert(self.paths[scenario], config)
+
+    @property
+    def car(self) -> CarDescription:
+        """The car as the surrogate believes it to be."""
+        return self.world.car
+
+    @property
+    def mount(self) -> Array:
+        """Driving camera on the car ``[4, 4]``."""
+        return self.world.T_car_from_camera
+
+    @property
+    def camera(self) -> Pinhole:
+        """Intrinsics of the driving camera."""
+        return self.world.camera
+
+    @cached_property
+    def view(self) -> PolicyView:
+        """What the policy sees of the driving camera.
+
+        Raises:
+            ConfigError: The window leaves the camera's image.
+        """
+        try:
+            return PolicyView(self.camera, **self.config.view.model_dump())
+        except ValueError as error:
+            raise ConfigError(
+                f"{self.file}: view: {error}; give the section view the window of the camera's image that is kept"
+            ) from error
+
+    @cached_property
+    def dynamics(self) -> Dubins | Ackermann:
+        """The surrogate's car, without the lag and the gain error of the deployed one."""
+        car, dt_s = self.car, self.config.dt_s
+        if car.wheelbase_m is None:
+            return Dubins(car.speed_mps, dt_s)
+        return Ackermann(car.wheelbase_m, car.speed_mps, dt_s, car.control_limits)
+
+    @property
+    def limits(self) -> Horizon:
+        """Over how many ticks a drive is measured, and what counts as off the track."""
+        return Horizon(self.config.horizon, self.config.dt_s, self.world.off_track_m, self.config.held_cap_m)
+
+    @property
+    def searched_ticks(self) -> int:
+        """Over how many ticks attacks are optimised."""
+        return self.config.attack.horizon or self.config.horizon
+
+    @cached_property
+    def held_to(self) -> Reference:
+        """What the report is held to.
+
+        Raises:
+            ConfigError: The file is not there, or is none of limits.
+        """
+        file = self.config.reference
+        return Reference() if file is None else load_config(Reference, self.file.parent / file)
+
+    @property
+    def launch_file(self) -> FilePath:
+        """The node graph of live drives."""
+        return self.file.parent / self.config.deploy.launch_file
+
+    def cell_folder(self, cell: Cell) -> FilePath:
+        """Where this experiment itself runs a cell."""
+        return self.folder / CELLS / cell.name
+
+    def cell_result(self, cell: Cell) -> FilePath:
+        """Where the result of a cell is that this experiment itself has run."""
+        return self.folder / CELLS / f"{cell.name}.json"
+
+    @property
+    def calibration_folder(self) -> FilePath:
+        """Calibration files that the capture stage left for the live nodes, and those of a screen."""
+        return self.stage_folder("capture") / CALIBRATION
+
+    def across_m(self, length_m: float) -> float:
+        """A distance sideways [m] that was chosen for half a lane of 1.75 m, in this world's lanes."""
+        return length_m * (self.world.off_track_m / _HALF_LANE_M)
+
+    def along_m(self, length_m: float) -> float:
+        """A distance along a path [m] that was chosen for 6 m/s, at this car's speed."""
+        return length_m * (self.car.speed_mps / _SPEED_MPS)
+
+    def start_states(self, scenario: str, seed: int) -> torch.Tensor:
+        """Start poses ``[B, 3]`` float64 of one attack, drawn about the nominal one; the first of seed 0 is the nominal one itself.
+
+        Searches get others from `measured_starts`.
+        """
+        wanted = self.config.attack
+        noise = self._start_noise(scenario, seed, wanted.starts)
+        if seed == 0 or wanted.nominal_start:
+            noise[0] = 0.0
+        return self._starts(scenario, noise)
+
+    def measured_starts(self, scenario: str) -> torch.Tensor:
+        """Start poses ``[M, 3]`` float64 from which all methods and seeds are measured, about the nominal one; no search has them."""
+        wanted = self.config.measure
+        return self._starts(scenario, self._start_noise(scenario, wanted.seed, wanted.starts))
+
+    def _start_noise(self, scenario: str, seed: int, count: int) -> Array:
+        generator = np.random.default_rng([seed, self.config.scenarios.index(scenario)])
+        return generator.standard_normal((count, 3))
+
+    def _starts(self, scenario: str, noise: Array) -> torch.Tensor:
+        # A tenth of a radian at the start would be 2.4 m of error at the junction.
+        spread = self.config.attack.start_sigma * np.array([1.0, 1.0, 0.25])
+        return torch.from_numpy(np.array(self.references[scenario].drive_start) + spread * noise)
+
+
+def as_json(description: WorldDescription) -> dict[str, Any]:
+    """A description as it is read back from a file."""
+    data: dict[str, Any] = json.loads(json.dumps(description.to_dict()))
+    return data

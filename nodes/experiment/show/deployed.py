@@ -1,0 +1,302 @@
+"""The deployment side: what the car's camera sees when opaque objects stand in a scene that gives colours and depth.
+
+Works with any `World`: per pixel the nearer of scene and object wins (the paper, section 4), in the camera's own pixels, and
+only then is the image cropped and resized for the policy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from advnerf_core.driving.dynamics import Dynamics
+from advnerf_core.driving.metrics import DriveMetrics, Horizon, drive_metrics
+from advnerf_core.driving.path import Path
+from advnerf_core.driving.rollout import drive
+from advnerf_core.fields.coloured import ColouredObject
+from advnerf_core.geometry import Array, Pinhole, planar_poses
+from advnerf_core.learning.sources import Show
+from advnerf_core.policies.pilotnet import Policy, images_to_tensor
+from advnerf_core.policies.view import PolicyView
+from advnerf_core.scene.surrogate import Frames, Surrogate
+from hardware.cameras.effects import ImperfectCamera
+from hardware.worlds.world import Depth, Rgb, World, collided_with
+from nodes.experiment.show.images import as_uint8
+
+# At a camera's own resolution one ray per pixel is what a rasteriser takes; the policy's resize averages three of them.
+_SUPERSAMPLE = 1
+
+
+class Dressed(Protocol):
+    """A deployment scene that shows an attack, as the policy sees it."""
+
+    scene: World
+    view: PolicyView
+
+    def plain_theta(self) -> Tensor | None:
+        """What stands for the objects without an attack."""
+
+    def prepare(self, states: Array, /) -> Any:
+        """What does not depend on the attack, of the policy's view from car states ``[B, 3]``; time does not pass."""
+
+    def policy_images(self, frames: Any, theta: Tensor | None, /) -> NDArray[np.uint8]:
+        """Policy images ``[B, 66, 200, 3]`` of what was prepared."""
+
+    def seen_now(self, theta: Tensor | None, /) -> NDArray[np.uint8]:
+        """Policy image ``[66, 200, 3]`` of the car where it is now."""
+
+    def camera_image(self, state: Array, theta: Tensor | None, /) -> NDArray[np.uint8]:
+        """The whole camera image ``[H, W, 3]`` from a car state ``[3]``."""
+
+    def paint(self, rgb: Rgb, state: Array, theta: Tensor, /) -> NDArray[np.uint8]:
+        """A camera image ``[H, W, 3]`` with the attack, from one without it that was seen from the same state ``[3]``."""
+
+
+def seen_in(scene: Dressed) -> Callable[[Array], Show]:
+    """Takes car states ``[B, 3]``, does what does not depend on the attack, and gives what the policy sees of an attack from them."""
+
+    def seen(states: Array) -> Show:
+        frames = scene.prepare(states)
+        return lambda theta: images_to_tensor(scene.policy_images(frames, theta))
+
+    return seen
+
+
+class DressedScene:
+    """A deployment scene with the attack's objects in it, as the policy sees it.
+
+    Args:
+        scene: The scene without objects.
+        view: What the policy sees of its camera.
+        objects: The objects, opaque; none for the empty scene. As in the learned scene, only what is nearer than they are by
+            `Surrogate.depth_tolerance_m` hides them: 0.15 m, so that where they touch the ground they do not flicker.
+    """
+
+    def __init__(self, scene: World, view: PolicyView, objects: Sequence[ColouredObject]) -> None:
+        self.scene, self.view = scene, view
+        self._window = Surrogate(
+            self._observed,
+            view.window_pinhole,
+            scene.T_car_from_camera,
+            objects,
+            supersample=_SUPERSAMPLE,
+            opaque=True,
+        )
+        self._whole = Surrogate(
+            self._observed,
+            view.camera,
+            scene.T_car_from_camera,
+            objects,
+            supersample=_SUPERSAMPLE,
+            opaque=True,
+        )
+
+    @property
+    def theta_shape(self) -> tuple[int, ...]:
+        """Shape of the objects' colours."""
+        return self._window.theta_shape
+
+    def plain_theta(self) -> Tensor:
+        """The objects' own colours."""
+        return self._window.plain_theta()
+
+    def prepare(self, states: Array) -> Frames:
+        """What does not depend on colours, of the policy's window from car states ``[B, 3]``; time does not pass."""
+        return self._window.prepare(
+            self._window.camera_poses(torch.from_numpy(np.asarray(states, dtype=np.float64)))
+        )
+
+    def policy_images(self, frames: Frames, theta: Tensor | None) -> NDArray[np.uint8]:
+        """Policy images ``[B, 66, 200, 3]`` of prepared windows."""
+        shown = self._window.plain_theta() if theta is None and self._window.objects else theta
+        return np.stack([self._resized(as_uint8(image)) for image in frames.render(shown).images])
+
+    def seen_now(self, theta: Tensor | None) -> NDArray[np.uint8]:
+        """Policy image ``[66, 200, 3]`` of the car where it is now."""
+        rgb, depth_m = self.scene.observe()
+        window = self.view.window
+        state = self.scene.state
+        pose = planar_poses(np.array([[state.x_m, state.y_m, state.yaw_rad]])) @ self.scene.T_car_from_camera
+        image = self._window.overlay(
+            rgb[window][None] / np.float32(255.0), depth_m[window][None], pose, theta
+        )
+        return self._resized(as_uint8(image[0]))
+
+    def camera_image(self, state: Array, theta: Tensor | None) -> NDArray[np.uint8]:
+        """The whole camera image ``[H, W, 3]`` from a car state ``[3]``, for films."""
+        poses = self._whole.camera_poses(torch.from_numpy(np.asarray(state, dtype=np.float64))[None])
+        return as_uint8(self._whole.render(poses, theta).images[0])
+
+    def paint(self, rgb: Rgb, state: Array, theta: Tensor) -> NDArray[np.uint8]:
+        """The whole camera image with the objects in these colours; see `Dressed.paint`."""
+        del rgb  # it says nothing of depth
+        return self.camera_image(state, theta)
+
+    def _resized(self, window: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        resized = cv2.resize(window, (self.view.width, self.view.height), interpolation=cv2.INTER_AREA)
+        return np.asarray(resized, dtype=np.uint8)
+
+    def _observed(self, poses: Array, pinhole: Pinhole) -> tuple[Tensor, Tensor]:
+        """The scene as a background renderer: the part of the camera image that the pinhole keeps."""
+        T_camera_from_car = np.linalg.inv(self.scene.T_car_from_camera)
+        top, left = round(self.view.camera.cy - pinhole.cy), round(self.view.camera.cx - pinhole.cx)
+        kept = slice(top, top + pinhole.height), slice(left, left + pinhole.width)
+        rgb: list[Rgb] = []
+        depth_m: list[Depth] = []
+        for pose in poses @ T_camera_from_car:
+            yaw = float(np.arctan2(pose[1, 0], pose[0, 0]))
+            image, depth = self.scene.observe_at(float(pose[0, 3]), float(pose[1, 3]), yaw)
+            rgb.append(image[kept])
+            depth_m.append(depth[kept])
+        return torch.from_numpy(np.stack(rgb)) / 255.0, torch.from_numpy(np.stack(depth_m))
+
+
+class SelfDriving:
+    """A scene's own car as the dynamics of a rollout: one car, whose true state is read back."""
+
+    state_size = 3
+
+    def __init__(self, scene: World, speed_mps: float, dt_s: float) -> None:
+        self.scene, self.speed_mps, self.dt_s = scene, speed_mps, dt_s
+        self.blocked_tick: int | None = None
+        self._tick = 0
+
+    def start(self, pose: Array) -> None:
+        """Put the car down."""
+        self.scene.reset(*map(float, pose[:3]))
+        self.blocked_tick, self._tick = None, 0
+
+    def step(self, states: Tensor, controls: Tensor) -> Tensor:
+        """Drive on for one tick; the state ``[1, 3]`` that is given is the one that was returned before."""
+        moved = self.scene.step(float(controls[0]), self.speed_mps, self.dt_s)
+        self._tick += 1
+        if self.scene.blocked and self.blocked_tick is None:
+            self.blocked_tick = self._tick
+        return states.new_tensor([[moved.x_m, moved.y_m, moved.yaw_rad]])
+
+    def jacobians(self, states: Tensor, controls: Tensor) -> tuple[Tensor, Tensor]:
+        """A scene has none."""
+        raise NotImplementedError(
+            "a deployment scene has no Jacobians: attacks are searched in the surrogate"
+        )
+
+
+class IdealDriving:
+    """The surrogate's car in a scene that is only looked at: it does what it is told, and nothing but the fence stops it.
+
+    Args:
+        dynamics: The surrogate's car.
+        fence_m: Where abs(x) or abs(y) exceeds this the car counts as blocked [m]; None without a fence.
+    """
+
+    def __init__(self, dynamics: Dynamics, fence_m: float | None) -> None:
+        self.state_size, self.dt_s = dynamics.state_size, dynamics.dt_s
+        self.blocked_tick: int | None = None
+        self._dynamics, self._fence_m, self._tick = dynamics, fence_m, 0
+
+    def start(self, pose: Array) -> None:
+        """Begin a drive."""
+        self.blocked_tick, self._tick = None, 0
+
+    def step(self, states: Tensor, controls: Tensor) -> Tensor:
+        """Drive on for one tick from states ``[1, n]``."""
+        moved = self._dynamics.step(states, controls)
+        self._tick += 1
+        outside = self._fence_m is not None and bool((moved[0, :2].abs() > self._fence_m).any())
+        if outside and self.blocked_tick is None:
+            self.blocked_tick = self._tick
+        return moved
+
+    def jacobians(self, states: Tensor, controls: Tensor) -> tuple[Tensor, Tensor]:
+        """Those of the surrogate's car."""
+        return self._dynamics.jacobians(states, controls)
+
+
+@dataclass(frozen=True, eq=False)
+class DeployedDrive:
+    """One drive in the deployment scene.
+
+    Attributes:
+        states: True states ``[T + 1, 3]``.
+        controls: What the policy commanded ``[T]``.
+        metrics: Total CTE and what belongs to it.
+        blocked_tick: When the car ran into something; None if it did not.
+        collided_with: Name of what it ran into; None if it did not.
+    """
+
+    states: Array
+    controls: Array
+    metrics: DriveMetrics
+    blocked_tick: int | None
+    collided_with: str | None = None
+
+
+Seen = Callable[[Array], NDArray[np.uint8]]
+"""Policy image ``[66, 200, 3]`` from the state ``[3]`` of the car that drives."""
+
+
+def _ideally(dressed: Dressed, theta: Tensor | None, car: SelfDriving | IdealDriving) -> Seen:
+    """What the policy sees of an ideal camera; the world is asked where its own car is, not where that should be."""
+    if isinstance(car, SelfDriving):
+        return lambda state: dressed.seen_now(theta)
+    return lambda state: dressed.policy_images(dressed.prepare(state[None]), theta)[0]
+
+
+def _through(camera: ImperfectCamera, dressed: Dressed, theta: Tensor | None, dt_s: float) -> Seen:
+    """What the policy sees through a camera, tick by tick; of a lost frame the one before."""
+    last: list[NDArray[np.uint8]] = []
+
+    def seen(state: Array) -> NDArray[np.uint8]:
+        picture = camera.see(lambda pose: dressed.camera_image(pose, theta), state, dt_s)
+        if picture is not None:
+            last[:] = [dressed.view.image(picture)]
+        return last[0]
+
+    return seen
+
+
+def drive_deployed(
+    dressed: Dressed,
+    policy: Policy,
+    goal: Sequence[float],
+    start: Array,
+    path: Path,
+    limits: Horizon,
+    car: SelfDriving | IdealDriving,
+    theta: Tensor | None,
+    camera: ImperfectCamera | None = None,
+) -> DeployedDrive:
+    """Drive once through the dressed scene, tick by tick.
+
+    Args:
+        dressed: The scene with its objects.
+        policy: The victim.
+        goal: What it is told; empty if it is told nothing.
+        start: Pose ``[3]``.
+        path: What it should follow.
+        limits: Ticks and limits.
+        car: What drives.
+        theta: The objects' colours; None for no objects.
+        camera: What takes the pictures; None for an ideal camera.
+    """
+    car.start(np.asarray(start))
+    goals = torch.tensor([tuple(goal)], dtype=torch.float32) if goal else None
+    first = torch.from_numpy(np.array(start, dtype=np.float64))[None]
+    seen = _ideally(dressed, theta, car) if camera is None else _through(camera, dressed, theta, limits.dt_s)
+    rollout = drive(
+        policy, lambda states: images_to_tensor(seen(states[0].numpy())), car, first, limits.ticks, goals
+    )
+    states = rollout.states[:, 0].numpy().copy()
+    states[:, 2] = np.unwrap(states[:, 2])
+    metrics = drive_metrics(path, states, limits, car.blocked_tick)
+    hit = None if car.blocked_tick is None else collided_with(dressed.scene, states[car.blocked_tick])
+    return DeployedDrive(
+        states, rollout.controls[:, 0].double().numpy(), metrics, car.blocked_tick, collided_with=hit
+    )

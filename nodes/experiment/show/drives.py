@@ -1,0 +1,79 @@
+"""Drives past objects, in the learned scene and where they are deployed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from advnerf_core.attack.adjoint import AttackProblem, evaluate
+from advnerf_core.driving.metrics import DriveMetrics, drive_metrics
+from advnerf_core.geometry import Array
+from advnerf_core.policies.pilotnet import Policy
+from hardware.cameras.effects import ImperfectCamera
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.deployed import DeployedDrive, Dressed, IdealDriving, SelfDriving, drive_deployed
+
+
+def learned_drives(
+    experiment: Experiment, problem: AttackProblem, theta: Tensor
+) -> tuple[Array, Array, list[DriveMetrics]]:
+    """States ``[B, T + 1, n]`` and commands ``[B, T]`` of the drives from all starts of a problem in its own scene, and their metrics."""
+    rollout, _ = evaluate(problem, theta)
+    states, commands = (each.transpose(0, 1).numpy() for each in (rollout.states, rollout.controls))
+    scores = [
+        drive_metrics(problem.path, each, experiment.limits, _fenced_tick(experiment, each))
+        for each in states
+    ]
+    return states, commands, scores
+
+
+def _fenced_tick(experiment: Experiment, states: Array) -> int | None:
+    """The tick at which the car is outside of the world's fence, where it is stopped; None if it never is."""
+    if experiment.world.fence_m is None:
+        return None
+    outside = np.flatnonzero((np.abs(states[:, :2]) > experiment.world.fence_m).any(axis=1))
+    return int(outside[0]) if outside.size else None
+
+
+def deployed_drives(
+    experiment: Experiment,
+    dressed: Dressed,
+    policy: Policy,
+    scenario: str,
+    starts: Tensor,
+    theta: Tensor | None,
+) -> list[DeployedDrive]:
+    """Drives through the deployment scene from starts ``[B, 3]``, of its own car or of an ideal one."""
+    effects, car = experiment.config.deploy.camera, _car(experiment, dressed)
+    return [
+        drive_deployed(
+            dressed,
+            policy,
+            experiment.goal(scenario),
+            np.asarray(start),
+            experiment.paths[scenario],
+            experiment.limits,
+            car,
+            theta,
+            None if effects.ideal else ImperfectCamera(effects, experiment.camera, number),
+        )
+        for number, start in enumerate(starts.numpy())
+    ]
+
+
+def _car(experiment: Experiment, dressed: Dressed) -> SelfDriving | IdealDriving:
+    if experiment.config.deploy.car == "ideal":
+        return IdealDriving(experiment.dynamics, experiment.world.fence_m)
+    return SelfDriving(dressed.scene, experiment.car.speed_mps, experiment.limits.dt_s)
+
+
+def totals(scores: Sequence[DriveMetrics]) -> dict[str, Any]:
+    """Total CTE [m], whether the track was left, and ticks until the car stopped, drive by drive."""
+    return {
+        "total_cte_m": [score.total_cte_m for score in scores],
+        "off_track": [score.off_track for score in scores],
+        "driven_ticks": [len(score.ctes_m) - score.held_ticks for score in scores],
+    }

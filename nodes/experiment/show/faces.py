@@ -1,0 +1,187 @@
+"""A face on a panel of the world: its object in the learned scene, the space of its colours, and how training and deployment show it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from advnerf_core.attack.artifact import TEXTURE_PX, face_texture
+from advnerf_core.attack.projection import FaceOverlay
+from advnerf_core.attack.spaces.face import FaceMount, FaceSpace
+from advnerf_core.attack.spaces.space import NamedObject
+from advnerf_core.display import DisplayModel
+from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object
+from advnerf_core.geometry import Array, invert_transform, make_transform, planar_pose, planar_poses
+from advnerf_core.plugins import unknown
+from advnerf_core.scene.surrogate import BackgroundRenderer, Surrogate
+from calibration.display_colour import DisplayCalibration
+from calibration.schema import load_calibration
+from hardware.worlds.world import Panel, Rgb, World
+from nodes.experiment.plan.space_config import FaceConfig
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.learned_scene import load_background
+from nodes.experiment.show.screen import cos_angle, face_picture, plain_picture, screens_of
+from nodes.runtime.errors import ConfigError
+
+# The deployed face lies this far in front of the panel that carries it, so that it is never inside it.
+FACE_OFFSET_M = 0.01
+DISPLAY = "display.yaml"
+
+
+def has_face(experiment: Experiment) -> bool:
+    """Whether the attack is a face on a panel."""
+    return isinstance(experiment.config.space, FaceConfig)
+
+
+def wanted_face(experiment: Experiment) -> FaceConfig:
+    """The section ``space`` of an experiment that attacks a face."""
+    assert isinstance(experiment.config.space, FaceConfig), "only asked where the space is a face"
+    return experiment.config.space
+
+
+def panel_of(experiment: Experiment) -> Panel:
+    """What carries the face.
+
+    Raises:
+        ConfigError: The world has no such panel.
+    """
+    name, panels = wanted_face(experiment).panel, experiment.world.panels
+    if name not in panels:
+        raise ConfigError(f"{experiment.file}: space.panel: {unknown(name, 'panel', panels)}")
+    return panels[name]
+
+
+def on_screen(experiment: Experiment) -> bool:
+    """Whether a screen shows the face; else it is projected onto a board."""
+    return has_face(experiment) and panel_of(experiment).screen_px is not None
+
+
+def face_object(experiment: Experiment) -> VoxelGridObject:
+    """The cube's face that is seen, on its panel, in one colour."""
+    wanted, panel = wanted_face(experiment), panel_of(experiment)
+    pose = panel.T_world_from_face @ make_transform(np.eye(3), [FACE_OFFSET_M, 0.0, 0.0])
+    return cube_face_object(panel.square_m, wanted.resolution, wanted.plain_rgb, pose)
+
+
+def corners_on(panel: Panel) -> Array:
+    """Corners ``[4, 3]`` of the face in its panel's frame: top left, top right, bottom right, bottom left for a viewer [m]."""
+    half = 0.5 * panel.square_m
+    # Facing the panel one looks along its -x with z up, so left is its -y.
+    return np.array([[0.0, -half, half], [0.0, half, half], [0.0, half, -half], [0.0, -half, -half]])
+
+
+def display_of(experiment: Experiment) -> DisplayModel:
+    """What the driving camera sees of the screen's colours, as measured in the capture stage."""
+    return load_calibration(DisplayCalibration, experiment.calibration_folder / DISPLAY).display
+
+
+def face_space(
+    experiment: Experiment, background: BackgroundRenderer | None = None, ideal: bool | None = None
+) -> FaceSpace:
+    """The colours of the face in the learned scene.
+
+    Args:
+        experiment: With a learned scene.
+        background: Of the scene, if it is loaded already.
+        ideal: Whether a screen is taken for ideal; None as the experiment says.
+    """
+    field, panel, wanted = face_object(experiment), panel_of(experiment), wanted_face(experiment)
+    surrogate = Surrogate(
+        background or load_background(experiment), experiment.view.pinhole, experiment.mount, [field]
+    )
+    mount = FaceMount(wanted.panel, (panel.square_m, panel.square_m), corners_on(panel))
+    named = NamedObject("face", field.sha256)
+    ideal = not wanted.display_model if ideal is None else ideal
+    if ideal or not on_screen(experiment):
+        return FaceSpace(surrogate, named, mount)
+    return FaceSpace(surrogate, named, mount, display_of(experiment), mean_cos_angle(experiment))
+
+
+def mean_cos_angle(experiment: Experiment) -> float:
+    """Cosine of the angle at which the camera looks at the panel, in the mean of the measured stretch of all paths, while it sees it."""
+    panel, ticks = panel_of(experiment), np.arange(experiment.config.horizon + 1)
+    parts = []
+    for name, path in experiment.paths.items():
+        start_s_m = float(path.project(np.array(experiment.references[name].drive_start[:2])).s_m)
+        along = path.pose_at(start_s_m + ticks * experiment.car.speed_mps * experiment.config.dt_s)
+        cameras = planar_poses(along) @ experiment.mount
+        towards = panel.T_world_from_face[:3, 3] - cameras[:, :3, 3]
+        ahead = np.einsum("ni,ni->n", towards, cameras[:, :3, 2]) > 0.0
+        cosines = cos_angle(panel, cameras[:, :3, 3])
+        parts.append(cosines[ahead & (cosines > 0.0)])
+    seen = np.concatenate(parts)
+    return float(seen.mean()) if seen.size else 1.0
+
+
+def plain_screen(experiment: Experiment) -> Rgb:
+    """What the screen shows without an attack."""
+    return plain_picture(panel_of(experiment), wanted_face(experiment).plain_rgb)
+
+
+class PaintedScene:
+    """A deployment scene with a face on its panel, as the policy sees it: `nodes.experiment.show.deployed.Dressed` for a face.
+
+    A board's face is drawn by the code that draws it live; a screen shows it, and the scene is seen again, as no projection knows its optics.
+
+    Args:
+        experiment: Whose face.
+        scene: The open scene.
+        texture_px: Size of the texture that is shown.
+    """
+
+    def __init__(self, experiment: Experiment, scene: World, texture_px: int = TEXTURE_PX) -> None:
+        self.scene, self.view = scene, experiment.view
+        self._panel, self._name, self._px = panel_of(experiment), wanted_face(experiment).panel, texture_px
+        self._plain = plain_screen(experiment) if on_screen(experiment) else None
+        self._T_camera_from_car = invert_transform(scene.T_car_from_camera)
+        if self._plain is not None:
+            screens_of(scene).show(self._name, self._plain)
+
+    def plain_theta(self) -> None:
+        """None: without an attack nothing is drawn."""
+        return
+
+    def prepare(self, states: Array) -> Array:
+        """The states ``[B, 3]`` themselves: a scene is asked for every picture."""
+        return np.asarray(states, dtype=np.float64)
+
+    def policy_images(self, frames: Any, theta: Tensor | None) -> Rgb:
+        """Policy images ``[B, 66, 200, 3]`` from car states."""
+        return np.stack([self.view.image(self.camera_image(state, theta)) for state in frames])
+
+    def seen_now(self, theta: Tensor | None) -> Rgb:
+        """Policy image ``[66, 200, 3]`` of the car where it is now."""
+        state = self.scene.state
+        return self.view.image(self.camera_image(np.array([state.x_m, state.y_m, state.yaw_rad]), theta))
+
+    def camera_image(self, state: Array, theta: Tensor | None) -> Rgb:
+        """The whole camera image ``[H, W, 3]`` from a car state ``[3]``."""
+        if theta is not None and self._plain is not None:
+            return self._on_screen(state, theta)
+        rgb = self._observed(state)
+        return rgb if theta is None else self._on_board(rgb, state, theta)
+
+    def paint(self, rgb: Rgb, state: Array, theta: Tensor) -> Rgb:
+        """A camera image ``[H, W, 3]`` with the face, from one without that was seen from the same state ``[3]``."""
+        return self._on_board(rgb, state, theta) if self._plain is None else self._on_screen(state, theta)
+
+    def _observed(self, state: Array) -> Rgb:
+        x_m, y_m, yaw_rad = map(float, state[:3])
+        return self.scene.observe_at(x_m, y_m, yaw_rad, depth=False)[0]
+
+    def _on_board(self, rgb: Rgb, state: Array, theta: Tensor) -> Rgb:
+        overlay = FaceOverlay(self._texture(theta), corners_on(self._panel), self.view.camera)
+        T_camera_from_world = self._T_camera_from_car @ invert_transform(planar_pose(*map(float, state[:3])))
+        return overlay.draw(rgb, T_camera_from_world @ self._panel.T_world_from_face)[0]
+
+    def _on_screen(self, state: Array, theta: Tensor) -> Rgb:
+        screens = screens_of(self.scene)
+        screens.show(self._name, face_picture(self._panel, self._texture(theta)))
+        painted = self._observed(state)
+        screens.show(self._name, self._plain)
+        return painted
+
+    def _texture(self, theta: Tensor) -> Rgb:
+        return face_texture(theta.detach().numpy(), self._px)

@@ -1,0 +1,84 @@
+"""The scene that an experiment of any kind has learned: its file, and how near it comes to held-out views of the driving camera."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from advnerf_core.data.dataset import load_transforms
+from advnerf_core.data.image_files import write_image
+from advnerf_core.files import write_atomically
+from advnerf_core.policies.view import PolicyView
+from advnerf_core.scene.baked import BakedScene
+from advnerf_core.scene.field import load_scene
+from advnerf_core.scene.metrics import psnr, ssim
+from advnerf_core.scene.render_field import FieldRenderer
+from nodes.experiment.engine.run_folder import RunFolder
+from nodes.runtime.progress import Report
+
+HELD_OUT = "held_out"  # the captured set that nothing learns from
+FIDELITY = "fidelity.json"  # how near the learned scene comes to it
+
+
+def scene_file(experiment: RunFolder[Any]) -> Path:
+    """Where the trained scene is."""
+    return experiment.stage_folder("scene") / "scene.safetensors"
+
+
+def baked_file(experiment: RunFolder[Any]) -> Path:
+    """Where the scene is as voxels, if it was baked."""
+    return experiment.stage_folder("bake") / "baked.safetensors"
+
+
+def load_field(experiment: RunFolder[Any]) -> FieldRenderer:
+    """The trained scene itself in the colours of the driving camera."""
+    return FieldRenderer.from_file(scene_file(experiment))
+
+
+def load_background(experiment: RunFolder[Any]) -> FieldRenderer | BakedScene:
+    """The trained scene in the colours of the driving camera, quick where it was baked."""
+    file = baked_file(experiment)
+    return BakedScene.load(file) if file.exists() else load_field(experiment)
+
+
+def scene_sha256(experiment: RunFolder[Any]) -> str:
+    """Content hash of the trained scene."""
+    return str(load_scene(scene_file(experiment))[2]["scene_hash"])
+
+
+def compare_views(experiment: RunFolder[Any], view: PolicyView, begin: float, report: Report) -> None:
+    """Write ``fidelity.json`` and pictures of true and learned views into the scene's folder.
+
+    PSNR and SSIM are taken at the camera's size and at the policy's: there the field's own render against the resized image.
+
+    Args:
+        experiment: Captured and learned.
+        view: What the policy sees of the driving camera.
+        begin: Share of the stage that is done already.
+        report: Told the progress.
+    """
+    folder, renderer = experiment.stage_folder("scene"), load_field(experiment)
+    listed = load_transforms(experiment.stage_folder("capture") / HELD_OUT, require_all=True)
+    views, rows = listed.load(), []
+    for index, (real, pose) in enumerate(zip(views.rgb, views.T_world_from_camera, strict=True)):
+        report(begin + (1 - begin) * index / len(views.rgb), f"held-out view {index + 1}")
+        full = renderer.render(pose[None], views.pinholes[index])[0][0].numpy()
+        small = renderer.render(pose[None], view.pinhole)[0][0].numpy()
+        seen = view.image(real)
+        row: dict[str, Any] = {
+            "label": listed.frames[index].path.name,
+            "psnr_full_db": psnr(full, real / 255.0),
+            "psnr_policy_db": psnr(small, seen / 255.0),
+            "ssim_full": ssim(full, real / 255.0),
+            "ssim_policy": ssim(small, seen / 255.0),
+        }
+        for name, image in (("real", real), ("surrogate", np.round(255 * full).astype(np.uint8))):
+            path = folder / "views" / f"{index:03d}_{name}.png"
+            write_image(path, image)
+            row[f"{name}_image"] = str(path.relative_to(experiment.folder))
+        rows.append(row)
+    means = {key: float(np.mean([row[key] for row in rows])) for key in ("psnr_full_db", "psnr_policy_db")}
+    write_atomically(folder / FIDELITY, json.dumps({"mean": means, "views": rows}, indent=1) + "\n")

@@ -1,0 +1,108 @@
+"""The light of a place on a panel: what the driving camera sees of a colour that is painted on it, measured with plain colours alone.
+
+The model is that of a monitor (`advnerf_core.display`): a curve for each channel, a mixing matrix, ambient light, and the camera's power.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.display import DisplayModel
+from advnerf_core.geometry import invert_transform, planar_pose, transform_points
+from calibration.display_colour import (
+    DisplayCalibration,
+    DisplayConfig,
+    DisplayFit,
+    colours_to_show,
+    fit_display,
+    mean_colour,
+)
+from calibration.schema import load_calibration
+from hardware.worlds.paths import Pose
+from hardware.worlds.world import NativePanels, Panel, World
+from nodes.experiment.plan.placed import PlacedObject
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.placing import seen_from
+from nodes.runtime.errors import ConfigError
+
+LIGHT = "panel_light.yaml"
+# Of a panel's side: what is looked at, without its edge. From so many poses, and with so many pixels at least.
+_INSIDE, _POSES, _LEAST_PX = 0.8, 3, 20
+_NAME = "light"
+# Without a room's glare on glass, black is black: primaries leave two channels dark.
+_GATES = DisplayConfig(least_free=0.4)
+
+
+def light_on_panels(experiment: Experiment) -> DisplayModel | None:
+    """The light on the panel, as the capture stage measured it; None where colours are taken to be seen as they are painted."""
+    if experiment.config.object.panel_light == "ideal":
+        return None
+    return load_calibration(DisplayCalibration, experiment.calibration_folder / LIGHT).display
+
+
+def measure_light(experiment: Experiment, world: World) -> DisplayFit:
+    """Show plain colours on the panel, look at them along the drive, and fit what is seen.
+
+    Args:
+        experiment: With one panel, which is placed.
+        world: Open; it has no panel afterwards.
+
+    Raises:
+        ConfigError: The world takes no panels, or no drive sees this one large enough.
+        DegenerateDataError: The colours do not tell the light, as where they are all too bright.
+        PoorFitError: The light is none that this model has.
+    """
+    if not isinstance(world, NativePanels):
+        raise ConfigError(
+            f"expected a world that takes panels (add_panel) with object.panel_light measured, got {type(world).__name__}"
+        )
+    (thing,) = experiment.objects
+    poses = _poses(experiment, world, thing)
+    panel = Panel(thing.T_world_from_face, thing.side_m, thing.side_m)
+    colours = colours_to_show(seed=experiment.config.capture.seed)
+    seen: list[NDArray[np.float64]] = []
+    try:
+        for colour in colours:
+            world.add_panel(_NAME, panel, np.full((2, 2, 3), colour, np.uint8))
+            pictures = [world.observe_at(*pose, depth=False)[0] for pose in poses]
+            seen += [
+                mean_colour([picture], _region(experiment, thing, pose))
+                for picture, pose in zip(pictures, poses, strict=True)
+            ]
+    finally:
+        world.add_panel(_NAME, panel, None)
+    # Paint has no falloff: where it is seen from does not matter.
+    return fit_display(np.repeat(colours / 255.0, len(poses), axis=0), np.array(seen), config=_GATES)
+
+
+def _poses(experiment: Experiment, world: World, thing: PlacedObject) -> list[Pose]:
+    """First, middle and last of the poses that see the panel large enough."""
+    found = [
+        pose
+        for pose in seen_from(experiment, world, thing, 1.0)
+        if _region(experiment, thing, pose).sum() >= _LEAST_PX
+    ]
+    if not found:
+        raise ConfigError(
+            f"{experiment.file}: expected the panel {thing.name} to be seen on the way along {experiment.config.scenarios[0]}, with {_LEAST_PX} pixels "
+            "inside its edge; it is hidden, turned away or too small: move it, or set object.panel_light=ideal"
+        )
+    return [
+        found[index] for index in np.linspace(0, len(found) - 1, min(_POSES, len(found))).round().astype(int)
+    ]
+
+
+def _region(experiment: Experiment, thing: PlacedObject, pose: Pose) -> NDArray[np.bool_]:
+    """Pixels ``[H, W]`` of the driving camera well inside the panel."""
+    half = 0.5 * _INSIDE * thing.side_m
+    corners = np.array([[0.0, -half, half], [0.0, half, half], [0.0, half, -half], [0.0, -half, -half]])
+    T_camera_from_world = invert_transform(planar_pose(*pose) @ experiment.mount)
+    pixels = (
+        experiment.camera.project(transform_points(T_camera_from_world @ thing.T_world_from_face, corners))
+        - 0.5
+    )
+    region = np.zeros((experiment.camera.height, experiment.camera.width), np.uint8)
+    cv2.fillConvexPoly(region, np.round(16 * pixels).astype(np.int32), 1, shift=4)
+    return cv2.erode(region, np.ones((3, 3), np.uint8), borderValue=0) > 0

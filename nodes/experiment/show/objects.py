@@ -1,0 +1,107 @@
+"""Stage object: cars and hydrants as voxels; and all objects, panels too, as they stand in the world."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object
+from advnerf_core.geometry import Array, Pinhole
+from advnerf_core.objects.voxel.build import build_from_mesh
+from advnerf_core.objects.voxel.generators import GENERATORS
+from advnerf_core.objects.voxel.mesh import stand
+from advnerf_core.objects.voxel.model import ObjectModel, load_object, save_object
+from advnerf_core.scene.surrogate import BackgroundRenderer, Surrogate
+from nodes.experiment.plan.placed import PANEL, ObjectKind
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.learned_scene import load_background
+from nodes.runtime.progress import Report
+
+# As of a stage (`run.VERSIONS`), of what is made of a mesh; the stage's own is that of panels, which it only describes.
+MESH_VERSION = 2
+GENERATOR_OF: dict[ObjectKind, str] = {"small_car": "car", "hydrant": "hydrant"}
+
+
+def version_of(kinds: Sequence[str]) -> dict[str, int]:
+    """What an experiment's objects depend on besides their settings."""
+    return {"meshes": MESH_VERSION} if set(kinds) - {PANEL} else {}
+
+
+def run(experiment: Experiment, folder: Path, report: Report) -> None:
+    """Write one object file for each kind; where they stand is not part of it."""
+    kinds = sorted({thing.kind for thing in experiment.config.objects} - {PANEL})
+    for index, kind in enumerate(kinds):
+
+        def progress(fraction: float, text: str, index: int = index, kind: str = kind) -> None:
+            report((index + fraction) / len(kinds), f"{kind}: {text}")
+
+        if not object_file(experiment, kind).exists():
+            save_object(object_file(experiment, kind), build(experiment, kind, progress))
+
+
+def build(experiment: Experiment, kind: ObjectKind, progress: Any = None) -> ObjectModel:
+    """One kind of object from its generator."""
+    wanted, generator = experiment.config.object, GENERATOR_OF[kind]
+    resolution = wanted.car_resolution if kind == "small_car" else wanted.hydrant_resolution
+    mesh = stand(GENERATORS[generator]())
+    return build_from_mesh(mesh, kind, resolution, wanted.fit_steps, {"generator": generator}, progress)
+
+
+def object_file(experiment: Experiment, kind: str) -> Path:
+    """Where a kind of object is."""
+    return experiment.stage_folder("object") / f"{kind}.object.safetensors"
+
+
+def placed_objects(experiment: Experiment) -> list[VoxelGridObject]:
+    """The objects in the order of the experiment file, in their plain colours."""
+    kinds = {thing.kind for thing in experiment.objects} - {PANEL}
+    models = {kind: load_object(object_file(experiment, kind)) for kind in kinds}
+    return [
+        panel_object(experiment, thing.side_m, thing.T_world_from_face)
+        if thing.kind == PANEL
+        else models[thing.kind].placed(thing.T_world_from_object, thing.scale)
+        for thing in experiment.objects
+    ]
+
+
+def panel_object(
+    experiment: Experiment, side_m: float, T_world_from_face: Array | None = None
+) -> VoxelGridObject:
+    """A panel in its plain colour: opaque, seen from its front."""
+    wanted = experiment.config.object
+    return cube_face_object(side_m, wanted.panel_resolution, wanted.panel_rgb, T_world_from_face)
+
+
+def describe(experiment: Experiment) -> list[dict[str, Any]]:
+    """Names, places and free colours of the objects, as plain data."""
+    things = zip(experiment.objects, placed_objects(experiment), strict=True)
+    return [{**thing.model_dump(), "free_colours": field.free_count} for thing, field in things]
+
+
+def surrogate_of(
+    experiment: Experiment, objects: Sequence[VoxelGridObject], background: BackgroundRenderer | None = None
+) -> Surrogate:
+    """The learned junction as the policy's camera sees it; ``background`` if it is loaded already."""
+    render = background or load_background(experiment)
+    return Surrogate(render, experiment.view.pinhole, experiment.mount, objects)
+
+
+def last_result_kept(render: BackgroundRenderer) -> BackgroundRenderer:
+    """The same renderer, which does not render twice in a row for the same poses (plain and textured views of one state)."""
+    last: list[tuple[Array, Pinhole, Any]] = []
+
+    def remembered(poses: Array, pinhole: Pinhole) -> Any:
+        if not (last and last[0][1] == pinhole and np.array_equal(last[0][0], poses)):
+            last[:] = [(poses.copy(), pinhole, render(poses, pinhole))]
+        return last[0][2]
+
+    return remembered
+
+
+def random_theta(shape: tuple[int, ...], sigma: float, rng: np.random.Generator) -> torch.Tensor:
+    """Grid values as the random attack draws them."""
+    return torch.from_numpy(sigma * rng.standard_normal(shape, dtype=np.float32))

@@ -1,0 +1,171 @@
+"""Where a panel stands by a rule: the first spot beside a path where it fits and is seen for long enough.
+
+A hand that places an object knows what it is for. This rule knows the world's description, its depth, and the drive without an error
+along the path; it is run while the world is photographed, before there is a learned scene or a victim.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from advnerf_core.geometry import Array, invert_transform, planar_pose
+from hardware.worlds.paths import Pose
+from hardware.worlds.world import Depth, World
+from nodes.experiment.plan.placed import PlacedObject, RuledObject, in_a_lane
+from nodes.experiment.show.context import Experiment
+from nodes.runtime.errors import ConfigError
+
+# Of half a lane: steps along the path and away from it, and how far away is looked.
+_ALONG, _AWAY, _FARTHEST = 0.25, 0.25, 6.0
+# Share of a panel's points that must be seen, what the scene's depth may be off by, and the steepest view [cos].
+_SEEN, _DEPTH_SHARE, _FACING = 0.9, 0.03, 0.3
+_FACE = np.stack(np.meshgrid(*[np.linspace(-0.95, 0.95, 7)] * 2), axis=-1).reshape(
+    -1, 2
+)  # across and up, in half sides
+
+
+@dataclass(frozen=True)
+class _View:
+    """What the driving camera sees from one place of the drive: ``T_camera_from_world`` and depth ``[H, W]`` [m]."""
+
+    T_camera_from_world: Array
+    depth_m: Depth
+
+
+def place_by_rule(experiment: Experiment, world: World) -> list[PlacedObject]:
+    """All objects of an experiment, those with a rule where it puts them.
+
+    Args:
+        experiment: Its world must be described.
+        world: The same, open.
+
+    Raises:
+        ConfigError: There is no such spot.
+    """
+    views: dict[str, list[_View]] = {}
+    standing = [each for each in experiment.config.objects if isinstance(each, PlacedObject)]
+    found: list[PlacedObject] = []
+    for wanted in experiment.config.objects:
+        if isinstance(wanted, PlacedObject):
+            found.append(wanted)
+            continue
+        name = wanted.stands.scenario or experiment.config.scenarios[0]
+        seen = views.setdefault(name, list(_views(experiment, world, name)))
+        spot = next(
+            (
+                spot
+                for spot in _spots(experiment, wanted, name)
+                if _fits(experiment, spot, standing, seen, wanted)
+            ),
+            None,
+        )
+        if spot is None:
+            raise ConfigError(
+                f"{experiment.file}: expected a spot beside the path {name} where {wanted.name} fits and is seen for {wanted.stands.seen_s:g} s, got "
+                "none; make it smaller (scale), let it be seen more briefly (stands.seen_s), or place it by hand (x_m, y_m)"
+            )
+        found.append(spot)
+        standing.append(spot)
+    return found
+
+
+def as_text(objects: Sequence[PlacedObject]) -> str:
+    """Placed objects as JSON."""
+    return json.dumps([each.model_dump(mode="json") for each in objects], indent=1) + "\n"
+
+
+def clean_poses(experiment: Experiment, name: str) -> Array:
+    """Poses ``[T + 1, 3]`` of a drive without an error."""
+    path, config = experiment.paths[name], experiment.config
+    start = np.array(experiment.references[name].drive_start[:2])
+    begin_m = float(path.project(start[None]).s_m[0])
+    along_m = begin_m + experiment.car.speed_mps * config.dt_s * np.arange(config.horizon + 1)
+    return np.asarray(path.pose_at(along_m if path.closed else along_m[along_m <= path.length_m]))
+
+
+def _views(experiment: Experiment, world: World, name: str) -> Iterator[_View]:
+    for x_m, y_m, yaw_rad in clean_poses(experiment, name).tolist():
+        T_world_from_camera = planar_pose(x_m, y_m, yaw_rad) @ experiment.mount
+        yield _View(invert_transform(T_world_from_camera), world.observe_at(x_m, y_m, yaw_rad)[1])
+
+
+def _spots(experiment: Experiment, wanted: RuledObject, name: str) -> Iterator[PlacedObject]:
+    """Spots in the order in which they are tried: along the drive, right before left, near before far."""
+    path, half_lane_m = experiment.paths[name], experiment.world.off_track_m
+    drive = clean_poses(experiment, name)
+    ahead_m = wanted.stands.seen_s * experiment.car.speed_mps
+    begin_m = float(path.project(drive[:1, :2]).s_m[0])
+    length_m = float(np.hypot(*np.diff(drive[:, :2], axis=0).T).sum())
+    sides = {"right": (-1.0,), "left": (1.0,), "either": (-1.0, 1.0)}[wanted.stands.side]
+    for passed_m in np.arange(ahead_m, length_m, _ALONG * half_lane_m):
+        x, y, yaw = np.asarray(path.pose_at(begin_m + passed_m)).tolist()
+        # It looks at where the car is when it must begin to be seen.
+        car = np.asarray(path.pose_at(begin_m + passed_m - ahead_m))[:2]
+        for side in sides:
+            for away_m in half_lane_m * np.arange(1.0, _FARTHEST, _AWAY):
+                at = np.array([x - side * away_m * math.sin(yaw), y + side * away_m * math.cos(yaw)])
+                towards = car - at
+                yield wanted.at(float(at[0]), float(at[1]), math.atan2(towards[1], towards[0]))
+
+
+def _fits(
+    experiment: Experiment,
+    spot: PlacedObject,
+    standing: Sequence[PlacedObject],
+    views: Sequence[_View],
+    wanted: RuledObject,
+) -> bool:
+    """Whether a spot is beside the lanes, free of other objects, and seen long enough."""
+    if in_a_lane([spot], experiment.world) is not None:
+        return False
+    for other in standing:
+        if math.hypot(spot.x_m - other.x_m, spot.y_m - other.y_m) < 0.5 * (spot.side_m + other.side_m):
+            return False
+    needed, ticks = math.ceil((wanted.stands.seen_s - 1e-9) / experiment.config.dt_s), 0
+    for passed, view in enumerate(views):
+        if ticks >= needed or ticks + len(views) - passed < needed:  # decided
+            break
+        ticks += _is_seen(experiment, spot, view, wanted.stands.least_px)
+    return ticks >= needed
+
+
+def seen_from(experiment: Experiment, world: World, panel: PlacedObject, least_px: float) -> list[Pose]:
+    """Poses of the drive without an error along the first path from which nearly all of a panel is seen."""
+    name = experiment.config.scenarios[0]
+    poses = [(float(x), float(y), float(yaw)) for x, y, yaw in clean_poses(experiment, name)]
+    views = _views(experiment, world, name)
+    return [
+        pose for pose, view in zip(poses, views, strict=True) if _is_seen(experiment, panel, view, least_px)
+    ]
+
+
+def _is_seen(experiment: Experiment, spot: PlacedObject, view: _View, least_px: float) -> bool:
+    """Whether nearly all of a panel is in the policy's window, in front of the scene, facing the camera and large enough."""
+    T_camera_from_face = view.T_camera_from_world @ spot.T_world_from_face
+    middle, normal = T_camera_from_face[:3, 3], T_camera_from_face[:3, 0]
+    # Its middle alone decides for most spots.
+    if middle[2] <= 0.0 or spot.side_m * experiment.view.pinhole.fy < least_px * middle[2]:
+        return False
+    if -(middle @ normal) < _FACING * math.sqrt(middle @ middle):
+        return False
+    points = middle + 0.5 * spot.side_m * _FACE @ T_camera_from_face[:3, 1:3].T
+    if points[:, 2].min() <= 0.0:
+        return False
+    pinhole, window = experiment.camera, experiment.view.window
+    columns, rows = (pinhole.project(points) - 0.5).round().astype(int).T
+    inside = (
+        (rows >= window[0].start)
+        & (rows < window[0].stop)
+        & (columns >= window[1].start)
+        & (columns < window[1].stop)
+    )
+    if inside.mean() < _SEEN:
+        return False
+    depth_m = view.depth_m[rows[inside], columns[inside]]
+    free = depth_m >= points[inside, 2] * (1.0 - _DEPTH_SHARE)
+    return bool(free.sum() >= _SEEN * len(points))

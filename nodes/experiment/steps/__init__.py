@@ -1,0 +1,1 @@
+"""The steps of an experiment: from photographs to deployed drives."""

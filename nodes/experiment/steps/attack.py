@@ -1,0 +1,294 @@
+"""The part of a cell in the surrogate: the search, its attack file, and the drives past what was found."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from advnerf_core.attack.adjoint import AttackProblem, evaluate
+from advnerf_core.attack.artifact import AttackFile, load_attack, save_attack
+from advnerf_core.attack.clean import clean_drive
+from advnerf_core.attack.methods import Method, SearchRun, SearchSettings, load_method
+from advnerf_core.attack.objectives import CTE, load_objective, objective_entry, objective_key
+from advnerf_core.attack.on_device import on_chosen_device, said_of_device
+from advnerf_core.attack.search.search import SearchResult
+from advnerf_core.attack.spaces.space import Shown, Space, half_precision
+from advnerf_core.documents import read_json
+from advnerf_core.files import write_atomically
+from advnerf_core.policies.policy_file import LoadedPolicy, load_policy
+from advnerf_core.report.conditions import CONTROLS, EMPTY, NONE
+from nodes.experiment.engine.stage_record import hash_of
+from nodes.experiment.engine.telling import telling
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.plan.method_names import keep_title
+from nodes.experiment.plan.space_config import (
+    ColoursConfig,
+    FaceConfig,
+    MeshShapeConfig,
+    MeshTextureConfig,
+    PlacesConfig,
+)
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.drives import learned_drives, totals
+from nodes.experiment.show.learned_scene import baked_file, load_field, scene_sha256
+from nodes.experiment.show.spaces import over_the_world
+from nodes.experiment.steps.frozen import frozen_for, hardness_before
+from nodes.experiment.steps.policy import HARDENED, victim_file, victims
+from nodes.experiment.steps.search_files import ATTACK, SEARCHED
+
+_STATE = "state.safetensors"
+
+
+def cells(experiment: Experiment) -> list[Cell]:
+    """All cells in order: controls, then every seed against the hardened victim, the first also against the naive one; quick ones first."""
+    seeds, methods = experiment.config.attack.seeds, experiment.config.attack.methods
+    rows = [
+        (victim, seed)
+        for victim in victims(experiment)
+        for seed in (seeds if victim == HARDENED else seeds[:1])
+    ]
+    controls = CONTROLS if experiment.config.measure.no_object else (NONE,)
+    # All seeds are measured from the same starts, so that a control is one cell for all of them.
+    found = [
+        Cell.of(scenario, victim, condition, 0 if condition in CONTROLS else seed)
+        for victim, seed in rows
+        for condition in (*controls, *methods)
+        for scenario in experiment.config.scenarios
+    ]
+    return list(dict.fromkeys(found))
+
+
+def surrogate_part(
+    experiment: Experiment, space: Space, cell: Cell, folder: Path, report: Callable[..., None]
+) -> dict[str, Any]:
+    """Search if the cell has a method, drive in the surrogate, and keep both; what is there already is read.
+
+    Args:
+        experiment: The experiment.
+        space: What is searched.
+        cell: Which.
+        folder: The cell's; gets ``attack.safetensors`` and ``surrogate.json``.
+        report: Told the finished fraction.
+
+    Returns:
+        Attack id (None without an attack), states and metrics of the drives, the curve of the search [m], and its seconds.
+    """
+    kept = folder / SEARCHED
+    if kept.exists():
+        found: dict[str, Any] = read_json(kept)
+        return found
+    policy = _victim(victim_file(experiment, cell.victim))
+    problem = attack_problem(experiment, space, policy, cell.scenario, cell.seed)
+    attack_id, curve, seconds, values = None, [], 0.0, {}
+    if cell.searched:
+        result = _search(experiment, space, problem, cell, folder, report)
+        seconds = sum(evaluation.seconds for evaluation in result.history)
+        curve = [evaluation.predicted_total_cte_m for evaluation in result.history]
+        if experiment.config.attack.objective != CTE:
+            values = {"curve_value": [evaluation.value for evaluation in result.history]}
+        attack = _attack_file(experiment, space, problem, policy, cell, result)
+        attack_id = save_attack(folder / ATTACK, attack)
+    data = {
+        "attack_id": attack_id,
+        "policy_sha256": policy.sha256,
+        "hardness": hardness_before(folder),
+        **surrogate_drives(experiment, space, cell, folder),
+        "curve_total_cte_m": curve,
+        **values,
+        "seconds": seconds,
+    }
+    write_atomically(kept, json.dumps(data) + "\n")
+    (folder / _STATE).unlink(missing_ok=True)
+    return data
+
+
+def surrogate_drives(experiment: Experiment, space: Space, cell: Cell, folder: Path) -> dict[str, Any]:
+    """Drives in the surrogate from the measured starts, past what the attack file in a folder says.
+
+    Args:
+        experiment: The experiment.
+        space: What was searched.
+        cell: Which; of a control nothing is read.
+        folder: Holds ``attack.safetensors``.
+
+    Returns:
+        States ``[S, T + 1, n]``, commands ``[S, T]`` and metrics, as JSON data.
+    """
+    policy = _victim(victim_file(experiment, cell.victim))
+    problem = attack_problem(experiment, space, policy, cell.scenario, cell.seed)
+    shown = load_shown(space, folder, cell)
+    measured = from_measured_starts(experiment, cell.scenario, past_field(experiment, problem, space, shown))
+    states, commands, scores = learned_drives(experiment, measured, shown.colours)
+    return {
+        "states": states.tolist(),
+        "commands": commands.tolist(),
+        **totals(scores),
+        "mean_cte_m": [score.mean_cte_m for score in scores],
+        "time_to_leave_s": [score.time_to_leaving_s for score in scores],
+    }
+
+
+def attack_problem(
+    experiment: Experiment, space: Space, policy: LoadedPolicy, scenario: str, seed: int
+) -> AttackProblem:
+    """The attack on one victim on one drive, with the starts of one seed."""
+    attack, robustness = experiment.config.attack, experiment.config.attack.robustness
+    # Drives of one start differ by what is drawn in them.
+    starts = experiment.start_states(scenario, seed).repeat_interleave(robustness.repeats, dim=0)
+    goals, objective = _goals(experiment, scenario, len(starts)), load_objective(attack.objective)
+    return AttackProblem(
+        policy.policy,
+        space.sensor,
+        experiment.dynamics,
+        experiment.paths[scenario],
+        starts,
+        experiment.searched_ticks,
+        goals,
+        time_batch=attack.time_batch,
+        cache_bytes=int(attack.cache_mib * 2**20),
+        fence_m=experiment.world.fence_m,
+        held_cap_m=experiment.config.held_cap_m,
+        off_track_m=experiment.world.off_track_m,
+        disturbances=robustness.disturbances(seed),
+        regulariser=robustness.regulariser(space.surrogate.objects),
+        objective=objective,
+        solids=experiment.solids if objective.needs_solids else None,
+    )
+
+
+def _goals(experiment: Experiment, scenario: str, count: int) -> torch.Tensor | None:
+    goal = experiment.goal(scenario)
+    return torch.tensor([goal], dtype=torch.float32).expand(count, -1) if goal else None
+
+
+def from_measured_starts(experiment: Experiment, scenario: str, problem: AttackProblem) -> AttackProblem:
+    """The problem from the starts, and over the horizon, that are measured; nothing disturbs what is seen."""
+    starts = experiment.measured_starts(scenario)
+    goals = _goals(experiment, scenario, len(starts))
+    return replace(problem.undisturbed(), start_states=starts, goals=goals, steps=experiment.config.horizon)
+
+
+def past(problem: AttackProblem, space: Space, shown: Shown) -> AttackProblem:
+    """The problem with the surrogate as its sensor, in which objects stand as they are shown; its theta are their colours."""
+    return replace(problem, sensor=shown.seen_by(space.surrogate))
+
+
+def past_field(experiment: Experiment, problem: AttackProblem, space: Space, shown: Shown) -> AttackProblem:
+    """`past` in the learned scene itself, where searches look at it baked: it is what a finished attack is judged by."""
+    seen = shown.seen_by(space.surrogate)
+    if not over_the_world(experiment):
+        seen = seen.with_background(load_field(experiment))
+    return replace(problem, sensor=seen)
+
+
+def load_shown(space: Space, folder: Path, cell: Cell) -> Shown:
+    """The objects as a search found them, of its attack file; of a control as they are, or none."""
+    if cell.method == EMPTY:
+        return Shown((), torch.zeros(0, 3))
+    attack = load_found(folder, cell)
+    return space.plain if attack is None else space.restored(attack)
+
+
+def load_found(folder: Path, cell: Cell) -> AttackFile | None:
+    """The attack file of a search; None of a control."""
+    return load_attack(folder / ATTACK) if cell.searched else None
+
+
+def search_settings(experiment: Experiment, method: Method) -> SearchSettings:
+    """What a search may spend."""
+    attack, space = experiment.config.attack, experiment.config.space
+    cells = space.cells if isinstance(space, (ColoursConfig, FaceConfig)) else 0
+    return SearchSettings(
+        evaluations=planned_evaluations(experiment),
+        learning_rate=space.learning_rate
+        if isinstance(space, (MeshTextureConfig, MeshShapeConfig))
+        else None,
+        population=attack.cem_population,
+        cells=cells,
+        gradient_rate=attack.learning_rate,
+        random_sigma=attack.random_sigma,
+        options=method.options({}),
+    )
+
+
+def planned_evaluations(experiment: Experiment) -> int:
+    """Drives of each search."""
+    space = experiment.config.space
+    return (
+        space.samples * space.steps
+        if isinstance(space, PlacesConfig)
+        else experiment.config.attack.evaluations
+    )
+
+
+def _search(
+    experiment: Experiment,
+    space: Space,
+    problem: AttackProblem,
+    cell: Cell,
+    folder: Path,
+    report: Callable[..., None],
+) -> SearchResult:
+    wanted = experiment.config.space.model_dump(mode="json")
+    wanted_of = {**frozen_for(experiment, cell), "scenario": cell.scenario, "space": wanted}
+    if (objective := experiment.config.attack.objective) != CTE:
+        wanted_of["objective"] = objective_key(objective)
+    settings_hash = hash_of(wanted_of)
+    method = load_method(cell.code)
+    keep_title(folder.parent, cell.method, method.title)
+    settings = search_settings(experiment, method)
+    told = telling(method.evaluations(problem, settings), report, objective=problem.objective)
+    run = SearchRun(cell.seed, folder / _STATE, told, settings_hash)
+    return space.search(cell.code, on_chosen_device(problem), settings, run)
+
+
+@lru_cache(maxsize=4)
+def _victim(path: Path) -> LoadedPolicy:
+    return load_policy(path)
+
+
+def _attack_file(
+    experiment: Experiment,
+    space: Space,
+    problem: AttackProblem,
+    policy: LoadedPolicy,
+    cell: Cell,
+    result: SearchResult,
+) -> AttackFile:
+    clean = clean_drive(past(problem, space, space.plain), space.plain.colours)
+    theta = half_precision(result.theta)
+    attack = AttackFile(
+        method=cell.method,
+        space=space.name,
+        objects=space.attacked(theta),
+        face=space.face(theta),
+        camera=experiment.view.pinhole,
+        scene_sha256=hash_of(experiment.world_settings)
+        if over_the_world(experiment)
+        else scene_sha256(experiment),
+        policy_sha256=policy.sha256,
+        config_sha256=hash_of(experiment.config.model_dump(mode="json")),
+        seed=cell.seed,
+        predicted_total_cte_m=result.best.predicted_total_cte_m,
+        software_version=version("advnerf"),
+        extra={
+            "victim": cell.victim,
+            "scenario": cell.scenario,
+            "horizon": experiment.searched_ticks,
+            **said_of_device(),
+            **objective_entry(experiment.config.attack.objective, problem.objective, result.best.value),
+        },
+        clean_drive=clean,
+    )
+    if not baked_file(experiment).exists() or over_the_world(experiment):
+        return attack
+    shown = space.restored(attack)
+    _, totals_m = evaluate(past_field(experiment, problem.undisturbed(), space, shown), shown.colours)
+    return replace(attack, field_total_cte_m=float(totals_m.protocol_cte_m.mean()))

@@ -1,0 +1,75 @@
+"""Stage bake: make the learned scene quick to render, and compare it with what was learned on views that nothing learned from."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from advnerf_core.data.dataset import load_transforms
+from advnerf_core.documents import read_json
+from advnerf_core.files import write_atomically
+from advnerf_core.geometry import Array, planar_poses
+from advnerf_core.scene.bake import NotBakedError, bake
+from advnerf_core.scene.baked import BakedScene
+from advnerf_core.scene.metrics import psnr
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.learned_scene import FIDELITY, HELD_OUT, baked_file, load_field
+from nodes.experiment.steps.capture import states_about
+from nodes.runtime.progress import Report
+
+# As of a stage (`run.VERSIONS`). It is part of the keys of what is made through baked scenes; the digest of this stage is not, as what it
+# writes follows from the scene, and machines differ in the last bits.
+VERSION = 1
+COMPARED = "baked.json"
+# What baking may cost on held-out views [dB]; a scene that loses more is rendered from its field.
+_MOST_LOST_DB = 0.3
+# Views that bricks are made for: as far from a path as an attack may throw a car [m, of half a lane of 1.75 m], and as turned [rad].
+_VIEWS, _LATERAL_M, _HEADING_RAD, _SEED = 320, 3.0, 0.5, 0
+
+
+def run(experiment: Experiment, folder: Path, report: Report) -> None:
+    """Write ``baked.safetensors``, unless the scene cannot be baked or loses by it, and ``baked.json``, which says which."""
+    report(0.0, "baking")
+    try:
+        baked = bake(load_field(experiment), views_of(experiment), experiment.view.pinhole)
+    except NotBakedError as error:
+        write_atomically(folder / COMPARED, json.dumps({"used": False, "why": str(error)}, indent=1) + "\n")
+        return
+    report(0.8, "comparing")
+    fidelity = read_json(experiment.stage_folder("scene") / FIDELITY)
+    before_db, after_db = fidelity["mean"]["psnr_policy_db"], _held_out_psnr_db(experiment, baked)
+    used = before_db - after_db <= _MOST_LOST_DB
+    if used:
+        baked.save(baked_file(experiment))
+    found = {
+        "used": used,
+        "psnr_field_db": before_db,
+        "psnr_baked_db": after_db,
+        "most_lost_db": _MOST_LOST_DB,
+        "mib": baked.voxels.nbytes / 2**20,
+    }
+    write_atomically(folder / COMPARED, json.dumps(found, indent=1) + "\n")
+
+
+def views_of(experiment: Experiment) -> Array:
+    """Poses ``[N, 4, 4]`` of the driving camera about all paths, equally many about each."""
+    count = len(experiment.paths) * (_VIEWS // len(experiment.paths))
+    states = states_about(experiment, count, np.random.default_rng(_SEED), _LATERAL_M, _HEADING_RAD)
+    return planar_poses(states) @ experiment.mount
+
+
+def _held_out_psnr_db(experiment: Experiment, baked: BakedScene) -> float:
+    """Mean over the held-out views as the policy sees them."""
+    views = load_transforms(experiment.stage_folder("capture") / HELD_OUT, require_all=True).load()
+    view = experiment.view
+    pairs = zip(views.rgb, views.T_world_from_camera, strict=True)
+    return float(
+        np.mean(
+            [
+                psnr(baked.render(pose[None], view.pinhole)[0][0].numpy(), view.image(rgb) / 255.0)
+                for rgb, pose in pairs
+            ]
+        )
+    )

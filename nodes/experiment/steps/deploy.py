@@ -1,0 +1,212 @@
+"""The part of a cell where it is deployed: drives past what its search found, by the world's own car or through the live nodes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+
+from advnerf_core.attack.spaces.space import Space
+from advnerf_core.documents import read_json
+from advnerf_core.files import write_atomically
+from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.report.conditions import NONE
+from advnerf_core.report.evidence.kept import kept_drives
+from hardware.worlds.world import World
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.deployed import DeployedDrive
+from nodes.experiment.show.drives import deployed_drives, totals
+from nodes.experiment.show.spaces import dress, shown_there
+from nodes.experiment.steps.attack import load_found, load_shown
+from nodes.experiment.steps.live import LiveRun, as_drive, drive_until_it_counts
+from nodes.experiment.steps.policy import victim_file
+from nodes.experiment.steps.search_files import ATTACK, SEARCHED, THETA
+from nodes.lab.trials.tries import NotDrivenError
+
+DRIVES = "drives.json"
+
+
+class Deployer(Protocol):
+    """Drives past what a search found."""
+
+    @property
+    def scene(self) -> World | None:
+        """The world, if it is open."""
+
+    def drive(self, space: Space, cell: Cell, folder: Path, tell: Callable[[str], None], /) -> Deployed:
+        """Drive a searched cell from the starts that are deployed; its attack file is in ``folder``, where bags go too."""
+
+
+@dataclass(frozen=True, eq=False)
+class Deployed:
+    """Deployed drives of one cell.
+
+    Attributes:
+        drives: One per start.
+        live: Of live drives what was measured in each bag, and in which folder it is.
+    """
+
+    drives: list[DeployedDrive]
+    live: list[dict[str, Any]] = field(default_factory=list)
+
+
+@dataclass(frozen=True, eq=False)
+class ThroughWorld:
+    """The open world's own car, tick by tick."""
+
+    experiment: Experiment
+    scene: World
+
+    def drive(self, space: Space, cell: Cell, folder: Path, tell: Callable[[str], None]) -> Deployed:
+        """Drive in this process; see `Deployer.drive`."""
+        del tell
+        experiment = self.experiment
+        policy = load_policy(victim_file(experiment, cell.victim)).policy
+        shown = load_shown(space, folder, cell)
+        there = dress(experiment, self.scene, shown)
+        starts, colours = (
+            deployed_starts(experiment, cell),
+            shown_there(experiment, shown, load_found(folder, cell)),
+        )
+        return Deployed(deployed_drives(experiment, there, policy, cell.scenario, starts, colours))
+
+
+@dataclass(frozen=True, eq=False)
+class ThroughNodes:
+    """The live node graph; every drive leaves a bag."""
+
+    experiment: Experiment
+    scene: None = None
+
+    def drive(self, space: Space, cell: Cell, folder: Path, tell: Callable[[str], None]) -> Deployed:
+        """Launch the nodes once per start; see `Deployer.drive`."""
+        del space
+        attack = None if cell.method == NONE else (folder / ATTACK).resolve()
+        found = []
+        for number, start in enumerate(deployed_starts(self.experiment, cell).tolist()):
+            name = live_name(number)
+            live = LiveRun(name, cell.victim, cell.scenario, (start[0], start[1], start[2]), attack)
+            found.append({"run": name, **drive_until_it_counts(self.experiment, live, folder, tell)})
+        return Deployed([as_drive(self.experiment, each) for each in found], found)
+
+
+def live_name(start: int) -> str:
+    """Name of the live run of a cell from one of its starts, in the cell's folder."""
+    return f"live{start}"
+
+
+def deployed_starts(experiment: Experiment, cell: Cell) -> torch.Tensor:
+    """The starts ``[B, 3]`` of a cell that are deployed."""
+    return experiment.measured_starts(cell.scenario)[: experiment.config.deploy.starts]
+
+
+def cell_data(
+    experiment: Experiment,
+    space: Space,
+    deployer: Deployer | None,
+    cell: Cell,
+    folder: Path,
+    clean: Path,
+    tell: Callable[[str], None],
+) -> dict[str, Any]:
+    """Drive a searched cell, and without attack, where they are deployed, and put together what was found.
+
+    Args:
+        experiment: The experiment.
+        space: What was searched.
+        deployer: What drives; None deploys nothing.
+        cell: Which.
+        folder: The cell's folder, with the surrogate's part.
+        clean: The folder of the same drive without attack, with the surrogate's part.
+        tell: Told of drives that do not count.
+
+    Returns:
+        Attack id, seconds; for ``surrogate`` and ``deployed`` the total CTE [m] and whether the car left the track, per start, and the total
+        CTE without attack; see `advnerf_core.report.cells`. A cell that was not driven live has no ``deployed``, and says why.
+    """
+    learned, undisturbed = (read_json(at / SEARCHED) for at in (folder, clean))
+    data = {
+        "scenario": cell.scenario,
+        "victim": cell.victim,
+        "method": cell.method,
+        "seed": cell.seed,
+        "attack_id": learned["attack_id"],
+        "seconds": round(learned["seconds"], 1),
+        "policy_sha256": learned["policy_sha256"],
+        "surrogate": _drives_of(learned, undisturbed),
+        "kept": {"surrogate": kept_drives(learned)},
+        "extra": {
+            "evaluations": len(learned["curve_total_cte_m"]),
+            "horizon": experiment.config.horizon,
+            "space": experiment.config.space.model_dump(mode="json"),
+            "deployed_through": experiment.config.deploy.through,
+            "hardness": learned.get("hardness", ""),
+            **({} if learned["attack_id"] is None else {"theta": THETA}),
+        },
+    }
+    if deployer is not None:
+        try:
+            without = deployed_part(space, deployer, cell.clean, clean, tell)
+            driven = without if folder == clean else deployed_part(space, deployer, cell, folder, tell)
+        except NotDrivenError as error:
+            # Either arm can be the spoiled one. Without both there is nothing to compare, so the cell has no deployed drives at all.
+            data["not_driven_live"] = str(error)
+            data["extra"]["spoiled_tries"] = [list(error.spoiled)]
+            return data
+        data["deployed"] = _drives_of(driven, without)
+        data["kept"]["deployed"] = kept_drives(driven)
+        data["extra"] |= {
+            "blocked_tick": driven["blocked_tick"],
+            "max_abs_cte_m": max(driven["max_cte_m"]),
+            "off_track_m": experiment.limits.off_track_m,
+            **_live_extra(driven["live"]),
+        }
+    return data
+
+
+def _drives_of(found: Mapping[str, Any], clean: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "total_cte_m": found["total_cte_m"],
+        "off_track": found["off_track"],
+        "none_total_cte_m": clean["total_cte_m"],
+    }
+
+
+def _live_extra(live: list[dict[str, Any]]) -> dict[str, Any]:
+    """What only live drives can tell, per start."""
+    if not live:
+        return {}
+    return {
+        "stopped_early": [each["outcome"]["stopped_early"] for each in live],
+        "missed_frames": [each["missed"] for each in live],
+        "spoiled_tries": [each["spoiled"] for each in live],
+        "time_to_leave_s": [each["metrics"]["time_to_leaving_s"] for each in live],
+    }
+
+
+def deployed_part(
+    space: Space, deployer: Deployer, cell: Cell, folder: Path, tell: Callable[[str], None]
+) -> dict[str, Any]:
+    """Deployed drives of a searched cell from its starts, kept in ``drives.json``; what is there already is read."""
+    kept = folder / DRIVES
+    if kept.exists():
+        found: dict[str, Any] = read_json(kept)
+        return found
+    deployed = deployer.drive(space, cell, folder, tell)
+    data = {
+        "states": [drive.states.tolist() for drive in deployed.drives],
+        "commands": [drive.controls.tolist() for drive in deployed.drives],
+        **totals([drive.metrics for drive in deployed.drives]),
+        "mean_cte_m": [drive.metrics.mean_cte_m for drive in deployed.drives],
+        "max_cte_m": [drive.metrics.max_cte_m for drive in deployed.drives],
+        "blocked_tick": [drive.blocked_tick for drive in deployed.drives],
+        "collided_with": [drive.collided_with for drive in deployed.drives],
+        "live": deployed.live,
+    }
+    write_atomically(kept, json.dumps(data) + "\n")
+    return data

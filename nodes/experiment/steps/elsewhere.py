@@ -1,0 +1,117 @@
+"""Where a victim learns that is not where it is attacked: other worlds of the same kind, each opened for its frames alone.
+
+A victim that learned on the attacked road knows it, and takes what stands there for a landmark. One that learned in other places
+meets the attacked one as a car meets a street: there, only photographs are taken and a scene is learned.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from advnerf_core.documents import Document
+from advnerf_core.learning.recipe import SourcePlan
+from advnerf_core.learning.sources import RenderedSource
+from hardware.worlds.world import World
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.deployed import seen_in
+from nodes.experiment.show.native import stand_in
+from nodes.experiment.show.objects import placed_objects, random_theta
+from nodes.experiment.show.placing import place_by_rule
+from nodes.runtime.config import apply_overrides
+from nodes.runtime.errors import ConfigError
+
+# What a policy carries from one place to the other.
+_SAME = ("car", "camera", "T_car_from_camera", "off_track_m")
+
+
+def plans_elsewhere(experiment: Experiment, opened: ExitStack) -> list[SourcePlan]:
+    """For each drive of each place two sources: half of the poses without any object, half with the objects where their rule puts them.
+
+    Args:
+        experiment: Its ``policy.learns_in`` names the places.
+        opened: Closes their worlds when the policy is trained.
+
+    Raises:
+        ConfigError: A place has another car or camera than the attacked one, lacks a path, or has no spot for an object.
+    """
+    return [
+        plan
+        for number, changes in enumerate(experiment.config.policy.learns_in)
+        for plan in _plans(*place_elsewhere(experiment, changes, opened), f"place{number}")
+    ]
+
+
+def place_elsewhere(
+    experiment: Experiment, changes: Sequence[str], opened: ExitStack
+) -> tuple[Experiment, World]:
+    """The experiment in another place, its objects where their rule puts them there, and that place, open.
+
+    Args:
+        experiment: In the attacked place.
+        changes: Of the section ``world``, as ``--set`` takes them.
+        opened: Closes the world.
+
+    Raises:
+        ConfigError: The place has another car or camera, or no spot for an object.
+    """
+    document = Document(copy.deepcopy(experiment.config.world), str(experiment.file))
+    apply_overrides(document, changes)
+    there = replace(experiment, config=experiment.config.model_copy(update={"world": document.data}))
+    world = opened.enter_context(there.named_world.make())
+    found = world.describe()
+    if differ := [
+        name for name in _SAME if not _equal(getattr(found, name), getattr(experiment.world, name))
+    ]:
+        raise ConfigError(
+            f"{experiment.file}: policy.learns_in: expected places with the {', '.join(_SAME)} of the attacked one, got other "
+            f"{', '.join(differ)} with {' '.join(changes)}"
+        )
+    # What the capture stage has kept is of the attacked place.
+    vars(there)["world"] = found
+    vars(there)["objects"] = tuple(place_by_rule(there, world))
+    return there, world
+
+
+def _equal(one: Any, other: Any) -> bool:
+    return bool(np.array_equal(one, other)) if isinstance(one, np.ndarray) else bool(one == other)
+
+
+def _plans(there: Experiment, world: World, place: str) -> list[SourcePlan]:
+    """Sources of one place."""
+    wanted = there.config.policy
+    bare = stand_in(there.view, world, [], wanted.panels)
+    dressed = stand_in(there.view, world, placed_objects(there), wanted.panels)
+    plain = dressed.plain_theta()
+    assert plain is not None, "an experiment that places objects by a rule has some"
+    shape, sigma = tuple(plain.shape), there.config.attack.random_sigma
+    found = []
+    for name in there.config.scenarios:
+        sources = (
+            RenderedSource(f"{place}-{name}-bare", seen_in(bare), there.dynamics),
+            RenderedSource(
+                f"{place}-{name}",
+                seen_in(dressed),
+                there.dynamics,
+                lambda rng: random_theta(shape, sigma, rng),
+            ),
+        )
+        for which, source in enumerate(sources):
+            found.append(
+                SourcePlan(
+                    source,
+                    (wanted.deployed_stills + which) // 2,
+                    (wanted.deployed_drives + which) // 2,
+                    wanted.drive_steps,
+                    goal=there.goal(name),
+                    expert=there.expert(name),
+                    driven_m=wanted.driven_m,
+                    drives_from_m=wanted.drives_from_m,
+                )
+            )
+    return found

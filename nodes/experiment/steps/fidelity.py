@@ -1,0 +1,248 @@
+"""Real and learned pictures, without and with an attack: what the fidelity gate and the prediction of transfer look at.
+
+Real pictures are the deployment scene's, with the opaque objects composed by depth, from where the car was on its drive past the plain
+objects; of a live drive those in its bag, into which a face is drawn by the code that draws it live, on a screen in the colours that its
+calibration says the camera sees. No drive with the attack is looked at.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from advnerf_core.attack.adjoint import AttackProblem
+from advnerf_core.attack.artifact import AttackFile, face_texture
+from advnerf_core.attack.projection import FaceOverlay
+from advnerf_core.attack.spaces.displayed import DisplayedSensor
+from advnerf_core.attack.spaces.space import Shown, Space
+from advnerf_core.attack.transfer import Scene
+from advnerf_core.data.dataset import load_transforms
+from advnerf_core.documents import read_json
+from advnerf_core.driving.measured_car import CarResponse, RespondingCar, fit_response
+from advnerf_core.driving.metrics import Horizon
+from advnerf_core.geometry import Array, invert_transform, planar_poses, yaw_of
+from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.scene.fidelity import Pictures
+from advnerf_core.scene.surrogate import Surrogate
+from nodes.bags.reader import read_messages
+from nodes.control.pose_buffer import PoseBuffer
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.drives import deployed_drives
+from nodes.experiment.show.faces import face_space, has_face, on_screen, panel_of
+from nodes.experiment.show.images import as_uint8
+from nodes.experiment.show.objects import surrogate_of
+from nodes.experiment.show.spaces import dress, make_space, shown_there
+from nodes.experiment.steps import capture
+from nodes.experiment.steps.attack import attack_problem, from_measured_starts, load_found
+from nodes.experiment.steps.deploy import DRIVES, live_name
+from nodes.experiment.steps.policy import victim_file
+from nodes.experiment.steps.search_files import ATTACK
+from nodes.runtime.errors import BagError, RuntimeFault
+from nodes.runtime.messages import decode, ns_from_stamp, pose_matrix
+from nodes.runtime.pictures import rgb_image
+from nodes.runtime.topics import topic as topic_row
+
+Rgb = NDArray[np.uint8]
+_MOST_FRAMES = 120
+_CAR, _IMAGE, _SAFETY = "/vicon/car", "/compositor/image", "/safety/state"
+
+
+def policy_of(experiment: Experiment, cell: Cell) -> tuple[Any, tuple[float, ...]]:
+    """The victim and what it is told on its path, of the first where none is named."""
+    goal = experiment.goal(cell.scenario or experiment.config.scenarios[0])
+    return load_policy(victim_file(experiment, cell.victim)).policy, goal
+
+
+def held_out(experiment: Experiment) -> Pictures:
+    """The driving camera's views that nothing was learned from, about all drives, without objects."""
+    views = load_transforms(experiment.stage_folder("capture") / capture.HELD_OUT, require_all=True).load()
+    surrogate = surrogate_of(experiment, [])
+    learned = [as_uint8(surrogate.render(pose[None], None).images[0]) for pose in views.T_world_from_camera]
+    return Pictures(
+        "held-out views", np.stack([experiment.view.image(rgb) for rgb in views.rgb]), np.stack(learned)
+    )
+
+
+def driven(experiment: Experiment, cell: Cell, clean: Path, bag: Path | None = None) -> Pictures:
+    """What the camera sees on the deployed drive without an attack.
+
+    Args:
+        experiment: The experiment.
+        cell: Which drive.
+        clean: Where its live drives without attack are kept.
+        bag: Instead, a bag of any live drive without attack.
+
+    Raises:
+        RuntimeFault: A bag is given where drives are asked of the scene, or there is no live drive yet.
+    """
+    if bag is None and not experiment.config.deploy.live:
+        return _along_the_drive(experiment, cell, None, "drive without attack")
+    if bag is not None and not has_face(experiment):
+        raise RuntimeFault(
+            "expected no bag for drives that are asked of the scene (deploy.through world); leave --bag out"
+        )
+    frames, states = posed_frames(bag or clean_bag(cell, clean))
+    surrogate = surrogate_of(experiment, [])
+    learned = _learned(surrogate, planar_poses(states) @ experiment.mount, None)
+    return Pictures("driven bag", np.stack([experiment.view.image(rgb) for rgb in frames]), learned)
+
+
+def lacks(experiment: Experiment, cell: Cell, folder: Path, clean: Path) -> str:
+    """What a prediction still needs, in words; empty if all is there."""
+    if not (folder / ATTACK).exists():
+        return "its search"
+    if experiment.config.deploy.live:
+        try:
+            clean_bag(cell, clean)
+        except RuntimeFault:
+            return "the live drive without attack: run the cell of method none first"
+    elif experiment.config.deploy.car == "own" and not (clean / DRIVES).exists():
+        return "the deployed drives without attack, which show the car: run the cell of method none first (--only method=none)"
+    return ""
+
+
+def attacked(experiment: Experiment, cell: Cell, folder: Path, clean: Path) -> Pictures:
+    """The same places with the colours of a finished search."""
+    space, attack = _found(experiment, cell, folder)
+    shown = space.restored(attack)
+    if not experiment.config.deploy.live:
+        there = shown_there(experiment, shown, attack)
+        return _along_the_drive(experiment, cell, (shown, there), "the same drive, attacked")
+    frames, states = posed_frames(clean_bag(cell, clean))
+    cars, overlay, panel = planar_poses(states), _overlay(experiment, attack), panel_of(experiment)
+    real = []
+    for rgb, car in zip(frames, cars, strict=True):
+        drawn, _ = overlay.draw(rgb, invert_transform(car @ experiment.mount) @ panel.T_world_from_face)
+        real.append(experiment.view.image(drawn))
+    surrogate = shown.seen_by(space.surrogate)
+    learned = _learned(surrogate, cars @ experiment.mount, shown.colours)
+    return Pictures("driven bag, attacked", np.stack(real), learned)
+
+
+def loop(
+    experiment: Experiment, cell: Cell, folder: Path, clean: Path
+) -> tuple[AttackProblem, Scene, torch.Tensor, Horizon]:
+    """What a prediction drives: the problem, pictures with or without the attack, the deployed starts ``[S, n]`` and the horizon.
+
+    Its car is the deployed one as the drives without attack in the folder ``clean`` have shown it.
+    """
+    space, attack = _found(experiment, cell, folder)
+    found, plain = space.restored(attack), space.plain
+    with_it, without = (each.seen_by(space.surrogate) for each in (found, plain))
+    problem = attack_problem(
+        experiment, space, load_policy(victim_file(experiment, cell.victim)), cell.scenario, cell.seed
+    )
+    car, problem = _measured_car(experiment, clean), from_measured_starts(experiment, cell.scenario, problem)
+    problem = replace(problem, dynamics=car, start_states=car.start(problem.start_states))
+
+    def images(states: torch.Tensor, attacked: bool) -> torch.Tensor:
+        sensor, colours = (with_it, found.colours) if attacked else (without, plain.colours)
+        return sensor.sense(states[:, :3], colours).images
+
+    starts = problem.start_states[: experiment.config.deploy.starts]
+    return problem, images, starts, experiment.limits
+
+
+def _measured_car(experiment: Experiment, clean: Path) -> RespondingCar:
+    """The deployed car as its drives without attack have shown it; the search's own where it drives."""
+    ideal = experiment.dynamics
+    if experiment.config.deploy.car == "ideal" or not (clean / DRIVES).exists():
+        return RespondingCar(ideal, CarResponse(ideal.speed_mps))
+    kept = read_json(clean / DRIVES)
+    ends = [
+        tick or len(commands) for tick, commands in zip(kept["blocked_tick"], kept["commands"], strict=True)
+    ]
+    poses = [np.array(each)[: end + 1] for each, end in zip(kept["states"], ends, strict=True)]
+    controls = [np.array(each)[:end] for each, end in zip(kept["commands"], ends, strict=True)]
+    return RespondingCar(ideal, fit_response(poses, controls, ideal))
+
+
+def _found(experiment: Experiment, cell: Cell, folder: Path) -> tuple[Space, AttackFile]:
+    """The space, in the learned scene, and the attack file of a finished search."""
+    attack = load_found(folder, cell)
+    assert attack is not None, "a prediction is of a method"
+    return make_space(experiment, None), attack
+
+
+def clean_bag(cell: Cell, clean: Path) -> Path:
+    """The bag of the live drive that cells of this victim and seed are compared with.
+
+    Raises:
+        RuntimeFault: It is not driven yet, or its bag is gone.
+    """
+    bag = clean / live_name(0) / "bag"
+    if not bag.exists():
+        raise RuntimeFault(
+            f"expected the live drive without attack of the {cell.victim} victim, seed {cell.seed}, at {bag}, got none; run that cell first"
+        )
+    return bag
+
+
+def _overlay(experiment: Experiment, attack: AttackFile) -> FaceOverlay:
+    """Draws the face into pictures of the driving camera, in the colours that the camera sees."""
+    face, texture = attack.required_face(), attack.required_face().texture
+    if on_screen(experiment):
+        sensor = face_space(experiment, ideal=False).sensor
+        assert isinstance(sensor, DisplayedSensor), "a screen is not taken for ideal here"
+        texture = face_texture(
+            sensor.seen_theta(torch.from_numpy(np.array(attack.face_object.theta))).numpy()
+        )
+    return FaceOverlay(texture, face.corners_in_subject, experiment.camera)
+
+
+def _learned(sensor: Surrogate, poses: Array, theta: torch.Tensor | None) -> Rgb:
+    return np.stack([as_uint8(sensor.render(pose[None], theta).images[0]) for pose in poses])
+
+
+def _along_the_drive(
+    experiment: Experiment,
+    cell: Cell,
+    attack: tuple[Shown, torch.Tensor | None] | None,
+    of: str,
+) -> Pictures:
+    """Pictures of the deployed drive without attack, again with an attack if one is given: as it is seen in the surrogate, and as it is shown."""
+    space = make_space(experiment, None)
+    policy, _ = policy_of(experiment, cell)
+    shown, there = attack or (space.plain, shown_there(experiment, space.plain, None))
+    with experiment.open_deployed_world() as scene:
+        dressed = dress(experiment, scene, space.plain)
+        start = experiment.measured_starts(cell.scenario)[:1]
+        plain = shown_there(experiment, space.plain, None)
+        (drive,) = deployed_drives(experiment, dressed, policy, cell.scenario, start, plain)
+        states = drive.states[:-1]
+        real = dressed.policy_images(dressed.prepare(states), there)
+    surrogate = shown.seen_by(space.surrogate)
+    poses = planar_poses(states) @ experiment.mount
+    return Pictures(of, real, _learned(surrogate, poses, shown.colours))
+
+
+def posed_frames(bag: Path) -> tuple[list[Rgb], Array]:
+    """Frames that were captured while the car was armed, of a long drive an even choice, and the car's states ``[N, 3]`` at their stamps."""
+    poses, armed = PoseBuffer(keep_s=1e6), []
+    for message in read_messages(bag, [_CAR, _SAFETY]):
+        decoded = decode(topic_row(message.topic).type, message.cdr)
+        stamp_ns = ns_from_stamp(decoded.header.stamp)
+        if message.topic == _CAR:
+            poses.add(stamp_ns, pose_matrix(decoded))
+        elif decoded.armed:
+            armed.append(stamp_ns)
+    frames, states = [], []
+    for message in read_messages(bag, [_IMAGE]):
+        image = decode(topic_row(_IMAGE).type, message.cdr)
+        stamp_ns = ns_from_stamp(image.header.stamp)
+        pose = poses.at(stamp_ns, 0.0)
+        if pose is not None and armed and min(armed) <= stamp_ns <= max(armed):
+            frames.append(rgb_image(image, f"{_IMAGE} in {bag}").copy())
+            states.append((pose.T[0, 3], pose.T[1, 3], yaw_of(pose.T)))
+    if not frames:
+        raise BagError(
+            f"expected images on {_IMAGE} with poses on {_CAR} while the car was armed in {bag}, got none"
+        )
+    step = -(-len(frames) // _MOST_FRAMES)  # neighbouring frames of a long drive say no more
+    return frames[::step], np.array(states)[::step]

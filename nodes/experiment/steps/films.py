@@ -1,0 +1,141 @@
+"""Films of drives from the driver's seat: one per drive of an experiment's report, and one per cell of a campaign."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.attack.spaces.space import Space
+from advnerf_core.documents import read_json
+from advnerf_core.geometry import Array, planar_poses
+from advnerf_core.report.clips import ClipTrack, write_clip
+from advnerf_core.report.conditions import NONE, style_of
+from advnerf_core.scene.surrogate import Surrogate
+from hardware.worlds.world import World
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.images import as_uint8
+from nodes.experiment.show.learned_scene import load_background
+from nodes.experiment.show.spaces import dress, shown_there
+from nodes.experiment.steps.attack import load_found, load_shown
+from nodes.experiment.steps.deploy import DRIVES
+from nodes.experiment.steps.keys import driven_folder
+from nodes.experiment.steps.policy import HARDENED
+from nodes.experiment.steps.search_files import SEARCHED
+from nodes.lab.trials import evaluation
+
+DOMAINS = ("surrogate", "deployed")
+_FRAME_S = 0.1  # of films: finer ticks are not all filmed
+
+
+def strongest(experiment: Experiment) -> str:
+    """The method that films show: the gradient if it was searched."""
+    methods = experiment.config.attack.method_names
+    return "gradient" if "gradient" in methods else methods[-1]
+
+
+def film_scenario(
+    experiment: Experiment, scene: World | None, space: Space, scenario: str, folder: Path
+) -> Path:
+    """The attacked drive in the surrogate, and the deployed ones without and with the attack, side by side; first seed and start.
+
+    Args:
+        experiment: With all stages before finished.
+        scene: Open; None where drives were live, whose bags have the pictures.
+        space: What was searched.
+        scenario: Which drive.
+        folder: Gets the film.
+    """
+    attacked = Cell(scenario, HARDENED, strongest(experiment), experiment.config.attack.seeds[0])
+    shown = load_shown(space, driven_folder(experiment, attacked), attacked)
+    whole = Surrogate(load_background(experiment), experiment.camera, experiment.mount, shown.objects)
+    every, rate_hz = filmed(experiment.config.dt_s)
+    learned = drives_of(experiment, "surrogate", attacked)[0][::every]
+    poses = planar_poses(learned) @ experiment.mount
+    frames = [as_uint8(whole.render(pose[None], shown.colours).images[0]) for pose in poses]
+    tracks = [_track(experiment, attacked, "learned scene, attacked", frames, learned)]
+    for cell in (attacked.clean, attacked):
+        if not (driven_folder(experiment, cell) / DRIVES).exists():
+            continue  # not driven live
+        title = "deployed, no attack" if cell.method == NONE else "deployed, attacked"
+        tracks.append(_deployed_track(experiment, scene, space, cell, title, driven_folder(experiment, cell)))
+    return write_clip(folder / f"{scenario}.mp4", tracks, rate_hz, experiment.world.off_track_m)
+
+
+def film_cell(
+    experiment: Experiment, scene: World | None, space: Space, cell: Cell, folder: Path, driven: Path
+) -> Path:
+    """The deployed drive of one cell, from its first start, as ``clip.mp4`` in ``folder``; its files are in the folder ``driven``."""
+    title = f"{style_of(cell.method).title}, {cell.victim}, seed {cell.seed}"
+    track = _deployed_track(experiment, scene, space, cell, title, driven)
+    _, rate_hz = filmed(experiment.config.dt_s)
+    return write_clip(folder / "clip.mp4", [track], rate_hz, experiment.world.off_track_m)
+
+
+def _deployed_track(
+    experiment: Experiment,
+    scene: World | None,
+    space: Space,
+    cell: Cell,
+    title: str,
+    folder: Path,
+) -> ClipTrack:
+    """What the camera saw on the first deployed drive of a cell: asked of the open scene again, or from the bag of a live drive."""
+    every, _ = filmed(experiment.config.dt_s)
+    file = folder / DRIVES
+    states = _states(file)[0][::every]
+    if scene is None:
+        live = read_json(file)["live"][0]
+        began_ns, period_s = live["outcome"]["start_real_ns"], every * experiment.config.dt_s
+        views = list(evaluation.frames(folder / live["run"] / "bag", began_ns, len(states), period_s))
+        note = live["outcome"]["stopped_early"] or "ended"
+        return _track(experiment, cell, title, views, states, "".join(live["attack_ids"]), note)
+    shown = load_shown(space, folder, cell)
+    dressed, colours = (
+        dress(experiment, scene, shown),
+        shown_there(experiment, shown, load_found(folder, cell)),
+    )
+    return _track(experiment, cell, title, [dressed.camera_image(state, colours) for state in states], states)
+
+
+def kept_film(folder: Path) -> Path | None:
+    """The film of a cell in its folder; None where there is none yet."""
+    return next(folder.glob("clip.*"), None)
+
+
+def with_film(data: dict[str, Any], film: Path | None) -> dict[str, Any]:
+    """The cell with the name of its film, relative to the folder of all cells."""
+    if film is None:
+        return data
+    return {**data, "extra": {**data["extra"], "clip": f"{film.parent.name}/{film.name}"}}
+
+
+def filmed(dt_s: float) -> tuple[int, float]:
+    """Every how many ticks a frame is taken, and the film's frames per second, so that it runs in real time."""
+    every = max(1, round(_FRAME_S / dt_s))
+    return every, 1.0 / (every * dt_s)
+
+
+def _track(
+    experiment: Experiment,
+    cell: Cell,
+    title: str,
+    frames: list[NDArray[np.uint8]],
+    states: Array,
+    attack_id: str = "",
+    note: str = "ended",
+) -> ClipTrack:
+    cte_m = experiment.paths[cell.scenario].project(np.asarray(states)[:, :2]).cte_m
+    return ClipTrack(title, cell.method, frames, cte_m, attack_id, note)
+
+
+def drives_of(experiment: Experiment, domain: str, cell: Cell) -> list[Array]:
+    """States ``[T + 1, 3]`` of a cell's drives in one domain."""
+    return _states(driven_folder(experiment, cell) / (SEARCHED if domain == "surrogate" else DRIVES))
+
+
+def _states(file: Path) -> list[Array]:
+    return [np.array(states)[:, :3] for states in read_json(file)["states"]]

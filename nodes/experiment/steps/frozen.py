@@ -1,0 +1,100 @@
+"""What is fixed before the first search against a victim, so that nothing of it can be changed once results are known."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from advnerf_core.documents import read_json
+from advnerf_core.files import write_atomically
+from advnerf_core.policies.pilotnet import load_policy
+from nodes.experiment.engine.stage_record import hash_of
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.faces import has_face, panel_of
+from nodes.experiment.show.learned_scene import scene_sha256
+from nodes.experiment.show.spaces import geometry_sha256
+from nodes.experiment.steps.policy import victim_file, victims
+from nodes.experiment.steps.search_files import FROZEN
+from nodes.experiment.steps.verdicts import passing_digest
+from nodes.runtime.errors import RuntimeFault
+
+
+class FrozenChangedError(RuntimeFault):
+    """Something that was fixed before the first attack is no longer what it was."""
+
+
+def frozen_hashes(experiment: Experiment) -> dict[str, str]:
+    """What is fixed before the first attack: scene, victims, objects and their places, starts and seeds."""
+    policies = {f"policy_{name}": _policy_sha256(experiment, name) for name in victims(experiment)}
+    starts = {
+        f"{scenario} {seed}": experiment.start_states(scenario, seed).tolist()
+        for scenario in experiment.config.scenarios
+        for seed in experiment.config.attack.seeds
+    }
+    starts |= {name: experiment.measured_starts(name).tolist() for name in experiment.config.scenarios}
+    return {
+        **_frozen_place(experiment),
+        **policies,
+        "starts_and_seeds": hash_of(starts),
+        # As the experiment was run: a report may be of fewer methods.
+        "config": hash_of(read_json(experiment.folder / "manifest.json")["config"]),
+    }
+
+
+def frozen_for(experiment: Experiment, cell: Cell) -> dict[str, str]:
+    """What is fixed before the search of a cell; other seeds and victims do not matter to it."""
+    return {
+        **_frozen_place(experiment),
+        "policy": _policy_sha256(experiment, cell.victim),
+        "starts": hash_of(
+            [
+                experiment.start_states(cell.scenario, cell.seed).tolist(),
+                experiment.measured_starts(cell.scenario).tolist(),
+            ]
+        ),
+    }
+
+
+def _policy_sha256(experiment: Experiment, victim: str) -> str:
+    return load_policy(victim_file(experiment, victim)).sha256
+
+
+def _frozen_place(experiment: Experiment) -> dict[str, str]:
+    """Scene, objects, and where they stand."""
+    things = experiment.objects
+    return {
+        "scene": scene_sha256(experiment),
+        "objects": hash_of([geometry_sha256(experiment, thing.kind) for thing in things]),
+        "placement": hash_of(
+            [thing.model_dump(mode="json") for thing in things]
+            + ([panel_of(experiment).to_dict()] if has_face(experiment) else [])
+        ),
+    }
+
+
+def freeze(experiment: Experiment, cell: Cell, folder: Path) -> None:
+    """Write what is fixed before the search of a cell, once."""
+    if not (folder / FROZEN).exists():
+        fixed = frozen_for(experiment, cell)
+        fixed["hardness"] = passing_digest(experiment, fixed["policy"])
+        write_atomically(folder / FROZEN, json.dumps(fixed, indent=1) + "\n")
+
+
+def hardness_before(folder: Path) -> str:
+    """Digest of the passing verdict of the victim that was there when a search began; empty without one."""
+    return str(read_json(folder / FROZEN).get("hardness", "")) if (folder / FROZEN).exists() else ""
+
+
+def check_frozen(experiment: Experiment, cell: Cell, folder: Path) -> None:
+    """Refuse to drive if scene, victims, objects, places or starts are not those of the search.
+
+    Raises:
+        FrozenChangedError: Something of it changed.
+    """
+    then, now = read_json(folder / FROZEN), frozen_for(experiment, cell)
+    changed = [name for name, value in now.items() if then.get(name) != value]
+    if changed:
+        raise FrozenChangedError(
+            f"expected {', '.join(changed)} as frozen before the search in {folder}, got another; remove that folder to search again"
+        )

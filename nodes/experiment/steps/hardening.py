@@ -1,0 +1,120 @@
+"""Judging a victim before any gradient runs against it: the worst of N random textures of families that it was not trained on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from advnerf_core.attack.adjoint import AttackProblem
+from advnerf_core.attack.clean import clean_drive
+from advnerf_core.attack.methods import SearchRun, load_method
+from advnerf_core.attack.spaces.space import Space
+from advnerf_core.driving.metrics import mean_cte_limit_m
+from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.report.evidence.hardness import (
+    FILE,
+    FamilyHardness,
+    HardnessError,
+    HardnessVerdict,
+    write_hardness,
+)
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.spaces import make_space
+from nodes.experiment.steps.attack import (
+    attack_problem,
+    cells,
+    from_measured_starts,
+    past,
+    planned_evaluations,
+    search_settings,
+)
+from nodes.experiment.steps.policy import victim_file
+from nodes.experiment.steps.verdicts import TRAINED_ON, VALIDATED_ON, hardness_record
+
+_SEED = 20_000  # no search has it
+
+
+def margin_m(experiment: Experiment) -> float:
+    """Mean excess per tick that counts as no effect [m]: half of what a victim that drives well may be off without attack."""
+    return 0.5 * mean_cte_limit_m(experiment.limits.off_track_m)
+
+
+def judge(experiment: Experiment, victim: str, textures: int = 0) -> HardnessVerdict:
+    """Drive a victim with random textures of each validation family from the measured starts, and keep the verdict in the run folder.
+
+    Args:
+        experiment: With scene and policies.
+        victim: Which policy.
+        textures: Drawn per family; 0 draws as many as a search of the experiment may evaluate.
+
+    Returns:
+        The verdict; one that is there for this policy is returned as it is.
+
+    Raises:
+        HardnessError: A gradient search of this run folder has begun, or three other recipes were judged.
+    """
+    record = hardness_record(experiment)
+    policy = load_policy(victim_file(experiment, victim))
+    known = next((each for each in record.verdicts if each.policy_sha256 == policy.sha256), None)
+    if known is not None:
+        return known
+    _refuse_late(experiment, victim)
+    count = textures or planned_evaluations(experiment)
+    verdict = HardnessVerdict(
+        victim=victim,
+        policy_sha256=policy.sha256,
+        recipe=experiment.config.policy.model_dump(mode="json"),
+        trained_on=TRAINED_ON,
+        validated_on=VALIDATED_ON,
+        textures=count,
+        seed=_SEED,
+        starts=experiment.config.measure.starts,
+        margin_m=margin_m(experiment),
+        families=tuple(family_hardness(experiment, victim, VALIDATED_ON, count)),
+    )
+    write_hardness(experiment.folder / FILE, record.with_verdict(verdict))
+    return verdict
+
+
+def family_hardness(
+    experiment: Experiment, victim: str, families: Sequence[str], textures: int
+) -> Iterator[FamilyHardness]:
+    """What random textures of some families do to a victim in the surrogate, scenario by scenario.
+
+    Args:
+        experiment: With scene and policies.
+        victim: Which policy.
+        families: Methods that draw the textures.
+        textures: Drawn per family; all measured starts are driven with each.
+    """
+    space = make_space(experiment, None)
+    policy = load_policy(victim_file(experiment, victim))
+    for scenario in experiment.config.scenarios:
+        problem = attack_problem(experiment, space, policy, scenario, _SEED)
+        problem = from_measured_starts(experiment, scenario, problem)
+        none_m = np.array(clean_drive(past(problem, space, space.plain), space.plain.colours).total_cte_m)
+        for family in families:
+            driven_m = _totals_m(experiment, space, problem, family, textures)
+            yield FamilyHardness.of(scenario, family, (driven_m - none_m) / problem.steps)
+
+
+def _totals_m(
+    experiment: Experiment, space: Space, problem: AttackProblem, family: str, textures: int
+) -> np.ndarray:
+    """Total CTE of every texture and start, ``[textures, starts]`` [m]."""
+    settings = replace(search_settings(experiment, load_method(family)), evaluations=textures)
+    found = space.search(family, problem, settings, SearchRun(_SEED, None, None, ""))
+    return np.array([each.protocol_cte_m for each in found.history])
+
+
+def _refuse_late(experiment: Experiment, victim: str) -> None:
+    """A verdict that comes after a gradient search says nothing about the choice of the victim."""
+    for cell in cells(experiment):
+        folder = experiment.cell_folder(cell)
+        if cell.victim == victim and cell.method.startswith("gradient") and folder.exists():
+            raise HardnessError(
+                f"expected to judge the victim before any gradient search, got one in {folder}; name another run folder, or leave the victim "
+                "unjudged: pages call it trained with textures"
+            )

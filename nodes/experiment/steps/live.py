@@ -1,0 +1,211 @@
+"""Live drives: one run of the node graph against the simulated lab, driven until it counts, and measured from its bag."""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from advnerf_core.attack.artifact import load_attack
+from advnerf_core.driving.metrics import DriveMetrics, Horizon, first_still_tick
+from advnerf_core.policies.policy_file import policy_sha256
+from hardware.worlds.lab.config import LabConfig
+from hardware.worlds.world import collided_with
+from nodes.control.stop_causes import is_stall
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.deployed import DeployedDrive
+from nodes.experiment.show.faces import on_screen, panel_of, wanted_face
+from nodes.experiment.steps.policy import HARDENED, victim_file
+from nodes.lab.trials.evaluation import attack_ids, counterfactual, score, timing, trajectory
+from nodes.lab.trials.trial import TrialPlan
+from nodes.lab.trials.trial_runner import run_trial
+from nodes.lab.trials.tries import NotDrivenError, drive_with_tries
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.errors import ConfigError, RuntimeFault
+from nodes.runtime.progress import Report
+
+Pose = tuple[float, float, float]
+# The absent panel of the empty scene stands outside the room, out of every camera's sight.
+_OUT_OF_SIGHT_M = 60.0
+
+
+@dataclass(frozen=True)
+class LiveRun:
+    """One live run.
+
+    Attributes:
+        name: Of its folder and its result.
+        victim: Which policy.
+        scenario: Which path.
+        start: Where it starts.
+        attack: What is shown; None for nothing.
+        ticks: Over how many control ticks it is measured; None as the experiment says.
+        empty: Whether the panel is taken away.
+        compare: Whether the counterfactual node steers by the clean frames too, to measure what the attack added.
+    """
+
+    name: str
+    victim: str
+    scenario: str
+    start: Pose
+    attack: Path | None = None
+    ticks: int | None = None
+    empty: bool = False
+    compare: bool = False
+
+
+def lab_of(experiment: Experiment) -> LabConfig:
+    """The simulated lab that live nodes drive in.
+
+    Raises:
+        ConfigError: The world is another.
+    """
+    config = experiment.named_world.config
+    if not isinstance(config, LabConfig):
+        raise ConfigError(
+            f"{experiment.file}: expected world.kind lab with deploy.through nodes, as the live nodes simulate no other world, got "
+            f"{experiment.named_world.kind}; set deploy.through=world"
+        )
+    return config
+
+
+def drive_until_it_counts(
+    experiment: Experiment, live: LiveRun, folder: Path, tell: Callable[[str], None]
+) -> dict[str, Any]:
+    """Drive one run until it counts; see `drive_with_tries`, which says what it raises.
+
+    Args:
+        experiment: In the lab.
+        live: Which run.
+        folder: Where its folder and its JSON go; a run that is there is read.
+        tell: Told of tries that do not count.
+    """
+    return drive_with_tries(lambda: drive_live(experiment, live, folder), folder / f"{live.name}.json", tell)
+
+
+def drive_live(experiment: Experiment, live: LiveRun, folder: Path) -> dict[str, Any]:
+    """Drive one run through the node graph, which leaves its bag, and measure it.
+
+    Raises:
+        SpoiledError: Load or a fault of the stack spoiled the drive. Nothing was measured.
+    """
+    nodes, overrides = tuple(experiment.config.deploy.nodes), live_overrides(experiment, live)
+    if live.compare:
+        nodes, overrides = (*nodes, "counterfactual"), [*overrides, "params.counterfactual=true"]
+    horizon = _horizon(experiment, live)
+    plan = TrialPlan(live.start, horizon.ticks * horizon.dt_s + 0.2, nodes)
+    run_dir = folder / live.name
+    outcome = run_trial(
+        experiment.launch_file, overrides, run_dir, plan, experiment.config.deploy.ready_timeout_s
+    )
+    bag, path = run_dir / "bag", experiment.paths[live.scenario]
+    states = trajectory(bag, outcome.start_real_ns, horizon)
+    stopped_s = (outcome.end_real_ns - outcome.start_real_ns) / NS_PER_S if outcome.stopped_early else None
+    metrics, held = score(states, path, horizon, stopped_s)
+    # A frame that was captured less than a tick before the end may rightly find the car disarmed.
+    last_frame_ns = outcome.end_real_ns - round(horizon.dt_s * NS_PER_S)
+    times = timing(bag, outcome.start_real_ns, last_frame_ns)
+    drawn = sorted(attack_ids(bag))
+    _check_drawn(live, drawn)
+    result: dict[str, Any] = {
+        "victim": live.victim,
+        "attack_ids": drawn,
+        "outcome": outcome.to_dict(),
+        "states": held.tolist(),
+        "cte_m": path.project(held[:, :2]).cte_m.tolist(),
+        "metrics": asdict(metrics),
+        "frames": times.frames,
+        "missed": times.missed,
+        "capture_to_serial_ms": times.capture_to_serial_ms.tolist(),
+        "hops_ms": {name: values.tolist() for name, values in times.hops_ms.items()},
+    }
+    if live.compare and (found := counterfactual(bag, outcome.start_real_ns, last_frame_ns)) is not None:
+        result["counterfactual"] = asdict(found)
+    return result
+
+
+def as_drive(experiment: Experiment, driven: dict[str, Any]) -> DeployedDrive:
+    """A live run as any deployed drive; what the policy commanded is in its bag."""
+    metrics = driven["metrics"] | {"ctes_m": tuple(driven["metrics"]["ctes_m"])}
+    states, tick = np.array(driven["states"]), blocked_tick(driven)
+    hit = None if tick is None else collided_with(experiment.named_world.make(), states[tick])
+    return DeployedDrive(states, np.zeros(0), DriveMetrics(**metrics), tick, collided_with=hit)
+
+
+def blocked_tick(driven: dict[str, Any]) -> int | None:
+    """The tick from which the car stood because it had run into something; None if it had not."""
+    stopped = driven["outcome"]["stopped_early"]
+    return first_still_tick(driven["states"]) if not stopped or is_stall(stopped) else None
+
+
+def extra_runs(experiment: Experiment) -> dict[str, LiveRun]:
+    """Runs of the hardened victim beside the cells: laps without attack, and a drive with the panel taken away, where they are asked for."""
+    wanted, scenario = experiment.config.deploy, experiment.config.scenarios[0]
+    start = experiment.references[scenario].drive_start
+    runs = {}
+    if wanted.laps:
+        way_m = wanted.laps * experiment.paths[scenario].length_m
+        ticks = round(way_m / experiment.car.speed_mps / experiment.config.dt_s)
+        runs["laps"] = LiveRun("laps", HARDENED, scenario, start, ticks=ticks)
+    if wanted.empty_scene:
+        runs["empty"] = LiveRun("empty", HARDENED, scenario, start, empty=True)
+    return runs
+
+
+def run(experiment: Experiment, folder: Path, report: Report) -> None:
+    """Stage live: drive the runs of `extra_runs` that are not driven yet. A run whose tries are all spoiled leaves no result."""
+    runs = extra_runs(experiment)
+    for index, live in enumerate(runs.values()):
+        report(index / len(runs), live.name)
+        with suppress(NotDrivenError):  # the report says so
+            drive_until_it_counts(experiment, live, folder, partial(report, index / len(runs)))
+
+
+def live_overrides(experiment: Experiment, live: LiveRun) -> list[str]:
+    """What the launch file is told for a run: its calibration and room, its victim, its attack."""
+    policy = victim_file(experiment, live.victim)
+    overrides = [
+        f"params.calibration={experiment.calibration_folder}",
+        f"params.policy={policy}",
+        f"params.vicon_port={_free_udp_port()}",
+        f"policy.sha256={policy_sha256(policy)}",
+        f"twin.lab={json.dumps(lab_of(experiment).model_dump(mode='json'))}",
+    ]
+    if not (effects := experiment.config.deploy.camera).ideal:
+        overrides.append(f"twin.camera_effects={json.dumps(effects.model_dump(mode='json'))}")
+    if on_screen(experiment):
+        overrides += [
+            f"monitor.plain_rgb={json.dumps(wanted_face(experiment).plain_rgb)}",
+            f"monitor.face_m={panel_of(experiment).square_m}",
+        ]
+    if live.attack is not None:
+        overrides.append(f"params.attack={live.attack}")
+    if live.empty:
+        overrides.append(f"twin.lab.{wanted_face(experiment).panel}.x_m={_OUT_OF_SIGHT_M}")
+    return overrides
+
+
+def _horizon(experiment: Experiment, live: LiveRun) -> Horizon:
+    """Control ticks over which a run is measured."""
+    limits = experiment.limits
+    return limits if live.ticks is None else Horizon(live.ticks, limits.dt_s, limits.off_track_m)
+
+
+def _free_udp_port() -> int:
+    """A port for this run's motion capture, so that a lab or another run on this host does not answer."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _check_drawn(live: LiveRun, drawn: list[str]) -> None:
+    expected = [load_attack(live.attack).attack_id] if live.attack is not None else []
+    if drawn != expected:
+        raise RuntimeFault(f"expected the attacks {expected} in the frames of run {live.name}, got {drawn}")

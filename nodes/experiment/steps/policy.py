@@ -1,0 +1,301 @@
+"""Stage policy: one goal-conditioned network learns all drives, from the deployment scene and the surrogate or in other places, by DAgger."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from advnerf_core.attack.spaces.displayed import DisplayedSensor
+from advnerf_core.attack.spaces.face import FaceSpace
+from advnerf_core.data.dataset import load_image, load_transforms
+from advnerf_core.data.image_files import write_image
+from advnerf_core.driving.path import Array
+from advnerf_core.fields.voxel_grid import VoxelGridObject
+from advnerf_core.files import write_atomically
+from advnerf_core.geometry import planar_pose
+from advnerf_core.learning.imitation import ImitationConfig, Learned, Progress, SourcePlan, train_policy
+from advnerf_core.learning.sources import FrameSource, RenderedSource, SceneSource, Show
+from advnerf_core.policies.pilotnet import Policy, images_to_tensor, load_policy
+from hardware.worlds.world import World
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.deployed import Dressed, seen_in
+from nodes.experiment.show.faces import PaintedScene, face_object, face_space, has_face
+from nodes.experiment.show.images import as_uint8
+from nodes.experiment.show.learned_scene import load_background
+from nodes.experiment.show.light import light_on_panels
+from nodes.experiment.show.native import stand_in
+from nodes.experiment.show.objects import (
+    describe,
+    last_result_kept,
+    placed_objects,
+    random_theta,
+    surrogate_of,
+)
+from nodes.experiment.steps import capture
+from nodes.experiment.steps.elsewhere import plans_elsewhere
+from nodes.runtime.errors import ConfigError
+from nodes.runtime.progress import MeasuringReport, Point
+
+HARDENED, NAIVE, RETRAINED = "hardened", "naive", "retrained"
+VICTIMS = (HARDENED, NAIVE)
+FILES = {HARDENED: "policy.safetensors", NAIVE: "naive.safetensors"}
+# Poses that the policy learns from: as far from the path [m, of half a lane of 1.75 m] as a recovery may have to begin.
+_STILLS_M, _DRIVES_M, _GIVE_UP_M = 1.6, 0.8, 3.0
+# Of a face in training: as many pixels as its nearest view has.
+_TRAINING_TEXTURE_PX = 128
+
+Sample = Callable[[np.random.Generator], torch.Tensor]
+
+
+def run(experiment: Experiment, folder: Path, report: MeasuringReport) -> None:
+    """Train the victims, then compare their controls on held-out views and on the surrogate's image of them."""
+    config = experiment.config.policy
+    settings = ImitationConfig(
+        seed=config.seed,
+        dagger_rounds=config.dagger_rounds,
+        first_steps=config.first_steps,
+        round_steps=config.round_steps,
+        naive_steps=config.naive_steps,
+        architecture=config.network,
+        lateral_m=experiment.across_m(_STILLS_M),
+        heading_rad=config.stills_heading_rad,
+        drive_lateral_m=experiment.across_m(_DRIVES_M),
+        drive_heading_rad=config.drives_heading_rad,
+        give_up_m=experiment.across_m(_GIVE_UP_M),
+        max_steering_rad=experiment.car.largest_control,
+    )
+    write_placement(experiment, folder)
+    with ExitStack() as opened:
+        learned_from = (
+            plans_elsewhere(experiment, opened)
+            if config.learns_in
+            else plans(experiment, opened.enter_context(experiment.open_world()))
+        )
+        trained = train_policy(
+            settings,
+            learned_from,
+            experiment.expert(experiment.config.scenarios[0]),
+            experiment.view,
+            folder,
+            _telling(experiment, report),
+        )
+    report(0.98, "comparing controls on true and learned views")
+    summary = {
+        "sha256": trained.sha256,
+        "naive_sha256": trained.naive_sha256,
+        "frames": trained.frames,
+        "validation_mae": trained.validation_mae_rad,
+        "naive_validation_mae": trained.naive_validation_mae_rad,
+        "control_unit": experiment.car.control_unit,
+        "on_held_out_views": agreement(experiment),
+    }
+    write_atomically(folder / "policy.json", json.dumps(summary, indent=1) + "\n")
+
+
+def _telling(experiment: Experiment, report: MeasuringReport) -> Progress:
+    """Progress of the training as that of the stage, with the error as a curve for each victim."""
+    unit = experiment.car.control_unit
+
+    def told(fraction: float, text: str, learned: Learned | None = None) -> None:
+        point = None
+        if learned is not None:
+            victim = NAIVE if learned.naive else HARDENED
+            point = Point(f"Error of the {victim} policy [{unit}]", learned.step, learned.error_rad)
+        report(0.98 * fraction, text, point)
+
+    return told
+
+
+def victims(experiment: Experiment) -> tuple[str, ...]:
+    """The policies that are attacked."""
+    return VICTIMS if experiment.config.policy.naive_steps else (HARDENED,)
+
+
+def attackable(experiment: Experiment) -> tuple[str, ...]:
+    """The policies that there are to attack: also the retrained one, where the experiment retrains."""
+    return (*victims(experiment), *([] if experiment.config.retrain is None else [RETRAINED]))
+
+
+def victim_file(experiment: Experiment, victim: str) -> Path:
+    """Policy file of a victim; the retrained one is that of the first round, as in the paper."""
+    if victim == RETRAINED:
+        return experiment.stage_folder("retrain") / "round0" / "policy.safetensors"
+    return experiment.stage_folder("policy") / FILES[victim]
+
+
+def plans(
+    experiment: Experiment,
+    scene: World,
+    sample: Sample | None = None,
+    objects: Sequence[VoxelGridObject] | None = None,
+    ending: str = "",
+) -> list[SourcePlan]:
+    """For each drive its frames from the deployment scene and from the surrogate, with its goal and its teacher.
+
+    Args:
+        experiment: The experiment.
+        scene: The deployment scene.
+        sample: Draws the colours of all objects ``[K, 3]``; None draws random ones.
+        objects: The objects where they are to stand; None has them where the world does.
+        ending: Of the sources' names, which tell their frames apart.
+    """
+    config = experiment.config.policy
+    domains = (
+        _face_domains(experiment, scene)
+        if has_face(experiment)
+        else _object_domains(experiment, scene, objects)
+    )
+    sigma, shape, dressed = experiment.config.attack.random_sigma, domains.theta_shape, domains.dressed
+
+    def any_colours(rng: np.random.Generator) -> torch.Tensor:
+        return random_theta(shape, sigma, rng)
+
+    def source(domain: str, name: str) -> FrameSource:
+        called, drawn = f"{domain}-{name}{ending}", sample or any_colours
+        if domain == "surrogate":
+            return RenderedSource(called, domains.seen_in_surrogate, experiment.dynamics, drawn)
+        if config.own_car:
+            speed_mps, dt_s = experiment.car.speed_mps, experiment.config.dt_s
+            return SceneSource(called, scene, experiment.view, speed_mps, dt_s, dressed.paint, drawn)
+        return RenderedSource(called, seen_in(dressed), experiment.dynamics, drawn)
+
+    found = []
+    for name in experiment.config.scenarios:
+        common: dict[str, Any] = {
+            "drive_steps": config.drive_steps,
+            "goal": experiment.goal(name),
+            "expert": experiment.expert(name),
+            "driven_m": config.driven_m,
+            "drives_from_m": config.drives_from_m,
+        }
+        amounts = (
+            ("deployed", config.deployed_stills, config.deployed_drives),
+            ("surrogate", config.surrogate_stills, config.surrogate_drives),
+        )
+        for domain, stills, drives in amounts:
+            found.append(SourcePlan(source(domain, name), stills, drives, **common))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Domains:
+    """Where frames come from: the dressed deployment scene, and the surrogate with the objects plain (None) or in any colours."""
+
+    dressed: Dressed
+    seen_in_surrogate: Callable[[Array], Show]
+    theta_shape: tuple[int, ...]
+
+
+def _object_domains(
+    experiment: Experiment, scene: World, objects: Sequence[VoxelGridObject] | None
+) -> _Domains:
+    """Objects stand in both scenes, plain or coloured."""
+    objects = placed_objects(experiment) if objects is None else objects
+    surrogate = surrogate_of(experiment, objects, load_background(experiment))
+    light = light_on_panels(experiment)
+    lit = None if light is None else DisplayedSensor(surrogate, light)
+
+    def seen(states: Array) -> Show:
+        frames = surrogate.prepare(surrogate.camera_poses(torch.from_numpy(np.asarray(states))))
+
+        def show(theta: torch.Tensor | None) -> torch.Tensor:
+            painted = surrogate.plain_theta() if theta is None else theta
+            return frames.render(painted if lit is None else lit.seen_theta(painted)).images
+
+        return show
+
+    return _Domains(
+        stand_in(experiment.view, scene, objects, experiment.config.policy.panels),
+        seen,
+        surrogate.theta_shape,
+    )
+
+
+def surrogate_plan(experiment: Experiment) -> SourcePlan:
+    """Frames of the learned scene alone, along the first path: beside recordings of the real one.
+
+    Raises:
+        ConfigError: The experiment attacks no face.
+    """
+    if not has_face(experiment):
+        raise ConfigError(
+            f"expected an experiment whose attack is a face (space.kind face), got {experiment.config.space.kind}"
+        )
+    space, seen = _seen_face(experiment)
+    shape, sigma = space.surrogate.theta_shape, experiment.config.attack.random_sigma
+    source = RenderedSource(
+        "surrogate", seen, experiment.dynamics, lambda rng: random_theta(shape, sigma, rng)
+    )
+    wanted = experiment.config.policy
+    return SourcePlan(source, wanted.surrogate_stills, wanted.surrogate_drives, wanted.drive_steps)
+
+
+def _face_domains(experiment: Experiment, scene: World) -> _Domains:
+    """The panel is seen as it was learned, or carries a face."""
+    space, seen = _seen_face(experiment)
+    dressed = PaintedScene(experiment, scene, _TRAINING_TEXTURE_PX)
+    return _Domains(dressed, seen, space.surrogate.theta_shape)
+
+
+def _seen_face(experiment: Experiment) -> tuple[FaceSpace, Callable[[Array], Show]]:
+    """The face in the learned scene, behind the display if a screen shows it, and what is seen of it."""
+    space = face_space(experiment, last_result_kept(load_background(experiment)), ideal=False)
+    surrogate, bare, sensor = space.surrogate, space.plain.seen_by(space.surrogate), space.sensor
+
+    def seen(states: Array) -> Show:
+        poses = surrogate.camera_poses(torch.from_numpy(np.asarray(states)))
+        plain, attacked = bare.prepare(poses), surrogate.prepare(poses)
+
+        def show(theta: torch.Tensor | None) -> torch.Tensor:
+            if theta is None:
+                return plain.render(None).images
+            behind = sensor.seen_theta(theta) if isinstance(sensor, DisplayedSensor) else theta
+            return attacked.render(behind).images
+
+        return show
+
+    return space, seen
+
+
+def agreement(experiment: Experiment, policy: Policy | None = None) -> list[dict[str, float]]:
+    """Control of a policy on each held-out view and on the surrogate's image of it, told to follow the first path.
+
+    Args:
+        experiment: With photographs and a scene.
+        policy: By default the experiment's hardened victim.
+    """
+    views = load_transforms(experiment.stage_folder("capture") / capture.HELD_OUT / "transforms.json")
+    policy = policy or load_policy(victim_file(experiment, HARDENED)).policy
+    surrogate = surrogate_of(experiment, [])
+    goal = torch.tensor([experiment.goal(experiment.config.scenarios[0])], dtype=torch.float32)
+    rows = []
+    for frame in views.frames:
+        real = experiment.view.image(load_image(frame)[0])
+        with torch.no_grad():
+            on_real = float(policy(images_to_tensor(real), goal)[0])
+            on_surrogate = float(
+                policy(surrogate.render(frame.T_world_from_camera[None], None).images, goal)[0]
+            )
+        rows.append({"real": on_real, "surrogate": on_surrogate})
+    return rows
+
+
+def write_placement(experiment: Experiment, folder: Path) -> None:
+    """The objects' places, and each drive's first view without and with them, plain."""
+    write_atomically(folder / "objects.json", json.dumps(describe(experiment), indent=1) + "\n")
+    background = load_background(experiment)
+    bare = surrogate_of(experiment, [], background)
+    attacked = [face_object(experiment)] if has_face(experiment) else placed_objects(experiment)
+    dressed = surrogate_of(experiment, attacked, background)
+    for name, reference in experiment.references.items():
+        pose = (planar_pose(*reference.drive_start) @ experiment.mount)[None]
+        with_objects = dressed.render(pose, dressed.plain_theta()).images[0]
+        write_image(folder / f"{name}_start_view.png", as_uint8(bare.render(pose, None).images[0]))
+        write_image(folder / f"{name}_start_view_with_objects.png", as_uint8(with_objects))

@@ -1,0 +1,324 @@
+"""Stage retrain: the defence. Attack, collect with the objects that were found, fine-tune on old and new, attack again, until it no longer pays.
+
+The paper retrains once and drives from an unseen start; here that is the first round, and the rounds after it say whether the defence holds
+against an adversary that answers it. Every search, collection, training and drive is kept when it is done, so a killed stage goes on.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from advnerf_core.attack.adjoint import evaluate
+from advnerf_core.attack.on_device import on_chosen_device
+from advnerf_core.attack.search.gradient import gradient_attack
+from advnerf_core.attack.spaces.space import ColourSpace
+from advnerf_core.documents import read_json
+from advnerf_core.driving.path import Array
+from advnerf_core.files import write_atomically
+from advnerf_core.learning.frames import Frames, FrameStore
+from advnerf_core.learning.imitation import SourcePlan, recovery_states
+from advnerf_core.learning.retrain import RetrainConfig, fine_tune
+from advnerf_core.learning.sources import Seen, steer_with
+from advnerf_core.policies.pilotnet import LoadedPolicy, load_policy
+from hardware.worlds.world import World
+from nodes.experiment.engine.stage_record import hash_of
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.deployed import Dressed
+from nodes.experiment.show.drives import deployed_drives
+from nodes.experiment.show.native import stand_in
+from nodes.experiment.show.objects import placed_objects
+from nodes.experiment.show.spaces import colour_space, random_placements
+from nodes.experiment.steps import retrain_plot
+from nodes.experiment.steps.attack import attack_problem, load_shown, surrogate_part
+from nodes.experiment.steps.frozen import freeze
+from nodes.experiment.steps.policy import HARDENED, plans, victim_file
+from nodes.experiment.steps.steering_gate import require_same_steering
+from nodes.runtime.progress import Report
+
+_NEAR_M, _TURNED_RAD, _GIVE_UP_M = 1.0, 0.15, 3.0  # metres of half a lane of 1.75 m
+_PLACES_SEED = 10_000  # far from the seeds of pose attacks, which must not find the places that were learned
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What one round of attacks found.
+
+    Attributes:
+        thetas: Colours of all objects by scenario ``[K, 3]``.
+        ratios: Total CTE against no attack, by domain and scenario.
+    """
+
+    thetas: dict[str, torch.Tensor]
+    ratios: dict[str, dict[str, float]]
+
+
+def run(experiment: Experiment, folder: Path, report: Report) -> None:
+    """Write a folder per round, and after each ``retrain.json`` with the curve and the drives under the old attacks, and ``curve.png``."""
+    wanted = experiment.config.retrain
+    assert wanted is not None, "the stage runs only where the experiment asks for it"
+    require_same_steering(experiment)
+    space = colour_space(experiment)
+    file, rounds, kept = victim_file(experiment, HARDENED), [], _old_frames(experiment)
+    victim = load_policy(file)
+    thetas: list[torch.Tensor] = []
+    with experiment.open_world() as scene:
+        dressed = stand_in(
+            experiment.view, scene, placed_objects(experiment), experiment.config.policy.panels
+        )
+        told = _part(report, 0.0, 1.0 / (wanted.rounds + 1), "round 0")
+        first = _first_attacks(experiment, space, dressed, victim, folder / "round0", told)
+        old_attacks: dict[str, Any] = {}
+        for number in range(wanted.rounds + 1):
+            here = folder / f"round{number}"
+            told = _part(report, number / (wanted.rounds + 1), 1.0 / (wanted.rounds + 1), f"round {number}")
+            found = first if number == 0 else _attack_again(experiment, space, dressed, victim, here, told)
+            rounds.append({"victim": victim.sha256, **found.ratios})
+            if number == 1:
+                old_attacks = _under_old_attacks(experiment, dressed, folder / "round0", first)
+            summary = {
+                "rounds": rounds,
+                "old_attacks": old_attacks,
+                "pays_ratio": wanted.pays_ratio,
+                "final_policy": os.path.relpath(file, experiment.folder),
+                "settings_hash": hash_of(wanted.model_dump(mode="json")),
+            }
+            # After every round: a loop takes hours, and may be stopped.
+            write_atomically(folder / "retrain.json", json.dumps(summary, indent=1) + "\n")
+            retrain_plot.draw(folder / "curve.png", rounds, wanted.pays_ratio)
+            if number == wanted.rounds or not _pays(found, wanted.pays_ratio):
+                break
+            thetas += list(found.thetas.values())
+            new = _collect(experiment, scene, victim, thetas, here, told)
+            settings = RetrainConfig(
+                steps=wanted.steps, new_share=wanted.new_share, seed=wanted.seed + number
+            )
+            file = here / "policy.safetensors"
+            if not file.exists():
+                fine_tune(victim, kept, new, settings, file, _stepping(told, wanted.steps))
+            victim, kept = load_policy(file), [*kept, *new]
+
+
+def unseen_start(experiment: Experiment, scenario: str) -> torch.Tensor:
+    """A start ``[1, 3]`` that no attack and no training drive began at: a metre back, a third of a metre to the left."""
+    x_m, y_m, yaw_rad = experiment.references[scenario].drive_start
+    back, left = np.array([-np.cos(yaw_rad), -np.sin(yaw_rad)]), np.array([-np.sin(yaw_rad), np.cos(yaw_rad)])
+    place = np.array([x_m, y_m]) + experiment.along_m(1.0) * back + experiment.across_m(0.35) * left
+    return torch.tensor([[place[0], place[1], yaw_rad]], dtype=torch.float64)
+
+
+def _part(report: Report, begin: float, share: float, name: str) -> Callable[[float, str], None]:
+    def told(part: float, text: str = "") -> None:
+        report(min(begin + share * part, 1.0), f"{name}: {text}")
+
+    return told
+
+
+def _stepping(told: Callable[[float, str], None], steps: int) -> Callable[[int, float], None]:
+    def stepped(step: int, loss: float) -> None:
+        told(0.7 + 0.3 * step / steps, f"fine-tuning: error {loss**0.5:.3f} rad/s")
+
+    return stepped
+
+
+def _pays(found: Found, ratio: float) -> bool:
+    return max(found.ratios["surrogate"].values()) >= ratio
+
+
+def _old_frames(experiment: Experiment) -> list[Frames]:
+    store = FrameStore(experiment.stage_folder("policy") / "frames")
+    return [store.load(name) for name in store.names()]
+
+
+def _first_attacks(
+    experiment: Experiment,
+    space: ColourSpace,
+    dressed: Dressed,
+    victim: LoadedPolicy,
+    folder: Path,
+    report: Callable[[float, str], None],
+) -> Found:
+    """What the gradient's cells of the first seed find; they are searched here if they are not yet."""
+    thetas: dict[str, torch.Tensor] = {}
+    for index, name in enumerate(experiment.config.scenarios):
+        cell = Cell(name, HARDENED, "gradient", experiment.config.attack.seeds[0])
+        at = experiment.cell_folder(cell)
+        freeze(experiment, cell, at)
+
+        def told(part: float, text: str = "", index: int = index, name: str = name) -> None:
+            done = (index + part) / len(experiment.config.scenarios)
+            report(0.4 * done, f"attacking, {name}: {text}")
+
+        surrogate_part(experiment, space, cell, at, told)
+        thetas[name] = load_shown(space, at, cell).colours
+    return _judged(experiment, space, dressed, victim, thetas, folder)
+
+
+def _attack_again(
+    experiment: Experiment,
+    space: ColourSpace,
+    dressed: Dressed,
+    victim: LoadedPolicy,
+    folder: Path,
+    report: Callable[[float, str], None],
+) -> Found:
+    """The gradient attack of the first seed on a retrained victim, as long as the attack on the first one."""
+    attack = experiment.config.attack
+    thetas: dict[str, torch.Tensor] = {}
+    for index, scenario in enumerate(experiment.config.scenarios):
+        problem = attack_problem(experiment, space, victim, scenario, attack.seeds[0])
+
+        def told(evaluation: Any, index: int = index, scenario: str = scenario) -> None:
+            done = (index + (evaluation.iteration + 1) / attack.evaluations) / len(
+                experiment.config.scenarios
+            )
+            report(
+                0.4 * done, f"attacking again, {scenario}: total CTE {evaluation.predicted_total_cte_m:.1f} m"
+            )
+
+        result = gradient_attack(
+            on_chosen_device(problem),
+            attack.evaluations,
+            attack.learning_rate,
+            seed=attack.seeds[0],
+            state_path=folder / f"{scenario}.state.safetensors",
+            on_evaluation=told,
+            settings_hash=hash_of({"victim": victim.sha256, "scenario": scenario}),
+        )
+        thetas[scenario] = result.theta
+    return _judged(experiment, space, dressed, victim, thetas, folder)
+
+
+def _judged(
+    experiment: Experiment,
+    space: ColourSpace,
+    dressed: Dressed,
+    policy: LoadedPolicy,
+    thetas: dict[str, torch.Tensor],
+    folder: Path,
+) -> Found:
+    """Ratios to no attack of the same victim in both domains, from the attack's starts; kept in the folder of the round."""
+    seed, kept = experiment.config.attack.seeds[0], folder / "ratios.json"
+    key = [policy.sha256, *(hashlib.sha256(theta.numpy().tobytes()).hexdigest() for theta in thetas.values())]
+    if kept.exists() and (known := read_json(kept))["of"] == key:
+        return Found(thetas, known["ratios"])
+    ratios: dict[str, dict[str, float]] = {"surrogate": {}, "deployed": {}}
+    for scenario, theta in thetas.items():
+        problem = attack_problem(experiment, space, policy, scenario, seed)
+        learned = [
+            float(evaluate(problem, each)[1].protocol_cte_m.mean()) for each in (theta, space.plain.colours)
+        ]
+        starts = experiment.start_states(scenario, seed)
+        driven = [_total_cte_m(experiment, dressed, policy, scenario, starts, each) for each in (theta, None)]
+        ratios["surrogate"][scenario], ratios["deployed"][scenario] = (
+            learned[0] / learned[1],
+            driven[0] / driven[1],
+        )
+    write_atomically(kept, json.dumps({"of": key, "ratios": ratios}, indent=1) + "\n")
+    return Found(thetas, ratios)
+
+
+def _total_cte_m(
+    experiment: Experiment,
+    dressed: Dressed,
+    policy: LoadedPolicy,
+    scenario: str,
+    starts: torch.Tensor,
+    theta: torch.Tensor | None,
+) -> float:
+    """Total CTE [m] of deployed drives, the mean over starts ``[B, 3]``; plain objects for None."""
+    shown = dressed.plain_theta() if theta is None else theta
+    drives = deployed_drives(experiment, dressed, policy.policy, scenario, starts, shown)
+    return float(np.mean([drive.metrics.total_cte_m for drive in drives]))
+
+
+def _collect(
+    experiment: Experiment,
+    scene: World,
+    victim: LoadedPolicy,
+    thetas: Sequence[torch.Tensor],
+    folder: Path,
+    report: Callable[[float, str], None],
+) -> list[Frames]:
+    """Frames of both domains with the found objects: stills about the paths, and drives of the victim, labelled by the teacher.
+
+    Where it is asked for also stills with all objects in random colours at random places.
+    """
+    wanted, store = experiment.config.retrain, FrameStore(folder / "frames")
+    assert wanted is not None
+    found = plans(experiment, scene, lambda rng: thetas[int(rng.integers(len(thetas)))])
+    chosen = [(plan, wanted.stills, wanted.drives) for plan in found]
+    places = random_placements(experiment, wanted.placements, seed=_PLACES_SEED + wanted.seed + len(thetas))
+    for number, objects in enumerate(places):
+        moved = plans(experiment, scene, None, objects, f"-moved{number}")
+        chosen += [(plan, math.ceil(wanted.stills / len(places)), 0) for plan in moved]
+    for number, (plan, stills, drives) in enumerate(chosen):
+        if plan.source.name not in store.names():
+            rng = np.random.default_rng([wanted.seed, len(thetas), number])
+            frames = _frames(plan, victim, stills, drives, wanted.drive_steps, rng, experiment.across_m(1.0))
+            store.append(plan.source.name, frames)
+        report(0.4 + 0.3 * (number + 1) / len(chosen), f"collecting: {plan.source.name}")
+    return [store.load(plan.source.name) for plan, _, _ in chosen]
+
+
+def _frames(
+    plan: SourcePlan,
+    victim: LoadedPolicy,
+    stills: int,
+    drives: int,
+    steps: int,
+    rng: np.random.Generator,
+    width: float,
+) -> Frames:
+    """Frames of one plan; distances sideways are ``width`` times those of the junction."""
+    expert, near_m = plan.expert, width * _NEAR_M
+    assert expert is not None, "every plan of a world has its own teacher"
+    places = recovery_states(expert.path, stills, rng, near_m, _TURNED_RAD, plan.driven_m)
+    size = plan.source.batch_size
+    parts = [plan.source.look(places[first : first + size], rng) for first in range(0, stills, size)]
+    # Early on the path: what follows is driven through.
+    begin_m = None if plan.driven_m is None else 0.3 * plan.driven_m
+    starts = recovery_states(expert.path, 2 * drives, rng, 0.5 * near_m, 0.5 * _TURNED_RAD, begin_m)
+    steer = steer_with(victim.policy, torch.tensor([plan.goal]))
+
+    def near(states: Array) -> NDArray[np.bool_]:
+        close: NDArray[np.bool_] = np.abs(expert.path.project(states[:, :2]).cte_m) <= width * _GIVE_UP_M
+        return close
+
+    # Two side by side, so that one of them meets a found texture throughout.
+    for first in range(0, 2 * drives, 2):
+        parts.append(plan.source.drive(steer, starts[first : first + 2], steps, near, rng))
+    seen = Seen.join(parts)
+    labels = expert.steer_states(seen.states).astype(np.float32)
+    goals = np.tile(np.array(plan.goal, np.float32), (len(labels), 1))
+    return Frames(seen.images, seen.states, labels, goals, seen.textured)
+
+
+def _under_old_attacks(
+    experiment: Experiment, dressed: Dressed, folder: Path, first: Found
+) -> dict[str, Any]:
+    """The retrained policy past the attacks that it was trained on, from a start that nothing has seen, beside the original undisturbed."""
+    original, file = load_policy(victim_file(experiment, HARDENED)), folder / "policy.safetensors"
+    retrained, rows = load_policy(file), {}
+    for scenario, theta in first.thetas.items():
+        start = unseen_start(experiment, scenario)
+        undisturbed = _total_cte_m(experiment, dressed, original, scenario, start, None)
+        rows[scenario] = {
+            "original_undisturbed_m": undisturbed,
+            "original_attacked_m": _total_cte_m(experiment, dressed, original, scenario, start, theta),
+            "retrained_undisturbed_m": _total_cte_m(experiment, dressed, retrained, scenario, start, None),
+            "retrained_attacked_m": _total_cte_m(experiment, dressed, retrained, scenario, start, theta),
+        }
+        rows[scenario]["ratio"] = rows[scenario]["retrained_attacked_m"] / undisturbed
+    return rows

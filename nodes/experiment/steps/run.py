@@ -1,0 +1,338 @@
+"""Resolves experiment files, and runs the stages that cells need."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from advnerf_core.attack.methods import method_digest, method_name
+from advnerf_core.attack.objectives import name_objective
+from advnerf_core.documents import Document, Key, read_yaml
+from advnerf_core.places import require_utf8
+from advnerf_core.plugins import unknown
+from advnerf_core.strict import validate
+from nodes.experiment.engine.reference import REFERENCE
+from nodes.experiment.engine.run_folder import run_to_end
+from nodes.experiment.engine.stage_record import Stage, StageRecord
+from nodes.experiment.engine.stages import begun_with
+from nodes.experiment.plan.config import ExperimentConfig
+from nodes.experiment.plan.placed import PlacedObject, in_a_lane
+from nodes.experiment.plan.space_config import FaceConfig
+from nodes.experiment.show import objects
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.steps import bake, capture, live, policy, retrain, scene
+from nodes.experiment.steps.live import lab_of
+from nodes.lab.worlds.named import read_world
+from nodes.launching.launch_file import load_launch
+from nodes.runtime.config import apply_overrides
+from nodes.runtime.errors import ConfigError
+from nodes.runtime.progress import Display, MeasuringReport
+
+_LIBRARIES = (
+    "torch",
+    "numpy",
+    "numba",
+    "opencv-contrib-python-headless",
+    "mujoco",
+    "pyzmq",
+    "rosbags",
+    "mcap",
+)
+# Raised when what a stage makes changes with the same settings: then its old results, and all that build on them, are made again.
+# tests/nodes/experiment/test_versions.py fails where a result changed and its version did not.
+VERSIONS = {"capture": 1, "scene": 2, "bake": bake.VERSION, "object": 1, "policy": 2, "retrain": 1, "live": 1}
+_WHOLE_STEP_S = 1e-6
+# What policies are trained with, beside what comes of it.
+_TRAINING_FILES = ("frames", "*.checkpoint.safetensors", "*.shards.json", "settings.json")
+
+
+def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: Path) -> Experiment:
+    """Resolve an experiment file.
+
+    Args:
+        file: A ``*.experiment.yaml`` file.
+        setting: Which of its settings to lay over its values.
+        overrides: ``section.key=value`` texts, applied last.
+        folder: The run folder.
+
+    Raises:
+        ConfigError: With file, line and the valid keys.
+    """
+    require_utf8(folder.absolute())
+    document = read_setting(file, setting, overrides)
+    config = validate(ExperimentConfig, document, file.parent)
+    read_world(document.part(("world",)), file.resolve().parent)
+    experiment = Experiment(config, file.resolve(), folder.resolve(), setting)
+    _check_ticks(experiment, document)
+    _check_objective(experiment, document)
+    if config.deploy.live:
+        lab_of(experiment)
+    if experiment.is_described:
+        _check_places(experiment, document)
+    return replace(experiment, kept=REFERENCE.digests(stages_of(experiment), experiment.folder))
+
+
+def read_setting(file: Path, setting: str, overrides: Sequence[str]) -> Document:
+    """An experiment file with one of its settings laid over its values, and overrides over that; see `load_experiment`."""
+    document = _on_its_base(file, ())
+    settings = document.data.pop("settings", None) or {}
+    if setting not in settings:
+        raise ConfigError(f"{file}: no setting called {setting!r}; known are {', '.join(settings) or 'none'}")
+    _lay_over(document, settings[setting] or {}, ("settings", setting), ())
+    apply_overrides(document, overrides)
+    return document
+
+
+def _on_its_base(file: Path, above: Sequence[Path]) -> Document:
+    """An experiment file, laid over the file that its key ``base`` names, if it has one."""
+    document = read_yaml(file)
+    if not isinstance(document.data, dict):
+        raise ConfigError(f"{file}: expected an experiment file with keys and values")
+    base = document.data.pop("base", None)
+    if base is None:
+        return document
+    at = file.parent / str(base)
+    if at.resolve() in [each.resolve() for each in (*above, file)]:
+        raise ConfigError(
+            f"{document.place(('base',))}: expected a base other than the file itself, got {base}"
+        )
+    under = _on_its_base(at, (*above, file))
+    _lay_over(under, document.data, (), (), document.places)
+    return Document(under.data, document.source, under.places)
+
+
+def _check_ticks(experiment: Experiment, document: Document) -> None:
+    """A control tick must be whole steps of the world."""
+    step_s, dt_s = experiment.traits.step_s, experiment.config.dt_s
+    if step_s is not None and abs(round(dt_s / step_s) * step_s - dt_s) > _WHOLE_STEP_S:
+        raise ConfigError(
+            f"{document.place(('dt_s',))}: expected dt_s to be whole steps of the world {experiment.named_world.kind}, {step_s:g} s each, "
+            f"got {dt_s:g} s"
+        )
+
+
+def _check_objective(experiment: Experiment, document: Document) -> None:
+    """The objective collision needs a world that says what its car can hit; users' objectives are asked when they are loaded."""
+    if experiment.config.attack.objective == "collision" and experiment.solids is None:
+        raise ConfigError(
+            f"{document.place(('attack', 'objective'))}: attack.objective: expected an objective that needs no solids, as the world "
+            f"{experiment.named_world.kind} does not say what its car can hit, got collision; choose cte, or add solids to the world (docs/worlds.md)"
+        )
+
+
+def _check_places(experiment: Experiment, document: Document) -> None:
+    """Scenarios must be the world's, and objects must stand beside its lanes; said with the line of the file."""
+    for index, name in enumerate(experiment.config.scenarios):
+        if name not in experiment.world.paths:
+            message = unknown(name, "scenario", experiment.world.paths)
+            raise ConfigError(f"{document.place(('scenarios', index))}: scenarios: {message}")
+    by_hand = [
+        index for index, each in enumerate(experiment.config.objects) if isinstance(each, PlacedObject)
+    ]
+    if (found := in_a_lane(experiment.placed_by_hand, experiment.world)) is not None:
+        raise ConfigError(f"{document.place(('objects', by_hand[found[0]]))}: {found[1]}")
+    if (
+        isinstance(space := experiment.config.space, FaceConfig)
+        and space.panel not in experiment.world.panels
+    ):
+        message = unknown(space.panel, "panel", experiment.world.panels)
+        raise ConfigError(f"{document.place(('space', 'panel'))}: space.panel: {message}")
+    if experiment.traits.own_photo_colours and not experiment.config.capture.colour_pairs:
+        raise ConfigError(
+            f"{document.place(('capture',))}: expected capture.colour_pairs of at least 1, as the photographs of the world "
+            f"{experiment.named_world.kind} have colours of their own, got 0; 12 will do"
+        )
+    _ = experiment.view
+
+
+def make_ready(
+    experiment: Experiment,
+    until: str | None = None,
+    console: Console | None = None,
+    anew: bool = False,
+    watcher: Display | None = None,
+) -> dict[str, StageRecord]:
+    """Run the stages that are not there yet: what cells need. Those that are kept with the code are there, unless all is to be made ``anew``.
+
+    Raises:
+        AdvnerfError: A stage failed, or the policy's architecture cannot be built.
+    """
+    reference = None if anew else REFERENCE
+    experiment.config.policy.network.check()
+    return run_to_end(experiment, stages_of(experiment), _LIBRARIES, until, console, reference, watcher)
+
+
+def prepare_victims(experiment: Experiment) -> None:
+    """Make scene, objects and policies, also the retrained one where the experiment retrains.
+
+    One round of it, if none is begun; rounds that were begun are gone on with, as many as were asked for then.
+    """
+    wanted = experiment.config.retrain
+    if wanted is None:
+        make_ready(experiment, until="policy")
+        return
+    begun = begun_with(stages_of(experiment), experiment.folder, "retrain")
+    if begun is not None and policy.victim_file(experiment, policy.RETRAINED).exists():
+        return
+    # Its victim is that of the first round: the others are left to the experiment itself, which goes on from here.
+    rounds = 1 if begun is None else begun["retrain"]["rounds"]
+    config = experiment.config.model_copy(update={"retrain": wanted.model_copy(update={"rounds": rounds})})
+    make_ready(replace(experiment, config=config), until="retrain")
+    if not policy.victim_file(experiment, policy.RETRAINED).exists():
+        raise ConfigError(
+            f"expected a retrained policy in {experiment.stage_folder('retrain')}, got none: no attack reaches retrain.pays_ratio = "
+            f"{wanted.pays_ratio:g} (see retrain.json there), so nothing was retrained; lower it, or leave the victim retrained out of the campaign"
+        )
+
+
+def stages_of(experiment: Experiment) -> list[Stage]:
+    """The stages that cells need, with the part of the configuration that each depends on; moving an object keeps capture, scene and object files.
+
+    The world must not have been opened for them.
+
+    More rounds of retraining go on from those that are there.
+    """
+    config, world = experiment.config, experiment.world_settings
+    measured = {
+        "horizon": config.horizon,
+        "dt_s": config.dt_s,
+        "held_cap_m": config.held_cap_m,
+        "scenarios": config.scenarios,
+    }
+    kinds = sorted({thing.kind for thing in config.objects})
+    placed = [thing.model_dump(mode="json") for thing in config.objects]
+
+    def stage(
+        name: str,
+        module: Any,
+        settings: dict[str, Any],
+        after: Sequence[str],
+        parts: Sequence[dict[str, Any]] = (),
+        bulk: Sequence[str] = (),
+        reads_bulk_of: Sequence[str] = (),
+    ) -> Stage:
+        def work(folder: Path, told: MeasuringReport) -> None:
+            module.run(experiment, folder, told)
+
+        settings, *smaller = json.loads(json.dumps([settings, *parts]))
+        return Stage(name, work, settings, after, VERSIONS[name], smaller, bulk, reads_bulk_of)
+
+    def part(name: str) -> Any:
+        return getattr(config, name).model_dump(mode="json")
+
+    # Of users' methods the code counts, not where it is.
+    searched = {**part("attack"), "methods": config.attack.method_names}
+    name_objective(searched)
+    if codes := {method_name(each): code for each in config.attack.methods if (code := method_digest(each))}:
+        searched["code"] = codes
+    view, space = part("view"), part("space")
+    # What a screen shows while a scene is photographed, and what policies meet, is part of what is learned.
+    shown = ("panel", "resolution", "plain_rgb")
+    face = {"face": {name: space[name] for name in shown}} if isinstance(config.space, FaceConfig) else {}
+    driven = {"world": world, "objects": placed, "view": view, **measured}
+    # A rule looks at the world while it is photographed.
+    ruled = {"objects": placed, "view": view} if experiment.has_rules else {}
+    if config.object.panel_light == "measured":
+        ruled = {"objects": placed, "view": view, "panel_light": "measured"}
+    stages = [
+        stage(
+            "capture",
+            capture,
+            {"world": experiment.seen_settings, "capture": part("capture"), **face, **ruled, **measured},
+            (),
+            bulk=(capture.PHOTOS, capture.COLOUR_PAIRS),
+        ),
+        stage(
+            "scene",
+            scene,
+            {"scene": part("scene"), "view": view, "colour_pairs": config.capture.colour_pairs},
+            ("capture",),
+            reads_bulk_of=("capture",),
+        ),
+        stage(
+            "bake",
+            bake,
+            {"view": view, "driven": {**measured, "world": world}},
+            ("capture", "scene"),
+        ),
+        stage("object", objects, {"object": part("object"), "kinds": kinds, **objects.version_of(kinds)}, ()),
+        stage(
+            "policy",
+            policy,
+            {
+                **driven,
+                **face,
+                "policy": config.policy.key(),
+                "sigma": config.attack.random_sigma,
+                "bake": bake.VERSION,
+            },
+            ("capture", "scene", "object"),
+            bulk=_TRAINING_FILES,
+        ),
+    ]
+    if config.retrain is not None:
+        settings = {
+            **driven,
+            "bake": bake.VERSION,
+            "retrain": part("retrain"),
+            "attack": searched,
+            "space": space,
+        }
+        fewer = [
+            {**settings, "retrain": {**settings["retrain"], "rounds": rounds}}
+            for rounds in range(1, config.retrain.rounds)
+        ]
+        after = ("scene", "object", "policy")
+        stages.append(stage("retrain", retrain, settings, after, fewer, reads_bulk_of=("policy",)))
+    if config.deploy.live and (config.deploy.laps or config.deploy.empty_scene):
+        # The same on every machine, wherever it is installed.
+        graph = load_launch(experiment.launch_file, twin_calibration="calibration/twin").resolved
+        stages.append(
+            stage(
+                "live",
+                live,
+                {**driven, **face, "deploy": part("deploy"), "graph": graph},
+                ("capture", "policy"),
+            )
+        )
+    return stages
+
+
+def _lay_over(
+    document: Document,
+    values: dict[str, Any],
+    origin: tuple[str, ...],
+    key: tuple[str, ...],
+    places: Mapping[Key, str] | None = None,
+) -> None:
+    """Merge values into the document, keeping for each the place where it stands: in ``places``, or in the document itself under ``origin``."""
+    source = document.places if places is None else places
+    target = document.data
+    for step in key:
+        if not isinstance(target.get(step), dict):
+            target[step] = {}
+        target = target[step]
+    for name, value in values.items():
+        here, there = (*key, name), (*origin, *key, name)
+        before = target.get(name)
+        if isinstance(value, dict) and isinstance(before, dict) and not _another_kind(before, value):
+            _lay_over(document, value, origin, here, places)
+            continue
+        target[name] = value
+        document.places[here] = next(
+            (source[there[:end]] for end in range(len(there), 0, -1) if there[:end] in source),
+            document.source,
+        )
+        document.places |= {
+            (*here, *at[len(there) :]): place for at, place in source.items() if at[: len(there)] == there
+        }
+
+
+def _another_kind(before: Mapping[str, Any], value: Mapping[str, Any]) -> bool:
+    """Whether a section is of another ``kind``, whose keys are others: it takes the place of the one before."""
+    return "kind" in value and value["kind"] != before.get("kind")

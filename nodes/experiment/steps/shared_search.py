@@ -1,0 +1,64 @@
+"""One search for all cells that differ in their deployment alone: the first that is finished is taken by the others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from advnerf_core.attack.methods import method_digest
+from advnerf_core.attack.objectives import ON_THE_PATH
+from advnerf_core.files import write_atomically
+from nodes.experiment.engine.stage_record import hash_of
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.steps.keys import cell_inputs
+from nodes.experiment.steps.search_files import ATTACK, SEARCHED
+
+_KEY = "search_key"
+
+
+def search_key(experiment: Experiment, cell: Cell) -> str:
+    """Hash of what a search, and the drives in the surrogate past what it found, depend on.
+
+    The section ``deploy`` is left out, and what of the world changes only how its own car moves (`Traits.unseen`).
+    """
+    inputs = cell_inputs(experiment, cell)
+    inputs["config"].pop("deploy")
+    inputs.pop("deployed_world", None)
+    if experiment.config.attack.objective in ON_THE_PATH:  # others may judge by the car's body
+        inputs["world"] = experiment.seen_settings
+    which = [cell.scenario, cell.victim, cell.method, cell.seed]
+    return hash_of({"cell": which, "code": method_digest(cell.code), "inputs": inputs})
+
+
+def take_search(experiment: Experiment, cell: Cell, folder: Path) -> Path | None:
+    """Copy what a cell beside this one has searched, if it is the same search; nothing happens if this one has begun its own.
+
+    Args:
+        experiment: Its stages before the cells must be there.
+        cell: Which.
+        folder: Of this cell; the cells beside it are in the folders beside this one.
+
+    Returns:
+        The folder that it was copied from.
+    """
+    own = folder / _KEY
+    key = search_key(experiment, cell)
+    if own.exists() and own.read_text().strip() == key:
+        return None
+    found = next(_finished(folder, key), None)
+    if found is not None:
+        # The drives come last: without them the search counts as unfinished.
+        for name in (ATTACK, SEARCHED):
+            if (found / name).exists():
+                write_atomically(folder / name, (found / name).read_bytes())
+    write_atomically(own, key + "\n")
+    return found
+
+
+def _finished(folder: Path, key: str) -> Iterator[Path]:
+    """Folders beside a cell's with the same search, finished."""
+    for file in sorted(folder.parent.glob(f"*/{_KEY}")):
+        at = file.parent
+        if at != folder and (at / SEARCHED).exists() and file.read_text().strip() == key:
+            yield at

@@ -1,0 +1,60 @@
+"""The gate of every experiment: a scene in which the policy steers otherwise than on real pictures is not attacked.
+
+A mean PSNR does not tell whether the wall by which the car steers was learned. The steering on held-out views along the paths does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from advnerf_core.documents import read_json
+from nodes.experiment.engine.run_folder import RunFolder
+from nodes.runtime.errors import RuntimeFault
+
+STEERING = "steering"
+# The room's victims differ by 0.04; all published sets, of wheel angles and turn rates, correlate by 0.998 or better.
+MOST_DIFFERENCE, LEAST_CORRELATION = 0.25, 0.9
+
+
+def require_same_steering(
+    experiment: RunFolder[Any], may_go_on: bool = False, say: Callable[[str], None] = print
+) -> None:
+    """Refuse a learned scene in which the hardened victim steers otherwise than on real pictures of the same places.
+
+    Args:
+        experiment: With a trained policy; it is judged if its key ``gate`` is ``steering``, the default.
+        may_go_on: Whether a refusal is only told.
+        say: Told of it.
+
+    Raises:
+        RuntimeFault: The scene is refused.
+    """
+    if experiment.config.gate != STEERING:
+        return
+    kept = read_json(experiment.stage_folder("policy") / "policy.json")
+    wrong = other_steering(kept["on_held_out_views"], kept.get("control_unit", "rad"))
+    if not wrong:
+        return
+    if not may_go_on:
+        raise RuntimeFault(f"{wrong}; --no-gate, or gate: null in the experiment, attacks it all the same")
+    say(f"fidelity gate: {wrong}")
+
+
+def other_steering(views: Sequence[dict[str, float]], unit: str) -> str:
+    """How the steering on learned pictures departs from that on real ones, in a sentence; empty if it does not."""
+    real, learned = (np.array([view[name] for view in views], np.float64) for name in ("real", "surrogate"))
+    difference, spread = float(np.abs(learned - real).mean()), float(np.abs(real - real.mean()).mean())
+    varies = min(np.ptp(real), np.ptp(learned)) > 0.0
+    correlation = float(np.corrcoef(real, learned)[0, 1]) if varies else float(np.array_equal(real, learned))
+    if difference <= MOST_DIFFERENCE * spread and correlation >= LEAST_CORRELATION:
+        return ""
+    worst = int(np.abs(learned - real).argmax())
+    return (
+        f"the learned scene lacks what the policy steers by: on {len(views)} held-out views its control differs by {difference:.3g} {unit} "
+        f"in the mean, at most {MOST_DIFFERENCE * spread:.3g} is allowed ({MOST_DIFFERENCE:.0%} of how it varies), and correlates by "
+        f"{correlation:.2f}, at least {LEAST_CORRELATION:g}; worst in view {worst}; look at scene/views, photograph what is missing, or "
+        "train longer (scene.steps, policy.first_steps)"
+    )
