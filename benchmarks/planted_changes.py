@@ -13,7 +13,9 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
+from itertools import repeat
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -45,6 +47,12 @@ class Counts:
     by_files: Counter[str] = field(default_factory=Counter)
     missed: Counter[str] = field(default_factory=Counter)
 
+    def add(self, other: Counts) -> None:
+        """Add those of other changes."""
+        self.planted += other.planted
+        self.by_files += other.by_files
+        self.missed += other.missed
+
 
 def main() -> None:
     """Plant, count and record."""
@@ -52,11 +60,14 @@ def main() -> None:
     parser.add_argument("set", nargs="?", default="", help="a published set; else one of simulated drives")
     parser.add_argument("--changes", type=int, default=_RECORDED)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=1, help="processes, each with a copy of its own")
     options = parser.parse_args()
     began = time.perf_counter()
-    with TemporaryDirectory() as work:
-        world = published_world(Path(work), options.set) if options.set else simulated_world(Path(work))
-        counts = planted(world, options.changes, options.seed)
+    parts = [range(options.changes)[job :: options.jobs] for job in range(options.jobs)]
+    counts = Counts()
+    with ProcessPoolExecutor(options.jobs) as pool:
+        for part in pool.map(_part, repeat(options.set), parts, repeat(options.seed)):
+            counts.add(part)
     found = options.changes - counts.missed.total()
     print(
         f"{found} of {options.changes} found in {time.perf_counter() - began:.0f} s, {counts.by_files.total()} of them by the files alone"
@@ -65,6 +76,13 @@ def main() -> None:
         print(f"{kind}: {count} planted, {counts.by_files[kind]} by files, {counts.missed[kind]} missed")
     if options.changes == _RECORDED:
         _record(options.set, counts, found)
+
+
+def _part(name: str, numbers: Sequence[int], seed: int) -> Counts:
+    """Some of the changes, in a copy of their own."""
+    with TemporaryDirectory() as work:
+        world = published_world(Path(work), name) if name else simulated_world(Path(work))
+        return planted(world, numbers, seed)
 
 
 def _record(name: str, counts: Counts, found: int) -> None:
@@ -80,8 +98,8 @@ def _record(name: str, counts: Counts, found: int) -> None:
     record_row(f"planted changes found by verify, {which}", round(percent, 1), "%", f">= {_TARGET_PERCENT:g} %", percent >= _TARGET_PERCENT, command, note)  # fmt: skip
 
 
-def planted(world: World, count: int, seed: int = 0) -> Counts:
-    """Plant changes one at a time, all kinds in turn.
+def planted(world: World, numbers: Sequence[int], seed: int = 0) -> Counts:
+    """Plant changes one at a time, all kinds in turn by their numbers.
 
     Raises:
         RuntimeError: The copy has problems before anything was changed.
@@ -90,7 +108,7 @@ def planted(world: World, count: int, seed: int = 0) -> Counts:
     if clean := find(world, picture):
         raise RuntimeError(f"expected a copy without problems, got {(*clean.files, *clean.history)[0]}")
     kinds, counts = list(KINDS), Counts()
-    for number in range(count):
+    for done, number in enumerate(numbers, 1):
         kind = kinds[number % len(kinds)]
         world.rng.seed(f"{seed} {number}")
         KINDS[kind].plant(world)
@@ -103,8 +121,8 @@ def planted(world: World, count: int, seed: int = 0) -> Counts:
         counts.by_files[kind] += bool(found.files)
         counts.missed[kind] += not found
         world.restore()
-        if not (number + 1) % 100:
-            print(f"{number + 1} of {count}, missed: {dict(+counts.missed) or None}", flush=True)
+        if not done % 100:
+            print(f"{done} of {len(numbers)}, missed: {dict(+counts.missed) or None}", flush=True)
     return counts
 
 

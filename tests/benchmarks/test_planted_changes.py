@@ -49,7 +49,7 @@ def check(world, picture, kind, seed):
 
 
 def test_changes_are_counted_by_kind(world):
-    counts = planted(world, 3)
+    counts = planted(world, range(3))
     assert dict(counts.planted) == dict.fromkeys(list(KINDS)[:3], 1)
     assert counts.missed.total() == 0
 
