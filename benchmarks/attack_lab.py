@@ -11,7 +11,7 @@ import torch
 from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.driving.dynamics import Ackermann
 from advnerf_core.fields.coloured import ColouredObject
-from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.surrogate import Surrogate
 from calibration.schema import CameraCalibration, RoomCalibration, VehicleCalibration, load_calibration

@@ -34,7 +34,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.geometry import planar_poses
 from advnerf_core.learning.imitation import recovery_states
 from advnerf_core.objects.voxel.model import load_object, save_object
-from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.scene.bake import bake
 from advnerf_core.scene.surrogate import BackgroundRenderer
 from benchmarks.results import REPOSITORY, record_row

@@ -41,7 +41,7 @@ from advnerf_core.files import write_atomically
 from advnerf_core.policies.contract import PolicyContract
 from advnerf_core.policies.load import load_any_policy
 from advnerf_core.policies.onnx_policy import export_onnx
-from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.scene.surrogate import Surrogate
 from benchmarks.attack_lab import lab_problem
 from benchmarks.results import record_row

@@ -20,7 +20,7 @@ from advnerf_core.attack.adjoint import adjoint_gradient
 from advnerf_core.attack.device import use_device
 from advnerf_core.attack.on_device import on_chosen_device
 from advnerf_core.attack.problem import AttackProblem
-from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.scene.surrogate import Surrogate
 from benchmarks.results import record_row
 from benchmarks.ticks import hydrants

@@ -16,7 +16,7 @@ import numpy as np
 from advnerf_core.documents import read_json
 from advnerf_core.driving.metrics import drives as drives_well
 from advnerf_core.driving.metrics import mean_cte_limit_m
-from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.report.cells import read_cell
 from benchmarks.results import record_row
 from nodes.experiment.show.context import Experiment

@@ -18,7 +18,8 @@ import torch
 
 from advnerf_core.data.dataset import load_image, load_transforms
 from advnerf_core.data.keyframes import KeyframeConfig
-from advnerf_core.policies.pilotnet import images_to_tensor, load_policy
+from advnerf_core.policies.network import images_to_tensor
+from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.scene.colour import IDENTITY
 from advnerf_core.scene.field import SceneFieldConfig, save_scene
 from advnerf_core.scene.metrics import psnr

@@ -20,7 +20,7 @@ import advnerf_core as advnerf_core  # isort: skip  # before torch, as in the co
 from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.search.together import gradient_attacks
-from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.policies.policy_file import load_policy
 from benchmarks.results import record_row
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.faces import face_space

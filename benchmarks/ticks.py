@@ -24,7 +24,7 @@ from advnerf_core.geometry import make_transform, planar_poses, rotation_z
 from advnerf_core.objects.voxel.build import build_from_mesh
 from advnerf_core.objects.voxel.generators import GENERATORS
 from advnerf_core.objects.voxel.mesh import stand
-from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.scene.surrogate import Surrogate
 from benchmarks.timing import seconds_in_turns
 from nodes.experiment.plan.config import ExperimentConfig

@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from advnerf_core.driving.metrics import drives, mean_cte_limit_m
-from advnerf_core.policies.pilotnet import Policy, load_policy
+from advnerf_core.policies.network import Policy
+from advnerf_core.policies.policy_file import load_policy
 from benchmarks.results import REPOSITORY, record_row
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import Dressed

@@ -47,7 +47,7 @@ HEADERS = {  # text in the header of a tensor file or archive that our own write
     "advnerf_core/files.py": 1,
     "advnerf_core/objects/voxel/model.py": 1,
     "advnerf_core/policies/exported_policy.py": 1,
-    "advnerf_core/policies/pilotnet.py": 3,
+    "advnerf_core/policies/policy_file.py": 3,
     "advnerf_core/scene/baked.py": 3,
     "advnerf_core/scene/field.py": 3,
     "advnerf_core/scene/train.py": 1,

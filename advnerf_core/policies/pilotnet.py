@@ -11,21 +11,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from advnerf_core.policies.architecture import IMAGE_HEIGHT, IMAGE_WIDTH, PilotNetConfiguration
-from advnerf_core.policies.network import Policy, SteeringNetwork, images_to_tensor
-from advnerf_core.policies.policy_file import LoadedPolicy, PolicyFileError, load_policy, save_policy
-
-__all__ = [
-    "IMAGE_HEIGHT",
-    "IMAGE_WIDTH",
-    "LoadedPolicy",
-    "PilotNet",
-    "Policy",
-    "PolicyFileError",
-    "images_to_tensor",
-    "load_policy",
-    "save_policy",
-]
+from advnerf_core.policies.architecture import PilotNetConfiguration
+from advnerf_core.policies.network import SteeringNetwork
 
 # (channels, kernel, stride) of each convolution, Bojarski et al. figure 4.
 CONVOLUTIONS = ((24, 5, 2), (36, 5, 2), (48, 5, 2), (64, 3, 1), (64, 3, 1))

@@ -8,7 +8,8 @@ import torch
 from pydantic import ValidationError
 
 from advnerf_core.geometry import Pinhole
-from advnerf_core.policies.pilotnet import LoadedPolicy, PilotNet
+from advnerf_core.policies.pilotnet import PilotNet
+from advnerf_core.policies.policy_file import LoadedPolicy
 from advnerf_core.policies.torch_driver import TorchDriver
 from advnerf_core.policies.view import PolicyView
 from nodes.compositor import CompositorConfig, CompositorNode

@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 from advnerf_core.documents import parse_yaml
 from advnerf_core.geometry import Pinhole, planar_pose
 from advnerf_core.policies.load import load_driver
-from advnerf_core.policies.pilotnet import PilotNet, load_policy, save_policy
+from advnerf_core.policies.pilotnet import PilotNet
+from advnerf_core.policies.policy_file import load_policy, save_policy
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.strict import validate
 from nodes.bags.reader import read_messages

@@ -11,7 +11,9 @@ import torch
 
 from advnerf_core.attack.artifact import AttackFile, save_attack
 from advnerf_core.geometry import Pinhole
-from advnerf_core.policies.pilotnet import PilotNet, images_to_tensor, load_policy, save_policy
+from advnerf_core.policies.network import images_to_tensor
+from advnerf_core.policies.pilotnet import PilotNet
+from advnerf_core.policies.policy_file import load_policy, save_policy
 from advnerf_core.policies.view import PolicyView
 from calibration.schema import CameraCalibration, RoomCalibration, TargetCalibration, load_calibration
 from nodes.bags.reader import read_messages

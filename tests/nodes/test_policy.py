@@ -8,15 +8,10 @@ import torch
 
 from advnerf_core.geometry import Pinhole
 from advnerf_core.policies.contract import PolicyContract
+from advnerf_core.policies.network import images_to_tensor
 from advnerf_core.policies.onnx_policy import export_onnx
-from advnerf_core.policies.pilotnet import (
-    LoadedPolicy,
-    PilotNet,
-    PolicyFileError,
-    images_to_tensor,
-    load_policy,
-    save_policy,
-)
+from advnerf_core.policies.pilotnet import PilotNet
+from advnerf_core.policies.policy_file import LoadedPolicy, PolicyFileError, load_policy, save_policy
 from advnerf_core.policies.torch_driver import TorchDriver
 from advnerf_core.policies.view import PolicyView
 from nodes.policy import PolicyConfig, PolicyNode

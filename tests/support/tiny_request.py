@@ -8,7 +8,8 @@ import numpy as np
 import torch
 
 from advnerf_core.fields.hash_grid import HashGridConfig
-from advnerf_core.policies.pilotnet import PilotNet, save_policy
+from advnerf_core.policies.pilotnet import PilotNet
+from advnerf_core.policies.policy_file import save_policy
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.field import SceneField, SceneFieldConfig, save_scene
 from calibration.schema import CameraCalibration, load_calibration

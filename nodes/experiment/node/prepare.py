@@ -36,7 +36,7 @@ from advnerf_core.objects.mesh.glb import glb_bytes
 from advnerf_core.objects.mesh.shape import ShapeSensor
 from advnerf_core.objects.mesh.surface import TexturedMesh
 from advnerf_core.policies.load import load_any_policy
-from advnerf_core.policies.pilotnet import LoadedPolicy
+from advnerf_core.policies.policy_file import LoadedPolicy
 from advnerf_core.scene.field import load_scene
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.surrogate import Surrogate, split_theta

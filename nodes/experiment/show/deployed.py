@@ -23,7 +23,7 @@ from advnerf_core.driving.rollout import drive
 from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.geometry import Array, Pinhole, planar_poses
 from advnerf_core.learning.sources import Show
-from advnerf_core.policies.pilotnet import Policy, images_to_tensor
+from advnerf_core.policies.network import Policy, images_to_tensor
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.surrogate import Frames, Surrogate
 from hardware.cameras.effects import ImperfectCamera

@@ -11,7 +11,7 @@ from torch import Tensor
 from advnerf_core.attack.adjoint import AttackProblem, evaluate
 from advnerf_core.driving.metrics import DriveMetrics, drive_metrics
 from advnerf_core.geometry import Array
-from advnerf_core.policies.pilotnet import Policy
+from advnerf_core.policies.network import Policy
 from hardware.cameras.effects import ImperfectCamera
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import DeployedDrive, Dressed, IdealDriving, SelfDriving, drive_deployed

@@ -13,7 +13,7 @@ import torch
 from advnerf_core.attack.spaces.space import Space
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
-from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.report.conditions import NONE
 from advnerf_core.report.evidence.kept import kept_drives
 from hardware.worlds.world import World

@@ -26,7 +26,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.driving.measured_car import CarResponse, RespondingCar, fit_response
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.geometry import Array, invert_transform, planar_poses, yaw_of
-from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.scene.fidelity import Pictures
 from advnerf_core.scene.surrogate import Surrogate
 from nodes.bags.reader import read_messages

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
-from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.policies.policy_file import policy_sha256
 from nodes.experiment.engine.stage_record import hash_of
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
@@ -57,7 +57,7 @@ def frozen_for(experiment: Experiment, cell: Cell) -> dict[str, str]:
 
 
 def _policy_sha256(experiment: Experiment, victim: str) -> str:
-    return load_policy(victim_file(experiment, victim)).sha256
+    return policy_sha256(victim_file(experiment, victim))
 
 
 def _frozen_place(experiment: Experiment) -> dict[str, str]:

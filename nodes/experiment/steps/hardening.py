@@ -12,7 +12,7 @@ from advnerf_core.attack.clean import clean_drive
 from advnerf_core.attack.methods import SearchRun, load_method
 from advnerf_core.attack.spaces.space import Space
 from advnerf_core.driving.metrics import mean_cte_limit_m
-from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.report.evidence.hardness import (
     FILE,
     FamilyHardness,

@@ -18,7 +18,7 @@ from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.memory import RETURNS_WHAT_IS_FREED, peak_mib, restart_peak
-from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.report.data import MemoryRow
 from advnerf_core.run_module import module_command
 from nodes.experiment.show.context import Experiment

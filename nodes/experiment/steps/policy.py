@@ -22,7 +22,8 @@ from advnerf_core.files import write_atomically
 from advnerf_core.geometry import planar_pose
 from advnerf_core.learning.imitation import ImitationConfig, Learned, Progress, SourcePlan, train_policy
 from advnerf_core.learning.sources import FrameSource, RenderedSource, SceneSource, Show
-from advnerf_core.policies.pilotnet import Policy, images_to_tensor, load_policy
+from advnerf_core.policies.network import Policy, images_to_tensor
+from advnerf_core.policies.policy_file import load_policy
 from hardware.worlds.world import World
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import Dressed, seen_in

@@ -13,7 +13,7 @@ from advnerf_core.attack.pose_maps import landscape, places_over, robustness_map
 from advnerf_core.attack.pose_plots import draw_landscape, draw_robustness
 from advnerf_core.attack.spaces.placed_sensor import PlacedSensor
 from advnerf_core.files import write_atomically
-from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.policies.policy_file import load_policy
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import make_space

@@ -30,7 +30,7 @@ from advnerf_core.learning.frames import Frames, FrameStore
 from advnerf_core.learning.imitation import SourcePlan, recovery_states
 from advnerf_core.learning.retrain import RetrainConfig, fine_tune
 from advnerf_core.learning.sources import Seen, steer_with
-from advnerf_core.policies.pilotnet import LoadedPolicy, load_policy
+from advnerf_core.policies.policy_file import LoadedPolicy, load_policy
 from hardware.worlds.world import World
 from nodes.experiment.engine.stage_record import hash_of
 from nodes.experiment.plan.cell import Cell

@@ -17,7 +17,8 @@ from advnerf_core.learning.frames import FrameStore
 from advnerf_core.learning.imitation import ImitationConfig, SourcePlan, recovery_states, train_policy
 from advnerf_core.learning.sources import RenderedSource
 from advnerf_core.policies.architecture import Architecture
-from advnerf_core.policies.pilotnet import PilotNet, load_policy
+from advnerf_core.policies.pilotnet import PilotNet
+from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.policies.view import PolicyView
 
 VIEW = PolicyView(Pinhole(336, 188, 173.97, 173.97, 168.0, 94.0))

@@ -19,7 +19,8 @@ from advnerf_core.learning.frames import Frames, FrameSet, FrameStore, FrameStor
 from advnerf_core.learning.imitation import ImitationConfig, SourcePlan, recovery_states, train_policy
 from advnerf_core.learning.sources import RenderedSource, SceneSource, steer_with
 from advnerf_core.policies.architecture import Architecture
-from advnerf_core.policies.pilotnet import PilotNet, load_policy
+from advnerf_core.policies.pilotnet import PilotNet
+from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.policies.view import PolicyView
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "my_architecture.py"

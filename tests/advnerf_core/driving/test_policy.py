@@ -7,13 +7,9 @@ import torch
 from advnerf_core.driving.dynamics import Ackermann
 from advnerf_core.driving.rollout import drive
 from advnerf_core.geometry import Pinhole
-from advnerf_core.policies.pilotnet import (
-    PilotNet,
-    PolicyFileError,
-    images_to_tensor,
-    load_policy,
-    save_policy,
-)
+from advnerf_core.policies.network import images_to_tensor
+from advnerf_core.policies.pilotnet import PilotNet
+from advnerf_core.policies.policy_file import PolicyFileError, load_policy, save_policy
 from advnerf_core.policies.view import PolicyView
 
 VIEW = PolicyView(Pinhole(336, 188, 173.97, 173.97, 168.0, 94.0))

@@ -11,7 +11,9 @@ from advnerf_core.learning.augment import AugmentConfig
 from advnerf_core.learning.frames import Frames, FrameStoreError
 from advnerf_core.learning.retrain import MixedFrames, RetrainConfig, fine_tune
 from advnerf_core.policies.architecture import PilotNetConfiguration
-from advnerf_core.policies.pilotnet import PilotNet, images_to_tensor, load_policy, save_policy
+from advnerf_core.policies.network import images_to_tensor
+from advnerf_core.policies.pilotnet import PilotNet
+from advnerf_core.policies.policy_file import load_policy, save_policy
 from advnerf_core.policies.view import PolicyView
 
 VIEW = PolicyView(Pinhole(336, 188, 174.0, 174.0, 168.0, 94.0))

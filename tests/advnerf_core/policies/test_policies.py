@@ -18,7 +18,8 @@ from advnerf_core.policies.contract import PolicyContract, PolicyContractError
 from advnerf_core.policies.exported_policy import export_program
 from advnerf_core.policies.load import load_adapted, load_any_policy, load_driver
 from advnerf_core.policies.onnx_policy import OnnxNetwork, export_onnx
-from advnerf_core.policies.pilotnet import PilotNet, save_policy
+from advnerf_core.policies.pilotnet import PilotNet
+from advnerf_core.policies.policy_file import save_policy
 from advnerf_core.policies.view import PolicyView
 
 VIEW = PolicyView(Pinhole(336, 188, 173.97, 173.97, 168.0, 94.0))

@@ -14,7 +14,7 @@ from advnerf_core.attack.search.black_box import BudgetError
 from advnerf_core.display import DisplayModel
 from advnerf_core.policies.contract import PolicyContract
 from advnerf_core.policies.onnx_policy import export_onnx
-from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.policies.policy_file import load_policy
 from calibration.display_colour import DisplayCalibration
 from calibration.schema import save_calibration
 from nodes.cli import main as cli

@@ -254,7 +254,8 @@ def test_libraries_of_this_computer_answer(tmp_path):
 
 def saved_policy(file, width, height):
     from advnerf_core.geometry import Pinhole
-    from advnerf_core.policies.pilotnet import PilotNet, save_policy
+    from advnerf_core.policies.pilotnet import PilotNet
+    from advnerf_core.policies.policy_file import save_policy
     from advnerf_core.policies.view import PolicyView
 
     save_policy(file, PilotNet(), PolicyView(Pinhole(width, height, 174.0, 174.0, width / 2, height / 2)), {})

@@ -12,7 +12,8 @@ from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.geometry import Array, Pinhole, VehicleState, planar_pose
 from advnerf_core.objects.voxel.model import save_object
 from advnerf_core.policies.architecture import PilotNetConfiguration
-from advnerf_core.policies.pilotnet import PilotNet, save_policy
+from advnerf_core.policies.pilotnet import PilotNet
+from advnerf_core.policies.policy_file import save_policy
 from advnerf_core.scene.field import SceneField, SceneFieldConfig, save_scene
 from hardware.worlds.junction.car import DubinsCar
 from hardware.worlds.junction.config import DubinsConfig, IntersectionConfig

@@ -16,7 +16,8 @@ from advnerf_core.attack.robustness import Disturbances
 from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.search.search import SearchStateError
 from advnerf_core.driving.rollout import drive
-from advnerf_core.policies.pilotnet import images_to_tensor, load_policy
+from advnerf_core.policies.network import images_to_tensor
+from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.report.transfer_page import text_table
 from advnerf_core.scene.surrogate import Surrogate
 from hardware.cameras.effects import CameraEffects

@@ -13,7 +13,7 @@ from advnerf_core.driving.path import Line, Path
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.geometry import make_transform
 from advnerf_core.objects.voxel.model import load_object
-from advnerf_core.policies.pilotnet import images_to_tensor
+from advnerf_core.policies.network import images_to_tensor
 from advnerf_core.policies.view import PolicyView
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import DressedScene, IdealDriving, SelfDriving, drive_deployed

@@ -17,7 +17,7 @@ from advnerf_core.driving.dynamics import Dubins
 from advnerf_core.driving.metrics import DriveMetrics, drive_metrics
 from advnerf_core.driving.rollout import drive
 from advnerf_core.geometry import Array
-from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.report.clips import read_clip
 from hardware.worlds.junction.config import DubinsConfig
 from hardware.worlds.world import World

@@ -10,7 +10,7 @@ import pytest
 from advnerf_core.attack.adjoint import evaluate
 from advnerf_core.attack.search import textures
 from advnerf_core.fields.colour_grid import colour_grid
-from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.report.evidence.hardness import FILE, HardnessError, read_hardness
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import search_cell

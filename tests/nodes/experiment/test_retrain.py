@@ -11,7 +11,7 @@ import pytest
 
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.learning.frames import Frames, FrameStore
-from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.policies.policy_file import load_policy
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.config import RetrainConfig
 from nodes.experiment.show.context import Experiment

@@ -7,7 +7,8 @@ import torch
 from advnerf_core.geometry import Pinhole
 from advnerf_core.policies.contract import PolicyContract
 from advnerf_core.policies.onnx_policy import export_onnx
-from advnerf_core.policies.pilotnet import PilotNet, save_policy
+from advnerf_core.policies.pilotnet import PilotNet
+from advnerf_core.policies.policy_file import save_policy
 from advnerf_core.policies.view import PolicyView
 from nodes.operator_page.pictures import view_of_policy
 
