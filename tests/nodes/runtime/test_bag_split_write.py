@@ -259,6 +259,7 @@ def test_memory_does_not_grow_with_the_number_of_parts(tmp_path, minutes):
     rows = [tuple(map(int, line.split())) for line in result.stdout.splitlines()]
     assert rows[-1][1] >= 10  # a part grows until the one before it is on the disk
     minute = 36  # rows in a minute
-    early = np.median([size for size, parts in rows[3 * minute : 4 * minute]])
-    late = np.median([size for size, parts in rows[-minute:]])
+    # What waits for a busy disk comes and goes; what is never given back raises the least of a minute too.
+    early = min(size for size, parts in rows[3 * minute : 4 * minute])
+    late = min(size for size, parts in rows[-minute:])
     assert late / early - 1.0 < 0.02
