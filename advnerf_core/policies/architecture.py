@@ -30,13 +30,13 @@ from advnerf_core.plugins import (
     require_known,
     resolve,
 )
+from advnerf_core.policies.view import IMAGE_HEIGHT, IMAGE_WIDTH
 from advnerf_core.strict import StrictModel
 
 if TYPE_CHECKING:
     from advnerf_core.policies.network import SteeringNetwork
 
 GROUP = "advnerf.architectures"
-IMAGE_HEIGHT, IMAGE_WIDTH = 66, 200
 PILOTNET = "pilotnet"
 _WHAT = "architecture"
 

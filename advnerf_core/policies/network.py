@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from advnerf_core.policies.architecture import IMAGE_HEIGHT, IMAGE_WIDTH
+from advnerf_core.policies.view import IMAGE_HEIGHT, IMAGE_WIDTH
 
 
 class Policy(Protocol):

@@ -13,8 +13,9 @@ from math import gcd
 import torch
 from torch import Tensor, nn
 
-from advnerf_core.policies.architecture import IMAGE_HEIGHT, IMAGE_WIDTH, ResNetConfiguration
+from advnerf_core.policies.architecture import ResNetConfiguration
 from advnerf_core.policies.network import SteeringNetwork
+from advnerf_core.policies.view import IMAGE_HEIGHT, IMAGE_WIDTH
 
 _GROUPS = 8
 # As for PilotNet: a few goal inputs beside thousands of features need larger weights at the start.

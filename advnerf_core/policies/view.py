@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 
 from advnerf_core.geometry import Pinhole
 
+# Of the policies that are trained here (Bojarski et al. 2016).
+IMAGE_HEIGHT, IMAGE_WIDTH = 66, 200
+
 Image = NDArray[np.uint8]
 
 
@@ -37,8 +40,8 @@ class PolicyView:
     camera: Pinhole
     crop_top_px: int = 24
     crop_height_px: int = 111
-    width: int = 200
-    height: int = 66
+    width: int = IMAGE_WIDTH
+    height: int = IMAGE_HEIGHT
     distortion: tuple[float, ...] = ()
     crop_left_px: int = 0
     crop_width_px: int | None = None

@@ -12,8 +12,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import scaled_dot_product_attention
 
-from advnerf_core.policies.architecture import IMAGE_HEIGHT, IMAGE_WIDTH, VisionTransformerConfiguration
+from advnerf_core.policies.architecture import VisionTransformerConfiguration
 from advnerf_core.policies.network import SteeringNetwork
+from advnerf_core.policies.view import IMAGE_HEIGHT, IMAGE_WIDTH
 
 _SPREAD = 0.02  # of the class token at the start
 _LONGEST = 100.0  # wavelength of positions over that of the shortest, as in Beyer et al.

@@ -16,9 +16,10 @@ import torch
 from torch import Tensor, nn
 
 from advnerf_core.adam import Adam
-from advnerf_core.policies.architecture import IMAGE_HEIGHT, IMAGE_WIDTH, Architecture
+from advnerf_core.policies.architecture import Architecture
 from advnerf_core.policies.network import SteeringNetwork
 from advnerf_core.policies.pilotnet import PilotNet
+from advnerf_core.policies.view import IMAGE_HEIGHT, IMAGE_WIDTH
 
 StudentFactory = Callable[[tuple[int, ...], int, float], nn.Module]
 """``(image shape [3, H, W], goal size, bound of the steering [rad]) -> network(images, goals)``."""

@@ -24,7 +24,7 @@ from advnerf_core.report.evidence.about import ObjectPlace, read_about
 from advnerf_core.report.evidence.page import above_of, film_of
 from advnerf_core.report.evidence.registration import PrimaryTest, read_registration
 from advnerf_core.report.evidence.results import Evidence
-from advnerf_core.report.evidence.verify import SET
+from advnerf_core.report.evidence.verifying.layout import SET
 from advnerf_core.report.palette import LIGHT
 from advnerf_core.report.plots import STYLE
 
