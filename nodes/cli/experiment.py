@@ -85,16 +85,16 @@ def load_cells(
 
 
 def _know_methods(campaign: Campaign) -> None:
+    from nodes.experiment.engine.run_folder import CELLS
     from nodes.experiment.plan.method_names import know_methods_of
-    from nodes.experiment.show.context import CELLS
 
     know_methods_of(campaign.folder / CELLS, {cell.method for cell in campaign.cells})
 
 
 def _say_code(file: Path, setting: str, folder: Path | None, overrides: Sequence[str]) -> None:
     """Print the code that a run of a file will execute; nothing is executed for it."""
+    from nodes.experiment.plan.setting_file import read_setting
     from nodes.experiment.run.config import is_campaign, load_campaign
-    from nodes.experiment.steps.run import read_setting
     from nodes.lab.plugin_tables import say_code
     from nodes.runtime.named_code import with_absolute_code
 

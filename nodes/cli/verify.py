@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Annotated
 import typer
 
 from advnerf_core.documents import parse_json
+from advnerf_core.run_module import module_command
 from nodes.cli.experiment import File, Folder, Only, Setting, load_cells
 from nodes.runtime.terminal import Overrides, say_error
 
@@ -123,11 +123,14 @@ def _ledger(published: Path) -> int:
     if root != Path.cwd() or not (root / "benchmarks" / "published_check.py").exists():
         print("rows and pages not checked: run it in the checkout, whose benchmarks compute them again")
         return 0
-    command = [sys.executable, "-m", "benchmarks.published_check"]
+    command = module_command("benchmarks.published_check")
     ended = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
     if ended.returncode:
-        return _say("rows and pages", (ended.stderr.strip().splitlines() or [f"{command} failed"])[-1:])
-    found = parse_json(ended.stdout, " ".join(command[1:]))
+        return _say(
+            "rows and pages",
+            (ended.stderr.strip().splitlines() or ["benchmarks.published_check failed"])[-1:],
+        )
+    found = parse_json(ended.stdout, "benchmarks.published_check")
     numbers = found["numbers"]
     what = (
         f"{found['rows']} rows computed again, {found['not_kept']} measured once; numbers on pages: {numbers['published']} of rows and sets, "

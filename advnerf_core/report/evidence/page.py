@@ -30,7 +30,7 @@ least where a few searches differ strongly from the rest: [statistics](statistic
 is when a test that may be read after every pair of searches would have ended; it claims nothing.
 """.format(*MEASURED_COVERAGE)
 # Columns that are left out where they tell no line from another.
-_OPTIONAL = ("condition", "victim", "collided")
+_OPTIONAL = ("condition", "collided")
 
 
 def results_page(sets: Mapping[str, Mapping[str, Any]]) -> str:

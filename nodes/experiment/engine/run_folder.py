@@ -22,6 +22,8 @@ from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import Display, ProgressDisplay
 
 Config = TypeVar("Config")
+# Folder of the cells in a run folder.
+CELLS = "cells"
 _MANIFEST = "manifest.json"
 
 

@@ -16,11 +16,12 @@ from advnerf_core.report.conditions import NONE
 from advnerf_core.report.transfer import TransferTable, make_table
 from advnerf_core.report.transfer_page import text_table
 from hardware.worlds.world import World
+from nodes.experiment.engine.run_folder import CELLS
 from nodes.experiment.pages import live_report, page
 from nodes.experiment.pages.table import wanted_rows, write_table
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.method_names import know_methods_of
-from nodes.experiment.show.context import CELLS, Experiment
+from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.overview import from_above
 from nodes.experiment.show.spaces import dress, make_space, shown_there
 from nodes.experiment.steps import films

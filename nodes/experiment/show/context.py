@@ -34,7 +34,7 @@ from hardware.worlds.world import (
     WorldDescription,
     traits_of,
 )
-from nodes.experiment.engine.run_folder import RunFolder
+from nodes.experiment.engine.run_folder import CELLS, RunFolder
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.plan.placed import PlacedObject, in_a_lane
@@ -43,7 +43,7 @@ from nodes.lab.worlds.named import NamedWorld, read_world, without
 from nodes.runtime.config import load_config
 from nodes.runtime.errors import ConfigError
 
-WORLD, PLACED, CALIBRATION, CELLS = "world.json", "objects.json", "calibration", "cells"
+WORLD, PLACED, CALIBRATION = "world.json", "objects.json", "calibration"
 # What two worlds have in common in which the same attack can be deployed.
 _SHARED = ("paths", "off_track_m", "car", "camera", "T_car_from_camera", "fence_m")
 # Distances that stages use were chosen for half a lane of this width [m] and for this speed [m/s]: those of the simulated junction.

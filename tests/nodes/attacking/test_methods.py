@@ -127,7 +127,8 @@ def test_a_broken_method_is_one_line_before_anything_is_written(tmp_path, monkey
     (tmp_path / "spiral.py").write_text("turns = 1 / 0\n")
     out = tmp_path / "out"
     assert command(monkeypatch, "run", file, "-o", out, "--set", FROM_FILE) == 2
-    (said,) = capsys.readouterr().err.splitlines()
+    named, said = capsys.readouterr().err.splitlines()
+    assert named.startswith("executes ")
     assert "attack method" in said
     assert "cannot be loaded: ZeroDivisionError: division by zero" in said
     assert not list(out.glob("*.yaml"))

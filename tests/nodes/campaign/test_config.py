@@ -106,7 +106,7 @@ def test_an_unknown_kind_is_told_with_what_there_is(tmp_path):
     with pytest.raises(ConfigError, match=r"kind of cells of experiment; got 'moon'; .*file\.py:Name"):
         load_kind("moon")
     (tmp_path / "no.py").write_text("class Cells:\n    pass\n")
-    with pytest.raises(ConfigError, match=r"a subclass of nodes\.experiment\.cell_kind\.CellKind"):
+    with pytest.raises(ConfigError, match=r"a subclass of nodes\.experiment\.run\.cell_kind\.CellKind"):
         load_kind("no.py:Cells", tmp_path)
 
 
