@@ -104,11 +104,14 @@ def _say_code(file: Path, setting: str, folder: Path | None, overrides: Sequence
     campaign = load_campaign(file, folder, tuple(overrides))
     named: list[Any] = [{"methods": [cell.code for cell in campaign.cells]}]
     for scenario in campaign.scenarios.values():
+        named.append({"kind": scenario.kind})
+        if scenario.kind != "experiment":  # files of other kinds are read by their own code
+            continue
         inner = (file.parent / scenario.experiment).resolve()
         # Of the methods only those of the campaign are run.
         data = read_setting(inner, scenario.setting, scenario.set).data
         worlds = {key: data[key] for key in ("world", "deploy") if key in data}
-        named += [{"kind": scenario.kind}, with_absolute_code(worlds, inner.parent)]
+        named.append(with_absolute_code(worlds, inner.parent))
     say_code(named, file.resolve().parent)
 
 

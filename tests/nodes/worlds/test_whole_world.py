@@ -92,5 +92,7 @@ def test_a_mistake_in_the_file_is_one_line(
         assert advnerf(monkeypatch, *asked) == 2
         said = capsys.readouterr().err
         assert told in said
-        assert len(said.splitlines()) == 1
+        code, *errors = said.splitlines()
+        assert code.startswith("executes ")
+        assert len(errors) == 1
     assert not (tmp_path / "run").exists()
