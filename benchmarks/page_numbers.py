@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,13 +79,15 @@ def count_numbers(docs: Path, rows: Iterable[Mapping[str, Any]]) -> Counted:
 
 
 def list_numbers(docs: Path, rows: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, list[str]]]:
-    """Numbers by page, and whether they are published."""
+    """Every number of each page, as often as it is there, and whether it is published."""
     known, found = _known(docs, rows), {}
     for page in _pages(docs):
         numbers = _results_on(page, page.read_text(encoding="utf-8"))
         if numbers and page.name not in SETTINGS:
-            kinds = {"published": numbers & known, MARK: numbers - known}
-            found[page.name] = {kind: sorted(map(" ".join, each)) for kind, each in kinds.items() if each}
+            kinds: dict[str, list[str]] = {}
+            for number in sorted(numbers):
+                kinds.setdefault("published" if number in known else MARK, []).append(" ".join(number))
+            found[page.name] = kinds
     return found
 
 
@@ -96,17 +99,19 @@ def write_list(docs: Path, rows: Iterable[Mapping[str, Any]]) -> None:
 def _problems(
     page: Path, text: str, known: Collection[Number], listed: Mapping[str, Sequence[str]]
 ) -> Iterator[str]:
-    found, published = set(map(" ".join, _results_on(page, text))), set(map(" ".join, known))
-    if wrong := sorted(found ^ {each for numbers in listed.values() for each in numbers}):
-        yield f"{page}: {wrong[0]} is not on the page or not in {LIST}; python -m benchmarks.page_numbers writes it"
+    found, published = Counter(map(" ".join, _results_on(page, text))), set(map(" ".join, known))
+    there = Counter(each for numbers in listed.values() for each in numbers)
+    if wrong := sorted(each for each in found | there if found[each] != there[each]):
+        yield f"{page}: {wrong[0]} is not as often on the page as in {LIST}; python -m benchmarks.page_numbers writes it"
     elif wrong := sorted(set(listed.get("published", ())) - published):
         yield f"{page}: {wrong[0]} is in no published row or set any more; correct the page, then run python -m benchmarks.page_numbers"
-    elif not is_marked(text) and (wrong := sorted(found - published)):
+    elif not is_marked(text) and (wrong := sorted(found.keys() - published)):
         yield f"{page}: {wrong[0]} is in no published row or set; say at the head of the page that figures were {MARK!r}"
 
 
-def _results_on(page: Path, text: str) -> set[Number]:
-    return set(numbers_in(text)) - _SETTINGS_ON.get(page.name, set())
+def _results_on(page: Path, text: str) -> list[Number]:
+    settings = _SETTINGS_ON.get(page.name, set())
+    return [number for number in numbers_in(text) if number not in settings]
 
 
 def _known(docs: Path, rows: Iterable[Mapping[str, Any]]) -> set[Number]:
