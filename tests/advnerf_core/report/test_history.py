@@ -130,8 +130,8 @@ def change_a_value(repository):
         (remove_a_cell, f"the file {CELL} was committed once", ("file", CELL)),
         (remove_a_scenario, "the scenario one/own was committed once", None),
         (remove_a_missed_row, "the row 'photos' was missed and is gone", ("row", "photos")),
-        (turn_a_verdict, "the row 'photos' has another verdict", ("row", "photos")),
-        (change_a_value, "the row 'photos' had the value 20.0 and has 27.0", ("row", "photos")),
+        (turn_a_verdict, "the row 'photos' has another verdict", ("value", "photos", 20.0)),
+        (change_a_value, "the row 'photos' had the value 20.0 and has 27.0", ("value", "photos", 27.0)),
     ],
 )
 def test_what_was_changed_or_removed_is_found_and_may_be_logged(repository, change, says, log, committed):
@@ -144,8 +144,9 @@ def test_what_was_changed_or_removed_is_found_and_may_be_logged(repository, chan
             repository.problems()
         )
         return
-    kind, name = log
-    repository.write("removed.json", [{"kind": kind, "names": [name], "reason": "It was wrong by a factor."}])
+    kind, name, *value = log
+    entry = {"kind": kind, "names": [name], "reason": "It was wrong by a factor."}
+    repository.write("removed.json", [entry | ({"stands": {name: value[0]}} if value else {})])
     assert repository.problems() == ()
 
 
@@ -204,6 +205,27 @@ def test_a_row_that_was_measured_again_may_have_another_value(repository):
     again = {**MISSED, "value": 27.0, "met": True, "date": "2026-01-01T10:00:01+00:00"}
     repository.write("../results.json", [again])
     assert repository.problems() == ()
+
+
+def test_a_logged_value_covers_neither_another_value_nor_a_removal(repository):
+    entry = {"kind": "value", "names": ["photos"], "reason": "It was rounded.", "stands": {"photos": 27.0}}
+    repository.write("removed.json", [entry])
+    for rows, says in (
+        ([{**MISSED, "value": 27.0}], ""),
+        ([{**MISSED, "value": 28.0}], "had the value 20.0 and has 28.0"),
+        ([], "was missed and is gone"),
+    ):
+        repository.write("../results.json", rows)
+        assert says in "".join(repository.problems())
+        assert bool(repository.problems()) == bool(says)
+
+
+@pytest.mark.parametrize("stands", [{}, {"other": 1.0}])
+def test_a_logged_value_names_the_value_of_each_row(repository, stands):
+    entry = {"kind": "value", "names": ["photos"], "reason": "It was rounded.", "stands": stands}
+    repository.write("removed.json", [entry])
+    with pytest.raises(SetError, match="expected stands to hold the value of each row"):
+        verify_history(repository.published)
 
 
 def test_without_a_history_it_says_why(repository, tmp_path_factory, monkeypatch):

@@ -14,7 +14,7 @@ from advnerf_core.documents import parse_json, read_json
 from advnerf_core.report.evidence.registration import FILE
 from advnerf_core.report.evidence.verifying.git import Change, History, NoHistory, blob_of
 from advnerf_core.report.evidence.verifying.layout import BUILD, SET, cell_files, sets_in
-from advnerf_core.report.evidence.verifying.removed import LOG, read_removed
+from advnerf_core.report.evidence.verifying.removed import LOG, read_removed, value_entry
 
 LEDGER = "../results.json"
 # What names one measurement of a row.
@@ -167,9 +167,11 @@ def _rows(history: History, published: Path, log: Log) -> Iterator[str]:
     for text in history.contents(dict.fromkeys(change.blob for change in changes)):
         for row in _ledger(text):
             line = row["line"]
-            if line in told or ("row", line) in log:
+            there = now.get(line)
+            entry = ("row", line) if there is None else value_entry(line, there["value"])
+            if line in told or entry in log:
                 continue
-            if problem := _row_problem(row, now.get(line)):
+            if problem := _row_problem(row, there):
                 told.add(line)
                 yield f"{published / LEDGER}: the row {line!r} {problem}, and {LOG} does not say why"
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, model_validator
 
 from advnerf_core.documents import read_json
 from advnerf_core.report.evidence.verifying.layout import SetError
@@ -18,17 +19,40 @@ class Removed(StrictModel):
     """Things that were removed or written again for one reason.
 
     Attributes:
-        kind: What they are: rows of the ledger, registered scenarios (``SET/SCENARIO``), files (by path), sets, or registrations that
-            were written again before anything of their sets was run (``SET``).
+        kind: What they are: rows of the ledger that are gone, values of rows that took the place of others of one measurement, registered
+            scenarios (``SET/SCENARIO``), files (by path), sets, or registrations that were written again before anything of their sets
+            was run (``SET``).
         names: Of each.
         reason: Why.
+        stands: Of ``value``, the value that each row has since; a later one is not covered.
         commit: Which one, as far as its number goes; for readers.
     """
 
-    kind: Literal["row", "scenario", "file", "set", "registration"]
+    kind: Literal["row", "value", "scenario", "file", "set", "registration"]
     names: tuple[str, ...] = Field(min_length=1)
     reason: str = Field(min_length=10)
+    stands: dict[str, float | str] = Field(default_factory=dict)
     commit: str = ""
+
+    @model_validator(mode="after")
+    def _stands_for_values(self) -> Removed:
+        if self.stands.keys() != (set(self.names) if self.kind == "value" else set()):
+            raise ValueError(
+                "expected stands to hold the value of each row of kind value, and of nothing else"
+            )
+        return self
+
+    def entries(self) -> Iterator[tuple[str, str]]:
+        """Kind and name of each, as checks look them up; a value with its row (`value_entry`)."""
+        if self.kind == "value":
+            yield from (value_entry(line, value) for line, value in self.stands.items())
+        else:
+            yield from ((self.kind, name) for name in self.names)
+
+
+def value_entry(line: str, value: float | str) -> tuple[str, str]:
+    """How the log is asked whether a row may have its value though it had another one in the same measurement."""
+    return "value", f"{line}: {value}"
 
 
 def read_removed(published: Path) -> dict[tuple[str, str], str]:
@@ -47,4 +71,4 @@ def read_removed(published: Path) -> dict[tuple[str, str], str]:
         raise SetError(
             f"{file}: expected a list of removals with their reasons, got: {text}; restore it from git"
         ) from None
-    return {(each.kind, name): each.reason for each in found for name in each.names}
+    return {entry: each.reason for each in found for entry in each.entries()}
