@@ -2,8 +2,8 @@
 
 A page may hold numbers of three kinds. A result stands in a row of ``docs/results.json`` or in a published set, rounded as it may be. A
 setting or a limit is no result; pages of nothing else are listed in `SETTINGS`. A page with any other number says `MARK` at its head.
-The command lists the numbers of all pages but those of settings in `LIST`, by kind: a number that is edited is then not listed, and one
-whose row has changed is not published any more.
+The command lists the numbers of all pages in `LIST`, by kind: a number that is edited is then not listed, and one whose row has changed is
+not published any more.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 
 MARK = "measured once, not kept"
+_SETTING = "settings"
 LIST = "page_numbers.json"  # in the folder of the pages
 _HEAD_LINES = 8
 # Made from rows and code by commands, which tests hold them to.
@@ -73,20 +74,20 @@ def count_numbers(docs: Path, rows: Iterable[Mapping[str, Any]]) -> Counted:
                 counts["settings"] += 1
             else:
                 counts["published" if number in known else "marked"] += 1
-        if page.name not in SETTINGS:
-            problems += _problems(page, text, known, listed.get(page.name, {}))
+        problems += _problems(page, text, known, listed.get(page.name, {}))
     return Counted(**counts, problems=tuple(problems))
 
 
 def list_numbers(docs: Path, rows: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, list[str]]]:
-    """Every number of each page, as often as it is there, and whether it is published."""
+    """Every number of each page, as often as it is there, by kind."""
     known, found = _known(docs, rows), {}
     for page in _pages(docs):
         numbers = _results_on(page, page.read_text(encoding="utf-8"))
-        if numbers and page.name not in SETTINGS:
+        if numbers:
             kinds: dict[str, list[str]] = {}
             for number in sorted(numbers):
-                kinds.setdefault("published" if number in known else MARK, []).append(" ".join(number))
+                kind = _SETTING if page.name in SETTINGS else "published" if number in known else MARK
+                kinds.setdefault(kind, []).append(" ".join(number))
             found[page.name] = kinds
     return found
 
@@ -105,7 +106,7 @@ def _problems(
         yield f"{page}: {wrong[0]} is not as often on the page as in {LIST}; python -m benchmarks.page_numbers writes it"
     elif wrong := sorted(set(listed.get("published", ())) - published):
         yield f"{page}: {wrong[0]} is in no published row or set any more; correct the page, then run python -m benchmarks.page_numbers"
-    elif not is_marked(text) and (wrong := sorted(found.keys() - published)):
+    elif page.name not in SETTINGS and not is_marked(text) and (wrong := sorted(found.keys() - published)):
         yield f"{page}: {wrong[0]} is in no published row or set; say at the head of the page that figures were {MARK!r}"
 
 

@@ -9,7 +9,7 @@ from advnerf_core.documents import read_json
 from benchmarks.kept_commands import kept_by
 from benchmarks.planting.world import Data, World
 
-_FIGURE = re.compile(r"\d+\.\d+(?= (?:m|%|x|dB|ms))")
+_FIGURE = re.compile(r"\d+\.\d+(?= (?:m|%|x|dB|ms)(?!\w))")
 
 
 def a_missed_row(world: World) -> None:
