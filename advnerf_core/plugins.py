@@ -131,6 +131,11 @@ def is_file_reference(name: str) -> bool:
     return bool(separator) and file.endswith(".py") and attribute.isidentifier()
 
 
+def name_in_results(reference: str) -> str:
+    """What a thing is called in tables and file names: of ``file.py:Name`` it is ``Name``. Names stay as they are."""
+    return reference.rpartition(":")[2] if is_file_reference(reference) else reference
+
+
 def absolute_reference(name: str, folder: Path) -> str:
     """``file.py:Name`` with the file's absolute path, so that a worker finds it from any working folder; other names as they are."""
     if not is_file_reference(name):

@@ -25,8 +25,8 @@ from advnerf_core.errors import AdvnerfError
 from advnerf_core.plugins import (
     PluginError,
     code_sha256,
-    is_file_reference,
     known_names,
+    name_in_results,
     options_of,
     require_known,
     resolve,
@@ -214,7 +214,7 @@ def require_method(reference: str, folder: Path | None = None) -> None:
         PluginError: There is no such method, or its name cannot be told from another's.
     """
     require_known(reference, _WHAT, METHODS, GROUP, folder)
-    name = method_name(reference)
+    name = name_in_results(reference)
     if not _NAME.fullmatch(name):
         raise PluginError(
             f"{_WHAT} {reference}: expected a name of letters, digits, - and _, as it becomes part of file names, got {name!r}; rename it"
@@ -224,11 +224,6 @@ def require_method(reference: str, folder: Path | None = None) -> None:
         raise PluginError(
             f"{_WHAT} {reference}: expected a name that no other condition has, got {name} of {', '.join(taken)}; rename it"
         )
-
-
-def method_name(reference: str) -> str:
-    """What a method is called in tables and file names; of ``file.py:Name`` it is ``Name``. Names stay as they are."""
-    return reference.rpartition(":")[2] if is_file_reference(reference) else reference
 
 
 def method_digest(reference: str) -> str:

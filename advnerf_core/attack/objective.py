@@ -84,10 +84,12 @@ class Objective:
     """What an attack maximises. Derive from it, and define at least ``value``; see docs/methods.md.
 
     Attributes:
+        title: What it is, in one line for lists.
         unit: Of the value.
         needs_solids: Whether it needs a place with solids.
     """
 
+    title: ClassVar[str] = ""
     unit: ClassVar[str] = "m"
     needs_solids: ClassVar[bool] = False
 
@@ -108,6 +110,8 @@ class CrossTrackError(Objective):
     error, capped. The loss is ``-sum_t |c_t|`` of a car that goes on driving beyond the fence, as the gradient would be zero there.
     """
 
+    title = "Total cross-track error"
+
     def value(self, drives: JudgedDrives) -> Tensor:
         """Total |CTE| of each drive by the protocol, ``[B]`` [m]."""
         return drives.per_drive([each.total_cte_m for each in drives.metrics])
@@ -127,6 +131,8 @@ class Peak(Objective):
     Attributes:
         temperature: Share of the off-track limit.
     """
+
+    title = "Greatest cross-track error"
 
     temperature: float = 0.1
 
@@ -150,6 +156,8 @@ class TimeOffTrack(Objective):
     Attributes:
         width: Share of the off-track limit.
     """
+
+    title = "Time off the track"
 
     unit: ClassVar[str] = "s"
     width: float = 0.25
@@ -179,6 +187,8 @@ class Collision(Objective):
     Attributes:
         width: Share of the off-track limit.
     """
+
+    title = "How deep the car drives into something solid"
 
     needs_solids: ClassVar[bool] = True
     width: float = 0.5

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 from advnerf_core.plugins import (
     PluginError,
     code_sha256,
-    is_file_reference,
     known_names,
+    name_in_results,
     require_known,
     resolve,
 )
@@ -74,22 +74,17 @@ def require_objective(reference: str, folder: Path | None = None) -> None:
         PluginError: There is no such objective, or its name is that of a built-in one.
     """
     require_known(reference, _WHAT, OBJECTIVES, GROUP, folder)
-    name = objective_name(reference)
+    name = name_in_results(reference)
     if name in OBJECTIVES and reference != name:
         raise PluginError(
             f"{_WHAT} {reference}: expected a name that no built-in objective has, got {name}; rename it"
         )
 
 
-def objective_name(reference: str) -> str:
-    """What an objective is called in results: of ``file.py:Class`` it is ``Class``. Names stay as they are."""
-    return reference.rpartition(":")[2] if is_file_reference(reference) else reference
-
-
 def objective_key(reference: str) -> str | list[str]:
     """What a result depends on: the name of a built-in objective; name and digest of a user's, wherever its file lies."""
     code = code_sha256(reference, OBJECTIVES, GROUP)[:16]
-    return [objective_name(reference), code] if code else reference
+    return [name_in_results(reference), code] if code else reference
 
 
 def name_objective(section: dict[str, Any]) -> None:
@@ -102,7 +97,7 @@ def objective_entry(reference: str, objective: Objective, value: float) -> dict[
     """What an attack file says of its objective: name, unit and value. Nothing for ``cte``, whose value is the predicted total CTE."""
     if reference == CTE:
         return {}
-    return {"objective": {"name": objective_name(reference), "unit": objective.unit, "value": value}}
+    return {"objective": {"name": name_in_results(reference), "unit": objective.unit, "value": value}}
 
 
 def objective_names() -> tuple[str, ...]:

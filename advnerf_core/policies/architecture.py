@@ -25,7 +25,6 @@ from advnerf_core.plugins import (
     absolute_reference,
     code_sha256,
     is_file_reference,
-    known_names,
     options_of,
     require_known,
     resolve,
@@ -255,11 +254,6 @@ def require_architecture(
     require_known(reference, _WHAT, ARCHITECTURES, GROUP, folder)
     if reference in ARCHITECTURES:
         _typed(ARCHITECTURES[reference].Configuration, reference, configuration or {})
-
-
-def architecture_names() -> tuple[str, ...]:
-    """Built-in architectures, then those of installed packages."""
-    return known_names(ARCHITECTURES, GROUP)
 
 
 def short_name(reference: str) -> str:

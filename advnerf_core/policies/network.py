@@ -11,6 +11,10 @@ from torch import Tensor, nn
 
 from advnerf_core.policies.view import IMAGE_HEIGHT, IMAGE_WIDTH
 
+# A few goal inputs beside a thousand features start with so much larger weights, or a policy learns every view before it learns
+# to be told where to go: only the views ahead of a junction need the goal.
+_GOAL_GAIN = 12.0
+
 
 class Policy(Protocol):
     """What a rollout and an attack need of a policy."""
@@ -89,6 +93,27 @@ class SteeringNetwork(nn.Module):
             raise ValueError(f"expected an output [B], got {list(output.shape)}")
         steering: Tensor = self.max_steering_rad * torch.tanh(output)
         return steering
+
+
+class FeaturesAndHead(SteeringNetwork):
+    """An architecture of ``features``, which become one row per image, and a linear ``head`` that the goal joins."""
+
+    features: nn.Module
+    head: nn.Module
+
+    def output(self, images: Tensor, goals: Tensor | None) -> Tensor:
+        """Unbounded output ``[B]`` of images ``[B, 3, 66, 200]`` in 0..1 and goals ``[B, goal_size]``; colours are scaled to [-1, 1]."""
+        features = self.features(images * 2.0 - 1.0)
+        if goals is not None:
+            features = torch.cat([features, goals], dim=1)
+        output: Tensor = self.head(features)[:, 0]
+        return output
+
+    def raise_goal_weights(self, feature_count: int) -> None:
+        """Start with larger weights of the goals, which come after the features in the first layer of ``head``."""
+        if self.goal_size:
+            with torch.no_grad():  # no file and no policy without a goal is touched by this
+                next(self.head.parameters())[:, feature_count:] *= _GOAL_GAIN
 
 
 def images_to_tensor(images: NDArray[np.uint8], dtype: torch.dtype = torch.float32) -> Tensor:

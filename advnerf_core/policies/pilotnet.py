@@ -8,21 +8,17 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-import torch
-from torch import Tensor, nn
+from torch import nn
 
 from advnerf_core.policies.architecture import PilotNetConfiguration
-from advnerf_core.policies.network import SteeringNetwork
+from advnerf_core.policies.network import FeaturesAndHead
 
 # (channels, kernel, stride) of each convolution, Bojarski et al. figure 4.
 CONVOLUTIONS = ((24, 5, 2), (36, 5, 2), (48, 5, 2), (64, 3, 1), (64, 3, 1))
 FLAT_FEATURES = 64 * 1 * 18
-# A few goal inputs beside a thousand features start with so much larger weights, or a policy learns every view before it learns
-# to be told where to go: only the views ahead of a junction need the goal.
-GOAL_GAIN = 12.0
 
 
-class PilotNet(SteeringNetwork):
+class PilotNet(FeaturesAndHead):
     """PilotNet with smooth activations, an optional goal vector and bounded steering.
 
     Every layer is smooth (ELU is continuously differentiable), so finite differences confirm its gradients. It has no
@@ -50,14 +46,4 @@ class PilotNet(SteeringNetwork):
         for fan_in, fan_out in pairwise(widths):
             linear += [nn.Linear(fan_in, fan_out), nn.ELU()]
         self.head = nn.Sequential(*linear, nn.Linear(widths[-1], 1))
-        if goal_size:
-            with torch.no_grad():  # no file and no policy without a goal is touched by this
-                next(self.head.parameters())[:, FLAT_FEATURES:] *= GOAL_GAIN
-
-    def output(self, images: Tensor, goals: Tensor | None) -> Tensor:
-        """Unbounded output ``[B]`` of images ``[B, 3, 66, 200]`` in 0..1 and goals ``[B, goal_size]``."""
-        features = self.features(images * 2.0 - 1.0)
-        if goals is not None:
-            features = torch.cat([features, goals], dim=1)
-        output: Tensor = self.head(features)[:, 0]
-        return output
+        self.raise_goal_weights(FLAT_FEATURES)

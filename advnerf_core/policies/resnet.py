@@ -10,19 +10,16 @@ from __future__ import annotations
 from itertools import pairwise
 from math import gcd
 
-import torch
 from torch import Tensor, nn
 
 from advnerf_core.policies.architecture import ResNetConfiguration
-from advnerf_core.policies.network import SteeringNetwork
+from advnerf_core.policies.network import FeaturesAndHead
 from advnerf_core.policies.view import IMAGE_HEIGHT, IMAGE_WIDTH
 
 _GROUPS = 8
-# As for PilotNet: a few goal inputs beside thousands of features need larger weights at the start.
-_GOAL_GAIN = 12.0
 
 
-class ResNet(SteeringNetwork):
+class ResNet(FeaturesAndHead):
     """A convolution, residual stages that each halve the image, and two linear layers.
 
     The features are flattened and not averaged over the image, because steering depends on where the track is seen. The goal joins them.
@@ -50,17 +47,7 @@ class ResNet(SteeringNetwork):
         self.head = nn.Sequential(
             nn.Linear(flat + goal_size, settings.hidden), nn.SiLU(), nn.Linear(settings.hidden, 1)
         )
-        if goal_size:
-            with torch.no_grad():
-                next(self.head.parameters())[:, flat:] *= _GOAL_GAIN
-
-    def output(self, images: Tensor, goals: Tensor | None) -> Tensor:
-        """Unbounded output ``[B]`` of images ``[B, 3, 66, 200]`` in 0..1 and goals ``[B, goal_size]``."""
-        features = self.features(images * 2.0 - 1.0)
-        if goals is not None:
-            features = torch.cat([features, goals], dim=1)
-        output: Tensor = self.head(features)[:, 0]
-        return output
+        self.raise_goal_weights(flat)
 
 
 class _Block(nn.Module):

@@ -481,7 +481,7 @@ def publish(
     """Copy the finished cells, and the scenes, victims and objects that they were run with, to where they are kept with the code."""
     from advnerf_core.report.evidence import registration
     from advnerf_core.report.evidence.above import write_above_of
-    from advnerf_core.report.evidence.publishing import write_page, write_set
+    from advnerf_core.report.evidence.publishing import write_numbers, write_page
     from advnerf_core.report.evidence.verifying import victims
     from advnerf_core.report.evidence.verifying.digests import write_beside
     from nodes.experiment.run.plan import statuses
@@ -514,12 +514,13 @@ def publish(
     if build:  # before the page, which says whether the set can be driven again
         _say_build(publish_build(campaign, cells, to, prune))
     if registered:
-        print(write_set(to / campaign.name))
+        print(write_numbers(to / campaign.name))
         if (film := write_film(campaign, to / campaign.name)) is not None:
             print(film)
             print(write_above_of(to / campaign.name))  # with frames of the film
         print(write_page(to))
-    write_beside(to)
+    else:
+        write_beside(to)
     unfinished = len(cells) - len(found.written) - len(found.same)
     print(f"{len(found.written)} cells written, {len(found.same)} were there, {unfinished} are not finished")
     if found.stale:

@@ -72,15 +72,13 @@ def _cameras() -> Mapping[str, str]:
 def _objectives() -> Mapping[str, str]:
     from advnerf_core.attack.objectives import OBJECTIVES, load_objective
 
-    # Their documentation begins with their name.
-    said = {name: one_line(type(load_objective(name))).partition(": ")[2] for name in OBJECTIVES}
-    return {name: text[:1].upper() + text[1:] for name, text in said.items()}
+    return {name: one_line(load_objective(name)) for name in OBJECTIVES}
 
 
 def _architectures() -> Mapping[str, str]:
     from advnerf_core.policies.architecture import ARCHITECTURES
 
-    return {name: one_line(row.load()) for name, row in ARCHITECTURES.items()}
+    return {name: row.title for name, row in ARCHITECTURES.items()}
 
 
 def _policies() -> Mapping[str, str]:

@@ -203,16 +203,28 @@ def read_withdrawn(folder: FilePath) -> dict[str, str]:
     Raises:
         RegistrationError: The file does not say so.
     """
-    file = folder / WITHDRAWN
+    return read_reasons(folder / WITHDRAWN, "withdrawn scenarios")
+
+
+def read_reasons(file: FilePath, what: str) -> dict[str, str]:
+    """Things of a set, each with a reason; empty without the file.
+
+    Args:
+        file: In the folder of a set.
+        what: They are, for messages: ``withdrawn scenarios``.
+
+    Raises:
+        RegistrationError: The file does not say so.
+    """
     if not file.exists():
         return {}
     try:
         found = read_json(file)
-        if not all(isinstance(each, str) and each for pair in found.items() for each in pair):
-            raise ValueError("expected a reason for each scenario")
+        if not all(isinstance(each, str) and each.strip() for pair in found.items() for each in pair):
+            raise ValueError("expected a reason for each")
     except (OSError, ValueError, AttributeError) as error:
         raise RegistrationError(
-            f"{file}: expected withdrawn scenarios with their reasons: {error}; restore it from git"
+            f"{file}: expected {what} with their reasons: {error}; restore it from git"
         ) from None
     return dict(found)
 

@@ -13,11 +13,12 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from advnerf_core.attack.methods import METHODS, alternatives, method_name
+from advnerf_core.attack.methods import METHODS, alternatives
 from advnerf_core.attack.objectives import CTE
 from advnerf_core.documents import Document, dump_yaml, parse_yaml, read_yaml
 from advnerf_core.geometry import Array, make_transform, rotation_z
 from advnerf_core.places import expanded
+from advnerf_core.plugins import name_in_results
 from advnerf_core.policies.load import is_factory
 from advnerf_core.strict import StrictModel, validate
 from nodes.experiment.node.mesh_request import MeshRequest, ShapeRequest
@@ -199,7 +200,7 @@ class SearchRequest(StrictModel):
     @property
     def method_name(self) -> str:
         """What the method is called in tables and attack files."""
-        return method_name(self.method)
+        return name_in_results(self.method)
 
 
 class AttackRequest(StrictModel):

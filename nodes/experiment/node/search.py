@@ -16,12 +16,13 @@ from advnerf_core.attack.methods import (
     black_box_methods,
     load_method,
 )
-from advnerf_core.attack.objectives import load_objective, objective_name
+from advnerf_core.attack.objectives import load_objective
 from advnerf_core.attack.on_device import all_on_chosen_device, on_chosen_device
 from advnerf_core.attack.search.search import Evaluation, OnEvaluation, SearchResult
 from advnerf_core.attack.search.together import gradient_attacks
 from advnerf_core.files import write_atomically
 from advnerf_core.places import require_utf8
+from advnerf_core.plugins import name_in_results
 from nodes.experiment.engine.telling import telling
 from nodes.experiment.node.job import REQUEST, TOGETHER_STATE, is_begun
 from nodes.experiment.node.prepare import Prepared, prepare
@@ -43,7 +44,7 @@ def chosen_method(request: AttackRequest) -> tuple[Method, SearchSettings]:
     if load_objective(wanted.objective).needs_solids:
         raise ConfigError(
             f"search.objective: expected an objective that needs no solids, as a room calibration does not say what the car can hit, got "
-            f"{objective_name(wanted.objective)}; search for it in an experiment, whose world does"
+            f"{name_in_results(wanted.objective)}; search for it in an experiment, whose world does"
         )
     if request.shape is not None and not method.reads_scale:
         raise ConfigError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-from advnerf_core.attack.methods import method_name
+from advnerf_core.plugins import name_in_results
 from advnerf_core.report.cells import cell_name
 from advnerf_core.report.conditions import CONTROLS, NONE
 from nodes.runtime.errors import ConfigError
@@ -37,7 +37,7 @@ class Cell:
     @classmethod
     def of(cls, scenario: str, victim: str, method: str, seed: int, placement: str = "") -> Cell:
         """The cell of a method as `load_method` takes it, or of a control."""
-        name = method_name(method)
+        name = name_in_results(method)
         return cls(scenario, victim, name, seed, placement, "" if method == name else method)
 
     @property

@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from advnerf_core.attack.methods import method_name
 from advnerf_core.attack.objectives import CTE
+from advnerf_core.plugins import name_in_results
 from advnerf_core.policies.architecture import PILOTNET, Architecture, require_architecture
 from advnerf_core.scene.gate_limits import GateLimits
 from advnerf_core.strict import StrictModel
@@ -289,7 +289,7 @@ class AttackConfig(StrictModel):
     @property
     def method_names(self) -> tuple[str, ...]:
         """What the methods are called in tables and file names."""
-        return tuple(map(method_name, self.methods))
+        return tuple(map(name_in_results, self.methods))
 
     @model_validator(mode="after")
     def _told_apart(self) -> AttackConfig:

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, StringConstraints, model_validator
 
-from advnerf_core.attack.methods import method_name
 from advnerf_core.documents import read_yaml
 from advnerf_core.places import require_utf8
+from advnerf_core.plugins import name_in_results
 from advnerf_core.report.conditions import CONTROLS, NONE, order_of
 from advnerf_core.report.evidence.registration import Contrast
 from advnerf_core.report.reference import Reference
@@ -51,7 +51,7 @@ class _NothingTwice(StrictModel):
         for name in ("seeds", "victims", "methods"):
             values = getattr(self, name) or ()
             # Two files may have methods of one name.
-            names = [method_name(value) for value in values] if name == "methods" else values
+            names = [name_in_results(value) for value in values] if name == "methods" else values
             if len(set(names)) != len(names):
                 raise ValueError(f"expected every one of {name} once, got {list(values)}")
         return self
@@ -256,4 +256,4 @@ def _cells(config: CampaignConfig) -> Iterator[Cell]:
 
 
 def _order(method: str) -> tuple[int, str]:
-    return order_of(method_name(method))
+    return order_of(name_in_results(method))

@@ -10,8 +10,8 @@ from typing import Any
 
 from rich.console import Console
 
-from advnerf_core.attack.methods import method_name
 from advnerf_core.files import sha256_of
+from advnerf_core.plugins import name_in_results
 from nodes.experiment.engine.progress_record import ProgressRecord
 from nodes.experiment.engine.run_folder import require_own_folder
 from nodes.experiment.engine.stage_record import Stage
@@ -150,7 +150,7 @@ def _write_report(
 def _of_methods(experiment: Experiment, names: Sequence[str]) -> Experiment:
     """The same experiment with some of its methods."""
     attack = experiment.config.attack
-    kept = tuple(each for each in attack.methods if method_name(each) in names)
+    kept = tuple(each for each in attack.methods if name_in_results(each) in names)
     if kept == attack.methods:
         return experiment
     fewer = attack.model_copy(update={"methods": kept})

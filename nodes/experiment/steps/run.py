@@ -10,11 +10,11 @@ from typing import Any
 
 from rich.console import Console
 
-from advnerf_core.attack.methods import method_digest, method_name
+from advnerf_core.attack.methods import method_digest
 from advnerf_core.attack.objectives import name_objective
 from advnerf_core.documents import Document
 from advnerf_core.places import require_utf8
-from advnerf_core.plugins import unknown
+from advnerf_core.plugins import name_in_results, unknown
 from advnerf_core.strict import validate
 from nodes.experiment.engine.reference import REFERENCE
 from nodes.experiment.engine.run_folder import run_to_end
@@ -199,7 +199,9 @@ def stages_of(experiment: Experiment) -> list[Stage]:
     # Of users' methods the code counts, not where it is.
     searched = {**part("attack"), "methods": config.attack.method_names}
     name_objective(searched)
-    if codes := {method_name(each): code for each in config.attack.methods if (code := method_digest(each))}:
+    if codes := {
+        name_in_results(each): code for each in config.attack.methods if (code := method_digest(each))
+    }:
         searched["code"] = codes
     view, space = part("view"), part("space")
     # What a screen shows while a scene is photographed, and what policies meet, is part of what is learned.

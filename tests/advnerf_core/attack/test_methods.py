@@ -20,7 +20,6 @@ from advnerf_core.attack.methods import (
     black_box_methods,
     load_method,
     method_digest,
-    method_name,
     method_names,
     require_method,
 )
@@ -38,7 +37,7 @@ from advnerf_core.fields.colour_grid import colour_grid
 from advnerf_core.objects.mesh.field import MeshField
 from advnerf_core.objects.mesh.shape import ShapeLimits, ShapeSensor
 from advnerf_core.objects.mesh.surface import sphere, unwrapped
-from advnerf_core.plugins import PluginError
+from advnerf_core.plugins import PluginError, name_in_results
 from advnerf_core.report.conditions import order_of
 from advnerf_core.scene.surrogate import Surrogate
 from benchmarks.attack_toy import MOUNT, VIEW, painted_room, toy_problem
@@ -206,8 +205,8 @@ def test_a_method_of_an_installed_package_is_known_by_its_name(tmp_path, monkeyp
 
 def test_names_are_fit_for_files_and_tables(tmp_path, monkeypatch):
     file = write_spiral(tmp_path)
-    assert method_name(f"{file}:Spiral") == "Spiral"
-    assert method_name("cem") == "cem"
+    assert name_in_results(f"{file}:Spiral") == "Spiral"
+    assert name_in_results("cem") == "cem"
     file.write_text(spiral_code() + "\ngradient = empty = Spiral\n")
     for taken in ("gradient", "empty"):
         with pytest.raises(PluginError, match=f"expected a name that no other condition has, got {taken}"):

@@ -22,19 +22,13 @@ from advnerf_core.attack.objective import (
     losses_of,
     values_of,
 )
-from advnerf_core.attack.objectives import (
-    OBJECTIVES,
-    load_objective,
-    objective_key,
-    objective_name,
-    objective_names,
-)
+from advnerf_core.attack.objectives import OBJECTIVES, load_objective, objective_key, objective_names
 from advnerf_core.attack.search.search import SearchStateError
 from advnerf_core.driving.dynamics import Dubins
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.driving.path import Line, Path
 from advnerf_core.driving.solids import Rectangle, Solids
-from advnerf_core.plugins import PluginError
+from advnerf_core.plugins import PluginError, name_in_results
 from benchmarks.adjoint_gradient import backpropagated_gradient, finite_difference, relative_error
 from benchmarks.attack_toy import toy_problem
 
@@ -197,7 +191,7 @@ def test_a_key_follows_the_code_and_not_the_folder(tmp_path):
         file.write_text(LEFT)
     keys = [objective_key(f"{file}:Left") for file in files]
     assert keys[0] == keys[1] == ["Left", keys[0][1]]
-    assert objective_name(f"{files[0]}:Left") == "Left"
+    assert name_in_results(f"{files[0]}:Left") == "Left"
     files[1].write_text(LEFT.replace("min=0.0", "min=0.1"))
     assert objective_key(f"{files[1]}:Left") != keys[0]
     assert objective_key("peak") == "peak"

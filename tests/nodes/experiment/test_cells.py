@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from advnerf_core.attack.methods import METHODS, load_method, method_name
+from advnerf_core.attack.methods import METHODS, load_method
+from advnerf_core.plugins import name_in_results
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import ExperimentCells
 from nodes.experiment.steps.attack import search_settings
@@ -63,5 +64,5 @@ def test_a_method_that_a_user_brings_names_its_cells(tmp_path):
     write_spiral(tmp_path)
     reference = f"{tmp_path / 'spiral.py'}:Spiral"
     cell = Cell.of("track", "hardened", reference, 1)
-    assert cell.name == f"track_hardened_{method_name(reference)}_1"
+    assert cell.name == f"track_hardened_{name_in_results(reference)}_1"
     assert load_method(cell.reference) is load_method(reference)

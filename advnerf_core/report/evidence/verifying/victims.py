@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.report.conditions import NONE
-from advnerf_core.report.evidence.registration import RegistrationError, scenario_key
+from advnerf_core.report.evidence.registration import RegistrationError, read_reasons, scenario_key
 from advnerf_core.report.evidence.results import DOMAINS, Evidence
 
 # In the folder of a set: victims that fail the rule, each with what its authors say about it.
@@ -53,18 +52,7 @@ def read_declared(folder: Path) -> dict[str, str]:
     Raises:
         RegistrationError: The file does not say so.
     """
-    file = folder / DECLARED
-    if not file.exists():
-        return {}
-    try:
-        found = read_json(file)
-        if not all(isinstance(each, str) and each.strip() for pair in found.items() for each in pair):
-            raise ValueError("expected a reason for each victim")
-    except (OSError, ValueError, AttributeError) as error:
-        raise RegistrationError(
-            f"{file}: expected victims with reasons: {error}; restore it from git"
-        ) from None
-    return dict(found)
+    return read_reasons(folder / DECLARED, "victims")
 
 
 def declare(folder: Path, victims: Mapping[str, str]) -> None:
