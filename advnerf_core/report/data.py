@@ -20,11 +20,9 @@ from advnerf_core.report.record import Floats, Image, Record
 from advnerf_core.report.reference import LiveLimit
 
 Domain = Literal["surrogate", "deployed"]
-Victim = Literal["hardened", "naive"]
 
 __all__ = [
     "DOMAINS",
-    "VICTIMS",
     "Clip",
     "Domain",
     "Fidelity",
@@ -42,25 +40,10 @@ __all__ = [
     "Settings",
     "StageTiming",
     "Texture",
-    "Victim",
     "face_segment",
-    "victim_named",
 ]
 
 DOMAINS: tuple[Domain, ...] = get_args(Domain)
-VICTIMS: tuple[Victim, ...] = get_args(Victim)
-
-
-def victim_named(name: str) -> Victim:
-    """A victim's name as it is typed here.
-
-    Raises:
-        ValueError: There is no such victim.
-    """
-    found = next((victim for victim in VICTIMS if victim == name), None)
-    if found is None:
-        raise ValueError(f"expected one of the victims {', '.join(VICTIMS)}, got {name!r}")
-    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +90,7 @@ class Run(Record):
         domain: Where it was driven: in the learned scene or by the live node graph.
         condition: What the object shows: "none" plain colours, the name of a method what it found, "empty" no object at all;
             see `conditions`.
-        victim: "hardened" has seen random textures in training, "naive" has not.
+        victim: Name of the policy: "hardened" has seen random textures in training, "naive" has not, others are a user's.
         seed: Seed of the attack; 0 where nothing is random.
         start: Index into `Settings.start_poses`.
         states: Pose of the rear axle at the control ticks, ``[T + 1, 3]``: x [m], y [m], yaw [rad], world.
@@ -123,7 +106,7 @@ class Run(Record):
 
     domain: Domain
     condition: str
-    victim: Victim
+    victim: str
     seed: int
     start: int
     states: Floats
@@ -140,7 +123,7 @@ class Run(Record):
         super().__post_init__()
         self.check_choice("domain", DOMAINS)
         self.check_named("condition")
-        self.check_choice("victim", VICTIMS)
+        self.check_named("victim")
         self.set_floats("cte_m", None)
         self.set_floats("states", len(self.cte_m), 3)
 
@@ -193,12 +176,12 @@ class LossCurve(Record):
     method: str
     seed: int
     total_cte_m: Floats
-    victim: Victim = "hardened"
+    victim: str = "hardened"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.check_named("method")
-        self.check_choice("victim", VICTIMS)
+        self.check_named("victim")
         self.set_floats("total_cte_m", None)
 
 
@@ -211,12 +194,12 @@ class Texture(Record):
     image: Image | None
     attack_id: str = ""
     seed: int = 0
-    victim: Victim = "hardened"
+    victim: str = "hardened"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.check_named("condition")
-        self.check_choice("victim", VICTIMS)
+        self.check_named("victim")
         self.check_image("image")
 
 
@@ -268,7 +251,7 @@ class LiveTries(Record):
     """
 
     condition: str
-    victim: Victim
+    victim: str
     seed: int
     driven: bool
     spoiled: tuple[str, ...] = ()
@@ -276,7 +259,7 @@ class LiveTries(Record):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.check_named("condition")
-        self.check_choice("victim", VICTIMS)
+        self.check_named("victim")
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,6 +314,11 @@ class ReportData(Record):
             raise ValueError(
                 f"expected ReportData.not_measured keys among {', '.join(sorted(known))}, got {unknown}"
             )
+
+    @property
+    def victims(self) -> tuple[str, ...]:
+        """Names of the policies that were driven, in the order of their first runs."""
+        return tuple(dict.fromkeys(run.victim for run in self.runs))
 
     def select(self, where: Callable[[Run], bool] | None = None, **equal: object) -> tuple[Run, ...]:
         """Runs whose fields equal the given values, such as ``domain="deployed"``, and for which ``where`` holds."""

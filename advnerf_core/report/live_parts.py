@@ -15,7 +15,7 @@ from markupsafe import Markup
 from advnerf_core.report import maps, plots, tables
 from advnerf_core.report.clips import Frames, data_uri, film_strip, image_uri
 from advnerf_core.report.conditions import style_of
-from advnerf_core.report.data import ReportData, Victim
+from advnerf_core.report.data import ReportData
 from advnerf_core.report.summary import key_figures, opening
 from advnerf_core.report.targets import evaluate_targets, targets_table
 
@@ -95,10 +95,8 @@ def _fragments(data: ReportData) -> Any:
 def _figures(data: ReportData) -> dict[str, Any]:
     """Inline SVG of all figures whose data there is, by name."""
     figures: dict[str, Any] = {"victims": []}
-    victims: tuple[Victim, ...] = ("hardened", "naive")
-    for victim in victims:
-        if data.select(victim=victim):
-            figures["victims"].append((victim, _run_figures(data, victim)))
+    for victim in data.victims:
+        figures["victims"].append((victim, _run_figures(data, victim)))
     if data.laps is not None:
         s = data.settings
         figures["laps_map"] = _svg(
@@ -120,7 +118,7 @@ def _figures(data: ReportData) -> dict[str, Any]:
     return figures
 
 
-def _run_figures(data: ReportData, victim: Victim) -> dict[str, Markup]:
+def _run_figures(data: ReportData, victim: str) -> dict[str, Markup]:
     out = {
         "room": _svg(
             maps.trajectory_map(data, victim=victim),

@@ -11,7 +11,7 @@ from matplotlib.patches import PathPatch, Polygon, Rectangle
 from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 
-from advnerf_core.report.data import Laps, ReportData, Run, Scene, Victim
+from advnerf_core.report.data import Laps, ReportData, Run, Scene
 from advnerf_core.report.palette import LIGHT
 from advnerf_core.report.plots import add_run_legend, end_style, new_axes, run_style
 
@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 _MARGIN_M = 0.15  # white around what a map shows
 
 
-def trajectory_map(data: ReportData, zoom: bool = False, victim: Victim = "hardened") -> Figure:
+def trajectory_map(data: ReportData, zoom: bool = False, victim: str = "hardened") -> Figure:
     """All drives of one victim from above: the whole room, or only where the car went."""
     runs = data.select(victim=victim)
     box = _driven_box(data.scene, runs) if zoom else np.reshape(data.scene.room_m, (2, 2))

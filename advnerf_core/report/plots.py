@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from advnerf_core.report.conditions import EMPTY, NONE, order_of, style_of
-from advnerf_core.report.data import Domain, Fidelity, Laps, Latency, MemoryRow, ReportData, Run, Victim
+from advnerf_core.report.data import Domain, Fidelity, Laps, Latency, MemoryRow, ReportData, Run
 from advnerf_core.report.palette import LIGHT, LINE_STYLES, themed_svg
 
 STYLE: dict[str, Any] = {
@@ -61,7 +61,7 @@ def new_axes(width_in: float = 6.0, height_in: float = 3.4) -> Iterator[Any]:
         yield Figure(figsize=(width_in, height_in), layout="constrained").add_subplot()
 
 
-def cte_over_time(data: ReportData, domain: Domain, victim: Victim = "hardened") -> Figure:
+def cte_over_time(data: ReportData, domain: Domain, victim: str = "hardened") -> Figure:
     """Signed cross-track error of all drives in one domain; the axis is shared by both domains."""
     period = data.settings.control_period_s
     everything = [abs(r.cte_m).max() for r in data.select(victim=victim)]
@@ -90,7 +90,7 @@ def cte_over_time(data: ReportData, domain: Domain, victim: Victim = "hardened")
     return ax.figure
 
 
-def loss_curves(data: ReportData, victim: Victim = "hardened") -> Figure:
+def loss_curves(data: ReportData, victim: str = "hardened") -> Figure:
     """Total CTE per evaluation of the searches; the no-attack level of the surrogate as reference."""
     curves = [c for c in data.curves if c.victim == victim]
     clean = [r.total_cte_m for r in data.select(domain="surrogate", condition=NONE, victim=victim)]

@@ -15,7 +15,7 @@ from markupsafe import Markup
 from rich.text import Text
 
 from advnerf_core.report.conditions import NONE, order_of, style_of
-from advnerf_core.report.data import DOMAINS, VICTIMS, Domain, ReportData, Run, Victim
+from advnerf_core.report.data import DOMAINS, Domain, ReportData, Run
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class TransferRow:
         time_to_leave_s: Mean time to leaving, of those that left [s].
     """
 
-    victim: Victim
+    victim: str
     domain: Domain
     condition: str
     runs: int
@@ -56,7 +56,7 @@ class TransferRow:
 def transfer_rows(data: ReportData) -> tuple[TransferRow, ...]:
     """Rows of the transfer table in reading order; cells without a drive are left out."""
     rows = []
-    for victim in VICTIMS:
+    for victim in data.victims:
         for domain in DOMAINS:
             clean = data.select(victim=victim, domain=domain, condition=NONE)
             met = {run.condition for run in data.select(victim=victim, domain=domain)}
@@ -68,7 +68,7 @@ def transfer_rows(data: ReportData) -> tuple[TransferRow, ...]:
 
 
 def find_row(
-    rows: Sequence[TransferRow], domain: Domain, condition: str, victim: Victim = "hardened"
+    rows: Sequence[TransferRow], domain: Domain, condition: str, victim: str = "hardened"
 ) -> TransferRow | None:
     """The row of one cell; None if nothing was driven there."""
     return next((r for r in rows if (r.domain, r.condition, r.victim) == (domain, condition, victim)), None)

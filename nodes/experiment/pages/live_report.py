@@ -107,9 +107,7 @@ def _report_data(
 def _live_tries(experiment: Experiment, cell: Cell) -> rd.LiveTries:
     result = read_cell(experiment.cell_result(cell))
     spoiled = tuple(reason for each in result.extra.get("spoiled_tries", ()) for reason in each)
-    return rd.LiveTries(
-        cell.method, rd.victim_named(cell.victim), cell.seed, not result.not_driven_live, spoiled
-    )
+    return rd.LiveTries(cell.method, cell.victim, cell.seed, not result.not_driven_live, spoiled)
 
 
 def _not_measured(
@@ -174,7 +172,7 @@ def _surrogate_runs(experiment: Experiment) -> Iterator[rd.Run]:
             yield rd.Run(
                 "surrogate",
                 cell.method,
-                rd.victim_named(cell.victim),
+                cell.victim,
                 cell.seed,
                 start,
                 np.array(states)[:, :3],
@@ -219,7 +217,7 @@ def _deployed_runs(
         yield rd.Run(
             "deployed",
             condition,
-            rd.victim_named(result["victim"]),
+            result["victim"],
             seed,
             start,
             np.array(result["states"]),
@@ -238,7 +236,7 @@ def _deployed_runs(
 def _curves(experiment: Experiment) -> Iterator[rd.LossCurve]:
     for cell in _attacked(experiment):
         curve = np.array(_searched(experiment, cell)["curve_total_cte_m"])
-        yield rd.LossCurve(cell.method, cell.seed, curve, rd.victim_named(cell.victim))
+        yield rd.LossCurve(cell.method, cell.seed, curve, cell.victim)
 
 
 def _textures(experiment: Experiment) -> Iterator[rd.Texture]:
@@ -251,7 +249,7 @@ def _textures(experiment: Experiment) -> Iterator[rd.Texture]:
             attack.required_face().texture,
             attack.attack_id,
             cell.seed,
-            rd.victim_named(cell.victim),
+            cell.victim,
         )
 
 
