@@ -15,14 +15,14 @@ from torch import Tensor
 from advnerf_core.attack.adjoint import AttackProblem, adjoint_gradient
 from advnerf_core.driving.rollout import Rollout
 from advnerf_core.fields.voxel_grid import VoxelGridObject
-from advnerf_core.scene.surrogate import Frames, Surrogate
+from advnerf_core.scene.surrogate import PoseBatch, Surrogate
 from benchmarks.attack_toy import toy_problem
 from benchmarks.results import record_row
 
 COMMAND = "python -m benchmarks.adjoint_gradient"
 
 
-def frozen_frames(problem: AttackProblem, rollout: Rollout) -> list[Frames]:
+def frozen_frames(problem: AttackProblem, rollout: Rollout) -> list[PoseBatch]:
     """What the camera meets at the nominal poses, before any colour is put on the objects, for each step."""
     sensor = problem.sensor
     assert isinstance(sensor, Surrogate)
@@ -46,7 +46,7 @@ def backpropagated_gradient(problem: AttackProblem, theta: Tensor, rollout: Roll
     return float(loss.detach()), gradient
 
 
-def _differentiable_images(frames: Frames, theta: Tensor) -> Tensor:
+def _differentiable_images(frames: PoseBatch, theta: Tensor) -> Tensor:
     (seen,), (W,), (pixels,) = frames.seen, frames.weights, frames.pixels
     assert isinstance(seen.field, VoxelGridObject)
     colours = seen.field.colours(theta)[torch.from_numpy(seen.rows)]
@@ -55,7 +55,7 @@ def _differentiable_images(frames: Frames, theta: Tensor) -> Tensor:
     return flat.reshape(frames.background.shape).permute(0, 3, 1, 2)
 
 
-def frozen_loss(problem: AttackProblem, theta: Tensor, frames: list[Frames]) -> float:
+def frozen_loss(problem: AttackProblem, theta: Tensor, frames: list[PoseBatch]) -> float:
     """Loss of the rollout for ``theta`` with the images taken at the nominal poses."""
     with torch.no_grad():
         states = [problem.start_states]

@@ -24,7 +24,7 @@ from calibration.charuco import Board, BoardDetector
 from calibration.measured import LensCalibration
 from calibration.schema import CameraCalibration
 from calibration.time_offset import fit_offset, image_turns
-from calibration.vehicle import Drive, fit_gains
+from calibration.vehicle import RecordedDrive, fit_gains
 from calibration.vehicle_response import fit_response
 from hardware.worlds.lab.config import CarConfig, LabConfig, MonitorOpticsConfig
 from hardware.worlds.lab.lab import Lab
@@ -110,7 +110,7 @@ def measure_camera_to_car(lab: Lab, seed: int) -> tuple[float, float, int]:
     return math.degrees(turn), distance, len(views)
 
 
-def recorded_drive(seed: int) -> Drive:
+def recorded_drive(seed: int) -> RecordedDrive:
     """Circles, straight runs and steps of the twin's car; commands at 20 Hz, poses at 100 Hz with noise."""
     rng, car = np.random.default_rng(seed), CarConfig()
     rows = [(2.5, angle, speed) for speed in (0.6, 1.0) for angle in (0.0, 0.25, -0.22, 0.12, -0.12)]
@@ -138,7 +138,7 @@ def recorded_drive(seed: int) -> Drive:
     seen = np.array(poses)
     seen[:, 2] = np.unwrap(seen[:, 2])
     seen += rng.normal(0.0, [MOCAP_M, MOCAP_M, MOCAP_RAD], seen.shape)
-    return Drive(pose_s, seen, command_s, servo, erpm, np.full(len(servo), np.nan))
+    return RecordedDrive(pose_s, seen, command_s, servo, erpm, np.full(len(servo), np.nan))
 
 
 def measure_vehicle(seed: int) -> tuple[float, float, float, float, float]:

@@ -23,7 +23,7 @@ from advnerf_core.geometry import Pinhole
 from benchmarks.painted_corner import poses_of, some_camera, write_photographs
 from benchmarks.results import record_row
 from benchmarks.structure_from_motion import say
-from calibration.structure_from_motion import ReconstructionError, SfmConfig, Source, reconstruct
+from calibration.structure_from_motion import PhotoSource, ReconstructionError, SfmConfig, reconstruct
 
 COMMAND = "python -m benchmarks.few_photographs"
 TEN_PERCENT, ELEVEN_PERCENT = 5.0, 1.0
@@ -61,7 +61,7 @@ def find(folder: Path, focal_px: dict[str, float]) -> Found:
     try:
         model = reconstruct(
             folder,
-            [Source("photos", tuple(focal_px))],
+            [PhotoSource("photos", tuple(focal_px))],
             folder / "work",
             SfmConfig(min_registered_share=0.3),
             say,

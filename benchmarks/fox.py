@@ -20,7 +20,7 @@ from advnerf_core.scene.field import SceneFieldConfig
 from advnerf_core.scene.metrics import psnr
 from advnerf_core.scene.presets import PHOTOGRAPH_BANDS, PRESETS, scene_preset
 from advnerf_core.scene.render_field import FieldRenderer
-from advnerf_core.scene.train import Progress, TrainConfig, TrainedScene, train_scene
+from advnerf_core.scene.train import TrainConfig, TrainedScene, TrainingReport, train_scene
 from advnerf_core.scene.train_config import DECAYS
 from benchmarks.results import record_row
 from benchmarks.timing import ProcessorUse
@@ -108,7 +108,7 @@ def main() -> None:
             record_row(line, mean_db, "dB", f">= {target_db:g} dB", mean_db >= target_db, command, note)
 
 
-def report(at: Progress) -> None:
+def report(at: TrainingReport) -> None:
     if at.step % 250 == 0:
         print(
             f"step {at.step}: {at.psnr_db:.2f} dB on training rays, {at.rays} rays, {at.eta_s:.0f} s left",

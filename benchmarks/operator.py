@@ -12,7 +12,7 @@ from hardware.emulators.vesc_firmware import WireEvent
 from nodes.runtime.arm_requests import arm_message
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import SystemClock
-from nodes.runtime.requests import Asked
+from nodes.runtime.requests import RequestIdentity
 
 _UP = ("ready", "active")
 MOTOR_EVENTS = ("SET_RPM", "SET_CURRENT_BRAKE", "SET_CURRENT", "TIMEOUT")
@@ -92,7 +92,7 @@ class LiveOperator:
     def say_arm(self, arm: bool = True, source: str = "trial") -> None:
         """Ask for arming or disarming, once."""
         now = SystemClock().now()
-        self.bus.publish("/arm", arm_message(Asked.at(now), now, arm, source, "test"))
+        self.bus.publish("/arm", arm_message(RequestIdentity.at(now), now, arm, source, "test"))
 
     def wait_ready(self, timeout_s: float = 300.0) -> None:
         """Wait for all nodes."""

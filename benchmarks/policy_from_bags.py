@@ -26,7 +26,7 @@ from benchmarks.results import record_row
 from calibration.schema import CameraCalibration, RoomCalibration, load_calibration
 from nodes.bags.reader import read_info
 from nodes.lab.policy_data.frames import frames_of_bag
-from nodes.lab.policy_data.train import Part, Training, train_from_recordings
+from nodes.lab.policy_data.train import Training, TrainingRecording, train_from_recordings
 from nodes.lab.trials.evaluation import score, trajectory
 from nodes.lab.trials.trial import TrialOutcome, TrialPlan
 from nodes.lab.trials.trial_runner import run_trial
@@ -64,7 +64,8 @@ def train(bags: list[Path], out: Path, steps: int) -> Training:
     view = PolicyView(camera.pinhole, distortion=camera.distortion)
     expert = Expert(room.reference_path, ExpertConfig(speed_mps=_SPEED_MPS))
     parts = [
-        Part(str(bag), read_info(bag).parts, {}, partial(frames_of_bag, bag, view, expert)) for bag in bags
+        TrainingRecording(str(bag), read_info(bag).parts, {}, partial(frames_of_bag, bag, view, expert))
+        for bag in bags
     ]
     return train_from_recordings(parts, view, expert, ImitationConfig(first_steps=steps), out, progress=_say)
 

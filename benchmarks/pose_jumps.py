@@ -32,7 +32,7 @@ from nodes.runtime.arm_requests import OPERATOR, arm_message
 from nodes.runtime.clock import NS_PER_S, Now
 from nodes.runtime.messages import drive_message, header, types
 from nodes.runtime.node import MessageInfo, Out
-from nodes.runtime.requests import Asked
+from nodes.runtime.requests import RequestIdentity
 from nodes.safety import SafetyConfig, SafetyNode
 from nodes.vicon import ViconNode, ViconNodeConfig
 
@@ -97,7 +97,7 @@ class SimulatedDrive:
             self.step(moving=False)
             if self.step_index > 20:
                 now = self._now(self._mono_ns)
-                self._say("/arm", arm_message(Asked.at(now), now, True, OPERATOR, "benchmark"), now)
+                self._say("/arm", arm_message(RequestIdentity.at(now), now, True, OPERATOR, "benchmark"), now)
             if self.armed:
                 return
         raise RuntimeError(f"expected the safety node to be armed within 20 s, it says: {self.reason}")

@@ -31,7 +31,7 @@ from advnerf_core.scene.field import SceneFieldConfig
 from advnerf_core.scene.intervals import pixel_intervals
 from advnerf_core.scene.metrics import psnr
 from advnerf_core.scene.render_field import FieldRenderer
-from advnerf_core.scene.train import Progress, TrainConfig, train_scene
+from advnerf_core.scene.train import TrainConfig, TrainingReport, train_scene
 from benchmarks.results import record_row
 from benchmarks.timing import seconds_in_turns
 from benchmarks.training_step import photograph_lab
@@ -210,8 +210,8 @@ def _of_focal(images: ImageSet, focal_px: float) -> ImageSet:
     return ImageSet(small, (lens.resized(*size),) * len(small), images.T_world_from_camera)
 
 
-def _report(name: str) -> Callable[[Progress], None]:
-    def told(at: Progress) -> None:
+def _report(name: str) -> Callable[[TrainingReport], None]:
+    def told(at: TrainingReport) -> None:
         if at.step % 250 == 0:
             print(
                 f"{name}, step {at.step}: {at.psnr_db:.2f} dB on training rays, {at.eta_s:.0f} s left",

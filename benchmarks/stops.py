@@ -42,7 +42,7 @@ from nodes.runtime.clock import SystemClock
 from nodes.runtime.errors import LaunchError
 from nodes.runtime.messages import drive_message, pose_message
 from nodes.runtime.process import run_node
-from nodes.runtime.requests import Asked
+from nodes.runtime.requests import RequestIdentity
 
 COMMAND = "python -m benchmarks.stops"
 TWIN = REPOSITORY / "calibration" / "twin"
@@ -217,7 +217,7 @@ def disturb(what: str, run_dir: Path) -> None:
             if what == "full queue":
                 now = clock.now()
                 # An id that is too long is refused.
-                asked = Asked("x" * 65, now.mono_ns, now.real_ns)
+                asked = RequestIdentity("x" * 65, now.mono_ns, now.real_ns)
                 buses[0].publish("/arm", arm_message(asked, now, True, "benchmark", "flood"))
             else:
                 buses[0].wait(0.1)

@@ -17,7 +17,7 @@ import numpy as np
 from advnerf_core.data.similarity import align_poses
 from benchmarks.lab_recordings import lab_with_phone, photograph
 from benchmarks.results import record_row
-from calibration.structure_from_motion import SfmConfig, Source, reconstruct
+from calibration.structure_from_motion import PhotoSource, SfmConfig, reconstruct
 from hardware.worlds.lab.lab import Lab
 from hardware.worlds.lab.phone import video_poses
 
@@ -45,7 +45,7 @@ def main() -> None:
     truth = {file.name: pose for file, pose in zip(files, poses, strict=True)}
 
     began = time.perf_counter()
-    source = Source("phone", tuple(truth), ordered=True)
+    source = PhotoSource("phone", tuple(truth), ordered=True)
     model = reconstruct(
         arguments.folder / "images",
         [source],

@@ -17,7 +17,7 @@ import numpy as np
 from advnerf_core.data.image_files import image_size
 from advnerf_core.files import write_atomically
 from calibration.lens_choice import FIRST_MODEL, FOCAL_RATIOS
-from calibration.photo_model import Report, SfmConfig, Source
+from calibration.photo_model import PhotoSource, Report, SfmConfig
 from calibration.photo_pairs import chosen_pairs, every_pair
 
 _FILE, _KEY = "database.db", "inputs.json"
@@ -48,7 +48,7 @@ def quiet() -> Iterator[None]:
         pycolmap.logging.minloglevel = before
 
 
-def open_work(root: Path, work: Path, sources: Sequence[Source], config: Mapping[str, Any]) -> Path:
+def open_work(root: Path, work: Path, sources: Sequence[PhotoSource], config: Mapping[str, Any]) -> Path:
     """Open the database of a stopped run with the same inputs, or create a new one with all cameras and images."""
     key = _key(root, sources, config)
     file = work / _FILE
@@ -62,7 +62,7 @@ def open_work(root: Path, work: Path, sources: Sequence[Source], config: Mapping
     return file
 
 
-def _key(root: Path, sources: Sequence[Source], config: Mapping[str, Any]) -> str:
+def _key(root: Path, sources: Sequence[PhotoSource], config: Mapping[str, Any]) -> str:
     digest = hashlib.sha256()
     for source in sources:
         digest.update(repr((source.camera_id, source.ordered, source.pinhole, source.lens)).encode())
@@ -73,12 +73,12 @@ def _key(root: Path, sources: Sequence[Source], config: Mapping[str, Any]) -> st
     )
 
 
-def _create(file: Path, root: Path, sources: Sequence[Source]) -> None:
+def _create(file: Path, root: Path, sources: Sequence[PhotoSource]) -> None:
     """One camera for each name, image size, and camera and focal length of the EXIF data; a phone held upright is another camera."""
     import pycolmap
 
     pycolmap.Database.open(file).close()
-    groups: dict[tuple[object, ...], tuple[Source, tuple[int, int], float | None, list[str]]] = {}
+    groups: dict[tuple[object, ...], tuple[PhotoSource, tuple[int, int], float | None, list[str]]] = {}
     for source in sources:
         for name in source.images:
             size, (model, focal_px) = image_size(root / name), exif(root / name)
@@ -109,7 +109,7 @@ def exif(path: Path) -> tuple[str | None, float | None]:
     return bitmap.exif_camera_model(), float(focal_px) if focal_px else None
 
 
-def _params(source: Source, size: tuple[int, int], focal_px: float | None) -> list[float] | None:
+def _params(source: PhotoSource, size: tuple[int, int], focal_px: float | None) -> list[float] | None:
     width, height = size
     if source.pinhole is not None:
         p = source.pinhole.resized(width, height)
@@ -128,7 +128,7 @@ def exif_focal_lengths(file: Path) -> dict[int, float]:
     return {int(c.camera_id): float(c.focal_length_x) for c in cameras if c.has_prior_focal_length}
 
 
-def held_cameras(file: Path, sources: Sequence[Source]) -> set[int]:
+def held_cameras(file: Path, sources: Sequence[PhotoSource]) -> set[int]:
     """COLMAP's numbers of the cameras whose intrinsics are known."""
     import pycolmap
 
@@ -137,7 +137,7 @@ def held_cameras(file: Path, sources: Sequence[Source]) -> set[int]:
         return {image.camera_id for image in database.read_all_images() if image.name in known}
 
 
-def camera_names(file: Path, sources: Sequence[Source]) -> dict[int, str]:
+def camera_names(file: Path, sources: Sequence[PhotoSource]) -> dict[int, str]:
     """Names of COLMAP's cameras: the source's, with the image or the image size where a source has several cameras."""
     import pycolmap
 
@@ -188,7 +188,7 @@ def extract_features(
             )
 
 
-def pairs_to_match(file: Path, sources: Sequence[Source], config: SfmConfig) -> list[tuple[str, str]]:
+def pairs_to_match(file: Path, sources: Sequence[PhotoSource], config: SfmConfig) -> list[tuple[str, str]]:
     """Names of the images of each pair worth matching."""
     import pycolmap
 

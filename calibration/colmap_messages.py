@@ -17,16 +17,16 @@ from calibration.photo_model import (
     FoundCamera,
     LeftOut,
     Model,
+    PhotoSource,
     ReconstructionError,
     Registered,
     SfmConfig,
-    Source,
 )
 
-Job = tuple[Path, tuple[Source, ...], Path, SfmConfig]
+Job = tuple[Path, tuple[PhotoSource, ...], Path, SfmConfig]
 
 
-def pack_job(root: Path, sources: Sequence[Source], work: Path, config: SfmConfig) -> bytes:
+def pack_job(root: Path, sources: Sequence[PhotoSource], work: Path, config: SfmConfig) -> bytes:
     """Encode a job as one line."""
     return _line(
         {
@@ -42,7 +42,7 @@ def unpack_job(line: bytes) -> Job:
     """Decode a job to the arguments of `pack_job`."""
     told = json.loads(line)
     sources = tuple(
-        Source(
+        PhotoSource(
             s["camera_id"],
             tuple(s["images"]),
             s["ordered"],

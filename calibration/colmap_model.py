@@ -16,17 +16,17 @@ from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array
 from calibration import colmap_database as database
-from calibration.lens_choice import FOCAL_RATIOS, Choice, choose_lenses, intrinsics
+from calibration.lens_choice import FOCAL_RATIOS, LensChoice, choose_lenses, intrinsics
 from calibration.photo_model import (
     MIN_IMAGES,
     FoundCamera,
     LeftOut,
     Model,
+    PhotoSource,
     ReconstructionError,
     Registered,
     Report,
     SfmConfig,
-    Source,
 )
 
 # Shares of the wall time, roughly: features, matches, poses, lenses.
@@ -36,7 +36,7 @@ _SHOWN_NAMES = 5
 
 
 def put_together(
-    root: Path, sources: Sequence[Source], work: Path, config: SfmConfig, report: Report
+    root: Path, sources: Sequence[PhotoSource], work: Path, config: SfmConfig, report: Report
 ) -> Model:
     """Reconstruct a model from photographs; see `calibration.structure_from_motion.reconstruct`."""
     names = [name for source in sources for name in source.images]
@@ -53,7 +53,7 @@ def _find_model(
     file: Path,
     root: Path,
     work: Path,
-    sources: Sequence[Source],
+    sources: Sequence[PhotoSource],
     cameras: Mapping[int, str],
     config: SfmConfig,
     report: Report,
@@ -117,7 +117,7 @@ def _map(
 
 
 def _write_finished(
-    work: Path, reconstruction: Any, parts: int, choices: Mapping[int, Choice], why: Mapping[str, str]
+    work: Path, reconstruction: Any, parts: int, choices: Mapping[int, LensChoice], why: Mapping[str, str]
 ) -> None:
     folder = work / "sparse" / "chosen"
     folder.mkdir()
@@ -130,23 +130,23 @@ def _write_finished(
     write_atomically(work / _FINISHED, json.dumps(record, indent=1))
 
 
-def _read_finished(work: Path, sources: Sequence[Source], cameras: Mapping[int, str]) -> Model | None:
+def _read_finished(work: Path, sources: Sequence[PhotoSource], cameras: Mapping[int, str]) -> Model | None:
     import pycolmap
 
     if not (work / _FINISHED).exists():
         return None
     record = read_json(work / _FINISHED)
-    choices = {int(number): Choice(**choice) for number, choice in record["choices"].items()}
+    choices = {int(number): LensChoice(**choice) for number, choice in record["choices"].items()}
     reconstruction = pycolmap.Reconstruction(work / "sparse" / "chosen")
     return _model(reconstruction, sources, cameras, record["parts"], choices, record["why"])
 
 
 def _model(
     reconstruction: Any,
-    sources: Sequence[Source],
+    sources: Sequence[PhotoSource],
     camera_ids: Mapping[int, str],
     parts: int,
-    choices: Mapping[int, Choice],
+    choices: Mapping[int, LensChoice],
     why: Mapping[str, str],
 ) -> Model:
     names = [name for source in sources for name in source.images]

@@ -40,7 +40,7 @@ _MAX_REPROJECTION_PX, _MIN_ANGLE_DEG = 4.0, 1.5
 
 
 @dataclass(frozen=True)
-class Choice:
+class LensChoice:
     """The chosen lens of one camera.
 
     Attributes:
@@ -96,7 +96,7 @@ def nonsense(pinhole: Pinhole, lens: Lens) -> str | None:
 
 def choose_lenses(
     reconstruction: Any, held: Collection[int], exif_focal_px: Mapping[int, float], report: Report
-) -> tuple[dict[int, Choice], dict[str, str]]:
+) -> tuple[dict[int, LensChoice], dict[str, str]]:
     """Choose the lens of every camera that is not held, refine the model with it, and take out cameras that make no sense.
 
     Args:
@@ -109,7 +109,7 @@ def choose_lenses(
         The choice for each camera that stays, and the reason for each image that was taken out.
     """
     images = _images_of(reconstruction)
-    known = {number: Choice("OPENCV", "known, held") for number in images if number in held}
+    known = {number: LensChoice("OPENCV", "known, held") for number in images if number in held}
     unknown = [number for number in images if number not in held]
     if not unknown:
         return known, {}
@@ -132,7 +132,7 @@ def choose_lenses(
             break
         distorted = [number for number in problems if chosen[number].model != "SIMPLE_PINHOLE"]
         for number in distorted:
-            chosen[number] = Choice(
+            chosen[number] = LensChoice(
                 "SIMPLE_PINHOLE", f"no distortion, because with it the {problems[number]}"
             )
         if distorted:
@@ -140,7 +140,7 @@ def choose_lenses(
         # One at a time: without the worst, the others may do.
         worst = max(problems, key=lambda number: errors.get(number, math.inf))
         if worst in exif_focal_px and worst not in constant:
-            chosen[worst] = Choice(
+            chosen[worst] = LensChoice(
                 "SIMPLE_PINHOLE", f"EXIF focal length, held, because without it the {problems[worst]}"
             )
             _set_focal_length(reconstruction.cameras[worst], exif_focal_px[worst])
@@ -188,7 +188,7 @@ def _typical_error_px(reconstruction: Any) -> float:
 
 def _by_evidence(
     reconstruction: Any, unknown: Collection[int], held: Collection[int], scale_px: float, report: Report
-) -> dict[int, Choice]:
+) -> dict[int, LensChoice]:
     """The choice of each camera: every model is fitted to a copy, to all cameras with enough images for it at once."""
     images = {number: len(each) for number, each in _images_of(reconstruction).items()}
     criteria: dict[int, dict[str, float]] = {number: {} for number in unknown}
@@ -214,7 +214,7 @@ def _criterion(distances_px: NDArray[np.float64], parameters: int, scale_px: flo
     return likelihood + parameters * math.log(max(2 * len(distances_px), 1))
 
 
-def _simplest(criteria: Mapping[str, float], images: int) -> Choice:
+def _simplest(criteria: Mapping[str, float], images: int) -> LensChoice:
     """The model that no later one beats by clear evidence."""
     said, best = [], None
     for model, _, fewest in _MODELS:
@@ -228,7 +228,7 @@ def _simplest(criteria: Mapping[str, float], images: int) -> Choice:
             gain = criteria[best] - criteria[model]
             said.append(f"{model} over {best}: evidence {gain:.0f}")
             best = model if gain > _EVIDENCE else best
-    return Choice(best or "SIMPLE_PINHOLE", f"{'; '.join(said)} ({_EVIDENCE:.0f} decides)")
+    return LensChoice(best or "SIMPLE_PINHOLE", f"{'; '.join(said)} ({_EVIDENCE:.0f} decides)")
 
 
 def _set_model(camera: Any, model: str) -> None:

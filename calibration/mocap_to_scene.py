@@ -19,7 +19,7 @@ from calibration.measured import SceneCalibration, rows_of
 
 
 @dataclass(frozen=True)
-class SceneConfig:
+class SceneFitLimits:
     """Limits beyond which a fit is rejected.
 
     Attributes:
@@ -85,7 +85,7 @@ class SceneFit:
 def place_scene(
     T_scene_from_camera: Mapping[str, Array],
     T_world_from_camera: Mapping[str, Array],
-    config: SceneConfig | None = None,
+    config: SceneFitLimits | None = None,
 ) -> SceneFit:
     """Find the similarity from a scene to the motion-capture world.
 
@@ -98,7 +98,7 @@ def place_scene(
         DegenerateDataError: Too few cameras in both, or all of them on one line.
         PoorFitError: Too few agree, or left-out cameras are misplaced.
     """
-    config = config or SceneConfig()
+    config = config or SceneFitLimits()
     names = tuple(name for name in T_scene_from_camera if name in T_world_from_camera)
     cure = "the images of both must have the same file names; take more frames of the car into the scene's reconstruction"
     require_count(len(names), config.min_cameras, "cameras with a pose in both worlds", cure)
@@ -118,7 +118,7 @@ def place_scene(
     return SceneFit(alignment, names, far, angle, target, alignment.similarity.poses(source))
 
 
-def _align(source: Array, target: Array, config: SceneConfig, share: float) -> Alignment:
+def _align(source: Array, target: Array, config: SceneFitLimits, share: float) -> Alignment:
     try:
         return align_poses(source, target, config.position_tolerance_m, config.rotation_tolerance_rad, share)
     except SimilarityError as error:
@@ -126,7 +126,7 @@ def _align(source: Array, target: Array, config: SceneConfig, share: float) -> A
         raise kind(str(error)) from error
 
 
-def _held_out(source: Array, target: Array, config: SceneConfig) -> tuple[Array, Array]:
+def _held_out(source: Array, target: Array, config: SceneFitLimits) -> tuple[Array, Array]:
     """Errors of each camera under the similarity of the others, in blocks of neighbours: next-door frames know too much."""
     fold = np.arange(len(source)) * config.folds // len(source)
     far, angle = np.empty(len(source)), np.empty(len(source))

@@ -17,7 +17,7 @@ _CENTRE_TOLERANCE_M = 0.01
 
 
 @dataclass(frozen=True)
-class Panel:
+class MonitorPanel:
     """A monitor's panel.
 
     Attributes:
@@ -64,7 +64,7 @@ def target_size(target: TargetCalibration) -> tuple[float, float]:
 
 def make_panel(
     size_px: tuple[int, int], target: TargetCalibration, edid_mm: tuple[float, float] | None = None
-) -> Panel:
+) -> MonitorPanel:
     """The panel of a monitor; where it says its size and the calibration says another, one of them is of another monitor.
 
     Args:
@@ -74,17 +74,17 @@ def make_panel(
     """
     measured = target_size(target)
     if edid_mm is None:
-        return Panel(size_px, measured)
+        return MonitorPanel(size_px, measured)
     said = (edid_mm[0] / 1000.0, edid_mm[1] / 1000.0)
     if any(abs(m / s - 1.0) > _SIZE_TOLERANCE for m, s in zip(measured, said, strict=True)):
         raise CalibrationError(
             f"the monitor reports a picture of {said[0]:.3f} x {said[1]:.3f} m, but the corners of target {target.subject} give "
             f"{measured[0]:.3f} x {measured[1]:.3f} m; measure the whole panel (advnerf room target), or set size_mm to override"
         )
-    return Panel(size_px, said)
+    return MonitorPanel(size_px, said)
 
 
-def require_fits(attack: AttackFile, panel: Panel, target: TargetCalibration) -> None:
+def require_fits(attack: AttackFile, panel: MonitorPanel, target: TargetCalibration) -> None:
     """Refuse an attack that this panel cannot show as it was computed: another carrier, too large, or off the centre."""
     face = attack.face
     if face is None or face.subject != target.subject:

@@ -21,7 +21,7 @@ class ReconstructionError(AdvnerfError):
 
 
 @dataclass(frozen=True)
-class Source:
+class PhotoSource:
     """Photographs that come from one place: a folder, a video, or a camera with known intrinsics.
 
     Sources with the same ``camera_id`` share a camera. A source holds several cameras if its images differ in size, or if their

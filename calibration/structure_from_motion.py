@@ -20,21 +20,28 @@ from calibration.photo_model import (
     FoundCamera,
     LeftOut,
     Model,
+    PhotoSource,
     ReconstructionError,
     Registered,
     Report,
     SfmConfig,
-    Source,
 )
 
 __all__ = [
-    "FoundCamera", "LeftOut", "Model", "ReconstructionError", "Registered", "SfmConfig", "Source", "reconstruct",
+    "FoundCamera",
+    "LeftOut",
+    "Model",
+    "PhotoSource",
+    "ReconstructionError",
+    "Registered",
+    "SfmConfig",
+    "reconstruct",
 ]  # fmt: skip
 
 
 def reconstruct(
     root: Path,
-    sources: Sequence[Source],
+    sources: Sequence[PhotoSource],
     work: Path,
     config: SfmConfig | None = None,
     report: Report | None = None,

@@ -25,7 +25,7 @@ from calibration.linear import line_stddev, linear_fit
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
+class RecordedDrive:
     """A recorded drive.
 
     Attributes:
@@ -148,7 +148,7 @@ class GainsFit:
         return float(np.sqrt(np.mean((self.speed_of(erpm) - self.speed_mps) ** 2)))
 
 
-def fit_gains(drive: Drive, wheelbase_m: float, config: GainsConfig | None = None) -> GainsFit:
+def fit_gains(drive: RecordedDrive, wheelbase_m: float, config: GainsConfig | None = None) -> GainsFit:
     """Fit the car's gains to a drive.
 
     Args:
@@ -198,7 +198,7 @@ def fit_gains(drive: Drive, wheelbase_m: float, config: GainsConfig | None = Non
     return fit
 
 
-def find_segments(drive: Drive, config: GainsConfig) -> list[Segment]:
+def find_segments(drive: RecordedDrive, config: GainsConfig) -> list[Segment]:
     """Stretches with constant commands, settled, with their twists."""
     if len(drive.command_s) < 2 or len(drive.pose_s) < 10:
         raise DegenerateDataError(
@@ -240,7 +240,7 @@ def twist(time_s: Array, poses: Array) -> tuple[float, float, float]:
     return vx, vy, w
 
 
-def _constant_stretches(drive: Drive, config: GainsConfig) -> list[tuple[float, float, float, float]]:
+def _constant_stretches(drive: RecordedDrive, config: GainsConfig) -> list[tuple[float, float, float, float]]:
     """Start, end, mean servo and mean erpm of runs in which each command is near the run's first."""
     stretches, first = [], 0
     servo, erpm, when = drive.servo, drive.erpm, drive.command_s

@@ -19,7 +19,7 @@ from scipy.optimize import least_squares
 from advnerf_core.geometry import Array
 from calibration.degeneracy import DegenerateDataError, PoorFitError
 from calibration.schema import GainsSection, ResponseSection, VehicleCalibration
-from calibration.vehicle import Drive, GainsFit
+from calibration.vehicle import GainsFit, RecordedDrive
 
 GRID_S, WINDOW = 0.01, 6  # the window in steps of the grid
 _DELAYS_S = np.arange(0.0, 0.41, 0.02)
@@ -94,7 +94,7 @@ class ResponseFit:
         )
 
 
-def fit_response(drive: Drive, gains: GainsFit, config: ResponseConfig | None = None) -> ResponseFit:
+def fit_response(drive: RecordedDrive, gains: GainsFit, config: ResponseConfig | None = None) -> ResponseFit:
     """Fit delay and lag to the drive whose gains are known.
 
     Raises:
@@ -209,7 +209,7 @@ def _require_changes(values: Array, least: float, needed: int, what: str, unit: 
         )
 
 
-def _motion(drive: Drive, gains: GainsFit, grid: Array) -> tuple[Array, Array]:
+def _motion(drive: RecordedDrive, gains: GainsFit, grid: Array) -> tuple[Array, Array]:
     """Yaw and way of the rear axle on the grid ``[K]``."""
     yaw = np.interp(grid, drive.pose_s, drive.poses[:, 2])
     c, s = np.cos(yaw), np.sin(yaw)
@@ -226,7 +226,7 @@ def _smooth_speed(travelled: Array) -> Array:
     return (padded[2 * half :] - padded[: -2 * half]) / (2 * half * GRID_S)
 
 
-def _in_force(drive: Drive, stopped: NDArray[np.bool_], grid: Array) -> NDArray[np.bool_]:
+def _in_force(drive: RecordedDrive, stopped: NDArray[np.bool_], grid: Array) -> NDArray[np.bool_]:
     """Windows after the first command and well after every stop."""
     kept: NDArray[np.bool_] = grid >= drive.command_s[0] + _AFTER_STOP_S
     for row in np.flatnonzero(stopped):

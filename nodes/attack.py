@@ -28,8 +28,8 @@ from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.messages import header, image_message, types
 from nodes.runtime.node import ACTIVE, READY, Inbox, MessageInfo, Node, NodeContext, Now, Out
 from nodes.runtime.process import run_node_main
-from nodes.runtime.requests import Answer, Answers
-from nodes.runtime.transfer import chunk_messages
+from nodes.runtime.requests import Answer, AnswerMemory
+from nodes.runtime.transfer import FileSender, chunk_messages
 
 _REQUEST, _CANCEL = "/attack/request", "/attack/cancel"
 _PROGRESS, _FILE = "/attack/progress", "/attack/file"
@@ -41,7 +41,7 @@ _INBOX = 1000
 RUNNING = ("preparing", "searching")
 
 
-class AttackConfig(StrictModel):
+class AttackNodeConfig(StrictModel):
     """Configuration of the attack node.
 
     Attributes:
@@ -71,7 +71,7 @@ class AttackNode(Node):
     tick_rate_hz = 20.0
 
     def __init__(
-        self, config: AttackConfig, folder: Path, subscribers: Callable[[str], int] = lambda topic: 0
+        self, config: AttackNodeConfig, folder: Path, subscribers: Callable[[str], int] = lambda topic: 0
     ) -> None:
         self.inbox: Inbox[Said] = Inbox(_INBOX)
         self._config, self._folder, self._subscribers = config, folder, subscribers
@@ -79,12 +79,12 @@ class AttackNode(Node):
         self._request_id = ""
         self._progress: dict[str, Any] = {}
         self._told_ns = 0
-        self._sender: Sender | None = None
-        self._answers = Answers()
+        self._sender: FileSender | None = None
+        self._answers = AnswerMemory()
         self._resume()
 
     @classmethod
-    def build(cls, config: AttackConfig, context: NodeContext) -> AttackNode:
+    def build(cls, config: AttackNodeConfig, context: NodeContext) -> AttackNode:
         """Make the node of a process; it goes on with what it was doing when it was killed."""
         folder = context.run_dir.resolve() / config.folder
         folder.mkdir(parents=True, exist_ok=True)
@@ -128,7 +128,7 @@ class AttackNode(Node):
         outs = [self._tell(now)] if now.mono_ns - self._told_ns >= _TELL_NS else []
         if (
             self._sender is not None
-            and (piece := self._sender.next(now, self._subscribers(_FILE))) is not None
+            and (piece := self._sender.next(now.mono_ns, self._subscribers(_FILE))) is not None
         ):
             outs.append(Out(_FILE, piece))
         return outs
@@ -197,7 +197,7 @@ class AttackNode(Node):
     def _begin_sending(self, file: Path, now: Now) -> None:
         attack = load_attack(file)
         chunks = chunk_messages(file.read_bytes(), attack.attack_id, now.real_ns)
-        self._sender = Sender(chunks, self._config.sends, round(self._config.repeat_s * NS_PER_S))
+        self._sender = FileSender(chunks, self._config.sends, round(self._config.repeat_s * NS_PER_S))
 
     def _keep(self, state: str, **more: str) -> None:
         content = {"request_id": self._request_id, "state": state, **more}
@@ -241,34 +241,6 @@ class AttackNode(Node):
         )
 
 
-class Sender:
-    """Sends the pieces of a file, one a tick, again and again: some rounds, and one more for whoever begins to listen.
-
-    Args:
-        chunks: The pieces.
-        rounds: How often.
-        pause_ns: Time between two rounds [ns].
-    """
-
-    def __init__(self, chunks: list[Any], rounds: int, pause_ns: int) -> None:
-        self._chunks, self._rounds, self._pause_ns = chunks, rounds, pause_ns
-        self._index, self._due_ns, self._listeners = 0, 0, 0
-
-    def next(self, now: Now, listeners: int) -> Any | None:
-        """The piece that is due, or None."""
-        if listeners > self._listeners:
-            self._rounds = max(self._rounds, 1 + (self._index > 0))
-        self._listeners = listeners
-        if self._rounds == 0 or now.mono_ns < self._due_ns:
-            return None
-        piece = self._chunks[self._index]
-        self._index = (self._index + 1) % len(self._chunks)
-        if self._index == 0:
-            self._rounds -= 1
-            self._due_ns = now.mono_ns + self._pause_ns
-        return piece
-
-
 def _fresh(state: str, text: str) -> dict[str, Any]:
     return {
         "state": state,
@@ -288,7 +260,7 @@ def _fresh(state: str, text: str) -> dict[str, Any]:
 
 def main() -> int:
     """Run the node as a process."""
-    return run_node_main(AttackConfig, AttackNode.build)
+    return run_node_main(AttackNodeConfig, AttackNode.build)
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ STEPS = 6
 
 
 @dataclass(frozen=True)
-class Part:
+class Manoeuvre:
     """A command that is held for some time.
 
     Attributes:
@@ -68,22 +68,22 @@ class CalibrationDriveConfig(StrictModel):
         return self
 
 
-def program(config: CalibrationDriveConfig) -> list[Part]:
+def program(config: CalibrationDriveConfig) -> list[Manoeuvre]:
     """Parts of the drive: a loop to the left, a faster loop to the right, then two rows of steps with half circles between them."""
     slow, fast, tight, wide = config.slow_mps, config.fast_mps, config.tight_rad, config.wide_rad
 
-    def half_circle(steering: float, speed: float) -> Part:
-        return Part(math.pi * config.wheelbase_m / math.tan(abs(steering)) / speed, steering, speed)
+    def half_circle(steering: float, speed: float) -> Manoeuvre:
+        return Manoeuvre(math.pi * config.wheelbase_m / math.tan(abs(steering)) / speed, steering, speed)
 
     parts = []
     for speed, hold_s, turn in ((slow, STRAIGHT_SLOW_S, tight), (fast, STRAIGHT_FAST_S, -tight)):
-        parts += [Part(hold_s, 0.0, speed), half_circle(turn, speed)]
-        parts += [Part(hold_s, wide, speed), Part(hold_s, -wide, speed), half_circle(turn, speed)]
+        parts += [Manoeuvre(hold_s, 0.0, speed), half_circle(turn, speed)]
+        parts += [Manoeuvre(hold_s, wide, speed), Manoeuvre(hold_s, -wide, speed), half_circle(turn, speed)]
     for row in (0, 1):
         side = 1.0 if row else -1.0
         for k in range(STEPS):
             speed = (slow, fast)[(k // 2 + row) % 2]
-            parts.append(Part(0.46 + 0.05 * k, side * (-1.0) ** k * tight * (0.96 - 0.08 * k), speed))
+            parts.append(Manoeuvre(0.46 + 0.05 * k, side * (-1.0) ** k * tight * (0.96 - 0.08 * k), speed))
         parts.append(half_circle(tight, fast))
     return parts
 
@@ -94,7 +94,7 @@ class CalibrationDrive(Node):
     subscriptions = (IMAGE, STATE)
     publications = (DRIVE,)
 
-    def __init__(self, parts: Sequence[Part]) -> None:
+    def __init__(self, parts: Sequence[Manoeuvre]) -> None:
         self._parts = parts
         self._index, self._since_ns = 0, 0
         self._armed = False

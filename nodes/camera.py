@@ -53,7 +53,7 @@ class CompressedConfig(StrictModel):
     quality: int = Field(default=80, ge=1, le=100)
 
 
-class CameraConfig(StrictModel):
+class CameraNodeConfig(StrictModel):
     """Configuration of the camera node.
 
     Attributes:
@@ -82,7 +82,7 @@ class CameraNode(Node):
 
     def __init__(
         self,
-        config: CameraConfig,
+        config: CameraNodeConfig,
         calibration: CameraCalibration,
         subscribers: Callable[[str], int] = lambda topic: 0,
         device: SteadyCamera | None = None,
@@ -107,7 +107,7 @@ class CameraNode(Node):
         self._stale = self._missed = 0
 
     @classmethod
-    def build(cls, config: CameraConfig, context: NodeContext) -> CameraNode:
+    def build(cls, config: CameraNodeConfig, context: NodeContext) -> CameraNode:
         """Build the node and start reading frames."""
         node = cls(config, load_calibration(CameraCalibration, config.calibration), context.subscribers)
         node._now_ns = lambda: context.clock.now().mono_ns
@@ -192,7 +192,7 @@ class CameraNode(Node):
 
 def main() -> int:
     """Run the node as a process."""
-    return run_node_main(CameraConfig, CameraNode.build)
+    return run_node_main(CameraNodeConfig, CameraNode.build)
 
 
 if __name__ == "__main__":

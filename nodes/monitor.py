@@ -21,7 +21,7 @@ from pydantic import Field, field_validator
 from advnerf_core.attack.artifact import AttackFile, attack_from_bytes, load_attack
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.strict import StrictModel
-from calibration.panel import Panel, make_panel, require_fits
+from calibration.panel import MonitorPanel, make_panel, require_fits
 from calibration.schema import TargetCalibration, load_calibration
 from hardware.errors import HardwareError
 from hardware.screen.display import Display, PygameDisplay, TwinDisplay
@@ -128,7 +128,7 @@ class MonitorNode(Node):
     def __init__(
         self,
         display: Display,
-        panel: Panel,
+        panel: MonitorPanel,
         attack: AttackFile | None,
         check: Callable[[AttackFile], None],
         plain_rgb: Colour = (0.20, 0.62, 0.28),
@@ -162,7 +162,9 @@ class MonitorNode(Node):
         try:
             said = config.size_mm or (display.edid.size_mm if display.edid else None)
             if config.size_mm:
-                panel = Panel(display.size_px, (config.size_mm[0] / 1000.0, config.size_mm[1] / 1000.0))
+                panel = MonitorPanel(
+                    display.size_px, (config.size_mm[0] / 1000.0, config.size_mm[1] / 1000.0)
+                )
             else:
                 panel = make_panel(display.size_px, target, said)
             check = partial(require_fits, panel=panel, target=target)

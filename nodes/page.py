@@ -21,15 +21,15 @@ from advnerf_core.strict import StrictModel
 from calibration.schema import RoomCalibration, load_calibration
 from nodes.launching.launched import read_launched
 from nodes.operator_page import board as topics
-from nodes.operator_page.board import Board
+from nodes.operator_page.board import ViewState
 from nodes.operator_page.catalogue import read_catalogue
-from nodes.operator_page.client import Asked, Gone
+from nodes.operator_page.client import ClientAct, Gone
 from nodes.operator_page.desk import Desk, DeskLimits
 from nodes.operator_page.diary import Diary
 from nodes.operator_page.disk import DiskWriter
 from nodes.operator_page.operation import ACT, FILE, RESET, SWITCH, TELEOP, Operation, Parts
 from nodes.operator_page.pictures import ATTACKED, CAMERA, POLICY, Picture, jpeg_of, view_of_policy
-from nodes.operator_page.recording import LAUNCH_RECORDER, RECORDER, Recording
+from nodes.operator_page.recording import LAUNCH_RECORDER, RECORDER, RecorderControl
 from nodes.operator_page.server import PageServer, ServerSettings
 from nodes.operator_page.trial import Trial
 from nodes.runtime.arm_requests import ARM
@@ -106,7 +106,7 @@ class PageNode(Node):
         room = None if config.room is None else load_calibration(RoomCalibration, config.room)
         nodes = launched.nodes if config.nodes is None else config.nodes
         self._catalogue, self._left_out = read_catalogue(config.attacks)
-        self._board = Board(room, nodes)
+        self._board = ViewState(room, nodes)
         self._view: PolicyView | None = view_of_policy(config.policy)
         self._operates = config.role == "operate"
         self._stops = self._operates or launched.known
@@ -115,7 +115,7 @@ class PageNode(Node):
         self._desk = Desk(limits)
         self._disk = DiskWriter()
         self._diary = Diary(run_dir / LOG, self._disk)
-        self._recording = Recording(run_dir, nodes)
+        self._recording = RecorderControl(run_dir, nodes)
         path = None if room is None else room.reference_path
         off_track_m = _OFF_TRACK_M if room is None else room.off_track_m
         parts = Parts(
@@ -129,7 +129,7 @@ class PageNode(Node):
             None if room is None else room.start_pose,
             self._operates,
         )
-        self.inbox: Inbox[Asked | Gone] = Inbox(_INBOX)
+        self.inbox: Inbox[ClientAct | Gone] = Inbox(_INBOX)
         self._operation = Operation(parts, self._answer)
         recorders = [name for name in (RECORDER, LAUNCH_RECORDER) if self._operates and name not in nodes]
         statuses = tuple(map(status_topic, (*nodes, *recorders)))
@@ -167,7 +167,7 @@ class PageNode(Node):
             self._operation.heard_motor(message, info)
         return []
 
-    def receive(self, item: Asked | Gone, now: Now) -> list[Out]:
+    def receive(self, item: ClientAct | Gone, now: Now) -> list[Out]:
         """Decide an act of a browser, or note that it has gone."""
         if isinstance(item, Gone):
             return self._operation.gone(item.client, now)

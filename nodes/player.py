@@ -17,7 +17,7 @@ from pydantic import Field
 
 from advnerf_core.strict import StrictModel
 from nodes.bags.keys import Keys
-from nodes.bags.play import PAUSE, RATE, RESUME, STEP, STOP, TOGGLE, Command, Playhead
+from nodes.bags.play import PAUSE, RATE, RESUME, STEP, STOP, TOGGLE, PlayerCommand, Playhead
 from nodes.bags.reader import BagMessage, read_info, read_messages, require_readable
 from nodes.bags.time_gaps import skipped_gaps
 from nodes.runtime.clock import NS_PER_S
@@ -25,7 +25,7 @@ from nodes.runtime.errors import BagError, MessageError, NodeFinished
 from nodes.runtime.messages import header, stamp_from_ns, types
 from nodes.runtime.node import ACTIVE, READY, Inbox, MessageInfo, Node, NodeContext, Now, Out, ReaderThread
 from nodes.runtime.process import run_node_main
-from nodes.runtime.requests import Answer, Answers
+from nodes.runtime.requests import Answer, AnswerMemory
 from nodes.runtime.topics import may_replay, type_of_topic
 from nodes.runtime.topics import topic as topic_row
 
@@ -108,7 +108,7 @@ class PlayerNode(Node):
         self._head: Playhead | None = None
         self._clock_due_ns = 0
         self._played, self._trouble = 0, ""
-        self._answers = Answers()
+        self._answers = AnswerMemory()
         self._ends_ns: int | None = None
         self._rewind()  # refuse a bag without messages in the wanted part here, and not when a subscriber connects
         self._keys, self._reader = None, None
@@ -129,7 +129,7 @@ class PlayerNode(Node):
         ask_id = str(message.ask_id)
         if not self._answers.repeat(ask_id):
             try:
-                outs = self._obey(Command.parse(str(message.command)), now)
+                outs = self._obey(PlayerCommand.parse(str(message.command)), now)
             except MessageError as error:
                 self._trouble = str(error)
             self._answers.give(Answer(ask_id, not self._trouble, self._trouble or self.status()[1]))
@@ -140,9 +140,11 @@ class PlayerNode(Node):
         if item in ("faster", "slower"):
             rate = self._head.rate if self._head else self._config.rate
             return self._obey(
-                Command(RATE, rate * _FASTER if item == "faster" else rate / _FASTER), now, by_request=False
+                PlayerCommand(RATE, rate * _FASTER if item == "faster" else rate / _FASTER),
+                now,
+                by_request=False,
             )
-        return self._obey(Command(item), now, by_request=False)
+        return self._obey(PlayerCommand(item), now, by_request=False)
 
     def tick(self, now: Now) -> list[Out]:
         """Publish the messages that are due."""
@@ -188,7 +190,7 @@ class PlayerNode(Node):
             self._reader.stop()
             self._keys.close()
 
-    def _obey(self, command: Command, now: Now, by_request: bool = True) -> list[Out]:
+    def _obey(self, command: PlayerCommand, now: Now, by_request: bool = True) -> list[Out]:
         self._trouble = ""
         if command.word == STOP:
             self._ends_ns = now.mono_ns + (_FAREWELL_NS if by_request else 0)

@@ -31,7 +31,7 @@ _ACTIVE_S = 1.0
 _CLOCK_TOLERANCE_S = 0.02
 
 
-class PolicyConfig(StrictModel):
+class PolicyNodeConfig(StrictModel):
     """Configuration of the policy node.
 
     Attributes:
@@ -91,7 +91,7 @@ class PolicyNode(Node):
         self._warm_up()
 
     @classmethod
-    def build(cls, config: PolicyConfig, context: NodeContext) -> PolicyNode:
+    def build(cls, config: PolicyNodeConfig, context: NodeContext) -> PolicyNode:
         """Build the node: load, check and warm up the policy."""
         del context  # not needed
         # One thread: with one image at a time, more would take cores from the other nodes and add wake-up delays.
@@ -172,7 +172,7 @@ class PolicyNode(Node):
 
 def main() -> int:
     """Run the node as a process."""
-    return run_node_main(PolicyConfig, PolicyNode.build)
+    return run_node_main(PolicyNodeConfig, PolicyNode.build)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from calibration.schema import VehicleCalibration, load_calibration
 from nodes.control.stamps import COMMAND_AGE_S, stamp_age_s, stamp_problem
 from nodes.linking.link import on_our_clock
 from nodes.linking.ros2.answers import stamp_of_cdr
-from nodes.linking.ros2.carried import Rate, Sent, Taken
+from nodes.linking.ros2.carried import Rate, SentTopic, Taken
 from nodes.linking.ros2.conversions import Setting
 from nodes.linking.ros2.routes import SAFETY_DRIVE, SendRoute, TakeRoute, check_routes, needs_wheelbase
 from nodes.linking.ros2.samples import Heard
@@ -130,10 +130,10 @@ class Ros2Node(Node):
         self.queues = {
             name: _QUEUE for name in self.subscriptions if name != SAFETY_DRIVE and topic_row(name).latest
         }
-        self._sent: dict[str, list[tuple[int, Sent, Rate]]] = defaultdict(list)
+        self._sent: dict[str, list[tuple[int, SentTopic, Rate]]] = defaultdict(list)
         for number, send in enumerate(config.send):
             setting = Setting(wheelbase_m, send.child_frame, send.frame)
-            self._sent[send.topic].append((number, Sent(send, setting), Rate(send.rate_hz)))
+            self._sent[send.topic].append((number, SentTopic(send, setting), Rate(send.rate_hz)))
         setting = Setting(wheelbase_m)
         self._taken = [(Taken(route, setting), Rate(route.rate_hz)) for route in config.take]
         self._counts: Counter[str] = Counter()
@@ -262,7 +262,7 @@ class Ros2Node(Node):
         finally:
             self._side.close()
 
-    def _send(self, number: int, sent: Sent, info: MessageInfo) -> None:
+    def _send(self, number: int, sent: SentTopic, info: MessageInfo) -> None:
         topic = sent.route.topic
         for taken, _ in self._taken:
             if taken.answers is not None and taken.route.answers == topic:

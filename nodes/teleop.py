@@ -16,7 +16,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from advnerf_core.strict import StrictModel
-from hardware.operator.gamepad import EVENT_LAYOUT, JS_LAYOUT, Gamepad, Layout
+from hardware.operator.gamepad import EVENT_LAYOUT, JS_LAYOUT, Gamepad, GamepadLayout
 from hardware.operator.hands import Hands
 from hardware.operator.keyboard import Keyboard
 from nodes.runtime.arm_asker import ArmAsker
@@ -167,7 +167,7 @@ class TeleopNode(Node):
         return Out("/teleop/state", message)
 
 
-def _layout(path: Path, axes: tuple[int, int] | None) -> Layout | None:
+def _layout(path: Path, axes: tuple[int, int] | None) -> GamepadLayout | None:
     if axes is None:
         return None
     from dataclasses import replace

@@ -13,7 +13,7 @@ from advnerf_core.strict import validate
 from calibration.schema import CalibrationError, RoomCalibration, VehicleCalibration, load_calibration
 from nodes.experiment.node.request import parse_request
 from nodes.lab.policy_data.frames import frames_of_log
-from nodes.policy import PolicyConfig
+from nodes.policy import PolicyNodeConfig
 
 ROOT = Path(__file__).parents[1]
 CASES = ROOT.parent / "shared/data/cases"
@@ -53,7 +53,7 @@ def test_a_byte_order_mark_before_a_log_and_a_transforms_file_is_no_matter(tmp_p
 
 def test_on_is_no_speed_and_yes_no_distance(tmp_path):
     with pytest.raises(ConfigError, match="speed_mps: input should be a valid number, got 'on'"):
-        validate(PolicyConfig, parse_yaml("policy: a\nspeed_mps: on\n", "a.yaml"))
+        validate(PolicyNodeConfig, parse_yaml("policy: a\nspeed_mps: on\n", "a.yaml"))
     text = (TWIN / "room.yaml").read_text()
     for word in ("yes", "true", "3:14"):
         changed = "".join(

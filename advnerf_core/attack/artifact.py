@@ -50,7 +50,7 @@ class AttackedObject:
         scale: World metres per object unit.
         sha256: Hash of its geometry and fixed colours.
         glb: Of a mesh, the found mesh as a binary glTF file, in the object's frame; empty for other objects.
-        size_m: Width and height of a panel's texture [m]; None for solid objects, for a face (see `Face`), and in older files.
+        size_m: Width and height of a panel's texture [m]; None for solid objects, for a face (see `AttackFace`), and in older files.
     """
 
     name: str
@@ -83,7 +83,7 @@ class AttackedObject:
 
 
 @dataclass(frozen=True, eq=False)
-class Face:
+class AttackFace:
     """The face of an object that a projection or a display can show.
 
     Attributes:
@@ -138,7 +138,7 @@ class AttackFile:
     method: str
     space: str
     objects: tuple[AttackedObject, ...]
-    face: Face | None
+    face: AttackFace | None
     camera: Pinhole
     scene_sha256: str
     policy_sha256: str
@@ -193,7 +193,7 @@ class AttackFile:
             theta: Colour grid before squashing ``[N, N, 3]`` float32.
             size_m: Width and height of the face [m].
             subject: Motion-capture subject that carries it.
-            corners_in_subject: As of `Face`, ``[4, 3]`` [m].
+            corners_in_subject: As of `AttackFace`, ``[4, 3]`` [m].
             T_world_from_object: Its pose ``[4, 4]``.
             texture: The face as it is displayed, ``[H, W, 3]`` uint8 sRGB; made of ``theta`` if it is not given.
             name: What it is called.
@@ -202,7 +202,7 @@ class AttackFile:
         """
         carrier = AttackedObject(name, theta, T_world_from_object, 1.0, sha256)
         shown = face_texture(theta) if texture is None else texture
-        face = Face(shown, size_m, subject, corners_in_subject)
+        face = AttackFace(shown, size_m, subject, corners_in_subject)
         return cls(space=COLOURS, objects=(carrier,), face=face, **others)
 
     @cached_property
@@ -228,7 +228,7 @@ class AttackFile:
         """
         return self.objects[self.required_face().carried_by]
 
-    def required_face(self) -> Face:
+    def required_face(self) -> AttackFace:
         """The face, for a projection or a display.
 
         Raises:
@@ -281,7 +281,7 @@ def _object_metadata(each: AttackedObject) -> dict[str, Any]:
     }
 
 
-def _face_metadata(face: Face) -> dict[str, Any]:
+def _face_metadata(face: AttackFace) -> dict[str, Any]:
     return {
         "size_m": [float(v) for v in face.size_m],
         "subject": face.subject,
@@ -390,7 +390,7 @@ def _from_parts(metadata: dict[str, Any], tensors: dict[str, NDArray[Any]]) -> A
     )
     if face is not None:
         corners = np.array(face["corners_in_subject"])
-        values["face"] = Face(
+        values["face"] = AttackFace(
             tensors["face.texture"], tuple(face["size_m"]), face["subject"], corners, face["carried_by"]
         )
     return AttackFile(**values)

@@ -28,7 +28,7 @@ from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.driving.rollout import Rollout
 from advnerf_core.geometry import Array
-from advnerf_core.scene.surrogate import Frames, Rendered, Surrogate
+from advnerf_core.scene.surrogate import PoseBatch, Rendered, Surrogate
 
 # Controls within this share of the steering range of its end count as saturated: nothing more can be asked of them.
 _SATURATED = 1e-3
@@ -43,7 +43,7 @@ class RememberedFrames:
 
     def __init__(self, surrogate: Surrogate) -> None:
         self._surrogate = surrogate
-        self._frames: dict[bytes, Frames] = {}
+        self._frames: dict[bytes, PoseBatch] = {}
 
     @property
     def theta_shape(self) -> tuple[int, ...]:

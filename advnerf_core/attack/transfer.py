@@ -25,7 +25,7 @@ from torch import Tensor
 from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.driving.metrics import Horizon, drive_metrics
 from advnerf_core.driving.rollout import drive
-from advnerf_core.scene.fidelity import Agreement, Effect
+from advnerf_core.scene.fidelity import Effect, SceneAgreement
 
 Floats = NDArray[np.float64]
 _BLOCK = 8
@@ -34,7 +34,7 @@ FEWEST_DRAWS = 9
 DEFAULT_DRAWS = 20
 
 
-class Scene(Protocol):
+class AttackableScene(Protocol):
     """Pictures with or without the attack from the same states."""
 
     def __call__(self, states: Tensor, attacked: bool) -> Tensor:
@@ -95,8 +95,8 @@ class TransferPrediction:
 
 def predict_transfer(
     problem: AttackProblem,
-    images: Scene,
-    clean: Agreement,
+    images: AttackableScene,
+    clean: SceneAgreement,
     effect: Effect,
     starts: Tensor,
     horizon: Horizon,
@@ -164,7 +164,9 @@ class _AsDeployed:
 
     stateless = True
 
-    def __init__(self, policy: Any, images: Scene, share: float, noise: Tensor, attacked: bool) -> None:
+    def __init__(
+        self, policy: Any, images: AttackableScene, share: float, noise: Tensor, attacked: bool
+    ) -> None:
         self._policy, self._images, self._share, self._noise, self._attacked = (
             policy,
             images,

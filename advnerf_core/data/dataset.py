@@ -11,10 +11,18 @@ from advnerf_core.data.lens import Lens
 from advnerf_core.data.posed_image import PosedImage
 from advnerf_core.data.transforms import load_transforms
 from advnerf_core.data.transforms_write import write_transforms
-from advnerf_core.data.view_loading import View, load_image, load_view
+from advnerf_core.data.view_loading import LoadedView, load_image, load_view
 from advnerf_core.data.views import ImageSet, PosedImages
 
 __all__ = [
-    "DatasetError", "ImageSet", "Lens", "PosedImage", "PosedImages", "View", "load_image", "load_transforms", "load_view",
+    "DatasetError",
+    "ImageSet",
+    "Lens",
+    "LoadedView",
+    "PosedImage",
+    "PosedImages",
+    "load_image",
+    "load_transforms",
+    "load_view",
     "write_transforms",
 ]  # fmt: skip

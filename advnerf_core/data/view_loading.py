@@ -20,7 +20,7 @@ _ASPECT_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class LoadedView:
     """One image in memory, undistorted.
 
     Attributes:
@@ -42,7 +42,7 @@ def load_image(frame: PosedImage, size: tuple[int, int] | None = None) -> tuple[
     return view.rgb, view.pinhole
 
 
-def load_view(frame: PosedImage, size: tuple[int, int] | None = None, keep_all: bool = False) -> View:
+def load_view(frame: PosedImage, size: tuple[int, int] | None = None, keep_all: bool = False) -> LoadedView:
     """Read one image, undistort it and bring it to ``size`` (width, height).
 
     Undistortion keeps the largest window without missing pixels, so intrinsics change a little with it; or with ``keep_all``
@@ -60,7 +60,7 @@ def load_view(frame: PosedImage, size: tuple[int, int] | None = None, keep_all: 
             # A pixel that is partly masked is masked.
             valid = _resize(np.where(valid, np.uint8(OPAQUE), np.uint8(0)), size) == OPAQUE
         pinhole = pinhole.resized(*size)
-    return View(rgb, alpha, valid, pinhole)
+    return LoadedView(rgb, alpha, valid, pinhole)
 
 
 def _pinhole_of_file(frame: PosedImage, width: int, height: int) -> Pinhole:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from advnerf_core.data.errors import DatasetError, raise_all
 from advnerf_core.data.image_files import OPAQUE, Grey, Rgb
 from advnerf_core.data.posed_image import PosedImage
-from advnerf_core.data.view_loading import View, load_view
+from advnerf_core.data.view_loading import LoadedView, load_view
 from advnerf_core.geometry import Array, Pinhole
 
 # Instant-NGP maps the file's coordinates into its unit cube by 0.33 x + 0.5, unless the file says otherwise.
@@ -155,7 +155,7 @@ class PosedImages:
             raise DatasetError(f"expected at least one image in {self._name} to load, got none")
         with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
             found = list(pool.map(lambda frame: _view_or_error(frame, size, keep_all), self.frames))
-        views = [each for each in found if isinstance(each, View)]
+        views = [each for each in found if isinstance(each, LoadedView)]
         raise_all([each for each in found if isinstance(each, DatasetError)], len(found), "images")
         sizes = {(view.pinhole.width, view.pinhole.height) for view in views}
         if len(sizes) > 1:
@@ -194,7 +194,9 @@ class PosedImages:
         return str(self.file) if self.file is not None else "the data set"
 
 
-def _view_or_error(frame: PosedImage, size: tuple[int, int] | None, keep_all: bool) -> View | DatasetError:
+def _view_or_error(
+    frame: PosedImage, size: tuple[int, int] | None, keep_all: bool
+) -> LoadedView | DatasetError:
     try:
         return load_view(frame, size, keep_all)
     except DatasetError as error:

@@ -24,15 +24,15 @@ from advnerf_core.files import write_atomically
 from advnerf_core.learning.fit import FitConfig, fit, mean_absolute_error
 from advnerf_core.learning.frames import Frames, FrameSet, FrameStore, FrameStoreError
 from advnerf_core.learning.recipe import ImitationConfig, SourcePlan, TrainedPolicy, recovery_states
-from advnerf_core.learning.sources import KeepDriving, Seen, steer_with
+from advnerf_core.learning.sources import KeepDriving, PolicyImages, steer_with
 from advnerf_core.policies.network import SteeringNetwork
 from advnerf_core.policies.policy_file import save_policy
 from advnerf_core.policies.view import PolicyView
 
 __all__ = [
     "ImitationConfig",
+    "ImitationProgress",
     "Learned",
-    "Progress",
     "SourcePlan",
     "TrainedPolicy",
     "recovery_states",
@@ -54,7 +54,7 @@ class Learned(NamedTuple):
     error_rad: float
 
 
-class Progress(Protocol):
+class ImitationProgress(Protocol):
     """Progress callback of a training."""
 
     def __call__(self, fraction: float, text: str, learned: Learned | None = None) -> None:
@@ -67,7 +67,7 @@ def train_policy(
     expert: Expert,
     view: PolicyView,
     out_dir: FilePath,
-    progress: Progress | None = None,
+    progress: ImitationProgress | None = None,
 ) -> TrainedPolicy:
     """Collect, clone, and improve by DAgger; writes ``policy.safetensors`` (and ``naive.safetensors``) into ``out_dir``.
 
@@ -92,7 +92,7 @@ class _Recipe:
         expert: Expert,
         view: PolicyView,
         out_dir: FilePath,
-        progress: Progress | None,
+        progress: ImitationProgress | None,
     ) -> None:
         names = [plan.source.name for plan in plans]
         if not names or len(set(names)) != len(names):
@@ -154,8 +154,8 @@ class _Recipe:
             mae,
         )
 
-    def _stills(self, plan: SourcePlan, number: int) -> Callable[[], list[Seen]]:
-        def collect() -> list[Seen]:
+    def _stills(self, plan: SourcePlan, number: int) -> Callable[[], list[PolicyImages]]:
+        def collect() -> list[PolicyImages]:
             rng = np.random.default_rng([self.config.seed, 0, number])
             path = self._expert_of(plan).path
             states = recovery_states(
@@ -174,8 +174,8 @@ class _Recipe:
 
     def _drives(
         self, plan: SourcePlan, policy: SteeringNetwork, turn: int, number: int
-    ) -> Callable[[], list[Seen]]:
-        def collect() -> list[Seen]:
+    ) -> Callable[[], list[PolicyImages]]:
+        def collect() -> list[PolicyImages]:
             config = self.config
             rng = np.random.default_rng([config.seed, 1 + turn, number])
             path = self._expert_of(plan).path
@@ -210,14 +210,16 @@ class _Recipe:
 
         return near
 
-    def _collect(self, name: str, plan: SourcePlan, looks: int, collect: Callable[[], list[Seen]]) -> None:
+    def _collect(
+        self, name: str, plan: SourcePlan, looks: int, collect: Callable[[], list[PolicyImages]]
+    ) -> None:
         if looks == 0:
             return
         if name in self.store.names():
             self._advance(0.02 * looks, f"frames {name} are there")
             return
         start = time.perf_counter()
-        seen = Seen.join(collect())
+        seen = PolicyImages.join(collect())
         labels = self._expert_of(plan).steer_states(seen.states).astype(np.float32)
         goals = np.tile(np.array(plan.goal, np.float32), (len(labels), 1))
         self.store.append(name, Frames(seen.images, seen.states, labels, goals, seen.textured))

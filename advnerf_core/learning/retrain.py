@@ -22,7 +22,7 @@ from advnerf_core.policies.policy_file import LoadedPolicy, architecture_of, sav
 
 
 @dataclass(frozen=True)
-class RetrainConfig:
+class FineTuneConfig:
     """Settings of a fine-tuning.
 
     Attributes:
@@ -72,7 +72,7 @@ class MixedFrames(FrameSet):
     Args:
         old: Shards that the policy was trained on.
         new: Shards with the found objects.
-        new_share: See `RetrainConfig`.
+        new_share: See `FineTuneConfig`.
         holdout_every: See `FrameSet`.
     """
 
@@ -107,7 +107,7 @@ def fine_tune(
     policy: LoadedPolicy,
     old: Sequence[Frames],
     new: Sequence[Frames],
-    config: RetrainConfig,
+    config: FineTuneConfig,
     out_file: Path,
     report: Callable[[int, float], None] | None = None,
 ) -> Retrained:

@@ -32,7 +32,7 @@ Overlay = Callable[[Image, Array, Any], Image]
 
 
 @dataclass(frozen=True)
-class Seen:
+class PolicyImages:
     """Policy images of some states.
 
     Attributes:
@@ -46,9 +46,9 @@ class Seen:
     textured: NDArray[np.bool_]
 
     @staticmethod
-    def join(parts: list[Seen]) -> Seen:
+    def join(parts: list[PolicyImages]) -> PolicyImages:
         """All parts in one, in order."""
-        return Seen(
+        return PolicyImages(
             np.concatenate([part.images for part in parts]),
             np.concatenate([part.states for part in parts]),
             np.concatenate([part.textured for part in parts]),
@@ -61,12 +61,12 @@ class FrameSource(Protocol):
     name: str
     batch_size: int  # how many states, or drives, it likes to handle at once
 
-    def look(self, states: Array, rng: np.random.Generator) -> Seen:
+    def look(self, states: Array, rng: np.random.Generator) -> PolicyImages:
         """What is seen from the states ``[B, 3]``."""
 
     def drive(
         self, steer: Steer, starts: Array, steps: int, keep_driving: KeepDriving, rng: np.random.Generator
-    ) -> Seen:
+    ) -> PolicyImages:
         """Closed-loop drives of up to ``steps`` ticks from ``starts [B, 3]``: everything seen on the way."""
 
 
@@ -120,17 +120,17 @@ class SceneSource:
         self._speed_mps, self._dt_s = speed_mps, dt_s
         self._sample, self._variants = sample_texture, variants
 
-    def look(self, states: Array, rng: np.random.Generator) -> Seen:
+    def look(self, states: Array, rng: np.random.Generator) -> PolicyImages:
         """What is seen from the states ``[B, 3]``."""
         parts = []
         for state in states:
             x, y, yaw = map(float, state)
             parts.append(self._seen(self._scene.observe_at(x, y, yaw, depth=False)[0], state, rng))
-        return Seen.join(parts)
+        return PolicyImages.join(parts)
 
     def drive(
         self, steer: Steer, starts: Array, steps: int, keep_driving: KeepDriving, rng: np.random.Generator
-    ) -> Seen:
+    ) -> PolicyImages:
         """Drives, one after another; in every second one the policy sees one random texture throughout."""
         parts = []
         for number, start in enumerate(starts):
@@ -146,9 +146,9 @@ class SceneSource:
                 state = np.array([moved.x_m, moved.y_m, moved.yaw_rad])
                 if not keep_driving(state[None])[0]:
                     break
-        return Seen.join(parts)
+        return PolicyImages.join(parts)
 
-    def _seen(self, rgb: Image, state: Array, rng: np.random.Generator, held: Any = None) -> Seen:
+    def _seen(self, rgb: Image, state: Array, rng: np.random.Generator, held: Any = None) -> PolicyImages:
         """The plain view first, the textured ones after it, a held texture last."""
         images = [self._view.image(rgb)]
         if self._overlay is not None and self._sample is not None:
@@ -158,7 +158,9 @@ class SceneSource:
                 if np.array_equal(painted, rgb):  # the object is out of view
                     break
                 images.append(self._view.image(painted))
-        return Seen(np.stack(images), np.tile(state[:3], (len(images), 1)), np.arange(len(images)) > 0)
+        return PolicyImages(
+            np.stack(images), np.tile(state[:3], (len(images), 1)), np.arange(len(images)) > 0
+        )
 
 
 Show = Callable[[Any], Tensor]
@@ -194,13 +196,13 @@ class RenderedSource:
             variants,
         )
 
-    def look(self, states: Array, rng: np.random.Generator) -> Seen:
+    def look(self, states: Array, rng: np.random.Generator) -> PolicyImages:
         """What is seen from the states ``[B, 3]``."""
         return self._seen(states, rng, None)[0]
 
     def drive(
         self, steer: Steer, starts: Array, steps: int, keep_driving: KeepDriving, rng: np.random.Generator
-    ) -> Seen:
+    ) -> PolicyImages:
         """Drives side by side; the odd ones see one random texture throughout."""
         held = None if self._sample is None else self._sample(rng)
         states = torch.zeros(len(starts), self._dynamics.state_size, dtype=torch.float64)
@@ -216,9 +218,9 @@ class RenderedSource:
             states, odd = states[torch.from_numpy(keep)], odd[keep]
             if not len(states):
                 break
-        return Seen.join(parts)
+        return PolicyImages.join(parts)
 
-    def _seen(self, states: Array, rng: np.random.Generator, held: Any) -> tuple[Seen, Image, Image]:
+    def _seen(self, states: Array, rng: np.random.Generator, held: Any) -> tuple[PolicyImages, Image, Image]:
         """Plain and (where they differ) textured views; and per state the plain view and that with the held texture."""
         show = self._prepare(states)
         plain = _as_uint8(show(None))
@@ -231,7 +233,7 @@ class RenderedSource:
             images += [plain[row], *in_view]
             rows += [row] * (1 + len(in_view))
             textured += [False] + [True] * len(in_view)
-        return Seen(np.stack(images), states[rows].copy(), np.array(textured)), plain, painted
+        return PolicyImages(np.stack(images), states[rows].copy(), np.array(textured)), plain, painted
 
 
 def _as_uint8(images: Tensor) -> Image:

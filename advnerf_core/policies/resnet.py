@@ -37,8 +37,8 @@ class ResNet(FeaturesAndHead):
         settings: ResNetConfiguration = self.configuration
         layers: list[nn.Module] = [nn.Conv2d(3, settings.widths[0], 5, 2, 2)]
         for before, after in pairwise(settings.widths):
-            layers.append(_Block(before, after, 2))
-            layers += [_Block(after, after, 1) for _ in range(settings.blocks - 1)]
+            layers.append(_ResidualBlock(before, after, 2))
+            layers += [_ResidualBlock(after, after, 1) for _ in range(settings.blocks - 1)]
         self.features = nn.Sequential(*layers, _normalised(settings.widths[-1]), nn.SiLU(), nn.Flatten())
         height, width = IMAGE_HEIGHT, IMAGE_WIDTH
         for _ in settings.widths:
@@ -50,7 +50,7 @@ class ResNet(FeaturesAndHead):
         self.raise_goal_weights(flat)
 
 
-class _Block(nn.Module):
+class _ResidualBlock(nn.Module):
     """Two convolutions beside a shortcut; the shortcut is a 1x1 convolution where the size changes."""
 
     def __init__(self, channels: int, width: int, stride: int) -> None:

@@ -39,7 +39,9 @@ class VisionTransformer(SteeringNetwork):
         self.first = nn.Parameter(_SPREAD * torch.randn(1, 1, settings.width))
         self.positions = nn.Parameter(_waves(IMAGE_HEIGHT // height, IMAGE_WIDTH // width, settings.width))
         self.goal = nn.Linear(goal_size, settings.width) if goal_size else None
-        self.blocks = nn.Sequential(*(_Block(settings.width, settings.heads) for _ in range(settings.depth)))
+        self.blocks = nn.Sequential(
+            *(_TransformerBlock(settings.width, settings.heads) for _ in range(settings.depth))
+        )
         self.head = nn.Sequential(nn.LayerNorm(settings.width), nn.Linear(settings.width, 1))
 
     def output(self, images: Tensor, goals: Tensor | None) -> Tensor:
@@ -53,7 +55,7 @@ class VisionTransformer(SteeringNetwork):
         return output
 
 
-class _Block(nn.Module):
+class _TransformerBlock(nn.Module):
     """Self-attention, then two linear layers for each token; both are added to their input."""
 
     def __init__(self, width: int, heads: int) -> None:

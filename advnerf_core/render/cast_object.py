@@ -133,13 +133,13 @@ def cast_work(
 
 def _grid_parts(
     fields: Mapping[int, VoxelGridObject], poses: Array, pinhole: Pinhole, supersample: int, dtype: Any
-) -> list[tuple[int, _Part]]:
+) -> list[tuple[int, _ObjectCast]]:
     bands = max(1, -(-_LEAST_PARTS // max(1, len(poses) * len(fields))))
     T_camera_from_world = invert_transform(poses)
     return [
         (
             k,
-            _Part(
+            _ObjectCast(
                 prepared(field, dtype),
                 field,
                 T,
@@ -246,7 +246,7 @@ def _whole(voxels: tuple[int, ...]) -> Array:
     return np.array([[np.full(3, -0.5), np.array(voxels) - 0.5]])
 
 
-class _Part:
+class _ObjectCast:
     """The cast of one object into rows of one image."""
 
     def __init__(
@@ -325,7 +325,7 @@ class _Part:
         self.ends, self.indices, self.values = ends[:found], indices[:filled], values[:filled]
 
 
-def _joined(parts: Sequence[_Part], field: VoxelGridObject, dtype: Any) -> ObjectCast:
+def _joined(parts: Sequence[_ObjectCast], field: VoxelGridObject, dtype: Any) -> ObjectCast:
     """One cast of all images from their parts in order."""
     before = np.concatenate([[0], np.cumsum([len(part.values) for part in parts])])
     starts = [np.zeros(1, np.int64), *(part.ends + first for part, first in zip(parts, before, strict=False))]

@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Agreement:
+class SceneAgreement:
     """Learned against real pictures of the same places, as the policy sees them.
 
     Attributes:
@@ -71,7 +71,7 @@ class Agreement:
 
 def agreement(
     real: Sequence[Any], learned: Sequence[Any], steer_real: ArrayLike, steer_learned: ArrayLike
-) -> Agreement:
+) -> SceneAgreement:
     """Compare pictures.
 
     Args:
@@ -85,7 +85,7 @@ def agreement(
             f"expected as many learned as real pictures, and some, got {len(learned)} and {len(real)}"
         )
     pairs = list(zip(learned, real, strict=True))
-    return Agreement(
+    return SceneAgreement(
         np.array([psnr(a, b) for a, b in pairs]),
         np.array([ssim(a, b) for a, b in pairs]),
         np.asarray(steer_real, np.float64),
@@ -112,7 +112,7 @@ class Verdict:
         return asdict(self)
 
 
-def judge(found: Agreement, limits: GateLimits, of: str = "held-out views") -> Verdict:
+def judge(found: SceneAgreement, limits: GateLimits, of: str = "held-out views") -> Verdict:
     """Hold what was measured against the limits.
 
     Args:
@@ -126,7 +126,7 @@ def judge(found: Agreement, limits: GateLimits, of: str = "held-out views") -> V
 
 
 def reasons_against(n: Mapping[str, float | int], limits: GateLimits, of: str) -> tuple[str, ...]:
-    """What a comparison's numbers, as `Agreement.summary` gives them, do not reach, in words."""
+    """What a comparison's numbers, as `SceneAgreement.summary` gives them, do not reach, in words."""
     checks = (
         (n["views"] >= limits.views, f"{n['views']} pictures, at least {limits.views} needed"),
         (
@@ -179,7 +179,7 @@ class Effect:
 
 
 @dataclass(frozen=True, eq=False)
-class Pictures:
+class PicturePairs:
     """Real and learned pictures of the same places, as the policy sees them, in the order of the path where there is one.
 
     Attributes:

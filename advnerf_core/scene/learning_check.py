@@ -6,7 +6,7 @@ import numpy as np
 
 from advnerf_core.data.image_files import OPAQUE
 from advnerf_core.data.views import ImageSet
-from advnerf_core.scene.train_config import Progress
+from advnerf_core.scene.train_config import TrainingReport
 
 AFTER_STEPS = 100
 _BETTER_DB = 1.0
@@ -26,7 +26,7 @@ class LearningCheck:
         self._one_colour_db = one_colour_db(images)
         self._done = images.alpha is not None or self._one_colour_db > _PLAIN_DB
 
-    def __call__(self, at: Progress) -> str | None:
+    def __call__(self, at: TrainingReport) -> str | None:
         """What is wrong, in a sentence, at the first report after 100 steps; else None."""
         if self._done or at.step < AFTER_STEPS:
             return None

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from advnerf_core.geometry import Array
-from advnerf_core.scene.surrogate import Frames, Rendered, Surrogate, split_theta
+from advnerf_core.scene.surrogate import PoseBatch, Rendered, Surrogate, split_theta
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ class ManyTextures:
             )
         return self._shown(self._surrogate.prepare(poses), theta.detach())
 
-    def _shown(self, frames: Frames, theta: Tensor) -> Rendered:
+    def _shown(self, frames: PoseBatch, theta: Tensor) -> Rendered:
         image = frames.background.numpy().copy()
         shares = [self._shares(pixels, frames.background.shape) for pixels in frames.pixels]
         values: list[list[Tensor]] = []
@@ -111,7 +111,7 @@ class ManyTextures:
 
 
 def _vjp(
-    frames: Frames, shares: Sequence[Sequence[_Share]], values: Sequence[Sequence[Tensor]], theta: Tensor
+    frames: PoseBatch, shares: Sequence[Sequence[_Share]], values: Sequence[Sequence[Tensor]], theta: Tensor
 ) -> Callable[[Tensor], Tensor]:
     # Only these names are kept alive: the background is not, nor are the textures.
     weights, seen, dtype, shape = frames.weights, frames.seen, theta.dtype, theta.shape

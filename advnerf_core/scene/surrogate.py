@@ -56,7 +56,7 @@ class Rendered:
 
 
 @dataclass(frozen=True, eq=False)
-class Frames:
+class PoseBatch:
     """A batch of camera poses with everything that does not depend on ``theta``; render it with as many as you like.
 
     Attributes:
@@ -191,7 +191,7 @@ class Surrogate:
         return self.with_background(RememberedBackground(self.background, budget_bytes))
 
     @torch.no_grad()
-    def prepare(self, T_world_from_camera: ArrayLike) -> Frames:
+    def prepare(self, T_world_from_camera: ArrayLike) -> PoseBatch:
         """Render the background and cast the objects for camera poses ``[B, 4, 4]``."""
         poses = np.asarray(T_world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
         casts, frames = self._casts_and_scene(poses)
@@ -229,12 +229,12 @@ class Surrogate:
         dtype = torch.empty(0, dtype=self.dtype).numpy().dtype
         return cast_work(self.objects, poses, self.camera, self.supersample, dtype)
 
-    def _composed(self, casts: Sequence[ObjectCast], rgb: Tensor, depth_m: Tensor) -> Frames:
+    def _composed(self, casts: Sequence[ObjectCast], rgb: Tensor, depth_m: Tensor) -> PoseBatch:
         if self.opaque:
             casts = [made_opaque(cast) for cast in casts]
         return self.composed(casts, rgb, depth_m)
 
-    def composed(self, casts: Sequence[ObjectCast], rgb: Tensor, depth_m: Tensor) -> Frames:
+    def composed(self, casts: Sequence[ObjectCast], rgb: Tensor, depth_m: Tensor) -> PoseBatch:
         """Compose casts of the objects with a background, colours ``[B, H, W, 3]`` and planar depth ``[B, H, W]`` [m]."""
         background, shares = sparse_shares(
             [cast.pixels for cast in casts],
@@ -246,7 +246,7 @@ class Surrogate:
             _seen(cast, share, field) for cast, share, field in zip(casts, shares, self.objects, strict=True)
         ]
         dimmed = rgb.numpy() * background.astype(rgb.numpy().dtype).reshape(depth_m.shape)[..., None]
-        return Frames(
+        return PoseBatch(
             torch.from_numpy(dimmed),
             tuple(part[1] for part in seen),
             tuple(part[0] for part in seen),

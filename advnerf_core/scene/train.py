@@ -27,7 +27,7 @@ from advnerf_core.scene.field import SceneField, SceneFieldConfig
 from advnerf_core.scene.fingerprint import training_fingerprint
 from advnerf_core.scene.intervals import pixel_intervals
 from advnerf_core.scene.torch_step import stepper_for
-from advnerf_core.scene.train_config import Progress, TrainConfig, TrainedScene
+from advnerf_core.scene.train_config import TrainConfig, TrainedScene, TrainingReport
 from advnerf_core.scene.train_step import Matte, StepResult
 
 Array32 = NDArray[np.float32]
@@ -106,7 +106,7 @@ class Trainer:
 
     def run(
         self,
-        progress: Callable[[Progress], None] | None = None,
+        progress: Callable[[TrainingReport], None] | None = None,
         checkpoint: Path | None = None,
         report_every: int = 50,
     ) -> TrainedScene:
@@ -265,7 +265,7 @@ class Trainer:
         """Factor on sample intervals: long while everything counts as occupied, 1 from the end of the warm-up."""
         return 1.0 + 5.0 * max(0.0, 1.0 - self.step / max(self.config.warmup_steps, 1))
 
-    def _report(self, progress: Callable[[Progress], None] | None) -> None:
+    def _report(self, progress: Callable[[TrainingReport], None] | None) -> None:
         recent, self._recent = self._recent, []
         mse = float(np.mean([r.mse for r in recent])) if recent else float("nan")
         psnr_db = -10.0 * math.log10(max(mse, 1e-12))
@@ -276,7 +276,9 @@ class Trainer:
         rays, samples = sum(r.rays for r in recent), sum(r.samples for r in recent)
         loss = float(np.mean([r.loss for r in recent]))
         progress(
-            Progress(self.step, self.fraction, loss, psnr_db, left, recent[-1].rays, samples / max(rays, 1))
+            TrainingReport(
+                self.step, self.fraction, loss, psnr_db, left, recent[-1].rays, samples / max(rays, 1)
+            )
         )
 
 
@@ -285,7 +287,7 @@ def train_scene(
     field_config: SceneFieldConfig,
     config: TrainConfig | None = None,
     checkpoint: Path | None = None,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Callable[[TrainingReport], None] | None = None,
 ) -> TrainedScene:
     """Train a scene field from the start, or from ``checkpoint`` if that exists.
 

@@ -90,7 +90,7 @@ class TrainConfig:
 
 
 @dataclass(frozen=True)
-class Progress:
+class TrainingReport:
     """What a running training reports.
 
     Attributes:

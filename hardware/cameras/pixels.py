@@ -13,7 +13,7 @@ Bytes = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
-class Layout:
+class PixelLayout:
     """Memory layout of an image, as confirmed by the driver.
 
     Attributes:
@@ -41,8 +41,8 @@ def _coloured(pixels: Bytes, code: int) -> Bytes:
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), code), dtype=np.uint8)
 
 
-def _packed_yuv(code: int) -> Callable[[Bytes, Layout], Bytes]:
-    def convert(data: Bytes, layout: Layout) -> Bytes:
+def _packed_yuv(code: int) -> Callable[[Bytes, PixelLayout], Bytes]:
+    def convert(data: Bytes, layout: PixelLayout) -> Bytes:
         pixels = _rows(data, layout, layout.height)[:, : 2 * layout.width].reshape(
             layout.height, layout.width, 2
         )
@@ -51,8 +51,8 @@ def _packed_yuv(code: int) -> Callable[[Bytes, Layout], Bytes]:
     return convert
 
 
-def _packed_three(swap: bool) -> Callable[[Bytes, Layout], Bytes]:
-    def convert(data: Bytes, layout: Layout) -> Bytes:
+def _packed_three(swap: bool) -> Callable[[Bytes, PixelLayout], Bytes]:
+    def convert(data: Bytes, layout: PixelLayout) -> Bytes:
         pixels = _rows(data, layout, layout.height)[:, : 3 * layout.width].reshape(
             layout.height, layout.width, 3
         )
@@ -62,17 +62,17 @@ def _packed_three(swap: bool) -> Callable[[Bytes, Layout], Bytes]:
     return convert
 
 
-def _grey(data: Bytes, layout: Layout) -> Bytes:
+def _grey(data: Bytes, layout: PixelLayout) -> Bytes:
     part = _rows(data, layout, layout.height)[:, slice(*layout.columns)]
     return _coloured(part, cv2.COLOR_GRAY2RGB)
 
 
-def _nv12(data: Bytes, layout: Layout) -> Bytes:
+def _nv12(data: Bytes, layout: PixelLayout) -> Bytes:
     rows = _rows(data, layout, layout.height * 3 // 2)[:, slice(*layout.columns)]
     return _coloured(rows, cv2.COLOR_YUV2RGB_NV12)
 
 
-def _jpeg(data: Bytes, layout: Layout) -> Bytes:
+def _jpeg(data: Bytes, layout: PixelLayout) -> Bytes:
     bgr = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if bgr is None:
         raise ValueError("the JPEG data of a frame are damaged")
@@ -84,7 +84,7 @@ def _jpeg(data: Bytes, layout: Layout) -> Bytes:
 
 
 # YUV is interpreted as BT.601 with limited range, which USB cameras send.
-_CONVERT: dict[str, Callable[[Bytes, Layout], Bytes]] = {
+_CONVERT: dict[str, Callable[[Bytes, PixelLayout], Bytes]] = {
     "YUYV": _packed_yuv(cv2.COLOR_YUV2RGB_YUYV),
     "UYVY": _packed_yuv(cv2.COLOR_YUV2RGB_UYVY),
     "YVYU": _packed_yuv(cv2.COLOR_YUV2RGB_YVYU),
@@ -105,7 +105,7 @@ def least_bytes_per_line(pixel_format: str, width: int) -> int:
     return 0 if pixel_format in COMPRESSED else width * _BYTES_PER_PIXEL.get(pixel_format, 2)
 
 
-def to_rgb(data: Bytes, layout: Layout) -> Bytes:
+def to_rgb(data: Bytes, layout: PixelLayout) -> Bytes:
     """Convert an image to newly allocated pixels ``[H, W, 3]``. Raises `ValueError` for invalid bytes."""
     if data.size < layout.size_bytes:
         raise ValueError(f"expected {layout.size_bytes} bytes, got {data.size}; the frame is truncated")
@@ -114,5 +114,5 @@ def to_rgb(data: Bytes, layout: Layout) -> Bytes:
     return rgb
 
 
-def _rows(data: Bytes, layout: Layout, rows: int) -> Bytes:
+def _rows(data: Bytes, layout: PixelLayout, rows: int) -> Bytes:
     return data[: rows * layout.bytes_per_line].reshape(rows, layout.bytes_per_line)

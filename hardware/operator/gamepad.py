@@ -35,7 +35,7 @@ _DEAD_ZONE = 0.05
 
 
 @dataclass(frozen=True)
-class Layout:
+class GamepadLayout:
     """Codes of buttons and axes.
 
     Attributes:
@@ -56,9 +56,9 @@ class Layout:
 
 
 # BTN_TL, BTN_TR, BTN_EAST (B), BTN_START, ABS_Y, ABS_RX; as the kernel's xpad driver names them.
-EVENT_LAYOUT = Layout(0x136, 0x137, 0x131, 0x13B, 1, 3)
+EVENT_LAYOUT = GamepadLayout(0x136, 0x137, 0x131, 0x13B, 1, 3)
 # The same pad as a joystick in XInput mode: LB 4, RB 5, B 1, Start 7, axes 1 and 3.
-JS_LAYOUT = Layout(4, 5, 1, 7, 1, 3)
+JS_LAYOUT = GamepadLayout(4, 5, 1, 7, 1, 3)
 
 
 def _evioc_gabs(axis: int) -> int:
@@ -87,7 +87,7 @@ class Gamepad:
         self,
         path: Path,
         mono_ns: Callable[[], int],
-        layout: Layout | None = None,
+        layout: GamepadLayout | None = None,
         ioctl: Callable[..., Any] = fcntl.ioctl,
     ) -> None:
         self.path = path

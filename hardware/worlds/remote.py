@@ -43,7 +43,7 @@ _TOLD_LINES = 3
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class ServerReply:
     """What a server answered.
 
     Attributes:
@@ -123,7 +123,7 @@ class RemoteServer:
         """Whether the process runs, and was not ended by a fault."""
         return self._end.alive and self._process is not None and self._process.poll() is None
 
-    def call(self, name: str, arguments: Mapping[str, Any], arrays: Arrays, deadline_s: float) -> Answer:
+    def call(self, name: str, arguments: Mapping[str, Any], arrays: Arrays, deadline_s: float) -> ServerReply:
         """Ask, and wait for the answer.
 
         Args:
@@ -152,7 +152,9 @@ class RemoteServer:
             _kill_all(self._process)
         self.close()
 
-    def _call(self, name: str, arguments: Mapping[str, Any], arrays: Arrays, deadline_s: float) -> Answer:
+    def _call(
+        self, name: str, arguments: Mapping[str, Any], arrays: Arrays, deadline_s: float
+    ) -> ServerReply:
         if not self._end.alive:
             raise ServerLost(
                 f"world {self.name}: its process was ended; reset the world to start another one"
@@ -193,7 +195,7 @@ class RemoteServer:
                     f"ended{self._said()}; raise the deadlines in the section world.server if it is slow"
                 )
 
-    def _read(self, name: str, message: list[bytes]) -> Answer:
+    def _read(self, name: str, message: list[bytes]) -> ServerReply:
         header = self._header(name, message[0])
         if header.get("protocol") != PROTOCOL:
             raise ServerVersionError(
@@ -205,7 +207,7 @@ class RemoteServer:
             raise SimulatorError(f"world {self.name}: {name}: {str(header['error'])[:500]}{self._said()}")
         if not isinstance(header.get("result"), dict):
             self._refuse(name, "a result", f"{header.get('result')!r:.80}")
-        return Answer(header["result"], self._arrays(name, header.get("arrays"), message[1:]))
+        return ServerReply(header["result"], self._arrays(name, header.get("arrays"), message[1:]))
 
     def _header(self, name: str, head: bytes) -> dict[str, Any]:
         try:

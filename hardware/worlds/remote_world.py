@@ -20,7 +20,7 @@ from pydantic import Field
 
 from advnerf_core.geometry import Array, Pinhole, VehicleState, planar_pose
 from advnerf_core.strict import StrictModel
-from hardware.worlds.remote import SERVERS, Answer, RemoteServer
+from hardware.worlds.remote import SERVERS, RemoteServer, ServerReply
 from hardware.worlds.remote_answers import (
     depth_in,
     picture_in,
@@ -249,7 +249,7 @@ class RemoteWorld(ABC):
             asked = {"camera": camera, "depth": False}
             self._call("render", asked, {"T_world_from_camera": place}, self._deadlines.open_s)
 
-    def _described(self, answer: Answer) -> WorldDescription:
+    def _described(self, answer: ServerReply) -> WorldDescription:
         try:
             return self.description_of(answer.result, answer.arrays)
         except WorldError:
@@ -259,14 +259,14 @@ class RemoteWorld(ABC):
                 f"expected a map that can be driven; got {type(error).__name__}: {error}"
             ) from error
 
-    def _ask(self, call: str, arguments: Mapping[str, Any], arrays: _Arrays | None = None) -> Answer:
+    def _ask(self, call: str, arguments: Mapping[str, Any], arrays: _Arrays | None = None) -> ServerReply:
         """Call the open simulator; where it was lost it is opened again."""
         self._require_open()
         if self.server is None:
             self._open()
         return self._call(call, arguments, arrays or {}, self._deadlines.call_s)
 
-    def _call(self, call: str, arguments: Mapping[str, Any], arrays: _Arrays, limit_s: float) -> Answer:
+    def _call(self, call: str, arguments: Mapping[str, Any], arrays: _Arrays, limit_s: float) -> ServerReply:
         assert self.server is not None, "it was started before"
         try:
             return self.server.call(call, arguments, arrays, limit_s)

@@ -30,7 +30,7 @@ ENDS, REPAIRS = "advnerf_end", "advnerf_repair"
 
 
 @dataclass
-class Layout:
+class FileLayout:
     """The parts of the new file in order: ranges of the old file, or bytes."""
 
     parts: list[range | bytes]
@@ -68,7 +68,7 @@ def contents_of(scan: Scan) -> Contents:
     return contents
 
 
-def assemble(scan: Scan, file_name: str, notes: dict[str, str]) -> Layout:
+def assemble(scan: Scan, file_name: str, notes: dict[str, str]) -> FileLayout:
     """Place every piece and write the end of the file.
 
     Args:
@@ -94,7 +94,7 @@ def assemble(scan: Scan, file_name: str, notes: dict[str, str]) -> Layout:
         parts.append(tail)
         at += len(tail)
     parts.append(_ending(scan, entries, at))
-    return Layout(parts)
+    return FileLayout(parts)
 
 
 def _with_what_is_missing(scan: Scan) -> list[Piece]:

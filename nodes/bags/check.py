@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nodes.bags.damage import describe
-from nodes.bags.formats import Format, no_checksums, recognise
+from nodes.bags.formats import BagFormat, no_checksums, recognise
 from nodes.bags.repair import being_written, examine, refusal_of
 from nodes.runtime.errors import BagError
 
@@ -36,7 +36,7 @@ def diagnose(path: Path) -> Diagnosis:
     Raises:
         BagError: The file is not a bag, or its compression is unknown.
     """
-    if (form := recognise(path)) is not Format.MCAP:
+    if (form := recognise(path)) is not BagFormat.MCAP:
         return Diagnosis(path, True, no_checksums(form), ())
     if being_written(path):
         raise BagError(f"{path} is being written at this moment; stop its recorder first")

@@ -25,7 +25,7 @@ from nodes.bags.records import (
     records_of,
     unpack_chunk,
 )
-from nodes.bags.scanned import Run
+from nodes.bags.scanned import MessageRun
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError
 
@@ -42,14 +42,14 @@ class RawMessage(NamedTuple):
     data: bytes
 
 
-class _Block(NamedTuple):
+class _ChunkSpan(NamedTuple):
     """A chunk, or messages outside of chunks, in order of the first log time."""
 
     start_ns: int
     offset: int
     end_ns: int
     channels: Collection[int]
-    source: ChunkIndex | Run
+    source: ChunkIndex | MessageRun
 
 
 def messages_in_order(
@@ -77,7 +77,7 @@ def messages_in_order(
         try:
             data = (
                 _run_data(file, block.source)
-                if isinstance(block.source, Run)
+                if isinstance(block.source, MessageRun)
                 else _chunk_data(file, block.source)
             )
             for message in _messages(data, wanted, block.offset):
@@ -94,9 +94,9 @@ def time_spans(summary: Summary) -> list[tuple[int, int]]:
     return [(block.start_ns, block.end_ns) for block in _blocks(summary) if block.channels or block.end_ns]
 
 
-def _blocks(summary: Summary) -> list[_Block]:
+def _blocks(summary: Summary) -> list[_ChunkSpan]:
     blocks = [
-        _Block(
+        _ChunkSpan(
             index.message_start_time,
             index.chunk_start_offset,
             index.message_end_time,
@@ -106,11 +106,11 @@ def _blocks(summary: Summary) -> list[_Block]:
         for index in summary.chunk_indexes
     ]
     for run in getattr(summary, "runs", ()):
-        blocks.append(_Block(run.start_ns, run.offset, run.end_ns, run.channels, run))
+        blocks.append(_ChunkSpan(run.start_ns, run.offset, run.end_ns, run.channels, run))
     return sorted(blocks, key=lambda block: block[:2])
 
 
-def _damaged(file: Any, summary: Summary, block: _Block, error: Damaged) -> BagError:
+def _damaged(file: Any, summary: Summary, block: _ChunkSpan, error: Damaged) -> BagError:
     path = getattr(file, "name", "the bag")
     first_ns = summary.statistics.message_start_time if summary.statistics is not None else block.start_ns
     since, until = ((moment - first_ns) / NS_PER_S for moment in (block.start_ns, block.end_ns))
@@ -146,7 +146,7 @@ def _chunk_data(file: BinaryIO, index: ChunkIndex) -> bytes:
     return unpack_chunk(head, record[head.data_at :])
 
 
-def _run_data(file: BinaryIO, run: Run) -> bytes:
+def _run_data(file: BinaryIO, run: MessageRun) -> bytes:
     file.seek(run.offset)
     data = file.read(run.length)
     if len(data) != run.length:

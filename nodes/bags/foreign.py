@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from rosbags import rosbag1, rosbag2
 from rosbags.interfaces import MessageDefinitionFormat
 
-from nodes.bags.formats import Format
+from nodes.bags.formats import BagFormat
 from nodes.bags.message_definitions import IDL, MSG, full_type_name
 from nodes.bags.stored_types import CDR, ROS1, RecordedTopic
 from nodes.runtime.errors import BagError
@@ -32,7 +32,7 @@ class StoredTopic(NamedTuple):
     messages: int
 
 
-class Stored(NamedTuple):
+class StoredBag(NamedTuple):
     """Contents of a file. Times are in nanoseconds since 1970, 0 for a file without messages."""
 
     start_ns: int
@@ -49,7 +49,7 @@ class StoredMessage(NamedTuple):
     data: bytes
 
 
-def read_stored(path: Path, form: Format) -> Stored:
+def read_stored(path: Path, form: BagFormat) -> StoredBag:
     """Read the contents of a file.
 
     Raises:
@@ -59,12 +59,12 @@ def read_stored(path: Path, form: Format) -> Stored:
         topics = tuple(_topic(connection, form) for connection in reader.connections)
         count = sum(topic.messages for topic in topics)
         if not count:
-            return Stored(0, 0, 0, topics)
-        return Stored(reader.start_time, reader.end_time - 1, count, topics)
+            return StoredBag(0, 0, 0, topics)
+        return StoredBag(reader.start_time, reader.end_time - 1, count, topics)
 
 
 def stored_messages(
-    path: Path, form: Format, numbers: Collection[int], start_ns: int
+    path: Path, form: BagFormat, numbers: Collection[int], start_ns: int
 ) -> Iterator[StoredMessage]:
     """Yield messages in order of their log time.
 
@@ -81,13 +81,13 @@ def stored_messages(
                 yield StoredMessage(connection.id, log_ns, bytes(data))
 
 
-def _topic(connection: Any, form: Format) -> StoredTopic:
+def _topic(connection: Any, form: BagFormat) -> StoredTopic:
     language = _LANGUAGES.get(connection.msgdef.format, "")
-    serialization = ROS1 if form is Format.ROS1 else connection.ext.serialization_format or CDR
+    serialization = ROS1 if form is BagFormat.ROS1 else connection.ext.serialization_format or CDR
     recorded = RecordedTopic(
         connection.topic,
         full_type_name(connection.msgtype),
-        "" if form is Format.ROS1 else connection.digest,
+        "" if form is BagFormat.ROS1 else connection.digest,
         connection.msgdef.data if language else "",
         language or MSG,
         serialization,
@@ -96,9 +96,9 @@ def _topic(connection: Any, form: Format) -> StoredTopic:
 
 
 @contextmanager
-def _opened(path: Path, form: Format) -> Iterator[Any]:
+def _opened(path: Path, form: BagFormat) -> Iterator[Any]:
     rest = path.with_name(f"{path.name}-wal")
-    if form is Format.SQLITE and rest.exists() and rest.stat().st_size:
+    if form is BagFormat.SQLITE and rest.exists() and rest.stat().st_size:
         raise BagError(
             f"{path} is unfinished: its recorder was killed or is still running, and the newest messages are in {rest.name}; "
             f"add them with: sqlite3 {path} 'PRAGMA wal_checkpoint(TRUNCATE)'"
@@ -115,8 +115,8 @@ def _opened(path: Path, form: Format) -> Iterator[Any]:
         ) from error
 
 
-def _reader(path: Path, form: Format) -> Any:
-    if form is Format.ROS1:
+def _reader(path: Path, form: BagFormat) -> Any:
+    if form is BagFormat.ROS1:
         return rosbag1.Reader(path)
     if path.suffix != ".db3":
         raise BagError(f"{path} is {form.value}; rename it to {path.stem}.db3 to read it")

@@ -8,7 +8,7 @@ from pathlib import Path
 from nodes.runtime.errors import BagError
 
 
-class Format(Enum):
+class BagFormat(Enum):
     """Formats of bags that can be read."""
 
     MCAP = "MCAP"
@@ -33,7 +33,7 @@ _OTHERS = (
 )  # fmt: skip
 
 
-def recognise(path: Path) -> Format:
+def recognise(path: Path) -> BagFormat:
     """Recognise the format of a file.
 
     Raises:
@@ -44,18 +44,18 @@ def recognise(path: Path) -> Format:
             head = file.read(512)
     except OSError as error:
         raise BagError(f"cannot read {path}: {error.strerror}") from error
-    for magic, found in ((_MCAP, Format.MCAP), (_SQLITE, Format.SQLITE), (_ROS1, Format.ROS1)):
+    for magic, found in ((_MCAP, BagFormat.MCAP), (_SQLITE, BagFormat.SQLITE), (_ROS1, BagFormat.ROS1)):
         if head.startswith(magic):
             return found
     # A recorder that is killed right after its start leaves fewer bytes than the format's signature.
     if head and _MCAP.startswith(head):
-        return Format.MCAP
+        return BagFormat.MCAP
     kind, advice = _kind(head)
     advice = advice.format(bag=path, folder=path.parent)
     raise BagError(f"{path} is {kind}; {_EXPECTED}" + (f". To read it, {advice}" if advice else ""))
 
 
-def no_checksums(form: Format) -> str:
+def no_checksums(form: BagFormat) -> str:
     """Explain why damage to a file of a format cannot be noticed."""
     return f"{form.value} has no checksums"
 
@@ -67,10 +67,10 @@ def require_mcap(path: Path, verb: str) -> None:
         path: The file.
         verb: Participle of the operation for the message, for example ``repaired``.
     """
-    if (found := recognise(path)) is not Format.MCAP:
+    if (found := recognise(path)) is not BagFormat.MCAP:
         raise BagError(
             f"{path} is {found.value}; only MCAP bags can be {verb}. Convert it first: {_CONVERT.format(bag=path)}"
-            + (f", or: ros2 bag convert -i {path} -o OPTIONS.yaml" if found is Format.SQLITE else "")
+            + (f", or: ros2 bag convert -i {path} -o OPTIONS.yaml" if found is BagFormat.SQLITE else "")
         )
 
 

@@ -24,7 +24,7 @@ RESERVE_BYTES, RESERVE_NAME = 8 * 1024 * 1024, ".reserve"
 
 
 @dataclass(frozen=True)
-class Entry:
+class JournalEntry:
     """A message of the unfinished chunk."""
 
     topic: str
@@ -53,7 +53,7 @@ class Journal:
         self._position = -1
         self.restart(position)
 
-    def add(self, entry: Entry) -> None:
+    def add(self, entry: JournalEntry) -> None:
         """Append a message."""
         topic = entry.topic.encode()
         lengths = len(topic), len(entry.cdr)
@@ -76,7 +76,7 @@ class Journal:
         os.close(self._descriptor)
 
 
-def read_journal(bag_file: Path) -> tuple[int, list[Entry]]:
+def read_journal(bag_file: Path) -> tuple[int, list[JournalEntry]]:
     """Read the length of the bag at the start of the chunk, and the chunk's messages; no messages without a journal."""
     try:
         content = journal_of(bag_file).read_bytes()
@@ -87,7 +87,7 @@ def read_journal(bag_file: Path) -> tuple[int, list[Entry]]:
     return _HEAD.unpack_from(content)[1], list(_entries(content))
 
 
-def _entries(content: bytes) -> Iterator[Entry]:
+def _entries(content: bytes) -> Iterator[JournalEntry]:
     """Yield the intact entries up to the first cut or damaged one."""
     at = _HEAD.size
     while at + _ENTRY.size <= len(content):
@@ -97,7 +97,7 @@ def _entries(content: bytes) -> Iterator[Entry]:
         if end > len(content) or zlib.crc32(content[at + _CRC_BYTES : end]) != crc:
             return
         topic = content[at + _ENTRY.size : middle].decode("utf-8", "replace")
-        yield Entry(topic, content[middle:end], log_ns, publish_ns, sequence)
+        yield JournalEntry(topic, content[middle:end], log_ns, publish_ns, sequence)
         at = end
 
 

@@ -11,7 +11,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Source(Generic[T]):
+class MergeSource(Generic[T]):
     """The messages of one file.
 
     Attributes:
@@ -23,7 +23,7 @@ class Source(Generic[T]):
     open: Callable[[], Iterator[T]]
 
 
-def merge_by_time(sources: Sequence[Source[T]], time_ns: Callable[[T], int]) -> Iterator[T]:
+def merge_by_time(sources: Sequence[MergeSource[T]], time_ns: Callable[[T], int]) -> Iterator[T]:
     """Yield all messages in order of time. Of two with the same time, that of the earlier source comes first.
 
     Args:

@@ -99,7 +99,7 @@ class Definition:
             MessageError: The bytes do not decode.
         """
         try:
-            reader = _Reader(data, ros1)
+            reader = _ByteReader(data, ros1)
             found = self._read(self.typename, reader)
             reader.require_end()
         except (struct.error, ValueError, RecursionError, UnicodeDecodeError) as error:
@@ -126,7 +126,7 @@ class Definition:
             return False
         return all(self._same(inner, seen) for _, kind in ours if (inner := _type_in(kind)))
 
-    def _read(self, typename: str, reader: _Reader) -> dict[str, Any]:
+    def _read(self, typename: str, reader: _ByteReader) -> dict[str, Any]:
         fields = self._fields(typename)
         if not fields and not reader.ros1:
             reader.number("u1")
@@ -136,7 +136,7 @@ class Definition:
             if name != _PLACEHOLDER or not reader.ros1
         }
 
-    def _value(self, kind: Any, reader: _Reader) -> Any:
+    def _value(self, kind: Any, reader: _ByteReader) -> Any:
         node, what = kind
         if node == Nodetype.NAME:
             return self._read(what, reader)
@@ -231,7 +231,7 @@ def _number(name: str) -> str:
     return _NUMBERS[name]
 
 
-class _Reader:
+class _ByteReader:
     """Reads values in sequence from the bytes of a message."""
 
     def __init__(self, data: bytes, ros1: bool) -> None:

@@ -15,7 +15,7 @@ _SLOWEST, _FASTEST = 1e-3, 1e3
 
 
 @dataclass(frozen=True)
-class Command:
+class PlayerCommand:
     """A command to the player.
 
     Attributes:
@@ -27,7 +27,7 @@ class Command:
     number: float = 1.0
 
     @classmethod
-    def parse(cls, text: str) -> Command:
+    def parse(cls, text: str) -> PlayerCommand:
         """Parse a command such as ``pause``, ``step``, ``step 10`` or ``rate 0.5``."""
         words = text.split()
         if len(words) == 1 and words[0] in (*_PLAIN, STEP):

@@ -10,7 +10,7 @@ from nodes.runtime.bus import Bus, Received
 from nodes.runtime.clock import Now
 from nodes.runtime.errors import LaunchError
 from nodes.runtime.messages import header, types
-from nodes.runtime.requests import Asked
+from nodes.runtime.requests import RequestIdentity
 
 _CONTROL, _STATE = "/player/control", "/player/state"
 _REPEAT_S, _PATIENCE_S = 0.05, 3.0
@@ -23,7 +23,7 @@ def ask_player(run_dir: Path, command: str) -> tuple[bool, str]:
         LaunchError: No player answered.
     """
 
-    def make(asked: Asked, now: Now) -> Any:
+    def make(asked: RequestIdentity, now: Now) -> Any:
         return types.PlayerControl(header=header(asked.real_ns), command=command, ask_id=asked.ask_id)
 
     def read(ask_id: str, received: Received) -> tuple[bool, str] | None:

@@ -16,8 +16,8 @@ from nodes.bags.check import diagnose
 from nodes.bags.chunks import messages_in_order, read_attachment_at, read_metadata_at, time_spans
 from nodes.bags.file import open_bag
 from nodes.bags.foreign import read_stored, stored_messages
-from nodes.bags.formats import Format, no_checksums, recognise
-from nodes.bags.merge import Source, merge_by_time
+from nodes.bags.formats import BagFormat, no_checksums, recognise
+from nodes.bags.merge import MergeSource, merge_by_time
 from nodes.bags.message_definitions import full_type_name
 from nodes.bags.parts import bag_parts
 from nodes.bags.stored_types import Convert, RecordedTopic, converter, unpacked
@@ -102,11 +102,11 @@ class BagMessage:
 
 
 @dataclass(frozen=True)
-class _Part:
+class _FileSummary:
     """Summary of one file without the index of its chunks. ``recorded`` has the topics by their numbers in the file."""
 
     path: Path
-    format: Format
+    format: BagFormat
     size_bytes: int
     start_ns: int
     end_ns: int
@@ -144,7 +144,7 @@ def message_spans(bag: Path) -> list[tuple[int, int]]:
     for part in _parts(bag):
         if part.messages:
             whole = [(part.start_ns, part.end_ns)]
-            spans += time_spans(_whole_file(part.path)[0]) if part.format is Format.MCAP else whole
+            spans += time_spans(_whole_file(part.path)[0]) if part.format is BagFormat.MCAP else whole
     return spans
 
 
@@ -245,7 +245,7 @@ def read_messages(
         )
     wanted = frozenset(topics or known)
     sources = [
-        Source(part.start_ns, partial(_messages_of, part, wanted, start_ns, converters))
+        MergeSource(part.start_ns, partial(_messages_of, part, wanted, start_ns, converters))
         for part in _parts(bag)
         if part.messages
         and part.end_ns >= start_ns
@@ -256,11 +256,11 @@ def read_messages(
 
 
 def _messages_of(
-    part: _Part, topics: frozenset[str], start_ns: int, converters: Mapping[int, Convert]
+    part: _FileSummary, topics: frozenset[str], start_ns: int, converters: Mapping[int, Convert]
 ) -> Iterator[BagMessage]:
     """Yield the messages of one file in order of their log time."""
     names = {number: recorded.topic for number, recorded in part.recorded.items() if recorded.topic in topics}
-    stored = _mcap_messages if part.format is Format.MCAP else _stored_messages
+    stored = _mcap_messages if part.format is BagFormat.MCAP else _stored_messages
     for number, message in stored(part, names, start_ns):
         data = unpacked(message.cdr, message.topic, str(part.path))
         if convert := converters.get(number):
@@ -268,7 +268,9 @@ def _messages_of(
         yield message if data is message.cdr else replace(message, cdr=data)
 
 
-def _mcap_messages(part: _Part, names: Mapping[int, str], start_ns: int) -> Iterator[tuple[int, BagMessage]]:
+def _mcap_messages(
+    part: _FileSummary, names: Mapping[int, str], start_ns: int
+) -> Iterator[tuple[int, BagMessage]]:
     summary, _ = _whole_file(part.path)
     with open_bag(part.path) as file:
         for raw in messages_in_order(file, summary, names, start_ns):
@@ -277,7 +279,7 @@ def _mcap_messages(part: _Part, names: Mapping[int, str], start_ns: int) -> Iter
 
 
 def _stored_messages(
-    part: _Part, names: Mapping[int, str], start_ns: int
+    part: _FileSummary, names: Mapping[int, str], start_ns: int
 ) -> Iterator[tuple[int, BagMessage]]:
     """Yield the messages of a file in another format than MCAP. Publish times and sequence numbers are generated."""
     counts = dict.fromkeys(names.values(), 0)
@@ -298,7 +300,7 @@ def require_readable(bag: Path, topics: Mapping[str, str]) -> None:
         _converters(part, frozenset(topics), topics)
 
 
-def _converters(part: _Part, topics: frozenset[str], types: Mapping[str, str]) -> dict[int, Convert]:
+def _converters(part: _FileSummary, topics: frozenset[str], types: Mapping[str, str]) -> dict[int, Convert]:
     """Converters of a file's messages by the number of their topic; topics without conversion are missing."""
     found = {}
     for number, recorded in part.recorded.items():
@@ -327,7 +329,7 @@ def _sum(one: TopicInfo, other: TopicInfo) -> TopicInfo:
     return TopicInfo(one.name, one.type or other.type, one.count + other.count, lost)
 
 
-def _parts(bag: Path) -> list[_Part]:
+def _parts(bag: Path) -> list[_FileSummary]:
     found = []
     for path in bag_parts(bag):
         state = path.stat()
@@ -338,9 +340,9 @@ def _parts(bag: Path) -> list[_Part]:
 
 
 @lru_cache(maxsize=1024)
-def _part_of(path: Path, mtime_ns: int, size_bytes: int) -> _Part | None:
+def _part_of(path: Path, mtime_ns: int, size_bytes: int) -> _FileSummary | None:
     form = recognise(path)
-    if form is not Format.MCAP:
+    if form is not BagFormat.MCAP:
         return _stored_part(path, form, size_bytes)
     if (found := _summary_of(path, mtime_ns, size_bytes)) is None:
         return None
@@ -355,7 +357,7 @@ def _part_of(path: Path, mtime_ns: int, size_bytes: int) -> _Part | None:
         count = statistics.channel_message_counts.get(channel.id, 0)
         topic = TopicInfo(channel.topic, type_of(summary, channel), count, lost)
         topics[channel.topic] = _sum(topics[channel.topic], topic) if channel.topic in topics else topic
-    return _Part(
+    return _FileSummary(
         path,
         form,
         size_bytes,
@@ -370,13 +372,13 @@ def _part_of(path: Path, mtime_ns: int, size_bytes: int) -> _Part | None:
     )
 
 
-def _stored_part(path: Path, form: Format, size_bytes: int) -> _Part:
+def _stored_part(path: Path, form: BagFormat, size_bytes: int) -> _FileSummary:
     stored = read_stored(path, form)
     topics: dict[str, TopicInfo] = {}
     for _, recorded, count in stored.topics:
         topic = TopicInfo(recorded.topic, recorded.type, count, None)
         topics[topic.name] = _sum(topics[topic.name], topic) if topic.name in topics else topic
-    return _Part(
+    return _FileSummary(
         path,
         form,
         size_bytes,

@@ -21,10 +21,10 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import Channel, Chunk, ChunkIndex, Message, MessageIndex, Schema
 
 from advnerf_core.files import write_atomically
-from nodes.bags.assemble import Layout, assemble, contents_of
+from nodes.bags.assemble import FileLayout, assemble, contents_of
 from nodes.bags.damage import describe
 from nodes.bags.formats import require_mcap
-from nodes.bags.journal import RESERVE_BYTES, RESERVE_NAME, Entry, journal_of, read_journal
+from nodes.bags.journal import RESERVE_BYTES, RESERVE_NAME, JournalEntry, journal_of, read_journal
 from nodes.bags.metadata import rosbag2_metadata
 from nodes.bags.parts import METADATA_FILE, bag_parts
 from nodes.bags.scan import scan_file
@@ -206,7 +206,9 @@ def being_written(path: Path) -> bool:
                 return False
 
 
-def _swap(path: Path, layout: Layout, scan: Scan, before: os.stat_result, keep_original: bool) -> Path | None:
+def _swap(
+    path: Path, layout: FileLayout, scan: Scan, before: os.stat_result, keep_original: bool
+) -> Path | None:
     """Write the new file, check it, and rename it. The old file is complete under one of its names at every moment."""
     temporary = path.with_name(f".{path.name}.repair")
     try:
@@ -276,7 +278,7 @@ def _keep(path: Path) -> Path:
     raise AssertionError("unreachable")
 
 
-def _extend(path: Path, layout: Layout) -> None:
+def _extend(path: Path, layout: FileLayout) -> None:
     """Truncate the file after the unchanged part and append the rest."""
     unchanged = layout.unchanged
     rest, at = [], 0
@@ -340,7 +342,7 @@ def _add_journal(scan: Scan, path: Path) -> None:
     scan.pieces.append(_chunk_piece(bytes(builder.end()), entries, indexes))
 
 
-def _count(scan: Scan, channel_id: int, entry: Entry) -> None:
+def _count(scan: Scan, channel_id: int, entry: JournalEntry) -> None:
     scan.start_ns = min(scan.start_ns, entry.log_ns) if scan.counts else entry.log_ns
     scan.end_ns = max(scan.end_ns, entry.log_ns)
     scan.counts[channel_id] = scan.counts.get(channel_id, 0) + 1
@@ -350,7 +352,9 @@ def _count(scan: Scan, channel_id: int, entry: Entry) -> None:
     scan.sequences[channel_id] = entry.sequence
 
 
-def _chunk_piece(data: bytes, entries: list[Entry], indexes: dict[int, list[tuple[int, int]]]) -> Piece:
+def _chunk_piece(
+    data: bytes, entries: list[JournalEntry], indexes: dict[int, list[tuple[int, int]]]
+) -> Piece:
     start_ns, end_ns = min(entry.log_ns for entry in entries), max(entry.log_ns for entry in entries)
     builder = RecordBuilder()
     Chunk("", data, end_ns, start_ns, zlib.crc32(data), len(data)).write(builder)

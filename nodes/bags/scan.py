@@ -42,7 +42,7 @@ from nodes.bags.records import (
 )
 from nodes.bags.resync import is_cut, makes_sense, next_record, only_zeros, plausible_end, runs_over
 from nodes.bags.salvage import good_records
-from nodes.bags.scanned import BAD, CUT, JUNK, ZEROS, Loss, Piece, Run, Scan
+from nodes.bags.scanned import BAD, CUT, JUNK, ZEROS, Loss, MessageRun, Piece, Scan
 from nodes.bags.summary import Ending, read_ending, read_summary_section
 from nodes.runtime.errors import BagError
 
@@ -193,7 +193,7 @@ class _Scanner:
             run.start_ns, run.end_ns = min(run.start_ns, log_ns), max(run.end_ns, log_ns)
             run.channels.add(channel_id)
         else:
-            runs.append(Run(at, end - at, log_ns, log_ns, {channel_id}))
+            runs.append(MessageRun(at, end - at, log_ns, log_ns, {channel_id}))
 
     def _take_chunk(self, at: int, body: int, end: int) -> int:
         head = chunk_head(self._buffer, body, end - body)

@@ -56,7 +56,7 @@ class Loss:
 
 
 @dataclass
-class Run:
+class MessageRun:
     """Consecutive messages outside chunks, with the fields of a `ChunkIndex` for reading."""
 
     offset: int
@@ -113,7 +113,7 @@ class Scan:
     end_ns: int = 0
     unchecked_chunks: int = 0
     unchecked_messages: int = 0
-    runs: list[Run] = field(default_factory=list)
+    runs: list[MessageRun] = field(default_factory=list)
     insert_at: int | None = None
     lost_definitions: list[Schema | Channel] = field(default_factory=list)
 

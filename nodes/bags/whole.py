@@ -13,7 +13,7 @@ from nodes.bags.damage import describe
 from nodes.bags.file import mapped
 from nodes.bags.records import DATA_END_BYTES, MAGIC, RECORD_HEAD, Damaged, record_at
 from nodes.bags.scan import scan_file
-from nodes.bags.scanned import Run, Scan
+from nodes.bags.scanned import MessageRun, Scan
 from nodes.bags.summary import Ending, read_ending, read_summary_section
 from nodes.runtime.errors import BagError
 
@@ -28,7 +28,7 @@ class FileSummary(Summary):
         unchecked: Why damage to messages may go unnoticed; empty if checksums cover them.
     """
 
-    runs: list[Run]
+    runs: list[MessageRun]
     unchecked: str
 
 

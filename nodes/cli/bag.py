@@ -254,12 +254,12 @@ def bag_control(
     run_dir: RunDir = None,
 ) -> None:
     """Control a running player: pause, resume, step, change the speed, or stop."""
-    from nodes.bags.play import Command
+    from nodes.bags.play import PlayerCommand
     from nodes.bags.player_requests import ask_player
     from nodes.launching.watching import find_run_dir
 
     text = " ".join(words)
-    Command.parse(text)
+    PlayerCommand.parse(text)
     granted, answer = ask_player(find_run_dir(run_dir), text)
     print(answer if granted else f"not done: {answer}")
     if not granted:

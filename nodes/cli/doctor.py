@@ -11,7 +11,7 @@ import typer
 from nodes.runtime.terminal import Overrides, launch_argument
 
 if TYPE_CHECKING:
-    from nodes.lab.doctor.check import Check, Finding
+    from nodes.lab.doctor.check import CheckResult, DoctorCheck
 
 _COLOURS = {"ok": "green", "absent": "bright_black", "warning": "yellow", "failure": "red"}
 _FAILURE_EXIT = 1
@@ -63,7 +63,7 @@ def doctor(
 
 def _checks(
     file: Path | None, folder: Path, vicon_port: int, vesc: str | None, host: str | None, overrides: list[str]
-) -> list[Check]:
+) -> list[DoctorCheck]:
     if file is None:
         from nodes.lab.doctor.general import checks
 
@@ -76,7 +76,7 @@ def _checks(
     return checks_of(load_launch(file, overrides, host=host), folder)
 
 
-def _print(finding: Finding) -> None:
+def _print(finding: CheckResult) -> None:
     cure = f" -> {finding.do}" if finding.do else ""
     state = typer.style(f"{finding.state:8}", fg=_COLOURS[finding.state])
     typer.echo(f"{state} {finding.check:13} {' '.join(finding.found.split())}{cure}")

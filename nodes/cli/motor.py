@@ -12,7 +12,7 @@ from nodes.runtime.terminal import RunDir, print_table, table
 if TYPE_CHECKING:
     from nodes.runtime.bus import Bus, Received
     from nodes.runtime.clock import Now
-    from nodes.runtime.requests import Asked
+    from nodes.runtime.requests import RequestIdentity
 
 app = typer.Typer(
     no_args_is_help=True, help="Inspect the motor controller, set its timeout, check the steering."
@@ -123,7 +123,7 @@ def _ask_motor(bus: Bus, action: str) -> None:
     from nodes.runtime.errors import LaunchError
     from nodes.runtime.messages import header, types
 
-    def make(asked: Asked, now: Now) -> Any:
+    def make(asked: RequestIdentity, now: Now) -> Any:
         return types.SteeringCheck(
             header=header(asked.real_ns), action=action, source="operator", ask_id=asked.ask_id
         )

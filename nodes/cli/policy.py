@@ -13,7 +13,7 @@ from nodes.runtime.terminal import PolicyName, print_table, table
 
 if TYPE_CHECKING:
     from advnerf_core.policies.view import PolicyView
-    from nodes.lab.policy_reference import Reference
+    from nodes.lab.policy_reference import ReferenceFrames
 
 _TWIN_ROOM = shipped("calibration/twin/room.yaml")
 
@@ -105,7 +105,7 @@ def _reference(
     room: Path,
     scene: Path | None,
     calibration: Path | None,
-) -> Reference:
+) -> ReferenceFrames:
     from nodes.lab.policy_reference import from_bag, from_run, from_scene, from_twin
     from nodes.runtime.errors import ConfigError
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from advnerf_core.learning.imitation import SourcePlan
     from advnerf_core.policies.architecture import Architecture
     from advnerf_core.policies.view import PolicyView
-    from nodes.lab.policy_data.train import Part
+    from nodes.lab.policy_data.train import TrainingRecording
 
 Camera = Annotated[
     Path | None,
@@ -243,22 +243,26 @@ def _parts(
     image_topic: str | None,
     columns: tuple[str, str],
     scale: float,
-) -> list[Part]:
+) -> list[TrainingRecording]:
     from nodes.bags.reader import read_info
     from nodes.lab.policy_data.frames import frames_of_bag, frames_of_log
-    from nodes.lab.policy_data.train import Part
+    from nodes.lab.policy_data.train import TrainingRecording
 
     parts = []
     for bag in bags:
         cut = partial(frames_of_bag, bag, view, expert, labels, image_topic)
         info = read_info(bag)
         parts.append(
-            Part(str(bag), info.parts, {"labels": labels, "images": image_topic}, cut, info.unchecked)
+            TrainingRecording(
+                str(bag), info.parts, {"labels": labels, "images": image_topic}, cut, info.unchecked
+            )
         )
     for log in logs:
         options = {"columns": columns, "scale": scale}
         parts.append(
-            Part(str(log), (log,), options, partial(_own_view, frames_of_log, log, view, columns, scale))
+            TrainingRecording(
+                str(log), (log,), options, partial(_own_view, frames_of_log, log, view, columns, scale)
+            )
         )
     return parts
 

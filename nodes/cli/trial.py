@@ -12,7 +12,7 @@ import typer
 from nodes.runtime.terminal import LaunchFile, Overrides, print_table, table
 
 if TYPE_CHECKING:
-    from nodes.lab.trials.plan import Run
+    from nodes.lab.trials.plan import PlannedDrive
 
 
 def add_to(app: typer.Typer) -> None:
@@ -77,7 +77,7 @@ def trial(
             )
     else:
 
-        def begin(run: Run) -> None:
+        def begin(run: PlannedDrive) -> None:
             print(f"run {run.number} of {count}: {run.condition} {run.attack_id}".rstrip(), flush=True)
 
         drive_series(series, ready_timeout_s, begin, lambda text: print(f"  {text}", flush=True))

@@ -6,7 +6,7 @@ Pure: time and messages come as arguments.
 from __future__ import annotations
 
 from nodes.control.arming import Arming
-from nodes.runtime.requests import Answer, Answers, is_id
+from nodes.runtime.requests import Answer, AnswerMemory, is_id
 
 
 class ArmRequests:
@@ -18,7 +18,7 @@ class ArmRequests:
 
     def __init__(self, arming: Arming) -> None:
         self._arming = arming
-        self._answers = Answers()
+        self._answers = AnswerMemory()
         self._asked_ns: dict[str, int] = {}
         self._forgotten_ns = 0
 

@@ -15,7 +15,7 @@ from nodes.runtime.clock import NS_PER_S, Now
 from nodes.runtime.errors import MessageError
 from nodes.runtime.messages import pose_matrix
 from nodes.runtime.node import Out
-from nodes.runtime.requests import Answer, Answers
+from nodes.runtime.requests import Answer, AnswerMemory
 from nodes.runtime.twin_port import is_twin, peer_text
 
 # Number of requests for the settings before the controller counts as one that does not report them.
@@ -40,7 +40,7 @@ class ControllerWatch:
 
     def __init__(self, wanted: TimeoutSettings, steering_check: str, shown: CheckSettings) -> None:
         self.check = SteeringCheck(shown)
-        self.answers = Answers()
+        self.answers = AnswerMemory()
         self.values: Values | None = None
         self.timeout: TimeoutSettings | None = None
         self._wanted = wanted

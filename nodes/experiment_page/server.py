@@ -37,7 +37,7 @@ _REPORT_POLICY = (
 )
 
 
-class Answers:
+class RequestHandler:
     """Answers the requests of browsers.
 
     Args:
@@ -121,7 +121,7 @@ def _texture(folder: Path, version: str) -> bytes | None:
     return texture_png(folder)
 
 
-def application(answers: Answers) -> Any:
+def application(answers: RequestHandler) -> Any:
     """The ASGI application: GET only."""
     from starlette.applications import Starlette
     from starlette.routing import Route
@@ -146,7 +146,7 @@ def main() -> None:
     take_share(HELPER)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     config = uvicorn.Config(
-        application(Answers(folder)),
+        application(RequestHandler(folder)),
         log_config=None,
         access_log=False,
         server_header=False,

@@ -14,7 +14,7 @@ import numpy as np
 from hardware.cameras.interface import Camera, Frame
 from hardware.cameras.steady import SteadyCamera
 from hardware.errors import DeviceBusy, DeviceNotFound, LinkLost
-from nodes.lab.findings import Finding, NotMet, look
+from nodes.runtime.findings import ContractFinding, NotMet, look
 from nodes.runtime.inbox import Inbox, ReaderThread
 
 _FRAMES = 4
@@ -305,14 +305,14 @@ CHECKS: dict[str, Check] = {
 """Parts of the contract, in the order of the report."""
 
 
-def check_camera(bench: CameraBench) -> list[Finding]:
+def check_camera(bench: CameraBench) -> list[ContractFinding]:
     """A finding for each part of the contract; the first one alone if there are no frames of the right form.
 
     Raises:
         DeviceNotFound: There is no such device.
         DeviceBusy: Another program has it.
     """
-    findings: list[Finding] = []
+    findings: list[ContractFinding] = []
     for name, check in CHECKS.items():
         findings.append(look(name, check, bench, (DeviceNotFound, DeviceBusy)))
         if not findings[0].met:

@@ -71,7 +71,7 @@ def describe_oaks() -> Iterator[str]:
 
 
 @dataclass(frozen=True)
-class Trial:
+class SourceTrial:
     """Measurements of a camera source.
 
     Attributes:
@@ -130,7 +130,7 @@ def save_picture(rgb: NDArray[np.uint8], file: Path) -> None:
     write_atomically(file, data.tobytes())
 
 
-def try_source(source: Any, frames: int = 50, timeout_s: float = 10.0) -> Trial:
+def try_source(source: Any, frames: int = 50, timeout_s: float = 10.0) -> SourceTrial:
     """Read a number of frames of a source, as the camera node does, and measure them."""
     device = source.steady()
     got: list[Frame] = []
@@ -149,7 +149,7 @@ def try_source(source: Any, frames: int = 50, timeout_s: float = 10.0) -> Trial:
         )
     span_s = (got[-1].stamp_mono_ns - got[0].stamp_mono_ns) / 1e9
     steps = np.diff([frame.sequence for frame in got])
-    return Trial(
+    return SourceTrial(
         frames=len(got),
         rate_hz=(len(got) - 1) / span_s,
         missed=int(np.maximum(steps - 1, 0).sum()),

@@ -25,7 +25,7 @@ from advnerf_core.driving.path import Path as Reference
 from advnerf_core.fields.voxel_grid import cube_face_object
 from advnerf_core.geometry import Pinhole, camera_mount, make_transform
 from advnerf_core.scene.surrogate import Surrogate
-from nodes.lab.findings import Finding, NotMet, look
+from nodes.runtime.findings import ContractFinding, NotMet, look
 
 _CAMERA = Pinhole(width=24, height=12, fx=15.0, fy=15.0, cx=12.0, cy=6.0)
 _STEPS, _EVALUATIONS, _STOPPED_AFTER = 4, 6, 2
@@ -241,7 +241,7 @@ CHECKS: Mapping[str, Callable[[MethodBench], str]] = {
 """Parts of the contract, in the order of the report."""
 
 
-def check_method(reference: str, options: Mapping[str, Any] | None = None) -> list[Finding]:
+def check_method(reference: str, options: Mapping[str, Any] | None = None) -> list[ContractFinding]:
     """A finding for each part of the contract; the first one alone if the method cannot search at all.
 
     Args:
@@ -254,7 +254,7 @@ def check_method(reference: str, options: Mapping[str, Any] | None = None) -> li
     """
     method = load_method(reference)
     settings = replace(_SETTINGS, options=method.options(options or {}))
-    findings: list[Finding] = []
+    findings: list[ContractFinding] = []
     with tempfile.TemporaryDirectory(prefix="advnerf-method-") as folder:
         bench = MethodBench(method, settings, Path(folder).resolve())
         for name, check in CHECKS.items():

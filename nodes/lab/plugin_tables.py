@@ -36,7 +36,7 @@ class PluginTable:
 
 
 @dataclass(frozen=True)
-class Row:
+class PluginRow:
     """One thing that can be named.
 
     Attributes:
@@ -103,14 +103,14 @@ TABLES: Mapping[str, PluginTable] = MappingProxyType(
 """One row makes a list of `advnerf list`, and has its entry points named before they are executed."""
 
 
-def rows_of(table: PluginTable) -> list[Row]:
+def rows_of(table: PluginTable) -> list[PluginRow]:
     """What a table has: built-in things, then those of installed packages, which are loaded for their title."""
-    own = [Row(name, line, BUILT_IN) for name, line in table.built_in().items()]
+    own = [PluginRow(name, line, BUILT_IN) for name, line in table.built_in().items()]
     found = sorted(entry_points(group=table.group), key=lambda each: each.name) if table.group else []
-    return [*own, *(Row(entry.name, _line_of_entry(entry), origin_of(entry)) for entry in found)]
+    return [*own, *(PluginRow(entry.name, _line_of_entry(entry), origin_of(entry)) for entry in found)]
 
 
-def names_twice(rows: list[Row]) -> list[str]:
+def names_twice(rows: list[PluginRow]) -> list[str]:
     """A sentence for each name that two things have; neither can be used."""
     origins: dict[str, list[str]] = {}
     for row in rows:

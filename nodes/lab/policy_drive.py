@@ -25,7 +25,7 @@ See = Callable[[Tensor], Tensor]
 """Policy images ``[B, 3, H, W]`` RGB in 0..1 from car states ``[B, 3]``."""
 
 
-class _Seen:
+class _ClearSensor:
     """A sensor without objects, for a drive."""
 
     theta_shape = (0, 3)
@@ -61,7 +61,7 @@ def drive_round(
     goals = torch.tensor([goal] * count, dtype=torch.float32) if goal else None
     problem = AttackProblem(
         policy,
-        _Seen(see),
+        _ClearSensor(see),
         Ackermann(vehicle.wheelbase_m, _SPEED_MPS, _PERIOD_S, limits),
         path,
         starts,
@@ -70,4 +70,4 @@ def drive_round(
         fence_m=float(np.abs(np.array(room.fence_m)).min()),
         off_track_m=room.off_track_m,
     )
-    return clean_drive(problem, torch.zeros(_Seen.theta_shape))
+    return clean_drive(problem, torch.zeros(_ClearSensor.theta_shape))

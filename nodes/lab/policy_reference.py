@@ -41,7 +41,7 @@ Drives = Callable[[Any, tuple[float, ...]], CleanDrive]
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
+class ReferenceFrames:
     """Frames with known steering.
 
     Attributes:
@@ -59,7 +59,7 @@ class Reference:
     asked: bool = False
 
 
-def from_twin(view: PolicyView, count: int = 48, seed: int = 0) -> Reference:
+def from_twin(view: PolicyView, count: int = 48, seed: int = 0) -> ReferenceFrames:
     """Make reference frames in the simulated lab around its path. No recording is needed."""
     os.environ.setdefault("MUJOCO_GL", "egl")
     from hardware.worlds.lab.config import LabConfig
@@ -84,10 +84,10 @@ def from_twin(view: PolicyView, count: int = 48, seed: int = 0) -> Reference:
     with Lab(LabConfig()) as lab:
         images = np.stack([frame(lab, *pose) for pose in poses.tolist()])
     source = f"{count} frames of the simulated lab"
-    return Reference(images, np.asarray(expert.steer_states(poses)), source, drives)
+    return ReferenceFrames(images, np.asarray(expert.steer_states(poses)), source, drives)
 
 
-def from_bag(bag: Path, room: Path, view: PolicyView, count: int = 96) -> Reference:
+def from_bag(bag: Path, room: Path, view: PolicyView, count: int = 96) -> ReferenceFrames:
     """Take reference frames spread over a bag, labelled by the expert at the recorded poses."""
     poses = PoseBuffer(keep_s=1e6)
     for message in read_messages(bag, [_CAR]):
@@ -112,12 +112,12 @@ def from_bag(bag: Path, room: Path, view: PolicyView, count: int = 96) -> Refere
             f"expected at least {_FEWEST} frames with poses and varying steering in {bag}, got {len(images)}; record a longer drive"
         )
     unchecked = ", unchecked" if read_info(bag).unchecked else ""
-    return Reference(
+    return ReferenceFrames(
         np.stack(images), np.array(steering), f"{len(images)} frames of {bag}{unchecked}", asked=True
     )
 
 
-def from_run(folder: Path, view: PolicyView) -> Reference:
+def from_run(folder: Path, view: PolicyView) -> ReferenceFrames:
     """Take the camera frames of an experiment's capture, and drives in its learned scene.
 
     The frames are full camera images, which the policy's view crops and resizes.
@@ -145,12 +145,14 @@ def from_run(folder: Path, view: PolicyView) -> Reference:
         )
     scene = folder / "scene" / "scene.safetensors"
     drives = _drives_in_scene(scene, calibration, view) if scene.is_file() else None
-    return Reference(
+    return ReferenceFrames(
         np.stack(images), np.array(steering), f"{len(images)} camera frames of {folder}", drives, True
     )
 
 
-def from_scene(scene: Path, calibration: Path, view: PolicyView, count: int = 48, seed: int = 0) -> Reference:
+def from_scene(
+    scene: Path, calibration: Path, view: PolicyView, count: int = 48, seed: int = 0
+) -> ReferenceFrames:
     """Render reference frames of a learned scene around the path of a room, and drives in it.
 
     Args:
@@ -166,7 +168,7 @@ def from_scene(scene: Path, calibration: Path, view: PolicyView, count: int = 48
     seen = _sight_of_scene(scene, calibration, view)(torch.from_numpy(poses))
     images = np.round(255.0 * seen.permute(0, 2, 3, 1).clamp(0.0, 1.0).numpy()).astype(np.uint8)
     drives = _drives_in_scene(scene, calibration, view)
-    return Reference(
+    return ReferenceFrames(
         images, np.asarray(expert.steer_states(poses)), f"{count} frames of {scene}", drives, True
     )
 
@@ -210,7 +212,7 @@ def _about_the_path(expert: Expert, count: int, seed: int) -> NDArray[np.float64
 
 def judged_by_drives(
     policy: AdaptedPolicy,
-    reference: Reference,
+    reference: ReferenceFrames,
     findings: list[Finding],
     goal: tuple[float, ...] | None = None,
 ) -> list[Finding]:

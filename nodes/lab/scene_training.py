@@ -27,7 +27,7 @@ from advnerf_core.scene.metrics import gain_fitted, psnr, ssim
 from advnerf_core.scene.presets import FAST, PHOTOGRAPH_BANDS
 from advnerf_core.scene.presets import PRESETS as SCENE_PRESETS
 from advnerf_core.scene.render_field import FieldRenderer
-from advnerf_core.scene.train import Progress, TrainConfig, train_scene
+from advnerf_core.scene.train import TrainConfig, TrainingReport, train_scene
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import Report
 
@@ -117,7 +117,7 @@ def train(request: TrainingRequest, report: Report) -> dict[str, Any]:
 
     check = LearningCheck(images)
 
-    def progress(at: Progress) -> None:
+    def progress(at: TrainingReport) -> None:
         if (told := check(at)) is not None:
             print(f"warning: {told}", flush=True)
         report(0.95 * at.fraction, f"step {at.step}, {at.psnr_db:.1f} dB on training rays")

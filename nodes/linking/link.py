@@ -21,7 +21,7 @@ import zmq
 from nodes.linking.clock_offset import Exchange, OffsetFilter
 from nodes.linking.doors import Doorkeeper, RefusalLog
 from nodes.linking.keys import DRIVE, WATCH, require_keys
-from nodes.linking.sockets import CLOCK, LINK_QUEUE, MOST_BYTES, PULSE, Doors, Handshake, LinkConfig
+from nodes.linking.sockets import CLOCK, LINK_QUEUE, MOST_BYTES, PULSE, Handshake, LinkConfig, LinkSockets
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import MessageError
 from nodes.runtime.inbox import Inbox
@@ -85,7 +85,7 @@ class Link:
         self._poller = zmq.Poller()
         self._poller.register(self._wake, zmq.POLLIN)
         self._keeper: Doorkeeper | None = None
-        self._doors = Doors(config, self._context, self._poller)
+        self._doors = LinkSockets(config, self._context, self._poller)
         self._thread = threading.Thread(target=self._run, name="link", daemon=True)
         try:
             self._open()

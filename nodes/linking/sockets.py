@@ -80,7 +80,7 @@ class Handshake:
     ended: bool = False
 
 
-class Doors:
+class LinkSockets:
     """The sockets of one end and their monitors. Not thread-safe: the link's thread owns them.
 
     Args:

@@ -37,7 +37,7 @@ _LEVELS = {0: "ok", 1: "warning", 2: "error", 3: "stale"}
 
 
 @dataclass
-class Board:
+class ViewState:
     """Collects messages and describes them.
 
     Attributes:

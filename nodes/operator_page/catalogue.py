@@ -1,4 +1,4 @@
-"""The attacks that the operator may choose from, and their transfer to the node that shows them."""
+"""The attacks that the operator may choose from."""
 
 from __future__ import annotations
 
@@ -11,16 +11,13 @@ import cv2
 import numpy as np
 
 from advnerf_core.attack.artifact import AttackFile, AttackFileError, load_attack
-from nodes.runtime.clock import NS_PER_S
-from nodes.runtime.transfer import chunk_messages
 
 _PICTURE_PX = 160
-_ROUNDS, _PAUSE_NS = 3, NS_PER_S
 _SUFFIX = ".safetensors"
 
 
 @dataclass(frozen=True)
-class Entry:
+class CatalogueEntry:
     """An attack that can be shown.
 
     Attributes:
@@ -36,7 +33,7 @@ class Entry:
     png: bytes
 
 
-def read_catalogue(places: Iterable[Path]) -> tuple[dict[str, Entry], list[str]]:
+def read_catalogue(places: Iterable[Path]) -> tuple[dict[str, CatalogueEntry], list[str]]:
     """Read the attack files among files and folders.
 
     Args:
@@ -45,7 +42,7 @@ def read_catalogue(places: Iterable[Path]) -> tuple[dict[str, Entry], list[str]]
     Returns:
         The attacks with a face, by id, and a line for each file that is left out.
     """
-    entries: dict[str, Entry] = {}
+    entries: dict[str, CatalogueEntry] = {}
     left_out = []
     for place in places:
         files = sorted(place.glob(f"*attack*{_SUFFIX}")) if place.is_dir() else [place]
@@ -59,7 +56,7 @@ def read_catalogue(places: Iterable[Path]) -> tuple[dict[str, Entry], list[str]]
     return entries, left_out
 
 
-def _entry(attack: AttackFile, file: Path) -> Entry:
+def _entry(attack: AttackFile, file: Path) -> CatalogueEntry:
     texture = attack.required_face().texture
     small = cv2.resize(texture, (_PICTURE_PX, _PICTURE_PX), interpolation=cv2.INTER_AREA)
     _, png = cv2.imencode(".png", cv2.cvtColor(np.asarray(small, np.uint8), cv2.COLOR_RGB2BGR))
@@ -73,29 +70,4 @@ def _entry(attack: AttackFile, file: Path) -> Entry:
         "predicted_m": attack.predicted_total_cte_m,
         "clean_m": None if clean is None else clean.mean_total_cte_m,
     }
-    return Entry(attack.attack_id, file, facts, png.tobytes())
-
-
-class Sender:
-    """Sends an attack file piece by piece, a few times, because the receiver may start in the middle.
-
-    Args:
-        entry: The attack.
-        real_ns: Time to stamp the pieces with [ns].
-    """
-
-    def __init__(self, entry: Entry, real_ns: int) -> None:
-        self.attack_id = entry.attack_id
-        self._chunks = chunk_messages(entry.file.read_bytes(), entry.attack_id, real_ns)
-        self._rounds, self._index, self._due_ns = _ROUNDS, 0, 0
-
-    def next(self, mono_ns: int) -> Any | None:
-        """Return the piece that is due, or None."""
-        if self._rounds == 0 or mono_ns < self._due_ns:
-            return None
-        piece = self._chunks[self._index]
-        self._index = (self._index + 1) % len(self._chunks)
-        if self._index == 0:
-            self._rounds -= 1
-            self._due_ns = mono_ns + _PAUSE_NS
-        return piece
+    return CatalogueEntry(attack.attack_id, file, facts, png.tobytes())

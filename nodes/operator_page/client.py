@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from nodes.operator_page.pictures import Picture
-from nodes.operator_page.said import STOPS, Act, Hold, Seen, Stop, Wants, read_said
+from nodes.operator_page.said import STOPS, Act, Hold, PictureSeen, Stop, Wants, read_said
 from nodes.runtime.errors import MessageError, SecurityError
 
 _CREDIT = 2
@@ -37,7 +37,7 @@ class Socket(Protocol):
 
 
 @dataclass(frozen=True)
-class Asked:
+class ClientAct:
     """An act of a browser, for the node.
 
     Attributes:
@@ -160,7 +160,7 @@ class Client:
                 self._sent.popitem(last=False)
             await self._socket.send_bytes(picture.packed())
 
-    def hear(self, data: str | bytes) -> Asked | None:
+    def hear(self, data: str | bytes) -> ClientAct | None:
         """Check a message. Returns an act for the node, or None.
 
         Raises:
@@ -180,14 +180,14 @@ class Client:
             self.answer({"t": "refused", "text": str(error)[:200]})
             return None
 
-    def _read(self, data: str | bytes) -> Asked | None:
+    def _read(self, data: str | bytes) -> ClientAct | None:
         said = read_said(data)
         if isinstance(said, Wants):
             self.wants = frozenset(said.c)
             return None
         if isinstance(said, Stop):
             return self._asked(said)
-        if isinstance(said, Seen):
+        if isinstance(said, PictureSeen):
             self._under_way[said.c] = max(0, self._under_way.get(said.c, 0) - 1)
             self._wake.set()
             return None
@@ -202,10 +202,10 @@ class Client:
             self._acts.pay("acts")
         return self._asked(said)
 
-    def _asked(self, act: Act) -> Asked:
+    def _asked(self, act: Act) -> ClientAct:
         frame_ns = int(act.frame)
         received_ns = self._sent.get(frame_ns, 0)
-        return Asked(
+        return ClientAct(
             self.number, self.address, act, frame_ns if received_ns else 0, received_ns, self.session
         )
 

@@ -39,7 +39,7 @@ class _Guesser:
 
 
 @dataclass
-class Doors:
+class Sessions:
     """Gives out codes and sessions.
 
     Attributes:

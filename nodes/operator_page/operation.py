@@ -11,12 +11,12 @@ from typing import Any
 
 from advnerf_core.geometry import planar_pose
 from nodes.launching.launched import Launched
-from nodes.operator_page.board import Board
-from nodes.operator_page.catalogue import Entry, Sender
-from nodes.operator_page.client import Asked
+from nodes.operator_page.board import ViewState
+from nodes.operator_page.catalogue import CatalogueEntry
+from nodes.operator_page.client import ClientAct
 from nodes.operator_page.desk import Desk
 from nodes.operator_page.diary import Diary
-from nodes.operator_page.recording import LAUNCH_RECORDER, TELEOP, Recording
+from nodes.operator_page.recording import LAUNCH_RECORDER, TELEOP, RecorderControl
 from nodes.operator_page.said import ChooseAttack, Hold, Label, Release, Stop, Take
 from nodes.operator_page.trial import Trial
 from nodes.runtime.arm_asker import ArmAsker
@@ -24,6 +24,7 @@ from nodes.runtime.clock import NS_PER_S, Now
 from nodes.runtime.messages import header, pose_message, stamp_from_ns, types
 from nodes.runtime.node import Out
 from nodes.runtime.requests import ESTOP_LATCHED
+from nodes.runtime.transfer import FileSender, chunk_messages
 from nodes.runtime.wire import MessageInfo
 
 ACT, RESET, SWITCH, FILE = (
@@ -37,6 +38,8 @@ _SWITCH_NS = NS_PER_S // 2
 # The e-stop's release and the request to re-arm travel on different topics, so the request waits.
 _REARM_NS = 120_000_000
 _TAKEN_S = 8.0
+# An attack file is sent so often, because its receiver may start in the middle.
+_FILE_ROUNDS = 3
 _IDLE, _AUTONOMY = "idle", "autonomy"
 _ONLY_WATCHES = "this page only watches"
 
@@ -58,11 +61,11 @@ class Parts:
     """
 
     desk: Desk
-    board: Board
+    board: ViewState
     diary: Diary
     trial: Trial
-    recording: Recording
-    catalogue: Mapping[str, Entry]
+    recording: RecorderControl
+    catalogue: Mapping[str, CatalogueEntry]
     launched: Launched
     start_pose: tuple[float, float, float] | None
     operates: bool
@@ -83,7 +86,7 @@ class Operation:
         self._told_ns = self._switched_ns = 0
         self._show: bool | None = None
         self._switched_by = ""
-        self._sender: Sender | None = None
+        self._sender: FileSender | None = None
         self._chosen, self._chosen_ns = "", 0
         self._rearm_ns: int | None = None
         self._refused_press = (0, 0)
@@ -91,7 +94,7 @@ class Operation:
         self._knows_latch = False
         self.done = self.refused = 0
 
-    def obey(self, asked: Asked, now: Now) -> list[Out]:
+    def obey(self, asked: ClientAct, now: Now) -> list[Out]:
         """Decide an act, log it, and answer it."""
         act = asked.act
         if isinstance(act, Stop):
@@ -179,7 +182,7 @@ class Operation:
         left_s = round(self._parts.desk.left_s(now.mono_ns))
         return {"client": lease.client, "session": lease.session, "name": lease.name, "left_s": left_s}
 
-    def _hold(self, asked: Asked, act: Hold, now: Now) -> list[Out]:
+    def _hold(self, asked: ClientAct, act: Hold, now: Now) -> list[Out]:
         """Note an answered beat. The first of a press is an act; the rest only keep it alive."""
         desk, was_held = self._parts.desk, self._parts.desk.held
         refusal = (
@@ -199,7 +202,7 @@ class Operation:
         self._why_ended = ""
         return [*self._teleop(now), *self._note(asked, "hold", "", "", now)]
 
-    def _do(self, asked: Asked, now: Now) -> tuple[str, str, list[Out]]:
+    def _do(self, asked: ClientAct, now: Now) -> tuple[str, str, list[Out]]:
         """Do an act of somebody who may. Returns why not, what it was about, and messages."""
         act, parts = asked.act, self._parts
         if isinstance(act, Take):
@@ -224,11 +227,11 @@ class Operation:
         refusal, outs = do(asked, now)
         return refusal, "", outs
 
-    def _leave(self, asked: Asked, now: Now) -> tuple[str, list[Out]]:
+    def _leave(self, asked: ClientAct, now: Now) -> tuple[str, list[Out]]:
         self._parts.desk.leave(asked.client)
         return "", self._teleop(now)
 
-    def _stop(self, asked: Asked, act: Stop, now: Now) -> list[Out]:
+    def _stop(self, asked: ClientAct, act: Stop, now: Now) -> list[Out]:
         """Stop the car. Every admitted browser may do so; no rule of the desk applies. The e-stop stays latched."""
         self._parts.desk.acted(asked.client, now.mono_ns)
         self._rearm_ns = None
@@ -242,7 +245,7 @@ class Operation:
         self._parts.desk.drop()
         return [self._asker.disarm(now, f"on the page by {name}"), *self._teleop(now)]
 
-    def _reset(self, asked: Asked, now: Now) -> tuple[str, list[Out]]:
+    def _reset(self, asked: ClientAct, now: Now) -> tuple[str, list[Out]]:
         """Release the e-stop. The safety node forgets its latch only at an explicit request of the operator.
 
         Without a held button that request cannot arm the car. So it is only sent if the safety node requires the button.
@@ -252,7 +255,7 @@ class Operation:
             self._rearm_ns = now.mono_ns + _REARM_NS
         return refusal, self._teleop(now)
 
-    def _start_trial(self, asked: Asked, now: Now) -> tuple[str, list[Out]]:
+    def _start_trial(self, asked: ClientAct, now: Now) -> tuple[str, list[Out]]:
         """Begin a trial. The simulated car is put to the start; a real one must be carried there."""
         parts = self._parts
         if parts.board.armed or parts.desk.held:
@@ -262,7 +265,7 @@ class Operation:
             return "", []
         return "", [Out(RESET, pose_message(planar_pose(*parts.start_pose), now.real_ns))]
 
-    def _give_up_trial(self, asked: Asked, now: Now) -> tuple[str, list[Out]]:
+    def _give_up_trial(self, asked: ClientAct, now: Now) -> tuple[str, list[Out]]:
         if not self._parts.trial.end():
             return "no trial is running", []
         return "", self._end_trial("the trial was ended", now)
@@ -278,24 +281,25 @@ class Operation:
         if entry is None:
             return f"no attack {attack_id} among the {len(self._parts.catalogue)} of this page"
         try:
-            self._sender = Sender(entry, now.real_ns)
+            chunks = chunk_messages(entry.file.read_bytes(), attack_id, now.real_ns)
         except (OSError, ValueError) as error:
             return f"cannot read {entry.file.name}: {error}"
+        self._sender = FileSender(chunks, _FILE_ROUNDS, NS_PER_S)
         self._chosen, self._chosen_ns = attack_id, now.mono_ns
         self._switch(True, client)
         return ""
 
-    def _attack_off(self, asked: Asked, now: Now) -> tuple[str, list[Out]]:
+    def _attack_off(self, asked: ClientAct, now: Now) -> tuple[str, list[Out]]:
         self._switch(False, asked.client)
         return "", self._attack(now)
 
     def _switch(self, show: bool, client: int) -> None:
         self._show, self._switched_by, self._switched_ns = show, self._name(client), 0
 
-    def _record(self, asked: Asked, now: Now) -> tuple[str, list[Out]]:
+    def _record(self, asked: ClientAct, now: Now) -> tuple[str, list[Out]]:
         return self._parts.recording.start(), []
 
-    def _record_stop(self, asked: Asked, now: Now) -> tuple[str, list[Out]]:
+    def _record_stop(self, asked: ClientAct, now: Now) -> tuple[str, list[Out]]:
         return self._parts.recording.stop(), []
 
     def _label_refusal(self, now: Now) -> str:
@@ -316,7 +320,7 @@ class Operation:
         self._parts.diary.note(now, name, "", "let_go", why, 0, "")
         return [*outs, self._act_out(now, name, "", "let_go", why, 0, "")]
 
-    def _note(self, asked: Asked, act: str, detail: str, refusal: str, now: Now) -> list[Out]:
+    def _note(self, asked: ClientAct, act: str, detail: str, refusal: str, now: Now) -> list[Out]:
         name = self._name(asked.client)
         if act == "take" and refusal:
             name = detail

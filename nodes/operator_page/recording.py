@@ -17,7 +17,7 @@ RECORDER, LAUNCH_RECORDER, TELEOP = "page_recorder", "recorder", "/teleop/state"
 _KILL_AFTER_S = 10.0
 
 
-class Recording:
+class RecorderControl:
     """Starts and stops a recorder process.
 
     Args:

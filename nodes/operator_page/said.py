@@ -42,7 +42,7 @@ def _stamp_or_zero(value: Any) -> str:
     )
 
 
-class Seen(StrictModel):
+class PictureSeen(StrictModel):
     """A picture was drawn on the screen, or could not be decoded."""
 
     t: Literal["seen"]
@@ -118,7 +118,7 @@ class Label(_Act):
 
 
 Act = Hold | Release | Take | Plain | Stop | ChooseAttack | Label
-Said = Seen | Wants | Act
+Said = PictureSeen | Wants | Act
 _ADAPTER: TypeAdapter[Said] = TypeAdapter(Annotated[Said, Field(discriminator="t")])
 
 

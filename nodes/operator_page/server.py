@@ -19,8 +19,8 @@ from typing import Any
 
 from nodes.linking.keys import is_loopback
 from nodes.operator_page.certificate import Certificate, certificate
-from nodes.operator_page.client import Asked, Client, Gone, Misuse
-from nodes.operator_page.doors import COOKIE, Doors, origin_is_ours, peer_is_same_user
+from nodes.operator_page.client import Client, ClientAct, Gone, Misuse
+from nodes.operator_page.doors import COOKIE, Sessions, origin_is_ours, peer_is_same_user
 from nodes.operator_page.listening import bound_socket, require_packages
 from nodes.operator_page.pictures import Picture
 from nodes.operator_page.responses import Guard, code_in, web_file
@@ -54,7 +54,7 @@ class ServerSettings:
 
 
 @dataclass
-class Counts:
+class RefusalCounts:
     """What the server refused and closed.
 
     Attributes:
@@ -86,12 +86,12 @@ class PageServer:
     png_of: Callable[[str], bytes | None]
     welcome: Callable[[], Mapping[str, Any]]
     stops: Callable[[], tuple[int, int]] = lambda: (0, 0)
-    counts: Counts = field(default_factory=Counts)
+    counts: RefusalCounts = field(default_factory=RefusalCounts)
 
     def __post_init__(self) -> None:
         require_packages(_PACKAGES)
         self.tls: Certificate | None = None if is_loopback(self.settings.host) else certificate()
-        self.doors = Doors(self.settings.code_s)
+        self.doors = Sessions(self.settings.code_s)
         self._door_lock = threading.Lock()
         self._socket = bound_socket(self.settings.host, self.settings.port)
         self.port = int(self._socket.getsockname()[1])
@@ -281,7 +281,9 @@ class PageServer:
             self.counts.refused += 1
             return JSONResponse({"confirmed": False}, status_code=403)
         before, _ = self.stops()
-        self.inbox.put(Asked(0, request.client.host, Stop(t=kind), 0, 0, self._public(request)), urgent=True)
+        self.inbox.put(
+            ClientAct(0, request.client.host, Stop(t=kind), 0, 0, self._public(request)), urgent=True
+        )
         deadline = time.monotonic() + _CONFIRM_S
         while not before < self.stops()[1] and time.monotonic() < deadline:
             await asyncio.sleep(_LOOK_S)

@@ -60,7 +60,7 @@ class Summary:
 
 
 @dataclass
-class _Stream:
+class _TopicStream:
     """Sequence numbers of one recorded topic. Gaps are losses, and a decrease means another publisher."""
 
     instance_id: int = 1
@@ -104,7 +104,7 @@ class Lockstep:
             for topic in node.subscriptions:
                 self._listeners.setdefault(topic, []).append(name)
         self._hash = hashlib.sha256()
-        self._streams: dict[str, _Stream] = {}
+        self._streams: dict[str, _TopicStream] = {}
         self._sequences: Counter[str] = Counter()
         self._next_due_ns = start_ns
         self._timers = [
@@ -122,7 +122,7 @@ class Lockstep:
     def feed(self, message: BagMessage) -> list[BagMessage]:
         """Advance to the time of a message and feed it to the nodes. Returns the messages that they publish, in order."""
         now = self._clock.move_to(message.log_ns)
-        lost = self._streams.setdefault(message.topic, _Stream()).take(message.sequence)
+        lost = self._streams.setdefault(message.topic, _TopicStream()).take(message.sequence)
         self.summary.messages += 1
         return self._spread(deque([(message, lost)]), now)
 

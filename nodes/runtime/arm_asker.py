@@ -8,7 +8,7 @@ from typing import Any
 from nodes.runtime.arm_requests import ARM, BRAKE_WAIT_S, OPERATOR, arm_message
 from nodes.runtime.clock import NS_PER_S, Now
 from nodes.runtime.node import Out
-from nodes.runtime.requests import Asked
+from nodes.runtime.requests import RequestIdentity
 from nodes.runtime.wire import MessageInfo
 
 # A request to arm is void after this time; a request to disarm is repeated until it is answered.
@@ -17,7 +17,7 @@ _ARM_NS = NS_PER_S
 
 @dataclass
 class _Pending:
-    asked: Asked
+    asked: RequestIdentity
     arm: bool
     reason: str
 
@@ -40,11 +40,11 @@ class ArmAsker:
     def arm(self, now: Now, reason: str) -> None:
         """Ask to arm, unless a request to disarm is not answered yet."""
         if self._pending is None or self._pending.arm:
-            self._pending = _Pending(Asked.at(now), True, reason)
+            self._pending = _Pending(RequestIdentity.at(now), True, reason)
 
     def disarm(self, now: Now, reason: str) -> Out:
         """Ask to disarm. Returns the first message."""
-        self._pending = _Pending(Asked.at(now), False, reason)
+        self._pending = _Pending(RequestIdentity.at(now), False, reason)
         self.stops_asked += 1
         self._answered_ns = None
         return self._message(self._pending, now)

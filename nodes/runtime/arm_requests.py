@@ -11,7 +11,7 @@ from nodes.runtime.bus import Bus, Received
 from nodes.runtime.clock import Now
 from nodes.runtime.errors import LaunchError
 from nodes.runtime.messages import header, types
-from nodes.runtime.requests import Asked
+from nodes.runtime.requests import RequestIdentity
 
 ARM, STATE, SENT = "/arm", "/safety/state", "/motor/sent"
 OPERATOR = "operator"
@@ -37,7 +37,7 @@ class ArmAnswer:
     braked: bool = False
 
 
-def arm_message(asked: Asked, now: Now, arm: bool, source: str, reason: str) -> Any:
+def arm_message(asked: RequestIdentity, now: Now, arm: bool, source: str, reason: str) -> Any:
     """Make the message for one repeat of a request to arm or to disarm."""
     return types.Arm(
         header=header(asked.real_ns),
@@ -56,7 +56,7 @@ def ask_to_arm(run_dir: Path, reason: str) -> ArmAnswer:
         LaunchError: The safety node did not answer.
     """
 
-    def make(asked: Asked, now: Now) -> Any:
+    def make(asked: RequestIdentity, now: Now) -> Any:
         return arm_message(asked, now, True, OPERATOR, reason)
 
     def read(ask_id: str, received: Received) -> Received | None:

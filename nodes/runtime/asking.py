@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 from nodes.runtime.bus import Bus, Received
 from nodes.runtime.clock import Now, SystemClock
 from nodes.runtime.errors import BusError, LaunchError, MessageError
-from nodes.runtime.requests import Asked
+from nodes.runtime.requests import RequestIdentity
 
 T = TypeVar("T")
 
@@ -25,7 +25,7 @@ class NoAnswerError(LaunchError):
 def ask(
     bus: Bus,
     topic: str,
-    make: Callable[[Asked, Now], Any],
+    make: Callable[[RequestIdentity, Now], Any],
     answers: str,
     read: Callable[[str, Received], T | None],
     *,
@@ -52,7 +52,7 @@ def ask(
     """
     clock = SystemClock()
     bus.subscribe(answers)
-    asked = Asked.at(clock.now())
+    asked = RequestIdentity.at(clock.now())
     began = time.monotonic()
     next_s, taken = began, None
     while True:

@@ -54,7 +54,7 @@ def counted(report: Report, what: str, count: int, before: int, total: int) -> C
     return lambda done: report((before + done) / total, f"{what} {done}/{count}")
 
 
-class Display(Protocol):
+class StageDisplay(Protocol):
     """Shows the progress of stages to the user."""
 
     def start(self, stage: str) -> MeasuringReport:
@@ -65,14 +65,14 @@ class Display(Protocol):
 
 
 class ProgressDisplay:
-    """Implements `Display`.
+    """Implements `StageDisplay`.
 
     Args:
         console: Where to write. A log file or pipe gets lines instead of bars.
         watcher: A second display that receives the same reports, such as the record of the experiment page.
     """
 
-    def __init__(self, console: Console | None = None, watcher: Display | None = None) -> None:
+    def __init__(self, console: Console | None = None, watcher: StageDisplay | None = None) -> None:
         self._console, self._watcher = console or Console(), watcher
         columns = (
             TextColumn("{task.fields[stage]:<8}"),

@@ -18,7 +18,7 @@ _LONGEST_ID = 64
 
 
 @dataclass(frozen=True)
-class Asked:
+class RequestIdentity:
     """Identity of a request, which is the same in all its repeats.
 
     Attributes:
@@ -32,7 +32,7 @@ class Asked:
     real_ns: int
 
     @classmethod
-    def at(cls, now: Now) -> Asked:
+    def at(cls, now: Now) -> RequestIdentity:
         """Make the identity of a request that is first sent now."""
         return cls(secrets.token_hex(8), now.mono_ns, now.real_ns)
 
@@ -61,7 +61,7 @@ def is_id(ask_id: str) -> bool:
     return 0 < len(ask_id) <= _LONGEST_ID
 
 
-class Answers:
+class AnswerMemory:
     """Remembers the answers of a node by request id. A repeat gets the same answer and has no further effect.
 
     Args:

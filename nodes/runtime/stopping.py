@@ -15,7 +15,7 @@ from nodes.runtime.arm_requests import ARM, BRAKE_WAIT_S, OPERATOR, SENT, STATE,
 from nodes.runtime.bus import Bus, Received
 from nodes.runtime.clock import SystemClock
 from nodes.runtime.errors import MessageError
-from nodes.runtime.requests import Asked
+from nodes.runtime.requests import RequestIdentity
 
 _REPEAT_S = 0.02
 _TELL_S = 1.0
@@ -49,7 +49,7 @@ class StopRequest:
     def __init__(self, run_dir: Path, reason: str) -> None:
         self.run_dir, self._reason = run_dir, reason
         self._clock = SystemClock()
-        self._asked = Asked.at(self._clock.now())
+        self._asked = RequestIdentity.at(self._clock.now())
         self._began_s = time.monotonic()
         self._next_s = 0.0
         self._tell_s = self._began_s + BRAKE_WAIT_S

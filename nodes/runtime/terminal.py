@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -13,6 +13,8 @@ from nodes.runtime.paths import named_file
 
 if TYPE_CHECKING:
     from rich.table import Table
+
+    from nodes.runtime.findings import ContractFinding
 
 _POLICY_FILES = (".safetensors", ".onnx", ".pt2")
 Overrides = Annotated[
@@ -71,22 +73,6 @@ RunDir = Annotated[
 Topics = Annotated[
     list[str] | None, typer.Option("--topics", metavar="TOPIC", help="Use only this topic. May be repeated.")
 ]
-
-
-class ContractFinding(Protocol):
-    """One line of the report of a check, as `nodes.lab.findings.Finding`."""
-
-    @property
-    def name(self) -> str:
-        """Part of the contract."""
-
-    @property
-    def met(self) -> bool:
-        """Whether it is met."""
-
-    @property
-    def text(self) -> str:
-        """What was found."""
 
 
 def table(*columns: str) -> Table:

@@ -39,6 +39,34 @@ def chunk_messages(content: bytes, name: str, stamp_ns: int) -> list[Any]:
     ]
 
 
+class FileSender:
+    """Sends the pieces of a file, one a tick: some rounds, and one more for each receiver that begins to listen.
+
+    Args:
+        chunks: The pieces.
+        rounds: How often.
+        pause_ns: Time between two rounds [ns].
+    """
+
+    def __init__(self, chunks: list[Any], rounds: int, pause_ns: int) -> None:
+        self._chunks, self._rounds, self._pause_ns = chunks, rounds, pause_ns
+        self._index, self._due_ns, self._listeners = 0, 0, 0
+
+    def next(self, mono_ns: int, listeners: int = 0) -> Any | None:
+        """Return the piece that is due, or None."""
+        if listeners > self._listeners:
+            self._rounds = max(self._rounds, 1 + (self._index > 0))
+        self._listeners = listeners
+        if self._rounds == 0 or mono_ns < self._due_ns:
+            return None
+        piece = self._chunks[self._index]
+        self._index = (self._index + 1) % len(self._chunks)
+        if self._index == 0:
+            self._rounds -= 1
+            self._due_ns = mono_ns + self._pause_ns
+        return piece
+
+
 @dataclass(frozen=True)
 class ReceivedFile:
     """A complete, verified file.

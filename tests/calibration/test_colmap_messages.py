@@ -9,10 +9,10 @@ from calibration.photo_model import (
     FoundCamera,
     LeftOut,
     Model,
+    PhotoSource,
     ReconstructionError,
     Registered,
     SfmConfig,
-    Source,
 )
 
 PINHOLE = Pinhole(640, 480, 601.1 / 3.0, 599.9, 320.0, 240.1)
@@ -21,8 +21,8 @@ LENS = Lens((0.1 / 3.0, -0.02, 0.0, 1e-9, 0.0))
 
 def test_a_job_arrives_as_it_was_sent(tmp_path):
     sources = (
-        Source("phone", ("a.jpg", "b.jpg"), True),
-        Source("car", ("c.png",), pinhole=PINHOLE, lens=LENS),
+        PhotoSource("phone", ("a.jpg", "b.jpg"), True),
+        PhotoSource("car", ("c.png",), pinhole=PINHOLE, lens=LENS),
     )
     job = messages.pack_job(tmp_path, sources, tmp_path / "work", SfmConfig(max_features=77, seed=3))
     assert job.count(b"\n") == 1

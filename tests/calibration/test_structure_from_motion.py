@@ -13,7 +13,7 @@ from advnerf_core.data.lens import Lens
 from advnerf_core.data.similarity import align_poses
 from advnerf_core.geometry import Pinhole, look_at
 from benchmarks.painted_corner import WALL_M, WALLS, photograph, poses_of, some_camera, write_photographs
-from calibration.structure_from_motion import ReconstructionError, SfmConfig, Source, reconstruct
+from calibration.structure_from_motion import PhotoSource, ReconstructionError, SfmConfig, reconstruct
 
 PHONE = Pinhole(400, 300, 330.0, 330.0, 200.0, 150.0)
 CAR = Pinhole(320, 200, 210.0, 210.0, 160.0, 100.0)
@@ -36,8 +36,8 @@ def scene(tmp_path_factory):
             truth[name] = pose
             names[camera].append(name)
     sources = [
-        Source("phone", tuple(names["phone"]), ordered=True),
-        Source("car", tuple(names["car"]), True, CAR, CAR_LENS),
+        PhotoSource("phone", tuple(names["phone"]), ordered=True),
+        PhotoSource("car", tuple(names["car"]), True, CAR, CAR_LENS),
     ]
     return root, sources, truth
 
@@ -101,7 +101,7 @@ def test_photographs_without_overlap_are_refused_with_what_to_do(tmp_path):
     with pytest.raises(
         ReconstructionError, match=r"but no two could be matched; take photographs with overlap"
     ):
-        reconstruct(tmp_path, [Source("phone", tuple(f"{k}.png" for k in range(4)))], tmp_path / "work")
+        reconstruct(tmp_path, [PhotoSource("phone", tuple(f"{k}.png" for k in range(4)))], tmp_path / "work")
 
 
 def true_focal_lengths(model, truth):
@@ -115,7 +115,7 @@ def test_ten_photographs_by_ten_cameras_have_ten_sane_lenses(tmp_path):
     said = []
     model = reconstruct(
         tmp_path,
-        [Source("photos", tuple(truth))],
+        [PhotoSource("photos", tuple(truth))],
         tmp_path / "work",
         report=lambda share, text: said.append((share, text)),
     )
@@ -144,7 +144,7 @@ def test_eleven_photographs_by_one_camera_give_its_focal_length(tmp_path):
     truth = write_photographs(tmp_path, poses, [(pinhole, Lens((-0.08, 0.02, 0.0, 0.0, 0.0)))] * 11)
     names = tuple(truth)
     # Two folders, but one camera: they share its lens.
-    sources = [Source("camera", names[:6]), Source("camera", names[6:])]
+    sources = [PhotoSource("camera", names[:6]), PhotoSource("camera", names[6:])]
     model = reconstruct(tmp_path, sources, tmp_path / "work", FEW_FEATURES)
     assert model.unregistered == ()
     assert [(camera.camera_id, camera.images) for camera in model.cameras] == [("camera", 11)]
@@ -178,7 +178,7 @@ def test_a_camera_whose_lens_cannot_be_told_is_left_out_by_name_or_held_at_its_e
         names[-1] = last = with_exif(
             tmp_path, last, round(43.27 * 500.0 / np.hypot(360.0, 360.0))
         )  # by the diagonal of the film
-    model = reconstruct(tmp_path, [Source("photos", tuple(names))], tmp_path / "work", FEW_FEATURES)
+    model = reconstruct(tmp_path, [PhotoSource("photos", tuple(names))], tmp_path / "work", FEW_FEATURES)
     cameras = {camera.camera_id: camera for camera in model.cameras}
     assert cameras["photos/400x300"].pinhole.fx == pytest.approx(380.0, rel=0.01)
     if knows_itself:
@@ -189,7 +189,7 @@ def test_a_camera_whose_lens_cannot_be_told_is_left_out_by_name_or_held_at_its_e
         assert model.unregistered == (last,)
         assert "focal length is only known within" in model.left_out[0].why
     # What was finished says the same again.
-    again = reconstruct(tmp_path, [Source("photos", tuple(names))], tmp_path / "work", FEW_FEATURES)
+    again = reconstruct(tmp_path, [PhotoSource("photos", tuple(names))], tmp_path / "work", FEW_FEATURES)
     assert (again.left_out, again.cameras) == (model.left_out, model.cameras)
 
 
@@ -202,16 +202,16 @@ def test_a_process_of_colmap_that_is_killed_is_one_error(tmp_path):
             child.kill()
 
     with pytest.raises(ReconstructionError, match=r"was ended by SIGKILL .* run the command again to resume"):
-        reconstruct(tmp_path, [Source("photos", tuple(truth))], tmp_path / "work", report=kill)
+        reconstruct(tmp_path, [PhotoSource("photos", tuple(truth))], tmp_path / "work", report=kill)
 
 
 def test_what_cannot_begin_is_refused_at_once(tmp_path):
     with pytest.raises(ReconstructionError, match="at least 3 different images, got 2"):
-        reconstruct(tmp_path, [Source("phone", ("a.png", "b.png"))], tmp_path / "work")
+        reconstruct(tmp_path, [PhotoSource("phone", ("a.png", "b.png"))], tmp_path / "work")
     with pytest.raises(ReconstructionError, match="got a fisheye"):
-        Source("phone", ("a.png",), lens=Lens((0.1, 0.0, 0.0, 0.0), fisheye=True))
+        PhotoSource("phone", ("a.png",), lens=Lens((0.1, 0.0, 0.0, 0.0), fisheye=True))
     with pytest.raises(ReconstructionError, match="images of camera 'phone', got none"):
-        Source("phone", ())
+        PhotoSource("phone", ())
 
 
 def test_the_painted_corner_is_seen_where_it_is(tmp_path):

@@ -18,7 +18,7 @@ from nodes.runtime.bus import Bus
 from nodes.runtime.clock import SystemClock
 from nodes.runtime.errors import LaunchError
 from nodes.runtime.messages import drive_message, header, pose_message, types
-from nodes.runtime.requests import Asked
+from nodes.runtime.requests import RequestIdentity
 from nodes.runtime.stopping import ask_to_disarm
 
 pytestmark = pytest.mark.live
@@ -195,7 +195,7 @@ def test_a_hung_safety_node_answers_when_it_wakes_and_an_arm_is_void_by_then(lab
     os.kill(lab.process.pid, signal.SIGSTOP)
     asking = command(lab, "disarm")
     assert "NOT CONFIRMED" in asking.stderr.readline()
-    asked = Asked.at(CLOCK.now())
+    asked = RequestIdentity.at(CLOCK.now())
     with sender(lab) as send:
         send(asked)
         time.sleep(1.1)
@@ -210,7 +210,7 @@ def test_a_hung_safety_node_answers_when_it_wakes_and_an_arm_is_void_by_then(lab
 def test_a_fault_between_two_repeats_of_an_arm_leaves_the_car_disarmed(lab):
     lab.start()
     lab.wait_ready()
-    asked = Asked.at(CLOCK.now())
+    asked = RequestIdentity.at(CLOCK.now())
     with sender(lab) as send:
         assert send.until_answered(asked).armed
         lab.well = False
@@ -226,7 +226,7 @@ def test_a_fault_between_two_repeats_of_an_arm_leaves_the_car_disarmed(lab):
 def test_a_restart_between_two_repeats_of_an_arm_leaves_the_car_disarmed(lab):
     lab.start()
     lab.wait_ready()
-    asked = Asked.at(CLOCK.now())
+    asked = RequestIdentity.at(CLOCK.now())
     with sender(lab) as send:
         assert send.until_answered(asked).armed
         lab.end()

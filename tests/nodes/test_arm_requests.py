@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from nodes.control.arming import Arming, ArmingLimits
 from nodes.control.arming_requests import ArmRequests
 from nodes.runtime.messages import header, types
-from nodes.runtime.requests import Answer, Answers, asked_mono_ns
+from nodes.runtime.requests import Answer, AnswerMemory, asked_mono_ns
 from nodes.runtime.wire import MessageInfo
 
 pytestmark = pytest.mark.live
@@ -180,7 +180,7 @@ def test_the_older_of_the_senders_clocks_counts(published_ms, stamp_ms, age_ms, 
 
 
 def test_answers_are_forgotten_oldest_first():
-    answers = Answers(limit=2)
+    answers = AnswerMemory(limit=2)
     assert [answers.give(Answer(ask_id, True)) for ask_id in "ab"] == [None, None]
     assert answers.give(Answer("c", True)) == Answer("a", True)
     assert [answers.repeat(ask_id) for ask_id in ("a", "b", "", "c")] == [False, True, False, True]

@@ -12,18 +12,18 @@ import yaml
 
 from advnerf_core.attack.artifact import attack_from_bytes, load_attack
 from advnerf_core.geometry import make_transform, planar_pose, rotation_z
-from nodes.attack import AttackConfig, AttackNode, Sender
+from nodes.attack import AttackNode, AttackNodeConfig
 from nodes.cli.attack_node import in_words
 from nodes.experiment.node import job, search
 from nodes.experiment.node.client import ask_for_attack, cancel_attack, new_request_id
 from nodes.experiment.node.request import load_request, request_text
 from nodes.runtime.bus import Bus
-from nodes.runtime.clock import ManualClock, Now, SystemClock
+from nodes.runtime.clock import ManualClock, SystemClock
 from nodes.runtime.errors import LaunchError
 from nodes.runtime.messages import decode, encode, header, image_message, pose_message, type_name, types
 from nodes.runtime.node import MessageInfo, NodeContext
 from nodes.runtime.pictures import rgb_image
-from nodes.runtime.transfer import Assembler, chunk_messages
+from nodes.runtime.transfer import Assembler, FileSender, chunk_messages
 from tests.support.tiny_request import tiny_request
 
 REPOSITORY = Path(__file__).parents[2]
@@ -42,7 +42,7 @@ class Bench:
     def __init__(self, run_dir, **config):
         self.out, self.clock = [], SystemClock()
         self.node = AttackNode.build(
-            AttackConfig(repeat_s=0.0, **config), NodeContext("attack", run_dir, ManualClock())
+            AttackNodeConfig(repeat_s=0.0, **config), NodeContext("attack", run_dir, ManualClock())
         )
 
     def send(self, topic, message):
@@ -219,11 +219,11 @@ def test_the_request_file_has_one_name():
 
 
 def test_a_file_is_sent_in_rounds_and_again_to_whoever_comes_late():
-    sender = Sender(["x", "y"], rounds=2, pause_ns=10)
-    sent = [sender.next(Now(ns, 0), 1) for ns in range(0, 30, 5)]
+    sender = FileSender(["x", "y"], rounds=2, pause_ns=10)
+    sent = [sender.next(ns, 1) for ns in range(0, 30, 5)]
     assert sent == ["x", "y", None, "x", "y", None]
-    assert [sender.next(Now(ns, 0), 1) for ns in (40, 50)] == [None, None]
-    assert [sender.next(Now(ns, 0), 2) for ns in (60, 61, 62, 80)] == ["x", "y", None, None]
+    assert [sender.next(ns, 1) for ns in (40, 50)] == [None, None]
+    assert [sender.next(ns, 2) for ns in (60, 61, 62, 80)] == ["x", "y", None, None]
 
 
 def node_process(module, run_dir, config):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calibration.vehicle import Drive, fit_gains
+from calibration.vehicle import RecordedDrive, fit_gains
 from calibration.vehicle_response import fit_response
 from hardware.worlds.lab.config import CarConfig
 from hardware.worlds.lab.vehicle import TwinVehicle
@@ -66,7 +66,7 @@ def driven():
     seen, sent = np.array(poses), np.array(commands[:-1])
     seen[:, 3] = np.unwrap(seen[:, 3])
     noisy = seen[:, 1:] + rng.normal(0.0, [0.0005, 0.0005, 0.001], (len(seen), 3))
-    return Drive(seen[:, 0], noisy, sent[:, 0], sent[:, 1], sent[:, 2], np.full(len(sent), np.nan))
+    return RecordedDrive(seen[:, 0], noisy, sent[:, 0], sent[:, 1], sent[:, 2], np.full(len(sent), np.nan))
 
 
 def test_its_data_fix_gains_delay_and_lag(driven):

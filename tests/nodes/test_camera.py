@@ -20,7 +20,7 @@ from hardware.cameras.zed.driver import ZedCamera
 from hardware.emulators.v4l2_device import VideoDevice
 from hardware.emulators.v4l2_emulator import VideoPortEmulator
 from hardware.emulators.zed_emulator import ZedRegisters
-from nodes.camera import CameraConfig, CameraNode
+from nodes.camera import CameraNode, CameraNodeConfig
 from nodes.launching.launch_file import load_launch
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import SystemClock
@@ -49,7 +49,7 @@ def frame(sequence=0, stamp_s=0.0):
 
 def config(source=None, **options):
     source = source or {"kind": "folder", "folder": "pictures"}
-    return CameraConfig.model_validate({"source": source, "calibration": str(TWIN), **options})
+    return CameraNodeConfig.model_validate({"source": source, "calibration": str(TWIN), **options})
 
 
 def node(configuration, subscribers=lambda topic: 1, device=None):
@@ -328,7 +328,7 @@ def test_error_in_a_source_is_told_as_it_was_written(tmp_path, source, message):
     path = tmp_path / "camera.yaml"
     path.write_text(f"source: {source}\ncalibration: c\n", encoding="utf-8")
     with pytest.raises(ConfigError, match=message):
-        load_node_config(CameraConfig, "camera", path)
+        load_node_config(CameraNodeConfig, "camera", path)
 
 
 def test_source_of_another_kind_replaces_the_one_of_the_included_launch_file(tmp_path):

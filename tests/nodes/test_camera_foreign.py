@@ -16,18 +16,18 @@ from typer.testing import CliRunner
 from advnerf_core.documents import dump_yaml
 from calibration.schema import CameraCalibration, load_calibration
 from nodes.bags import read_messages
-from nodes.camera import CameraConfig
+from nodes.camera import CameraNodeConfig
 from nodes.cli.main import app
 from nodes.lab import camera_check
 from nodes.lab.camera_check import CHECKS, CameraBench
 from nodes.lab.camera_tools import parse_source
-from nodes.lab.findings import NotMet
 from nodes.launching.launch import Launch
 from nodes.launching.launch_check import check_nodes
 from nodes.launching.launch_file import load_launch
 from nodes.runtime import decode
 from nodes.runtime.config import load_node_config
 from nodes.runtime.errors import ConfigError
+from nodes.runtime.findings import NotMet
 from nodes.runtime.pictures import rgb_image
 
 ROOT = Path(__file__).parents[2]
@@ -241,7 +241,7 @@ def test_a_relative_file_is_relative_to_the_launch_file_that_names_it(
     plain.write_text(
         dump_yaml({"calibration": str(TWIN), "source": {"kind": "mine.py:Generator", "width": 336}})
     )
-    assert load_node_config(CameraConfig, "camera", plain).source.config.width == 336
+    assert load_node_config(CameraNodeConfig, "camera", plain).source.config.width == 336
 
 
 def test_the_example_is_a_camera(stream: str) -> None:

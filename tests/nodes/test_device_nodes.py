@@ -14,7 +14,7 @@ from calibration.schema import CalibrationError, CameraCalibration, load_calibra
 from hardware.cameras.interface import Frame
 from hardware.emulators.frame_server import FrameServer
 from hardware.mocap.vicon_codec import encode_blocks, object_pose
-from nodes.camera import CameraConfig, CameraNode
+from nodes.camera import CameraNode, CameraNodeConfig
 from nodes.runtime.clock import SystemClock
 from nodes.runtime.errors import RuntimeFault
 from nodes.runtime.messages import ns_from_stamp, pinhole_from_camera_info, pose_matrix
@@ -51,7 +51,7 @@ def frame(sequence=0, age_s=0.0, shape=(188, 336, 3)):
 
 @pytest.fixture
 def camera(tmp_path, node_context):
-    config = CameraConfig.model_validate(
+    config = CameraNodeConfig.model_validate(
         {"source": {"kind": "socket", "path": tmp_path / "frames"}, "calibration": TWIN / "camera.yaml"}
     )
     node = CameraNode.build(config, node_context)
@@ -110,7 +110,7 @@ def test_camera_subtracts_the_measured_latency(tmp_path):
     calibration = load_calibration(CameraCalibration, TWIN / "camera.yaml").model_copy(
         update={"latency_s": 0.03}
     )
-    config = CameraConfig.model_validate(
+    config = CameraNodeConfig.model_validate(
         {"source": {"kind": "socket", "path": tmp_path / "f"}, "calibration": TWIN / "camera.yaml"}
     )
     node = CameraNode(config, calibration)
@@ -120,7 +120,7 @@ def test_camera_subtracts_the_measured_latency(tmp_path):
 
 
 def test_camera_without_calibration(tmp_path, node_context):
-    config = CameraConfig.model_validate(
+    config = CameraNodeConfig.model_validate(
         {"source": {"kind": "folder", "folder": tmp_path}, "calibration": tmp_path / "no.yaml"}
     )
     with pytest.raises(CalibrationError, match="no such calibration"):

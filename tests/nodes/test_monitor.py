@@ -9,7 +9,7 @@ import pytest
 
 from advnerf_core.attack.artifact import AttackFile, face_texture, save_attack
 from advnerf_core.geometry import Pinhole
-from calibration.panel import Panel, centre_square, make_panel, require_fits
+from calibration.panel import MonitorPanel, centre_square, make_panel, require_fits
 from calibration.schema import CalibrationError, TargetCalibration, load_calibration
 from hardware.emulators.monitor_port import MonitorPort
 from hardware.errors import HardwareError
@@ -173,7 +173,7 @@ def test_the_operator_switches_the_attack_off_and_on(screen):
 
 def test_every_pixel_of_the_texture_is_where_nearest_neighbour_puts_it():
     texture = np.random.default_rng(1).integers(0, 256, (64, 64, 3), dtype=np.uint8)
-    picture = Panel((1920, 1080), (0.64, 0.36)).picture(texture, (0.18, 0.18))  # 540 px square
+    picture = MonitorPanel((1920, 1080), (0.64, 0.36)).picture(texture, (0.18, 0.18))  # 540 px square
     rows = [int((row + 0.5) * 64 / 540) for row in range(540)]
     left, top = (1920 - 540) // 2, (1080 - 540) // 2
     np.testing.assert_array_equal(picture[top : top + 540, left : left + 540], texture[np.ix_(rows, rows)])

@@ -14,7 +14,7 @@ from advnerf_core.policies.pilotnet import PilotNet
 from advnerf_core.policies.policy_file import LoadedPolicy, PolicyFileError, load_policy, save_policy
 from advnerf_core.policies.torch_driver import TorchDriver
 from advnerf_core.policies.view import PolicyView
-from nodes.policy import PolicyConfig, PolicyNode
+from nodes.policy import PolicyNode, PolicyNodeConfig
 from nodes.runtime.clock import ManualClock
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.messages import decode, encode, image_message, stamp_ns, type_name
@@ -104,7 +104,7 @@ def test_built_from_a_file_with_its_hash(tmp_path: Path) -> None:
     context = NodeContext("policy", tmp_path, ManualClock())
     threads = torch.get_num_threads()
     try:
-        config = PolicyConfig(
+        config = PolicyNodeConfig(
             policy=str(tmp_path / "policy.safetensors"), sha256=digest, image_topic="/camera/image_raw"
         )
         node = PolicyNode.build(config, context)
@@ -134,11 +134,11 @@ import sys
 sys.modules["torch"] = None
 import numpy as np
 from pathlib import Path
-from nodes.policy import PolicyConfig, PolicyNode
+from nodes.policy import PolicyNodeConfig, PolicyNode
 from nodes.runtime.clock import ManualClock
 from nodes.runtime.messages import image_message
 from nodes.runtime.node import MessageInfo, NodeContext
-node = PolicyNode.build(PolicyConfig(policy={str(file)!r}, goal=(0.5, -1.0)), NodeContext("policy", Path("."), ManualClock()))
+node = PolicyNode.build(PolicyNodeConfig(policy={str(file)!r}, goal=(0.5, -1.0)), NodeContext("policy", Path("."), ManualClock()))
 clock = ManualClock(mono_ns=10**10, real_ns={T0} + 10**7)
 (out,) = node.handle("/compositor/image", image_message(np.load({str(tmp_path / "rgb.npy")!r}), {T0}, "c"), MessageInfo(10**10, 10**10), clock.now())
 print(out.message.drive.steering_angle)

@@ -15,7 +15,7 @@ from nodes.runtime.arm_requests import arm_message
 from nodes.runtime.clock import Now
 from nodes.runtime.messages import drive_message, header, ns_from_stamp, pose_message, types
 from nodes.runtime.node import MessageInfo
-from nodes.runtime.requests import Asked
+from nodes.runtime.requests import RequestIdentity
 from nodes.safety import SafetyConfig, SafetyNode
 
 pytestmark = pytest.mark.live
@@ -112,7 +112,7 @@ class Guard:
 
     def arm(self, arm=True):
         self.ms += 1
-        return self.say("/arm", arm_message(Asked.at(self.now), self.now, arm, "trial", "test"))
+        return self.say("/arm", arm_message(RequestIdentity.at(self.now), self.now, arm, "trial", "test"))
 
 
 def drives_of(outs):

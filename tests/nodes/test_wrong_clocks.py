@@ -232,9 +232,9 @@ def test_a_suspend_of_which_only_the_boot_clock_tells(driving):
 
 def test_a_request_to_arm_from_before_a_suspend_is_void(stack):
     from nodes.runtime.arm_requests import arm_message
-    from nodes.runtime.requests import Asked
+    from nodes.runtime.requests import RequestIdentity
 
-    asked = Asked.at(stack.now)
+    asked = RequestIdentity.at(stack.now)
     message = arm_message(asked, stack.now, True, "operator", "")
     stack.asleep_ns += 10 * S
     stack.real_ns += 10 * S
@@ -245,10 +245,10 @@ def test_a_request_to_arm_from_before_a_suspend_is_void(stack):
 
 def test_a_request_to_arm_from_the_future_does_not_count(stack):
     from nodes.runtime.arm_requests import arm_message
-    from nodes.runtime.requests import Asked
+    from nodes.runtime.requests import RequestIdentity
 
     later = Now(stack.mono_ns, stack.real_ns + 60 * S)
-    stack.say("/arm", arm_message(Asked.at(later), later, True, "operator", ""), 7)
+    stack.say("/arm", arm_message(RequestIdentity.at(later), later, True, "operator", ""), 7)
     assert not stack.armed
     drive(stack)
 

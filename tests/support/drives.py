@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from calibration.vehicle import Drive
+from calibration.vehicle import RecordedDrive
 from hardware.worlds.lab.config import CarConfig
 from hardware.worlds.lab.vehicle import TwinVehicle
 
@@ -54,4 +54,4 @@ def drive(
     noisy = np.stack([x, y, yaw + turned_rad], axis=1) + rng.normal(
         0.0, [mocap[0], mocap[0], mocap[1]], (len(yaw), 3)
     )
-    return Drive(seen[:, 0], noisy, command_s, servo, erpm, np.full(len(servo), pipeline_s))
+    return RecordedDrive(seen[:, 0], noisy, command_s, servo, erpm, np.full(len(servo), pipeline_s))

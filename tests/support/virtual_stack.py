@@ -21,7 +21,7 @@ from nodes.runtime.arm_requests import arm_message
 from nodes.runtime.clock import Now
 from nodes.runtime.messages import camera_info_message, drive_message, header, pose_message, types
 from nodes.runtime.node import MessageInfo, Out
-from nodes.runtime.requests import Asked
+from nodes.runtime.requests import RequestIdentity
 from nodes.safety import SafetyConfig, SafetyNode
 from tests.support.stack import CALIBRATION
 
@@ -169,7 +169,7 @@ class VirtualStack:
     def arm(self, source: str = "operator") -> VirtualStack:
         """Ask the safety node to arm, as the command does."""
         self.wait(1)
-        self.say("/arm", arm_message(Asked.at(self.now), self.now, True, source, "test"), 7)
+        self.say("/arm", arm_message(RequestIdentity.at(self.now), self.now, True, source, "test"), 7)
         return self
 
     def moves(self, since_ns: int = 0) -> list[WireEvent]:

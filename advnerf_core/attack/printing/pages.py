@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from advnerf_core.attack.printing.pdf import Document, Page
+from advnerf_core.attack.printing.pdf import Page, PdfDocument
 from advnerf_core.attack.printing.poster import Poster, pixels_of
 from advnerf_core.attack.printing.sheet import RULER_MM, overview, ruler
 from advnerf_core.attack.printing.tiles import FOOTER_MM, Layout, Paper, Tile
@@ -17,7 +17,7 @@ def pdf_bytes(poster: Poster, layout: Layout, paper: Paper, dpi: float) -> bytes
     Raises:
         PrintError: More pixels on a page than fit into memory.
     """
-    document = Document(f"Attack {poster.attack.attack_id}, {poster.name}")
+    document = PdfDocument(f"Attack {poster.attack.attack_id}, {poster.name}")
     for tile in layout.tiles:
         document.add(_tile_page(poster, layout, tile, dpi))
     document.add(overview(poster, layout, paper))

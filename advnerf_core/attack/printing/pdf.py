@@ -83,7 +83,7 @@ class Page:
         self.images.append(rgb)
 
 
-class Document:
+class PdfDocument:
     """Pages in order.
 
     Args:

@@ -16,7 +16,7 @@ from advnerf_core.attack.adjoint import RenderCache
 from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.driving.rollout import Rollout, drive
 from advnerf_core.geometry import Array
-from advnerf_core.scene.surrogate import Frames, Rendered
+from advnerf_core.scene.surrogate import PoseBatch, Rendered
 
 
 @runtime_checkable
@@ -26,7 +26,7 @@ class PreparingSensor(Protocol):
     def camera_poses(self, states: Tensor) -> Array:
         """``T_world_from_camera [B, 4, 4]``."""
 
-    def prepare(self, T_world_from_camera: Array) -> Frames:
+    def prepare(self, T_world_from_camera: Array) -> PoseBatch:
         """Everything of these frames that does not depend on theta."""
 
 
@@ -43,7 +43,7 @@ class Visited:
 
     def __init__(self, problem: AttackProblem, ticks: Sequence[int], states: Tensor) -> None:
         self._problem, self._ticks, self._states = problem, tuple(ticks), states.clone()
-        self._frames: Frames | None = None
+        self._frames: PoseBatch | None = None
         if problem.disturbances is None and isinstance(problem.sensor, PreparingSensor):
             self._frames = problem.sensor.prepare(problem.sensor.camera_poses(states))
 

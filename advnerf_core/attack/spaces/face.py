@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advnerf_core.attack.artifact import COLOURS, AttackedObject, AttackFile, Face, face_texture
+from advnerf_core.attack.artifact import COLOURS, AttackedObject, AttackFace, AttackFile, face_texture
 from advnerf_core.attack.methods import SearchRun, SearchSettings, load_method
 from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.attack.search.search import SearchResult
@@ -26,7 +26,7 @@ class FaceMount:
     Attributes:
         subject: What carries it: the panel's name, which is also that of the motion-capture subject.
         size_m: Width and height [m].
-        corners_in_subject: As of `advnerf_core.attack.artifact.Face`, ``[4, 3]`` [m].
+        corners_in_subject: As of `advnerf_core.attack.artifact.AttackFace`, ``[4, 3]`` [m].
     """
 
     subject: str
@@ -83,10 +83,10 @@ class FaceSpace:
             ),
         )
 
-    def face(self, theta: Tensor) -> Face:
+    def face(self, theta: Tensor) -> AttackFace:
         """The face as it is displayed."""
         texture = face_texture(theta.detach().numpy().astype(np.float32))
-        return Face(texture, self.mount.size_m, self.mount.subject, self.mount.corners_in_subject)
+        return AttackFace(texture, self.mount.size_m, self.mount.subject, self.mount.corners_in_subject)
 
     def restored(self, attack: AttackFile) -> Shown:
         """The face in the colours that are seen, behind the display if there is one; see `Space.restored`."""

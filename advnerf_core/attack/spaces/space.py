@@ -19,9 +19,9 @@ from advnerf_core.attack.artifact import (
     MESH_SHAPE,
     MESH_TEXTURE,
     AttackedObject,
+    AttackFace,
     AttackFile,
     AttackFileError,
-    Face,
 )
 from advnerf_core.attack.methods import SearchRun, SearchSettings, load_method
 from advnerf_core.attack.problem import AttackProblem, Sensor
@@ -110,7 +110,7 @@ class Space(Protocol):
     def attacked(self, theta: Tensor) -> tuple[AttackedObject, ...]:
         """What an attack file keeps of ``theta``."""
 
-    def face(self, theta: Tensor) -> Face | None:
+    def face(self, theta: Tensor) -> AttackFace | None:
         """The face that a projection or a display can show; None where the objects are none."""
 
     def restored(self, attack: AttackFile) -> Shown:

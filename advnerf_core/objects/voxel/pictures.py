@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from advnerf_core.data.image_files import OPAQUE
-from advnerf_core.data.view_loading import View, load_view
+from advnerf_core.data.view_loading import LoadedView, load_view
 from advnerf_core.data.views import PosedImages
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Array, Pinhole, invert_transform, transform_points
@@ -122,11 +122,11 @@ def load_pictures(listed: PosedImages, size: tuple[int, int] | None = None) -> P
     return PosedRgba(images, np.stack([frame.T_world_from_camera for frame in frames]), tuple(pinholes))
 
 
-def _size(view: View) -> str:
+def _size(view: LoadedView) -> str:
     return f"{view.pinhole.width} x {view.pinhole.height}"
 
 
-def _write_premultiplied(view: View, out: NDArray[np.uint8]) -> None:
+def _write_premultiplied(view: LoadedView, out: NDArray[np.uint8]) -> None:
     alpha = np.full(view.rgb.shape[:2], OPAQUE, np.uint8) if view.alpha is None else view.alpha
     share = alpha[..., None].astype(np.float32) / np.float32(OPAQUE)
     out[..., :3] = np.rint(view.rgb * share)

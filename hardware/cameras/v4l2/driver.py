@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hardware.cameras.interface import Camera, Frame
-from hardware.cameras.pixels import Layout, to_rgb
+from hardware.cameras.pixels import PixelLayout, to_rgb
 from hardware.cameras.stamping import NS_PER_S, Decimator, Stamper
 from hardware.cameras.v4l2 import abi
 from hardware.cameras.v4l2 import controls as v4l2_controls
@@ -75,7 +75,7 @@ class V4l2Camera(Camera):
         self._started = started
         self._stamper = stamper or Stamper()
         self._fd: int | None = None
-        self._layout: Layout | None = None
+        self._layout: PixelLayout | None = None
         self._maps: list[Any] = []
         self._to_skip = 0
         self._last_sequence: int | None = None

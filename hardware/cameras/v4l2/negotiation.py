@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from hardware.cameras.pixels import PIXEL_FORMATS, Layout, least_bytes_per_line
+from hardware.cameras.pixels import PIXEL_FORMATS, PixelLayout, least_bytes_per_line
 from hardware.cameras.v4l2 import abi
 from hardware.cameras.v4l2.port import VideoPort, request
 from hardware.errors import ProtocolError
@@ -83,7 +83,9 @@ def identify(port: VideoPort, fd: int, path: Path) -> Identity:
     return identity
 
 
-def agree(port: VideoPort, fd: int, path: Path, mode: Mode, columns: tuple[int, int] | None = None) -> Layout:
+def agree(
+    port: VideoPort, fd: int, path: Path, mode: Mode, columns: tuple[int, int] | None = None
+) -> PixelLayout:
     """Set a mode, read it back, and return the memory layout. Raises `ProtocolError` if the device chose another mode."""
     asked = abi.Format(type=abi.CAPTURE)
     asked.fmt.pix = abi.PixelFormat(
@@ -103,7 +105,7 @@ def agree(port: VideoPort, fd: int, path: Path, mode: Mode, columns: tuple[int, 
     if least and got.bytesperline < least:
         raise ProtocolError(f"expected rows of at least {least} bytes from {path}, got {got.bytesperline}")
     _agree_on_rate(port, fd, path, mode)
-    return Layout(
+    return PixelLayout(
         mode.pixel_format,
         mode.width,
         mode.height,

@@ -54,7 +54,7 @@ class Mailbox:
         )
 
 
-class Camera:
+class CarlaCamera:
     """One camera of the server, without distortion, that is put where it is needed.
 
     It hangs on nothing: a camera that rides on a vehicle sees from wherever suspension and terrain leave it, and the drive needs

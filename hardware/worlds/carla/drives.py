@@ -13,7 +13,7 @@ from hardware.worlds.paths import ReferencePath
 
 
 @dataclass(frozen=True)
-class Drives:
+class JunctionDrives:
     """The three drives, in the scene's own frame: x along the straight drive, origin in the junction's middle on the ground.
 
     The frame and the names are those of the simulated intersection: straight leaves to the east, right to the south; left comes
@@ -52,7 +52,7 @@ class Drives:
         return {**self.place, "paths": paths, "lane_width_m": self.lane_width_m}
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Drives:
+    def from_dict(cls, data: Mapping[str, Any]) -> JunctionDrives:
         """Rebuild drives from :meth:`to_dict`.
 
         Raises:
@@ -68,5 +68,5 @@ class Drives:
             return cls(frame=SceneFrame(**data["frame"]), paths=paths, **rest)
         except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
             raise CarlaMapError(
-                f"expected drives as written by Drives.to_dict, got something else: {error!r}"
+                f"expected drives as written by JunctionDrives.to_dict, got something else: {error!r}"
             ) from error

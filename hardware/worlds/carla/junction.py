@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from advnerf_core.geometry import Array, wrap_angle
-from hardware.worlds.carla.drives import Drives
+from hardware.worlds.carla.drives import JunctionDrives
 from hardware.worlds.carla.errors import CarlaMapError
 from hardware.worlds.carla.frames import CarlaPose, SceneFrame
 from hardware.worlds.fitting import fit_lines_and_arcs
@@ -97,7 +97,7 @@ def find_drives(
     beyond_m: float = 40.0,
     max_height_range_m: float = math.inf,
     tolerance_m: float = 0.02,
-) -> Drives:
+) -> JunctionDrives:
     """The drives through one junction.
 
     Args:
@@ -131,7 +131,7 @@ def find_drives(
 
 def _drives_at(
     junction: Any, library: Any, choice: int, approach_m: float, beyond_m: float, tolerance_m: float
-) -> Drives:
+) -> JunctionDrives:
     sets = _sets_of_three(_crossings(junction, library))
     if not 0 <= choice < len(sets):
         raise CarlaMapError(
@@ -148,7 +148,7 @@ def _drives_at(
     frame = SceneFrame(x, y, float(np.median(heights)), frame.yaw_rad)
     paths = {name: _path(name, points, frame, tolerance_m) for name, points in waypoints.items()}
     width = min(point.lane_width for points in waypoints.values() for point in points)
-    return Drives(
+    return JunctionDrives(
         junction.id, frame, paths, float(width), float(np.ptp(heights)), bool(three["straight"].begin.is_rht)
     )
 

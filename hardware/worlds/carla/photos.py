@@ -8,14 +8,16 @@ import numpy as np
 
 from advnerf_core.geometry import Array, camera_mount, look_at, planar_pose
 from hardware.worlds.carla.config import CarlaConfig
-from hardware.worlds.carla.drives import Drives
+from hardware.worlds.carla.drives import JunctionDrives
 from hardware.worlds.lab.config import CameraConfig
 
 BEHIND_M = 4.0  # photographs begin so far before the drives' starts
 DRIVEN_M = 44.0  # and go on so far behind them: the drive, and what a car sees that runs on
 
 
-def photo_poses(drives: Drives, config: CarlaConfig, count: int, rng: np.random.Generator) -> list[Array]:
+def photo_poses(
+    drives: JunctionDrives, config: CarlaConfig, count: int, rng: np.random.Generator
+) -> list[Array]:
     """Poses that cover the three drives evenly, mixed so that any prefix covers them too.
 
     Of ten photographs six are taken close to a lane's middle at about the driving camera's height, two from a car that has left
@@ -49,7 +51,9 @@ def photo_poses(drives: Drives, config: CarlaConfig, count: int, rng: np.random.
     return poses
 
 
-def held_out_states(drives: Drives, count: int, rng: np.random.Generator) -> list[tuple[float, float, float]]:
+def held_out_states(
+    drives: JunctionDrives, count: int, rng: np.random.Generator
+) -> list[tuple[float, float, float]]:
     """Poses of the car (x [m], y [m], yaw [rad]) about the drives, whose views nothing learns from."""
     paths, states = list(drives.paths.values()), []
     for index in range(count):

@@ -13,10 +13,10 @@ import numpy as np
 
 from advnerf_core.geometry import Array, Pinhole, VehicleState, look_at, planar_pose
 from hardware.worlds.carla.body import CarlaCar
-from hardware.worlds.carla.camera import DEPTH, RGB, Camera
+from hardware.worlds.carla.camera import DEPTH, RGB, CarlaCamera
 from hardware.worlds.carla.config import CarlaConfig
 from hardware.worlds.carla.connection import check_nobody_else, connect, open_world
-from hardware.worlds.carla.drives import Drives
+from hardware.worlds.carla.drives import JunctionDrives
 from hardware.worlds.carla.errors import CarlaError, CarlaFrameError
 from hardware.worlds.carla.frames import CarlaPose
 from hardware.worlds.carla.junction import find_drives
@@ -71,11 +71,11 @@ class CarlaScene:
         self.photo_pinhole: Pinhole = self.config.photo.pinhole
         self.T_car_from_camera: Array = self.config.camera.T_car_from_camera
         self.repeated_frames = 0
-        self._drives: Drives | None = None
+        self._drives: JunctionDrives | None = None
         self._opened = False
         self._changed = True  # whether something stands elsewhere since the last tick
         self._library = library
-        self._cameras: dict[str, Camera] = {}
+        self._cameras: dict[str, CarlaCamera] = {}
         self._undo = Undo()
         self._client: Any = None
         self._car: CarlaCar | None = None
@@ -113,7 +113,7 @@ class CarlaScene:
         self._opened = True
 
     @property
-    def drives(self) -> Drives:
+    def drives(self) -> JunctionDrives:
         """Junction, frame and lanes, as the map has them.
 
         Raises:
@@ -321,7 +321,7 @@ class CarlaScene:
         for name, (kind, pinhole) in wanted.items():
             if name not in self._cameras:
                 parts = (self._world, self._library, kind, pinhole, pose, self.config.render, self._undo)
-                self._cameras[name] = Camera(*parts)
+                self._cameras[name] = CarlaCamera(*parts)
             elif self._cameras[name].pose != pose:
                 self._cameras[name].aim(pose, jump=True)
         cameras = [self._cameras[name] for name in wanted]
@@ -340,11 +340,11 @@ class CarlaScene:
                 self._tick()
         return [self._picture(camera) for camera in cameras]
 
-    def _picture(self, camera: Camera) -> Any:
+    def _picture(self, camera: CarlaCamera) -> Any:
         return camera.picture(self._ticked.frame, self.config.server.frame_timeout_s)
 
 
-def drives_in(carla_map: Any, library: Any, config: CarlaConfig) -> Drives:
+def drives_in(carla_map: Any, library: Any, config: CarlaConfig) -> JunctionDrives:
     """The drives of the configured junction, on ground that is flat enough for a car that moves in a plane.
 
     Raises:

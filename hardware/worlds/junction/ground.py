@@ -8,7 +8,7 @@ import numpy as np
 
 from advnerf_core.geometry import Array
 from hardware.worlds.junction.config import RoadConfig
-from hardware.worlds.junction.solids import Solid, fan, joined, strip, wall
+from hardware.worlds.junction.solids import TexturedSolid, fan, joined, strip, wall
 
 KERB_M = 0.2  # width of the kerb stones
 PAINT_M = 0.01  # height of the markings above the asphalt, so that they win against it at every distance
@@ -31,7 +31,7 @@ def kerb_lines(road: RoadConfig, inset_m: float) -> dict[str, Array]:
     return {"north": np.array([(-half, edge), (half, edge)]), "west": west, "east": west[::-1] * (-1.0, 1.0)}
 
 
-def ground(road: RoadConfig, kerb_u: float) -> dict[str, Solid]:
+def ground(road: RoadConfig, kerb_u: float) -> dict[str, TexturedSolid]:
     """The raised ground by picture: "pavement", "garden", and the "swatches" of the kerb stones."""
     half, top = road.half_m, road.kerb_height_m
     asphalt, stone, inner = (kerb_lines(road, inset) for inset in (0.0, KERB_M, road.pavement_width_m))
@@ -40,7 +40,7 @@ def ground(road: RoadConfig, kerb_u: float) -> dict[str, Solid]:
     for name, line in asphalt.items():
         kerbs.append(wall(line, 0.0, top, kerb_u, tone=0.9))
         flat = strip(stone[name], line, top, half)
-        kerbs.append(Solid(flat.vertices, flat.faces, np.tile([kerb_u, 0.90], (len(flat.uv), 1))))
+        kerbs.append(TexturedSolid(flat.vertices, flat.faces, np.tile([kerb_u, 0.90], (len(flat.uv), 1))))
         pavements.append(strip(inner[name], stone[name], top, half))
         if name != "north":
             gardens.append(fan(far[name], inner[name], top, half))

@@ -51,7 +51,7 @@ def slow(like: Image, waves: float, rng: np.random.Generator, spread: float) -> 
     return np.asarray(1.0 + spread * fine[..., None], dtype=np.float32)
 
 
-class Plan(Canvas):
+class MapCanvas(Canvas):
     """A canvas addressed in world coordinates [m], the junction's middle in its middle."""
 
     def __init__(self, half_m: float, pixels_per_m: float, rgb: Colour) -> None:
@@ -73,7 +73,7 @@ class Plan(Canvas):
 
 def asphalt(road: RoadConfig, rng: np.random.Generator, pixels_per_m: float = 12.0) -> Image:
     """Plan of the roads: newer and older stretches, repaired patches, a few cracks, and manhole covers."""
-    plan = Plan(road.half_m, pixels_per_m, (0.385, 0.385, 0.39))
+    plan = MapCanvas(road.half_m, pixels_per_m, (0.385, 0.385, 0.39))
     width, half = road.lane_width_m, road.half_m
     # The side road was laid later; two stretches of the main road are older.
     plan.rect(-width - 9.0, -half, 2.0 * width + 18.0, half - width, (0.345, 0.35, 0.365))
@@ -108,7 +108,7 @@ def _on_a_road(road: RoadConfig, rng: np.random.Generator) -> tuple[float, float
     return (across, -along) if arm == 0 else ((along if arm == 1 else -along), across)
 
 
-def _patch(plan: Plan, x: float, y: float, rng: np.random.Generator) -> None:
+def _patch(plan: MapCanvas, x: float, y: float, rng: np.random.Generator) -> None:
     length, width, angle = (
         rng.uniform(0.8, 3.5),
         rng.uniform(0.5, 1.4),
@@ -120,7 +120,7 @@ def _patch(plan: Plan, x: float, y: float, rng: np.random.Generator) -> None:
     plan.polygon([(x + c * u - s * v, y + s * u + c * v) for u, v in ends], (tone, tone, 1.02 * tone))
 
 
-def _crack(plan: Plan, x: float, y: float, rng: np.random.Generator) -> None:
+def _crack(plan: MapCanvas, x: float, y: float, rng: np.random.Generator) -> None:
     heading, points = rng.uniform(0.0, 2.0 * math.pi), [(x, y)]
     for _ in range(int(rng.integers(3, 7))):
         heading += rng.normal(0.0, 0.5)
@@ -132,7 +132,7 @@ def _crack(plan: Plan, x: float, y: float, rng: np.random.Generator) -> None:
 def pavement(road: RoadConfig, rng: np.random.Generator, pixels_per_m: float = 12.0) -> Image:
     """Plan of the pavements: slabs of slightly different tone, each block of houses in its own colour, and shadows."""
     half, width = road.half_m, road.lane_width_m
-    plan = Plan(half, pixels_per_m, (0.64, 0.59, 0.55))
+    plan = MapCanvas(half, pixels_per_m, (0.64, 0.59, 0.55))
     plan.rect(-half, -half, half, half, (0.61, 0.61, 0.60))
     plan.rect(0.0, -half, half, half, (0.66, 0.63, 0.55))
     count = round(2.0 * half)
@@ -154,7 +154,7 @@ def pavement(road: RoadConfig, rng: np.random.Generator, pixels_per_m: float = 1
 
 def garden(road: RoadConfig, rng: np.random.Generator, pixels_per_m: float = 8.0) -> Image:
     """Plan of front gardens and park: grass, paths to the doors, beds, forecourts of the shops, and shadows."""
-    plan = Plan(road.half_m, pixels_per_m, (0.38, 0.50, 0.27))
+    plan = MapCanvas(road.half_m, pixels_per_m, (0.38, 0.50, 0.27))
     plan.image *= slow(plan.image, 18.0, rng, 0.07)
     plan.image *= slow(plan.image, 70.0, rng, 0.05)
     for house in HOUSES:
@@ -171,7 +171,7 @@ def garden(road: RoadConfig, rng: np.random.Generator, pixels_per_m: float = 8.0
     return _shadowed(plan.image, road, pixels_per_m)
 
 
-def _front_garden(plan: Plan, house: House, rng: np.random.Generator) -> None:
+def _front_garden(plan: MapCanvas, house: House, rng: np.random.Generator) -> None:
     """What lies between a house's front and the pavement."""
     (x0, x1), (y0, y1) = house.x, house.y
     middle, deep = (0.5 * (x0 + x1), 0.5 * (y0 + y1)), 4.0
@@ -203,7 +203,7 @@ def _front_garden(plan: Plan, house: House, rng: np.random.Generator) -> None:
 
 def _shadowed(image: Image, road: RoadConfig, pixels_per_m: float) -> Image:
     """Soft shadows of houses and trees on raised ground."""
-    shadow = Plan(road.half_m, 0.5 * pixels_per_m, (0.0, 0.0, 0.0))
+    shadow = MapCanvas(road.half_m, 0.5 * pixels_per_m, (0.0, 0.0, 0.0))
     away: Array = -SUN[:2] / SUN[2]
     for house in HOUSES:
         (x0, x1), (y0, y1) = house.x, house.y

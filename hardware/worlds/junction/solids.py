@@ -30,7 +30,7 @@ def shade(normal: ArrayLike) -> Array:
 
 
 @dataclass(frozen=True)
-class Solid:
+class TexturedSolid:
     """Triangles with picture coordinates.
 
     Attributes:
@@ -44,10 +44,10 @@ class Solid:
     uv: Array
 
 
-def joined(solids: Sequence[Solid]) -> Solid:
+def joined(solids: Sequence[TexturedSolid]) -> TexturedSolid:
     """All of them as one."""
     firsts = np.cumsum([0, *(len(solid.vertices) for solid in solids)])
-    return Solid(
+    return TexturedSolid(
         np.concatenate([solid.vertices for solid in solids]),
         np.concatenate(
             [solid.faces + first for solid, first in zip(solids, firsts[:-1], strict=True)]
@@ -61,7 +61,7 @@ def plan_uv(vertices: Array, half_m: float) -> Array:
     return np.asarray(vertices[:, :2] / (2.0 * half_m) + 0.5, dtype=np.float64)
 
 
-def strip(left: Array, right: Array, z_m: float, half_m: float) -> Solid:
+def strip(left: Array, right: Array, z_m: float, half_m: float) -> TexturedSolid:
     """Level ground between two lines ``[N, 2]`` of points across from each other, ``left`` to the left of the way along them."""
     count = len(left)
     i = np.arange(count - 1)
@@ -69,26 +69,30 @@ def strip(left: Array, right: Array, z_m: float, half_m: float) -> Solid:
     faces = np.concatenate([np.c_[i, i + count, i + count + 1], np.c_[i, i + count + 1, i + 1]]).astype(
         np.int32
     )
-    return Solid(vertices, faces, plan_uv(vertices, half_m))
+    return TexturedSolid(vertices, faces, plan_uv(vertices, half_m))
 
 
-def fan(middle: tuple[float, float], line: Array, z_m: float, half_m: float) -> Solid:
+def fan(middle: tuple[float, float], line: Array, z_m: float, half_m: float) -> TexturedSolid:
     """Level ground between one point and a line ``[N, 2]`` that runs counter-clockwise round it."""
     count = len(line)
     vertices = np.c_[np.concatenate([[middle], line]), np.full(count + 1, z_m)]
     i = np.arange(1, count)
-    return Solid(vertices, np.c_[np.zeros_like(i), i, i + 1].astype(np.int32), plan_uv(vertices, half_m))
+    return TexturedSolid(
+        vertices, np.c_[np.zeros_like(i), i, i + 1].astype(np.int32), plan_uv(vertices, half_m)
+    )
 
 
-def polygon(corners: ArrayLike, uv: ArrayLike) -> Solid:
+def polygon(corners: ArrayLike, uv: ArrayLike) -> TexturedSolid:
     """A flat convex polygon of corners ``[N, 3]``, counter-clockwise from where it is seen."""
     points = np.asarray(corners, dtype=np.float64)
     i = np.arange(1, len(points) - 1)
     faces = np.c_[np.zeros_like(i), i, i + 1].astype(np.int32)
-    return Solid(points, faces, np.broadcast_to(np.asarray(uv, dtype=np.float64), (len(points), 2)).copy())
+    return TexturedSolid(
+        points, faces, np.broadcast_to(np.asarray(uv, dtype=np.float64), (len(points), 2)).copy()
+    )
 
 
-def wall(line: Array, low_m: float, high_m: float, u: float, tone: float = 1.0) -> Solid:
+def wall(line: Array, low_m: float, high_m: float, u: float, tone: float = 1.0) -> TexturedSolid:
     """An upright band under a line ``[N, 2]``, seen from its right; one swatch, lit by its own direction."""
     parts = []
     for a, b in itertools.pairwise(line):
@@ -98,7 +102,7 @@ def wall(line: Array, low_m: float, high_m: float, u: float, tone: float = 1.0) 
     return joined(parts)
 
 
-def block(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], u: float) -> Solid:
+def block(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], u: float) -> TexturedSolid:
     """A box without its floor."""
     (x0, x1), (y0, y1), (z0, z1) = x, y, z
     around = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)])
@@ -108,7 +112,9 @@ def block(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float]
     return joined([wall(around, z0, z1, u), top])
 
 
-def post(x_m: float, y_m: float, z: tuple[float, float], radius_m: float, u: float, sides: int = 8) -> Solid:
+def post(
+    x_m: float, y_m: float, z: tuple[float, float], radius_m: float, u: float, sides: int = 8
+) -> TexturedSolid:
     """An upright cylinder without ends."""
     angles = np.linspace(0.0, 2.0 * math.pi, sides + 1)
     around = np.c_[x_m + radius_m * np.cos(angles), y_m + radius_m * np.sin(angles)]
@@ -117,7 +123,7 @@ def post(x_m: float, y_m: float, z: tuple[float, float], radius_m: float, u: flo
 
 def crown(
     centre: tuple[float, float, float], radii: tuple[float, float], u: float, rng: np.random.Generator
-) -> Solid:
+) -> TexturedSolid:
     """A tree's crown: an uneven ellipsoid (radius across, radius up), light where the sun is, blotched like leaves."""
     rings, sides = 9, 14
     latitude, longitude = np.meshgrid(
@@ -137,7 +143,7 @@ def crown(
     i, j = np.meshgrid(np.arange(rings - 1), np.arange(sides), indexing="ij")
     a, b = (i * sides + j).ravel(), (i * sides + (j + 1) % sides).ravel()
     faces = np.concatenate([np.c_[a, b, b + sides], np.c_[a, b + sides, a + sides]]).astype(np.int32)
-    return Solid(vertices, faces, np.c_[np.full(len(v), u), v])
+    return TexturedSolid(vertices, faces, np.c_[np.full(len(v), u), v])
 
 
 def gable(
@@ -148,7 +154,7 @@ def gable(
     u: float,
     wall_u: float,
     along_x: bool,
-) -> list[Solid]:
+) -> list[TexturedSolid]:
     """A pitched roof with its two gable walls.
 
     Args:

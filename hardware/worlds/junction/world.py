@@ -16,7 +16,7 @@ from hardware.worlds.junction.pictures import swatch_u
 from hardware.worlds.junction.sky import backdrop
 from hardware.worlds.junction.solids import (
     BRIGHTEST,
-    Solid,
+    TexturedSolid,
     block,
     crown,
     gable,
@@ -54,7 +54,7 @@ def build_model(config: IntersectionConfig) -> Any:
 
 
 @lru_cache(maxsize=2)
-def _painted(road: RoadConfig) -> tuple[list[Surface], dict[str, Solid], dict[str, textures.Image]]:
+def _painted(road: RoadConfig) -> tuple[list[Surface], dict[str, TexturedSolid], dict[str, textures.Image]]:
     """Flat pictures, triangles by picture, and their pictures; a second scene of the same roads reuses them."""
     rng = np.random.default_rng(road.seed)
     half = road.half_m
@@ -91,7 +91,7 @@ def _walls(name: str, house: House, ground_m: float, rng: np.random.Generator) -
     return surfaces
 
 
-def _furniture(road: RoadConfig, rng: np.random.Generator) -> list[Solid]:
+def _furniture(road: RoadConfig, rng: np.random.Generator) -> list[TexturedSolid]:
     """Markings, roofs, trees, lamps and the stop sign: all that takes its colour from the swatches."""
     kerb = road.kerb_height_m
     white = (swatch_u("paint"), float(shade(UP)) / BRIGHTEST)
@@ -131,14 +131,14 @@ def _furniture(road: RoadConfig, rng: np.random.Generator) -> list[Solid]:
     return solids
 
 
-def _rectangle(surface: Surface) -> Solid:
+def _rectangle(surface: Surface) -> TexturedSolid:
     """A picture's rectangle as triangles: MuJoCo's own planes are far slower to draw, and are seen from behind too."""
     right, up = surface.half_m[0] * surface.right, surface.half_m[1] * surface.up
     corners = [surface.centre_m + a * right + b * up for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     return polygon(corners, [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
 
 
-def _add_solid(mujoco: Any, spec: Any, name: str, solid: Solid, image: textures.Image) -> None:
+def _add_solid(mujoco: Any, spec: Any, name: str, solid: TexturedSolid, image: textures.Image) -> None:
     add_texture(mujoco, spec, name, textures.to_uint8(image))
     add_material(mujoco, spec, name).emission = 1.0
     mesh = spec.add_mesh()

@@ -48,7 +48,7 @@ class Solid:
         )
 
 
-class _Place:
+class _LocalSolids:
     """Collects solids given in a local frame: x right, y back (towards the wall), z up, origin on the floor."""
 
     def __init__(self, x_m: float, y_m: float, yaw_rad: float) -> None:
@@ -96,9 +96,9 @@ def furnish(config: LabConfig) -> list[Solid]:
     return [replace(solid, name=name) for name, place in places for solid in place.solids]
 
 
-def _panel(panel: PanelConfig, stand_rgb: Colour) -> _Place:
+def _panel(panel: PanelConfig, stand_rgb: Colour) -> _LocalSolids:
     """The box behind a panel's face, a pole and a foot."""
-    place = _Place(panel.x_m, panel.y_m, panel.yaw_rad - 0.5 * math.pi)  # local -y is behind the face
+    place = _LocalSolids(panel.x_m, panel.y_m, panel.yaw_rad - 0.5 * math.pi)  # local -y is behind the face
     back, half_t = -panel.thickness_m, 0.5 * panel.thickness_m
     face_gap = 0.0005  # the face itself is drawn as its own surface, just in front of the box
     place.add(
@@ -131,8 +131,8 @@ def vehicle_in_room(config: LabConfig) -> TwinVehicle:
     return TwinVehicle(config.car, obstacles(config), 0.5 * config.room.side_m, config.start_pose)
 
 
-def _bookshelf(x: float, y: float, yaw: float) -> _Place:
-    p = _Place(x, y, yaw)
+def _bookshelf(x: float, y: float, yaw: float) -> _LocalSolids:
+    p = _LocalSolids(x, y, yaw)
     depth, width, height = 0.32, 1.5, 1.8
     p.box(0.0, -0.025, 0.0, width, 0.04, height, DARK_WOOD)
     for side in (-1, 1):
@@ -156,8 +156,8 @@ def _bookshelf(x: float, y: float, yaw: float) -> _Place:
     return p
 
 
-def _cabinet(x: float, y: float, yaw: float) -> _Place:
-    p = _Place(x, y, yaw)
+def _cabinet(x: float, y: float, yaw: float) -> _LocalSolids:
+    p = _LocalSolids(x, y, yaw)
     p.box(0.0, -0.24, 0.08, 1.5, 0.44, 0.62, (0.72, 0.70, 0.64))
     p.box(0.0, -0.24, 0.0, 1.4, 0.36, 0.08, DARK_WOOD)
     for side, rgb in ((-0.375, (0.44, 0.56, 0.60)), (0.375, (0.80, 0.60, 0.42))):
@@ -168,8 +168,8 @@ def _cabinet(x: float, y: float, yaw: float) -> _Place:
     return p
 
 
-def _plant(x: float, y: float, size: float) -> _Place:
-    p = _Place(x, y, 0.3)
+def _plant(x: float, y: float, size: float) -> _LocalSolids:
+    p = _LocalSolids(x, y, 0.3)
     p.cylinder(0.0, 0.0, 0.0, 0.5 * size, 0.8 * size, TERRACOTTA)
     crown: list[tuple[float, float, float, float, Colour]] = [
         (0.0, 0.0, 1.9, 0.62, LEAF),
@@ -182,16 +182,16 @@ def _plant(x: float, y: float, size: float) -> _Place:
     return p
 
 
-def _crates(x: float, y: float) -> _Place:
-    p = _Place(x, y, 0.12)
+def _crates(x: float, y: float) -> _LocalSolids:
+    p = _LocalSolids(x, y, 0.12)
     p.box(0.0, 0.0, 0.0, 0.62, 0.56, 0.44, (0.20, 0.36, 0.56))
     p.box(-0.02, 0.03, 0.44, 0.50, 0.46, 0.38, (0.80, 0.55, 0.20))
     p.box(0.05, 0.02, 0.82, 0.34, 0.34, 0.26, (0.64, 0.24, 0.24))
     return p
 
 
-def _sofa(x: float, y: float, yaw: float) -> _Place:
-    p = _Place(x, y, yaw)
+def _sofa(x: float, y: float, yaw: float) -> _LocalSolids:
+    p = _LocalSolids(x, y, yaw)
     body, cushion = (0.30, 0.36, 0.50), (0.42, 0.49, 0.64)
     p.box(0.0, -0.42, 0.06, 1.9, 0.80, 0.30, body)
     p.box(0.0, -0.13, 0.36, 1.9, 0.22, 0.46, body)
@@ -203,16 +203,16 @@ def _sofa(x: float, y: float, yaw: float) -> _Place:
     return p
 
 
-def _lamp(x: float, y: float) -> _Place:
-    p = _Place(x, y, 0.0)
+def _lamp(x: float, y: float) -> _LocalSolids:
+    p = _LocalSolids(x, y, 0.0)
     p.cylinder(0.0, 0.0, 0.0, 0.17, 0.04, GREY)
     p.cylinder(0.0, 0.0, 0.04, 0.025, 1.36, GREY)
     p.cylinder(0.0, 0.0, 1.40, 0.21, 0.30, (0.95, 0.88, 0.66))
     return p
 
 
-def _desk(x: float, y: float, yaw: float) -> _Place:
-    p = _Place(x, y, yaw)
+def _desk(x: float, y: float, yaw: float) -> _LocalSolids:
+    p = _LocalSolids(x, y, yaw)
     p.box(0.0, -0.36, 0.70, 1.6, 0.70, 0.05, WOOD)
     p.box(0.56, -0.36, 0.0, 0.42, 0.62, 0.70, (0.62, 0.62, 0.60))
     p.box(-0.75, -0.36, 0.0, 0.06, 0.62, 0.70, WOOD)
@@ -227,15 +227,15 @@ def _desk(x: float, y: float, yaw: float) -> _Place:
     return p
 
 
-def _radiator(x: float, y: float, yaw: float) -> _Place:
-    p = _Place(x, y, yaw)
+def _radiator(x: float, y: float, yaw: float) -> _LocalSolids:
+    p = _LocalSolids(x, y, yaw)
     p.box(0.0, -0.07, 0.12, 1.1, 0.10, 0.58, WHITE)
     p.box(0.0, -0.05, 0.0, 0.9, 0.05, 0.12, GREY)
     return p
 
 
-def _wardrobe(x: float, y: float, yaw: float) -> _Place:
-    p = _Place(x, y, yaw)
+def _wardrobe(x: float, y: float, yaw: float) -> _LocalSolids:
+    p = _LocalSolids(x, y, yaw)
     p.box(0.0, -0.29, 0.0, 1.3, 0.56, 1.95, (0.66, 0.55, 0.42))
     for side, rgb in ((-0.32, (0.74, 0.64, 0.50)), (0.32, (0.70, 0.60, 0.47))):
         p.box(side, -0.575, 0.10, 0.58, 0.014, 1.75, rgb)
@@ -244,8 +244,8 @@ def _wardrobe(x: float, y: float, yaw: float) -> _Place:
     return p
 
 
-def _armchair(x: float, y: float, yaw: float) -> _Place:
-    p = _Place(x, y, yaw)
+def _armchair(x: float, y: float, yaw: float) -> _LocalSolids:
+    p = _LocalSolids(x, y, yaw)
     body = (0.66, 0.30, 0.26)
     p.box(0.0, 0.0, 0.05, 0.80, 0.74, 0.33, body)
     p.box(0.0, 0.28, 0.38, 0.80, 0.20, 0.46, body)
@@ -255,15 +255,15 @@ def _armchair(x: float, y: float, yaw: float) -> _Place:
     return p
 
 
-def _bin(x: float, y: float) -> _Place:
-    p = _Place(x, y, 0.0)
+def _bin(x: float, y: float) -> _LocalSolids:
+    p = _LocalSolids(x, y, 0.0)
     p.cylinder(0.0, 0.0, 0.0, 0.20, 0.50, (0.34, 0.36, 0.40))
     p.cylinder(0.0, 0.0, 0.50, 0.21, 0.04, (0.85, 0.72, 0.22))
     return p
 
 
-def _cartons(x: float, y: float) -> _Place:
-    p = _Place(x, y, -0.2 if y < 0 else 0.25)
+def _cartons(x: float, y: float) -> _LocalSolids:
+    p = _LocalSolids(x, y, -0.2 if y < 0 else 0.25)
     p.box(0.0, 0.0, 0.0, 0.60, 0.50, 0.40 if y < 0 else 0.62, (0.71, 0.56, 0.38))
     p.box(0.0, 0.0, 0.40 if y < 0 else 0.62, 0.10, 0.50, 0.004, (0.82, 0.74, 0.60))
     p.box(
@@ -278,9 +278,9 @@ def _cartons(x: float, y: float) -> _Place:
     return p
 
 
-def _island() -> _Place:
+def _island() -> _LocalSolids:
     """Low things within 1 m of the middle: they must not hide one side of the track from the other."""
-    p = _Place(0.0, 0.0, 0.0)
+    p = _LocalSolids(0.0, 0.0, 0.0)
     p.cylinder(0.12, 0.22, 0.0, 0.30, 0.05, DARK_WOOD)
     p.cylinder(0.12, 0.22, 0.05, 0.06, 0.36, DARK_WOOD)
     p.cylinder(0.12, 0.22, 0.41, 0.52, 0.05, (0.78, 0.68, 0.52))

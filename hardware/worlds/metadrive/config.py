@@ -13,7 +13,7 @@ from hardware.worlds.lab.config import CameraConfig
 from hardware.worlds.remote_world import ServerDeadlines
 
 
-class RoadConfig(StrictModel):
+class MetaDriveRoadConfig(StrictModel):
     """A road of MetaDrive's generator, and the stretch of its route that is driven.
 
     Attributes:
@@ -36,7 +36,7 @@ class RoadConfig(StrictModel):
     length_m: float = Field(default=90.0, gt=10.0)
 
 
-class CarConfig(StrictModel):
+class MetaDriveCarConfig(StrictModel):
     """The car: MetaDrive's own Bullet vehicle under a speed and steering controller, or an ideal one.
 
     Attributes:
@@ -68,10 +68,10 @@ class MetaDriveConfig(StrictModel):
         server: Deadlines of its process.
     """
 
-    road: RoadConfig = RoadConfig()
+    road: MetaDriveRoadConfig = MetaDriveRoadConfig()
     camera: CameraConfig = CameraConfig(x_m=1.2, z_m=1.5, pitch_down_rad=math.radians(8.0))
     photo: PhotoConfig = PhotoConfig()
-    car: CarConfig = CarConfig()
+    car: MetaDriveCarConfig = MetaDriveCarConfig()
     traffic_density: float = Field(default=0.0, ge=0.0, le=1.0)
     supersampling: Literal[1, 3] = 3
     sky: bool = True

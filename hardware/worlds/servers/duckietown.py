@@ -36,7 +36,7 @@ import geometry  # noqa: E402 - of Duckietown's packages, which need the names a
 from duckietown_world.world_duckietown.dynamics_delay import ApplyDelay  # noqa: E402
 from duckietown_world.world_duckietown.pwm_dynamics import PWMCommands, get_DB18_nominal  # noqa: E402
 from gym_duckietown.simulator import CAMERA_FORWARD_DIST, Simulator, get_agent_corners  # noqa: E402
-from pyglet_camera import Panel, View, taken_from, to_opengl  # noqa: E402
+from pyglet_camera import PygletPanel, PygletView, taken_from, to_opengl  # noqa: E402
 
 STEP_S, DELAY_S = 0.02, 0.15
 _CURVE_POINTS, _JOINED_M = 12, 0.01
@@ -56,7 +56,7 @@ class Map:
             map_name=config["map_name"], seed=config["seed"], domain_rand=False, distortion=False, camera_width=16,
             camera_height=16, frame_rate=1.0 / STEP_S, max_steps=10**9, accept_start_angle_deg=180, num_tris_distractors=0,
         )  # fmt: skip
-        self._views = {name: View(lens, config["supersampling"]) for name, lens in cameras.items()}
+        self._views = {name: PygletView(lens, config["supersampling"]) for name, lens in cameras.items()}
         self._things = list(self._sim.objects)
         self._panels: dict[str, Any] = {}
         self._model: Any = None
@@ -124,7 +124,7 @@ class Map:
         """Put a panel with ``T_world_from_face`` and texture ``rgb`` into the scene; without a size, take it out."""
         self._panels.pop(name, None)
         if size_m is not None:
-            self._panels[name] = Panel(size_m, **arrays)
+            self._panels[name] = PygletPanel(size_m, **arrays)
         return {}, {}
 
     def _rolling(self, speed_mps: float) -> Any:
@@ -138,7 +138,7 @@ class Map:
         )
         return ApplyDelay(dynamics, DELAY_S, PWMCommands(voltage, voltage)).initialize(c0=begin, t0=0)
 
-    def _aim(self, T: np.ndarray, view: View) -> None:
+    def _aim(self, T: np.ndarray, view: PygletView) -> None:
         """Put Duckietown's camera at ``T_world_from_camera``: its robot turned and moved, its camera pitched."""
         forward, right = T[:3, 2], T[:3, 0]
         if abs(right[2]) > 1e-6:

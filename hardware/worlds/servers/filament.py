@@ -38,7 +38,9 @@ class Room:
         self._scene = self._context.create_scene(mjrf.SceneParams())
         self._fill(_model(config, files))
         fine = config["lab"]["supersampling"]
-        self._views = {name: View(self._context, self._scene, lens, fine) for name, lens in cameras.items()}
+        self._views = {
+            name: FilamentView(self._context, self._scene, lens, fine) for name, lens in cameras.items()
+        }
         self._panels: dict[str, list[Any]] = {}
 
     def _fill(self, model: Any) -> None:
@@ -119,16 +121,16 @@ class Room:
         return texture
 
 
-class View:
+class FilamentView:
     """A lens, with a target for colours, each the mean of ``supersampling`` squared ones, and one for depth at pixel centres."""
 
     def __init__(self, context: Any, scene: Any, lens: dict[str, Any], supersampling: int) -> None:
         self._context, self._scene, self._lens, self._fine = context, scene, lens, supersampling
         height, width = lens["height"], lens["width"]
-        self._colours = Target(
+        self._colours = RenderTarget(
             context, np.zeros((supersampling * height, supersampling * width, 3), np.uint8)
         )
-        self._nearness = Target(context, np.zeros((height, width), np.float32))
+        self._nearness = RenderTarget(context, np.zeros((height, width), np.float32))
         share = np.arange(255 * supersampling**2 + 1) / (255.0 * supersampling**2)
         curve = np.where(share <= 0.0031308, 12.92 * share, 1.055 * share ** (1.0 / 2.4) - 0.055)
         self._display = np.rint(255.0 * curve).astype(np.uint8)
@@ -164,7 +166,7 @@ class View:
         depth_m = 1.0 / (share * (1.0 / NEAR_M - 1.0 / FAR_M) + 1.0 / FAR_M)
         return np.where(share > 0.0, depth_m, np.inf).astype(np.float32)
 
-    def _draw(self, eye: Any, target: Target, mode: Any) -> None:
+    def _draw(self, eye: Any, target: RenderTarget, mode: Any) -> None:
         height, width = target.buffer.shape[:2]
         request = mjrf.RenderRequest(
             scene=self._scene,
@@ -182,7 +184,7 @@ class View:
         self._context.wait_for_frame(self._context.render([request], [target.reading]))
 
 
-class Target:
+class RenderTarget:
     """Where a frame is drawn, and the array that it is read into."""
 
     def __init__(self, context: Any, buffer: np.ndarray) -> None:

@@ -19,7 +19,7 @@ from metadrive.constants import BodyName, CamMask  # noqa: E402
 from metadrive.engine.core.our_pbr import OurPipeline  # noqa: E402
 from metadrive.envs.metadrive_env import MetaDriveEnv  # noqa: E402
 from panda3d.core import LQuaternionf, Vec3  # noqa: E402
-from panda_camera import View, panel_card  # noqa: E402
+from panda_camera import PandaView, panel_card  # noqa: E402
 
 # Software rendering has no 16 samples per pixel for the pass before the tone curve; our cameras average pixels and apply that curve to the mean.
 loadPrcFileData("", "framebuffer-multisample 0\nmultisamples 0\nload-display p3headlessgl")
@@ -52,7 +52,9 @@ class Simulator:
         self._env.reset()
         self._engine = self._env.engine
         fine, mask = config["supersampling"], CamMask.RgbCam
-        self._views = {name: View(self._engine, name, lens, fine, mask) for name, lens in cameras.items()}
+        self._views = {
+            name: PandaView(self._engine, name, lens, fine, mask) for name, lens in cameras.items()
+        }
         for window in self._engine.graphicsEngine.getWindows():
             window.setActive(False)
         self._engine.world_light.direction_np.node().setShadowCaster(False)

@@ -22,7 +22,7 @@ from panda3d.core import (
 NEAR_M, SKY_M, FAR_M = 0.2, 30_000.0, 1000.0
 
 
-class View:
+class PandaView:
     """One camera: every pixel is the mean of ``supersampling`` squared ones, its depth that of the one in the middle."""
 
     def __init__(self, engine: Any, name: str, lens: dict[str, Any], supersampling: int, mask: Any) -> None:

@@ -14,7 +14,7 @@ from pyglet import gl
 NEAR_M, FAR_M = 0.04, 100.0  # of Duckietown's projection
 
 
-class View:
+class PygletView:
     """A frame buffer with colours and depth; every pixel is the mean of ``supersampling`` squared ones."""
 
     def __init__(self, lens: dict[str, Any], supersampling: int) -> None:
@@ -60,7 +60,7 @@ class View:
         return np.where(share < 1.0, depth_m, np.inf).astype(np.float32)
 
 
-class Panel:
+class PygletPanel:
     """A textured rectangle that is lit as everything else; its back is plain."""
 
     def __init__(self, size_m: list[float], T_world_from_face: np.ndarray, rgb: np.ndarray) -> None:

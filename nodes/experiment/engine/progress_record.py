@@ -51,7 +51,7 @@ class Part:
 
 
 class ProgressRecord:
-    """Implements `nodes.runtime.progress.Display`.
+    """Implements `nodes.runtime.progress.StageDisplay`.
 
     Args:
         folder: The run folder. Curves of an earlier run there are gone on with.

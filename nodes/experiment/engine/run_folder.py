@@ -19,7 +19,7 @@ from nodes.experiment.engine.reference import ReferenceBuild
 from nodes.experiment.engine.stage_record import Stage, StageRecord
 from nodes.experiment.engine.stages import check_until, run_stages
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.progress import Display, ProgressDisplay
+from nodes.runtime.progress import ProgressDisplay, StageDisplay
 
 Config = TypeVar("Config")
 # Folder of the cells in a run folder.
@@ -55,7 +55,7 @@ def run_to_end(
     until: str | None = None,
     console: Console | None = None,
     reference: ReferenceBuild | None = None,
-    watcher: Display | None = None,
+    watcher: StageDisplay | None = None,
 ) -> dict[str, StageRecord]:
     """Run the stages that are not there yet.
 

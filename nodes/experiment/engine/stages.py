@@ -30,7 +30,7 @@ from nodes.experiment.engine.stage_record import (
     write_record,
 )
 from nodes.runtime.locks import HeldError, hold
-from nodes.runtime.progress import Display
+from nodes.runtime.progress import StageDisplay
 
 
 class StageError(AdvnerfError):
@@ -40,7 +40,7 @@ class StageError(AdvnerfError):
 def run_stages(
     stages: Sequence[Stage],
     folder: Path,
-    display: Display,
+    display: StageDisplay,
     until: str | None = None,
     reference: ReferenceBuild | None = None,
 ) -> dict[str, StageRecord]:
@@ -135,7 +135,7 @@ class _Place:
 
 
 def _run_or_reuse(
-    stage: Stage, at: _Place, records: Mapping[str, StageRecord], display: Display
+    stage: Stage, at: _Place, records: Mapping[str, StageRecord], display: StageDisplay
 ) -> StageRecord:
     missing = [name for name in stage.after if name not in records]
     if missing:
@@ -150,7 +150,7 @@ def _run_or_reuse(
         return _go_on_or_begin(stage, at, key, records, display)
 
 
-def _finished(at: _Place, key: str, display: Display) -> StageRecord | None:
+def _finished(at: _Place, key: str, display: StageDisplay) -> StageRecord | None:
     record = read_record(at.folder)
     if record is None or record.key != key or record.digest is None:
         return None
@@ -175,7 +175,7 @@ def _alone(folder: Path) -> Iterator[None]:
 
 
 def _go_on_or_begin(
-    stage: Stage, at: _Place, key: str, records: Mapping[str, StageRecord], display: Display
+    stage: Stage, at: _Place, key: str, records: Mapping[str, StageRecord], display: StageDisplay
 ) -> StageRecord:
     folder, old = at.folder, read_record(at.folder)
     parts = [key_of(replace(stage, settings=settings), records) for settings in stage.goes_on_from]
@@ -200,7 +200,7 @@ def _require_ours(folder: Path) -> None:
         )
 
 
-def _run(stage: Stage, folder: Path, key: str, earlier_s: float, display: Display) -> StageRecord:
+def _run(stage: Stage, folder: Path, key: str, earlier_s: float, display: StageDisplay) -> StageRecord:
     folder.mkdir(parents=True, exist_ok=True)
     settings = json.loads(json.dumps(stage.settings))
     write_record(folder, StageRecord(key, None, earlier_s, settings))

@@ -13,7 +13,7 @@ from nodes.runtime.bus import Bus, Received
 from nodes.runtime.clock import Now
 from nodes.runtime.errors import LaunchError
 from nodes.runtime.messages import header, types
-from nodes.runtime.requests import Asked
+from nodes.runtime.requests import RequestIdentity
 
 _REPEAT_S, _ANSWER_S = 0.2, 10.0
 _SILENCE_S = 10.0
@@ -47,7 +47,7 @@ def ask_for_attack(
         LaunchError: No node listens, or it has fallen silent.
     """
 
-    def make(asked: Asked, now: Now) -> Any:
+    def make(asked: RequestIdentity, now: Now) -> Any:
         return types.AttackRequest(
             header=header(asked.real_ns),
             request_id=request_id,
@@ -72,7 +72,7 @@ def ask_for_attack(
 def cancel_attack(run_dir: Path, request_id: str, reason: str) -> Any:
     """End the search of a request, or whichever there is; returns the node's ``AttackProgress`` after it."""
 
-    def make(asked: Asked, now: Now) -> Any:
+    def make(asked: RequestIdentity, now: Now) -> Any:
         return types.AttackCancel(
             header=header(asked.real_ns), request_id=request_id, reason=reason, ask_id=asked.ask_id
         )
@@ -81,7 +81,7 @@ def cancel_attack(run_dir: Path, request_id: str, reason: str) -> Any:
         return _ask(bus, "/attack/cancel", make)
 
 
-def _ask(bus: Bus, topic: str, make: Callable[[Asked, Now], Any]) -> Any:
+def _ask(bus: Bus, topic: str, make: Callable[[RequestIdentity, Now], Any]) -> Any:
     """Send a message until the attack node has answered it; the progress that answers."""
 
     def read(ask_id: str, received: Received) -> Any:

@@ -36,7 +36,7 @@ from nodes.experiment.node.prepare import Prepared, prepare
 from nodes.experiment.node.request import AttackRequest
 from nodes.experiment.node.search import attack_file, keep_request
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.progress import Display
+from nodes.runtime.progress import StageDisplay
 
 Report = Callable[[float, str], None]
 
@@ -197,7 +197,7 @@ def pose_attack_file(ready: PreparedPoses, result: SearchResult) -> AttackFile:
     return replace(file, space=PLACES, extra=extra)
 
 
-def run_poses(request: AttackRequest, folder: Path, display: Display) -> list[Path]:
+def run_poses(request: AttackRequest, folder: Path, display: StageDisplay) -> list[Path]:
     """Run every seed of a pose attack in a folder, going on where it was stopped.
 
     Returns:

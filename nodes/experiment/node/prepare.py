@@ -18,8 +18,8 @@ from advnerf_core.attack.artifact import (
     MESH_SHAPE,
     MESH_TEXTURE,
     AttackedObject,
+    AttackFace,
     AttackFile,
-    Face,
     face_texture,
 )
 from advnerf_core.attack.clean import clean_drive
@@ -167,12 +167,12 @@ class Prepared:
             return MESH_SHAPE
         return MESH_TEXTURE if all(wanted.mesh is not None for wanted in self.request.objects) else COLOURS
 
-    def _face(self, objects: Sequence[AttackedObject]) -> Face | None:
+    def _face(self, objects: Sequence[AttackedObject]) -> AttackFace | None:
         """The first face that can be deployed; None if no object has one."""
         for number, (placed, found) in enumerate(zip(self.objects, objects, strict=True)):
             if (face := placed.face) is not None:
                 texture = face_texture(found.theta)
-                return Face(texture, face.size_m, face.subject, face.corners_in_subject, number)
+                return AttackFace(texture, face.size_m, face.subject, face.corners_in_subject, number)
         return None
 
 

@@ -28,7 +28,7 @@ from nodes.experiment.node.job import REQUEST, TOGETHER_STATE, is_begun
 from nodes.experiment.node.prepare import Prepared, prepare
 from nodes.experiment.node.request import SHAPE_METHODS, AttackRequest, load_request, request_text
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.progress import Display
+from nodes.runtime.progress import StageDisplay
 
 
 def chosen_method(request: AttackRequest) -> tuple[Method, SearchSettings]:
@@ -93,7 +93,7 @@ def finish(prepared: Prepared, result: SearchResult) -> AttackFile:
 def run_attack(
     request: AttackRequest,
     folder: Path,
-    display: Display,
+    display: StageDisplay,
     on_evaluation: OnEvaluation | None = None,
     on_prepared: Callable[[Prepared], None] | None = None,
 ) -> list[Path]:
@@ -158,7 +158,9 @@ def kept_request(folder: Path) -> AttackRequest:
     return load_request(folder / REQUEST)
 
 
-def _run_seed(prepared: Prepared, folder: Path, display: Display, on_evaluation: OnEvaluation | None) -> None:
+def _run_seed(
+    prepared: Prepared, folder: Path, display: StageDisplay, on_evaluation: OnEvaluation | None
+) -> None:
     name, state_path = f"seed_{prepared.seed}", folder / f"seed_{prepared.seed}.state.safetensors"
     report = display.start(name)
     report(0.0, "drive without attack")
@@ -174,7 +176,7 @@ def _run_seed(prepared: Prepared, folder: Path, display: Display, on_evaluation:
 def _run_together(
     request: AttackRequest,
     folder: Path,
-    display: Display,
+    display: StageDisplay,
     on_evaluation: OnEvaluation | None,
     on_prepared: Callable[[Prepared], None] | None,
 ) -> list[Path]:

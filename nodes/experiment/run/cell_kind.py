@@ -19,12 +19,12 @@ if TYPE_CHECKING:
     import torch
 
     from advnerf_core.attack.adjoint import AttackProblem
-    from advnerf_core.attack.transfer import Scene
+    from advnerf_core.attack.transfer import AttackableScene
     from advnerf_core.driving.metrics import Horizon
-    from advnerf_core.scene.fidelity import Pictures
+    from advnerf_core.scene.fidelity import PicturePairs
     from nodes.experiment.engine.reference import ReferenceBuild
 
-    Loop = tuple[AttackProblem, Scene, torch.Tensor, Horizon]
+    Loop = tuple[AttackProblem, AttackableScene, torch.Tensor, Horizon]
 
 
 class NoPicturesError(RuntimeFault):
@@ -100,11 +100,11 @@ class CellKind(ABC):
         """The victim of a cell and what it is told."""
         raise self._no_pictures()
 
-    def held_out(self, experiment: Any, cell: Cell) -> Pictures:
+    def held_out(self, experiment: Any, cell: Cell) -> PicturePairs:
         """Views that nothing was learned from, without an attack."""
         raise self._no_pictures()
 
-    def driven(self, experiment: Any, cell: Cell, folder: Path, bag: Path | None = None) -> Pictures:
+    def driven(self, experiment: Any, cell: Cell, folder: Path, bag: Path | None = None) -> PicturePairs:
         """Views of the deployed drive without attack of a cell, or of a bag of one."""
         raise self._no_pictures()
 
@@ -112,7 +112,7 @@ class CellKind(ABC):
         """What a prediction still needs, in words; empty if all is there."""
         raise self._no_pictures()
 
-    def attacked(self, experiment: Any, cell: Cell, folder: Path) -> Pictures:
+    def attacked(self, experiment: Any, cell: Cell, folder: Path) -> PicturePairs:
         """The views of `driven` with what the finished search found."""
         raise self._no_pictures()
 

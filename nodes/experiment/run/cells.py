@@ -38,7 +38,7 @@ from nodes.experiment.steps.shared_search import take_search
 from nodes.runtime.progress import Report
 
 if TYPE_CHECKING:
-    from advnerf_core.scene.fidelity import Pictures
+    from advnerf_core.scene.fidelity import PicturePairs
     from nodes.experiment.run.cell_kind import Loop
 
 _SEARCHED = 0.9  # share of a cell's work
@@ -240,12 +240,14 @@ class ExperimentCells(CellKind):
         """See `fidelity.policy_of`."""
         return fidelity.policy_of(experiment, cell)
 
-    def held_out(self, experiment: Experiment, cell: Cell) -> Pictures:
+    def held_out(self, experiment: Experiment, cell: Cell) -> PicturePairs:
         """See `fidelity.held_out`."""
         del cell  # views about all paths
         return fidelity.held_out(experiment)
 
-    def driven(self, experiment: Experiment, cell: Cell, folder: Path, bag: Path | None = None) -> Pictures:
+    def driven(
+        self, experiment: Experiment, cell: Cell, folder: Path, bag: Path | None = None
+    ) -> PicturePairs:
         """See `fidelity.driven`."""
         return fidelity.driven(experiment, cell, clean_folder(experiment, cell, folder), bag)
 
@@ -253,7 +255,7 @@ class ExperimentCells(CellKind):
         """See `fidelity.lacks`."""
         return fidelity.lacks(experiment, cell, folder, clean_folder(experiment, cell, folder))
 
-    def attacked(self, experiment: Experiment, cell: Cell, folder: Path) -> Pictures:
+    def attacked(self, experiment: Experiment, cell: Cell, folder: Path) -> PicturePairs:
         """See `fidelity.attacked`."""
         return fidelity.attacked(experiment, cell, folder, clean_folder(experiment, cell, folder))
 

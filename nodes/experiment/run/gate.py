@@ -11,7 +11,7 @@ from typing import Any
 from advnerf_core.attack.transfer import DEFAULT_DRAWS, TransferPrediction, predict_transfer
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
-from advnerf_core.scene.fidelity import Agreement, Effect, Pictures, Verdict, agreement, judge
+from advnerf_core.scene.fidelity import Effect, PicturePairs, SceneAgreement, Verdict, agreement, judge
 from advnerf_core.scene.gate_limits import GateLimits
 from nodes.experiment.engine.stage_record import hash_of, stage_digests
 from nodes.experiment.plan.cell import Cell
@@ -28,11 +28,11 @@ class CleanDrive:
         none_m: Total CTE of each draw without attack [m].
     """
 
-    agreement: Agreement
+    agreement: SceneAgreement
     none_m: tuple[float, ...]
 
 
-def agreement_on(policy: Any, goal: tuple[float, ...], pictures: Pictures) -> Agreement:
+def agreement_on(policy: Any, goal: tuple[float, ...], pictures: PicturePairs) -> SceneAgreement:
     """How alike pictures look, and how alike the policy steers on them."""
     steering = [predict(policy, images, goal) for images in (pictures.real, pictures.learned)]
     return agreement(list(pictures.real), list(pictures.learned), *steering)

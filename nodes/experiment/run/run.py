@@ -21,7 +21,7 @@ from nodes.experiment.run.store import NOT_DRIVEN, Store, store_of
 from nodes.experiment.run.worker import Ended, Job, run_here, run_in_process
 from nodes.lab.trials.tries import allow_more_tries
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.progress import Display, ProgressDisplay, Report
+from nodes.runtime.progress import ProgressDisplay, Report, StageDisplay
 
 Backend = Literal["local", "ray"]
 Say = Callable[[str], None]
@@ -63,7 +63,7 @@ def run_campaign(
     say: Say,
     experiments: dict[tuple[str, str], Any] | None = None,
     console: Console | None = None,
-    watcher: Display | None = None,
+    watcher: StageDisplay | None = None,
 ) -> list[Ended]:
     """Run the cells that are not there yet.
 

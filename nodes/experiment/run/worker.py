@@ -31,7 +31,7 @@ from nodes.experiment.run.store import LOG, Store
 from nodes.runtime.errors import RuntimeFault
 from nodes.runtime.locks import HeldError, hold
 from nodes.runtime.machine import machine_name
-from nodes.runtime.progress import Display, Report
+from nodes.runtime.progress import Report, StageDisplay
 from nodes.runtime.termination import ends_in_order
 
 Phase = Literal["search", "whole"]
@@ -161,7 +161,7 @@ def run_in_process(job: Job) -> Ended:
     return Ended(job.name, "failed", said, seconds)
 
 
-def run_here(job: Job, store: Store, kind: CellKind, experiment: Any, display: Display) -> Ended:
+def run_here(job: Job, store: Store, kind: CellKind, experiment: Any, display: StageDisplay) -> Ended:
     """Run a cell in this process; what ends it by an error is kept, and other cells go on."""
     began = time.monotonic()
     store.lock_file(job.name).parent.mkdir(parents=True, exist_ok=True)

@@ -25,7 +25,7 @@ from advnerf_core.geometry import Array, Pinhole, planar_poses
 from advnerf_core.learning.sources import Show
 from advnerf_core.policies.network import Policy, images_to_tensor
 from advnerf_core.policies.view import PolicyView
-from advnerf_core.scene.surrogate import Frames, Surrogate
+from advnerf_core.scene.surrogate import PoseBatch, Surrogate
 from hardware.cameras.effects import ImperfectCamera
 from hardware.worlds.world import Depth, Rgb, World, collided_with
 from nodes.experiment.show.images import as_uint8
@@ -107,13 +107,13 @@ class DressedScene:
         """The objects' own colours."""
         return self._window.plain_theta()
 
-    def prepare(self, states: Array) -> Frames:
+    def prepare(self, states: Array) -> PoseBatch:
         """What does not depend on colours, of the policy's window from car states ``[B, 3]``; time does not pass."""
         return self._window.prepare(
             self._window.camera_poses(torch.from_numpy(np.asarray(states, dtype=np.float64)))
         )
 
-    def policy_images(self, frames: Frames, theta: Tensor | None) -> NDArray[np.uint8]:
+    def policy_images(self, frames: PoseBatch, theta: Tensor | None) -> NDArray[np.uint8]:
         """Policy images ``[B, 66, 200, 3]`` of prepared windows."""
         shown = self._window.plain_theta() if theta is None and self._window.objects else theta
         return np.stack([self._resized(as_uint8(image)) for image in frames.render(shown).images])

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from advnerf_core.geometry import Array, invert_transform, transform_points
 from calibration.display_colour import DisplayFit, colours_to_show, fit_display, mean_colour, screen_region
-from calibration.panel import Panel as Pixels
+from calibration.panel import MonitorPanel
 from hardware.worlds.world import Panel, Screens, World
 from nodes.runtime.errors import ConfigError
 
@@ -22,7 +22,7 @@ _DISTANCE_M, _ANGLES_RAD = 1.1, (0.0, 0.5, -0.85)
 def face_picture(panel: Panel, texture: Rgb) -> Rgb:
     """A square face ``[n, n, 3]`` in true size in the middle of a black screen, as the monitor node shows it."""
     assert panel.screen_px is not None, "a board shows no pictures"
-    pixels = Pixels(panel.screen_px, (panel.width_m, panel.height_m))
+    pixels = MonitorPanel(panel.screen_px, (panel.width_m, panel.height_m))
     return pixels.picture(texture, (panel.square_m, panel.square_m))
 
 

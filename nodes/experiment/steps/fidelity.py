@@ -20,14 +20,14 @@ from advnerf_core.attack.artifact import AttackFile, face_texture
 from advnerf_core.attack.projection import FaceOverlay
 from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.attack.spaces.space import Shown, Space
-from advnerf_core.attack.transfer import Scene
+from advnerf_core.attack.transfer import AttackableScene
 from advnerf_core.data.dataset import load_transforms
 from advnerf_core.documents import read_json
 from advnerf_core.driving.measured_car import CarResponse, RespondingCar, fit_response
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.geometry import Array, invert_transform, planar_poses, yaw_of
 from advnerf_core.policies.policy_file import load_policy
-from advnerf_core.scene.fidelity import Pictures
+from advnerf_core.scene.fidelity import PicturePairs
 from advnerf_core.scene.surrogate import Surrogate
 from nodes.bags.reader import read_messages
 from nodes.control.pose_buffer import PoseBuffer
@@ -59,17 +59,17 @@ def policy_of(experiment: Experiment, cell: Cell) -> tuple[Any, tuple[float, ...
     return load_policy(victim_file(experiment, cell.victim)).policy, goal
 
 
-def held_out(experiment: Experiment) -> Pictures:
+def held_out(experiment: Experiment) -> PicturePairs:
     """The driving camera's views that nothing was learned from, about all drives, without objects."""
     views = load_transforms(experiment.stage_folder("capture") / capture.HELD_OUT, require_all=True).load()
     surrogate = surrogate_of(experiment, [])
     learned = [as_uint8(surrogate.render(pose[None], None).images[0]) for pose in views.T_world_from_camera]
-    return Pictures(
+    return PicturePairs(
         "held-out views", np.stack([experiment.view.image(rgb) for rgb in views.rgb]), np.stack(learned)
     )
 
 
-def driven(experiment: Experiment, cell: Cell, clean: Path, bag: Path | None = None) -> Pictures:
+def driven(experiment: Experiment, cell: Cell, clean: Path, bag: Path | None = None) -> PicturePairs:
     """What the camera sees on the deployed drive without an attack.
 
     Args:
@@ -90,7 +90,7 @@ def driven(experiment: Experiment, cell: Cell, clean: Path, bag: Path | None = N
     frames, states = posed_frames(bag or clean_bag(cell, clean))
     surrogate = surrogate_of(experiment, [])
     learned = _learned(surrogate, planar_poses(states) @ experiment.mount, None)
-    return Pictures("driven bag", np.stack([experiment.view.image(rgb) for rgb in frames]), learned)
+    return PicturePairs("driven bag", np.stack([experiment.view.image(rgb) for rgb in frames]), learned)
 
 
 def lacks(experiment: Experiment, cell: Cell, folder: Path, clean: Path) -> str:
@@ -107,7 +107,7 @@ def lacks(experiment: Experiment, cell: Cell, folder: Path, clean: Path) -> str:
     return ""
 
 
-def attacked(experiment: Experiment, cell: Cell, folder: Path, clean: Path) -> Pictures:
+def attacked(experiment: Experiment, cell: Cell, folder: Path, clean: Path) -> PicturePairs:
     """The same places with the colours of a finished search."""
     space, attack = _found(experiment, cell, folder)
     shown = space.restored(attack)
@@ -122,12 +122,12 @@ def attacked(experiment: Experiment, cell: Cell, folder: Path, clean: Path) -> P
         real.append(experiment.view.image(drawn))
     surrogate = shown.seen_by(space.surrogate)
     learned = _learned(surrogate, cars @ experiment.mount, shown.colours)
-    return Pictures("driven bag, attacked", np.stack(real), learned)
+    return PicturePairs("driven bag, attacked", np.stack(real), learned)
 
 
 def loop(
     experiment: Experiment, cell: Cell, folder: Path, clean: Path
-) -> tuple[AttackProblem, Scene, torch.Tensor, Horizon]:
+) -> tuple[AttackProblem, AttackableScene, torch.Tensor, Horizon]:
     """What a prediction drives: the problem, pictures with or without the attack, the deployed starts ``[S, n]`` and the horizon.
 
     Its car is the deployed one as the drives without attack in the folder ``clean`` have shown it.
@@ -205,7 +205,7 @@ def _along_the_drive(
     cell: Cell,
     attack: tuple[Shown, torch.Tensor | None] | None,
     of: str,
-) -> Pictures:
+) -> PicturePairs:
     """Pictures of the deployed drive without attack, again with an attack if one is given: as it is seen in the surrogate, and as it is shown."""
     space = make_space(experiment, None)
     policy, _ = policy_of(experiment, cell)
@@ -219,7 +219,7 @@ def _along_the_drive(
         real = dressed.policy_images(dressed.prepare(states), there)
     surrogate = shown.seen_by(space.surrogate)
     poses = planar_poses(states) @ experiment.mount
-    return Pictures(of, real, _learned(surrogate, poses, shown.colours))
+    return PicturePairs(of, real, _learned(surrogate, poses, shown.colours))
 
 
 def posed_frames(bag: Path) -> tuple[list[Rgb], Array]:

@@ -20,7 +20,13 @@ from advnerf_core.driving.path import Array
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import planar_pose
-from advnerf_core.learning.imitation import ImitationConfig, Learned, Progress, SourcePlan, train_policy
+from advnerf_core.learning.imitation import (
+    ImitationConfig,
+    ImitationProgress,
+    Learned,
+    SourcePlan,
+    train_policy,
+)
 from advnerf_core.learning.sources import FrameSource, RenderedSource, SceneSource, Show
 from advnerf_core.policies.network import Policy, images_to_tensor
 from advnerf_core.policies.policy_file import load_policy
@@ -100,7 +106,7 @@ def run(experiment: Experiment, folder: Path, report: MeasuringReport) -> None:
     write_atomically(folder / "policy.json", json.dumps(summary, indent=1) + "\n")
 
 
-def _telling(experiment: Experiment, report: MeasuringReport) -> Progress:
+def _telling(experiment: Experiment, report: MeasuringReport) -> ImitationProgress:
     """Progress of the training as that of the stage, with the error as a curve for each victim."""
     unit = experiment.car.control_unit
 

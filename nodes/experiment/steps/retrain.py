@@ -28,8 +28,8 @@ from advnerf_core.driving.path import Array
 from advnerf_core.files import write_atomically
 from advnerf_core.learning.frames import Frames, FrameStore
 from advnerf_core.learning.imitation import SourcePlan, recovery_states
-from advnerf_core.learning.retrain import RetrainConfig, fine_tune
-from advnerf_core.learning.sources import Seen, steer_with
+from advnerf_core.learning.retrain import FineTuneConfig, fine_tune
+from advnerf_core.learning.sources import PolicyImages, steer_with
 from advnerf_core.policies.policy_file import LoadedPolicy, load_policy
 from hardware.worlds.world import World
 from nodes.experiment.engine.stage_record import hash_of
@@ -101,7 +101,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
                 break
             thetas += list(found.thetas.values())
             new = _collect(experiment, scene, victim, thetas, here, told)
-            settings = RetrainConfig(
+            settings = FineTuneConfig(
                 steps=wanted.steps, new_share=wanted.new_share, seed=wanted.seed + number
             )
             file = here / "policy.safetensors"
@@ -299,7 +299,7 @@ def _frames(
     # Two side by side, so that one of them meets a found texture throughout.
     for first in range(0, 2 * drives, 2):
         parts.append(plan.source.drive(steer, starts[first : first + 2], steps, near, rng))
-    seen = Seen.join(parts)
+    seen = PolicyImages.join(parts)
     labels = expert.steer_states(seen.states).astype(np.float32)
     goals = np.tile(np.array(plan.goal, np.float32), (len(labels), 1))
     return Frames(seen.images, seen.states, labels, goals, seen.textured)

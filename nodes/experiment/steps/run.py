@@ -31,7 +31,7 @@ from nodes.experiment.steps.live import lab_of
 from nodes.lab.worlds.named import read_world
 from nodes.launching.launch_file import load_launch
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.progress import Display, MeasuringReport
+from nodes.runtime.progress import MeasuringReport, StageDisplay
 
 _LIBRARIES = (
     "torch",
@@ -126,7 +126,7 @@ def make_ready(
     until: str | None = None,
     console: Console | None = None,
     anew: bool = False,
-    watcher: Display | None = None,
+    watcher: StageDisplay | None = None,
 ) -> dict[str, StageRecord]:
     """Run the stages that are not there yet: what cells need. Those that are kept with the code are there, unless all is to be made ``anew``.
 

@@ -15,7 +15,7 @@ from advnerf_core.scene.colour import ColourMap, fit_colour_map
 from advnerf_core.scene.field import SceneFieldConfig, save_scene
 from advnerf_core.scene.intervals import pixel_intervals
 from advnerf_core.scene.render_field import FieldRenderer
-from advnerf_core.scene.train import Progress, TrainConfig, TrainedScene, train_scene
+from advnerf_core.scene.train import TrainConfig, TrainedScene, TrainingReport, train_scene
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.learned_scene import compare_views, scene_file
 from nodes.experiment.steps import capture
@@ -31,7 +31,7 @@ def run(experiment: Experiment, folder: Path, report: MeasuringReport) -> None:
         experiment.stage_folder("capture") / capture.PHOTOS, require_all=True
     ).load()
 
-    def progress(at: Progress) -> None:
+    def progress(at: TrainingReport) -> None:
         text = f"step {at.step}, {at.psnr_db:.1f} dB on training rays"
         report(_TRAINING_SHARE * at.fraction, text, Point("PSNR on training rays [dB]", at.step, at.psnr_db))
 

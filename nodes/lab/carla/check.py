@@ -28,7 +28,7 @@ _GROUND_SHARE = 0.5  # at least so much of the picture's lower middle must be ro
 
 
 @dataclass(frozen=True)
-class Check:
+class CarlaCheck:
     """One thing that was looked at.
 
     Attributes:
@@ -42,7 +42,7 @@ class Check:
     text: str
 
 
-def check_server(config: CarlaConfig, library: Any = None, pictures: Path | None = None) -> list[Check]:
+def check_server(config: CarlaConfig, library: Any = None, pictures: Path | None = None) -> list[CarlaCheck]:
     """Look at a server; ends at the first thing without which the rest cannot be looked at.
 
     The map is not changed. If everything else is right a scene is opened for a few ticks and put back.
@@ -52,7 +52,7 @@ def check_server(config: CarlaConfig, library: Any = None, pictures: Path | None
         library: The ``carla`` module; None imports it.
         pictures: Folder for what the driving camera sees, to be looked at by a person.
     """
-    checks: list[Check] = []
+    checks: list[CarlaCheck] = []
 
     def look(name: str, what: Callable[[], Any]) -> Any:
         """The result of a look, or None if it failed, which is written down."""
@@ -60,7 +60,7 @@ def check_server(config: CarlaConfig, library: Any = None, pictures: Path | None
             with server_answers(name):
                 found = what()
         except CarlaError as error:
-            checks.append(Check(name, "failure", str(error)))
+            checks.append(CarlaCheck(name, "failure", str(error)))
             return None
         return found
 
@@ -71,7 +71,7 @@ def check_server(config: CarlaConfig, library: Any = None, pictures: Path | None
     if client is None:
         return checks
     where = f"CARLA {client.get_server_version()} at {config.server.host}:{config.server.port}, as the client library"
-    checks.append(Check("server", "ok", where))
+    checks.append(CarlaCheck("server", "ok", where))
     world = look("map", client.get_world)
     if world is None or not _look_at_map(config, client, world, checks):
         return checks
@@ -86,27 +86,29 @@ def check_server(config: CarlaConfig, library: Any = None, pictures: Path | None
     return checks
 
 
-def _look_at_map(config: CarlaConfig, client: Any, world: Any, checks: list[Check]) -> bool:
+def _look_at_map(config: CarlaConfig, client: Any, world: Any, checks: list[CarlaCheck]) -> bool:
     """Whether the wanted map is the one that is loaded."""
     loaded, wanted = map_name(world.get_map().name), config.server.town
     if wanted in (None, loaded):
-        checks.append(Check("map", "ok", loaded))
+        checks.append(CarlaCheck("map", "ok", loaded))
         return True
     if wanted not in {map_name(path) for path in client.get_available_maps()}:
         checks.append(
-            Check("map", "failure", f"expected {wanted}, got {loaded}, and the server does not have {wanted}")
+            CarlaCheck(
+                "map", "failure", f"expected {wanted}, got {loaded}, and the server does not have {wanted}"
+            )
         )
     elif config.server.load_town:
         text = f"{loaded}; an experiment would load {wanted}. To look at that: ask with --set server.town={loaded}, or load it first"
-        checks.append(Check("map", "warning", text))
+        checks.append(CarlaCheck("map", "warning", text))
     else:
         checks.append(
-            Check("map", "failure", f"expected {wanted}, got {loaded}, and server.load_town is off")
+            CarlaCheck("map", "failure", f"expected {wanted}, got {loaded}, and server.load_town is off")
         )
     return False
 
 
-def _look_at_junction(config: CarlaConfig, world: Any, library: Any, checks: list[Check]) -> bool:
+def _look_at_junction(config: CarlaConfig, world: Any, library: Any, checks: list[CarlaCheck]) -> bool:
     drives = drives_in(world.get_map(), library, config)
     lengths = ", ".join(f"{name} {path.length_m:.1f} m" for name, path in drives.paths.items())
     side = "right" if drives.right_hand else "left"
@@ -114,17 +116,17 @@ def _look_at_junction(config: CarlaConfig, world: Any, library: Any, checks: lis
         f"{drives.junction_id}: {lengths}; lanes {drives.lane_width_m:.2f} m, traffic on the {side}, heights within "
         f"{drives.height_range_m:.2f} m"
     )
-    checks.append(Check("junction", "ok" if drives.right_hand else "warning", text))
+    checks.append(CarlaCheck("junction", "ok" if drives.right_hand else "warning", text))
     return True
 
 
-def _look_at_world(config: CarlaConfig, world: Any, checks: list[Check]) -> bool:
+def _look_at_world(config: CarlaConfig, world: Any, checks: list[CarlaCheck]) -> bool:
     check_nobody_else(world, config.server)
-    checks.append(Check("world", "ok", "nobody else drives it or is in it"))
+    checks.append(CarlaCheck("world", "ok", "nobody else drives it or is in it"))
     return True
 
 
-def _look_at_blueprints(config: CarlaConfig, world: Any, checks: list[Check]) -> bool:
+def _look_at_blueprints(config: CarlaConfig, world: Any, checks: list[CarlaCheck]) -> bool:
     for kind in (RGB, DEPTH):
         camera_blueprint(world, kind, config.camera.pinhole, config.render)
     vehicle = config.body.blueprint
@@ -134,12 +136,14 @@ def _look_at_blueprints(config: CarlaConfig, world: Any, checks: list[Check]) ->
         except IndexError as error:
             raise CarlaMapError(f"expected the vehicle {vehicle} (body.blueprint), got: {error}") from error
     checks.append(
-        Check("blueprints", "ok", f"{RGB}, {DEPTH}, {vehicle or 'no vehicle'}, with all attributes")
+        CarlaCheck("blueprints", "ok", f"{RGB}, {DEPTH}, {vehicle or 'no vehicle'}, with all attributes")
     )
     return True
 
 
-def _look_at_pictures(config: CarlaConfig, library: Any, folder: Path | None, checks: list[Check]) -> bool:
+def _look_at_pictures(
+    config: CarlaConfig, library: Any, folder: Path | None, checks: list[CarlaCheck]
+) -> bool:
     with CarlaScene(config, library) as scene:
         scene.reset(*scene.paths["straight"].start_pose)
         rgb, depth = scene.observe()
@@ -151,7 +155,7 @@ def _look_at_pictures(config: CarlaConfig, library: Any, folder: Path | None, ch
         text = f"frame numbers and poses as asked, {1e3 * seconds:.0f} ms for a step and its picture"
         if repeated:
             text += f"; {repeated} of {_STEPS + 1} pictures had to be asked for again, which costs time and nothing else"
-        checks.append(Check("pictures", "warning" if repeated else "ok", text))
+        checks.append(CarlaCheck("pictures", "warning" if repeated else "ok", text))
         if folder is not None:
             _write(folder, rgb, depth)
         checks.append(_ground(scene.camera_pinhole, scene.T_car_from_camera, rgb, depth))
@@ -160,7 +164,7 @@ def _look_at_pictures(config: CarlaConfig, library: Any, folder: Path | None, ch
 
 def _ground(
     pinhole: Pinhole, T_car_from_camera: Any, rgb: NDArray[np.uint8], depth: NDArray[np.float32]
-) -> Check:
+) -> CarlaCheck:
     """Is the road where depth says, for a camera mounted as ours is? Wrong units, a wrong angle or a bonnet in view show here."""
     rows, columns = slice(int(0.75 * pinhole.height), None), slice(pinhole.width // 3, 2 * pinhole.width // 3)
     down = -(pinhole.directions()[rows, columns] @ T_car_from_camera[:3, :3].T)[..., 2]
@@ -169,27 +173,27 @@ def _ground(
     share = float(np.mean(np.abs(ratio - 1.0) < _GROUND_TOLERANCE))
     text = f"{100 * share:.0f} % of the lower middle of the picture is road at the expected depth"
     if float(rgb.std()) < 1.0:
-        return Check(
+        return CarlaCheck(
             "picture",
             "failure",
             f"{text}, but the picture is of one colour: does the server render? (-RenderOffScreen)",
         )
     if share >= _GROUND_SHARE:
-        return Check("depth", "ok", text)
+        return CarlaCheck("depth", "ok", text)
     text += (
         f"; depth there is {float(np.median(ratio)):.2f} of what a flat road gives. Does the camera see the car itself, is the ground at the "
         "height of the map's lanes, is the camera higher than they say? Look at the pictures (--pictures)"
     )
-    return Check("depth", "failure", text)
+    return CarlaCheck("depth", "failure", text)
 
 
-def _look_at_settings(world: Any, checks: list[Check]) -> bool:
+def _look_at_settings(world: Any, checks: list[CarlaCheck]) -> bool:
     settings = world.get_settings()
     if settings.synchronous_mode:
         raise CarlaFrameError(
             "expected the world to tick by itself again, it does not: `advnerf carla release`"
         )
-    checks.append(Check("put back", "ok", "the world ticks by itself again"))
+    checks.append(CarlaCheck("put back", "ok", "the world ticks by itself again"))
     return True
 
 

@@ -21,7 +21,7 @@ CHILD_S = 60.0
 
 
 @dataclass(frozen=True)
-class Finding:
+class CheckResult:
     """The result of a check, printed as one line.
 
     Attributes:
@@ -43,7 +43,7 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Check:
+class DoctorCheck:
     """A check to run.
 
     Attributes:
@@ -54,7 +54,7 @@ class Check:
     """
 
     name: str
-    run: Callable[[], Sequence[Finding]]
+    run: Callable[[], Sequence[CheckResult]]
     deadline_s: float = 10.0
     cure: str = (
         "look for a process in state D (ps aux), unplug the device it waits for, or restart the computer"
@@ -62,7 +62,7 @@ class Check:
 
 
 @dataclass(frozen=True)
-class Answer:
+class ProbeResult:
     """The answer of a probe in a separate process.
 
     Attributes:
@@ -80,7 +80,7 @@ class Answer:
         return "run advnerf doctor again when this computer has less to do" if self.late else of_failure
 
 
-def examine(checks: Sequence[Check]) -> Iterator[Finding]:
+def examine(checks: Sequence[DoctorCheck]) -> Iterator[CheckResult]:
     """Run checks, a few in parallel. Yields their findings in the order of the checks."""
     with ThreadPoolExecutor(_AT_ONCE, "doctor") as pool:
         try:
@@ -90,12 +90,12 @@ def examine(checks: Sequence[Check]) -> Iterator[Finding]:
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-def worst(findings: Sequence[Finding]) -> str:
+def worst(findings: Sequence[CheckResult]) -> str:
     """Return the worst state of the findings; ``ok`` without findings."""
     return STATES[max((STATES.index(finding.state) for finding in findings), default=0)]
 
 
-def in_child(probe: str, *arguments: Any, timeout_s: float = CHILD_S) -> Answer:
+def in_child(probe: str, *arguments: Any, timeout_s: float = CHILD_S) -> ProbeResult:
     """Run a probe of `nodes.lab.doctor.probes` in a separate process, because a broken library may crash, hang, or use all memory.
 
     Args:
@@ -109,18 +109,20 @@ def in_child(probe: str, *arguments: Any, timeout_s: float = CHILD_S) -> Answer:
             command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout_s, check=False
         )
     except subprocess.TimeoutExpired:
-        return Answer(None, f"no answer within {timeout_s:g} s", late=True)
+        return ProbeResult(None, f"no answer within {timeout_s:g} s", late=True)
     if done.returncode < 0:
-        return Answer(None, f"its process was ended by signal {-done.returncode}")
+        return ProbeResult(None, f"its process was ended by signal {-done.returncode}")
     lines = (done.stderr if done.returncode else done.stdout).strip().splitlines()
     if done.returncode or not lines:
-        return Answer(None, lines[-1] if lines else f"its process ended with exit code {done.returncode}")
-    return Answer(json.loads(lines[-1]))
+        return ProbeResult(
+            None, lines[-1] if lines else f"its process ended with exit code {done.returncode}"
+        )
+    return ProbeResult(json.loads(lines[-1]))
 
 
-def _within_deadline(check: Check) -> Sequence[Finding]:
+def _within_deadline(check: DoctorCheck) -> Sequence[CheckResult]:
     """Run a check in a daemon thread and return its findings, or a failure after the deadline."""
-    found: list[Sequence[Finding]] = []
+    found: list[Sequence[CheckResult]] = []
     thread = threading.Thread(
         target=lambda: found.append(_run(check)), name=f"doctor {check.name}", daemon=True
     )
@@ -129,18 +131,18 @@ def _within_deadline(check: Check) -> Sequence[Finding]:
     return (
         found[0]
         if found
-        else [Finding(check.name, FAILURE, f"no answer within {check.deadline_s:g} s", check.cure)]
+        else [CheckResult(check.name, FAILURE, f"no answer within {check.deadline_s:g} s", check.cure)]
     )
 
 
-def _run(check: Check) -> Sequence[Finding]:
+def _run(check: DoctorCheck) -> Sequence[CheckResult]:
     try:
         return check.run()
     except (AdvnerfError, OSError, ValueError) as error:
-        return [Finding(check.name, FAILURE, str(error) or type(error).__name__)]
+        return [CheckResult(check.name, FAILURE, str(error) or type(error).__name__)]
     except Exception as error:  # a bug in one check must not prevent the others
         return [
-            Finding(
+            CheckResult(
                 check.name, WARNING, f"the check itself failed: {type(error).__name__}: {error}", "report it"
             )
         ]

@@ -18,7 +18,7 @@ from calibration.schema import (
     load_calibration,
 )
 from nodes.compositor import show
-from nodes.lab.doctor.check import FAILURE, OK, Finding
+from nodes.lab.doctor.check import FAILURE, OK, CheckResult
 from nodes.launching.launch_file import Plan
 
 _CURE = "run advnerf calibrate (docs/calibration.md), or set params.calibration to the right folder"
@@ -30,18 +30,18 @@ _OWN: dict[str, type[Calibration]] = {"nodes.camera": CameraCalibration, "nodes.
 _FILES = (".safetensors", ".onnx", ".pt2", ".conf", ".yaml", ".mcap", ".db3", ".bag")
 
 
-def calibrations(plan: Plan) -> list[Finding]:
+def calibrations(plan: Plan) -> list[CheckResult]:
     """Load every calibration file once."""
     rows, good = [], []
     for file, kind in dict.fromkeys(_calibration_files(plan)):
         try:
             good.append((file, load_calibration(kind, file)))
         except (AdvnerfError, OSError, ValueError) as error:
-            rows.append(Finding("calibration", FAILURE, str(error), _CURE))
+            rows.append(CheckResult("calibration", FAILURE, str(error), _CURE))
     if good:
         oldest = min(good, key=lambda item: item[1].date)
         text = f"{', '.join(str(file) for file, _ in good)}; the oldest, {oldest[0].name}, is from {oldest[1].date}"
-        rows.append(Finding("calibration", OK, text))
+        rows.append(CheckResult("calibration", OK, text))
     return rows
 
 
@@ -54,14 +54,14 @@ def _calibration_files(plan: Plan) -> Iterator[tuple[Path, type[Calibration]]]:
                 yield Path(value), kind
 
 
-def named(plan: Plan) -> list[Finding]:
+def named(plan: Plan) -> list[CheckResult]:
     """Check that every other file exists, and that attacks fit camera and face."""
     rows = []
     known = {str(file) for file, _ in _calibration_files(plan)}
     for name in plan.nodes:
         data = plan.documents[name].data
         rows += [
-            Finding(
+            CheckResult(
                 "files",
                 FAILURE,
                 f"{name}: no file {value}",
@@ -72,7 +72,7 @@ def named(plan: Plan) -> list[Finding]:
         ]
         if isinstance(data, dict) and data.get("attack"):
             rows += _attack(name, data)
-    return rows or [Finding("files", OK, "all files that the nodes name exist")]
+    return rows or [CheckResult("files", OK, "all files that the nodes name exist")]
 
 
 def _paths(value: Any) -> Iterator[str]:
@@ -86,14 +86,14 @@ def _paths(value: Any) -> Iterator[str]:
         yield value
 
 
-def _attack(name: str, data: dict[str, Any]) -> list[Finding]:
+def _attack(name: str, data: dict[str, Any]) -> list[CheckResult]:
     file = Path(data["attack"])
     if not file.exists():
         return []  # said already
     try:
         attack = load_attack(file)
     except AdvnerfError as error:
-        return [Finding("attack", FAILURE, str(error), "run the attack again, or name another file")]
+        return [CheckResult("attack", FAILURE, str(error), "run the attack again, or name another file")]
     try:
         if "camera" in data and "target" in data:
             camera = load_calibration(CameraCalibration, data["camera"])
@@ -101,6 +101,6 @@ def _attack(name: str, data: dict[str, Any]) -> list[Finding]:
     except CalibrationError:
         pass  # said under "calibration"
     except AdvnerfError as error:
-        return [Finding("attack", FAILURE, f"{name}: {error}", "give the target that it was made for")]
+        return [CheckResult("attack", FAILURE, f"{name}: {error}", "give the target that it was made for")]
     subject = "no subject" if attack.face is None else attack.face.subject
-    return [Finding("attack", OK, f"{name}: {attack.attack_id}, {attack.method}, for {subject}")]
+    return [CheckResult("attack", OK, f"{name}: {attack.attack_id}, {attack.method}, for {subject}")]

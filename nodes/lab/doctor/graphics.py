@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from hardware.screen.edid import connected_displays
-from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, Answer, Finding, in_child
+from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, CheckResult, ProbeResult, in_child
 from nodes.runtime.extras import CPU_TORCH, installs
 
 _EGL_CURE = "apt-get install libegl1 libgl1-mesa-dri libegl-mesa0 libopengl0 (Debian, Ubuntu)"
@@ -20,25 +20,29 @@ _SCREEN_CURE = (
 _NO_SCREEN = ("offscreen", "dummy")
 
 
-def _missing(answer: Answer) -> bool:
+def _missing(answer: ProbeResult) -> bool:
     return "ModuleNotFoundError" in answer.trouble
 
 
-def egl(required: bool = False) -> list[Finding]:
+def egl(required: bool = False) -> list[CheckResult]:
     """Check whether the simulated lab can render."""
     answer = in_child("egl")
     if answer.data is not None:
-        return [Finding("EGL", OK, f"MuJoCo {answer.data['version']} renders off-screen")]
+        return [CheckResult("EGL", OK, f"MuJoCo {answer.data['version']} renders off-screen")]
     if _missing(answer):
         state = FAILURE if required else ABSENT
-        return [Finding("EGL", state, "no simulated lab: MuJoCo is missing", "pip install 'advnerf[twin]'")]
+        return [
+            CheckResult("EGL", state, "no simulated lab: MuJoCo is missing", "pip install 'advnerf[twin]'")
+        ]
     state = FAILURE if required else WARNING
     return [
-        Finding("EGL", state, f"the simulated lab cannot render: {answer.trouble}", answer.cure(_EGL_CURE))
+        CheckResult(
+            "EGL", state, f"the simulated lab cannot render: {answer.trouble}", answer.cure(_EGL_CURE)
+        )
     ]
 
 
-def torch(required: bool = False) -> list[Finding]:
+def torch(required: bool = False) -> list[CheckResult]:
     """Check the version of torch and its devices."""
     answer = in_child("torch")
     if answer.data is None:
@@ -46,34 +50,42 @@ def torch(required: bool = False) -> list[Finding]:
             "is missing: no training, no attack, only ONNX policies" if _missing(answer) else answer.trouble
         )
         state = FAILURE if required else ABSENT if _missing(answer) else WARNING
-        return [Finding("torch", state, text, answer.cure(installs("torch") or ""))]
+        return [CheckResult("torch", state, text, answer.cure(installs("torch") or ""))]
     version, gpus, built_for = (answer.data[key] for key in ("version", "gpus", "built_for"))
     if gpus:
-        return [Finding("torch", OK, f"{version}, CUDA {built_for}: {', '.join(gpus)}")]
+        return [CheckResult("torch", OK, f"{version}, CUDA {built_for}: {', '.join(gpus)}")]
     if built_for:
         do = (
             "make nvidia-smi work first: install the driver, or start the container with --gpus all; without such a GPU, "
             f"pip uninstall torch, then {CPU_TORCH}, saves several GB"
         )
-        return [Finding("torch", WARNING, f"{version} is built for CUDA {built_for}, but sees no GPU", do)]
-    return [Finding("torch", OK, f"{version}, CPU only")]
+        return [
+            CheckResult("torch", WARNING, f"{version} is built for CUDA {built_for}, but sees no GPU", do)
+        ]
+    return [CheckResult("torch", OK, f"{version}, CPU only")]
 
 
-def llvm() -> list[Finding]:
+def llvm() -> list[CheckResult]:
     """Check whether Mitsuba can compile, which attacks on meshes need."""
     answer = in_child("llvm")
     if answer.data is not None:
-        return [Finding("LLVM", OK, f"{answer.data['llvm']} compiles for Mitsuba {answer.data['version']}")]
+        return [
+            CheckResult("LLVM", OK, f"{answer.data['llvm']} compiles for Mitsuba {answer.data['version']}")
+        ]
     if "cannot be imported" in answer.trouble or _missing(answer):
         return [
-            Finding("LLVM", ABSENT, "Mitsuba is missing: no attacks on meshes", "pip install 'advnerf[mesh]'")
+            CheckResult(
+                "LLVM", ABSENT, "Mitsuba is missing: no attacks on meshes", "pip install 'advnerf[mesh]'"
+            )
         ]
     return [
-        Finding("LLVM", WARNING, answer.trouble, answer.cure("apt-get install libllvm19 (Debian, Ubuntu)"))
+        CheckResult(
+            "LLVM", WARNING, answer.trouble, answer.cure("apt-get install libllvm19 (Debian, Ubuntu)")
+        )
     ]
 
 
-def screens(display: Any | None = None) -> list[Finding]:
+def screens(display: Any | None = None) -> list[CheckResult]:
     """Check the screens of the window system and the connected monitors.
 
     Args:
@@ -88,27 +100,27 @@ def screens(display: Any | None = None) -> list[Finding]:
     if answer.data is None:
         if _missing(answer):
             text = "pygame-ce is missing: no attack on a monitor"
-            return [Finding("screens", state, text, "pip install 'advnerf[monitor]'")]
+            return [CheckResult("screens", state, text, "pip install 'advnerf[monitor]'")]
         if answer.late:
-            return [Finding("screens", state, answer.trouble, answer.cure(""))]
+            return [CheckResult("screens", state, answer.trouble, answer.cure(""))]
         return [_no_window_system(answer.trouble, state, named)]
     if answer.data["driver"] in _NO_SCREEN and os.environ.get("SDL_VIDEODRIVER") != answer.data["driver"]:
         return [_no_window_system("SDL found neither X11 nor Wayland", state, named)]
     sizes = [tuple(size) for size in answer.data["sizes"]]
     text = f"{answer.data['driver']}: " + ", ".join(f"{n}: {w} x {h}" for n, (w, h) in enumerate(sizes))
-    rows = [Finding("screens", OK, text + (f"; plugged in: {named}" if named else ""))]
+    rows = [CheckResult("screens", OK, text + (f"; plugged in: {named}" if named else ""))]
     return rows if display is None else [*rows, *_fits(display, sizes, plugged)]
 
 
-def _no_window_system(trouble: str, state: str, named: str) -> Finding:
+def _no_window_system(trouble: str, state: str, named: str) -> CheckResult:
     text = f"no window system: {trouble}" + (f"; plugged in: {named}" if named else "")
-    return Finding("screens", state, text, _SCREEN_CURE)
+    return CheckResult("screens", state, text, _SCREEN_CURE)
 
 
-def _fits(display: Any, sizes: Sequence[tuple[int, ...]], plugged: dict[str, Any]) -> Sequence[Finding]:
+def _fits(display: Any, sizes: Sequence[tuple[int, ...]], plugged: dict[str, Any]) -> Sequence[CheckResult]:
     if display.index >= len(sizes):
         return [
-            Finding(
+            CheckResult(
                 "screens",
                 FAILURE,
                 f"no screen with index {display.index}",
@@ -120,7 +132,7 @@ def _fits(display: Any, sizes: Sequence[tuple[int, ...]], plugged: dict[str, Any
     if display.connector not in plugged:
         there = ", ".join(plugged) or "none"
         return [
-            Finding(
+            CheckResult(
                 "screens",
                 FAILURE,
                 f"no monitor at {display.connector}; there are {there}",
@@ -131,6 +143,8 @@ def _fits(display: Any, sizes: Sequence[tuple[int, ...]], plugged: dict[str, Any
     if tuple(native) != tuple(sizes[display.index]):
         text = f"screen {display.index} is {sizes[display.index][0]} x {sizes[display.index][1]}, the panel {native[0]} x {native[1]}"
         return [
-            Finding("screens", FAILURE, text, "use the native resolution and 100 % scaling, or another index")
+            CheckResult(
+                "screens", FAILURE, text, "use the native resolution and 100 % scaling, or another index"
+            )
         ]
     return []

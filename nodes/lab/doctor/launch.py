@@ -16,17 +16,17 @@ from advnerf_core.strict import validate
 from calibration.schema import CameraCalibration, load_calibration
 from hardware.mocap.vicon import ViconConfig
 from hardware.motor.vesc_settings import TimeoutSettings
-from nodes.camera import CameraConfig
+from nodes.camera import CameraNodeConfig
 from nodes.gateway import GatewayConfig
 from nodes.lab.doctor import cameras, files, graphics, machine, mocap, motor, network
-from nodes.lab.doctor.check import CHILD_S, FAILURE, OK, Check, Finding, in_child
-from nodes.lab.doctor.recording import Pictures, bytes_per_s
+from nodes.lab.doctor.check import CHILD_S, FAILURE, OK, CheckResult, DoctorCheck, in_child
+from nodes.lab.doctor.recording import ImageFormat, bytes_per_s
 from nodes.launching.launch_check import check_nodes
 from nodes.launching.launch_file import Plan
 from nodes.launching.launch_hosts import GATEWAY
 from nodes.monitor import MonitorConfig, ScreenConfig
 from nodes.motor import MotorConfig
-from nodes.policy import PolicyConfig
+from nodes.policy import PolicyNodeConfig
 from nodes.recorder import RecorderConfig
 from nodes.runtime.errors import ConfigError
 from nodes.safety import SafetyConfig
@@ -57,7 +57,7 @@ class _Asked:
         return validate(kind, self.plan.documents[self.name])
 
 
-def checks_of(plan: Plan, folder: Path) -> list[Check]:
+def checks_of(plan: Plan, folder: Path) -> list[DoctorCheck]:
     """Return the checks for a launch file on this host.
 
     Args:
@@ -65,14 +65,14 @@ def checks_of(plan: Plan, folder: Path) -> list[Check]:
         folder: Folder for its runs.
     """
     checks = [
-        Check("versions", machine.versions),
-        Check("machine", machine.machine),
-        Check("places", machine.places),
-        Check("sockets", machine.sockets),
-        Check("launches", machine.launches),
-        Check("nodes", partial(_nodes, plan), _NODES_S),
-        Check("calibration", partial(files.calibrations, plan)),
-        Check("files", partial(files.named, plan)),
+        DoctorCheck("versions", machine.versions),
+        DoctorCheck("machine", machine.machine),
+        DoctorCheck("places", machine.places),
+        DoctorCheck("sockets", machine.sockets),
+        DoctorCheck("launches", machine.launches),
+        DoctorCheck("nodes", partial(_nodes, plan), _NODES_S),
+        DoctorCheck("calibration", partial(files.calibrations, plan)),
+        DoctorCheck("files", partial(files.named, plan)),
     ]
     for name, entry in plan.nodes.items():
         asked = _Asked(plan, name)
@@ -82,7 +82,7 @@ def checks_of(plan: Plan, folder: Path) -> list[Check]:
             except (AdvnerfError, OSError):
                 continue  # the check "nodes" reports errors of the node's configuration
     if "recorder" in plan.documents:
-        checks.append(Check("disk", partial(_disk, plan, folder)))
+        checks.append(DoctorCheck("disk", partial(_disk, plan, folder)))
     return checks
 
 
@@ -96,42 +96,44 @@ def policy_problems(plan: Plan) -> list[str]:
         if entry.module != _POLICY:
             continue
         asked = _Asked(plan, name)
-        if (missing := _missing_policy(asked.config(PolicyConfig))) is not None:
+        if (missing := _missing_policy(asked.config(PolicyNodeConfig))) is not None:
             problems.append(
                 f"{name}: expected a policy file at {missing}, found none; give another with --set params.policy=FILE"
             )
             continue
-        _, unfit = _try_policy(asked.config(PolicyConfig), _image_size(plan))
+        _, unfit = _try_policy(asked.config(PolicyNodeConfig), _image_size(plan))
         problems += [f"{name}: {finding.found}; {finding.do}" for finding in unfit]
     return problems
 
 
-def _missing_policy(config: PolicyConfig) -> str | None:
+def _missing_policy(config: PolicyNodeConfig) -> str | None:
     return None if is_factory(config.policy) or Path(config.policy).exists() else str(config.policy)
 
 
-def _nodes(plan: Plan) -> list[Finding]:
+def _nodes(plan: Plan) -> list[CheckResult]:
     """Check whether every node accepts its configuration, by asking the nodes."""
     problems = check_nodes(plan)
     if problems:
         return [
-            Finding("nodes", FAILURE, " ".join(text.split()), "correct the launch file")
+            CheckResult("nodes", FAILURE, " ".join(text.split()), "correct the launch file")
             for text in problems.values()
         ]
-    return [Finding("nodes", OK, f"{', '.join(plan.nodes)} accept their configuration")]
+    return [CheckResult("nodes", OK, f"{', '.join(plan.nodes)} accept their configuration")]
 
 
-def _camera(asked: _Asked) -> list[Check]:
-    config = asked.config(CameraConfig)
+def _camera(asked: _Asked) -> list[DoctorCheck]:
+    config = asked.config(CameraNodeConfig)
     where = str(getattr(config.source, "path", ""))
     if config.source.kind == "socket" and where.startswith(_OF_THE_RUN):
-        return [] if asked.on_twin else [Check("camera", partial(_nobody, "camera", where))]
-    checks: list[Check] = []
+        return [] if asked.on_twin else [DoctorCheck("camera", partial(_nobody, "camera", where))]
+    checks: list[DoctorCheck] = []
     if config.source.kind == "oak":
-        checks.append(Check("OAK", partial(cameras.oaks, True), 30.0, "unplug the OAK and plug it in again"))
+        checks.append(
+            DoctorCheck("OAK", partial(cameras.oaks, True), 30.0, "unplug the OAK and plug it in again")
+        )
     calibration = _calibration(config.calibration)
     checks.append(
-        Check(
+        DoctorCheck(
             "camera",
             partial(cameras.source, config.source, calibration),
             20.0,
@@ -148,46 +150,50 @@ def _calibration(file: Path) -> CameraCalibration | None:
         return None  # said under "calibration"
 
 
-def _nobody(name: str, where: str) -> list[Finding]:
+def _nobody(name: str, where: str) -> list[CheckResult]:
     do = "give the real device, or enable the simulated lab (twin.if=true)"
-    return [Finding(name, FAILURE, f"expected at {where}, but this launch has no node that provides it", do)]
-
-
-def _vicon(asked: _Asked) -> list[Check]:
-    config = asked.config(ViconNodeConfig)
-    if config.library is not None:
-        return [Check("VICON", partial(network.mocap_library, config.library, config.hostname))]
-    if asked.on_twin:
-        return [Check("VICON", partial(mocap.free_port, config.port, config.host))]
-    listening = ViconConfig(config.subjects, config.host, config.port, source=config.source)
-    # Boards and wands may be absent, but without the car nothing can be armed.
-    return [Check("VICON", partial(mocap.listen, listening, True, mocap.LISTEN_S, ("car",)))]
-
-
-def _motor(asked: _Asked) -> list[Check]:
-    config = asked.config(MotorConfig)
-    if config.port.startswith(_OF_THE_RUN):
-        return [] if asked.on_twin else [Check("VESC", partial(_nobody, "VESC", config.port))]
-    wanted = TimeoutSettings(config.controller_timeout_ms, config.controller_brake_current_a)
     return [
-        Check("serial", motor.serial_ports),
-        Check("VESC", partial(motor.vesc, config.port, wanted, config.battery_warning_v, True)),
+        CheckResult(name, FAILURE, f"expected at {where}, but this launch has no node that provides it", do)
     ]
 
 
-def _safety(asked: _Asked) -> list[Check]:
+def _vicon(asked: _Asked) -> list[DoctorCheck]:
+    config = asked.config(ViconNodeConfig)
+    if config.library is not None:
+        return [DoctorCheck("VICON", partial(network.mocap_library, config.library, config.hostname))]
+    if asked.on_twin:
+        return [DoctorCheck("VICON", partial(mocap.free_port, config.port, config.host))]
+    listening = ViconConfig(config.subjects, config.host, config.port, source=config.source)
+    # Boards and wands may be absent, but without the car nothing can be armed.
+    return [DoctorCheck("VICON", partial(mocap.listen, listening, True, mocap.LISTEN_S, ("car",)))]
+
+
+def _motor(asked: _Asked) -> list[DoctorCheck]:
+    config = asked.config(MotorConfig)
+    if config.port.startswith(_OF_THE_RUN):
+        return [] if asked.on_twin else [DoctorCheck("VESC", partial(_nobody, "VESC", config.port))]
+    wanted = TimeoutSettings(config.controller_timeout_ms, config.controller_brake_current_a)
+    return [
+        DoctorCheck("serial", motor.serial_ports),
+        DoctorCheck("VESC", partial(motor.vesc, config.port, wanted, config.battery_warning_v, True)),
+    ]
+
+
+def _safety(asked: _Asked) -> list[DoctorCheck]:
     return (
-        [Check("gamepad", partial(motor.gamepads, True))]
+        [DoctorCheck("gamepad", partial(motor.gamepads, True))]
         if asked.config(SafetyConfig).teleop == "hold"
         else []
     )
 
 
-def _policy(asked: _Asked) -> list[Check]:
-    config = asked.config(PolicyConfig)
+def _policy(asked: _Asked) -> list[DoctorCheck]:
+    config = asked.config(PolicyNodeConfig)
     if _missing_policy(config) is not None:
         return []  # said under "files"
-    return [Check("policy", partial(_policy_findings, config, _image_size(asked.plan)), _CHILD_DEADLINE_S)]
+    return [
+        DoctorCheck("policy", partial(_policy_findings, config, _image_size(asked.plan)), _CHILD_DEADLINE_S)
+    ]
 
 
 def _image_size(plan: Plan) -> tuple[int, int] | None:
@@ -203,13 +209,13 @@ def _camera_file(value: Any) -> CameraCalibration | None:
     return _calibration(Path(value)) if isinstance(value, str) and value.endswith(".yaml") else None
 
 
-def _policy_findings(config: PolicyConfig, size: tuple[int, int] | None) -> list[Finding]:
+def _policy_findings(config: PolicyNodeConfig, size: tuple[int, int] | None) -> list[CheckResult]:
     data, rows = _try_policy(config, size)
     if data is None:
         return rows
     if data["ms"] > _POLICY_SLOW_MS:
         rows.append(
-            Finding(
+            CheckResult(
                 "policy",
                 FAILURE,
                 f"{data['ms']:.0f} ms for one image",
@@ -217,14 +223,16 @@ def _policy_findings(config: PolicyConfig, size: tuple[int, int] | None) -> list
             )
         )
     return [
-        Finding("policy", OK, f"{config.policy}, {data['sha256'][:12]}, {data['ms']:.1f} ms for one image"),
+        CheckResult(
+            "policy", OK, f"{config.policy}, {data['sha256'][:12]}, {data['ms']:.1f} ms for one image"
+        ),
         *rows,
     ]
 
 
 def _try_policy(
-    config: PolicyConfig, size: tuple[int, int] | None
-) -> tuple[dict[str, Any] | None, list[Finding]]:
+    config: PolicyNodeConfig, size: tuple[int, int] | None
+) -> tuple[dict[str, Any] | None, list[CheckResult]]:
     """Load a policy in a separate process.
 
     Args:
@@ -237,45 +245,49 @@ def _try_policy(
     answer = in_child("policy", config.policy, config.sha256)
     if answer.data is None:
         trouble = answer.trouble.partition(": ")[2] or answer.trouble
-        return None, [Finding("policy", FAILURE, trouble, answer.cure("correct params.policy"))]
+        return None, [CheckResult("policy", FAILURE, trouble, answer.cure("correct params.policy"))]
     data, rows = answer.data, []
     if size is not None and tuple(data["size"]) != size:
         text = f"trained for {data['size'][0]} x {data['size'][1]}, the camera is calibrated for {size[0]} x {size[1]}"
-        rows.append(Finding("policy", FAILURE, text, "train for this camera, or set the size of the source"))
+        rows.append(
+            CheckResult("policy", FAILURE, text, "train for this camera, or set the size of the source")
+        )
     if data["goal_size"] != len(config.goal):
         text = f"expected a goal of {data['goal_size']} numbers, got {len(config.goal)}"
-        rows.append(Finding("policy", FAILURE, text, "set policy.goal"))
+        rows.append(CheckResult("policy", FAILURE, text, "set policy.goal"))
     return data, rows
 
 
-def _twin(asked: _Asked) -> list[Check]:
-    return [Check("EGL", partial(graphics.egl, True), _CHILD_DEADLINE_S)]
+def _twin(asked: _Asked) -> list[DoctorCheck]:
+    return [DoctorCheck("EGL", partial(graphics.egl, True), _CHILD_DEADLINE_S)]
 
 
-def _attack(asked: _Asked) -> list[Check]:
-    return [Check("torch", partial(graphics.torch, True), _CHILD_DEADLINE_S)]
+def _attack(asked: _Asked) -> list[DoctorCheck]:
+    return [DoctorCheck("torch", partial(graphics.torch, True), _CHILD_DEADLINE_S)]
 
 
-def _monitor(asked: _Asked) -> list[Check]:
+def _monitor(asked: _Asked) -> list[DoctorCheck]:
     config = asked.config(MonitorConfig)
     if not isinstance(config.display, ScreenConfig):
         return (
-            [] if asked.on_twin else [Check("screens", partial(_nobody, "screens", str(config.display.path)))]
+            []
+            if asked.on_twin
+            else [DoctorCheck("screens", partial(_nobody, "screens", str(config.display.path)))]
         )
-    return [Check("screens", partial(graphics.screens, config.display), _CHILD_DEADLINE_S)]
+    return [DoctorCheck("screens", partial(graphics.screens, config.display), _CHILD_DEADLINE_S)]
 
 
-def _gateway(asked: _Asked) -> list[Check]:
+def _gateway(asked: _Asked) -> list[DoctorCheck]:
     config = asked.config(GatewayConfig)
-    return [Check("clock", machine.clock), Check("network", partial(network.gateway, config))]
+    return [DoctorCheck("clock", machine.clock), DoctorCheck("network", partial(network.gateway, config))]
 
 
-def _viewer(asked: _Asked) -> list[Check]:
+def _viewer(asked: _Asked) -> list[DoctorCheck]:
     config = asked.config(ViewerConfig)
-    return [Check("viewer", partial(network.viewer, config.host, config.port))]
+    return [DoctorCheck("viewer", partial(network.viewer, config.host, config.port))]
 
 
-def _disk(plan: Plan, folder: Path) -> Sequence[Finding]:
+def _disk(plan: Plan, folder: Path) -> Sequence[CheckResult]:
     config = validate(RecorderConfig, plan.documents["recorder"])
     # With two hosts, all recorded topics are sent to this host.
     roles = None
@@ -286,21 +298,21 @@ def _disk(plan: Plan, folder: Path) -> Sequence[Finding]:
     return machine.disk(folder, bytes_per_s(pictures_of(plan), config.topics, roles, len(config.statuses_of)))
 
 
-def pictures_of(plan: Plan) -> Pictures:
+def pictures_of(plan: Plan) -> ImageFormat:
     """Size and rate of the images of a launch file; defaults if its camera is on another host."""
     for name, entry in plan.nodes.items():
         if entry.module == "nodes.camera":
             try:
-                config = validate(CameraConfig, plan.documents[name])
+                config = validate(CameraNodeConfig, plan.documents[name])
                 size = load_calibration(CameraCalibration, config.calibration)
             except (ConfigError, AdvnerfError):
                 break
-            rate_hz = 1.0 / config.source.period_s() if config.source.period_s() else Pictures.rate_hz
-            return Pictures(size.width, size.height, rate_hz, config.compressed is not None)
-    return Pictures()
+            rate_hz = 1.0 / config.source.period_s() if config.source.period_s() else ImageFormat.rate_hz
+            return ImageFormat(size.width, size.height, rate_hz, config.compressed is not None)
+    return ImageFormat()
 
 
-_BY_MODULE: dict[str, Callable[[_Asked], list[Check]]] = {
+_BY_MODULE: dict[str, Callable[[_Asked], list[DoctorCheck]]] = {
     "nodes.camera": _camera, "nodes.vicon": _vicon, "nodes.motor": _motor, "nodes.safety": _safety, "nodes.policy": _policy,
     "nodes.twin": _twin, "nodes.attack": _attack, "nodes.monitor": _monitor, "nodes.gateway": _gateway, "nodes.viewer": _viewer,
 }  # fmt: skip

@@ -19,7 +19,7 @@ from pathlib import Path
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.kernel_cache import use_own_folder
 from advnerf_core.places import PlaceError, is_writable, user_place
-from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, Finding
+from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, CheckResult
 from nodes.launching.running import active_launches
 from nodes.linking.keys import DRIVE, KeyFolder, default_folder
 from nodes.runtime.bus import Bus
@@ -39,17 +39,17 @@ _REQUIREMENT = re.compile(
 _NOT_OURS = ("all", "dev")
 
 
-def versions() -> list[Finding]:
+def versions() -> list[CheckResult]:
     """Check Python, advnerf, the required packages and the extras."""
     found = platform.python_version()
     tested = (3, 10) <= sys.version_info[:2] <= (3, 12)
     text = f"{found}, advnerf {importlib.metadata.version('advnerf')}, Linux {platform.release()} {platform.machine()}"
     do = "" if tested else "create the environment with Python 3.10, 3.11 or 3.12, which are tested"
-    rows = [Finding("python", OK if tested else WARNING, text, do)]
+    rows = [CheckResult("python", OK if tested else WARNING, text, do)]
     return rows + packages(importlib.metadata.requires("advnerf") or [])
 
 
-def packages(requirements: Iterable[str]) -> list[Finding]:
+def packages(requirements: Iterable[str]) -> list[CheckResult]:
     """Check a package's requirements: missing, too old or too new packages, and complete extras."""
     wrong: dict[str, list[str]] = {}
     for requirement in requirements:
@@ -60,13 +60,13 @@ def packages(requirements: Iterable[str]) -> list[Finding]:
         if trouble := _trouble(match[1], match[2].strip()):
             wrong[extra].append(trouble)
     extras = [name for name in wrong if name and not wrong[name]]
-    rows = [Finding("extras", OK, f"complete: {', '.join(extras) or 'none'}")]
+    rows = [CheckResult("extras", OK, f"complete: {', '.join(extras) or 'none'}")]
     if base := wrong.get("", []):
-        rows.insert(0, Finding("packages", FAILURE, "; ".join(base), "pip install advnerf"))
+        rows.insert(0, CheckResult("packages", FAILURE, "; ".join(base), "pip install advnerf"))
     for name in (name for name in wrong if name and wrong[name]):
         stale = [trouble for trouble in wrong[name] if not trouble.endswith("missing")]
         if stale:
-            rows.append(Finding("extras", WARNING, "; ".join(stale), f"pip install 'advnerf[{name}]'"))
+            rows.append(CheckResult("extras", WARNING, "; ".join(stale), f"pip install 'advnerf[{name}]'"))
     return rows
 
 
@@ -96,17 +96,17 @@ def _release(text: str) -> tuple[int, ...]:
     return tuple(map(int, match[0].split("."))) if match else ()
 
 
-def machine() -> list[Finding]:
+def machine() -> list[CheckResult]:
     """Check cores and memory."""
     memory = memory_gib()
     text = f"{os.cpu_count()} cores, {memory:.0f} GiB memory"
     if memory < _MEMORY_WARNING_GIB:
         do = f"train and attack on another computer, which needs {_MEMORY_WARNING_GIB} GiB"
-        return [Finding("machine", WARNING, text, do)]
-    return [Finding("machine", OK, text)]
+        return [CheckResult("machine", WARNING, text, do)]
+    return [CheckResult("machine", OK, text)]
 
 
-def disk(folder: Path, bytes_per_s: float, minutes: float = 30.0) -> list[Finding]:
+def disk(folder: Path, bytes_per_s: float, minutes: float = 30.0) -> list[CheckResult]:
     """Check how many minutes of recording fit on the disk.
 
     Args:
@@ -117,7 +117,7 @@ def disk(folder: Path, bytes_per_s: float, minutes: float = 30.0) -> list[Findin
     existing = next(path for path in (folder.resolve(), *folder.resolve().parents) if path.is_dir())
     if not os.access(existing, os.W_OK):
         return [
-            Finding(
+            CheckResult(
                 "disk",
                 FAILURE,
                 f"{existing} cannot be written to",
@@ -129,49 +129,51 @@ def disk(folder: Path, bytes_per_s: float, minutes: float = 30.0) -> list[Findin
     hourly = bytes_per_s * 3600.0 / 1e9
     text = f"{free / 2**30:.1f} GiB free in {existing}: {lasts:.0f} minutes of recording at {hourly:.1f} GB an hour"
     if lasts < 1.0:
-        return [Finding("disk", FAILURE, text, "free some space, or give another --folder")]
+        return [CheckResult("disk", FAILURE, text, "free some space, or give another --folder")]
     if lasts < minutes:
-        return [Finding("disk", WARNING, text, "free some space; advnerf bag info shows what a bag contains")]
-    return [Finding("disk", OK, text)]
+        return [
+            CheckResult("disk", WARNING, text, "free some space; advnerf bag info shows what a bag contains")
+        ]
+    return [CheckResult("disk", OK, text)]
 
 
-def places() -> list[Finding]:
+def places() -> list[CheckResult]:
     """Check whether this user has a home, and where compiled kernels are kept, by writing there."""
     return [_home(), _cache()]
 
 
-def _home() -> Finding:
+def _home() -> CheckResult:
     do = "set HOME to a folder of this user, or XDG_CONFIG_HOME (keys) and XDG_DATA_HOME (worlds)"
     try:
         folder = user_place("config")
     except PlaceError as error:
-        return Finding("home", WARNING, str(error), do)
+        return CheckResult("home", WARNING, str(error), do)
     above = next(path for path in (folder, *folder.parents) if path.is_dir())
     if not is_writable(above):
-        return Finding("home", WARNING, f"{above} cannot be written", do)
-    return Finding("home", OK, str(folder))
+        return CheckResult("home", WARNING, f"{above} cannot be written", do)
+    return CheckResult("home", OK, str(folder))
 
 
-def _cache() -> Finding:
+def _cache() -> CheckResult:
     do = "set NUMBA_CACHE_DIR to a folder of this user that stays"
     try:
         folder = use_own_folder()
         with tempfile.TemporaryFile(dir=folder):
             pass
     except (PlaceError, OSError) as error:
-        return Finding("cache", FAILURE, f"compiled kernels cannot be kept: {error}", do)
+        return CheckResult("cache", FAILURE, f"compiled kernels cannot be kept: {error}", do)
     if folder.is_relative_to(tempfile.gettempdir()):
-        return Finding("cache", WARNING, f"{folder}, which a restart may empty", do)
-    return Finding("cache", OK, str(folder))
+        return CheckResult("cache", WARNING, f"{folder}, which a restart may empty", do)
+    return CheckResult("cache", OK, str(folder))
 
 
-def sockets() -> list[Finding]:
+def sockets() -> list[CheckResult]:
     """Check whether nodes can create their sockets."""
     try:
-        return [Finding("sockets", OK, f"in {user_folder()}")]
+        return [CheckResult("sockets", OK, f"in {user_folder()}")]
     except (AdvnerfError, OSError) as error:
         return [
-            Finding(
+            CheckResult(
                 "sockets",
                 FAILURE,
                 str(error),
@@ -180,7 +182,7 @@ def sockets() -> list[Finding]:
         ]
 
 
-def keys(folder: Path | None = None) -> list[Finding]:
+def keys(folder: Path | None = None) -> list[CheckResult]:
     """Check the keys for a second host."""
     try:
         folder = folder or default_folder()
@@ -190,21 +192,23 @@ def keys(folder: Path | None = None) -> list[Finding]:
             if row.ours:
                 store.secret(row.name)
     except (AdvnerfError, OSError) as error:
-        return [Finding("keys", WARNING, str(error))]
+        return [CheckResult("keys", WARNING, str(error))]
     ours = ", ".join(row.name for row in rows if row.ours)
     drivers = ", ".join(row.name for row in rows if DRIVE in row.rights) or "no key"
     if not ours:
-        return [Finding("keys", ABSENT, f"none in {folder}", "two hosts need them: advnerf keys new NAME")]
-    return [Finding("keys", OK, f"ours: {ours}; {drivers} may drive over the network")]
+        return [
+            CheckResult("keys", ABSENT, f"none in {folder}", "two hosts need them: advnerf keys new NAME")
+        ]
+    return [CheckResult("keys", OK, f"ours: {ours}; {drivers} may drive over the network")]
 
 
-def clock() -> list[Finding]:
+def clock() -> list[CheckResult]:
     """Check whether this computer's clock is synchronised. Ages across hosts are only as accurate as their clocks."""
     seconds, keeper = adjtimex_error_s(), _keeper()
     if seconds is None:
         do = "for two hosts, install chrony on both: sudo apt-get install chrony"
         return [
-            Finding(
+            CheckResult(
                 "clock",
                 WARNING,
                 f"not synchronised according to the kernel; {keeper or 'no time service found'}",
@@ -213,8 +217,10 @@ def clock() -> list[Finding]:
         ]
     text = f"off by at most {seconds * 1e3:.1f} ms{', ' + keeper if keeper else ''}"
     if seconds > CLOCK_ERROR_S:
-        return [Finding("clock", WARNING, text, "wait for chrony; chronyc sources lists its time sources")]
-    return [Finding("clock", OK, text)]
+        return [
+            CheckResult("clock", WARNING, text, "wait for chrony; chronyc sources lists its time sources")
+        ]
+    return [CheckResult("clock", OK, text)]
 
 
 def adjtimex_error_s() -> float | None:
@@ -246,19 +252,21 @@ def _keeper() -> str:
     return "kept by systemd-timesyncd" if Path("/run/systemd/timesync/synchronized").exists() else ""
 
 
-def launches() -> list[Finding]:
+def launches() -> list[CheckResult]:
     """Check for running launches, which hold ports and devices, and report the clock offset of a second host."""
     rows = []
     for launch in active_launches():
         text = f"running: {launch['name']} in {launch['run_dir']} (process {launch['pid']})"
         rows.append(
-            Finding("launches", WARNING, text, "its devices are in use; stop it with Ctrl-C in its terminal")
+            CheckResult(
+                "launches", WARNING, text, "its devices are in use; stop it with Ctrl-C in its terminal"
+            )
         )
         rows += _offset(Path(launch["run_dir"]))
-    return rows or [Finding("launches", OK, "none running")]
+    return rows or [CheckResult("launches", OK, "none running")]
 
 
-def _offset(run_dir: Path) -> Sequence[Finding]:
+def _offset(run_dir: Path) -> Sequence[CheckResult]:
     """Check the clock offset of the other host, if a gateway of this launch measures it."""
     with Bus(run_dir) as bus:
         bus.subscribe("/clock/offset")
@@ -271,14 +279,14 @@ def _offset(run_dir: Path) -> Sequence[Finding]:
     return []
 
 
-def offset_finding(peer: str, offset_s: float, error_s: float) -> Finding:
+def offset_finding(peer: str, offset_s: float, error_s: float) -> CheckResult:
     """Compare the clock offset of another host with the limits of the safety node."""
     text = f"{peer} is {offset_s * 1e3:+.1f} +- {error_s * 1e3:.1f} ms off"
     limit_s = SafetyConfig.model_fields["clock_offset_limit_s"].default
     if abs(offset_s) > limit_s:
         do = "install chrony on both hosts, then run chronyc makestep; until then the car cannot be armed"
-        return Finding("clock offset", FAILURE, text, do)
+        return CheckResult("clock offset", FAILURE, text, do)
     near = abs(offset_s) <= CLOCK_ERROR_S
-    return Finding(
+    return CheckResult(
         "clock offset", OK if near else WARNING, text, "" if near else "install chrony on both hosts"
     )

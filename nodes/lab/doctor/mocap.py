@@ -10,14 +10,14 @@ from collections.abc import Sequence
 from hardware.errors import DeviceBusy, ProtocolError
 from hardware.mocap.vicon import DEFAULT_PORT, ViconConfig, ViconReceiver
 from hardware.mocap.vicon_codec import decode_block
-from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, Finding
+from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, CheckResult
 
 LISTEN_S = 1.5
 _NAME = "VICON"
 _CURE = "in Tracker, enable System > UDP Object Stream to this computer's address; firewall: sudo ufw allow {port}/udp"
 
 
-def free_port(port: int = DEFAULT_PORT, host: str = "") -> list[Finding]:
+def free_port(port: int = DEFAULT_PORT, host: str = "") -> list[CheckResult]:
     """Check that no other program uses the port."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
@@ -26,8 +26,8 @@ def free_port(port: int = DEFAULT_PORT, host: str = "") -> list[Finding]:
             do = f"stop the program that uses it (sudo ss -ulpn 'sport = {port}'), or choose another port here and in Tracker"
             if error.errno == errno.EADDRNOTAVAIL:
                 do = "give an address of this computer, or 0.0.0.0 for all"
-            return [Finding(_NAME, FAILURE, f"UDP {host or '*'}:{port}: {error.strerror}", do)]
-    return [Finding(_NAME, OK, f"UDP {port} is free")]
+            return [CheckResult(_NAME, FAILURE, f"UDP {host or '*'}:{port}: {error.strerror}", do)]
+    return [CheckResult(_NAME, OK, f"UDP {port} is free")]
 
 
 def listen(
@@ -35,7 +35,7 @@ def listen(
     required: bool = False,
     listen_s: float = LISTEN_S,
     needed: Sequence[str] | None = None,
-) -> list[Finding]:
+) -> list[CheckResult]:
     """Listen to the stream for a moment, and check datagrams, senders, subjects and rates.
 
     Args:
@@ -59,13 +59,15 @@ def listen(
     where = f"UDP {config.host or '*'}:{config.port}"
     if not counts.datagrams:
         text = f"no datagram on {where} within {listen_s:g} s"
-        return [Finding(_NAME, FAILURE if required else ABSENT, text, _CURE.format(port=config.port))]
+        return [CheckResult(_NAME, FAILURE if required else ABSENT, text, _CURE.format(port=config.port))]
     rate_hz = counts.datagrams / listen_s
-    rows = [Finding(_NAME, OK, f"{rate_hz:.0f} datagrams a second on {where}")]
+    rows = [CheckResult(_NAME, OK, f"{rate_hz:.0f} datagrams a second on {where}")]
     if counts.refused:
         do = "find the other sender, or set vicon.source to Tracker's address"
         rows = [
-            Finding(_NAME, WARNING, f"{counts.refused} of {counts.datagrams} datagrams are not Tracker's", do)
+            CheckResult(
+                _NAME, WARNING, f"{counts.refused} of {counts.datagrams} datagrams are not Tracker's", do
+            )
         ]
     return rows + [
         _subject(name, number / listen_s, required and name in (needed or config.subjects))
@@ -73,11 +75,11 @@ def listen(
     ]
 
 
-def _subject(name: str, rate_hz: float, required: bool) -> Finding:
+def _subject(name: str, rate_hz: float, required: bool) -> CheckResult:
     if rate_hz:
-        return Finding(_NAME, OK, f"{name}: {rate_hz:.0f} poses a second")
+        return CheckResult(_NAME, OK, f"{name}: {rate_hz:.0f} poses a second")
     do = "check the subject's name, tick mark and markers in Tracker"
-    return Finding(_NAME, FAILURE if required else WARNING, f"{name} is not seen", do)
+    return CheckResult(_NAME, FAILURE if required else WARNING, f"{name} is not seen", do)
 
 
 def _names(config: ViconConfig, listen_s: float) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from hardware.errors import DeviceBusy, DeviceNotFound, HardwareError, LinkTimeo
 from hardware.motor.limits import DriveLimits, VehicleGains
 from hardware.motor.vesc import Vesc
 from hardware.motor.vesc_settings import TimeoutSettings
-from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, Finding
+from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, CheckResult
 
 # The VESC's USB port is ST's virtual COM port.
 VESC_USB = (0x0483, 0x5740)
@@ -33,12 +33,12 @@ def ports() -> list[Any]:
     return [port for port in list_ports.comports() if port.vid is not None]
 
 
-def serial_ports() -> list[Finding]:
+def serial_ports() -> list[CheckResult]:
     """Check USB serial devices: stable names and permissions."""
     found = ports()
     if not found:
         return [
-            Finding(
+            CheckResult(
                 "serial",
                 ABSENT,
                 "no USB serial device",
@@ -49,7 +49,7 @@ def serial_ports() -> list[Finding]:
     if manager := _running("ModemManager"):
         do = 'ENV{ID_MM_DEVICE_IGNORE}="1" in the udev rule (docs/wiring.md), or: sudo apt-get purge modemmanager'
         rows.append(
-            Finding(
+            CheckResult(
                 "serial",
                 WARNING,
                 f"ModemManager is running (process {manager}) and writes to serial devices",
@@ -59,15 +59,15 @@ def serial_ports() -> list[Finding]:
     return rows
 
 
-def _port(port: Any) -> Finding:
+def _port(port: Any) -> CheckResult:
     names = stable_names(Path(port.device))
     text = f"{port.device} ({port.description})" + (f", {', '.join(map(str, names))}" if names else "")
     if not os.access(port.device, os.R_OK | os.W_OK):
-        return Finding("serial", WARNING, f"no permission for {text}", permission_cure(_SERIAL_GROUP))
+        return CheckResult("serial", WARNING, f"no permission for {text}", permission_cure(_SERIAL_GROUP))
     if (port.vid, port.pid) == VESC_USB and FIXED_NAME not in names:
         do = f"install the udev rule of docs/wiring.md, so that {FIXED_NAME} is always the VESC"
-        return Finding("serial", WARNING, text, do)
-    return Finding("serial", OK, text)
+        return CheckResult("serial", WARNING, text, do)
+    return CheckResult("serial", OK, text)
 
 
 def stable_names(device: Path, folders: Iterable[Path] = (BY_ID,), fixed: Path = FIXED_NAME) -> list[Path]:
@@ -108,7 +108,7 @@ def vesc(
     wanted: TimeoutSettings = WANTED,
     battery_v: float = BATTERY_WARNING_V,
     required: bool = False,
-) -> list[Finding]:
+) -> list[CheckResult]:
     """Check a motor controller: firmware, telemetry, faults, battery and its own time-out. No motor command is sent.
 
     Args:
@@ -120,7 +120,7 @@ def vesc(
     port = port or find_vesc()
     if port is None:
         return [
-            Finding(
+            CheckResult(
                 "VESC",
                 FAILURE if required else ABSENT,
                 "none found",
@@ -131,18 +131,18 @@ def vesc(
     try:
         device.open()
     except DeviceBusy as error:
-        return [Finding("VESC", WARNING, str(error), "stop the launch, or close VESC Tool")]
+        return [CheckResult("VESC", WARNING, str(error), "stop the launch, or close VESC Tool")]
     except DeviceNotFound as error:
         denied = os.path.exists(port) and not os.access(port, os.R_OK | os.W_OK)
         do = (
             permission_cure(_SERIAL_GROUP) if denied else "check its USB cable and udev rule (docs/wiring.md)"
         )
-        return [Finding("VESC", FAILURE, str(error), do)]
+        return [CheckResult("VESC", FAILURE, str(error), do)]
     try:
         return _ask(device, wanted, battery_v)
     except LinkTimeout as error:
         return [
-            Finding(
+            CheckResult(
                 "VESC",
                 FAILURE,
                 str(error),
@@ -150,35 +150,41 @@ def vesc(
             )
         ]
     except HardwareError as error:
-        return [Finding("VESC", FAILURE, str(error), "run advnerf motor info, then check cable and firmware")]
+        return [
+            CheckResult("VESC", FAILURE, str(error), "run advnerf motor info, then check cable and firmware")
+        ]
     finally:
         device.abandon()
 
 
-def _ask(device: Vesc, wanted: TimeoutSettings, battery_v: float) -> list[Finding]:
+def _ask(device: Vesc, wanted: TimeoutSettings, battery_v: float) -> list[CheckResult]:
     firmware, values = device.identify(), device.read_values(0.5)
-    rows = [Finding("VESC", OK, f"{firmware} at {device.port}, telemetry {values.generation}")]
+    rows = [CheckResult("VESC", OK, f"{firmware} at {device.port}, telemetry {values.generation}")]
     if values.fault:
-        rows.append(Finding("VESC", WARNING, f"reports a fault: {values.fault_name}", "see docs/faults.md"))
+        rows.append(
+            CheckResult("VESC", WARNING, f"reports a fault: {values.fault_name}", "see docs/faults.md")
+        )
     rows.append(_time_out(device, wanted))
     low = values.v_in < battery_v
     do = "charge or connect the motor battery" if low else ""
-    return [*rows, Finding("battery", WARNING if low else OK, f"{values.v_in:.1f} V at the VESC", do)]
+    return [*rows, CheckResult("battery", WARNING if low else OK, f"{values.v_in:.1f} V at the VESC", do)]
 
 
-def _time_out(device: Vesc, wanted: TimeoutSettings) -> Finding:
+def _time_out(device: Vesc, wanted: TimeoutSettings) -> CheckResult:
     name = "VESC time-out"
     try:
         found = device.read_timeout()
     except (LinkTimeout, ProtocolError) as error:
-        return Finding(name, WARNING, f"this firmware does not report it: {error}", "check it in VESC Tool")
+        return CheckResult(
+            name, WARNING, f"this firmware does not report it: {error}", "check it in VESC Tool"
+        )
     if found.at_least(wanted):
-        return Finding(name, OK, f"{found}; required is at most {wanted}")
+        return CheckResult(name, OK, f"{found}; required is at most {wanted}")
     do = (
         f"advnerf motor set-timeout --port {device.port} --timeout-ms {wanted.timeout_ms} "
         f"--brake-current {wanted.brake_current_a:g}"
     )
-    return Finding(
+    return CheckResult(
         name,
         FAILURE,
         f"{found}; required is at most {wanted}: the car would keep rolling if its computer failed",
@@ -198,17 +204,19 @@ def _running(name: str) -> int | None:
     return None
 
 
-def gamepads(required: bool) -> Sequence[Finding]:
+def gamepads(required: bool) -> Sequence[CheckResult]:
     """Check which gamepads the teleop node can read."""
     found = sorted(Path("/dev/input/by-id").glob("*-event-joystick")) or sorted(
         Path("/dev/input").glob("js*")
     )
     if not found:
         do = "use advnerf teleop with the keyboard, or plug in a gamepad (docs/driving.md)"
-        return [Finding("gamepad", WARNING if required else ABSENT, "none", do)]
+        return [CheckResult("gamepad", WARNING if required else ABSENT, "none", do)]
     denied = [str(path) for path in found if not os.access(path, os.R_OK)]
     if denied:
         return [
-            Finding("gamepad", WARNING, f"no permission for {', '.join(denied)}", permission_cure("input"))
+            CheckResult(
+                "gamepad", WARNING, f"no permission for {', '.join(denied)}", permission_cure("input")
+            )
         ]
-    return [Finding("gamepad", OK, ", ".join(map(str, found)))]
+    return [CheckResult("gamepad", OK, ", ".join(map(str, found)))]

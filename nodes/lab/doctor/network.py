@@ -8,14 +8,14 @@ import socket
 
 from hardware.mocap.library import SYSTEMS
 from nodes.gateway import GatewayConfig
-from nodes.lab.doctor.check import FAILURE, OK, WARNING, Finding
+from nodes.lab.doctor.check import FAILURE, OK, WARNING, CheckResult
 from nodes.linking.keys import DRIVE, KeyFolder, require_keys
 from nodes.runtime.errors import SecurityError
 
 _CONNECT_S = 2.0
 
 
-def gateway(config: GatewayConfig) -> list[Finding]:
+def gateway(config: GatewayConfig) -> list[CheckResult]:
     """Check the keys of this end, and whether the other host answers or the own ports are free."""
     address = config.listen or config.connect or ""
     rows = _keys(config, address)
@@ -24,21 +24,21 @@ def gateway(config: GatewayConfig) -> list[Finding]:
     return rows
 
 
-def _keys(config: GatewayConfig, address: str) -> list[Finding]:
+def _keys(config: GatewayConfig, address: str) -> list[CheckResult]:
     store = None if config.keys is None else KeyFolder(config.keys)
     try:
         if config.listen:
             require_keys(address, store)
         if store is None:
-            return [Finding("keys", OK, f"none, on the loopback address {address}")]
+            return [CheckResult("keys", OK, f"none, on the loopback address {address}")]
         store.secret(config.key)
         if not config.listen:
             store.public(config.peer_key)
-            return [Finding("keys", OK, f"ours is {config.key}, the other host's {config.peer_key}")]
+            return [CheckResult("keys", OK, f"ours is {config.key}, the other host's {config.peer_key}")]
         drivers = ", ".join(store.allowed(DRIVE))
     except (SecurityError, OSError) as error:
         return [
-            Finding(
+            CheckResult(
                 "keys",
                 FAILURE,
                 str(error),
@@ -47,17 +47,17 @@ def _keys(config: GatewayConfig, address: str) -> list[Finding]:
         ]
     if not drivers:
         return [
-            Finding(
+            CheckResult(
                 "keys",
                 FAILURE,
                 "no key may drive over the network",
                 "advnerf keys allow workstation --to drive",
             )
         ]
-    return [Finding("keys", OK, f"ours is {config.key}; {drivers} may drive")]
+    return [CheckResult("keys", OK, f"ours is {config.key}; {drivers} may drive")]
 
 
-def _own_port(address: str, port: int) -> list[Finding]:
+def _own_port(address: str, port: int) -> list[CheckResult]:
     with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -69,32 +69,34 @@ def _own_port(address: str, port: int) -> list[Finding]:
                 if mine
                 else "use an address of this computer (ip addr lists them)"
             )
-            return [Finding("network", FAILURE, f"cannot listen on {address}:{port}: {error.strerror}", do)]
-    return [Finding("network", OK, f"TCP {address}:{port} is free")]
+            return [
+                CheckResult("network", FAILURE, f"cannot listen on {address}:{port}: {error.strerror}", do)
+            ]
+    return [CheckResult("network", OK, f"TCP {address}:{port} is free")]
 
 
-def _other_host(address: str, port: int) -> list[Finding]:
+def _other_host(address: str, port: int) -> list[CheckResult]:
     try:
         socket.create_connection((address, port), timeout=_CONNECT_S).close()
     except OSError as error:
         why = error.strerror or str(error) or "no answer"
         do = "start the launch there; then check ping and its firewall (sudo ufw allow from ... to any port ...)"
-        return [Finding("network", WARNING, f"{address}:{port} does not answer: {why}", do)]
-    return [Finding("network", OK, f"{address}:{port} answers")]
+        return [CheckResult("network", WARNING, f"{address}:{port} does not answer: {why}", do)]
+    return [CheckResult("network", OK, f"{address}:{port} answers")]
 
 
-def viewer(host: str, port: int) -> list[Finding]:
+def viewer(host: str, port: int) -> list[CheckResult]:
     """Check whether the viewer can listen."""
     if importlib.util.find_spec("foxglove") is None:
-        return [Finding("viewer", FAILURE, "foxglove-sdk is missing", "pip install 'advnerf[view]'")]
+        return [CheckResult("viewer", FAILURE, "foxglove-sdk is missing", "pip install 'advnerf[view]'")]
     return [] if port == 0 else _own_port(host, port)
 
 
-def mocap_library(system: str, hostname: str) -> list[Finding]:
+def mocap_library(system: str, hostname: str) -> list[CheckResult]:
     """Check whether the library is installed and its host can be resolved."""
     if importlib.util.find_spec("motioncapture") is None:
         return [
-            Finding(
+            CheckResult(
                 "VICON",
                 FAILURE,
                 "the library motioncapture is missing",
@@ -102,16 +104,16 @@ def mocap_library(system: str, hostname: str) -> list[Finding]:
             )
         ]
     if system not in SYSTEMS:
-        return [Finding("VICON", FAILURE, f"unknown system {system}", f"use one of {', '.join(SYSTEMS)}")]
+        return [CheckResult("VICON", FAILURE, f"unknown system {system}", f"use one of {', '.join(SYSTEMS)}")]
     try:
         socket.getaddrinfo(hostname, None)
     except OSError as error:
         return [
-            Finding(
+            CheckResult(
                 "VICON",
                 FAILURE,
                 f"{hostname}: {error.strerror or error}",
                 "set vicon.hostname to its IP address",
             )
         ]
-    return [Finding("VICON", OK, f"{system} at {hostname}; the node reports the subjects")]
+    return [CheckResult("VICON", OK, f"{system} at {hostname}; the node reports the subjects")]

@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from nodes.lab.doctor.check import OK, WARNING, Finding
+from nodes.lab.doctor.check import OK, WARNING, CheckResult
 from nodes.launching.running import active_launches
 from nodes.runtime.paths import lock_path, socket_path
 from nodes.runtime.priority import FIRST, Share, share_of
@@ -18,7 +18,7 @@ DEADLINE_S = _PROBE_S + 5.0
 _DO = "allow it: add the line '<user> - nice -10' to /etc/security/limits.conf and log in again"
 
 
-def shares() -> list[Finding]:
+def shares() -> list[CheckResult]:
     """Check whether safety and motor run before other processes."""
     program = (
         "import dataclasses, json; from nodes.runtime.priority import *; "
@@ -34,14 +34,14 @@ def shares() -> list[Finding]:
         check=False,
     )
     if done.returncode:
-        return [Finding("priority", WARNING, (done.stderr.strip().splitlines() or ["no answer"])[-1])]
+        return [CheckResult("priority", WARNING, (done.stderr.strip().splitlines() or ["no answer"])[-1])]
     share = Share(*json.loads(done.stdout))
     if share.reaches(FIRST):
-        rows = [Finding("priority", OK, f"safety and motor run before all other nodes: {share}")]
+        rows = [CheckResult("priority", OK, f"safety and motor run before all other nodes: {share}")]
     else:
         text = f"safety and motor get {share}, expected nice {FIRST}: on a busy computer they stop the car too early"
-        rows = [Finding("priority", WARNING, text, _DO)]
-    return rows + [Finding("priority", OK, line) for line in _running()]
+        rows = [CheckResult("priority", WARNING, text, _DO)]
+    return rows + [CheckResult("priority", OK, line) for line in _running()]
 
 
 def _running() -> list[str]:

@@ -16,7 +16,7 @@ _BY_CAMERA = ("camera", "compositor")
 
 
 @dataclass(frozen=True)
-class Pictures:
+class ImageFormat:
     """Format of the camera's images.
 
     Attributes:
@@ -33,7 +33,7 @@ class Pictures:
 
 
 def bytes_per_s(
-    pictures: Pictures,
+    pictures: ImageFormat,
     topics: Iterable[str] | None = None,
     publishers: Iterable[str] | None = None,
     statuses: int = 8,

@@ -16,7 +16,7 @@ from advnerf_core.data.similarity import Similarity, extent
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, Pinhole, make_transform
 from calibration.phone_and_car import Placed, PlacingConfig, place_in_mocap
-from calibration.structure_from_motion import Model, SfmConfig, Source, reconstruct
+from calibration.structure_from_motion import Model, PhotoSource, SfmConfig, reconstruct
 from nodes.lab.importing.driven_bag import CAR_CAMERA, BagConfig, DrivenFrames, take_frames
 from nodes.lab.importing.errors import ImportRecordingError
 from nodes.lab.importing.media import IMAGES, MediaConfig, gather
@@ -189,7 +189,7 @@ def _from_phone_and_car(
         )
     names = tuple(file.relative_to(output).as_posix() for file in frames.files)
     camera = frames.calibration
-    car = Source(CAR_CAMERA, names, ordered=True, pinhole=camera.pinhole, lens=Lens(camera.distortion))
+    car = PhotoSource(CAR_CAMERA, names, ordered=True, pinhole=camera.pinhole, lens=Lens(camera.distortion))
     model = _reconstruct(output, [*sources, car], sfm, report)
     placed = place_in_mocap(model, dict(zip(names, frames.T_world_from_camera, strict=True)), placing)
     facts = {
@@ -225,7 +225,7 @@ def upright(model: Model, extent_m: float) -> Similarity:
     return Similarity(scale, make_transform(R, -scale * R @ middle))
 
 
-def _reconstruct(output: Path, sources: Sequence[Source], sfm: SfmConfig, report: Report) -> Model:
+def _reconstruct(output: Path, sources: Sequence[PhotoSource], sfm: SfmConfig, report: Report) -> Model:
     return reconstruct(
         output,
         sources,

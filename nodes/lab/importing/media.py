@@ -16,7 +16,7 @@ from advnerf_core.data import image_bytes, image_files, video
 from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.keyframes import KeyframeConfig
 from advnerf_core.files import write_atomically
-from calibration.structure_from_motion import Source
+from calibration.structure_from_motion import PhotoSource
 from nodes.lab.importing.errors import ImportRecordingError
 from nodes.runtime.progress import Report
 
@@ -39,7 +39,7 @@ class MediaConfig:
     one_camera: bool = False
 
 
-def gather(media: Sequence[Path], output: Path, config: MediaConfig, report: Report) -> list[Source]:
+def gather(media: Sequence[Path], output: Path, config: MediaConfig, report: Report) -> list[PhotoSource]:
     """Fill ``output/images`` from videos and folders of photographs. Finished parts of an earlier run are kept.
 
     Args:
@@ -74,7 +74,7 @@ def gather(media: Sequence[Path], output: Path, config: MediaConfig, report: Rep
         else:
             kept = _copy_photographs(_thinned(files, config.most), folder, progress)
         images = tuple(path.relative_to(output).as_posix() for path in kept)
-        sources.append(Source("camera" if config.one_camera else name, images, ordered=is_video))
+        sources.append(PhotoSource("camera" if config.one_camera else name, images, ordered=is_video))
     return sources
 
 

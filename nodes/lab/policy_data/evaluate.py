@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from advnerf_core.files import write_atomically
-from nodes.lab.policy_data.frames import Recording
+from nodes.lab.policy_data.frames import RecordedFrames
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError
 
@@ -95,7 +95,7 @@ def overlay(image: NDArray[np.uint8], share: NDArray[np.float32]) -> NDArray[np.
     return np.asarray(grey + share[..., None] * (red - grey), dtype=np.float32).round().astype(np.uint8)
 
 
-def draw(recording: Recording, predicted_rad: NDArray[np.float64], title: str, out: Path) -> None:
+def draw(recording: RecordedFrames, predicted_rad: NDArray[np.float64], title: str, out: Path) -> None:
     """Plot predicted, recorded and labelled steering over time as PNG."""
     import io
 
@@ -125,7 +125,7 @@ def draw(recording: Recording, predicted_rad: NDArray[np.float64], title: str, o
 
 
 def write_saliency(
-    policy: Any, recording: Recording, out: Path, count: int, video: bool, goal: tuple[float, ...] = ()
+    policy: Any, recording: RecordedFrames, out: Path, count: int, video: bool, goal: tuple[float, ...] = ()
 ) -> list[Path]:
     """Write PNG files of ``count`` frames spread over the recording, image above saliency, and with ``video`` an MP4 of all frames."""
     images = recording.frames.images

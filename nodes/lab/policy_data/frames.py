@@ -39,7 +39,7 @@ _GIVE_UP_M = 0.7
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class RecordedFrames:
     """Frames with their stamps.
 
     Attributes:
@@ -87,7 +87,7 @@ def frames_of_bag(
     expert: Expert | None,
     labels: Labels = "expert",
     images_on: str | None = None,
-) -> Recording:
+) -> RecordedFrames:
     """Take the frames of a bag.
 
     Args:
@@ -130,7 +130,7 @@ def frames_of_bag(
 
 def frames_of_log(
     log: Path, view: PolicyView | None, image_column: str, steering_column: str, rad_per_unit: float = 1.0
-) -> tuple[Recording, PolicyView]:
+) -> tuple[RecordedFrames, PolicyView]:
     """Take the frames of a foreign log: a CSV file with a header and one row per image. Image paths are relative to the file.
 
     Args:
@@ -230,7 +230,7 @@ def _usable(
 
 def _recording(
     images: Any, states: Any, steering: Any, recorded: Any, stamps: Any, name: str, counts: Any
-) -> Recording:
+) -> RecordedFrames:
     count = len(images)
     frames = Frames(
         np.stack(images),
@@ -239,7 +239,7 @@ def _recording(
         np.zeros((count, 0), np.float32),
         np.zeros(count, bool),
     )
-    return Recording(frames, np.array(stamps, np.int64), np.array(recorded, np.float64), name, counts)
+    return RecordedFrames(frames, np.array(stamps, np.int64), np.array(recorded, np.float64), name, counts)
 
 
 def _require_size(rgb: Any, view: PolicyView, source: str) -> None:

@@ -17,18 +17,18 @@ from advnerf_core.driving.expert import Expert
 from advnerf_core.files import write_atomically
 from advnerf_core.learning.fit import FitConfig, fit, mean_absolute_error
 from advnerf_core.learning.frames import FrameSet, FrameStore
-from advnerf_core.learning.imitation import ImitationConfig, Progress, SourcePlan, train_policy
+from advnerf_core.learning.imitation import ImitationConfig, ImitationProgress, SourcePlan, train_policy
 from advnerf_core.places import require_utf8
 from advnerf_core.policies.policy_file import copy_policy, save_policy
 from advnerf_core.policies.view import PolicyView
-from nodes.lab.policy_data.frames import Recording
+from nodes.lab.policy_data.frames import RecordedFrames
 from nodes.runtime.progress import Report
 
 POLICY = "policy.safetensors"
 
 
 @dataclass(frozen=True)
-class Part:
+class TrainingRecording:
     """One recording of the training data.
 
     Attributes:
@@ -42,7 +42,7 @@ class Part:
     name: str
     files: tuple[Path, ...]
     options: dict[str, Any]
-    cut: Callable[[], Recording]
+    cut: Callable[[], RecordedFrames]
     unchecked: str = ""
 
     @property
@@ -74,7 +74,7 @@ class Training:
 
 
 def train_from_recordings(
-    parts: Sequence[Part],
+    parts: Sequence[TrainingRecording],
     view: PolicyView,
     expert: Expert,
     config: ImitationConfig,
@@ -104,7 +104,7 @@ def train_from_recordings(
     if surrogate is None:
         sha256, mae = _clone(store, view, expert, config, work, {"recordings": claim["parts"]}, report)
     else:
-        bare: Progress = lambda share, text, learned=None: report(share, text)  # noqa: E731 - typed
+        bare: ImitationProgress = lambda share, text, learned=None: report(share, text)  # noqa: E731 - typed
         trained = train_policy(config, [surrogate], expert, view, work, bare)
         sha256, mae = trained.sha256, trained.validation_mae_rad
     copy_policy(work / POLICY, out / POLICY)
@@ -120,7 +120,7 @@ def train_from_recordings(
     return result
 
 
-def _cut(part: Part, store: FrameStore, work: Path, report: Report) -> dict[str, int]:
+def _cut(part: TrainingRecording, store: FrameStore, work: Path, report: Report) -> dict[str, int]:
     """Extract the frames of a recording to a shard, once. Returns the numbers of skipped images."""
     record = work / f"{_shard(part)}.json"
     if _shard(part) not in store.names() or not record.is_file():
@@ -169,7 +169,7 @@ def _clone(
     return save_policy(work / POLICY, policy, view, details), mae
 
 
-def _shard(part: Part) -> str:
+def _shard(part: TrainingRecording) -> str:
     return f"recording-{part.digest}"
 
 

@@ -27,7 +27,7 @@ class CampaignError(RuntimeFault, ValueError):
 
 
 @dataclass(frozen=True)
-class Run:
+class PlannedDrive:
     """One planned drive.
 
     Attributes:
@@ -101,11 +101,11 @@ class TrialsPlan:
     start_pose: tuple[float, float, float]
     room_sha256: str
     policy_sha256: str
-    runs: tuple[Run, ...]
+    runs: tuple[PlannedDrive, ...]
     host: str | None = None
 
 
-def make_runs(attacks: dict[str, list[Path]], repeats: int, seed: int) -> tuple[Run, ...]:
+def make_runs(attacks: dict[str, list[Path]], repeats: int, seed: int) -> tuple[PlannedDrive, ...]:
     """Make all runs, in order. The attack files of a condition alternate.
 
     Args:
@@ -117,7 +117,7 @@ def make_runs(attacks: dict[str, list[Path]], repeats: int, seed: int) -> tuple[
     runs = []
     for number, (condition, repeat) in enumerate(make_order([NONE, *attacks], repeats, seed), start=1):
         file = str(attacks[condition][repeat % len(attacks[condition])]) if condition != NONE else ""
-        runs.append(Run(number, condition, repeat, file, ids.get(file, "")))
+        runs.append(PlannedDrive(number, condition, repeat, file, ids.get(file, "")))
     return tuple(runs)
 
 

@@ -20,7 +20,7 @@ from nodes.lab.trials.bags import measure_drives
 from nodes.lab.trials.plan import (
     NONE,
     CampaignError,
-    Run,
+    PlannedDrive,
     TrialsPlan,
     finished,
     keep_plan,
@@ -112,7 +112,10 @@ def prepare_series(
 
 
 def drive_series(
-    series: Series, ready_timeout_s: float, begin: Callable[[Run], None], guide: Callable[[str], None]
+    series: Series,
+    ready_timeout_s: float,
+    begin: Callable[[PlannedDrive], None],
+    guide: Callable[[str], None],
 ) -> None:
     """Drive the runs that are not finished.
 
@@ -130,7 +133,7 @@ def drive_series(
 
 
 def drive_run(
-    series: Series, run: Run, ready_timeout_s: float, guide: Callable[[str], None]
+    series: Series, run: PlannedDrive, ready_timeout_s: float, guide: Callable[[str], None]
 ) -> dict[str, Any]:
     """Drive one run and write its result. A run that load or a fault of the stack spoiled is driven again, at most three times."""
     file = series.folder / f"{run.name}.json"
@@ -143,7 +146,7 @@ def drive_run(
 
 
 def _drive_once(
-    series: Series, run: Run, ready_timeout_s: float, guide: Callable[[str], None]
+    series: Series, run: PlannedDrive, ready_timeout_s: float, guide: Callable[[str], None]
 ) -> dict[str, Any]:
     plan, run_dir = series.plan, series.folder / run.name
     trial = TrialPlan(plan.start_pose, plan.ticks * TICK_S + _TAIL_S, series.nodes, by_hand=True)

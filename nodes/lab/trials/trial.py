@@ -20,7 +20,7 @@ from nodes.runtime.clock import NS_PER_S, Now
 from nodes.runtime.errors import NodeFinished, RuntimeFault
 from nodes.runtime.messages import ns_from_stamp, pose_matrix, pose_message
 from nodes.runtime.node import MessageInfo, Node, Out
-from nodes.runtime.requests import Asked
+from nodes.runtime.requests import RequestIdentity
 from nodes.runtime.topics import status_topic
 from nodes.runtime.twin_port import is_twin
 
@@ -93,7 +93,7 @@ class TrialOutcome:
 
 
 @dataclass
-class _Seen:
+class _NewestMessages:
     """The newest observed messages."""
 
     ready: set[str] = field(default_factory=set)
@@ -129,10 +129,10 @@ class TrialNode(Node):
         self.outcome = TrialOutcome()
         self.phase = Phase.GATHERING
         self.subscriptions = ("/vicon/car", "/safety/state", "/motor/sent", *map(status_topic, plan.nodes))
-        self._seen = _Seen()
+        self._seen = _NewestMessages()
         self._phase_began_ns: int | None = None
         self._said_ns = 0
-        self._asked: Asked | None = None
+        self._asked: RequestIdentity | None = None
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Note a message. A pose of the car is handled at once."""
@@ -305,7 +305,7 @@ class TrialNode(Node):
 
     def _arm_message(self, arm: bool, now: Now) -> Out:
         """Make a repeat of the request of this phase."""
-        self._asked = self._asked or Asked.at(now)
+        self._asked = self._asked or RequestIdentity.at(now)
         reason = "trial starts" if arm else "trial is over"
         return Out("/arm", arm_message(self._asked, now, arm, "trial", reason))
 

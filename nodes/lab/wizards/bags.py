@@ -22,7 +22,7 @@ from calibration.charuco import BoardDetector, Detection
 from calibration.degeneracy import DegenerateDataError, mean_rotation
 from calibration.display_colour import mean_colour, screen_region
 from calibration.schema import CalibrationError
-from calibration.vehicle import Drive
+from calibration.vehicle import RecordedDrive
 from nodes.bags.images import image_messages, image_topic
 from nodes.bags.parts import holds_bag
 from nodes.bags.reader import read_info, read_messages
@@ -100,7 +100,7 @@ def read_picture(file: Path) -> Rgb:
         raise CalibrationError(str(error)) from error
 
 
-def read_drive(bag: Path) -> Drive:
+def read_drive(bag: Path) -> RecordedDrive:
     """Read the commands sent to the motor controller, and the poses of the car."""
     rows = []
     for message in _decoded(bag, SENT):
@@ -121,7 +121,9 @@ def read_drive(bag: Path) -> Drive:
     # Telemetry and commands may have the same microsecond, but times must increase.
     kept = np.concatenate([[True], np.diff(when) > 0.0])
     table = np.array([row[1:] for row in rows])[kept]
-    return Drive((poses.stamps_ns - start) / 1e9, planar, when[kept], table[:, 0], table[:, 1], table[:, 2])
+    return RecordedDrive(
+        (poses.stamps_ns - start) / 1e9, planar, when[kept], table[:, 0], table[:, 1], table[:, 2]
+    )
 
 
 @dataclass(frozen=True)

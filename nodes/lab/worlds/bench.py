@@ -19,7 +19,7 @@ DRIVEN_S = 6.0
 
 
 @dataclass(frozen=True)
-class Bench:
+class WorldBench:
     """An open world under test.
 
     Attributes:
@@ -60,7 +60,7 @@ class Bench:
         return float(x + c * ahead_m - s * left_m), float(y + s * ahead_m + c * left_m), float(yaw + turn_rad)
 
 
-Check = Callable[[Bench], str]
+Check = Callable[[WorldBench], str]
 """Looks at one part of the contract: gives what was found, or raises `NotMet`."""
 
 

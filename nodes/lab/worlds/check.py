@@ -14,8 +14,7 @@ from advnerf_core.files import write_atomically
 from advnerf_core.geometry import planar_pose
 from advnerf_core.plugins import unknown
 from hardware.worlds.world import NativePanels, NotOpenError, World, WorldDescription, traits_of
-from nodes.lab.findings import Finding, NotMet, look
-from nodes.lab.worlds.bench import Bench, Check
+from nodes.lab.worlds.bench import Check, WorldBench
 from nodes.lab.worlds.driving import (
     expert_keeps_its_lane,
     is_put_down,
@@ -27,6 +26,7 @@ from nodes.lab.worlds.named import NamedWorld
 from nodes.lab.worlds.panels import panels_are_native
 from nodes.lab.worlds.pictures import form, is_not_late, photographs_match, repeats, takes_no_time
 from nodes.runtime.errors import ConfigError
+from nodes.runtime.findings import ContractFinding, NotMet, look
 
 _DESCRIPTION = "description"
 # Without the first of these nothing else can be looked at.
@@ -51,7 +51,9 @@ _OF_THE_WORLD = (AdvnerfError,)
 _PANELS: tuple[str, Check] = ("panels", panels_are_native)
 
 
-def check_world(named: NamedWorld, pictures: Path | None = None, only: Collection[str] = ()) -> list[Finding]:
+def check_world(
+    named: NamedWorld, pictures: Path | None = None, only: Collection[str] = ()
+) -> list[ContractFinding]:
     """Look at everything that can be told of a world from the outside.
 
     Args:
@@ -71,18 +73,18 @@ def check_world(named: NamedWorld, pictures: Path | None = None, only: Collectio
         if name not in names:
             raise ConfigError(unknown(name, "part of the contract", names))
     closed = _described(named.make())
-    findings: list[Finding] = []
+    findings: list[ContractFinding] = []
     with named.make() as world:
         described = world.describe()
         findings.append(
             look(
                 _DESCRIPTION,
                 lambda bench: _is_consistent(bench, closed),
-                Bench(named, world, described, None),
+                WorldBench(named, world, described, None),
                 _OF_THE_WORLD,
             )
         )
-        bench = Bench(named, world, described, traits_of(world).step_s)
+        bench = WorldBench(named, world, described, traits_of(world).step_s)
         for name, check in _FIRST:
             findings.append(look(name, check, bench, _OF_THE_WORLD))
             if not findings[-1].met:
@@ -104,7 +106,7 @@ def _described(world: World) -> WorldDescription | None:
         return None
 
 
-def _is_consistent(bench: Bench, closed: WorldDescription | None) -> str:
+def _is_consistent(bench: WorldBench, closed: WorldDescription | None) -> str:
     """The description says the same every time and through JSON, and has the camera that the world has; settings are JSON."""
     world, described = bench.world, bench.description
     text = json.dumps(described.to_dict())
@@ -137,7 +139,7 @@ def _has(settings: dict[str, object], key: str) -> bool:
     return True
 
 
-def _write_pictures(bench: Bench, folder: Path) -> None:
+def _write_pictures(bench: WorldBench, folder: Path) -> None:
     """What the driving camera sees where each path begins, its depth (near is bright), and a photograph from there."""
     for name, path in bench.description.paths.items():
         rgb, depth = bench.world.observe_at(*path.start_pose)

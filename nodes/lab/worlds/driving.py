@@ -10,9 +10,9 @@ import numpy as np
 from advnerf_core.geometry import Array, wrap_angle
 from hardware.worlds.paths import ReferencePath
 from hardware.worlds.world import CarDescription
-from nodes.lab.findings import NotMet
-from nodes.lab.worlds.bench import Bench, pose_of
+from nodes.lab.worlds.bench import WorldBench, pose_of
 from nodes.lab.worlds.expert_drive import as_path, drive_expert, lane_expert
+from nodes.runtime.findings import NotMet
 
 _RESET_TOLERANCE = 1e-4
 # A drive that is measured [s]: its second half, when lags have died away.
@@ -22,7 +22,7 @@ _TURN_TOLERANCE, _SPEED_TOLERANCE, _SLIP_RAD = 0.25, 0.2, 0.06
 _STIFFNESS_HALF_LANES, _START_ASIDE = 0.35, 0.3
 
 
-def is_put_down(bench: Bench) -> str:
+def is_put_down(bench: WorldBench) -> str:
     """The car is where ``reset`` puts it, at rest, and has forgotten what was commanded."""
     world, car = bench.world, bench.description.car
     for x, y, yaw in [*bench.places, (*bench.places[0][:2], bench.places[0][2] + 4.0 * math.pi)]:
@@ -49,7 +49,7 @@ def is_put_down(bench: Bench) -> str:
     return f"within {_RESET_TOLERANCE:g} m and rad at {len(bench.places)} places, at rest, nothing of the last command left"
 
 
-def moves_as_described(bench: Bench) -> str:
+def moves_as_described(bench: WorldBench) -> str:
     """The car goes as fast, and turns as fast and to the side, as kind, speed and wheelbase say; a small lag and error are its own."""
     car, told = bench.description.car, []
     for name, path in bench.description.paths.items():
@@ -76,7 +76,7 @@ def moves_as_described(bench: Bench) -> str:
     return f"{_law(car)}: {'; '.join(told)}"
 
 
-def paths_are_drivable(bench: Bench) -> str:
+def paths_are_drivable(bench: WorldBench) -> str:
     """Paths are continuous, no tighter than the car can turn, free of obstacles, and in a lane; those that begin together have different goals."""
     paths, car, told = bench.description.paths, bench.description.car, []
     lanes = np.concatenate(
@@ -125,7 +125,7 @@ def paths_are_drivable(bench: Bench) -> str:
     return "; ".join(told)
 
 
-def expert_keeps_its_lane(bench: Bench) -> str:
+def expert_keeps_its_lane(bench: WorldBench) -> str:
     """The project's expert, told the true state, stays in its lane on every path, from a start beside it."""
     told, car, half_lane_m = [], bench.description.car, bench.description.off_track_m
     for name, path in bench.description.paths.items():
@@ -146,7 +146,7 @@ def expert_keeps_its_lane(bench: Bench) -> str:
     return f"farthest from the path in {bench.tick_s:g} s ticks: {', '.join(told)}; half a lane is {half_lane_m:g} m"
 
 
-def _turned_after_reset(bench: Bench, control: float) -> float:
+def _turned_after_reset(bench: WorldBench, control: float) -> float:
     """Change of heading [rad] over a tick without control, after driving with one and a reset."""
     world, car = bench.world, bench.description.car
     world.reset(*bench.places[0])
@@ -156,7 +156,7 @@ def _turned_after_reset(bench: Bench, control: float) -> float:
     return float(wrap_angle(world.step(0.0, car.speed_mps, bench.tick_s).yaw_rad - start.yaw_rad))
 
 
-def _measured(bench: Bench, path: ReferencePath) -> tuple[float, float, float]:
+def _measured(bench: WorldBench, path: ReferencePath) -> tuple[float, float, float]:
     """Turn rate and speed over what the description says, and the largest angle between heading and motion [rad], in drives along a path."""
     car, ticks = bench.description.car, max(round(_MEASURED_S / bench.tick_s), 4)
     way_m = ticks * bench.tick_s * car.speed_mps

@@ -24,8 +24,8 @@ from advnerf_core.geometry import (
 )
 from hardware.worlds.paths import Pose
 from hardware.worlds.world import Depth
-from nodes.lab.findings import NotMet
-from nodes.lab.worlds.bench import Bench
+from nodes.lab.worlds.bench import WorldBench
+from nodes.runtime.findings import NotMet
 
 # Predicted depth may be off by this share, and colour by so much [grey levels, and of the picture's spread]; points on edges and behind others are.
 _SAME_DEPTH, _LEAST_AGREEMENT, _BETTER_BY = 0.02, 0.75, 0.1
@@ -59,7 +59,7 @@ class Reading:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class CameraView:
     """What the driving camera gives from a pose of the car: depth ``[H, W]``, and colours ``[H, W, 3]`` a little blurred [grey levels]."""
 
     pose: Pose
@@ -67,7 +67,7 @@ class View:
     rgb: NDArray[np.float32]
 
 
-def views_agree(bench: Bench) -> str:
+def views_agree(bench: WorldBench) -> str:
     """Points that depth puts into the world from one pose of the car are there, in the same colour, from another pose."""
     pairs = _pairs_of_views(bench)
     readings = _readings(bench)
@@ -86,7 +86,7 @@ def views_agree(bench: Bench) -> str:
     return f"{100 * shares[0]:.0f} % of the points seen from two poses are in one place, within {100 * _SAME_DEPTH:.0f} % of their distance and of one colour"
 
 
-def ground_is_flat(bench: Bench) -> str:
+def ground_is_flat(bench: WorldBench) -> str:
     """What lies in the lane ahead is at z = 0: the camera is as high as declared, and nothing stands in a lane."""
     middles = np.array(
         [
@@ -127,7 +127,7 @@ def ground_is_flat(bench: Bench) -> str:
     return f"{100 * share:.0f} % of the lane ahead is at z = 0, its median at {float(np.median(z_m)):+.3f} m"
 
 
-def box_holds_what_is_seen(bench: Bench) -> str:
+def box_holds_what_is_seen(bench: WorldBench) -> str:
     """The box holds what the driving camera sees, or at least what is driven if the rest is contracted."""
     box = bench.description.box
     if box.contraction:
@@ -152,7 +152,7 @@ def box_holds_what_is_seen(bench: Bench) -> str:
     return f"{100 * share:.1f} % of {what} are inside"
 
 
-def photographs_cover(bench: Bench) -> str:
+def photographs_cover(bench: WorldBench) -> str:
     """Photographs for learning are upright, above the ground, and see the stretch of each path that is driven."""
     world, count = bench.world, _PHOTOS
     poses = np.asarray(world.photo_poses(count, np.random.default_rng(0)), dtype=np.float64)
@@ -192,7 +192,7 @@ def photographs_cover(bench: Bench) -> str:
     return f"{100 * share:.0f} % of the paths are looked at by {_SEEN_BY} of {count} photographs or more"
 
 
-def _pairs_of_views(bench: Bench) -> list[list[tuple[View, View]]]:
+def _pairs_of_views(bench: WorldBench) -> list[list[tuple[CameraView, CameraView]]]:
     """Views from two poses near each other; one list for each kind of move."""
     car, half_lane_m = bench.description.car, bench.description.off_track_m
     first = [_view(bench, place) for place in bench.places]
@@ -205,12 +205,12 @@ def _pairs_of_views(bench: Bench) -> list[list[tuple[View, View]]]:
     ]
 
 
-def _view(bench: Bench, pose: Pose) -> View:
+def _view(bench: WorldBench, pose: Pose) -> CameraView:
     rgb, depth = bench.world.observe_at(*pose)
-    return View(pose, depth, np.asarray(cv2.blur(rgb, (3, 3)), dtype=np.float32))
+    return CameraView(pose, depth, np.asarray(cv2.blur(rgb, (3, 3)), dtype=np.float32))
 
 
-def _readings(bench: Bench) -> list[Reading]:
+def _readings(bench: WorldBench) -> list[Reading]:
     """The contract's reading first, then what is commonly wrong."""
     T = np.asarray(bench.world.T_car_from_camera, dtype=np.float64)
     level = camera_mount(*map(float, T[:3, 3]))
@@ -255,7 +255,7 @@ def _readings(bench: Bench) -> list[Reading]:
     ]
 
 
-def _agreement(reading: Reading, pairs: list[list[tuple[View, View]]], pinhole: Pinhole) -> float:
+def _agreement(reading: Reading, pairs: list[list[tuple[CameraView, CameraView]]], pinhole: Pinhole) -> float:
     """Share of points that are in one place from both poses, for the kind of move where it is lowest."""
     shares = []
     for kind in pairs:
@@ -265,7 +265,7 @@ def _agreement(reading: Reading, pairs: list[list[tuple[View, View]]], pinhole: 
     return float(min(shares))
 
 
-def _in_one_place(reading: Reading, one: View, other: View, pinhole: Pinhole) -> tuple[int, int]:
+def _in_one_place(reading: Reading, one: CameraView, other: CameraView, pinhole: Pinhole) -> tuple[int, int]:
     """How many points of a view's lower part are where the other view has them, in depth and colour, and how many are in the other view at all."""
     directions = pinhole.directions()
     below = (
@@ -308,7 +308,7 @@ def _sampled(image: NDArray[np.float32], xy: NDArray[np.float32]) -> Array:
     return np.concatenate(values).astype(np.float64)
 
 
-def _points(bench: Bench, place: Pose) -> tuple[Array, Array]:
+def _points(bench: WorldBench, place: Pose) -> tuple[Array, Array]:
     """What the driving camera sees from a pose of the car, in the world ``[N, 3]`` [m], and its depth ``[N]`` [m]."""
     depth = np.asarray(bench.world.observe_at(*place)[1], dtype=np.float64)
     kept = slice(None, None, _EVERY_PX), slice(None, None, _EVERY_PX)

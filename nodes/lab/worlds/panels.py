@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from advnerf_core.geometry import Array, invert_transform, make_transform, planar_pose, rotation_z
 from hardware.worlds.paths import Pose
 from hardware.worlds.world import NativePanels, Panel, Rgb
-from nodes.lab.findings import NotMet
-from nodes.lab.worlds.bench import Bench
+from nodes.lab.worlds.bench import WorldBench
+from nodes.runtime.findings import NotMet
 
 # The panel stands so far ahead of the car, and is so wide and high, in half lanes.
 _AHEAD, _WIDE, _HIGH = 4.0, 1.6, 1.0
@@ -29,7 +29,7 @@ _WRONG_WAYS = {
 }
 
 
-def panels_are_native(bench: Bench) -> str:
+def panels_are_native(bench: WorldBench) -> str:
     """A panel appears where it should, in its true size, the right way up and not mirrored, in depth too; the ground hides it; it can be taken out."""
     world = bench.world
     assert isinstance(world, NativePanels), "only asked where the world takes panels"
@@ -57,7 +57,7 @@ def panels_are_native(bench: Bench) -> str:
     )
 
 
-def _drives_on(bench: Bench, place: Pose) -> None:
+def _drives_on(bench: WorldBench, place: Pose) -> None:
     """A car is put down and drives while a panel is in the scene, also after a picture of it."""
     world, car = bench.world, bench.description.car
     world.reset(*place)
@@ -68,7 +68,7 @@ def _drives_on(bench: Bench, place: Pose) -> None:
         )
 
 
-def _panel(bench: Bench, place: Pose, height_m: float) -> Panel:
+def _panel(bench: WorldBench, place: Pose, height_m: float) -> Panel:
     """A panel ahead of the car that faces it, its middle at a height."""
     half_lane_m = bench.description.off_track_m
     x, y, yaw = bench.beside(place, _AHEAD * half_lane_m, 0.0, 0.0)
@@ -83,7 +83,7 @@ def _texture() -> Rgb:
     )
 
 
-def _stands_there(bench: Bench, panel: Panel, view: Pose, before: Rgb) -> float:
+def _stands_there(bench: WorldBench, panel: Panel, view: Pose, before: Rgb) -> float:
     """Outline, colours and depth of the panel in one view; the share of the outline that is where it should be."""
     rgb, depth_m = bench.world.observe_at(*view)
     on_it, u, v, z_m = _seen(bench, panel, view)
@@ -108,7 +108,7 @@ def _stands_there(bench: Bench, panel: Panel, view: Pose, before: Rgb) -> float:
     return overlap
 
 
-def _is_hidden_by_the_ground(bench: Bench, panel: Panel, view: Pose, before: Rgb) -> float:
+def _is_hidden_by_the_ground(bench: WorldBench, panel: Panel, view: Pose, before: Rgb) -> float:
     """Of a panel whose middle is on the ground the upper half is seen."""
     rgb, _ = bench.world.observe_at(*view)
     on_it, _, v, _ = _seen(bench, panel, view)
@@ -121,7 +121,7 @@ def _is_hidden_by_the_ground(bench: Bench, panel: Panel, view: Pose, before: Rgb
     return upper
 
 
-def _seen(bench: Bench, panel: Panel, view: Pose) -> tuple[NDArray[np.bool_], Array, Array, Array]:
+def _seen(bench: WorldBench, panel: Panel, view: Pose) -> tuple[NDArray[np.bool_], Array, Array, Array]:
     """Which pixels ``[H, W]`` look at a panel that nothing hides; where on it, as shares of its size, right and up; and at which depth [m]."""
     lens = bench.world.camera_pinhole
     T = invert_transform(panel.T_world_from_face) @ planar_pose(*view) @ bench.world.T_car_from_camera

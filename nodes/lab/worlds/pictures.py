@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from advnerf_core.geometry import Array, Pinhole, planar_pose
 from hardware.worlds.world import Rgb, traits_of
-from nodes.lab.findings import NotMet
-from nodes.lab.worlds.bench import Bench, pose_of
+from nodes.lab.worlds.bench import WorldBench, pose_of
+from nodes.runtime.findings import NotMet
 
 # A picture of one colour is no picture [grey levels].
 _LEAST_SPREAD = 1.0
@@ -25,7 +25,7 @@ _LATE_SHARE = 0.25
 _AHEAD_S = 0.3
 
 
-def form(bench: Bench) -> str:
+def form(bench: WorldBench) -> str:
     """Sizes, types and ranges of colours, depth and photographs, and that each call gives an array of its own."""
     world, camera, photo = bench.world, bench.world.camera_pinhole, bench.world.photo_pinhole
     finite = []
@@ -64,7 +64,7 @@ def form(bench: Bench) -> str:
     return f"views {camera.width} x {camera.height}, photographs {photo.width} x {photo.height}, depth finite in {100 * min(finite):.0f} % of each view or more"
 
 
-def repeats(bench: Bench) -> str:
+def repeats(bench: WorldBench) -> str:
     """The same calls give the same bytes, whatever was asked in between."""
     first = _script(bench)
     bench.world.reset(*bench.places[-1])
@@ -83,7 +83,7 @@ def repeats(bench: Bench) -> str:
     return f"{len(first)} results of the same calls are equal to the byte"
 
 
-def takes_no_time(bench: Bench) -> str:
+def takes_no_time(bench: WorldBench) -> str:
     """The car and what it sees stay as they are while the world is looked at, photographed and described."""
     world, car = bench.world, bench.description.car
     world.reset(*bench.places[0])
@@ -109,7 +109,7 @@ def takes_no_time(bench: Bench) -> str:
     return f"the car stands through {', '.join(looks)}"
 
 
-def is_not_late(bench: Bench) -> str:
+def is_not_late(bench: WorldBench) -> str:
     """What the car sees after a step is what is to be seen from where it is then, not from where it was."""
     world, car = bench.world, bench.description.car
     worst, compared = 0.0, 0
@@ -142,7 +142,7 @@ def is_not_late(bench: Bench) -> str:
     return f"observe after a step differs from observe_at by at most {100 * worst:.1f} % of what {_AHEAD_S} s of driving change"
 
 
-def photographs_match(bench: Bench) -> str:
+def photographs_match(bench: WorldBench) -> str:
     """A photograph from the driving camera's place shows what the driving camera sees: the pose is taken as it is meant, and colours are in one order."""
     world, correlations, plain, swapped, colour = bench.world, [], [], [], []
     for place in bench.places:
@@ -182,7 +182,7 @@ def photographs_match(bench: Bench) -> str:
     return f"correlation {np.median(correlations):.3f}, difference {np.mean(plain):.1f} grey levels; {told}"
 
 
-def _script(bench: Bench) -> list[tuple[str, NDArray[Any]]]:
+def _script(bench: WorldBench) -> list[tuple[str, NDArray[Any]]]:
     """Results of a fixed sequence of calls."""
     world, car = bench.world, bench.description.car
     found: list[tuple[str, NDArray[Any]]] = [("state", pose_of(world.reset(*bench.places[0])))]
@@ -218,7 +218,7 @@ def _difference(one: Rgb, other: Rgb) -> float:
     return float(np.abs(one.astype(np.int16) - other.astype(np.int16)).mean())
 
 
-def _seen_by_both(view: Rgb, photo: Rgb, bench: Bench) -> tuple[tuple[Rgb, Rgb], NDArray[np.bool_]]:
+def _seen_by_both(view: Rgb, photo: Rgb, bench: WorldBench) -> tuple[tuple[Rgb, Rgb], NDArray[np.bool_]]:
     """The driving camera's picture and the photograph as that camera would have it, both a little blurred; and where there is a photograph.
 
     Both look from one point, so that a pixel's direction alone says where it is in the other picture.

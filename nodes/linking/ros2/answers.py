@@ -29,7 +29,7 @@ def stamp_of_cdr(cdr: bytes) -> int:
     return int(sec) * NS_PER_S + int(nanosec)
 
 
-class Answers:
+class AnsweredStamps:
     """Compares the stamps of commands with those of the messages that were sent.
 
     Args:

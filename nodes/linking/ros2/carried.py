@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from nodes.linking.ros2.answers import Answers, OneWriter, stamp_of_cdr
+from nodes.linking.ros2.answers import AnsweredStamps, OneWriter, stamp_of_cdr
 from nodes.linking.ros2.conversions import COMPRESSED, IMAGE, Setting, conversion
 from nodes.linking.ros2.routes import SHARED, SendRoute, TakeRoute
 from nodes.linking.ros2.samples import Heard
@@ -23,7 +23,7 @@ class Taken:
         self.route, self._setting = route, setting
         self.writer = OneWriter(route.topic in SHARED)
         self.rivals: tuple[str, ...] = ()
-        self.answers = Answers(route.max_age_s) if route.answers else None
+        self.answers = AnsweredStamps(route.max_age_s) if route.answers else None
         self.sequence = 0
         self.passed_ns: int | None = None
         self.mismatch = ""
@@ -61,7 +61,7 @@ class Taken:
         return converted
 
 
-class Sent:
+class SentTopic:
     """State of one sent topic."""
 
     def __init__(self, route: SendRoute, setting: Setting) -> None:

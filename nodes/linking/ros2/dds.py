@@ -98,9 +98,9 @@ class Participant:
             if local:  # before there is a reader that a packet from elsewhere could reach
                 _bind_to_device(_udp_sockets() - before, interface)
             self._writers = [_writer(self._participant, each) for each in sends]
-            self._readers = [_Reader(number, self._participant, each) for number, each in enumerate(takes)]
+            self._readers = [_DdsReader(number, self._participant, each) for number, each in enumerate(takes)]
             self._rivals = {
-                number: _Reader(number, self._participant, _any_qos(sends[number])) for number in watched
+                number: _DdsReader(number, self._participant, _any_qos(sends[number])) for number in watched
             }
         except DDSException as error:
             raise BusError(
@@ -158,7 +158,7 @@ class Participant:
         return heard or None
 
 
-class _Reader:
+class _DdsReader:
     """One DDS reader and the identities of its publishers."""
 
     def __init__(self, number: int, participant: Any, endpoint: Endpoint) -> None:

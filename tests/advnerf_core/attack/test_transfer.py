@@ -10,7 +10,7 @@ from advnerf_core.driving.dynamics import Dubins
 from advnerf_core.driving.metrics import Horizon, drive_metrics
 from advnerf_core.driving.path import Line, Path
 from advnerf_core.driving.rollout import drive
-from advnerf_core.scene.fidelity import Agreement, Effect
+from advnerf_core.scene.fidelity import Effect, SceneAgreement
 
 PATH = Path.from_segments((0.0, 0.0, 0.0), [Line(50.0)], closed=False)
 HORIZON = Horizon(20, 0.1, 0.4)
@@ -43,7 +43,7 @@ def problem():
 
 def views(difference, effect_learned, effect_real):
     ones = np.ones(len(difference))
-    return Agreement(30 * ones, ones, 0 * ones, np.asarray(difference)), Effect(
+    return SceneAgreement(30 * ones, ones, 0 * ones, np.asarray(difference)), Effect(
         np.asarray(effect_learned), np.asarray(effect_real)
     )
 

@@ -9,7 +9,7 @@ import torch
 from advnerf_core.geometry import Pinhole
 from advnerf_core.learning.augment import AugmentConfig
 from advnerf_core.learning.frames import Frames, FrameStoreError
-from advnerf_core.learning.retrain import MixedFrames, RetrainConfig, fine_tune
+from advnerf_core.learning.retrain import FineTuneConfig, MixedFrames, fine_tune
 from advnerf_core.policies.architecture import PilotNetConfiguration
 from advnerf_core.policies.network import images_to_tensor
 from advnerf_core.policies.pilotnet import PilotNet
@@ -63,7 +63,7 @@ def test_new_frames_take_their_share_by_repetition_and_none_is_dropped():
 
 def test_it_learns_the_new_and_keeps_the_old(policy, tmp_path):
     old, new = frames(96, False, 0.1), frames(32, True, -0.1)
-    config = RetrainConfig(steps=40, batch_size=16, learning_rate=2e-3, holdout_every=2, augment=QUIET)
+    config = FineTuneConfig(steps=40, batch_size=16, learning_rate=2e-3, holdout_every=2, augment=QUIET)
     done = fine_tune(policy, [old], [new], config, tmp_path / "new.safetensors")
     assert done.new_mae_rad[1] < 0.4 * done.new_mae_rad[0]
     assert done.old_mae_rad[1] < 0.04
@@ -79,7 +79,7 @@ def test_it_learns_the_new_and_keeps_the_old(policy, tmp_path):
 
 def test_a_stopped_one_ends_in_the_same_weights(policy, tmp_path):
     old, new = [frames(32, False, 0.1)], [frames(16, True, -0.1)]
-    config = RetrainConfig(steps=12, batch_size=8, holdout_every=0, augment=QUIET)
+    config = FineTuneConfig(steps=12, batch_size=8, holdout_every=0, augment=QUIET)
 
     class Stop(Exception):
         pass
@@ -99,8 +99,8 @@ def test_what_does_not_fit_is_refused(policy, tmp_path):
     one = [frames(16, False, 0.0)]
     with_goals = [frames(16, False, 0.0, goals=3)]
     with pytest.raises(FrameStoreError, match="goals of size 0 for this policy, got 3"):
-        fine_tune(policy, with_goals, with_goals, RetrainConfig(steps=1), tmp_path / "x.safetensors")
+        fine_tune(policy, with_goals, with_goals, FineTuneConfig(steps=1), tmp_path / "x.safetensors")
     with pytest.raises(FrameStoreError, match="old and new frames, got 1 old and 0 new"):
         MixedFrames(one, [], 0.5, 0)
     with pytest.raises(ValueError, match="between 0 and 1"):
-        RetrainConfig(new_share=1.0)
+        FineTuneConfig(new_share=1.0)

@@ -12,7 +12,7 @@ from advnerf_core.geometry import Pinhole
 from advnerf_core.learning.augment import AugmentConfig
 from advnerf_core.learning.fit import FitConfig, fit, mean_absolute_error
 from advnerf_core.learning.frames import Frames, FrameSet
-from advnerf_core.learning.retrain import RetrainConfig, fine_tune
+from advnerf_core.learning.retrain import FineTuneConfig, fine_tune
 from advnerf_core.plugins import PluginError
 from advnerf_core.policies.adapter import AdaptedPolicy
 from advnerf_core.policies.architecture import ARCHITECTURES, Architecture, ArchitectureError
@@ -28,7 +28,7 @@ from advnerf_core.policies.policy_file import (
     save_policy,
 )
 from advnerf_core.policies.view import PolicyView
-from advnerf_core.policies.vit import _Block
+from advnerf_core.policies.vit import _TransformerBlock
 
 VIEW = PolicyView(Pinhole(336, 188, 174.0, 174.0, 168.0, 94.0))
 EXAMPLE = Path(__file__).parents[3] / "examples" / "my_architecture.py"
@@ -146,7 +146,7 @@ def test_retraining_goes_on_from_its_weights(name: str, tmp_path) -> None:
     save_policy(tmp_path / "old.safetensors", built(name), VIEW, {})
     old, config = (
         load_policy(tmp_path / "old.safetensors"),
-        RetrainConfig(steps=1, batch_size=4, learning_rate=1e-9),
+        FineTuneConfig(steps=1, batch_size=4, learning_rate=1e-9),
     )
     done = fine_tune(old, [frames(20)], [frames(20, seed=1)], config, tmp_path / "r" / "new.safetensors")
     new, images = load_policy(done.path), torch.rand(2, 3, 66, 200)
@@ -157,7 +157,7 @@ def test_retraining_goes_on_from_its_weights(name: str, tmp_path) -> None:
 
 def test_a_transformer_block_is_that_of_torch() -> None:
     torch.manual_seed(0)
-    block, tokens = _Block(16, 4), torch.randn(2, 7, 16)
+    block, tokens = _TransformerBlock(16, 4), torch.randn(2, 7, 16)
     other = nn.TransformerEncoderLayer(16, 4, 32, 0.0, "gelu", batch_first=True, norm_first=True)
     norm, first, _, second = block.perceptron
     pairs = [

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from advnerf_core.scene.fidelity import Agreement, Effect, Pictures, agreement, judge
+from advnerf_core.scene.fidelity import Effect, PicturePairs, SceneAgreement, agreement, judge
 from advnerf_core.scene.gate_limits import GateLimits
 
 RNG = np.random.default_rng(0)
@@ -41,7 +41,7 @@ def test_each_limit_alone_refuses_and_says_why():
 
 def test_constant_steering_correlates_only_with_itself():
     flat, ones = np.zeros(12), np.ones(12)
-    make = lambda a, b: Agreement(ones, ones, a, b)  # noqa: E731
+    make = lambda a, b: SceneAgreement(ones, ones, a, b)  # noqa: E731
     assert make(flat, flat).correlation == 1.0
     assert make(flat, STEERING).correlation == 0.0
 
@@ -64,6 +64,6 @@ def test_bad_input_is_refused():
     with pytest.raises(ValueError, match="one effect per view"):
         Effect(np.zeros(2), np.zeros(3))
     with pytest.raises(ValueError, match=r"\[N, H, W, 3\]"):
-        Pictures("x", REAL, REAL[:3])
+        PicturePairs("x", REAL, REAL[:3])
     with pytest.raises(ValidationError):
         GateLimits(psnr=30)

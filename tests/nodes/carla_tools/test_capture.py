@@ -8,7 +8,7 @@ import pytest
 from advnerf_core.data.dataset import load_transforms
 from advnerf_core.geometry import transform_points
 from hardware.worlds.carla import CarlaConfig, CarlaUnreachable
-from hardware.worlds.carla.drives import Drives
+from hardware.worlds.carla.drives import JunctionDrives
 from hardware.worlds.carla.errors import CarlaMapError
 from hardware.worlds.carla.junction import find_drives
 from hardware.worlds.carla.photos import photo_poses
@@ -30,7 +30,7 @@ def run(library, settings, folder, request=REQUEST, **changes):
 
 def test_images_and_poses_belong_together(library, settings, tmp_path):
     assert run(library, settings, tmp_path / "set") == (15, 0)
-    drives = Drives.from_dict(json.loads((tmp_path / "set" / "drives.json").read_text()))
+    drives = JunctionDrives.from_dict(json.loads((tmp_path / "set" / "drives.json").read_text()))
     for name, count, size in (("photos", 12, (64, 36)), ("held_out", 3, (84, 46))):
         views = load_transforms(tmp_path / "set" / name, require_all=True).load()
         assert len(views.rgb) == count
@@ -100,9 +100,9 @@ def test_another_capture_is_not_mixed_in(library, settings, tmp_path):
 def test_drives_come_back_from_plain_data(library, settings, tmp_path):
     run(library, settings, tmp_path / "set", CaptureRequest(photos=1, held_out=0))
     data = json.loads((tmp_path / "set" / "drives.json").read_text())
-    drives = Drives.from_dict(data)
+    drives = JunctionDrives.from_dict(data)
     assert json.loads(json.dumps(drives.to_dict())) == data
     assert drives.paths["left"].goal == (0.0, 0.0, 1.0)
     for wrong in ({}, {**data, "paths": {"up": data["paths"]["left"]}}, {**data, "frame": {}}, []):
         with pytest.raises(CarlaMapError, match="expected drives as written"):
-            Drives.from_dict(wrong)
+            JunctionDrives.from_dict(wrong)

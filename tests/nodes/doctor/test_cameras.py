@@ -13,7 +13,7 @@ from hardware.cameras.v4l2.negotiation import Mode
 from hardware.emulators.v4l2_device import VideoDevice
 from hardware.emulators.v4l2_emulator import VideoPortEmulator
 from nodes.lab.doctor import cameras, graphics
-from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, Check, examine
+from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, DoctorCheck, examine
 
 pytestmark = pytest.mark.live
 
@@ -40,7 +40,7 @@ def test_a_driver_that_hangs_in_the_kernel_costs_the_deadline():
             never.wait()
 
     port = Hung({"/dev/a": VideoDevice()})
-    (row,) = examine([Check("camera", lambda: cameras.video_devices(port), 0.2, "unplug it")])
+    (row,) = examine([DoctorCheck("camera", lambda: cameras.video_devices(port), 0.2, "unplug it")])
     never.set()
     assert (row.state, row.found, row.do) == (FAILURE, "no answer within 0.2 s", "unplug it")
 

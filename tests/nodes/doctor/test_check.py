@@ -11,9 +11,9 @@ from nodes.lab.doctor.check import (
     FAILURE,
     OK,
     WARNING,
-    Answer,
-    Check,
-    Finding,
+    CheckResult,
+    DoctorCheck,
+    ProbeResult,
     examine,
     in_child,
     worst,
@@ -26,7 +26,7 @@ def test_a_hung_check_costs_its_deadline_and_the_others_are_told_in_order():
     never = threading.Event()
 
     def fine(name):
-        return lambda: [Finding(name, OK, "there")]
+        return lambda: [CheckResult(name, OK, "there")]
 
     def lost():
         raise LinkLost("lost the camera")
@@ -37,11 +37,11 @@ def test_a_hung_check_costs_its_deadline_and_the_others_are_told_in_order():
     found = list(
         examine(
             [
-                Check("a", fine("a")),
-                Check("b", never.wait, 0.2, "unplug it"),
-                Check("c", lost),
-                Check("d", defect),
-                Check("e", fine("e")),
+                DoctorCheck("a", fine("a")),
+                DoctorCheck("b", never.wait, 0.2, "unplug it"),
+                DoctorCheck("c", lost),
+                DoctorCheck("d", defect),
+                DoctorCheck("e", fine("e")),
             ]
         )
     )
@@ -58,7 +58,7 @@ def test_a_hung_check_costs_its_deadline_and_the_others_are_told_in_order():
     assert "IndexError" in found[3].found
     assert worst(found) == FAILURE
     assert worst([]) == OK
-    assert worst([Finding("x", ABSENT, ""), Finding("y", WARNING, "")]) == WARNING
+    assert worst([CheckResult("x", ABSENT, ""), CheckResult("y", WARNING, "")]) == WARNING
 
 
 @pytest.fixture
@@ -97,7 +97,7 @@ def test_what_is_not_installed_is_absent_unless_it_is_needed(library):
 
 
 def test_a_library_that_is_only_slow_is_not_to_be_installed(monkeypatch):
-    late = Answer(None, "no answer within 60 s", late=True)
+    late = ProbeResult(None, "no answer within 60 s", late=True)
     monkeypatch.setattr(graphics, "in_child", lambda probe: late)
     rows = [*graphics.torch(True), *graphics.egl(True), *graphics.llvm(), *graphics.screens()]
     for row in rows:
@@ -117,7 +117,7 @@ __version__ = "2.9.0"
 
 def test_gpus_are_named_and_a_build_that_sees_none_is_a_warning(library):
     library("torch", CUDA.format(gpus=1))
-    assert graphics.torch() == [Finding("torch", OK, "2.9.0, CUDA 12.8: H200")]
+    assert graphics.torch() == [CheckResult("torch", OK, "2.9.0, CUDA 12.8: H200")]
     library("torch", CUDA.format(gpus=0))
     (found,) = graphics.torch()
     assert (found.state, "nvidia-smi" in found.do) == (WARNING, True)

@@ -22,7 +22,7 @@ from hardware.motor.vesc_settings import TimeoutSettings
 from hardware.worlds.lab.config import CarConfig
 from hardware.worlds.lab.vehicle import TwinVehicle
 from nodes.lab.doctor import mocap, motor
-from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, Check, examine
+from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, DoctorCheck, examine
 
 TWIN = Path(__file__).parents[3] / "calibration" / "twin"
 GOOD = {"timeout_ms": 250.0, "timeout_brake_current_a": 20.0}
@@ -212,4 +212,4 @@ def test_what_a_lost_line_says_is_the_finding():
     def lost():
         raise LinkLost("lost the VESC")
 
-    assert [row.found for row in examine([Check("VESC", lost)])] == ["lost the VESC"]
+    assert [row.found for row in examine([DoctorCheck("VESC", lost)])] == ["lost the VESC"]

@@ -5,8 +5,8 @@ from collections import namedtuple
 import pytest
 
 from nodes.lab.doctor import machine, motor
-from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, Finding
-from nodes.lab.doctor.recording import Pictures, bytes_per_s
+from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, CheckResult
+from nodes.lab.doctor.recording import ImageFormat, bytes_per_s
 from nodes.linking.keys import DRIVE, KeyFolder
 from nodes.runtime.bus import Bus
 from nodes.runtime.messages import header, types
@@ -20,7 +20,9 @@ def test_keys_are_shown_and_one_that_others_may_read_is_a_finding_with_its_cure(
     keys = KeyFolder(tmp_path)
     keys.new("robot")
     keys.allow("robot", DRIVE)
-    assert machine.keys(tmp_path) == [Finding("keys", OK, "ours: robot; robot may drive over the network")]
+    assert machine.keys(tmp_path) == [
+        CheckResult("keys", OK, "ours: robot; robot may drive over the network")
+    ]
     (tmp_path / "secret" / "robot.key").chmod(0o640)
     (found,) = machine.keys(tmp_path)
     assert found.state == WARNING
@@ -46,7 +48,7 @@ def test_chrony_says_whom_it_follows_and_one_that_hangs_costs_its_deadline_only(
     row = "C0A80A01,192.168.10.1,3,1700000000.1,0.000250000,0.0001,0.0002,1.2,0.001,0.02,0.001,0.002,64.0,Normal"
     chronyc(tmp_path, monkeypatch, f"echo {row}")
     assert machine.clock() == [
-        Finding("clock", OK, "off by at most 1.0 ms, chrony follows 192.168.10.1, offset +0.25 ms")
+        CheckResult("clock", OK, "off by at most 1.0 ms, chrony follows 192.168.10.1, offset +0.25 ms")
     ]
     chronyc(tmp_path, monkeypatch, "echo '506 Cannot talk to daemon' >&2; exit 1")
     assert "chronyd is not running" in machine.clock()[0].found
@@ -93,16 +95,16 @@ def test_disk_is_told_in_minutes_of_recording(tmp_path, monkeypatch):
 def test_a_recording_is_two_picture_streams_and_little_else():
     roles = ("camera", "vicon", "compositor", "policy", "safety", "motor")
     pictures = 2 * 336 * 188 * 3 * 10.0
-    assert pictures < bytes_per_s(Pictures(), publishers=roles) < 1.15 * pictures
-    assert bytes_per_s(Pictures(rate_hz=20.0), publishers=roles) > 1.8 * pictures
-    assert bytes_per_s(Pictures(), ["/vicon/car"], statuses=0) == 100.0 * 400
-    small = bytes_per_s(Pictures(compressed=True), ["/camera/image_raw/compressed"], statuses=0)
+    assert pictures < bytes_per_s(ImageFormat(), publishers=roles) < 1.15 * pictures
+    assert bytes_per_s(ImageFormat(rate_hz=20.0), publishers=roles) > 1.8 * pictures
+    assert bytes_per_s(ImageFormat(), ["/vicon/car"], statuses=0) == 100.0 * 400
+    small = bytes_per_s(ImageFormat(compressed=True), ["/camera/image_raw/compressed"], statuses=0)
     assert 0.1 < small / (pictures / 2) < 0.25
 
 
 def test_requirements_are_compared_with_what_is_installed():
     unused = ['nobody-has-this>=1; extra == "gadget"', 'nor-this[a1]>=1; extra == "gadget-cu12"']
-    assert machine.packages(["numpy>=1.26,<3", *unused]) == [Finding("extras", OK, "complete: none")]
+    assert machine.packages(["numpy>=1.26,<3", *unused]) == [CheckResult("extras", OK, "complete: none")]
     rows = machine.packages(
         ["numpy>=99", "nobody-has-this", 'numpy<1; extra == "old"', 'pydantic>=2; extra == "good"']
     )

@@ -6,13 +6,13 @@ import socket
 import pytest
 
 from nodes.operator_page.certificate import certificate
-from nodes.operator_page.doors import Doors, host_is_ours, origin_is_ours, peer_is_same_user
+from nodes.operator_page.doors import Sessions, host_is_ours, origin_is_ours, peer_is_same_user
 
 S = 1_000_000_000
 
 
 def test_a_code_opens_once():
-    doors = Doors(code_s=300.0)
+    doors = Sessions(code_s=300.0)
     assert doors.renew(0)
     code = doors.code
     assert not doors.renew(299 * S)
@@ -26,7 +26,7 @@ def test_a_code_opens_once():
 
 
 def test_an_expired_code_opens_nothing():
-    doors = Doors(code_s=300.0)
+    doors = Sessions(code_s=300.0)
     doors.renew(0)
     assert doors.enter(doors.code, "10.0.0.7", 301 * S) == ""
     assert doors.refused == 1
@@ -41,7 +41,7 @@ def guess(doors, address, ns, code="AAAAAAAA"):
 
 
 def test_wrong_codes_of_one_address_wait_longer_and_longer_and_void_nothing():
-    doors = Doors(code_s=1e9)
+    doors = Sessions(code_s=1e9)
     doors.renew(0)
     code, ns, looked_at = doors.code, 0, []
     while ns < 600 * S:
@@ -57,7 +57,7 @@ def test_wrong_codes_of_one_address_wait_longer_and_longer_and_void_nothing():
 
 def test_many_strangers_slow_a_code_down_and_never_void_it():
     """Ten thousand addresses guess at once: the operator's code still opens, after the turns that were taken before it."""
-    doors = Doors(code_s=1e9)
+    doors = Sessions(code_s=1e9)
     doors.renew(0)
     code = doors.code
     for number in range(50):
@@ -72,7 +72,7 @@ def test_many_strangers_slow_a_code_down_and_never_void_it():
 
 
 def test_sessions_are_untouched_by_wrong_codes():
-    doors = Doors()
+    doors = Sessions()
     token = doors.admit("10.0.0.7", 0)
     for _ in range(2000):
         doors.enter("AAAAAAAA", "10.0.0.7", 1)
@@ -91,15 +91,15 @@ def test_sessions_are_untouched_by_wrong_codes():
     ],
 )
 def test_guesses_count_for_an_address_or_for_a_network_that_one_host_can_fill(one, other, same):
-    doors = Doors()
+    doors = Sessions()
     for _ in range(10):
         doors.enter("AAAAAAAA", one, 1)
     assert (doors.wait_s(other, 1) > 0.0) == same
 
 
 def test_no_code_is_no_empty_code():
-    assert Doors().enter("", "10.0.0.7", 1) == ""
-    assert not Doors().knows("", "10.0.0.7", 1)
+    assert Sessions().enter("", "10.0.0.7", 1) == ""
+    assert not Sessions().knows("", "10.0.0.7", 1)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from nodes.operator_page.recording import RECORDER, Recording
+from nodes.operator_page.recording import RECORDER, RecorderControl
 from nodes.runtime.messages import header, types
 from tests.support.waiting import wait_for
 
@@ -28,7 +28,7 @@ def status(pid, received):
 
 
 def test_a_recorder_records_for_the_page_once_it_has_received_something_from_it(tmp_path):
-    recording = Recording(tmp_path, ())
+    recording = RecorderControl(tmp_path, ())
     assert (recording.records, recording.starting) == (False, False)
     assert recording.start() == ""
     try:

@@ -9,14 +9,14 @@ from hypothesis import strategies as st
 
 from nodes.operator_page.client import Client, Misuse
 from nodes.operator_page.pictures import Picture
-from nodes.operator_page.said import Hold, Label, Seen, read_said
+from nodes.operator_page.said import Hold, Label, PictureSeen, read_said
 from nodes.runtime.errors import MessageError
 
 ACT = {"key": "0" * 32, "n": 1, "frame": "0"}
 
 
 def test_what_a_page_says():
-    assert read_said('{"t":"seen","c":1,"s":"1763900000000000000"}') == Seen(
+    assert read_said('{"t":"seen","c":1,"s":"1763900000000000000"}') == PictureSeen(
         t="seen", c=1, s="1763900000000000000"
     )
     assert isinstance(read_said(json.dumps({"t": "hold", "beat": 3, "press": 1, **ACT})), Hold)

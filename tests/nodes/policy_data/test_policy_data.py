@@ -11,7 +11,7 @@ from advnerf_core.learning.imitation import ImitationConfig
 from advnerf_core.policies.policy_file import load_policy
 from nodes.lab.policy_data.evaluate import compare, saliency
 from nodes.lab.policy_data.frames import frames_of_log, view_for_size
-from nodes.lab.policy_data.train import Part, train_from_recordings
+from nodes.lab.policy_data.train import TrainingRecording, train_from_recordings
 from nodes.runtime.errors import ConfigError
 
 EXPERT = Expert(DrivingPath.rounded_square(4.0, 1.1))
@@ -114,7 +114,7 @@ def test_training_learns_is_kept_and_begins_anew_for_other_recordings(tmp_path):
             cuts.append(1)
             return frames_of_log(log, view, "frame", "angle", 0.5)[0]
 
-        parts = [Part("log", (log,), {}, cut)]
+        parts = [TrainingRecording("log", (log,), {}, cut)]
         config = ImitationConfig(first_steps=steps, batch_size=16, dagger_rounds=0)
         return train_from_recordings(parts, view, EXPERT, config, tmp_path / "out")
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from nodes.linking.ros2.answers import Answers, OneWriter, stamp_of_cdr
+from nodes.linking.ros2.answers import AnsweredStamps, OneWriter, stamp_of_cdr
 from nodes.runtime.errors import MessageError
 from nodes.runtime.messages import drive_message, encode
 
@@ -11,7 +11,7 @@ S = 10**9
 
 @pytest.fixture
 def answers():
-    found = Answers(max_age_s=0.15)
+    found = AnsweredStamps(max_age_s=0.15)
     for k in range(5):
         found.sent(stamp_ns=100 + k, mono_ns=S + k * S // 10)
     return found

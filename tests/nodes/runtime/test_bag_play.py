@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from nodes.bags.keys import Keys
-from nodes.bags.play import Command, Playhead
+from nodes.bags.play import PlayerCommand, Playhead
 from nodes.bags.writer import BagWriter
 from nodes.player import PlayerConfig, PlayerNode
 from nodes.runtime.bus import Bus
@@ -161,7 +161,7 @@ def test_stop_ends_it_even_while_it_waits(bag):
 )
 def test_texts_that_mean_nothing_change_nothing(bag, text):
     with pytest.raises(MessageError, match="expected pause, resume"):
-        Command.parse(text)
+        PlayerCommand.parse(text)
     bench = Bench(bag)
     bench.run(0.1)
     assert bench.tell(text) == []

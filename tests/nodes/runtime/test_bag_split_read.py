@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
-from nodes.bags.merge import Source, merge_by_time
+from nodes.bags.merge import MergeSource, merge_by_time
 from nodes.bags.reader import extract_attachments, read_attachment, read_attachments, read_info, read_messages
 from nodes.runtime.errors import BagError
 from tests.support.bag_samples import START_NS
@@ -84,7 +84,7 @@ def test_files_are_opened_only_when_their_time_has_come():
             opened.append(start)
             yield from times
 
-        return Source(start, read)
+        return MergeSource(start, read)
 
     merged = merge_by_time(
         [source(0, [0, 1, 2, 5]), source(3, [3, 4]), source(100, [100])], lambda time: time

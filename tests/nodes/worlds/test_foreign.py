@@ -13,7 +13,7 @@ from hardware.worlds.environments import ENVIRONMENTS
 from hardware.worlds.filament.config import FilamentConfig
 from hardware.worlds.filament.world import Filament
 from hardware.worlds.lab.lab_world import LabWorld
-from hardware.worlds.metadrive.config import CarConfig, MetaDriveConfig, RoadConfig
+from hardware.worlds.metadrive.config import MetaDriveCarConfig, MetaDriveConfig, MetaDriveRoadConfig
 from hardware.worlds.metadrive.world import MetaDrive
 from hardware.worlds.remote_errors import RemoteWorldError
 from hardware.worlds.world import NotOpenError, Panel, WorldError
@@ -53,7 +53,7 @@ def test_a_foreign_world_keeps_the_contract(kind: str, changes: tuple[str, ...])
 def test_the_ideal_car_is_the_one_that_is_described_and_the_own_one_lags() -> None:
     ends = {}
     for own in (False, True):
-        with MetaDrive(MetaDriveConfig(car=CarConfig(own=own))) as world:
+        with MetaDrive(MetaDriveConfig(car=MetaDriveCarConfig(own=own))) as world:
             car = world.describe().car
             world.reset(30.0, -3.5, 0.0)
             for _ in range(10):
@@ -73,7 +73,7 @@ def test_the_ideal_car_is_the_one_that_is_described_and_the_own_one_lags() -> No
 @installed["metadrive"]
 def test_a_road_is_the_same_in_every_process_and_another_seed_is_another_road() -> None:
     def route(seed: int) -> object:
-        with MetaDrive(MetaDriveConfig(road=RoadConfig(blocks="CC", seed=seed))) as world:
+        with MetaDrive(MetaDriveConfig(road=MetaDriveRoadConfig(blocks="CC", seed=seed))) as world:
             return world.describe().to_dict(), world.observe_at(35.0, -3.5, 0.0)[0]
 
     first, again, other = route(4), route(4), route(7)
@@ -86,7 +86,7 @@ def test_a_road_is_the_same_in_every_process_and_another_seed_is_another_road() 
 @pytest.mark.slow
 @installed["metadrive"]
 def test_a_road_that_ends_too_early_is_refused() -> None:
-    world = MetaDrive(MetaDriveConfig(road=RoadConfig(blocks="S", from_m=500.0)))
+    world = MetaDrive(MetaDriveConfig(road=MetaDriveRoadConfig(blocks="S", from_m=500.0)))
     with pytest.raises(WorldError, match="add blocks, or begin earlier") as refused, world:
         raise AssertionError("it was opened")
     assert not isinstance(refused.value, RemoteWorldError)
@@ -99,8 +99,8 @@ def test_a_road_that_ends_too_early_is_refused() -> None:
 @installed["metadrive"]
 def test_a_lane_that_ends_is_refused_and_the_one_beside_it_is_driven() -> None:
     with pytest.raises(WorldError, match=r"name another one in road\.lane"):
-        MetaDrive(MetaDriveConfig(road=RoadConfig(blocks="y", seed=5))).__enter__()
-    with MetaDrive(MetaDriveConfig(road=RoadConfig(blocks="y", seed=5, lane=0))) as world:
+        MetaDrive(MetaDriveConfig(road=MetaDriveRoadConfig(blocks="y", seed=5))).__enter__()
+    with MetaDrive(MetaDriveConfig(road=MetaDriveRoadConfig(blocks="y", seed=5, lane=0))) as world:
         assert world.describe().paths["route"].length_m > 40.0
 
 

@@ -7,10 +7,10 @@ import pytest
 
 from advnerf_core.geometry import make_transform, rotation_y, rotation_z
 from hardware.worlds.world import NativePanels, Panel, Rgb
-from nodes.lab.findings import NotMet
-from nodes.lab.worlds.bench import Bench
+from nodes.lab.worlds.bench import WorldBench
 from nodes.lab.worlds.named import NamedWorld
 from nodes.lab.worlds.panels import panels_are_native
+from nodes.runtime.findings import NotMet
 from tests.support.remote.flat_world import FlatConfig, FlatWorld
 from tests.support.warehouse import Warehouse
 
@@ -122,7 +122,7 @@ class NothingHidesIt(OverThePicture):
 def look(kind: type[FlatWorld]) -> str:
     with kind(FlatConfig(width=224, height=126)) as world:
         named = NamedWorld("flat", kind, world.config, "")
-        return panels_are_native(Bench(named, world, world.describe(), None))
+        return panels_are_native(WorldBench(named, world, world.describe(), None))
 
 
 def test_a_world_that_takes_panels_says_how_well() -> None:

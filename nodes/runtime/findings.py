@@ -14,7 +14,7 @@ class NotMet(Exception):
 
 
 @dataclass(frozen=True)
-class Finding:
+class ContractFinding:
     """One line of the report.
 
     Attributes:
@@ -30,7 +30,7 @@ class Finding:
 
 def look(
     name: str, check: Callable[[T], str], bench: T, lets_through: tuple[type[Exception], ...] = ()
-) -> Finding:
+) -> ContractFinding:
     """The finding of one check.
 
     Args:
@@ -40,10 +40,12 @@ def look(
         lets_through: Errors that end the whole report. Any other error is a part that is not met.
     """
     try:
-        return Finding(name, True, check(bench))
+        return ContractFinding(name, True, check(bench))
     except NotMet as reason:
-        return Finding(name, False, str(reason))
+        return ContractFinding(name, False, str(reason))
     except lets_through:
         raise
     except Exception as error:  # a plug-in may raise anything
-        return Finding(name, False, f"raised {type(error).__name__}: {' '.join(str(error).split()):.200}")
+        return ContractFinding(
+            name, False, f"raised {type(error).__name__}: {' '.join(str(error).split()):.200}"
+        )
