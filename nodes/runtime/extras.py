@@ -6,7 +6,7 @@ from importlib.util import find_spec
 
 # Without an index of its own, pip installs torch for CUDA, with several GB of NVIDIA's packages.
 CPU_TORCH = "pip install torch --index-url https://download.pytorch.org/whl/cpu"
-_EXTRA_OF = dict.fromkeys(("torch", "numba", "scipy", "matplotlib", "jinja2", "av", "joblib"), "core") | {
+_EXTRA_OF = dict.fromkeys(("torch", "numba", "scipy", "matplotlib", "jinja2", "av"), "core") | {
     "mujoco": "twin",
     "pycolmap": "sfm",
     "trimesh": "mesh",

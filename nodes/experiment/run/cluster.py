@@ -1,14 +1,14 @@
-"""Cells over machines: joblib with its Ray backend. Every machine needs this package and the folders of the campaign, under the same paths."""
+"""Cells over machines, with Ray. Every machine needs this package and the folders of the campaign, under the same paths."""
 
 from __future__ import annotations
 
 import logging
 import os
 import socket
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-
-import joblib
+from typing import Any
 
 from nodes.experiment.run.worker import Ended, Job, run_in_process
 from nodes.runtime.errors import ConfigError
@@ -65,27 +65,37 @@ def _require_reachable(address: str) -> None:
         ) from None
 
 
-def collect_on_ray(jobs: list[Job], at_a_time: int) -> list[Ended] | None:
-    """Run jobs on the cluster in force, all of them before it returns; None if a machine was lost, with which what it had told goes.
+def run_on_ray(jobs: Sequence[Job], at_a_time: int) -> Iterator[tuple[Job, Ended | None]]:
+    """Run jobs on the cluster in force.
 
-    What was finished is in the campaign's folder all the same.
+    Args:
+        jobs: The cells to run.
+        at_a_time: Largest number of cells that run at once.
+
+    Yields:
+        Each job as it ends, with how it ended; None if its machine was lost.
 
     Raises:
         ConfigError: A machine cannot run a job at all, as one without this package.
     """
-    from ray.exceptions import NodeDiedError, ObjectLostError, RayActorError, RayError, WorkerCrashedError
-    from ray.util.joblib import register_ray
+    import ray
+    from ray.exceptions import NodeDiedError, ObjectLostError, RayError, WorkerCrashedError
 
-    register_ray()
-    with joblib.parallel_config(backend="ray", n_jobs=at_a_time):
-        # This backend of joblib can only give everything at once.
-        parallel = joblib.Parallel(batch_size=1, pre_dispatch="all")
+    run = ray.remote(num_cpus=1, max_retries=0, scheduling_strategy="SPREAD")(run_in_process)
+    waiting = deque(jobs)
+    running: dict[Any, Job] = {}
+    while waiting or running:
+        while waiting and len(running) < at_a_time:
+            job = waiting.popleft()
+            running[run.remote(job)] = job
+        ready, _ = ray.wait(list(running))
+        job = running.pop(ready[0])
         try:
-            found: list[Ended] = parallel(joblib.delayed(run_in_process)(job) for job in jobs)
-        except (RayActorError, WorkerCrashedError, NodeDiedError, ObjectLostError):
-            return None
+            end = ray.get(ready[0])
+        except (NodeDiedError, ObjectLostError, WorkerCrashedError):
+            end = None
         except RayError as error:
             raise ConfigError(
                 f"expected every machine of the cluster to have this package and the campaign's folders, got {' '.join(str(error).split())[-500:]}"
             ) from None
-    return found
+        yield job, end

@@ -6,10 +6,10 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from typing import Any, Literal
 
-import joblib
 from rich.console import Console
 
 from nodes.experiment.plan.cell import Cell
@@ -241,20 +241,15 @@ def _allow_more_tries(store: Store, name: str) -> None:
 def _run_beside(jobs: list[Job], at_a_time: int, options: Options, say: Say) -> list[Ended]:
     if not jobs:
         return []
-    if options.backend == "local":
-        with joblib.parallel_config(backend="threading", n_jobs=at_a_time):
-            return _collect(jobs, say)
-    return _run_on_ray(jobs, at_a_time, options, say)
-
-
-def _collect(jobs: list[Job], say: Say) -> list[Ended]:
-    """Hand the jobs out to joblib's backend in force; tell of each as it ends."""
-    parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="all")
-    return [_tell(end, say) for end in parallel(joblib.delayed(run_in_process)(job) for job in jobs)]
+    if options.backend == "ray":
+        return _run_on_ray(jobs, at_a_time, options, say)
+    # Its threads are daemons: they do not keep a campaign that is stopped from ending, and their cells end with it.
+    with ThreadPool(at_a_time) as pool:
+        return [_tell(end, say) for end in pool.imap_unordered(run_in_process, jobs)]
 
 
 def _run_on_ray(jobs: list[Job], at_a_time: int, options: Options, say: Say) -> list[Ended]:
-    from nodes.experiment.run.cluster import collect_on_ray, ray_session
+    from nodes.experiment.run.cluster import ray_session, run_on_ray
 
     with ray_session(options.address, at_a_time or _cores()) as cores:
         say(f"Ray cluster with {cores} cores; advnerf status tells how far it is")
@@ -262,13 +257,18 @@ def _run_on_ray(jobs: list[Job], at_a_time: int, options: Options, say: Say) -> 
         ended: list[Ended] = []
         left = jobs
         for _ in range(_ROUNDS):
-            found = collect_on_ray(left, min(at_a_time, cores))
-            if found is not None:
-                return ended + [_tell(end, say) for end in found]
-            finished = [Ended(job.name, "done", "", 0.0) for job in left if _is_finished(job)]
-            ended += [_tell(end, say) for end in finished]
-            left = [job for job in left if not _is_finished(job)]
-            say(f"a machine of the cluster was lost: {len(left)} cells are handed out again")
+            lost = []
+            for job, end in run_on_ray(left, min(at_a_time, cores)):
+                if end is None and _is_finished(job):
+                    end = Ended(job.name, "done", "", 0.0)
+                if end is None:
+                    lost.append(job)
+                else:
+                    ended.append(_tell(end, say))
+            if not lost:
+                return ended
+            say(f"a machine of the cluster was lost: {len(lost)} cells are handed out again")
+            left = lost
         text = "its machine was lost again and again; it goes on when the campaign is run again"
         return ended + [_tell(Ended(job.name, "lost", text, 0.0), say) for job in left]
 

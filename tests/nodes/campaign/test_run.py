@@ -148,24 +148,50 @@ def test_live_cells_run_alone_after_all_others(here):
     assert all(lines[k][1] == lines[k + 1][1] for k in range(0, 8, 2))
 
 
-@pytest.mark.slow
-def test_a_ray_cluster_of_several_workers_runs_the_cells(here):
+@pytest.fixture
+def cluster(here):
+    """A Ray cluster of two machines with one core each, on this one."""
+    pytest.importorskip("ray")
     from ray.cluster_utils import Cluster
 
-    cluster = Cluster()
+    made = Cluster()
     try:
         for _ in range(2):
-            cluster.add_node(num_cpus=1)
-        cluster.wait_for_nodes()
-        code, out, err = here.call("experiment", str(here.file), "--cluster", cluster.address)
-        assert code == 0, err
-        assert "Ray cluster with 2 cores" in out
-        assert set(states(here).values()) == {"done"}
-        assert len(here.begun()) == 4
-        code, out, _ = here.call("experiment", str(here.file), "--cluster", cluster.address)
-        assert "nothing to do" in out
+            made.add_node(num_cpus=1)
+        made.wait_for_nodes()
+        yield made
     finally:
-        cluster.shutdown()
+        made.shutdown()
+
+
+@pytest.mark.slow
+def test_a_ray_cluster_of_several_workers_runs_the_cells(here, cluster):
+    code, out, err = here.call("experiment", str(here.file), "--cluster", cluster.address)
+    assert code == 0, err
+    assert "Ray cluster with 2 cores" in out
+    assert set(states(here).values()) == {"done"}
+    assert len(here.begun()) == 4
+    code, out, _ = here.call("experiment", str(here.file), "--cluster", cluster.address)
+    assert "nothing to do" in out
+
+
+@pytest.mark.slow
+def test_a_lost_machine_costs_only_its_cells(here, cluster):
+    (here.folder / "hang").touch()
+    process = here.start("experiment", str(here.file), "--cluster", cluster.address)
+    workers = [pid_of(here, f"straight_hardened_gradient_{seed}") for seed in (0, 1)]  # one on each machine
+    cluster.remove_node(cluster.list_all_nodes()[-1], allow_graceful=False)
+    wait_for(lambda: not all(map(is_alive, workers)), "the cells of the lost machine to end")
+    (here.folder / "hang").unlink()
+    out, err = process.communicate(timeout=600)
+    assert process.returncode == 0, err
+    lines = out.splitlines()
+    again = lines.index("a machine of the cluster was lost: 1 cells are handed out again")
+    # The other ends are reported before: each when it came.
+    assert sum("done after" in line for line in lines[:again]) == 3
+    assert sum("done after" in line for line in lines[again:]) == 1
+    assert set(states(here).values()) == {"done"}
+    assert len(here.begun()) == 4 + 1
 
 
 @pytest.mark.slow
