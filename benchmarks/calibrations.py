@@ -28,7 +28,6 @@ from calibration.vehicle import RecordedDrive, fit_gains
 from calibration.vehicle_response import fit_response
 from hardware.worlds.lab.config import CarConfig, LabConfig, MonitorOpticsConfig
 from hardware.worlds.lab.lab import Lab
-from hardware.worlds.lab.lab_world import LabWorld
 from hardware.worlds.lab.vehicle import TwinVehicle
 from nodes.experiment.show import screen
 
@@ -192,7 +191,7 @@ def measure_time_offset(lab: Lab, seed: int) -> float:
     return error
 
 
-def measure_display(world: LabWorld, seed: int) -> tuple[float, float]:
+def measure_display(world: Lab, seed: int) -> tuple[float, float]:
     """RMSE on held-out colours, of the model and of a monitor taken for ideal, over three places of the car."""
     rng = np.random.default_rng(seed)
     panel = world.describe().panels["monitor"]
@@ -220,13 +219,12 @@ def main() -> None:
     seeds = range(1 if trial else REPETITIONS)
     drives = np.array([measure_vehicle(seed) for seed in seeds])
     config = LabConfig(monitor_optics=MonitorOpticsConfig.office())
-    with LabWorld(config) as world:
-        lab = world.lab
+    with Lab(config) as lab:
         lab.set_board_image(board_texture())
         mounts = np.array([measure_camera_to_car(lab, seed)[:2] for seed in seeds])
         lab.set_board_image(None)
         offsets = [measure_time_offset(lab, seed) for seed in seeds]
-        displays = np.array([measure_display(world, seed) for seed in seeds])
+        displays = np.array([measure_display(lab, seed) for seed in seeds])
     if trial:
         return
     noise = (

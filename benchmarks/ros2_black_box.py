@@ -27,7 +27,7 @@ from advnerf_core.report.statistics import bootstrap
 from benchmarks.rclpy_peer import RclpyPeer
 from benchmarks.results import REPOSITORY, record_row
 from calibration.schema import RoomCalibration, load_calibration
-from hardware.worlds.lab.lab_world import LabWorld
+from hardware.worlds.lab.lab import Lab
 from nodes.experiment.show.deployed import DressedScene, SelfDriving, drive_deployed
 from nodes.lab.ros2_policy import ros2_policy
 
@@ -47,7 +47,7 @@ def drive_starts(
     x_m, y_m, yaw_rad = room.start_pose
     starts = draw_start_states((x_m, y_m, yaw_rad), count, SIGMA, 1).numpy()
     found, horizon = [], Horizon(ticks, off_track_m=room.off_track_m)
-    with LabWorld() as world:
+    with Lab() as world:
         dressed = DressedScene(world, policy.contract.view, [face])
         shown = (
             dressed.plain_theta(),

@@ -23,7 +23,7 @@ from calibration.schema import (
 )
 from hardware.motor.limits import DriveLimits, VehicleGains
 from hardware.worlds.lab.config import CarConfig, LabConfig, PanelConfig
-from hardware.worlds.lab.lab_world import FENCE_MARGIN_M, HALF_LANE_M
+from hardware.worlds.lab.lab import FENCE_MARGIN_M, HALF_LANE_M
 
 METHOD = "by construction"
 # The day the default lab got its numbers; the files do not change when they are written again.

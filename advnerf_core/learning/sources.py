@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -79,10 +79,10 @@ class SteppedScene(Protocol):
     def step(self, steering_rad: float, speed_mps: float, duration_s: float) -> VehicleState:
         """Drive on and return the true state."""
 
-    def observe(self, depth: Literal[False]) -> tuple[Image, None]:
+    def observe(self, depth: bool) -> tuple[Image, Any]:
         """RGB ``[H, W, 3]`` uint8 of the driving camera, without depth."""
 
-    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]) -> tuple[Image, None]:
+    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool) -> tuple[Image, Any]:
         """The same, as if the car stood there."""
 
 

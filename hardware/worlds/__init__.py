@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
@@ -49,48 +50,16 @@ else:
 ENTRY_POINTS = "advnerf.worlds"
 
 
-def _lab() -> WorldClass:
-    from hardware.worlds.lab.lab_world import LabWorld
-
-    return LabWorld
-
-
-def _junction() -> WorldClass:
-    from hardware.worlds.junction.scene import Intersection
-
-    return Intersection
-
-
-def _carla() -> WorldClass:
-    from hardware.worlds.carla.scene import CarlaScene
-
-    return CarlaScene
-
-
-def _metadrive() -> WorldClass:
-    from hardware.worlds.metadrive.world import MetaDrive
-
-    return MetaDrive
-
-
-def _duckietown() -> WorldClass:
-    from hardware.worlds.duckietown.world import Duckietown
-
-    return Duckietown
-
-
-def _filament() -> WorldClass:
-    from hardware.worlds.filament.world import Filament
-
-    return Filament
+def _loader(module: str, name: str) -> Callable[[], WorldClass]:
+    return lambda: getattr(importlib.import_module(f"{__name__}.{module}"), name)
 
 
 WORLDS: Mapping[str, Callable[[], WorldClass]] = {
-    "lab": _lab,
-    "junction": _junction,
-    "carla": _carla,
-    "metadrive": _metadrive,
-    "duckietown": _duckietown,
-    "filament": _filament,
+    "lab": _loader("lab.lab", "Lab"),
+    "junction": _loader("junction.scene", "Intersection"),
+    "carla": _loader("carla.scene", "CarlaScene"),
+    "metadrive": _loader("metadrive.world", "MetaDrive"),
+    "duckietown": _loader("duckietown.world", "Duckietown"),
+    "filament": _loader("filament.world", "Filament"),
 }
 """Loaders of the worlds' classes by name; a simulator is imported when its world is opened."""

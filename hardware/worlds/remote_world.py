@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, TypeVar, overload
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,7 @@ from hardware.worlds.remote_answers import (
     state_in,
 )
 from hardware.worlds.remote_errors import RemoteWorldError, ServerLost, ServerProtocolError
-from hardware.worlds.world import Depth, NotOpenError, Panel, Rgb, WorldDescription, WorldError
+from hardware.worlds.world import NotOpenError, Panel, Rgb, View, WorldDescription, WorldError
 
 _World = TypeVar("_World", bound="RemoteWorld")
 _Arrays = Mapping[str, NDArray[Any]]
@@ -169,11 +169,7 @@ class RemoteWorld(ABC):
         self._state = state
         return state
 
-    @overload
-    def observe(self, depth: Literal[True] = True) -> tuple[Rgb, Depth]: ...
-    @overload
-    def observe(self, depth: Literal[False]) -> tuple[Rgb, None]: ...
-    def observe(self, depth: bool = True) -> tuple[Rgb, Depth | None]:
+    def observe(self, depth: bool = True) -> View:
         """What the driving camera sees; see `World.observe`."""
         T = self.state.T_world_from_car @ self._mount
         rgb, depth_m = self._render("driving", self.camera_pinhole, T, depth)
@@ -182,17 +178,7 @@ class RemoteWorld(ABC):
                 require_ground_ahead(depth_m, self.camera_pinhole, T)
         return rgb, depth_m
 
-    @overload
-    def observe_at(
-        self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[True] = True
-    ) -> tuple[Rgb, Depth]: ...
-    @overload
-    def observe_at(
-        self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]
-    ) -> tuple[Rgb, None]: ...
-    def observe_at(
-        self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True
-    ) -> tuple[Rgb, Depth | None]:
+    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True) -> View:
         """What the driving camera would see from another pose of the car; see `World.observe_at`."""
         return self._render(
             "driving", self.camera_pinhole, planar_pose(x_m, y_m, yaw_rad) @ self._mount, depth

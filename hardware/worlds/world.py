@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from types import TracebackType
-from typing import Any, Literal, Protocol, overload, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +25,8 @@ from hardware.worlds.paths import ReferencePath
 Rgb = NDArray[np.uint8]
 Depth = NDArray[np.float32]
 Vector3 = tuple[float, float, float]
+View = tuple[Rgb, Depth | None]
+"""Colours ``[H, W, 3]`` and planar depth ``[H, W]`` [m], or None where depth was not wanted."""
 
 
 class WorldError(AdvnerfError, ValueError):
@@ -302,25 +304,11 @@ class World(Protocol):
         """
         ...
 
-    @overload
-    def observe(self, depth: Literal[True] = True) -> tuple[Rgb, Depth]: ...
-    @overload
-    def observe(self, depth: Literal[False]) -> tuple[Rgb, None]: ...
-    def observe(self, depth: bool = True) -> tuple[Rgb, Depth | None]:
+    def observe(self, depth: bool = True) -> View:
         """What the driving camera sees: colours ``[H, W, 3]`` and planar depth ``[H, W]`` [m], or None if not wanted."""
         ...
 
-    @overload
-    def observe_at(
-        self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[True] = True
-    ) -> tuple[Rgb, Depth]: ...
-    @overload
-    def observe_at(
-        self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]
-    ) -> tuple[Rgb, None]: ...
-    def observe_at(
-        self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True
-    ) -> tuple[Rgb, Depth | None]:
+    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True) -> View:
         """What the driving camera would see from another pose of the car (see :meth:`observe`); the car stays where it is."""
         ...
 
@@ -408,6 +396,20 @@ class HasSolids(Protocol):
     def solids(self) -> Sequence[Footprint]:
         """What the car cannot drive through, walls included."""
         ...
+
+
+def require_depth(view: View) -> tuple[Rgb, Depth]:
+    """A view that was asked for with depth.
+
+    Raises:
+        WorldError: It has none.
+    """
+    rgb, depth_m = view
+    if depth_m is None:
+        raise WorldError(
+            "expected colours and depth; got no depth. Make the world's observe and observe_at return both"
+        )
+    return rgb, depth_m
 
 
 def collided_with(world: World, pose: ArrayLike) -> str:

@@ -7,7 +7,7 @@ import logging
 import weakref
 from collections.abc import Iterator
 from types import TracebackType
-from typing import Any, ClassVar, Literal, overload
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from hardware.worlds.carla.undo import Undo
 from hardware.worlds.junction.config import UNSEEN_OF_A_CAR
 from hardware.worlds.junction.paths import PathName
 from hardware.worlds.paths import ReferencePath
-from hardware.worlds.world import Box, Depth, NotOpenError, Rgb, Traits, WorldDescription
+from hardware.worlds.world import Box, NotOpenError, Rgb, Traits, View, WorldDescription
 
 _log = logging.getLogger(__name__)
 _CLOSING_TIMEOUT_S = 5.0
@@ -208,11 +208,7 @@ class CarlaScene:
                 self._tick()
         return self.state
 
-    @overload
-    def observe(self, depth: Literal[True] = True) -> tuple[Rgb, Depth]: ...
-    @overload
-    def observe(self, depth: Literal[False]) -> tuple[Rgb, None]: ...
-    def observe(self, depth: bool = True) -> tuple[Rgb, Depth | None]:
+    def observe(self, depth: bool = True) -> View:
         """What the driving camera sees: colours ``[H, W, 3]`` and planar depth ``[H, W]`` [m], or None if not wanted.
 
         Raises:
@@ -221,17 +217,7 @@ class CarlaScene:
         """
         return self._see(self.state.T_world_from_car, depth)
 
-    @overload
-    def observe_at(
-        self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[True] = True
-    ) -> tuple[Rgb, Depth]: ...
-    @overload
-    def observe_at(
-        self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]
-    ) -> tuple[Rgb, None]: ...
-    def observe_at(
-        self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True
-    ) -> tuple[Rgb, Depth | None]:
+    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True) -> View:
         """What the driving camera would see from another pose of the car (see :meth:`observe`); the car stays where it is, and out of sight."""
         with server_answers("looking from elsewhere"), self._without_car():
             return self._see(planar_pose(x_m, y_m, yaw_rad), depth)
@@ -307,7 +293,7 @@ class CarlaScene:
     def _driving_pose(self) -> CarlaPose:
         return self.drives.frame.camera_pose(self.state.T_world_from_car @ self.T_car_from_camera)
 
-    def _see(self, T_world_from_car: Array, depth: bool) -> tuple[Rgb, Depth | None]:
+    def _see(self, T_world_from_car: Array, depth: bool) -> View:
         p = self.camera_pinhole
         wanted = {RGB: (RGB, p)} | ({DEPTH: (DEPTH, p)} if depth else {})
         with server_answers("taking a picture"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, ClassVar, Literal, overload
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +14,9 @@ from hardware.worlds.filament.config import FilamentConfig
 from hardware.worlds.installed_world import InstalledWorld
 from hardware.worlds.lab.driven import DrivenCar
 from hardware.worlds.lab.files import room_as_files
-from hardware.worlds.lab.lab_world import LabWorld
+from hardware.worlds.lab.lab import Lab
 from hardware.worlds.lab.phone import apply_colours
-from hardware.worlds.world import Depth, Panel, Rgb, Traits, WorldDescription, WorldError
+from hardware.worlds.world import Panel, Rgb, Traits, View, WorldDescription, WorldError
 
 RANGE_M = (0.02, 30.0)
 MONITOR = "monitor"
@@ -24,7 +24,7 @@ _BEFORE_SCREEN_M = 0.002
 
 
 class Filament(InstalledWorld):
-    """The lab with another renderer: the room, the cameras and the car are those of `hardware.worlds.lab.lab_world.LabWorld`.
+    """The lab with another renderer: the room, the cameras and the car are those of `hardware.worlds.lab.lab.Lab`.
 
     The scene is composed here and sent as files. The car drives here too, by the same code, so that the same commands move it as in the lab, to
     the bit; the other process only draws. The car's own body is in no picture.
@@ -35,14 +35,14 @@ class Filament(InstalledWorld):
 
     Config: ClassVar[type[FilamentConfig]] = FilamentConfig
     traits: ClassVar[Traits] = Traits(
-        unseen=tuple(f"lab.{key}" for key in LabWorld.traits.unseen), own_photo_colours=True
+        unseen=tuple(f"lab.{key}" for key in Lab.traits.unseen), own_photo_colours=True
     )
 
     def __init__(self, config: FilamentConfig | None = None) -> None:
         self.config = FilamentConfig() if config is None else config
         super().__init__("filament", self.config, RANGE_M, 0.0)
         # Never opened: what it says of itself needs no renderer.
-        self._room = LabWorld(self.config.lab)
+        self._room = Lab(self.config.lab)
         self._car = DrivenCar(self.config.lab)
 
     def opened_with(self) -> Mapping[str, NDArray[Any]]:
@@ -78,14 +78,10 @@ class Filament(InstalledWorld):
         self._blocked = self._car.blocked
         return self._state
 
-    @overload
-    def observe(self, depth: Literal[True] = True) -> tuple[Rgb, Depth]: ...
-    @overload
-    def observe(self, depth: Literal[False]) -> tuple[Rgb, None]: ...
-    def observe(self, depth: bool = True) -> tuple[Rgb, Depth | None]:
+    def observe(self, depth: bool = True) -> View:
         """What the driving camera sees; right before it there may be furniture instead of the floor."""
         state = self.state
-        return self.observe_at(state.x_m, state.y_m, state.yaw_rad, depth)  # type: ignore[call-overload]
+        return self.observe_at(state.x_m, state.y_m, state.yaw_rad, depth)
 
     def photograph(self, T_world_from_camera: Array) -> Rgb:
         """A photograph ``[H, W, 3]`` with the phone's lens and the phone's own colours."""

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from types import TracebackType
-from typing import ClassVar, Literal, overload
+from typing import ClassVar
 
 import numpy as np
 
-from advnerf_core.geometry import Array, Pinhole, VehicleState, look_at, planar_pose
+from advnerf_core.geometry import Array, Pinhole, VehicleState, look_at
 from hardware.worlds.footprints import Footprint, touched_by
 from hardware.worlds.junction.car import DubinsCar
 from hardware.worlds.junction.config import UNSEEN_OF_A_CAR, IntersectionConfig
@@ -16,12 +15,13 @@ from hardware.worlds.junction.photos import photo_poses
 from hardware.worlds.junction.town import obstacles
 from hardware.worlds.junction.world import build_model
 from hardware.worlds.lab.renderer import Renderer
-from hardware.worlds.world import Box, Depth, NotOpenError, Rgb, Traits, WorldDescription
+from hardware.worlds.seen import SeenWorld
+from hardware.worlds.world import Box, NotOpenError, Rgb, Traits, View, WorldDescription
 
 RANGE_M = (0.1, 250.0)  # from the near plane to past the farthest corner of the sky
 
 
-class Intersection:
+class Intersection(SeenWorld):
     """A junction of three roads with a Dubins car in it; a `hardware.worlds.world.World`.
 
     The same configuration and the same calls give the same bytes on one machine. While it is open it owns an OpenGL context: use it in the
@@ -120,35 +120,6 @@ class Intersection:
         x, y = x_m + car.body_ahead_m * np.cos(yaw_rad), y_m + car.body_ahead_m * np.sin(yaw_rad)
         return Footprint(float(x), float(y), 0.5 * car.body_length_m, 0.5 * car.body_width_m, yaw_rad)
 
-    @overload
-    def observe(self, depth: Literal[True] = True) -> tuple[Rgb, Depth]: ...
-    @overload
-    def observe(self, depth: Literal[False]) -> tuple[Rgb, None]: ...
-    def observe(self, depth: bool = True) -> tuple[Rgb, Depth | None]:
-        """What the driving camera sees now.
-
-        Args:
-            depth: Whether depth is wanted too.
-
-        Returns:
-            Colour image ``[H, W, 3]`` uint8 and planar depth ``[H, W]`` float32 [m], or None.
-        """
-        return self._see(self.state.T_world_from_car, depth)
-
-    @overload
-    def observe_at(
-        self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[True] = True
-    ) -> tuple[Rgb, Depth]: ...
-    @overload
-    def observe_at(
-        self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]
-    ) -> tuple[Rgb, None]: ...
-    def observe_at(
-        self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True
-    ) -> tuple[Rgb, Depth | None]:
-        """What the driving camera would see from another pose of the car (see :meth:`observe`); the car stays where it is."""
-        return self._see(planar_pose(x_m, y_m, yaw_rad), depth)
-
     def photograph(self, T_world_from_camera: Array) -> Rgb:
         """A photograph ``[H, W, 3]`` uint8 with ``photo_pinhole``, in the driving camera's colours."""
         return self._open_renderer().render_rgb(T_world_from_camera, self.photo_pinhole)
@@ -171,11 +142,6 @@ class Intersection:
             self._renderer = Renderer(build_model(self.config), self.config.supersampling, range_m=RANGE_M)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
     def _open_renderer(self) -> Renderer:
         if self._renderer is None:
             raise NotOpenError(
@@ -183,7 +149,7 @@ class Intersection:
             )
         return self._renderer
 
-    def _see(self, T_world_from_car: Array, depth: bool) -> tuple[Rgb, Depth | None]:
+    def _see(self, T_world_from_car: Array, depth: bool) -> View:
         renderer, T = self._open_renderer(), T_world_from_car @ self.T_car_from_camera
         rgb = renderer.render_rgb(T, self.camera_pinhole)
         return rgb, renderer.render_depth(T, self.camera_pinhole) if depth else None

@@ -1,57 +1,135 @@
-"""The simulated lab, synchronous: observe, decide, step, as fast as it goes. Lab time passes only in ``step``."""
+"""The simulated lab, synchronous: observe, decide, step, as fast as it goes. Lab time passes only in ``step``.
+
+The car drives along the tape, past a board and a monitor.
+"""
 
 from __future__ import annotations
 
-from types import TracebackType
-from typing import Literal, overload
+import math
+from typing import ClassVar
 
 import numpy as np
 
 from advnerf_core.geometry import Array, Pinhole, VehicleState, look_at, planar_pose
+from hardware.worlds.footprints import Footprint
 from hardware.worlds.lab import textures
 from hardware.worlds.lab.config import LabConfig, MonitorOpticsConfig
 from hardware.worlds.lab.driven import DrivenCar
+from hardware.worlds.lab.furniture import obstacles, vehicle_in_room, walls
 from hardware.worlds.lab.monitor import ScreenOptics
-from hardware.worlds.lab.phone import apply_colours
+from hardware.worlds.lab.phone import apply_colours, car_mounted_poses, track_pose, walk_around_poses
 from hardware.worlds.lab.renderer import Renderer
 from hardware.worlds.lab.world import CAR_GROUP, CEILING_GROUP, MONITOR_PIXELS, build_model
-from hardware.worlds.world import Depth, Panel, Rgb
+from hardware.worlds.paths import ReferencePath, Segment
+from hardware.worlds.seen import SeenWorld
+from hardware.worlds.world import (
+    Box,
+    CarDescription,
+    NotOpenError,
+    Panel,
+    Rgb,
+    Traits,
+    View,
+    WorldDescription,
+    WorldError,
+)
+
+HALF_LANE_M = 0.4
+FENCE_MARGIN_M = 0.5
+# The true car behind the nominal one: how it answers, not what it is asked.
+_UNSEEN = (
+    "car.true_servo_gain", "car.true_servo_offset", "car.true_erpm_gain", "car.steering_lag_s", "car.steering_slew_radps", "car.motor_lag_s",
+    "car.drag_stop_lag_s", "car.friction_mps2", "car.acceleration_per_amp_mps2", "car.grip_mps2", "car.command_delay_s",
+)  # fmt: skip
 
 
-class Lab:
-    """A room with a car in it.
+class Lab(SeenWorld):
+    """A room with a car in it; a `hardware.worlds.world.World`.
 
-    The same configuration and the same calls give the same bytes on one machine. A ``Lab`` owns an OpenGL context: use
-    it in the thread that made it, and close it or use it as a context manager.
+    The same configuration and the same calls give the same bytes on one machine. While it is open it owns an OpenGL context: use
+    it in the thread that opened it.
 
     Args:
         config: All numbers of the lab.
 
     Raises:
-        TwinUnavailable: MuJoCo or EGL is missing; the message names the packages.
+        TwinUnavailable: When it is opened, MuJoCo or EGL is missing; the message names the packages.
     """
+
+    Config: ClassVar[type[LabConfig]] = LabConfig
+    traits: ClassVar[Traits] = Traits(unseen=_UNSEEN, own_photo_colours=True)
 
     def __init__(self, config: LabConfig | None = None) -> None:
         self.config = LabConfig() if config is None else config
         self.camera_pinhole: Pinhole = self.config.camera.pinhole
-        self.phone_pinhole: Pinhole = self.config.phone.pinhole
-        self.photo_pinhole: Pinhole = self.phone_pinhole
+        self.photo_pinhole: Pinhole = self.config.phone.pinhole
         self.T_car_from_camera: Array = self.config.camera.T_car_from_camera
         self._car = DrivenCar(self.config)
         self._stood: dict[str, tuple[Panel, Rgb]] = {}
         self._shown: dict[str, Rgb] = {}  # textures that are no longer those of the model
-        self._renderer = self._new_renderer()
+        self._open_renderer: Renderer | None = None
         # None where colours are seen as they are shown: nothing to compute from frame to frame.
         self._optics: ScreenOptics | None = None
         if self.config.monitor_optics != MonitorOpticsConfig():
             self._optics = ScreenOptics(self.config.monitor_optics, self.config.monitor, MONITOR_PIXELS)
         self._screen_seen_from: Array | None = None
-        if self._optics is not None:
-            self.set_monitor_image(None)
 
-    def _new_renderer(self) -> Renderer:
-        model = build_model(self.config, self._stood)
-        return Renderer(model, self.config.supersampling, hidden_groups=(CAR_GROUP,))
+    def describe(self) -> WorldDescription:
+        """One closed path: the tape. The box is the room; its panels are the board and the monitor."""
+        track, room, car = self.config.track, self.config.room, self.config.car
+        straight: Segment = ("line", track.side_m - 2.0 * track.corner_radius_m)
+        corner: Segment = ("arc", track.corner_radius_m, 0.5 * math.pi)
+        ends = [
+            (servo - car.nominal_servo_offset) / car.nominal_servo_gain
+            for servo in (car.servo_min, car.servo_max)
+        ]
+        half = 0.5 * room.side_m
+        board, monitor = (
+            Panel(each.T_world_from_face, each.width_m, each.height_m, pixels)
+            for each, pixels in ((self.config.board, None), (self.config.monitor, MONITOR_PIXELS))
+        )
+        return WorldDescription(
+            paths={
+                "track": ReferencePath(
+                    track_pose(track, 0.0),
+                    (straight, corner) * 4,
+                    closed=True,
+                    drive_from=self.config.start_pose,
+                )
+            },
+            off_track_m=HALF_LANE_M,
+            car=CarDescription("ackermann", car.speed_mps, (min(ends), max(ends)), car.wheelbase_m),
+            camera=self.camera_pinhole,
+            T_car_from_camera=self.T_car_from_camera,
+            box=Box((-half, -half, 0.0), (half, half, room.height_m)),
+            road_edge=(
+                np.array([(-half, -half), (half, -half), (half, half), (-half, half), (-half, -half)]),
+            ),
+            panels={"board": board, "monitor": monitor},
+            fence_m=half - FENCE_MARGIN_M,
+        )
+
+    def photo_poses(self, count: int, rng: np.random.Generator) -> list[Array]:
+        """From the car, and on a walk around the room, in turn."""
+        driven = car_mounted_poses(self.config, (count + 1) // 2, rng)
+        walked = walk_around_poses(self.config, count // 2, rng)
+        # Each list goes round once: shuffled, so that any prefix covers the track.
+        both = [[each[index] for index in rng.permutation(len(each))] for each in (driven, walked)]
+        return [both[index % 2][index // 2] for index in range(count)]
+
+    def touches(self, x_m: float, y_m: float, yaw_rad: float) -> str:
+        """Name of what the car stands against at a pose; see `hardware.worlds.world.NamesObstacles`. The lab need not be open."""
+        return vehicle_in_room(self.config).touches(x_m, y_m, yaw_rad)
+
+    @property
+    def car_body(self) -> Footprint:
+        """The car's body around its rear axle; see `hardware.worlds.world.HasSolids`."""
+        return vehicle_in_room(self.config).body_at(0.0, 0.0, 0.0)
+
+    @property
+    def solids(self) -> list[Footprint]:
+        """Furniture and walls."""
+        return [*obstacles(self.config), *walls(self.config)]
 
     def reset(self, x_m: float, y_m: float, yaw_rad: float, speed_mps: float = 0.0) -> VehicleState:
         """Put the car down, forget commands under way and start lab time at 0; a speed, if given, is held."""
@@ -85,51 +163,18 @@ class Lab:
         """Whether the car stands against a wall or an obstacle."""
         return self._car.blocked
 
-    @overload
-    def observe(self, depth: Literal[True] = True) -> tuple[Rgb, Depth]: ...
-    @overload
-    def observe(self, depth: Literal[False]) -> tuple[Rgb, None]: ...
-    def observe(self, depth: bool = True) -> tuple[Rgb, Depth | None]:
-        """What the driving camera sees now.
-
-        Args:
-            depth: Whether depth is wanted too; it costs about half as much again.
-
-        Returns:
-            Colour image ``[H, W, 3]`` uint8 and planar depth ``[H, W]`` float32 [m], or None.
-        """
-        return self._see(planar_pose(*self._pose()), depth)
-
-    @overload
-    def observe_at(
-        self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[True] = True
-    ) -> tuple[Rgb, Depth]: ...
-    @overload
-    def observe_at(
-        self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]
-    ) -> tuple[Rgb, None]: ...
-    def observe_at(
-        self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True
-    ) -> tuple[Rgb, Depth | None]:
-        """What the driving camera would see from another pose of the car (see :meth:`observe`); the car stays where it is."""
-        return self._see(planar_pose(x_m, y_m, yaw_rad), depth)
-
     def observe_held(self, T_world_from_car: Array) -> Rgb:
         """What the driving camera sees ``[H, W, 3]`` while a person holds the car at any pose ``[4, 4]``, tilted too."""
         return self._see(T_world_from_car, depth=False)[0]
 
     def photograph(self, T_world_from_camera: Array) -> Rgb:
-        """Take a phone photo ``[H, W, 3]`` uint8 with ``phone_pinhole`` and the phone's own colours."""
+        """Take a phone photo ``[H, W, 3]`` uint8 with ``photo_pinhole`` and the phone's own colours."""
         self._light_screen(T_world_from_camera)
-        rgb = self._renderer.render_rgb(T_world_from_camera, self.phone_pinhole)
+        rgb = self._renderer.render_rgb(T_world_from_camera, self.photo_pinhole)
         return apply_colours(rgb, self.config.phone)
 
-    def overview(self, width: int = 960, height: int = 720) -> Rgb:
-        """Picture ``[height, width, 3]`` of the whole room and the car from above the south wall, without the ceiling, for reports."""
-        return self.seen_from_above(width, height)[0]
-
-    def seen_from_above(self, width: int = 960, height: int = 720) -> tuple[Rgb, Pinhole, Array]:
-        """The picture of :meth:`overview`, and the camera that took it: intrinsics and ``T_world_from_camera`` ``[4, 4]``."""
+    def overview(self, width: int = 960, height: int = 720) -> tuple[Rgb, Pinhole, Array]:
+        """The room and the car from above the south wall, without the ceiling, and the camera: its intrinsics and ``T_world_from_camera`` ``[4, 4]``."""
         focal = 1.04 * width
         pinhole = Pinhole(width, height, focal, focal, 0.5 * width, 0.5 * height)
         side = self.config.room.side_m
@@ -140,13 +185,15 @@ class Lab:
         finally:
             self._renderer.place("car", np.eye(4), hidden_groups=(CAR_GROUP,))
 
-    def subject_poses(self) -> dict[str, Array]:
-        """What motion capture sees: ``T_world_from_subject`` ``[4, 4]`` of "car", "board" and "monitor"."""
-        return {
-            "car": planar_pose(*self._pose()),
-            "board": self.config.board.T_world_from_face,
-            "monitor": self.config.monitor.T_world_from_face,
-        }
+    def show(self, panel: str, rgb: Rgb | None) -> None:
+        """Show a picture on the monitor.
+
+        Raises:
+            WorldError: The panel is no screen.
+        """
+        if panel != "monitor":
+            raise WorldError(f"expected a screen of the lab: monitor; got {panel!r}")
+        self.set_monitor_image(rgb)
 
     def set_board_image(self, rgb: Rgb | None) -> None:
         """Show a picture ``[h, w, 3]`` on the board's face (row 0 on top); None makes it plain again."""
@@ -187,9 +234,19 @@ class Lab:
     def _rebuild(self) -> None:
         """Another model; what board and monitor show stays."""
         self._renderer.close()
-        self._renderer = self._new_renderer()
+        self._open_renderer = self._new_renderer()
         for name, rgb in self._shown.items():
             self._renderer.set_texture(name, rgb)
+
+    def _new_renderer(self) -> Renderer:
+        model = build_model(self.config, self._stood)
+        return Renderer(model, self.config.supersampling, hidden_groups=(CAR_GROUP,))
+
+    @property
+    def _renderer(self) -> Renderer:
+        if self._open_renderer is None:
+            raise NotOpenError("expected the lab to be open; it is closed: use it as a context manager")
+        return self._open_renderer
 
     def _set_texture(self, name: str, rgb: Rgb) -> None:
         self._shown[name] = np.array(rgb)
@@ -197,21 +254,25 @@ class Lab:
 
     def close(self) -> None:
         """Free the OpenGL context; safe to call twice."""
-        self._renderer.close()
+        if self._open_renderer is not None:
+            self._open_renderer.close()
+            self._open_renderer = None
+        self._stood.clear()
+        self._shown.clear()
+        self._screen_seen_from = None
 
     def __enter__(self) -> Lab:
+        if self._open_renderer is None:
+            self._car, self._open_renderer = DrivenCar(self.config), self._new_renderer()
+            if self._optics is not None:
+                self.set_monitor_image(None)
         return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _pose(self) -> tuple[float, float, float]:
         state = self._car.state
         return state.x_m, state.y_m, state.yaw_rad
 
-    def _see(self, T_world_from_car: Array, depth: bool) -> tuple[Rgb, Depth | None]:
+    def _see(self, T_world_from_car: Array, depth: bool) -> View:
         T = T_world_from_car @ self.T_car_from_camera
         self._light_screen(T)
         rgb = self._renderer.render_rgb(T, self.camera_pinhole)

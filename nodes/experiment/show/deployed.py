@@ -27,7 +27,7 @@ from advnerf_core.policies.network import Policy, images_to_tensor
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.surrogate import PoseBatch, Surrogate
 from hardware.cameras.effects import ImperfectCamera
-from hardware.worlds.world import Depth, Rgb, World, collided_with
+from hardware.worlds.world import Depth, Rgb, World, collided_with, require_depth
 from nodes.experiment.show.images import as_uint8
 
 # At a camera's own resolution one ray per pixel is what a rasteriser takes; the policy's resize averages three of them.
@@ -120,7 +120,7 @@ class DressedScene:
 
     def seen_now(self, theta: Tensor | None) -> NDArray[np.uint8]:
         """Policy image ``[66, 200, 3]`` of the car where it is now."""
-        rgb, depth_m = self.scene.observe()
+        rgb, depth_m = require_depth(self.scene.observe())
         window = self.view.window
         state = self.scene.state
         pose = planar_poses(np.array([[state.x_m, state.y_m, state.yaw_rad]])) @ self.scene.T_car_from_camera
@@ -152,7 +152,7 @@ class DressedScene:
         depth_m: list[Depth] = []
         for pose in poses @ T_camera_from_car:
             yaw = float(np.arctan2(pose[1, 0], pose[0, 0]))
-            image, depth = self.scene.observe_at(float(pose[0, 3]), float(pose[1, 3]), yaw)
+            image, depth = require_depth(self.scene.observe_at(float(pose[0, 3]), float(pose[1, 3]), yaw))
             rgb.append(image[kept])
             depth_m.append(depth[kept])
         return torch.from_numpy(np.stack(rgb)) / 255.0, torch.from_numpy(np.stack(depth_m))

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from advnerf_core.geometry import Array, Pinhole, yaw_of
 from advnerf_core.policies.view import PolicyView
-from hardware.worlds.world import World
+from hardware.worlds.world import World, require_depth
 
 
 class DeployedFrames:
@@ -33,7 +33,9 @@ class DeployedFrames:
         size = (self.view.width, self.view.height)
         rgb, depth_m = [], []
         for pose in poses @ self._T_camera_from_car:
-            image, depth = self.scene.observe_at(float(pose[0, 3]), float(pose[1, 3]), yaw_of(pose))
+            image, depth = require_depth(
+                self.scene.observe_at(float(pose[0, 3]), float(pose[1, 3]), yaw_of(pose))
+            )
             rgb.append(self.view.image(image))
             depth_m.append(cv2.resize(depth[self.view.window], size, interpolation=cv2.INTER_NEAREST_EXACT))
         return np.stack(rgb).astype(np.float32) / np.float32(255.0), np.stack(depth_m).astype(np.float32)

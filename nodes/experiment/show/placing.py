@@ -15,7 +15,7 @@ import numpy as np
 
 from advnerf_core.geometry import Array, invert_transform, planar_pose
 from hardware.worlds.paths import Pose
-from hardware.worlds.world import Depth, World
+from hardware.worlds.world import Depth, World, require_depth
 from nodes.experiment.plan.placed import PlacedObject, RuledObject, in_a_lane
 from nodes.experiment.show.context import Experiment
 from nodes.runtime.errors import ConfigError
@@ -91,7 +91,8 @@ def clean_poses(experiment: Experiment, name: str) -> Array:
 def _views(experiment: Experiment, world: World, name: str) -> Iterator[_View]:
     for x_m, y_m, yaw_rad in clean_poses(experiment, name).tolist():
         T_world_from_camera = planar_pose(x_m, y_m, yaw_rad) @ experiment.mount
-        yield _View(invert_transform(T_world_from_camera), world.observe_at(x_m, y_m, yaw_rad)[1])
+        _, depth_m = require_depth(world.observe_at(x_m, y_m, yaw_rad))
+        yield _View(invert_transform(T_world_from_camera), depth_m)
 
 
 def _spots(experiment: Experiment, wanted: RuledObject, name: str) -> Iterator[PlacedObject]:

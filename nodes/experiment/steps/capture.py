@@ -13,7 +13,7 @@ from advnerf_core.geometry import Array, planar_pose
 from advnerf_core.learning.imitation import recovery_states
 from calibration.by_construction import write_twin_calibrations
 from calibration.schema import save_calibration
-from hardware.worlds.lab.lab_world import LabWorld
+from hardware.worlds.lab.lab import Lab
 from hardware.worlds.world import World
 from nodes.experiment.show.context import CALIBRATION, PLACED, Experiment
 from nodes.experiment.show.faces import DISPLAY, on_screen, panel_of, plain_screen, wanted_face
@@ -91,7 +91,7 @@ def _driving_views(
 
 def _calibrate(experiment: Experiment, scene: World, folder: Path, report: Report) -> None:
     """Files that live nodes read, and the colours of a screen that carries the attack, which then shows the plain face."""
-    if isinstance(scene, LabWorld):
+    if isinstance(scene, Lab):
         write_twin_calibrations(scene.config, folder)
     if on_screen(experiment):
         report(0.0, "measuring the screen's colours")

@@ -20,6 +20,7 @@ from hardware.worlds.carla.connection import check_nobody_else, connect, map_nam
 from hardware.worlds.carla.errors import CarlaError, CarlaFrameError, CarlaMapError
 from hardware.worlds.carla.library import load_carla, server_answers
 from hardware.worlds.carla.scene import CarlaScene, drives_in
+from hardware.worlds.world import require_depth
 
 State = Literal["ok", "warning", "failure"]
 _STEPS = 10
@@ -146,11 +147,11 @@ def _look_at_pictures(
 ) -> bool:
     with CarlaScene(config, library) as scene:
         scene.reset(*scene.paths["straight"].start_pose)
-        rgb, depth = scene.observe()
+        rgb, depth = require_depth(scene.observe())
         began = time.monotonic()
         for _ in range(_STEPS):
             scene.step(0.0, config.car.speed_mps, config.render.fixed_delta_s)
-            rgb, depth = scene.observe()
+            rgb, depth = require_depth(scene.observe())
         seconds, repeated = (time.monotonic() - began) / _STEPS, scene.repeated_frames
         text = f"frame numbers and poses as asked, {1e3 * seconds:.0f} ms for a step and its picture"
         if repeated:

@@ -13,7 +13,14 @@ from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import planar_pose
 from advnerf_core.plugins import unknown
-from hardware.worlds.world import NativePanels, NotOpenError, World, WorldDescription, traits_of
+from hardware.worlds.world import (
+    NativePanels,
+    NotOpenError,
+    World,
+    WorldDescription,
+    require_depth,
+    traits_of,
+)
 from nodes.lab.worlds.bench import Check, WorldBench
 from nodes.lab.worlds.driving import (
     expert_keeps_its_lane,
@@ -142,7 +149,7 @@ def _has(settings: dict[str, object], key: str) -> bool:
 def _write_pictures(bench: WorldBench, folder: Path) -> None:
     """What the driving camera sees where each path begins, its depth (near is bright), and a photograph from there."""
     for name, path in bench.description.paths.items():
-        rgb, depth = bench.world.observe_at(*path.start_pose)
+        rgb, depth = require_depth(bench.world.observe_at(*path.start_pose))
         near = 255.0 * np.clip(1.0 - np.log1p(np.minimum(depth, 1e4)) / 5.0, 0.0, 1.0)
         photo = bench.world.photograph(planar_pose(*path.start_pose) @ bench.world.T_car_from_camera)
         for what, image in (

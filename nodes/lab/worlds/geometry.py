@@ -23,7 +23,7 @@ from advnerf_core.geometry import (
     transform_points,
 )
 from hardware.worlds.paths import Pose
-from hardware.worlds.world import Depth
+from hardware.worlds.world import Depth, require_depth
 from nodes.lab.worlds.bench import WorldBench
 from nodes.runtime.findings import NotMet
 
@@ -206,7 +206,7 @@ def _pairs_of_views(bench: WorldBench) -> list[list[tuple[CameraView, CameraView
 
 
 def _view(bench: WorldBench, pose: Pose) -> CameraView:
-    rgb, depth = bench.world.observe_at(*pose)
+    rgb, depth = require_depth(bench.world.observe_at(*pose))
     return CameraView(pose, depth, np.asarray(cv2.blur(rgb, (3, 3)), dtype=np.float32))
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from advnerf_core.geometry import Array, invert_transform, make_transform, planar_pose, rotation_z
 from hardware.worlds.paths import Pose
-from hardware.worlds.world import NativePanels, Panel, Rgb
+from hardware.worlds.world import NativePanels, Panel, Rgb, require_depth
 from nodes.lab.worlds.bench import WorldBench
 from nodes.runtime.findings import NotMet
 
@@ -85,7 +85,7 @@ def _texture() -> Rgb:
 
 def _stands_there(bench: WorldBench, panel: Panel, view: Pose, before: Rgb) -> float:
     """Outline, colours and depth of the panel in one view; the share of the outline that is where it should be."""
-    rgb, depth_m = bench.world.observe_at(*view)
+    rgb, depth_m = require_depth(bench.world.observe_at(*view))
     on_it, u, v, z_m = _seen(bench, panel, view)
     if on_it.sum() < _LEAST_PX:
         raise NotMet(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.geometry import Array, Pinhole, planar_pose
-from hardware.worlds.world import Rgb, traits_of
+from hardware.worlds.world import Rgb, require_depth, traits_of
 from nodes.lab.worlds.bench import WorldBench, pose_of
 from nodes.runtime.findings import NotMet
 
@@ -188,7 +188,7 @@ def _script(bench: WorldBench) -> list[tuple[str, NDArray[Any]]]:
     found: list[tuple[str, NDArray[Any]]] = [("state", pose_of(world.reset(*bench.places[0])))]
     for control in (0.0, 0.4 * car.control_limits[0], 0.3 * car.control_limits[1]):
         found.append(("state", pose_of(world.step(control, car.speed_mps, bench.tick_s))))
-        rgb, depth = world.observe()
+        rgb, depth = require_depth(world.observe())
         found += [("picture", rgb), ("depth", depth)]
     found.append(("picture", world.observe_at(*bench.places[-1], depth=False)[0]))
     poses = world.photo_poses(4, np.random.default_rng(1))

@@ -11,7 +11,6 @@ from hardware.worlds.lab import gl, lighting
 from hardware.worlds.lab.config import LabConfig
 from hardware.worlds.lab.furniture import Solid, furnish, obstacles
 from hardware.worlds.lab.lab import Lab
-from hardware.worlds.lab.lab_world import LabWorld
 from hardware.worlds.lab.phone import track_length, track_pose
 
 CONFIG = LabConfig()
@@ -65,7 +64,7 @@ def test_phone_sees_the_monitor_where_the_pinhole_projects_it(lab):
     T = look_at([1.4, 2.0, 0.9], [1.75, 3.15, 0.4])
     image = lab.photograph(T)
     points = transform_points(CONFIG.monitor.T_world_from_face, chess_corners_on_face(CONFIG.monitor))
-    expected = lab.phone_pinhole.project(transform_points(invert_transform(T), points))
+    expected = lab.photo_pinhole.project(transform_points(invert_transform(T), points))
     error = np.linalg.norm(detect_corners(image, expected) - expected, axis=1)
     lab.set_monitor_image(None)
     assert error.mean() < 0.15
@@ -190,7 +189,7 @@ def test_nothing_stands_in_the_lane():
 
 def test_a_closed_lab_names_what_the_car_stands_against():
     board = CONFIG.board
-    lab, ahead = LabWorld(CONFIG), 0.5 * (CONFIG.car.wheelbase_m + CONFIG.car.body_length_m) + 0.01
+    lab, ahead = Lab(CONFIG), 0.5 * (CONFIG.car.wheelbase_m + CONFIG.car.body_length_m) + 0.01
     # With its nose at the middle of the board's face, which looks along its yaw.
     x = board.x_m + ahead * math.cos(board.yaw_rad)
     y = board.y_m + ahead * math.sin(board.yaw_rad)

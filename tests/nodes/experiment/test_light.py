@@ -11,7 +11,7 @@ from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.attack.spaces.space import ColourSpace, NamedObject
 from advnerf_core.geometry import planar_pose
 from advnerf_core.scene.surrogate import Surrogate
-from hardware.worlds.lab.lab_world import LabWorld
+from hardware.worlds.lab.lab import Lab
 from hardware.worlds.lab.world import shading
 from nodes.experiment.show.deployed import DressedScene
 from nodes.experiment.show.light import measure_light
@@ -38,7 +38,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory):
     experiment = load_experiment(
         LAUNCH / "room.experiment.yaml", "demo", [*CHANGES, f"objects=[{BOARD}]"], folder
     )
-    with LabWorld() as world:
+    with Lab() as world:
         yield experiment, world, measure_light(experiment, world)
 
 
@@ -95,7 +95,7 @@ def test_light_needs_a_panel_and_a_world_that_takes_it(tmp_path: Path) -> None:
     )
     with junction.open_world() as world, pytest.raises(ConfigError, match="a world that takes panels"):
         measure_light(junction, world)
-    with LabWorld() as world, pytest.raises(ConfigError, match="hidden, turned away or too small"):
+    with Lab() as world, pytest.raises(ConfigError, match="hidden, turned away or too small"):
         measure_light(load("room", *CHANGES, f"objects=[{BOARD.replace('2.8, scale', '0.3, scale')}]"), world)
     plain = load("room", *CHANGES[:3], *CHANGES[4:], f"objects=[{BOARD}]")
     measured = load("room", *CHANGES, f"objects=[{BOARD}]")

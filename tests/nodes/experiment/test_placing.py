@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from hardware.worlds.lab.lab_world import LabWorld
+from hardware.worlds.lab.lab import Lab
 from nodes.experiment.plan.placed import PlacedObject
 from nodes.experiment.show.context import PLACED, Experiment
 from nodes.experiment.show.deployed import DressedScene
@@ -31,7 +31,7 @@ def room(folder: Path, rule: str = "{}", scale: float = 0.25) -> Experiment:
     return load_experiment(ROOM, "demo", changes, folder)
 
 
-def placed(experiment: Experiment, world: LabWorld) -> PlacedObject:
+def placed(experiment: Experiment, world: Lab) -> PlacedObject:
     (spot,) = place_by_rule(experiment, world)
     file = experiment.stage_folder("capture") / PLACED
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -41,13 +41,13 @@ def placed(experiment: Experiment, world: LabWorld) -> PlacedObject:
 
 @pytest.fixture(scope="module")
 def lab():
-    with LabWorld() as world:
+    with Lab() as world:
         # Every search for a spot looks from the same poses.
         world.observe_at = lru_cache(maxsize=None)(world.observe_at)
         yield world
 
 
-def test_a_panel_stands_where_a_drive_sees_it_for_two_seconds(lab: LabWorld, tmp_path: Path) -> None:
+def test_a_panel_stands_where_a_drive_sees_it_for_two_seconds(lab: Lab, tmp_path: Path) -> None:
     experiment = room(tmp_path)
     with pytest.raises(ConfigError, match="run that stage first"):
         _ = experiment.objects
@@ -72,7 +72,7 @@ def test_a_panel_stands_where_a_drive_sees_it_for_two_seconds(lab: LabWorld, tmp
     assert np.hypot(spot.x_m - start[0], spot.y_m - start[1]) < 4.0
 
 
-def test_the_rule_is_obeyed_or_refused(lab: LabWorld, tmp_path: Path) -> None:
+def test_the_rule_is_obeyed_or_refused(lab: Lab, tmp_path: Path) -> None:
     left = placed(room(tmp_path / "left", "{side: left, seen_s: 1.0, least_px: 4}", 0.1), lab)
     path = room(tmp_path / "path").paths["track"]
     assert float(path.project(np.array([left.x_m, left.y_m])).cte_m) > 0.4
@@ -112,7 +112,7 @@ def test_what_is_captured_depends_on_the_rule_and_on_no_place_by_hand(tmp_path: 
 class _Nothing:
     """The lab's cameras in a void: nothing hides what is composed."""
 
-    def __init__(self, lab: LabWorld) -> None:
+    def __init__(self, lab: Lab) -> None:
         self.T_car_from_camera, self.camera_pinhole = lab.T_car_from_camera, lab.camera_pinhole
 
     def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True):

@@ -12,7 +12,7 @@ from hardware.worlds.duckietown.world import Duckietown
 from hardware.worlds.environments import ENVIRONMENTS
 from hardware.worlds.filament.config import FilamentConfig
 from hardware.worlds.filament.world import Filament
-from hardware.worlds.lab.lab_world import LabWorld
+from hardware.worlds.lab.lab import Lab
 from hardware.worlds.metadrive.config import MetaDriveCarConfig, MetaDriveConfig, MetaDriveRoadConfig
 from hardware.worlds.metadrive.world import MetaDrive
 from hardware.worlds.remote_errors import RemoteWorldError
@@ -114,7 +114,7 @@ def test_a_map_without_a_way_round_is_refused() -> None:
 @pytest.mark.slow
 @installed["filament"]
 def test_another_renderer_changes_the_colours_and_neither_depth_nor_dynamics() -> None:
-    with Filament() as drawn, LabWorld() as lab:
+    with Filament() as drawn, Lab() as lab:
         told, expected = drawn.describe().to_dict(), lab.describe().to_dict()
         assert told.pop("facts") == {"simulator": "Filament of MuJoCo 4.0.0"}
         assert told == {key: value for key, value in expected.items() if key != "facts"}

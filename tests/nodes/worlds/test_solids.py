@@ -8,7 +8,7 @@ from advnerf_core.driving.solids import Rectangle, Solids
 from hardware.worlds.junction.scene import Intersection
 from hardware.worlds.lab.config import LabConfig
 from hardware.worlds.lab.furniture import vehicle_in_room
-from hardware.worlds.lab.lab_world import LabWorld
+from hardware.worlds.lab.lab import Lab
 from hardware.worlds.world import HasSolids
 
 
@@ -20,7 +20,7 @@ def rectangle(footprint):
 
 @pytest.mark.parametrize("kind", ["lab", "junction"])
 def test_a_clearance_above_zero_is_a_free_place(kind):
-    world = LabWorld(LabConfig()) if kind == "lab" else Intersection(Intersection.Config())
+    world = Lab(LabConfig()) if kind == "lab" else Intersection(Intersection.Config())
     fits = vehicle_in_room(LabConfig()).fits if kind == "lab" else world.fits
     half_m = 3.2 if kind == "lab" else 25.0  # the junction ends where it is not solid
     assert isinstance(world, HasSolids)
