@@ -122,7 +122,7 @@ def runner(
         return (
             search.first_calls(),
             search.step_calls(problem),
-            lambda **kept: black_box_attack(problem, search, calls, **kept),
+            lambda **kept: black_box_attack(problem, search, calls, SearchRun(**kept)),
         )
     settings = SearchSettings(calls // each, population=20)
     return 0, each, lambda **kept: load_method(name).search(problem, settings, SearchRun(**kept))
@@ -133,7 +133,7 @@ def white_box(problem: AttackProblem, out: Path, end_s: float) -> tuple[float, f
     search = Search("white_box", out, calls_per_evaluation(problem))
     told = search.listen(0, calls_per_evaluation(problem), end_s)
     if len(search.curve) < ITERATIONS:
-        gradient_attack(problem, ITERATIONS, state_path=search.state_path, on_evaluation=told)
+        gradient_attack(problem, ITERATIONS, run=SearchRun(state_path=search.state_path, on_evaluation=told))
     surrogate = problem.sensor
     assert isinstance(surrogate, Surrogate)
     _, totals = evaluate(problem, surrogate.plain_theta())

@@ -16,6 +16,8 @@ import time
 from pathlib import Path
 from statistics import median
 
+from advnerf_core.attack.methods import SearchRun
+
 import advnerf_core as advnerf_core  # isort: skip  # before torch, as in the commands
 from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.attack.search.gradient import gradient_attack
@@ -105,7 +107,7 @@ def _timed(folder: Path, seeds: list[int], batch: bool) -> float:
         gradient_attacks(problems, seeds, _ITERATIONS)
     else:
         for seed, each in zip(seeds, problems, strict=True):
-            gradient_attack(each, _ITERATIONS, seed=seed)
+            gradient_attack(each, _ITERATIONS, run=SearchRun(seed))
     return time.perf_counter() - began
 
 

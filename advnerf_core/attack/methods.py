@@ -93,6 +93,9 @@ class SearchRun:
     settings_hash: str = ""
 
 
+FRESH_RUN = SearchRun()
+"""Seed 0, no state file, no callback."""
+
 Search = Callable[["AttackProblem", SearchSettings, SearchRun], "SearchResult"]
 Planned = Callable[["AttackProblem", SearchSettings], int]
 

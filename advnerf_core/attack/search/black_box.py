@@ -23,14 +23,13 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import AdjointResult, gradient_pass
-from advnerf_core.attack.methods import SearchRun, SearchSettings
+from advnerf_core.attack.methods import FRESH_RUN, SearchRun, SearchSettings
 from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.attack.search.distil import (
     ArchitectureStudent,
@@ -45,11 +44,12 @@ from advnerf_core.attack.search.population import Coarse
 from advnerf_core.attack.search.query_count import CountedPolicy, calls_per_evaluation
 from advnerf_core.attack.search.search import (
     Evaluation,
-    OnEvaluation,
     SearchDivergedError,
     SearchResult,
     SearchState,
-    begin,
+    begin_drawing,
+    go_on,
+    require_finite,
     search_fingerprint,
 )
 from advnerf_core.attack.search.student_options import StudentOptions
@@ -140,10 +140,7 @@ def black_box_attack(
     problem: AttackProblem,
     search: BlackBoxSearch,
     calls: int,
-    seed: int = 0,
-    state_path: Path | None = None,
-    on_evaluation: OnEvaluation | None = None,
-    settings_hash: str = "",
+    run: SearchRun = FRESH_RUN,
 ) -> SearchResult:
     """Maximise the objective by questions alone.
 
@@ -151,10 +148,7 @@ def black_box_attack(
         problem: What is attacked; its policy is asked for steering only, also where it has a gradient.
         search: Method and settings.
         calls: Policy calls (images) in all, those of a resumed state included; never exceeded.
-        seed: Of the start, the student and the probes.
-        state_path: State file, written after every evaluation; if it exists, the search goes on from it, to the bit.
-        on_evaluation: Called after every evaluation.
-        settings_hash: Hash of scene, policy and configuration; a state file of another one is refused.
+        run: Seed of the start, the student and the probes, state file and callback; a search goes on from its state file to the bit.
 
     Raises:
         BudgetError: ``calls`` do not allow one step.
@@ -164,35 +158,26 @@ def black_box_attack(
     victim = CountedPolicy(problem.policy)
     problem = replace(problem, policy=victim)
     shape = tuple(problem.sensor.theta_shape)
-    fingerprint = search_fingerprint(problem, shape, method=search.settings(), seed=seed, hash=settings_hash)
-    generator = torch.Generator().manual_seed(seed)
-    state = begin(state_path, fingerprint, lambda: _fresh(problem, generator))
-    generator.set_state(state.tensors["generator"])
+    fingerprint = search_fingerprint(
+        problem, shape, method=search.settings(), seed=run.seed, hash=run.settings_hash
+    )
+    state, generator = begin_drawing(run, fingerprint, lambda generator: _fresh(problem, generator))
     victim.calls = int(state.tensors["calls"])
-    loop = _Loop(problem, search, state, generator, seed)
-    while len(state.history) < evaluations:
+    loop = _Loop(problem, search, state, generator, run.seed)
+
+    def step() -> Evaluation:
         evaluation = loop.step()
         state.tensors["calls"] = torch.tensor(victim.calls)
-        if state_path is not None:
-            state.save(state_path, fingerprint)
-        if on_evaluation is not None:
-            on_evaluation(evaluation)
-    return state.result()
+        return evaluation
+
+    return go_on(state, run, fingerprint, evaluations, step)
 
 
 def search_as(
     method: Method, problem: AttackProblem, settings: SearchSettings, run: SearchRun
 ) -> SearchResult:
     """`black_box_attack` with the settings of a method; see there for what it raises."""
-    return black_box_attack(
-        problem,
-        _asked(method, settings),
-        _policy_calls(problem, settings),
-        run.seed,
-        run.state_path,
-        run.on_evaluation,
-        run.settings_hash,
-    )
+    return black_box_attack(problem, _asked(method, settings), _policy_calls(problem, settings), run)
 
 
 def planned_evaluations(method: Method, problem: AttackProblem, settings: SearchSettings) -> int:
@@ -227,7 +212,7 @@ def _policy_calls(problem: AttackProblem, settings: SearchSettings) -> int:
 def _fresh(problem: AttackProblem, generator: torch.Generator) -> dict[str, Tensor]:
     theta = problem.sensor.initial_theta(generator)
     moments = {"m": torch.zeros_like(theta), "v": torch.zeros_like(theta)}
-    return {"theta": theta, **moments, "calls": torch.tensor(0), "generator": generator.get_state()}
+    return {"theta": theta, **moments, "calls": torch.tensor(0)}
 
 
 class _Loop:
@@ -274,10 +259,7 @@ class _Loop:
         if problem.regulariser is not None:
             extra, slope = problem.regulariser(theta)
             loss_m, gradient = loss_m + extra, gradient + slope
-        if not (math.isfinite(loss_m) and bool(torch.isfinite(gradient).all())):
-            raise SearchDivergedError(
-                f"expected a finite loss and gradient at evaluation {number}, got loss {loss_m}"
-            )
+        require_finite(loss_m, gradient, number)
         self._student.go_on(self._generator)
         evaluation = self._state.record(theta, loss_m, result.totals, time.perf_counter() - began)
         moved = _adam_step(theta, gradient, known["m"], known["v"], number + 1, self._search.learning_rate)

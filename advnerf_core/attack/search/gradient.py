@@ -2,51 +2,39 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem, Totals, adjoint_gradient
-from advnerf_core.attack.methods import SearchRun, SearchSettings
+from advnerf_core.attack.methods import FRESH_RUN, SearchRun, SearchSettings
 from advnerf_core.attack.search.descent import Descent
 from advnerf_core.attack.search.population import Coarse
 from advnerf_core.attack.search.search import (
-    OnEvaluation,
-    SearchDivergedError,
+    Evaluation,
     SearchResult,
     begin,
+    go_on,
     gradient_step,
+    require_finite,
     search_fingerprint,
 )
 
 
 def search(problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
     """The method as `advnerf_core.attack.methods` has it."""
-    return gradient_attack(
-        problem,
-        settings.evaluations,
-        gradient_step(problem, settings),
-        run.seed,
-        run.state_path,
-        run.on_evaluation,
-        run.settings_hash,
-    )
+    return gradient_attack(problem, settings.evaluations, gradient_step(problem, settings), run)
 
 
 def gradient_attack(
     problem: AttackProblem,
     iterations: int = 50,
     learning_rate: float = 0.1,
-    seed: int = 0,
-    state_path: Path | None = None,
-    on_evaluation: OnEvaluation | None = None,
-    settings_hash: str = "",
+    run: SearchRun = FRESH_RUN,
 ) -> SearchResult:
     """Maximise the objective by gradient descent on its loss.
 
@@ -56,12 +44,8 @@ def gradient_attack(
         problem: What is attacked.
         iterations: Evaluations in all, those of a resumed state included.
         learning_rate: Of Adam.
-        seed: Of the starting noise.
-        state_path: State file, written after every iteration; if it exists, the attack goes on from it.
-        on_evaluation: Called after every iteration.
-        settings_hash: Hash of scene, policy and configuration; a state file of another one is refused.
+        run: Seed of the starting noise, state file and callback.
     """
-    run = SearchRun(seed, state_path, on_evaluation, settings_hash)
     return climb(problem, adjoint_slope, iterations, learning_rate, run, method="gradient")
 
 
@@ -113,8 +97,6 @@ def climb(
     Raises:
         SearchDivergedError: A loss or gradient is not finite.
     """
-    if evaluations < 1:
-        raise ValueError(f"expected at least one iteration, got {evaluations}")
     if cells:
         settings["cells"] = cells
     coarse = Coarse(tuple(problem.sensor.theta_shape), cells)
@@ -131,25 +113,16 @@ def climb(
         run.state_path, fingerprint, lambda: {"theta": coarse.sampled(problem.sensor.initial_theta(start))}
     )
     descent = Descent(state.tensors, learning_rate)
-    while len(state.history) < evaluations:
+
+    def step() -> Evaluation:
         began, number = time.perf_counter(), len(state.history)
         theta = coarse.expand(descent.theta)
         slope = slope_of(problem.at_draw(number), theta)
-        _check_finite(slope, number)
+        require_finite(slope.loss_m, slope.gradient, number)
         evaluated = theta.clone()  # before Adam changes it in place
         descent.step(coarse.gathered(slope.gradient))
         evaluation = state.record(evaluated, slope.loss_m, slope.totals, time.perf_counter() - began)
         state.tensors = descent.tensors
-        if run.state_path is not None:
-            state.save(run.state_path, fingerprint)
-        if run.on_evaluation is not None:
-            run.on_evaluation(evaluation)
-    return state.result()
+        return evaluation
 
-
-def _check_finite(slope: Slope, number: int) -> None:
-    if not (math.isfinite(slope.loss_m) and bool(torch.isfinite(slope.gradient).all())):
-        raise SearchDivergedError(
-            f"expected a finite loss and gradient at iteration {number}, got loss {slope.loss_m}; "
-            "check the policy and the scene for NaN"
-        )
+    return go_on(state, run, fingerprint, evaluations, step)

@@ -9,20 +9,19 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem
-from advnerf_core.attack.methods import SearchRun, SearchSettings
+from advnerf_core.attack.methods import FRESH_RUN, SearchRun, SearchSettings
 from advnerf_core.attack.search.search import (
     Evaluation,
-    OnEvaluation,
     SearchResult,
     SearchState,
-    begin,
+    begin_drawing,
+    go_on,
     search_fingerprint,
     without_gradient,
 )
@@ -97,10 +96,7 @@ def population_search(
     evaluations: int = 50,
     population: int = 10,
     cells: int = 8,
-    seed: int = 0,
-    state_path: Path | None = None,
-    on_evaluation: OnEvaluation | None = None,
-    settings_hash: str = "",
+    run: SearchRun = FRESH_RUN,
 ) -> SearchResult:
     """Minimise the loss without its gradient, generation by generation; the best by the objective's value is kept.
 
@@ -110,43 +106,37 @@ def population_search(
         evaluations: Rollouts in all, those of a resumed state included; a last generation may stay unfinished.
         population: Candidates of a generation.
         cells: See `Coarse`.
-        seed: Of the candidates.
-        state_path: State file, written after every evaluation; if it exists, the search goes on from it, to the bit.
-        on_evaluation: Called after every evaluation.
-        settings_hash: Hash of scene, policy and configuration; a state file of another one is refused.
+        run: Seed of the candidates, state file and callback; a search goes on from its state file to the bit.
     """
-    if evaluations < 1 or population < 4:
-        raise ValueError(
-            f"expected evaluations >= 1 and a population >= 4, got {evaluations} and {population}"
-        )
+    if population < 4:
+        raise ValueError(f"expected a population >= 4, got {population}")
     coarse = Coarse(tuple(problem.sensor.theta_shape), cells)
     fingerprint = search_fingerprint(
         problem,
         coarse.theta_shape,
         method=repr(strategy),
-        seed=seed,
+        seed=run.seed,
         population=population,
         cells=cells,
-        hash=settings_hash,
+        hash=run.settings_hash,
     )
-    generator = torch.Generator().manual_seed(seed)
 
-    def generation(known: dict[str, Tensor]) -> dict[str, Tensor]:
+    def generation(known: dict[str, Tensor], generator: torch.Generator) -> dict[str, Tensor]:
         candidates = strategy.ask(known, population, generator)
         losses = torch.zeros(population, dtype=torch.float64)
         return {**known, "candidates": candidates, "losses": losses, "generator": generator.get_state()}
 
-    state = begin(state_path, fingerprint, lambda: generation(strategy.fresh(coarse.shape)))
-    generator.set_state(state.tensors["generator"])
-    while len(state.history) < evaluations:
+    state, generator = begin_drawing(
+        run, fingerprint, lambda generator: generation(strategy.fresh(coarse.shape), generator)
+    )
+
+    def step() -> Evaluation:
         evaluation = _evaluate_next(problem, state, coarse, population)
         if len(state.history) % population == 0:
-            state.tensors = generation(_learned(strategy, state.tensors))
-        if state_path is not None:
-            state.save(state_path, fingerprint)
-        if on_evaluation is not None:
-            on_evaluation(evaluation)
-    return state.result()
+            state.tensors = generation(_learned(strategy, state.tensors), generator)
+        return evaluation
+
+    return go_on(state, run, fingerprint, evaluations, step)
 
 
 def search_with(
@@ -154,15 +144,7 @@ def search_with(
 ) -> SearchResult:
     """`population_search` with the settings of a method."""
     return population_search(
-        problem,
-        strategy,
-        settings.evaluations,
-        settings.population,
-        settings.cells,
-        run.seed,
-        run.state_path,
-        run.on_evaluation,
-        run.settings_hash,
+        problem, strategy, settings.evaluations, settings.population, settings.cells, run
     )
 
 

@@ -8,11 +8,9 @@ deployment shows them; the gradient is that of the same frames, from the same st
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -29,12 +27,13 @@ from advnerf_core.attack.adjoint import (
     gradient_pass,
     roll_out,
 )
+from advnerf_core.attack.methods import FRESH_RUN, SearchRun
 from advnerf_core.attack.search.search import (
-    OnEvaluation,
-    SearchDivergedError,
+    Evaluation,
     SearchResult,
-    SearchState,
-    begin,
+    begin_drawing,
+    go_on,
+    require_finite,
     search_fingerprint,
     without_gradient,
 )
@@ -77,20 +76,14 @@ class MultiStart:
 def multi_start(
     problem: AttackProblem,
     budget: MultiStart | None = None,
-    seed: int = 0,
-    state_path: Path | None = None,
-    on_evaluation: OnEvaluation | None = None,
-    settings_hash: str = "",
+    run: SearchRun = FRESH_RUN,
 ) -> SearchResult:
     """Draw poses, refine each by projected gradient steps, keep the best evaluation of all.
 
     Args:
         problem: What is attacked; its sensor must be a `PlacedSensor`.
         budget: Samples, steps and rates.
-        seed: Of the poses and of the colours' starting noise.
-        state_path: State file, written after every evaluation; if it exists, the search goes on from it.
-        on_evaluation: Called after every evaluation.
-        settings_hash: Hash of scene, policy and configuration; a state file of another one is refused.
+        run: Seed of the poses and of the colours' starting noise, state file and callback.
 
     Raises:
         PoseBoundsError: The bounds leave no place beside the lane.
@@ -103,43 +96,35 @@ def multi_start(
     fingerprint = _fingerprint(
         problem,
         "multi-start",
-        seed=seed,
+        seed=run.seed,
         steps=budget.steps,
-        hash=settings_hash,
+        hash=run.settings_hash,
         rates=[budget.pose_rate, budget.colour_rate],
     )
-    generator = torch.Generator().manual_seed(seed)
-    state = begin(state_path, fingerprint, lambda: {"generator": generator.get_state()})
-    generator.set_state(state.tensors["generator"])
+    state, generator = begin_drawing(run, fingerprint, lambda generator: {})
     climb = _Climb.resumed(sensor, budget, state.tensors)
-    while len(state.history) < budget.evaluations:
+
+    def step() -> Evaluation:
+        nonlocal climb
         began, number = time.perf_counter(), len(state.history)
         if number % budget.steps == 0:
             climb = _Climb.fresh(sensor, budget, generator)
         theta = climb.theta
         result = _gradient(problem.at_draw(number), theta)
-        if not (math.isfinite(result.loss) and bool(torch.isfinite(result.gradient).all())):
-            raise SearchDivergedError(
-                f"expected a finite loss and gradient at evaluation {number}, got loss {result.loss}; "
-                "check the policy and the scene for NaN"
-            )
+        require_finite(result.loss, result.gradient, number)
         climb.step(result.gradient)
         evaluation = state.record(theta, result.loss, result.totals, time.perf_counter() - began)
         state.tensors = {"generator": generator.get_state(), **climb.tensors()}
-        _keep(state, state_path, fingerprint)
-        if on_evaluation is not None:
-            on_evaluation(evaluation)
-    return state.result()
+        return evaluation
+
+    return go_on(state, run, fingerprint, budget.evaluations, step)
 
 
 def random_poses(
     problem: AttackProblem,
     evaluations: int = 50,
     sigma: float = 5.0,
-    seed: int = 0,
-    state_path: Path | None = None,
-    on_evaluation: OnEvaluation | None = None,
-    settings_hash: str = "",
+    run: SearchRun = FRESH_RUN,
 ) -> SearchResult:
     """The baseline: poses drawn evenly from what is allowed and, if colours are free, these from ``N(0, sigma^2)``; the best is kept.
 
@@ -147,24 +132,18 @@ def random_poses(
         problem: What is attacked; its sensor must be a `PlacedSensor`.
         evaluations: Drives in all, those of a resumed state included; as many as a multi-start's, for a fair comparison.
         sigma: Spread of the colours before squashing.
-        seed: Of the draws.
-        state_path: State file, written after every evaluation; if it exists, the search goes on from it.
-        on_evaluation: Called after every evaluation.
-        settings_hash: Hash of scene, policy and configuration; a state file of another one is refused.
+        run: Seed of the draws, state file and callback.
 
     Raises:
         PoseBoundsError: The bounds leave no place beside the lane.
         SearchDivergedError: A loss is not finite.
         SearchStateError: The state file cannot be used.
     """
-    if evaluations < 1:
-        raise ValueError(f"expected at least one evaluation, got {evaluations}")
     sensor = _sensor(problem)
-    fingerprint = _fingerprint(problem, "random poses", seed=seed, sigma=sigma, hash=settings_hash)
-    generator = torch.Generator().manual_seed(seed)
-    state = begin(state_path, fingerprint, lambda: {"generator": generator.get_state()})
-    generator.set_state(state.tensors["generator"])
-    while len(state.history) < evaluations:
+    fingerprint = _fingerprint(problem, "random poses", seed=run.seed, sigma=sigma, hash=run.settings_hash)
+    state, generator = begin_drawing(run, fingerprint, lambda generator: {})
+
+    def step() -> Evaluation:
         began = time.perf_counter()
         unit = sensor.space.draw(generator)
         colours = torch.zeros(0, dtype=torch.float64)
@@ -175,12 +154,10 @@ def random_poses(
         theta = sensor.join(unit, colours)
         sharp, shown = placed_problem(problem, theta)
         loss_m, totals = without_gradient(sharp, shown, len(state.history))
-        evaluation = state.record(theta, loss_m, totals, time.perf_counter() - began)
         state.tensors = {"generator": generator.get_state()}
-        _keep(state, state_path, fingerprint)
-        if on_evaluation is not None:
-            on_evaluation(evaluation)
-    return state.result()
+        return state.record(theta, loss_m, totals, time.perf_counter() - began)
+
+    return go_on(state, run, fingerprint, evaluations, step)
 
 
 def placed_problem(
@@ -297,8 +274,3 @@ def _fingerprint(problem: AttackProblem, method: str, **settings: Any) -> str:
         limits=[part.tolist() for part in limits],
         **settings,
     )
-
-
-def _keep(state: SearchState, path: Path | None, fingerprint: str) -> None:
-    if path is not None:
-        state.save(path, fingerprint)

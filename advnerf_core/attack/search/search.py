@@ -31,7 +31,7 @@ from advnerf_core.places import open_tensors
 
 __all__ = [
     "Evaluation", "OnEvaluation", "SearchDivergedError", "SearchResult", "SearchState", "SearchStateError", "begin",
-    "draw_start_states", "evaluate_theta", "evaluation_from_json", "gradient_step", "load_state", "random_spread", "search_fingerprint",
+    "begin_drawing", "draw_start_states", "evaluate_theta", "evaluation_from_json", "go_on", "gradient_step", "load_state", "random_spread", "require_finite", "search_fingerprint",
     "without_gradient",
 ]  # fmt: skip
 
@@ -186,6 +186,54 @@ def begin(path: Path | None, fingerprint: str, fresh: Callable[[], dict[str, Ten
     return SearchState(fresh())
 
 
+def begin_drawing(
+    run: SearchRun, fingerprint: str, fresh: Callable[[torch.Generator], dict[str, Tensor]]
+) -> tuple[SearchState, torch.Generator]:
+    """The state of a search that draws, and its generator where the state left it.
+
+    Args:
+        run: Seed and state file.
+        fingerprint: Of the search.
+        fresh: Tensors of a search that begins; those that it draws come from the generator.
+    """
+    generator = torch.Generator().manual_seed(run.seed)
+
+    def started() -> dict[str, Tensor]:
+        tensors = fresh(generator)
+        return {**tensors, "generator": generator.get_state()}
+
+    state = begin(run.state_path, fingerprint, started)
+    generator.set_state(state.tensors["generator"])
+    return state, generator
+
+
+def go_on(
+    state: SearchState, run: SearchRun, fingerprint: str, evaluations: int, step: Callable[[], Evaluation]
+) -> SearchResult:
+    """Evaluate until a state has so many evaluations.
+
+    Args:
+        state: Of the search.
+        run: Where the state is kept, and its callback, which is called when the state is on disk.
+        fingerprint: Of the search.
+        evaluations: In all, those of a resumed state included.
+        step: Makes and records the next evaluation, and leaves the tensors to go on with in the state.
+    """
+    if evaluations < 1:
+        raise ValueError(f"expected at least one evaluation, got {evaluations}")
+    while len(state.history) < evaluations:
+        _keep(step(), state, run, fingerprint)
+    return state.result()
+
+
+def _keep(evaluation: Evaluation, state: SearchState, run: SearchRun, fingerprint: str) -> Evaluation:
+    if run.state_path is not None:
+        state.save(run.state_path, fingerprint)
+    if run.on_evaluation is not None:
+        run.on_evaluation(evaluation)
+    return evaluation
+
+
 def without_gradient(problem: AttackProblem, theta: Tensor, number: int) -> tuple[float, Totals]:
     """Loss and totals of evaluation ``number`` of a search that asks for no gradient.
 
@@ -201,6 +249,15 @@ def without_gradient(problem: AttackProblem, theta: Tensor, number: int) -> tupl
             f"expected a finite loss at evaluation {number}, got {loss_m}; check the policy and the scene for NaN"
         )
     return loss_m, totals
+
+
+def require_finite(loss_m: float, gradient: Tensor, number: int) -> None:
+    """Raise `SearchDivergedError` unless loss and gradient of evaluation ``number`` are finite."""
+    if not (math.isfinite(loss_m) and bool(torch.isfinite(gradient).all())):
+        raise SearchDivergedError(
+            f"expected a finite loss and gradient at evaluation {number}, got loss {loss_m}; "
+            "check the policy and the scene for NaN"
+        )
 
 
 def evaluate_theta(
@@ -221,11 +278,7 @@ def evaluate_theta(
     began = time.perf_counter()
     loss_m, totals = without_gradient(problem, theta, len(state.history))
     evaluation = state.record(theta, loss_m, totals, time.perf_counter() - began)
-    if run.state_path is not None:
-        state.save(run.state_path, fingerprint)
-    if run.on_evaluation is not None:
-        run.on_evaluation(evaluation)
-    return evaluation
+    return _keep(evaluation, state, run, fingerprint)
 
 
 def gradient_step(problem: AttackProblem, settings: SearchSettings) -> float:

@@ -78,12 +78,10 @@ class PlaceSpace:
         """Search places; see `Space.search`. The budget is that of the space."""
         if method not in METHODS:
             raise SpaceError(f"expected a method that searches places, {' or '.join(METHODS)}, got {method}")
-        common = (run.seed, run.state_path, run.on_evaluation, run.settings_hash)
         if method == "gradient":
-            return multi_start(problem, self._budget, *common)
-        return random_poses(
-            problem, self._budget.evaluations, settings.sigma or settings.random_sigma, *common
-        )
+            return multi_start(problem, self._budget, run)
+        sigma = settings.sigma or settings.random_sigma
+        return random_poses(problem, self._budget.evaluations, sigma, run)
 
     def attacked(self, theta: Tensor) -> tuple[AttackedObject, ...]:
         """Each object at its place, with its colours."""

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem, BlackBoxError, evaluate
 from advnerf_core.attack.artifact import PLACES, AttackFile, load_attack, save_attack
+from advnerf_core.attack.methods import SearchRun
 from advnerf_core.attack.pose_plots import draw_placements
 from advnerf_core.attack.search.poses import (
     KeepOut,
@@ -165,15 +166,16 @@ def search_poses(
     ready: PreparedPoses, state_path: Path | None = None, report: Report = lambda fraction, text: None
 ) -> SearchResult:
     """Search as the request asks: multi-start for the method gradient, random poses at as many evaluations for random."""
-    problem, asked, seed = ready.problem, ready.asked, ready.prepared.seed
+    problem, asked = ready.problem, ready.asked
     told = telling(asked.evaluations, report, ready.prepared.clean_drive, problem.objective)
+    run = SearchRun(ready.prepared.seed, state_path, told, ready.settings_hash)
     if ready.prepared.request.search.method == "random":
         sigma = ready.prepared.request.search.sigma or 5.0
-        return random_poses(problem, asked.evaluations, sigma, seed, state_path, told, ready.settings_hash)
+        return random_poses(problem, asked.evaluations, sigma, run)
     if not problem.differentiable:
         raise BlackBoxError(f"{ready.prepared.request.policy} has no gradient: use the method random")
     budget = MultiStart(asked.samples, asked.steps, asked.pose_rate, asked.colour_rate)
-    return multi_start(problem, budget, seed, state_path, told, ready.settings_hash)
+    return multi_start(problem, budget, run)
 
 
 def pose_attack_file(ready: PreparedPoses, result: SearchResult) -> AttackFile:

@@ -20,6 +20,7 @@ import torch
 from numpy.typing import NDArray
 
 from advnerf_core.attack.adjoint import evaluate
+from advnerf_core.attack.methods import SearchRun
 from advnerf_core.attack.on_device import on_chosen_device
 from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.spaces.space import ColourSpace
@@ -191,10 +192,12 @@ def _attack_again(
             on_chosen_device(problem),
             attack.evaluations,
             attack.learning_rate,
-            seed=attack.seeds[0],
-            state_path=folder / f"{scenario}.state.safetensors",
-            on_evaluation=told,
-            settings_hash=hash_of({"victim": victim.sha256, "scenario": scenario}),
+            SearchRun(
+                attack.seeds[0],
+                folder / f"{scenario}.state.safetensors",
+                told,
+                hash_of({"victim": victim.sha256, "scenario": scenario}),
+            ),
         )
         thetas[scenario] = result.theta
     return _judged(experiment, space, dressed, victim, thetas, folder)

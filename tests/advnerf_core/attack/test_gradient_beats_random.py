@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem, evaluate
+from advnerf_core.attack.methods import SearchRun
 from advnerf_core.attack.search.gradient import gradient_attack
 from benchmarks.attack_toy import toy_problem
 
@@ -39,7 +40,9 @@ def test_the_gradient_beats_as_many_random_textures_of_every_coarseness(
 ) -> None:
     generator = torch.Generator().manual_seed(seed)
     plain_m = float(evaluate(problem, problem.sensor.initial_theta(generator))[1].protocol_cte_m.mean())
-    found = gradient_attack(problem, EVALUATIONS, 0.5, seed=seed).best.predicted_total_cte_m - plain_m
+    found = (
+        gradient_attack(problem, EVALUATIONS, 0.5, run=SearchRun(seed)).best.predicted_total_cte_m - plain_m
+    )
     best = max(
         float(evaluate(problem, random_texture(LEVELS[k % len(LEVELS)], generator))[1].protocol_cte_m.mean())
         - plain_m

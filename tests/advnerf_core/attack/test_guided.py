@@ -111,7 +111,9 @@ def first_estimate(problem, search, tmp_path):
     from safetensors.torch import load_file
 
     path = tmp_path / f"{search.method}.safetensors"
-    result = black_box_attack(problem, search, least_calls(search, problem, 1), state_path=path)
+    result = black_box_attack(
+        problem, search, least_calls(search, problem, 1), run=SearchRun(state_path=path)
+    )
     return result.theta, 10.0 * load_file(path)["m"]
 
 
@@ -155,9 +157,9 @@ def test_guided_beats_plain_evolution_at_equal_calls_and_comes_near_the_white_bo
     white = gradient_attack(problem, 12, learning_rate=0.5)
     search = replace(GUIDED, learning_rate=0.5, probes=4, cells=4)
     calls = least_calls(search, problem, 12)
-    guided = black_box_attack(problem, search, calls, seed=0)
+    guided = black_box_attack(problem, search, calls, run=SearchRun(0))
     plain = population_search(
-        problem, Evolution(), calls // calls_per_evaluation(problem), population=8, cells=4, seed=0
+        problem, Evolution(), calls // calls_per_evaluation(problem), population=8, cells=4, run=SearchRun(0)
     )
     none = white.history[0].predicted_total_cte_m
     gain = [result.best.predicted_total_cte_m - none for result in (white, guided, plain)]
@@ -186,7 +188,7 @@ def test_calls_are_exactly_what_was_announced_and_never_more_than_allowed(search
 def test_a_search_stopped_anywhere_resumes_to_the_bit(tmp_path, search, options):
     problem = linear_problem(**options)
     calls = least_calls(search, problem, 4)
-    whole = black_box_attack(problem, search, calls, seed=1)
+    whole = black_box_attack(problem, search, calls, run=SearchRun(1))
     path = tmp_path / "state.safetensors"
     for stop in (0, 2):
 
@@ -195,13 +197,15 @@ def test_a_search_stopped_anywhere_resumes_to_the_bit(tmp_path, search, options)
                 raise StoppedError
 
         with pytest.raises(StoppedError):
-            black_box_attack(problem, search, calls, seed=1, state_path=path, on_evaluation=stop_there)
-    resumed = black_box_attack(problem, search, calls, seed=1, state_path=path)
+            black_box_attack(
+                problem, search, calls, run=SearchRun(1, state_path=path, on_evaluation=stop_there)
+            )
+    resumed = black_box_attack(problem, search, calls, run=SearchRun(1, state_path=path))
     assert torch.equal(resumed.theta, whole.theta)
     strip = [[dataclasses.replace(e, seconds=0.0) for e in result.history] for result in (whole, resumed)]
     assert strip[0] == strip[1]
     with pytest.raises(SearchStateError, match="other settings"):
-        black_box_attack(problem, replace(search, probe_sigma=0.2), calls, seed=1, state_path=path)
+        black_box_attack(problem, replace(search, probe_sigma=0.2), calls, run=SearchRun(1, state_path=path))
 
 
 @pytest.mark.slow

@@ -73,22 +73,22 @@ def by_hand(problem):
         return climb(problem, slope, 4, 0.1, run, method="frame")
 
     return {
-        "random": lambda: random_search(problem, 4, 5.0, seed=3),
+        "random": lambda: random_search(problem, 4, 5.0, run=SearchRun(3)),
         "random_coarse": lambda: family("random_coarse", textures.coarse(2)),
         "random_levels": lambda: family("random_levels", textures.levels),
         "random_pink": lambda: family("random_pink", textures.pink),
         "random_natural": lambda: family("random_natural", textures.natural),
-        "cem": lambda: population_search(problem, CrossEntropy(3.0), 4, 4, 2, seed=3),
-        "evolution": lambda: population_search(problem, Evolution(1.0, 0.5), 4, 4, 2, seed=3),
-        "gradient": lambda: gradient_attack(problem, 4, 0.1, seed=3),
+        "cem": lambda: population_search(problem, CrossEntropy(3.0), 4, 4, 2, run=SearchRun(3)),
+        "evolution": lambda: population_search(problem, Evolution(1.0, 0.5), 4, 4, 2, run=SearchRun(3)),
+        "gradient": lambda: gradient_attack(problem, 4, 0.1, run=SearchRun(3)),
         "gradient_coarse": lambda: climb(problem, adjoint_slope, 4, 0.1, run, 2, method="gradient_coarse"),
         "frame": frames,
         # 4 evaluations of 2 starts and 2 ticks: 16 calls. 4 for the first lesson, 12 for a drive with one pair of questions.
         "guided": lambda: black_box_attack(
-            problem, BlackBoxSearch("guided", 0.3, 1, **black_box), 16, seed=3
+            problem, BlackBoxSearch("guided", 0.3, 1, **black_box), 16, run=SearchRun(3)
         ),
         "distilled": lambda: black_box_attack(
-            problem, BlackBoxSearch("distilled", 0.1, 1, **black_box), 16, seed=3
+            problem, BlackBoxSearch("distilled", 0.1, 1, **black_box), 16, run=SearchRun(3)
         ),
     }
 

@@ -8,6 +8,7 @@ from numba import config
 
 from advnerf_core.attack.adjoint import adjoint_gradient
 from advnerf_core.attack.device import use_device
+from advnerf_core.attack.methods import SearchRun
 from advnerf_core.attack.on_device import (
     PolicyThere,
     all_on_chosen_device,
@@ -82,8 +83,8 @@ def test_loss_and_gradient_are_those_of_the_processor(on_cuda, mark, changes):
 @pytest.mark.parametrize("mark", [pytest.param(0, marks=there_only)])
 def test_searches_alone_and_together_end_where_those_of_the_processor_do(on_cuda, mark):
     problem = small()
-    wanted = gradient_attack(problem, 2, seed=5)
-    alone = gradient_attack(on_chosen_device(problem), 2, seed=5)
+    wanted = gradient_attack(problem, 2, run=SearchRun(5))
+    alone = gradient_attack(on_chosen_device(problem), 2, run=SearchRun(5))
     together = gradient_attacks(all_on_chosen_device([problem, problem]), [4, 5], 2)
     for found in (alone, together[1]):
         torch.testing.assert_close(found.theta, wanted.theta, atol=1e-8, rtol=0)

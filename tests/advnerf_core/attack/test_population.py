@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from advnerf_core.attack.adjoint import BlackBoxError, adjoint_gradient
+from advnerf_core.attack.methods import SearchRun
 from advnerf_core.attack.search.cem import CrossEntropy
 from advnerf_core.attack.search.evolution import Evolution, rank_utilities
 from advnerf_core.attack.search.population import Coarse, population_search
@@ -80,7 +81,7 @@ def test_a_search_stopped_anywhere_resumes_to_the_bit(problem, tmp_path, strateg
     class StoppedError(Exception):
         pass
 
-    whole = population_search(problem, strategy, 11, population=4, cells=2, seed=1)
+    whole = population_search(problem, strategy, 11, population=4, cells=2, run=SearchRun(1))
     path = tmp_path / "state.safetensors"
     for stop in (1, 3, 4, 8):  # within a generation, at its end, at its begin
 
@@ -89,15 +90,17 @@ def test_a_search_stopped_anywhere_resumes_to_the_bit(problem, tmp_path, strateg
                 raise StoppedError
 
         with pytest.raises(StoppedError):
-            population_search(problem, strategy, 11, 4, 2, seed=1, state_path=path, on_evaluation=stop_there)
-    resumed = population_search(problem, strategy, 11, 4, 2, seed=1, state_path=path)
+            population_search(
+                problem, strategy, 11, 4, 2, run=SearchRun(1, state_path=path, on_evaluation=stop_there)
+            )
+    resumed = population_search(problem, strategy, 11, 4, 2, run=SearchRun(1, state_path=path))
     assert torch.equal(resumed.theta, whole.theta)
     strip = [[dataclasses.replace(e, seconds=0.0) for e in result.history] for result in (whole, resumed)]
     assert strip[0] == strip[1]
     assert len(whole.history) == 11
     with pytest.raises(SearchStateError, match="other settings"):
         population_search(
-            problem, dataclasses.replace(strategy, sigma=9.0), 12, 4, 2, seed=1, state_path=path
+            problem, dataclasses.replace(strategy, sigma=9.0), 12, 4, 2, run=SearchRun(1, state_path=path)
         )
 
 
@@ -139,7 +142,7 @@ def test_a_policy_with_random_weights_is_attacked_better_than_grey(problem):
         24,
         8,
         cells=2,
-        seed=2,
+        run=SearchRun(2),
     )
     totals = [e.predicted_total_cte_m for e in searched.history]
     assert max(totals) == searched.best.predicted_total_cte_m

@@ -181,7 +181,9 @@ def test_a_step_onto_the_lane_ends_beside_it_and_a_whole_turn_has_no_ends():
 def test_the_searches_spend_their_evaluations_and_multi_start_starts_over():
     problem = moving(2)
     seen = []
-    climbed = multi_start(problem, MultiStart(samples=2, steps=3), seed=1, on_evaluation=seen.append)
+    climbed = multi_start(
+        problem, MultiStart(samples=2, steps=3), run=SearchRun(1, on_evaluation=seen.append)
+    )
     assert seen == list(climbed.history)
     assert [e.iteration for e in seen] == list(range(6))
     assert climbed.best.predicted_total_cte_m == max(e.predicted_total_cte_m for e in seen)
@@ -189,14 +191,14 @@ def test_the_searches_spend_their_evaluations_and_multi_start_starts_over():
     np.testing.assert_allclose(
         float(judge(problem, climbed.theta).protocol_cte_m.mean()), climbed.best.predicted_total_cte_m
     )
-    guessed = random_poses(problem, 3, seed=1)
+    guessed = random_poses(problem, 3, run=SearchRun(1))
     np.testing.assert_allclose(
         float(judge(problem, guessed.theta).protocol_cte_m.mean()), guessed.best.predicted_total_cte_m
     )
     # The second sample does not depend on what became of the first one.
-    alone = multi_start(problem, MultiStart(samples=2, steps=1), seed=1)
+    alone = multi_start(problem, MultiStart(samples=2, steps=1), run=SearchRun(1))
     np.testing.assert_allclose(alone.history[1].loss_m, climbed.history[3].loss_m)
-    assert len(random_poses(problem, 6, seed=1).history) == 6
+    assert len(random_poses(problem, 6, run=SearchRun(1)).history) == 6
 
 
 @pytest.mark.parametrize("free_colours", [True, False])
@@ -204,7 +206,11 @@ def test_the_searches_spend_their_evaluations_and_multi_start_starts_over():
 def test_a_stopped_search_goes_on_to_the_bit(search, free_colours, tmp_path):
     problem, path = moving(2, free_colours=free_colours), tmp_path / "state.safetensors"
     settings = {"budget": MultiStart(2, 3)} if search == "multi_start" else {"evaluations": 6}
-    run = partial(multi_start if search == "multi_start" else random_poses, problem, seed=4, **settings)
+    searched = multi_start if search == "multi_start" else random_poses
+
+    def run(**kept):
+        return searched(problem, **settings, run=SearchRun(4, **kept))
+
     whole = run()
     for stop in (1, 2, 4):
 
@@ -221,7 +227,7 @@ def test_a_stopped_search_goes_on_to_the_bit(search, free_colours, tmp_path):
         run(state_path=path, settings_hash="another scene")
     other = moving(2, free_colours=free_colours, clearance_m=0.2)
     with pytest.raises(SearchStateError, match="other settings"):
-        (multi_start if search == "multi_start" else random_poses)(other, seed=4, state_path=path, **settings)
+        searched(other, **settings, run=SearchRun(4, path))
 
 
 @pytest.mark.parametrize(
@@ -305,7 +311,7 @@ def test_an_attack_file_of_places_gives_what_a_deployment_shows():
     space = space_of(problem, MultiStart(2, 2))
     surrogate, placed_there = space.surrogate, dataclasses.replace(problem, sensor=space.sensor)
     result, attack = attack_of(space, placed_there, "gradient")
-    expected = multi_start(problem, MultiStart(2, 2), seed=7)
+    expected = multi_start(problem, MultiStart(2, 2), run=SearchRun(7))
     assert torch.equal(result.theta, expected.theta)
     assert attack.space == "places"
     found = space.restored(attack)
@@ -358,7 +364,9 @@ def test_the_scene_of_a_drive_is_rendered_once_for_its_gradient_too():
         rendered.clear()
         space = placed_one.sensor.space
         sensor = PlacedSensor(surrogate.remembering(kept_bytes), space)
-        result = multi_start(dataclasses.replace(placed_one, sensor=sensor), MultiStart(1, 2), seed=7)
+        result = multi_start(
+            dataclasses.replace(placed_one, sensor=sensor), MultiStart(1, 2), run=SearchRun(7)
+        )
         found[kept_bytes] = (result.theta, len(rendered))
     frames = placed_one.steps * len(placed_one.start_states)
     # Two evaluations with gradients; what is kept are the frames of one drive.

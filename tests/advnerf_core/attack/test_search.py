@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
+from advnerf_core.attack.methods import SearchRun
 from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.search.random_search import random_search
 from advnerf_core.attack.search.search import (
@@ -37,13 +38,13 @@ def test_the_first_iterations_are_adam_written_out(problem):
         g = result.gradient.double()
         m, v = 0.9 * m + 0.1 * g, 0.999 * v + 0.001 * g**2
         theta = theta - 0.1 * (m / (1 - 0.9**step)) / ((v / (1 - 0.999**step)).sqrt() + 1e-8)
-    result = gradient_attack(problem, iterations=3, seed=5)
+    result = gradient_attack(problem, iterations=3, run=SearchRun(5))
     np.testing.assert_allclose([e.loss_m for e in result.history], losses, rtol=1e-5)
 
 
 def test_the_attack_raises_the_error_and_keeps_its_best(problem):
     seen = []
-    result = gradient_attack(problem, iterations=8, on_evaluation=seen.append)
+    result = gradient_attack(problem, iterations=8, run=SearchRun(on_evaluation=seen.append))
     totals = [e.predicted_total_cte_m for e in result.history]
     assert seen == list(result.history)
     assert max(totals) > totals[0]
@@ -61,30 +62,30 @@ def test_a_stopped_search_resumes_to_the_bit(problem, tmp_path, search):
         if evaluation.iteration == 2:
             raise StoppedError
 
-    whole = search(problem, 5, seed=1)
+    whole = search(problem, 5, run=SearchRun(1))
     path = tmp_path / "state.safetensors"
     with pytest.raises(StoppedError):
-        search(problem, 5, seed=1, state_path=path, on_evaluation=stop_at_two)
+        search(problem, 5, run=SearchRun(1, state_path=path, on_evaluation=stop_at_two))
     seen = []
-    resumed = search(problem, 5, seed=1, state_path=path, on_evaluation=seen.append)
+    resumed = search(problem, 5, run=SearchRun(1, state_path=path, on_evaluation=seen.append))
     assert [e.iteration for e in seen] == [3, 4]
     assert torch.equal(resumed.theta, whole.theta)
     assert without_times(resumed.history) == without_times(whole.history)
     # Nothing is left to do: the same result, no evaluation.
-    assert torch.equal(search(problem, 5, seed=1, state_path=path).theta, whole.theta)
+    assert torch.equal(search(problem, 5, run=SearchRun(1, state_path=path)).theta, whole.theta)
 
 
 @pytest.mark.parametrize("search", [gradient_attack, random_search])
 def test_a_state_of_other_settings_or_garbage_is_refused(problem, tmp_path, search):
     path = tmp_path / "state.safetensors"
-    search(problem, 1, seed=1, state_path=path)
+    search(problem, 1, run=SearchRun(1, state_path=path))
     with pytest.raises(SearchStateError, match="other settings"):
-        search(problem, 2, seed=2, state_path=path)
+        search(problem, 2, run=SearchRun(2, state_path=path))
     with pytest.raises(SearchStateError, match="other settings"):
-        search(problem, 2, seed=1, state_path=path, settings_hash="other policy")
+        search(problem, 2, run=SearchRun(1, state_path=path, settings_hash="other policy"))
     path.write_bytes(path.read_bytes()[:50])
     with pytest.raises(SearchStateError, match="delete it to start afresh"):
-        search(problem, 2, seed=1, state_path=path)
+        search(problem, 2, run=SearchRun(1, state_path=path))
 
 
 def test_two_names_for_one_tensor_are_two_tensors_in_the_state(tmp_path):
@@ -127,7 +128,7 @@ def test_a_gradient_that_is_not_finite_is_one_clear_error(problem):
                 rendered.images, lambda grad: torch.full(self.theta_shape, torch.nan), rendered.nbytes
             )
 
-    with pytest.raises(SearchDivergedError, match="at iteration 0"):
+    with pytest.raises(SearchDivergedError, match="at evaluation 0"):
         gradient_attack(dataclasses.replace(problem, sensor=Broken()), 2)
 
 

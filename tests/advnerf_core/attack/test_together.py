@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from advnerf_core.attack.adjoint import adjoint_gradient
+from advnerf_core.attack.methods import SearchRun
 from advnerf_core.attack.robustness import Smoothness
 from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.search.search import SearchStateError
@@ -53,7 +54,7 @@ def test_a_search_together_ends_where_searches_alone_do(problems):
     smooth = [dataclasses.replace(p, regulariser=Smoothness(p.sensor.objects, 0.05)) for p in problems]
     results = gradient_attacks(smooth, SEEDS, 3)
     for problem, seed, result in zip(smooth, SEEDS, results, strict=True):
-        alone = gradient_attack(problem, 3, seed=seed)
+        alone = gradient_attack(problem, 3, run=SearchRun(seed))
         torch.testing.assert_close(result.theta, alone.theta, rtol=1e-6, atol=1e-9)
         assert [e.loss_m for e in result.history] == pytest.approx(
             [e.loss_m for e in alone.history], rel=1e-9

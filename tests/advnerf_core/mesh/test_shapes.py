@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from advnerf_core.attack.adjoint import AttackProblem, adjoint_gradient
+from advnerf_core.attack.methods import SearchRun
 from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.driving.dynamics import Ackermann
 from advnerf_core.driving.path import Line, Path
@@ -181,13 +182,13 @@ def problem():
 def test_an_attack_on_shapes_gains_and_resumes_to_the_bit(problem, tmp_path, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "2")  # sums over samples keep their order all the same
     rate = problem.sensor.limits.learning_rate
-    whole = gradient_attack(problem, 6, rate, state_path=tmp_path / "whole.safetensors")
+    whole = gradient_attack(problem, 6, rate, run=SearchRun(state_path=tmp_path / "whole.safetensors"))
     totals = [evaluation.predicted_total_cte_m for evaluation in whole.history]
     assert max(totals) > 1.05 * totals[0]
     cut = tmp_path / "cut.safetensors"
-    gradient_attack(problem, 3, rate, state_path=cut)
+    gradient_attack(problem, 3, rate, run=SearchRun(state_path=cut))
     fresh = dataclasses.replace(problem, sensor=ShapeSensor(problem.sensor.surrogate, problem.sensor.limits))
-    resumed = gradient_attack(fresh, 6, rate, state_path=cut)
+    resumed = gradient_attack(fresh, 6, rate, run=SearchRun(state_path=cut))
     assert torch.equal(resumed.theta, whole.theta)
     assert [e.loss_m for e in resumed.history] == [e.loss_m for e in whole.history]
 

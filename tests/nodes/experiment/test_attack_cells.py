@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from advnerf_core.attack.artifact import load_attack
+from advnerf_core.attack.methods import SearchRun
 from advnerf_core.attack.robustness import Disturbances
 from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.search.search import SearchStateError
@@ -228,7 +229,7 @@ def test_a_search_bears_what_it_is_asked_to_and_is_measured_undisturbed(fresh: E
     # The same search by hand.
     disturbed = replace(problem, disturbances=Disturbances(noise=0.2, gain=0.5, seed=0))
     budget = bearing.config.attack.evaluations
-    by_hand = gradient_attack(disturbed, budget, bearing.config.attack.learning_rate, seed=0)
+    by_hand = gradient_attack(disturbed, budget, bearing.config.attack.learning_rate, run=SearchRun(0))
     colours = space.restored(load_attack(bearing.cell_folder(GRADIENT) / attack.ATTACK)).colours
     assert np.array_equal(colours, in_half_precision(by_hand.theta))
     # Measured is a drive in which nothing is drawn.
