@@ -57,17 +57,11 @@ def _run(folder: Path, request: object) -> None:
     from nodes.experiment.node.printed import print_attacks
     from nodes.experiment.node.request import AttackRequest
     from nodes.experiment.node.search import run_attack
-    from nodes.runtime.errors import ConfigError
-    from nodes.runtime.locks import HeldError, hold
+    from nodes.runtime.locks import hold_folder
     from nodes.runtime.progress import ProgressDisplay
 
     assert isinstance(request, AttackRequest)
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        lock = hold(folder / ".lock")
-    except HeldError as error:
-        raise ConfigError(f"{folder} is in use by process {error.owner}: wait for it, or stop it") from None
-    with lock, ProgressDisplay() as display:
+    with hold_folder(folder), ProgressDisplay() as display:
         files = run_attack(request, folder, display)
     print_attacks(files)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, TextIO
+from typing import Annotated
 
 import typer
 
@@ -32,11 +32,12 @@ def attack_poses(file: RequestFile, output: Output = None, overrides: Overrides 
     from nodes.experiment.node.poses import run_poses
     from nodes.experiment.node.printed import print_attacks
     from nodes.experiment.node.request import load_request
+    from nodes.runtime.locks import hold_folder
     from nodes.runtime.progress import ProgressDisplay
 
     request = load_request(file, overrides or [])
     folder = output or Path("runs") / request.name
-    with _held(folder), ProgressDisplay() as display:
+    with hold_folder(folder), ProgressDisplay() as display:
         files = run_poses(request, folder, display)
     rows = table("attack", "object", "x [m]", "y [m]", "yaw [rad]", "scale", "predicted total CTE [m]")
     for each in files:
@@ -58,11 +59,12 @@ def attack_landscape(
 
     from nodes.experiment.node.pose_maps import make_landscape
     from nodes.experiment.node.request import load_request
+    from nodes.runtime.locks import hold_folder
     from nodes.runtime.progress import ProgressDisplay
 
     request = load_request(file, overrides or [])
     folder = output or Path("runs") / request.name
-    with _held(folder), ProgressDisplay() as display:
+    with hold_folder(folder), ProgressDisplay() as display:
         found, picture = make_landscape(request, folder, attack, display.start("landscape"))
     values = found.total_cte_m
     if np.isnan(values).all():
@@ -84,11 +86,12 @@ def attack_robustness(
 
     from nodes.experiment.node.pose_maps import make_robustness
     from nodes.experiment.node.request import load_request
+    from nodes.runtime.locks import hold_folder
     from nodes.runtime.progress import ProgressDisplay
 
     request = load_request(file, overrides or [])
     folder = output or Path("runs") / request.name
-    with _held(folder), ProgressDisplay() as display:
+    with hold_folder(folder), ProgressDisplay() as display:
         found, picture = make_robustness(request, folder, attack, display.start("robustness"))
     ratios = found.total_cte_m / found.plain_cte_m
     clear = ratios[np.isfinite(ratios)]
@@ -100,17 +103,6 @@ def attack_robustness(
         )
     )
     print(f"{text}: {picture}")
-
-
-def _held(folder: Path) -> TextIO:
-    from nodes.runtime.errors import ConfigError
-    from nodes.runtime.locks import HeldError, hold
-
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        return hold(folder / ".lock")
-    except HeldError as error:
-        raise ConfigError(f"{folder} is in use by process {error.owner}: wait for it, or stop it") from None
 
 
 def add_to(app: typer.Typer) -> None:

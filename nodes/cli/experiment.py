@@ -7,12 +7,13 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from nodes.runtime.options import with_groups
 from nodes.runtime.terminal import Device, Overrides, experiment_argument, print_table, say_error, table
 from nodes.runtime.termination import ends_in_order
 
@@ -52,6 +53,19 @@ Only = Annotated[
         help="Only these cells, e.g. scenario=straight+left,method=gradient.",
     ),
 ]
+
+
+@dataclass(frozen=True)
+class CellChoice:
+    """Which cells of a file."""
+
+    file: File
+    setting: Setting = "demo"
+    folder: Folder = None
+    only: Only = ""
+    overrides: Overrides = None
+
+
 _COLOURS = {
     "done": "green",
     "not driven live": "yellow",
@@ -64,24 +78,24 @@ _COLOURS = {
 _FAILURE_EXIT = 1
 
 
-def load_cells(
-    file: Path, setting: str, folder: Path | None, overrides: list[str] | None, only: str
-) -> tuple[Campaign, list[Cell]]:
+def load_cells(choice: CellChoice) -> tuple[Campaign, list[Cell]]:
     """The cells of a file, all and those that are wanted."""
     os.environ.setdefault("MUJOCO_GL", "egl")
     from nodes.experiment.plan.cell import select
     from nodes.experiment.run.config import campaign_of, is_campaign, load_campaign
 
-    if is_campaign(file):
-        campaign = load_campaign(file, folder, tuple(overrides or ()))
+    overrides = choice.overrides or []
+    if is_campaign(choice.file):
+        campaign = load_campaign(choice.file, choice.folder, tuple(overrides))
     else:
         from nodes.experiment.steps.attack import cells
         from nodes.experiment.steps.run import load_experiment
 
-        experiment = load_experiment(file, setting, overrides or [], folder or Path("runs") / setting)
-        campaign = campaign_of(experiment, overrides or [], cells(experiment))
+        folder = choice.folder or Path("runs") / choice.setting
+        experiment = load_experiment(choice.file, choice.setting, overrides, folder)
+        campaign = campaign_of(experiment, overrides, cells(experiment))
     _know_methods(campaign)
-    return campaign, select(campaign.cells, only)
+    return campaign, select(campaign.cells, choice.only)
 
 
 def _know_methods(campaign: Campaign) -> None:
@@ -91,17 +105,18 @@ def _know_methods(campaign: Campaign) -> None:
     know_methods_of(campaign.folder / CELLS, {cell.method for cell in campaign.cells})
 
 
-def _say_code(file: Path, setting: str, folder: Path | None, overrides: Sequence[str]) -> None:
+def _say_code(choice: CellChoice) -> None:
     """Print the code that a run of a file will execute; nothing is executed for it."""
     from nodes.experiment.plan.setting_file import read_setting
     from nodes.experiment.run.config import is_campaign, load_campaign
     from nodes.lab.plugin_tables import say_code
     from nodes.runtime.named_code import with_absolute_code
 
+    file, overrides = choice.file, choice.overrides or []
     if not is_campaign(file):
-        say_code(read_setting(file, setting, overrides).data, file.resolve().parent)
+        say_code(read_setting(file, choice.setting, overrides).data, file.resolve().parent)
         return
-    campaign = load_campaign(file, folder, tuple(overrides))
+    campaign = load_campaign(file, choice.folder, tuple(overrides))
     named: list[Any] = [{"methods": [cell.code for cell in campaign.cells]}]
     for scenario in campaign.scenarios.values():
         named.append({"kind": scenario.kind})
@@ -116,9 +131,7 @@ def _say_code(file: Path, setting: str, folder: Path | None, overrides: Sequence
 
 
 def experiment(
-    file: File,
-    setting: Setting = "demo",
-    folder: Folder = None,
+    choice: CellChoice,
     until: Annotated[
         str | None,
         typer.Option(
@@ -127,7 +140,6 @@ def experiment(
             help="Stop after this stage: capture, scene, bake, object, policy, retrain or live.",
         ),
     ] = None,
-    only: Only = "",
     jobs: Annotated[
         int | None,
         typer.Option(
@@ -182,7 +194,6 @@ def experiment(
     page_port: Annotated[
         int, typer.Option("--page-port", min=0, max=65535, help="Port of the page; 0 selects a free one.")
     ] = 8091,
-    overrides: Overrides = None,
 ) -> None:
     """Run an experiment, from the photographs to the report: every stage and every cell that is not there yet. It may be stopped at any time."""
     os.environ.setdefault("MUJOCO_GL", "egl")
@@ -192,8 +203,8 @@ def experiment(
     from nodes.runtime.errors import ConfigError
 
     use_device(device)
-    many = is_campaign(file)
-    _say_code(file, setting, folder, overrides or [])
+    many = is_campaign(choice.file)
+    _say_code(choice)
     address = "" if cluster in (None, "auto") else str(cluster)
     backend: Literal["local", "ray"] = "local" if cluster is None else "ray"
     here = not many and jobs is None and cluster is None
@@ -201,38 +212,27 @@ def experiment(
         jobs or 0, threads or 0, backend, address, retry, gate, search_only, here, ready=not many
     )
     if not many:
-        port = page_port if page else None
-        run_folder = folder or Path("runs") / setting
-        _run_one(file, setting, run_folder, until, only, options, overrides or [], anew, port)
+        _run_one(choice, until, options, anew, page_port if page else None)
         return
     if until is not None or anew or page:
         what = "--until" if until is not None else "--anew" if anew else "--page"
-        raise ConfigError(f"expected {what} with an experiment file, got it with the campaign {file}")
-    _run_many(file, folder, only, options, overrides)
+        raise ConfigError(f"expected {what} with an experiment file, got it with the campaign {choice.file}")
+    _run_many(choice, options)
 
 
-def _run_one(
-    file: Path,
-    setting: str,
-    folder: Path,
-    until: str | None,
-    only: str,
-    options: Options,
-    overrides: Sequence[str],
-    anew: bool,
-    port: int | None,
-) -> None:
+def _run_one(choice: CellChoice, until: str | None, options: Options, anew: bool, port: int | None) -> None:
     from nodes.experiment.run.whole import run_experiment
     from nodes.experiment.steps.run import load_experiment
 
+    overrides, folder = choice.overrides or [], choice.folder or Path("runs") / choice.setting
     with ends_in_order():
-        loaded = load_experiment(file, setting, overrides, folder)
+        loaded = load_experiment(choice.file, choice.setting, overrides, folder)
         if options.here and len(loaded.config.attack.seeds) > 1:
             # Searches with one core each are faster than one after another on all: `python -m benchmarks.seeds_together`.
             options = replace(options, here=False)
 
         def run(record: ProgressRecord | None) -> list[Ended]:
-            return run_experiment(loaded, until, options, only, overrides, anew=anew, record=record)
+            return run_experiment(loaded, until, options, choice.only, overrides, anew=anew, record=record)
 
         if port is None:
             ended = run(None)
@@ -243,12 +243,10 @@ def _run_one(
     _say_wrong(ended)
 
 
-def _run_many(
-    file: Path, folder: Path | None, only: str, options: Options, overrides: list[str] | None
-) -> None:
+def _run_many(choice: CellChoice, options: Options) -> None:
     from nodes.experiment.run.run import run_campaign
 
-    campaign, cells = load_cells(file, "", folder, overrides, only)
+    campaign, cells = load_cells(choice)
     with ends_in_order():
         ended = run_campaign(campaign, cells, options, lambda text: print(text, flush=True))
     if not options.search_only:
@@ -265,16 +263,12 @@ def _say_wrong(ended: Sequence[Any]) -> None:
 
 
 def status(
-    file: File,
-    setting: Setting = "demo",
-    folder: Folder = None,
-    only: Only = "",
-    overrides: Overrides = None,
+    choice: CellChoice,
 ) -> None:
     """Say which cells are done, running, failed (and why), made with other settings, or missing."""
     from nodes.experiment.run.plan import statuses
 
-    campaign, cells = load_cells(file, setting, folder, overrides, only)
+    campaign, cells = load_cells(choice)
     found = statuses(campaign, cells)
     rows = table("cell", "state", "")
     for each in found:
@@ -289,10 +283,7 @@ def status(
 
 
 def table_command(
-    file: File,
-    setting: Setting = "demo",
-    folder: Folder = None,
-    only: Only = "",
+    choice: CellChoice,
     source: Annotated[
         Path | None,
         typer.Option(
@@ -301,18 +292,14 @@ def table_command(
             show_default="those of these settings",
         ),
     ] = None,
-    overrides: Overrides = None,
 ) -> None:
     """Print the table of all cells, and the targets."""
-    campaign, cells = load_cells(file, setting, folder, overrides, only)
+    campaign, cells = load_cells(choice)
     _show(campaign, cells, None, source)
 
 
 def report(
-    file: File,
-    setting: Setting = "demo",
-    folder: Folder = None,
-    only: Only = "",
+    choice: CellChoice,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -323,16 +310,15 @@ def report(
         Path | None,
         typer.Option("--from", help="Of the cells that were published there.", show_default="the own cells"),
     ] = None,
-    overrides: Overrides = None,
 ) -> None:
     """Write the table as JSON, CSV, Markdown and a page with the films by outcome, and print it."""
     from nodes.runtime.errors import ConfigError
 
-    if only and output is None:
+    if choice.only and output is None:
         raise ConfigError(
             "expected --output with --only, as the page of some cells would replace that of all"
         )
-    campaign, cells = load_cells(file, setting, folder, overrides, only)
+    campaign, cells = load_cells(choice)
     _show(campaign, cells, output or _page_folder(campaign), source)
 
 
@@ -409,45 +395,34 @@ def _say_where(full: TransferTable, cells: Sequence[Cell], page: Path | None) ->
 
 
 def predict(
-    file: File,
-    setting: Setting = "demo",
-    folder: Folder = None,
-    only: Only = "",
+    choice: CellChoice,
     draws: Annotated[int, typer.Option("--draws", min=9, help="Drives per prediction.")] = 20,
-    overrides: Overrides = None,
 ) -> None:
     """Predict how the attacks transfer from pictures without a deployed drive with them; the table then says how good that was."""
     os.environ.setdefault("MUJOCO_GL", "egl")
     from nodes.experiment.run.predictions import predict_campaign
 
-    campaign, cells = load_cells(file, setting, folder, overrides, only)
+    campaign, cells = load_cells(choice)
     with ends_in_order():
         made = predict_campaign(campaign, cells, lambda text: print(text, flush=True), draws)
     print(f"{made} predictions made")
 
 
 def maps(
-    file: File,
-    setting: Setting = "demo",
-    folder: Folder = None,
-    only: Only = "",
+    choice: CellChoice,
     number: Annotated[int, typer.Option("--object", min=0, help="Which object is moved.")] = 0,
-    overrides: Overrides = None,
 ) -> None:
     """Draw the loss landscape and the robustness map (starts x moves of an object) of finished cells that have placed objects."""
     os.environ.setdefault("MUJOCO_GL", "egl")
     from nodes.experiment.run.maps import map_cells
 
-    campaign, cells = load_cells(file, setting, folder, overrides, only)
+    campaign, cells = load_cells(choice)
     for picture in map_cells(campaign, cells, number):
         print(picture)
 
 
 def publish(
-    file: File,
-    setting: Setting = "demo",
-    folder: Folder = None,
-    only: Only = "",
+    choice: CellChoice,
     to: Annotated[Path, typer.Option("--to", help="Gets a folder with the campaign's name.")] = Path(
         "docs/results"
     ),
@@ -476,7 +451,6 @@ def publish(
             help="Say that a victim breaks the registered rule of what drives well, and why it is shown; the page says so.",
         ),
     ] = None,
-    overrides: Overrides = None,
 ) -> None:
     """Copy the finished cells, and the scenes, victims and objects that they were run with, to where they are kept with the code."""
     from advnerf_core.report.evidence import registration
@@ -491,7 +465,7 @@ def publish(
     from nodes.experiment.run.store import NOT_DRIVEN
     from nodes.runtime.errors import ConfigError
 
-    campaign, cells = load_cells(file, setting, folder, overrides, only)
+    campaign, cells = load_cells(choice)
     registered = (to / campaign.name / registration.FILE).exists()
     if registered and not build:
         raise ConfigError(
@@ -546,5 +520,5 @@ def _say_build(build: PublishedBuild) -> None:
 def add_to(app: typer.Typer) -> None:
     """Add the commands."""
     for command in (experiment, status, report, predict, maps, publish):
-        app.command()(command)
-    app.command(name="table")(table_command)
+        app.command()(with_groups(command))
+    app.command(name="table")(with_groups(table_command))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from nodes.runtime.options import with_groups
 from nodes.runtime.terminal import PolicyName, experiment_argument, print_table, table
 
 if TYPE_CHECKING:
@@ -15,6 +17,7 @@ if TYPE_CHECKING:
     from advnerf_core.learning.imitation import SourcePlan
     from advnerf_core.policies.architecture import Architecture
     from advnerf_core.policies.view import PolicyView
+    from nodes.lab.policy_data.frames import RecordedFrames
     from nodes.lab.policy_data.train import TrainingRecording
 
 Camera = Annotated[
@@ -23,36 +26,80 @@ Camera = Annotated[
         "--camera", exists=True, help="Camera calibration.", show_default="the one in the first bag"
     ),
 ]
-Room = Annotated[
-    Path | None,
-    typer.Option(
-        "--room",
-        exists=True,
-        help="Room calibration with the reference path.",
-        show_default="the one in the first bag",
-    ),
+Labels = Literal["expert", "recorded"]
+ImageTopic = Annotated[
+    str | None, typer.Option("--image-topic", show_default="the compositor's, else the camera's")
 ]
-Stiffness = Annotated[
-    float, typer.Option("--stiffness", min=0.1, help="Gain with which the expert returns to the path [1/m].")
-]
-Delay = Annotated[
-    float,
-    typer.Option(
-        "--delay",
-        min=0.0,
-        help="Delay from an image to the resulting wheel angle that the labels account for [s].",
-    ),
-]
-Speed = Annotated[float, typer.Option("--speed", min=0.1, help="Speed at which the policy will drive [m/s].")]
-LogColumns = Annotated[
-    tuple[str, str], typer.Option("--log-columns", help="CSV columns of the image file and of the steering.")
-]
-LogScale = Annotated[
-    float,
-    typer.Option(
-        "--log-scale", help="Factor from the logs' steering to radians, left positive; for example -0.26."
-    ),
-]
+
+
+@dataclass(frozen=True)
+class ExpertOptions:
+    """The expert that labels recordings."""
+
+    room: Annotated[
+        Path | None,
+        typer.Option(
+            exists=True,
+            help="Room calibration with the reference path.",
+            show_default="the one in the first bag",
+        ),
+    ] = None
+    speed_mps: Annotated[
+        float, typer.Option("--speed", min=0.1, help="Speed at which the policy will drive [m/s].")
+    ] = 0.8
+    delay_s: Annotated[
+        float,
+        typer.Option(
+            "--delay",
+            min=0.0,
+            help="Delay from an image to the resulting wheel angle that the labels account for [s].",
+        ),
+    ] = 0.16
+    stiffness_1pm: Annotated[
+        float,
+        typer.Option("--stiffness", min=0.1, help="Gain with which the expert returns to the path [1/m]."),
+    ] = 1.0
+
+    def expert(self, bags: list[Path], needed: bool) -> Expert:
+        """The expert on the path of the room, which is that of the first bag unless a file is given."""
+        from advnerf_core.driving.expert import Expert, ExpertConfig
+        from advnerf_core.driving.path import Path as DrivingPath
+        from calibration.schema import RoomCalibration
+
+        config = ExpertConfig(
+            speed_mps=self.speed_mps, delay_s=self.delay_s, stiffness_1pm=self.stiffness_1pm
+        )
+        if not needed and self.room is None:
+            # Not used for labels: the labels are recorded.
+            return Expert(DrivingPath.rounded_square(4.0, 1.1), config)
+        return Expert(_calibration(RoomCalibration, self.room, bags, "room").reference_path, config)
+
+
+@dataclass(frozen=True)
+class LogOptions:
+    """How the CSV file of a log is read."""
+
+    log_columns: Annotated[
+        tuple[str, str], typer.Option(help="CSV columns of the image file and of the steering.")
+    ] = ("image", "steering")
+    log_scale: Annotated[
+        float,
+        typer.Option(help="Factor from the logs' steering to radians, left positive; for example -0.26."),
+    ] = 1.0
+
+    def frames(self, log: Path, view: PolicyView | None) -> tuple[RecordedFrames, PolicyView]:
+        """Frames of a log; None makes the view of its images."""
+        from nodes.lab.policy_data.frames import frames_of_log
+
+        return frames_of_log(log, view, *self.log_columns, self.log_scale)
+
+    def cropped(self, log: Path, view: PolicyView) -> RecordedFrames:
+        """The policy's view for another camera: images of another size are cropped at the same fraction of the image."""
+        from advnerf_core.data.image_files import image_size
+        from nodes.lab.policy_data.frames import first_image
+
+        same = image_size(first_image(log, self.log_columns[0])) == (view.camera.width, view.camera.height)
+        return self.frames(log, view if same else None)[0]
 
 
 def train(
@@ -62,6 +109,8 @@ def train(
             "--out", help="Folder of the policy. Run the same command again to resume a stopped training."
         ),
     ],
+    expert_options: ExpertOptions,
+    log_options: LogOptions,
     bags: Annotated[
         list[Path] | None,
         typer.Option(
@@ -75,17 +124,14 @@ def train(
         typer.Option("--log", exists=True, help="CSV file of a log from another car; may be repeated."),
     ] = None,
     labels: Annotated[
-        Literal["expert", "recorded"],
+        Labels,
         typer.Option(
             "--labels",
             help="Source of the labels: the expert at the measured pose, or the recorded commands.",
         ),
     ] = "expert",
-    image_topic: Annotated[
-        str | None, typer.Option("--image-topic", show_default="the compositor's, else the camera's")
-    ] = None,
+    image_topic: ImageTopic = None,
     camera: Camera = None,
-    room: Room = None,
     surrogate: Annotated[
         Path | None,
         typer.Option(
@@ -114,11 +160,6 @@ def train(
             help="Setting of the architecture, for example 'widths=[16, 32]'; may be repeated.",
         ),
     ] = None,
-    speed_mps: Speed = 0.8,
-    delay_s: Delay = 0.16,
-    stiffness_1pm: Stiffness = 1.0,
-    log_columns: LogColumns = ("image", "steering"),
-    log_scale: LogScale = 1.0,
 ) -> None:
     """Train a policy on recordings: laps of the expert, relabelled drives of the policy (DAgger), logs of other cars."""
     from advnerf_core.learning.imitation import ImitationConfig
@@ -132,10 +173,10 @@ def train(
             "expected --bags BAG or --log FILE.csv, got neither. Give at least one recording; see docs/driving.md"
         )
     network = _architecture(architecture, configuration or [])
-    options = (bags, logs, labels, image_topic, log_columns, log_scale)
-    view = _view(camera, bags, logs, log_columns, log_scale)
-    expert = _expert(room, bags, speed_mps, delay_s, stiffness_1pm, needed=labels == "expert" and bool(bags))
-    parts = _parts(view, expert, *options)
+    view = _view(camera, bags, logs, log_options)
+    expert = expert_options.expert(bags, needed=labels == "expert" and bool(bags))
+    parts = [_of_bag(bag, view, expert, labels, image_topic) for bag in bags]
+    parts += [_of_log(log, view, log_options) for log in logs]
     config = ImitationConfig(
         seed=seed,
         dagger_rounds=1 if surrogate else 0,
@@ -165,20 +206,19 @@ def evaluate(
             metavar="BAG", exists=True, help="Bag of a drive, or CSV file of a log from another car."
         ),
     ],
+    expert_options: ExpertOptions,
+    log_options: LogOptions,
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for the plot and the saliency maps.")
     ] = None,
     labels: Annotated[
-        Literal["expert", "recorded"],
+        Labels,
         typer.Option(
             "--labels",
             help="Source of the reference steering: the expert at the measured pose, or the recorded commands.",
         ),
     ] = "recorded",
-    image_topic: Annotated[
-        str | None, typer.Option("--image-topic", show_default="the compositor's, else the camera's")
-    ] = None,
-    room: Room = None,
+    image_topic: ImageTopic = None,
     maps: Annotated[
         int, typer.Option("--saliency", min=0, help="Number of frames for which a saliency map is drawn.")
     ] = 8,
@@ -187,24 +227,19 @@ def evaluate(
         list[float] | None,
         typer.Option("--goal", help="One number of the goal vector. Repeat for each number."),
     ] = None,
-    speed_mps: Speed = 0.8,
-    delay_s: Delay = 0.16,
-    stiffness_1pm: Stiffness = 1.0,
-    log_columns: LogColumns = ("image", "steering"),
-    log_scale: LogScale = 1.0,
 ) -> None:
     """Compare the steering of a policy with a recording: table, plot and saliency maps."""
     import numpy as np
 
     from advnerf_core.policies.load import load_any_policy
     from nodes.lab.policy_data import evaluate as measure
-    from nodes.lab.policy_data.frames import frames_of_bag, frames_of_log
+    from nodes.lab.policy_data.frames import frames_of_bag
 
     loaded = load_any_policy(policy)
     if recording.suffix == ".csv":
-        found = frames_of_log(recording, loaded.view, *log_columns, log_scale)[0]
+        found = log_options.frames(recording, loaded.view)[0]
     else:
-        expert = _expert(room, [recording], speed_mps, delay_s, stiffness_1pm, needed=labels == "expert")
+        expert = expert_options.expert([recording], needed=labels == "expert")
         found = frames_of_bag(recording, loaded.view, expert, labels, image_topic)
     goals = tuple(goal or ())
     predicted = measure.predict(loaded.policy, found.frames.images, goals)
@@ -230,41 +265,27 @@ def evaluate(
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands with ``advnerf policy``."""
-    app.command("train")(train)
-    app.command("eval")(evaluate)
+    app.command("train")(with_groups(train))
+    app.command("eval")(with_groups(evaluate))
 
 
-def _parts(
-    view: PolicyView,
-    expert: Expert,
-    bags: list[Path],
-    logs: list[Path],
-    labels: Any,
-    image_topic: str | None,
-    columns: tuple[str, str],
-    scale: float,
-) -> list[TrainingRecording]:
+def _of_bag(
+    bag: Path, view: PolicyView, expert: Expert, labels: Labels, image_topic: str | None
+) -> TrainingRecording:
     from nodes.bags.reader import read_info
-    from nodes.lab.policy_data.frames import frames_of_bag, frames_of_log
+    from nodes.lab.policy_data.frames import frames_of_bag
     from nodes.lab.policy_data.train import TrainingRecording
 
-    parts = []
-    for bag in bags:
-        cut = partial(frames_of_bag, bag, view, expert, labels, image_topic)
-        info = read_info(bag)
-        parts.append(
-            TrainingRecording(
-                str(bag), info.parts, {"labels": labels, "images": image_topic}, cut, info.unchecked
-            )
-        )
-    for log in logs:
-        options = {"columns": columns, "scale": scale}
-        parts.append(
-            TrainingRecording(
-                str(log), (log,), options, partial(_own_view, frames_of_log, log, view, columns, scale)
-            )
-        )
-    return parts
+    cut, info = partial(frames_of_bag, bag, view, expert, labels, image_topic), read_info(bag)
+    options = {"labels": labels, "images": image_topic}
+    return TrainingRecording(str(bag), info.parts, options, cut, info.unchecked)
+
+
+def _of_log(log: Path, view: PolicyView, options: LogOptions) -> TrainingRecording:
+    from nodes.lab.policy_data.train import TrainingRecording
+
+    named = {"columns": options.log_columns, "scale": options.log_scale}
+    return TrainingRecording(str(log), (log,), named, partial(options.cropped, log, view))
 
 
 def _architecture(name: str, configuration: list[str]) -> Architecture:
@@ -287,41 +308,14 @@ def _architecture(name: str, configuration: list[str]) -> Architecture:
     return found
 
 
-def _own_view(read: Any, log: Path, view: PolicyView, columns: tuple[str, str], scale: float) -> Any:
-    """The policy's view for another camera: images of another size are cropped at the same fraction of the image."""
-    from advnerf_core.data.image_files import image_size
-    from nodes.lab.policy_data.frames import first_image
-
-    same = image_size(first_image(log, columns[0])) == (view.camera.width, view.camera.height)
-    return read(log, view if same else None, *columns, scale)[0]
-
-
-def _view(
-    camera: Path | None, bags: list[Path], logs: list[Path], columns: tuple[str, str], scale: float
-) -> PolicyView:
+def _view(camera: Path | None, bags: list[Path], logs: list[Path], options: LogOptions) -> PolicyView:
     from advnerf_core.policies.view import PolicyView
     from calibration.schema import CameraCalibration
-    from nodes.lab.policy_data.frames import frames_of_log
 
     if camera is None and not bags:
-        return frames_of_log(logs[0], None, *columns, scale)[1]
+        return options.frames(logs[0], None)[1]
     calibration = _calibration(CameraCalibration, camera, bags, "camera")
     return PolicyView(calibration.pinhole, distortion=calibration.distortion)
-
-
-def _expert(
-    room: Path | None, bags: list[Path], speed_mps: float, delay_s: float, stiffness_1pm: float, needed: bool
-) -> Expert:
-    from advnerf_core.driving.expert import Expert, ExpertConfig
-    from advnerf_core.driving.path import Path as DrivingPath
-    from calibration.schema import RoomCalibration
-
-    config = ExpertConfig(speed_mps=speed_mps, delay_s=delay_s, stiffness_1pm=stiffness_1pm)
-    if not needed and room is None:
-        return Expert(
-            DrivingPath.rounded_square(4.0, 1.1), config
-        )  # not used for labels: the labels are recorded
-    return Expert(_calibration(RoomCalibration, room, bags, "room").reference_path, config)
 
 
 def _calibration(model: Any, given: Path | None, bags: list[Path], name: str) -> Any:

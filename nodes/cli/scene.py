@@ -9,6 +9,8 @@ import typer
 
 from nodes.cli import scene_gate as cli_scene_gate
 from nodes.cli import scene_import as cli_scene_import
+from nodes.lab.training_request import TrainingRequest
+from nodes.runtime.options import with_groups
 from nodes.runtime.terminal import print_table, table
 
 app = typer.Typer(
@@ -25,9 +27,6 @@ Size = Annotated[
     tuple[int, int] | None,
     typer.Option("--size", help="Resize the images to this width and height.", show_default="their size"),
 ]
-Corner = Annotated[
-    tuple[float, float, float] | None, typer.Option(help="Corner of the scene box, in the unit of the file.")
-]
 IntervalScale = Annotated[
     float,
     typer.Option(
@@ -41,136 +40,18 @@ _HELD_OUT_EVERY = 8
 
 
 @app.command("train")
-def scene_train(
-    transforms: DataSet,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="Folder of the results. A stopped training resumes there.")
-    ],
-    steps: Annotated[
-        int | None,
-        typer.Option("--steps", min=1, show_default="1000 without --minutes; presets with a time: none"),
-    ] = None,
-    minutes: Annotated[
-        float | None,
-        typer.Option("--minutes", min=0.01, help="Train for this many minutes instead of --steps."),
-    ] = None,
-    box_low: Corner = None,
-    box_high: Corner = None,
-    size: Size = None,
-    open_scene: Annotated[
-        bool, typer.Option("--open", help="Outdoor scene: rays may leave the box.")
-    ] = False,
-    every: Annotated[
-        int, typer.Option("--every", min=2, help="Hold out every N-th image.")
-    ] = _HELD_OUT_EVERY,
-    near: Annotated[
-        float | None,
-        typer.Option(
-            "--near",
-            min=0.0,
-            help="Learn nothing closer to a camera than this, in the unit of the file.",
-            show_default="1/80 of the box's longest side",
-        ),
-    ] = None,
-    seed: Annotated[int, typer.Option("--seed")] = 0,
-    checkpoint_every_s: Annotated[
-        float,
-        typer.Option(
-            "--checkpoint-every",
-            min=0.0,
-            help="Time between checkpoints; the most training that a kill loses [s].",
-        ),
-    ] = 30.0,
-    unbounded: Annotated[
-        bool | None,
-        typer.Option(
-            "--unbounded/--bounded",
-            help="Also learn the scene outside the box, to the horizon, with detail that decreases with distance.",
-            show_default="unbounded if aabb_scale in the file is more than 1",
-        ),
-    ] = None,
-    preset: Annotated[
-        str,
-        typer.Option(
-            "--preset",
-            help="room: for rooms and for training on a CPU (8 levels of 4 features, 2^17 entries, view-independent colours unless "
-            "--open or --unbounded). instant-ngp: default sizes of instant-ngp (16 levels of 2 features, 2^19 entries, finest "
-            "2048 x aabb_scale, directions to degree 4), for detail and comparisons; slower. minutes, best: for photographs of "
-            "any place, sizes and training for 3 and 10 minutes on two cores (view-dependent colours); --minutes changes the time.",
-        ),
-    ] = "room",
-    interval_px: Annotated[
-        float | None,
-        typer.Option(
-            "--interval-px",
-            help="Length of a sample interval in image pixels. Smaller values are finer and slower.",
-            show_default="4; 1.5 if all cameras stand outside the box",
-        ),
-    ] = None,
-    interval: Annotated[
-        tuple[float, float] | None,
-        typer.Option(
-            "--interval",
-            help="Shortest and longest sample interval, in the unit of the file.",
-            show_default="1/1024 and 1/64 of the box",
-        ),
-    ] = None,
-    interval_growth: Annotated[
-        float | None,
-        typer.Option(
-            "--interval-growth",
-            help="Sample interval per distance.",
-            show_default="--interval-px / focal length",
-        ),
-    ] = None,
-    exposure: Annotated[
-        bool,
-        typer.Option(
-            "--exposure",
-            help="Learn a gain per channel for each photograph, for cameras that choose exposure and white balance themselves.",
-        ),
-    ] = False,
-) -> None:
+@with_groups
+def scene_train(request: TrainingRequest) -> None:
     """Train a scene on posed images and print PSNR and SSIM on the held-out images.
 
     The alpha channel of images is learned too: transparent areas stay transparent.
     """
-    from nodes.lab.scene_training import FIGURES, SCENE, TrainingRequest, train, training_length
-    from nodes.runtime.errors import ConfigError
-    from nodes.runtime.locks import HeldError, hold
+    from nodes.lab.scene_training import FIGURES, SCENE, train
+    from nodes.runtime.locks import hold_folder
     from nodes.runtime.progress import ProgressDisplay
 
-    if (box_low is None) != (box_high is None):
-        raise ConfigError("expected both --box-low and --box-high or neither, got one; add the other")
-    steps, minutes = training_length(preset, steps, minutes)
-    box = None if box_low is None or box_high is None else (box_low, box_high)
-    request = TrainingRequest(
-        transforms,
-        output,
-        steps,
-        minutes,
-        box,
-        size,
-        open_scene,
-        every,
-        near,
-        seed,
-        checkpoint_every_s,
-        unbounded,
-        preset,
-        interval_px,
-        interval,
-        interval_growth,
-        exposure,
-    )
-    output.mkdir(parents=True, exist_ok=True)
-    try:
-        lock = hold(output / ".lock")
-    except HeldError as error:
-        raise ConfigError(
-            f"{output} is in use by process {error.owner}; wait until it ends, or stop it"
-        ) from None
-    with lock, ProgressDisplay() as display:
+    output = request.output
+    with hold_folder(output), ProgressDisplay() as display:
         figures = train(request, display.start("scene"))
     _print_figures(figures)
     print(f"{output / SCENE}; every image in {output / FIGURES}")

@@ -13,7 +13,7 @@ import typer
 
 from advnerf_core.documents import parse_json
 from advnerf_core.run_module import module_command
-from nodes.cli.experiment import File, Folder, Only, Setting, load_cells
+from nodes.cli.experiment import CellChoice, File, Folder, Only, Setting, load_cells
 from nodes.runtime.terminal import Overrides, say_error
 
 Published = Annotated[
@@ -35,7 +35,7 @@ def register(
     from nodes.experiment.run.config import is_campaign
     from nodes.experiment.run.registering import register as write_registration
 
-    campaign, cells = load_cells(file, setting, folder, overrides, only)
+    campaign, cells = load_cells(CellChoice(file, setting, folder, only, overrides))
     shown = "" if is_campaign(file) else setting
     found = write_registration(replace(campaign, cells=tuple(cells)), shown, overrides or [], published)
     print(f"{published / found.name / FILE}: {found.digest[:12]}")
@@ -148,7 +148,8 @@ def _redrive(folder: Path, count: int, seed: int) -> int:
     assert registration is not None, "the set was verified"
     file = Path("launch") / registration.file
     with TemporaryDirectory() as run:
-        campaign, _ = load_cells(file, registration.setting, Path(run), list(registration.overrides), "")
+        choice = CellChoice(file, registration.setting, Path(run), overrides=list(registration.overrides))
+        campaign, _ = load_cells(choice)
         ended = redrive(campaign, folder, count, seed, print)
     for each in ended:
         verdict = "as published" if each.same else f"otherwise: more than {TOLERANCE_M} m"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,6 @@ from advnerf_core.data.image_files import OPAQUE
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array
-from advnerf_core.places import require_utf8
 from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.field import SceneFieldConfig, save_scene
 from advnerf_core.scene.intervals import pixel_intervals
@@ -28,6 +27,7 @@ from advnerf_core.scene.presets import FAST, PHOTOGRAPH_BANDS
 from advnerf_core.scene.presets import PRESETS as SCENE_PRESETS
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.train import TrainConfig, TrainingReport, train_scene
+from nodes.lab.training_request import TrainingRequest
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import Report
 
@@ -38,71 +38,10 @@ SCENE, CHECKPOINT, FIGURES, EXPOSURE = (
     "exposure.json",
 )
 MM_PER_M = 1000.0
-_DEFAULT_STEPS, _NO_TIME_LIMIT_STEPS = 1000, 1_000_000
-PRESETS = ("room", "instant-ngp", *SCENE_PRESETS)
+_NO_TIME_LIMIT_STEPS = 1_000_000
 _WHITE = (1.0, 1.0, 1.0)
 _VIDEO_FPS = 10
 _MEASURES = ("psnr_db", "gain_fitted_psnr_db", "ssim")
-
-
-@dataclass(frozen=True)
-class TrainingRequest:
-    """Settings of a scene training.
-
-    Attributes:
-        transforms: The data set: a ``transforms.json`` or its folder.
-        output: Folder of the results. A stopped training resumes there.
-        steps: Optimisation steps; None with ``minutes``.
-        minutes: Time limit instead of steps [min].
-        box_m: Low and high corner of the scene box, in the data set's unit; None uses Instant-NGP's box of the file.
-        size: ``(width, height)`` to which images are resized; None keeps their size.
-        open_scene: Whether rays may leave the box and colours may depend on the direction, as outdoors.
-        every: Every N-th image is held out, unless the data set has a split.
-        near: Distance from a camera below which nothing is learned, in the data set's unit; None: 1/80 of the box's longest side.
-        seed: Random seed.
-        checkpoint_every_s: Time between checkpoints, the most training that a kill loses [s].
-        unbounded: Whether the scene extends, contracted, outside the box; None: if the file's ``aabb_scale`` is more than 1.
-        preset: Sizes of the field: ``room``, ``instant-ngp``, ``minutes`` or ``best``. The last two also set how to train, see
-            `advnerf_core.scene.presets`.
-        interval_px: Sample intervals in pixels of the training images; None uses the default rule, see `pixel_intervals`.
-        interval: Shortest and longest sample interval, which override the rule, in the data set's unit.
-        interval_growth: Interval per distance, which overrides the rule.
-        exposure: Whether a gain per channel is learned for each photograph.
-    """
-
-    transforms: Path
-    output: Path
-    steps: int | None = 1000
-    minutes: float | None = None
-    box_m: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
-    size: tuple[int, int] | None = None
-    open_scene: bool = False
-    every: int = 8
-    near: float | None = None
-    seed: int = 0
-    checkpoint_every_s: float = 30.0
-    unbounded: bool | None = None
-    preset: str = "room"
-    interval_px: float | None = None
-    interval: tuple[float, float] | None = None
-    interval_growth: float | None = None
-    exposure: bool = False
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        require_utf8(self.output.absolute())
-        if (self.steps is None) == (self.minutes is None):
-            raise ConfigError("expected either --steps or --minutes; give exactly one of them")
-        if self.box_m is not None and not all(low < high for low, high in zip(*self.box_m, strict=True)):
-            raise ConfigError(f"expected a box with low < high, got {self.box_m}")
-        if self.preset not in PRESETS:
-            raise ConfigError(f"expected a preset of {', '.join(PRESETS)}, got {self.preset!r}")
-        if self.interval_px is not None and not self.interval_px > 0.0:
-            raise ConfigError(f"expected --interval-px above 0, got {self.interval_px}")
-        if self.interval is not None and not 0.0 < self.interval[0] <= self.interval[1]:
-            raise ConfigError(f"expected --interval as 0 < SHORTEST <= LONGEST, got {list(self.interval)}")
-        if self.interval_growth is not None and not self.interval_growth >= 0.0:
-            raise ConfigError(f"expected --interval-growth of 0 or more, got {self.interval_growth}")
 
 
 def train(request: TrainingRequest, report: Report) -> dict[str, Any]:
@@ -282,9 +221,10 @@ def sample_intervals(request: TrainingRequest, field: SceneFieldConfig, images: 
 
 def _train_config(request: TrainingRequest, field: SceneFieldConfig, march: MarchConfig) -> TrainConfig:
     is_open = request.open_scene or field.contraction
+    steps, minutes = request.length
     if request.preset in SCENE_PRESETS:
         return replace(
-            SCENE_PRESETS[request.preset].train_config(request.minutes, request.steps),
+            SCENE_PRESETS[request.preset].train_config(minutes, steps),
             seed=request.seed,
             checkpoint_every_s=request.checkpoint_every_s,
             march=march,
@@ -293,24 +233,15 @@ def _train_config(request: TrainingRequest, field: SceneFieldConfig, march: Marc
         )
     return replace(
         FAST,
-        steps=request.steps or _NO_TIME_LIMIT_STEPS,
+        steps=steps or _NO_TIME_LIMIT_STEPS,
         seed=request.seed,
         checkpoint_every_s=request.checkpoint_every_s,
-        max_seconds=None if request.minutes is None else 60.0 * request.minutes,
+        max_seconds=None if minutes is None else 60.0 * minutes,
         march=march,
         opacity=0.0 if is_open else TrainConfig.opacity,
         distortion=2e-3 if is_open else TrainConfig.distortion,
         exposure=request.exposure,
     )
-
-
-def training_length(preset: str, steps: int | None, minutes: float | None) -> tuple[int | None, float | None]:
-    """Steps and minutes of a training: as given, else the preset's minutes, else 1000 steps."""
-    if steps is not None or minutes is not None:
-        return steps, minutes
-    if preset in SCENE_PRESETS:
-        return None, SCENE_PRESETS[preset].minutes
-    return _DEFAULT_STEPS, None
 
 
 def _described(request: TrainingRequest, field: SceneFieldConfig, march: MarchConfig) -> str:

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import TextIO
 
-from nodes.runtime.errors import RuntimeFault
+from nodes.runtime.errors import ConfigError, RuntimeFault
 
 
 class HeldError(RuntimeFault, OSError):
@@ -46,3 +46,16 @@ def hold(path: Path) -> TextIO:
         lock.write(f"{os.getpid()}\n")
         lock.flush()
     return lock
+
+
+def hold_folder(folder: Path) -> TextIO:
+    """Make a folder and take its lock.
+
+    Raises:
+        ConfigError: Another process works in it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        return hold(folder / ".lock")
+    except HeldError as error:
+        raise ConfigError(f"{folder} is in use by process {error.owner}: wait for it, or stop it") from None

@@ -21,7 +21,8 @@ from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.train import TrainConfig, train_scene
 from nodes.cli import main as cli
 from nodes.lab import scene_training
-from nodes.lab.scene_training import TrainingRequest, sample_intervals, scene_field, training_length
+from nodes.lab.scene_training import sample_intervals, scene_field
+from nodes.lab.training_request import TrainingRequest
 from nodes.runtime.errors import ConfigError
 
 TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -94,7 +95,7 @@ def test_unbounded_needs_no_box(tmp_path: Path) -> None:
     field = scene_field(request_for(tmp_path, unbounded=True), listed)
     np.testing.assert_allclose(field.box_high_m, 0.5 + 1.45 - 0.5)
     own = ((-2.0, -2.0, -1.0), (2.0, 2.0, 1.0))
-    given = scene_field(request_for(tmp_path, unbounded=True, box_m=own), listed)
+    given = scene_field(request_for(tmp_path, unbounded=True, box_low=own[0], box_high=own[1]), listed)
     assert (given.box_low_m, given.box_high_m) == own
 
 
@@ -140,7 +141,8 @@ def test_photographs_of_changing_exposure_are_learned_with_gains(tmp_path: Path)
         cv2.imwrite(str(file), image)
     box = ((-0.8,) * 3, (0.8,) * 3)
     figures = scene_training.train(
-        request_for(folder, exposure=True, steps=150, box_m=box), lambda part, text="": None
+        request_for(folder, exposure=True, steps=150, box_low=box[0], box_high=box[1]),
+        lambda part, text="": None,
     )
     rows = json.loads((folder / "learned" / scene_training.EXPOSURE).read_text())
     gains = {row["image"]: np.mean(row["gain"]) for row in rows}
@@ -156,12 +158,12 @@ def test_an_unknown_preset_is_refused(tmp_path: Path) -> None:
         request_for(tmp_path, preset="huge")
 
 
-def test_presets_with_a_time_end_by_it_unless_the_user_says_when() -> None:
-    assert training_length("room", None, None) == (1000, None)
-    assert training_length("minutes", None, None) == (None, 3.0)
-    assert training_length("best", None, None) == (None, 10.0)
-    assert training_length("best", 50, None) == (50, None)
-    assert training_length("minutes", None, 7.0) == (None, 7.0)
+def test_presets_with_a_time_end_by_it_unless_the_user_says_when(tmp_path: Path) -> None:
+    assert request_for(tmp_path, preset="room", steps=None, minutes=None).length == (1000, None)
+    assert request_for(tmp_path, preset="minutes", steps=None, minutes=None).length == (None, 3.0)
+    assert request_for(tmp_path, preset="best", steps=None, minutes=None).length == (None, 10.0)
+    assert request_for(tmp_path, preset="best", steps=50, minutes=None).length == (50, None)
+    assert request_for(tmp_path, preset="minutes", steps=None, minutes=7.0).length == (None, 7.0)
 
 
 @pytest.mark.parametrize(
@@ -239,7 +241,7 @@ def test_intervals_follow_the_images_unless_the_user_says_otherwise(pictures: Pa
     images = listed.with_frames(listed.frames[:2]).load()
 
     def chosen(**changes: object) -> MarchConfig:
-        request = request_for(pictures, box_m=((-0.8,) * 3, (0.8,) * 3), **changes)
+        request = request_for(pictures, box_low=(-0.8,) * 3, box_high=(0.8,) * 3, **changes)
         return sample_intervals(request, scene_field(request, listed, transparent=True), images)
 
     rule = chosen()

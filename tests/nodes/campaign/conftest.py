@@ -68,7 +68,7 @@ from advnerf_core.driving.dynamics import Dubins
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.driving.path import Line
 from advnerf_core.driving.path import Path as DrivingPath
-from advnerf_core.scene.fidelity import Pictures
+from advnerf_core.scene.fidelity import PicturePairs
 from nodes.runtime.errors import RuntimeFault
 
 # Real pictures keep half of what the attack does on learned ones.
@@ -88,7 +88,7 @@ def _pictures(of, real, learned):
     grain = np.random.default_rng(0).uniform(0.0, 0.1, (len(real), 66, 200, 3))  # as SSIM of flat pictures says nothing
     grain[:, 0, 0] = 0.0
     show = lambda values: np.round(255 * (grain + np.asarray(values)[:, None, None, None])).astype(np.uint8)
-    return Pictures(of, show(real), show(learned))
+    return PicturePairs(of, show(real), show(learned))
 
 class Gated(Toy):
     searches_apart = True
