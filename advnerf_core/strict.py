@@ -13,7 +13,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, Union
 
-from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, Tag, TypeAdapter, ValidationError
 from pydantic_core import CoreSchema, PydanticKnownError, SchemaValidator, core_schema
 
 from advnerf_core.documents import Document, Key, raise_problems
@@ -231,10 +231,13 @@ def _what(model: Any, key: Key, problem: Any) -> str:
 
 
 def _as_written(data: Any, location: Key) -> Key:
-    """Path of a key as the user wrote it, without the ``kind`` that pydantic inserts for sections with several models."""
+    """Path of a key as the user wrote it, without the ``kind`` or the tag that pydantic inserts for sections with several models.
+
+    Tags are words with spaces, which no key is.
+    """
     key: list[str | int] = []
     for part in location:
-        if isinstance(data, dict) and part not in data and data.get("kind") == part:
+        if isinstance(data, dict) and part not in data and (data.get("kind") == part or " " in str(part)):
             continue
         key.append(part)
         inside = isinstance(data, dict) or (
@@ -255,12 +258,17 @@ def _valid_keys(annotation: Any, key: Key) -> list[str]:
     arguments = typing.get_args(annotation)
     origin = typing.get_origin(annotation)
     if origin in (Union, types.UnionType):
-        if key and (chosen := [option for option in arguments if _kind(option) == key[0]]):
+        if key and (chosen := [option for option in arguments if key[0] in (_kind(option), _tag(option))]):
             return _valid_keys(chosen[0], key[1:])
         return next((keys for option in arguments if (keys := _valid_keys(option, key))), [])
     if key and arguments and isinstance(origin, type) and issubclass(origin, typing.Iterable):
         return _valid_keys(arguments[-1] if issubclass(origin, dict) else arguments[0], key[1:])
     return []
+
+
+def _tag(option: Any) -> Any:
+    """The tag of a model that a function selects; None without one."""
+    return next((each.tag for each in typing.get_args(option) if isinstance(each, Tag)), None)
 
 
 def _kind(option: Any) -> Any:

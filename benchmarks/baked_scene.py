@@ -34,17 +34,17 @@ from advnerf_core.documents import read_json
 from advnerf_core.geometry import planar_poses
 from advnerf_core.learning.imitation import recovery_states
 from advnerf_core.objects.voxel.model import load_object, save_object
-from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.scene.bake import bake
 from advnerf_core.scene.surrogate import BackgroundRenderer
 from benchmarks.results import REPOSITORY, record_row
+from nodes.experiment.plan.victims import HARDENED, NAIVE
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.drives import deployed_drives
 from nodes.experiment.show.faces import PaintedScene, face_space
 from nodes.experiment.show.learned_scene import load_background, load_field
+from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps import bake as bake_stage
 from nodes.experiment.steps.attack import attack_problem, search_settings
-from nodes.experiment.steps.policy import HARDENED, NAIVE, victim_file
 
 COMMAND = "python -m benchmarks.baked_scene"
 _VIEWS, _EXCESS_M, _MOST_EVALUATIONS, _ITERATIONS, _SEEDS = 200, 0.15, 60, 50, 3
@@ -75,7 +75,7 @@ def fidelity(experiment: Experiment, backgrounds: Backgrounds) -> None:
     states = recovery_states(path, _VIEWS, np.random.default_rng(77), experiment.world.off_track_m, 0.3, None)
     poses, policy = (
         planar_poses(states) @ experiment.mount,
-        load_policy(victim_file(experiment, HARDENED)).policy,
+        load_victim(experiment, HARDENED).policy,
     )
     with torch.no_grad():
         on = {
@@ -186,7 +186,7 @@ def _copy_as_of_before(run: Path, target: Path) -> None:
 
 
 def _problem(experiment: Experiment, background: BackgroundRenderer, victim: str, seed: int) -> AttackProblem:
-    policy = load_policy(victim_file(experiment, victim))
+    policy = load_victim(experiment, victim)
     return attack_problem(
         experiment, face_space(experiment, background), policy, experiment.config.scenarios[0], seed
     )
@@ -262,7 +262,7 @@ def pairs(experiment: Experiment, backgrounds: Backgrounds) -> None:
     with experiment.open_world() as scene:
         dressed = PaintedScene(experiment, scene)
         for victim in (HARDENED, NAIVE):
-            policy = load_policy(victim_file(experiment, victim)).policy
+            policy = load_victim(experiment, victim).policy
             for seed in range(_SEEDS):
                 starts = experiment.start_states(scenario, seed)
                 driven = partial(deployed_drives, experiment, dressed, policy, scenario, starts)

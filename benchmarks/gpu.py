@@ -20,16 +20,16 @@ from advnerf_core.attack.adjoint import adjoint_gradient
 from advnerf_core.attack.device import use_device
 from advnerf_core.attack.on_device import on_chosen_device
 from advnerf_core.attack.problem import AttackProblem
-from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.scene.surrogate import Surrogate
 from benchmarks.results import record_row
 from benchmarks.ticks import hydrants
 from benchmarks.timing import seconds_in_turns
+from nodes.experiment.plan.victims import HARDENED
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.faces import face_space
 from nodes.experiment.show.learned_scene import load_background
+from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.attack import attack_problem
-from nodes.experiment.steps.policy import HARDENED, victim_file
 
 _STEPS, _REPEATS, _DRIVES = 40, 5, (1, 16)
 _ITERATION = "attack iteration of 40 ticks on a GPU, against the processor"
@@ -55,7 +55,7 @@ def main() -> None:
         return
     use_device("cuda")
     experiment = Experiment.resolved_in(arguments.run_folder.resolve())
-    policy, scenario = load_policy(victim_file(experiment, HARDENED)), experiment.config.scenarios[0]
+    policy, scenario = load_victim(experiment, HARDENED), experiment.config.scenarios[0]
     background = load_background(experiment)
     surrogate = Surrogate(background, experiment.view.pinhole, experiment.mount, hydrants(1))
     space = face_space(experiment, background)

@@ -19,8 +19,10 @@ from advnerf_core.driving.metrics import mean_cte_limit_m
 from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.report.cells import read_cell
 from benchmarks.results import record_row
+from nodes.experiment.plan.victims import HARDENED
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.steps.policy import HARDENED, agreement, victim_file
+from nodes.experiment.show.victims import victim_spec
+from nodes.experiment.steps.policy import agreement
 
 _LEAST_DB, _MOST_SHARE, _MOST_MIN = 25.0, 0.02, 60.0
 
@@ -83,7 +85,10 @@ def record(experiment: Experiment, cell: Path | None = None, victim_of: Path | N
         views = read_json(folder / "policy" / "policy.json")["on_held_out_views"]
     else:
         other = Experiment.resolved_in(victim_of)
-        victim, whose = victim_file(other, HARDENED), f"; by the victim of {road_of(other.config.world)}"
+        victim, whose = (
+            Path(victim_spec(other, HARDENED)),
+            f"; by the victim of {road_of(other.config.world)}",
+        )
         views = agreement(experiment, load_policy(victim).policy)
     right, left = about["car"]["control_limits"]
     share = float(np.mean([abs(view["real"] - view["surrogate"]) for view in views])) / (left - right)

@@ -22,12 +22,12 @@ import advnerf_core as advnerf_core  # isort: skip  # before torch, as in the co
 from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.search.together import gradient_attacks
-from advnerf_core.policies.policy_file import load_policy
 from benchmarks.results import record_row
+from nodes.experiment.plan.victims import HARDENED
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.faces import face_space
+from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.attack import attack_problem
-from nodes.experiment.steps.policy import HARDENED, victim_file
 
 _ITERATIONS, _REPEATS = 6, 3
 _BATCH, _IN_A_ROW, _BESIDE = "one batch", "one after the other", "beside each other"
@@ -94,7 +94,7 @@ def _run(folder: Path, shares: list[list[int]], batch: bool, threads: int) -> fl
 def _timed(folder: Path, seeds: list[int], batch: bool) -> float:
     """Seconds of the iterations of these seeds in this process."""
     experiment = Experiment.resolved_in(folder.resolve())
-    space, policy = face_space(experiment), load_policy(victim_file(experiment, HARDENED))
+    space, policy = face_space(experiment), load_victim(experiment, HARDENED)
     (scenario,) = experiment.config.scenarios
 
     def problem(seed: int) -> AttackProblem:

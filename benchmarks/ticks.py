@@ -24,16 +24,16 @@ from advnerf_core.geometry import make_transform, planar_poses, rotation_z
 from advnerf_core.objects.voxel.build import build_from_mesh
 from advnerf_core.objects.voxel.generators import GENERATORS
 from advnerf_core.objects.voxel.mesh import stand
-from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.scene.surrogate import Surrogate
 from benchmarks.timing import seconds_in_turns
 from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.plan.space_config import FaceConfig
+from nodes.experiment.plan.victims import HARDENED
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.learned_scene import load_background
 from nodes.experiment.show.spaces import make_space
+from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.attack import attack_problem
-from nodes.experiment.steps.policy import HARDENED, victim_file
 
 STEPS, OBJECTS = 40, (1, 5)
 
@@ -62,7 +62,7 @@ def measured(folder: Path, repeats: int = 5) -> dict[str, float]:
 def _ticks(experiment: Experiment, repeats: int) -> dict[str, float]:
     """Of a tick of a rollout with one object and with five (scene, objects, policy, car, 200 x 66)."""
     scenario, background = experiment.config.scenarios[0], load_background(experiment)
-    path, loaded = experiment.paths[scenario], load_policy(victim_file(experiment, HARDENED))
+    path, loaded = experiment.paths[scenario], load_victim(experiment, HARDENED)
     states = np.array([path.pose_at(float(s)) for s in np.linspace(0.0, 3.0, 30)])
     poses, found = planar_poses(states) @ experiment.mount, {}
     start = torch.zeros(1, experiment.dynamics.state_size)
@@ -84,7 +84,7 @@ def _ticks(experiment: Experiment, repeats: int) -> dict[str, float]:
 def _iteration(experiment: Experiment, repeats: int) -> float:
     """Of a rollout and its gradient."""
     scenario, space = experiment.config.scenarios[0], make_space(experiment, None)
-    loaded = load_policy(victim_file(experiment, HARDENED))
+    loaded = load_victim(experiment, HARDENED)
     problem = replace(attack_problem(experiment, space, loaded, scenario, 0), steps=STEPS)
     theta = space.surrogate.initial_theta(torch.Generator().manual_seed(0))
     return (

@@ -16,15 +16,15 @@ import numpy as np
 
 from advnerf_core.driving.metrics import drives, mean_cte_limit_m
 from advnerf_core.policies.network import Policy
-from advnerf_core.policies.policy_file import load_policy
 from benchmarks.results import REPOSITORY, record_row
+from nodes.experiment.plan.victims import HARDENED
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import Dressed
 from nodes.experiment.show.drives import deployed_drives
 from nodes.experiment.show.native import stand_in
 from nodes.experiment.show.objects import placed_objects
+from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.elsewhere import place_elsewhere
-from nodes.experiment.steps.policy import HARDENED, victim_file
 from nodes.experiment.steps.run import load_experiment
 
 ROADS = (("CS", 201), ("SC", 202), ("CC", 203), ("CSC", 204), ("SCS", 205))
@@ -38,7 +38,7 @@ def main() -> None:
     parser.add_argument("run_folder", type=Path)
     folder = parser.parse_args().run_folder
     experiment = load_experiment(_FILE, "unseen", [f"measure.starts={_STARTS}"], folder)
-    policy = load_policy(victim_file(experiment, HARDENED)).policy
+    policy = load_victim(experiment, HARDENED).policy
     well: dict[str, list[bool]] = {"no panel": [], "a plain panel": []}
     means: dict[str, list[float]] = {past: [] for past in well}
     for blocks, seed in ROADS:

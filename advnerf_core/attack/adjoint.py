@@ -33,7 +33,7 @@ from advnerf_core.attack.problem import (
     Totals,
 )
 from advnerf_core.driving.dynamics import Dynamics
-from advnerf_core.driving.rollout import Rollout, drive
+from advnerf_core.driving.rollout import Remembering, Rollout, drive
 from advnerf_core.scene.surrogate import Rendered
 
 __all__ = [
@@ -100,9 +100,7 @@ def roll_out(
         return rendered.images
 
     policy = (
-        problem.policy
-        if problem.policy.stateless
-        else _Remembering(problem.policy, len(problem.start_states))
+        problem.policy if problem.policy.stateless else Remembering(problem.policy, len(problem.start_states))
     )
     rollout = drive(policy, observe, problem.dynamics, problem.start_states, problem.steps, problem.goals)
     if not bool(torch.isfinite(rollout.states).all()):
@@ -110,22 +108,7 @@ def roll_out(
         raise SearchDivergedError(
             f"expected finite states, got some that are not after {tick} ticks; check policy and scene for NaN"
         )
-    return rollout, policy.memories if isinstance(policy, _Remembering) else []
-
-
-class _Remembering:
-    """A recurrent policy as a rollout sees it: it keeps every memory it had."""
-
-    stateless = True
-
-    def __init__(self, policy: RecurrentPolicy, batch: int) -> None:
-        self._policy = policy
-        self.memories = [policy.initial_memory(batch)]
-
-    def __call__(self, images: Tensor, goals: Tensor | None = None) -> Tensor:
-        steering, memory = self._policy(images, goals, self.memories[-1])
-        self.memories.append(memory)
-        return steering
+    return rollout, policy.memories if isinstance(policy, Remembering) else []
 
 
 def evaluate(problem: AttackProblem, theta: Tensor) -> tuple[Rollout, Totals]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -61,6 +62,28 @@ def drive(
         controls[t] = _steer(policy, observe(states[t]), goals)
         states[t + 1] = dynamics.step(states[t], controls[t])
     return Rollout(states, controls)
+
+
+class Remembering:
+    """A policy with memory as a drive sees it: every memory that it had is kept.
+
+    Args:
+        policy: Called as ``policy(images, goals, memory) -> (steering, memory)``; it has ``initial_memory(batch)``.
+        batch: How many cars drive.
+    """
+
+    stateless = True
+
+    def __init__(self, policy: Any, batch: int) -> None:
+        self._policy = policy
+        self.memories: list[Tensor] = [policy.initial_memory(batch)]
+
+    def __call__(self, images: Tensor, goals: Tensor | None = None) -> Tensor:
+        """Controls ``[B]`` of images ``[B, 3, H, W]``; the memory goes on."""
+        steering: Tensor
+        steering, memory = self._policy(images, goals, self.memories[-1])
+        self.memories.append(memory)
+        return steering
 
 
 def _steer(policy: Policy, images: Tensor, goals: Tensor | None) -> Tensor:

@@ -30,13 +30,18 @@ if TYPE_CHECKING:
     from advnerf_core.policies.policy_file import LoadedPolicy
 
 _FACTORY = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
-_SUFFIXES = (".safetensors", ".onnx", ".pt2")
+POLICY_SUFFIXES = (".safetensors", ".onnx", ".pt2")
 _CODE_OF_MODULES: WeakKeyDictionary[ModuleType, str] = WeakKeyDictionary()
 
 
 def is_factory(spec: str | os.PathLike[str]) -> bool:
     """Whether a policy is named as ``package.module:factory`` and not as a file."""
     return _FACTORY.fullmatch(str(spec)) is not None
+
+
+def is_code(spec: str | os.PathLike[str]) -> bool:
+    """Whether a policy is named as something that is executed or asked, and not as a file."""
+    return is_factory(spec)
 
 
 def load_any_policy(spec: str | os.PathLike[str], expected_sha256: str | None = None) -> LoadedPolicy:
@@ -89,7 +94,7 @@ def load_adapted(spec: str | os.PathLike[str]) -> tuple[AdaptedPolicy, str]:
             loaded.policy, PolicyContract(loaded.view, goal_size=loaded.policy.goal_size)
         ), loaded.sha256
     raise PolicyContractError(
-        f"expected a file of {', '.join(_SUFFIXES)} or package.module:factory, got {spec}"
+        f"expected a file of {', '.join(POLICY_SUFFIXES)} or package.module:factory, got {spec}"
     )
 
 
@@ -159,6 +164,25 @@ def _factory_sha256(spec: str, policy: AdaptedPolicy, code: str) -> str:
     if policy.identity:
         digest.update(f"{policy.identity}\0{policy.answers_mrad()}".encode())
     return digest.hexdigest()
+
+
+def source_sha256(spec: str | os.PathLike[str]) -> str:
+    """Hash of what a policy is made from, without loading it: of a file's content, or of a factory's code.
+
+    It changes whenever the hash of `load_any_policy` does, unless a program that a factory asks is another.
+
+    Raises:
+        PolicyContractError: A file is missing, or the module of a factory cannot be found.
+    """
+    if not is_code(spec):
+        return policy_file_sha256(Path(spec))
+    search_working_folder_last()
+    try:
+        return module_sha256(str(spec).partition(":")[0])
+    except ImportError as error:
+        raise PolicyContractError(
+            f"cannot find {spec}: {error}; start in the folder that holds it"
+        ) from error
 
 
 def policy_file_sha256(path: Path) -> str:

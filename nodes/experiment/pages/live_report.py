@@ -30,8 +30,8 @@ from nodes.experiment.steps.deploy import DRIVES
 from nodes.experiment.steps.frozen import frozen_hashes
 from nodes.experiment.steps.keys import driven_folder
 from nodes.experiment.steps.live import extra_runs, lab_of
-from nodes.experiment.steps.policy import HARDENED
 from nodes.experiment.steps.search_files import ATTACK, SEARCHED
+from nodes.experiment.steps.steering_gate import steering_of_victims
 from nodes.lab.trials import evaluation
 from nodes.runtime.machine import memory_gib, processor_name
 from nodes.runtime.progress import Report
@@ -242,7 +242,7 @@ def _curves(experiment: Experiment) -> Iterator[rd.LossCurve]:
 def _textures(experiment: Experiment) -> Iterator[rd.Texture]:
     for cell in _attacked(experiment):
         attack = load_attack(experiment.cell_folder(cell) / ATTACK)
-        naive = "" if cell.victim == HARDENED else f", {cell.victim} victim"
+        naive = "" if cell.victim == experiment.config.main_victim else f", {cell.victim} victim"
         yield rd.Texture(
             f"{cell.method}, seed {cell.seed}{naive}",
             cell.method,
@@ -259,7 +259,7 @@ def _attacked(experiment: Experiment) -> list[Cell]:
 
 def _fidelity(experiment: Experiment) -> rd.Fidelity:
     scene = read_json(experiment.stage_folder("scene") / FIDELITY)
-    steering = read_json(experiment.stage_folder("policy") / "policy.json")["on_held_out_views"]
+    steering = steering_of_victims(experiment)[experiment.config.main_victim]
     shown = {int(i) for i in np.linspace(0, len(scene["views"]) - 1, SHOWN_VIEWS).round()}
     views = []
     for index, (view, angles) in enumerate(zip(scene["views"], steering, strict=True)):

@@ -24,7 +24,7 @@ from nodes.experiment.show.learned_scene import FIDELITY
 from nodes.experiment.steps import films
 from nodes.experiment.steps.attack import cells
 from nodes.experiment.steps.frozen import frozen_hashes
-from nodes.experiment.steps.policy import HARDENED
+from nodes.experiment.steps.steering_gate import steering_of_victims
 
 _MARGIN_M, _SHOWN_VIEWS = 3.0, 3
 
@@ -92,7 +92,11 @@ def trajectories(experiment: Experiment, name: str) -> Figure:
     """All drives of the hardened victim on one path, from above."""
     path = experiment.paths[name]
     line = path.pose_at(np.linspace(0.0, path.length_m, 300))[:, :2]
-    found = [cell for cell in cells(experiment) if cell.scenario == name and cell.victim == HARDENED]
+    found = [
+        cell
+        for cell in cells(experiment)
+        if cell.scenario == name and cell.victim == experiment.config.main_victim
+    ]
     drives = [
         (cell, domain, states)
         for cell in found
@@ -135,7 +139,7 @@ def _ground(ax: Any, experiment: Experiment) -> None:
 
 def _fidelity(experiment: Experiment) -> list[Markup]:
     scene = read_json(experiment.stage_folder("scene") / FIDELITY)
-    controls = read_json(experiment.stage_folder("policy") / "policy.json")["on_held_out_views"]
+    controls = steering_of_victims(experiment)[experiment.config.main_victim]
     difference = float(np.mean([abs(row["real"] - row["surrogate"]) for row in controls]))
     mean, views = scene["mean"], scene["views"]
     text = (

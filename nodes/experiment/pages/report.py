@@ -27,7 +27,6 @@ from nodes.experiment.show.spaces import dress, make_space, shown_there
 from nodes.experiment.steps import films
 from nodes.experiment.steps.attack import cells, load_found, load_shown
 from nodes.experiment.steps.keys import driven_folder
-from nodes.experiment.steps.policy import HARDENED
 from nodes.runtime.progress import Report
 
 PAGE = "report.html"
@@ -105,7 +104,7 @@ def textures_seen(
     states = [np.array(reference.pose_at(experiment.along_m(at))) for at in _SEEN_AT_M]
     seen = {}
     for method in (NONE, *experiment.config.attack.method_names):
-        cell = Cell(scenario, HARDENED, method, seed)
+        cell = Cell(scenario, experiment.config.main_victim, method, seed)
         folder = driven_folder(experiment, cell)
         shown = load_shown(space, folder, cell)
         dressed, colours = (

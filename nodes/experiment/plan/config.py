@@ -24,6 +24,16 @@ from nodes.experiment.plan.space_config import (
     PlacesConfig,
     SpaceConfig,
 )
+from nodes.experiment.plan.victims import (
+    HARDENED,
+    NAIVE,
+    RETRAINED,
+    TRAINED,
+    TRAINED_PLAIN,
+    TrainedVictim,
+    VictimConfig,
+    VictimName,
+)
 
 Count = Annotated[int, Field(ge=0)]
 Positive = Annotated[int, Field(ge=1)]
@@ -341,6 +351,27 @@ class ExperimentConfig(StrictModel):
         return self
 
     @model_validator(mode="after")
+    def _victims_there_can_be(self) -> ExperimentConfig:
+        if RETRAINED in self.victims:
+            raise ValueError(
+                f"victims: expected other names than {RETRAINED}, which the section retrain makes, got it"
+            )
+        trained = {name: each for name, each in self.victims.items() if isinstance(each, TrainedVictim)}
+        if len({each.train.textures for each in trained.values()}) != len(trained):
+            raise ValueError(
+                f"victims: expected one victim for each way of training, got {', '.join(trained)}, of which two would be the same policy"
+            )
+        if TRAINED_PLAIN in trained.values() and not self.policy.naive_steps:
+            raise ValueError(
+                "expected policy.naive_steps of at least 1 with a victim of train.textures none, got 0"
+            )
+        if self.retrain is not None and self.attacked[self.main_victim] != TRAINED:
+            raise ValueError(
+                f"expected the first of victims to be trained here with random textures where retrain is, got {self.main_victim}"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _retraining_needs_the_gradient(self) -> ExperimentConfig:
         if self.retrain is not None and "gradient" not in self.attack.methods:
             raise ValueError(
@@ -482,6 +513,13 @@ class ExperimentConfig(StrictModel):
     capture: CaptureConfig = CaptureConfig()
     scene: SceneConfig = SceneConfig()
     view: ViewConfig = ViewConfig()
+    victims: dict[VictimName, VictimConfig] = Field(
+        default={},
+        exclude_if=lambda victims: not victims,
+        description="Which policies are attacked, the main one first: mine: {policy: FILE, package.module:factory or grpc://HOST:PORT}, or "
+        "NAME: {train: {textures: random}}, which the section policy trains. None: hardened and, with policy.naive_steps, naive, trained "
+        "with and without random textures.",
+    )
     policy: PolicyConfig = PolicyConfig()
     object: ObjectConfig = ObjectConfig()
     attack: AttackConfig = AttackConfig()
@@ -499,3 +537,23 @@ class ExperimentConfig(StrictModel):
     retrain: RetrainConfig | None = Field(
         default=None, description="Retrain the hardened victim on what was found; none: not."
     )
+
+    @property
+    def attacked(self) -> dict[str, VictimConfig]:
+        """The policies that are attacked by name, the main one first; the retrained one is not among them."""
+        if self.victims:
+            return self.victims
+        trained: dict[str, VictimConfig] = {HARDENED: TRAINED}
+        if self.policy.naive_steps:
+            trained[NAIVE] = TRAINED_PLAIN
+        return trained
+
+    @property
+    def main_victim(self) -> str:
+        """The victim that reports open with, and that is retrained."""
+        return next(iter(self.attacked))
+
+    @property
+    def trains(self) -> bool:
+        """Whether a victim is trained here."""
+        return any(isinstance(each, TrainedVictim) for each in self.attacked.values())

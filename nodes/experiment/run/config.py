@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field, StringConstraints, model_validator
 
@@ -19,6 +19,7 @@ from advnerf_core.scene.gate_limits import GateLimits
 from advnerf_core.strict import StrictModel
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.method_names import ConditionReference
+from nodes.experiment.plan.victims import HARDENED, NAIVE, VictimName
 from nodes.experiment.run.kinds import absolute_kind
 from nodes.runtime.config import load_config
 from nodes.runtime.errors import ConfigError
@@ -26,12 +27,11 @@ from nodes.runtime.errors import ConfigError
 if TYPE_CHECKING:
     from nodes.experiment.show.context import Experiment
 
-Victim = Literal["hardened", "naive", "retrained"]
-# Names become file names, whose parts are separated by "_" and "."; a scenario may hold "_" as its victim is one of three words.
+# Names become file names, whose parts are separated by "_" and "."; a scenario may hold "_", victims may not.
 Name = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_-]*$")]
 # Of a file that names none.
 METHODS: tuple[str, ...] = (NONE, "random", "cem", "gradient")
-VICTIMS: tuple[Victim, ...] = ("hardened", "naive")
+VICTIMS: tuple[VictimName, ...] = (HARDENED, NAIVE)
 
 
 class PlacementConfig(StrictModel):
@@ -78,7 +78,7 @@ class ScenarioConfig(_NothingTwice):
     seeds: tuple[int, ...] | None = Field(
         default=None, min_length=1, description="Instead of the campaign's."
     )
-    victims: tuple[Victim, ...] | None = Field(
+    victims: tuple[VictimName, ...] | None = Field(
         default=None, min_length=1, description="Instead of the campaign's."
     )
     methods: tuple[ConditionReference, ...] | None = Field(
@@ -103,7 +103,7 @@ class CampaignConfig(_NothingTwice):
     name: Name
     folder: Path | None = Field(default=None, description="Where cells go; default runs/campaigns/NAME.")
     seeds: tuple[int, ...] = Field(default=(0, 1, 2), min_length=1)
-    victims: tuple[Victim, ...] = Field(default=VICTIMS, min_length=1)
+    victims: tuple[VictimName, ...] = Field(default=VICTIMS, min_length=1)
     methods: tuple[ConditionReference, ...] = Field(
         default=METHODS,
         min_length=1,

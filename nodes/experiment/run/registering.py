@@ -38,9 +38,9 @@ from nodes.experiment.run.plan import read_experiment, statuses
 from nodes.experiment.run.registered import registered_cell
 from nodes.experiment.run.store import FINISHED
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.victims import given
 from nodes.experiment.steps.attack import planned_evaluations
 from nodes.experiment.steps.keys import registered_settings
-from nodes.experiment.steps.policy import HARDENED
 from nodes.experiment.steps.verdicts import TRAINED_ON, VALIDATED_ON, unseen
 
 
@@ -103,7 +103,7 @@ def _experiment(campaign: Campaign, cell: Cell) -> Experiment:
 
 
 def _scenario(experiment: Experiment, name: str) -> RegisteredScenario:
-    config, limits = experiment.config, experiment.limits
+    config, limits, found = experiment.config, experiment.limits, given(experiment)
     starts = [(float(x), float(y), float(yaw)) for x, y, yaw in experiment.measured_starts(name).tolist()]
     deployed = 0 if config.deploy.through == "nothing" else len(starts[: config.deploy.starts])
     return RegisteredScenario(
@@ -117,13 +117,16 @@ def _scenario(experiment: Experiment, name: str) -> RegisteredScenario:
         deployed_starts=deployed,
         evaluations=planned_evaluations(experiment),
         space=config.space.model_dump(mode="json"),
-        victims=config.policy.key(),
+        victims={
+            **(config.policy.key() if config.trains else {}),
+            **({"policies": {each: policy.sha256 for each, policy in found.items()}} if found else {}),
+        },
         drives_well_mean_cte_m=mean_cte_limit_m(limits.off_track_m),
     )
 
 
 def primary_tests(campaign: Campaign) -> list[PrimaryTest]:
-    """The tests on the victim trained with textures, per scenario: the gradient against all baselines, and that in coarse cells against coarse ones.
+    """The tests on the main victim, per scenario: the gradient against all baselines, and that in coarse cells against coarse ones.
 
     Baselines are the methods whose textures neither trained nor judged the victim. A scenario without any has no test.
 
@@ -133,11 +136,13 @@ def primary_tests(campaign: Campaign) -> list[PrimaryTest]:
     tests = []
     for scenario, placement in dict.fromkeys((cell.scenario, cell.placement) for cell in campaign.cells):
         found = [each for each in campaign.cells if (each.scenario, each.placement) == (scenario, placement)]
-        methods = unseen(cell.method for cell in found if cell.victim == HARDENED and cell.searched)
+        config = read_experiment(campaign, found[0]).config
+        victim = config.main_victim
+        methods = unseen(cell.method for cell in found if cell.victim == victim and cell.searched)
         against = [name for name in methods if name not in (GRADIENT, COARSE_GRADIENT)]
         if GRADIENT not in methods or not against:
             continue
-        lacking = _lacking(methods, read_experiment(campaign, found[0]).config)
+        lacking = _lacking(methods, config)
         if lacking:
             raise RegistrationError(
                 f"{scenario_key(scenario, placement)}: expected the baselines that a test of the gradient needs, got {', '.join(against)} "
@@ -147,7 +152,7 @@ def primary_tests(campaign: Campaign) -> list[PrimaryTest]:
         coarse = [name for name in against if name in COARSE_BASELINES] if COARSE_GRADIENT in methods else []
         tests += [
             PrimaryTest(
-                scenario=scenario, placement=placement, victim=HARDENED, method=method, against=tuple(names)
+                scenario=scenario, placement=placement, victim=victim, method=method, against=tuple(names)
             )
             for method, names in ((GRADIENT, against), (COARSE_GRADIENT, coarse))
             if names

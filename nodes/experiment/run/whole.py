@@ -24,6 +24,7 @@ from nodes.experiment.run.run import Options, run_campaign
 from nodes.experiment.run.store import FINISHED, NOT_DRIVEN
 from nodes.experiment.run.worker import Ended
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.victims import look_at_given
 from nodes.experiment.steps.attack import cells
 from nodes.experiment.steps.run import make_ready, stages_of
 from nodes.experiment.steps.steering_gate import require_same_steering
@@ -62,12 +63,13 @@ def run_experiment(
         ConfigError: The folder has the stages of another experiment, or ``only`` fits no cell.
     """
     console, began = console or Console(), time.monotonic()
+    require_own_folder(experiment)
+    look_at_given(experiment)
     stages = [*stages_of(experiment), _report_stage(experiment, {})]
     check_until(stages, until)
     plan = cells(experiment)
     chosen = select(plan, only)
     if record is not None:
-        require_own_folder(experiment)
         names = [stage.name for stage in stages]
         until_there = names if until is None else names[: names.index(until) + 1]
         record.plan(until_there, chosen if REPORT in until_there else [])

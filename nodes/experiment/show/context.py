@@ -38,6 +38,7 @@ from nodes.experiment.engine.run_folder import CELLS, RunFolder
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.plan.placed import PlacedObject, in_a_lane
+from nodes.experiment.show.victims import given, given_in
 from nodes.lab.worlds.expert_drive import as_path
 from nodes.lab.worlds.named import NamedWorld, read_world, without
 from nodes.runtime.config import load_config
@@ -125,6 +126,11 @@ class Experiment(RunFolder[ExperimentConfig]):
         except ConfigError:
             return False
         return True
+
+    @property
+    def view_settings(self) -> dict[str, Any]:
+        """What of the policy's view results depend on, as JSON data."""
+        return self.view.to_dict() if given_in(self.config) else self.config.view.model_dump(mode="json")
 
     def ask_world(self) -> None:
         """Have a world that must be asked for its description say it, before the capture stage keeps it: nothing is photographed for it."""
@@ -296,11 +302,23 @@ class Experiment(RunFolder[ExperimentConfig]):
 
     @cached_property
     def view(self) -> PolicyView:
-        """What the policy sees of the driving camera.
+        """What the policy sees of the driving camera: as the section view says, or as policies that exist declare.
 
         Raises:
-            ConfigError: The window leaves the camera's image.
+            ConfigError: The window leaves the camera's image; or a policy was made for another camera, or was not looked at yet.
         """
+        for name, policy in given(self).items():
+            view = policy.declared.view
+            if "view" in self.config.model_fields_set:
+                raise ConfigError(
+                    f"{self.file}: expected no section view with victims.{name}, whose declaration says what it sees; remove the section"
+                )
+            if view.camera != self.camera or any(view.distortion):
+                raise ConfigError(
+                    f"{self.file}: victims.{name}: expected a policy that was trained for the driving camera, {self.camera} without distortion, "
+                    f"got {view.camera}{' with distortion' * any(view.distortion)}; correct its declaration, or the world's camera"
+                )
+            return view
         try:
             return PolicyView(self.camera, **self.config.view.model_dump())
         except ValueError as error:

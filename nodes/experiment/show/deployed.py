@@ -19,7 +19,7 @@ from torch import Tensor
 from advnerf_core.driving.dynamics import Dynamics
 from advnerf_core.driving.metrics import DriveMetrics, Horizon, drive_metrics
 from advnerf_core.driving.path import Path
-from advnerf_core.driving.rollout import drive
+from advnerf_core.driving.rollout import Remembering, drive
 from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.geometry import Array, Pinhole, planar_poses
 from advnerf_core.learning.sources import Show
@@ -290,8 +290,9 @@ def drive_deployed(
     goals = torch.tensor([tuple(goal)], dtype=torch.float32) if goal else None
     first = torch.from_numpy(np.array(start, dtype=np.float64))[None]
     seen = _ideally(dressed, theta, car) if camera is None else _through(camera, dressed, theta, limits.dt_s)
+    driver: Policy = policy if getattr(policy, "stateless", True) else Remembering(policy, 1)
     rollout = drive(
-        policy, lambda states: images_to_tensor(seen(states[0].numpy())), car, first, limits.ticks, goals
+        driver, lambda states: images_to_tensor(seen(states[0].numpy())), car, first, limits.ticks, goals
     )
     states = rollout.states[:, 0].numpy().copy()
     states[:, 2] = np.unwrap(states[:, 2])

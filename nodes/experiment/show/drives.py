@@ -15,6 +15,7 @@ from advnerf_core.policies.network import Policy
 from hardware.cameras.effects import ImperfectCamera
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import DeployedDrive, Dressed, IdealDriving, SelfDriving, drive_deployed
+from nodes.experiment.show.victims import told
 
 
 def learned_drives(
@@ -52,7 +53,7 @@ def deployed_drives(
         drive_deployed(
             dressed,
             policy,
-            experiment.goal(scenario),
+            told(experiment, policy, scenario),
             np.asarray(start),
             experiment.paths[scenario],
             experiment.limits,

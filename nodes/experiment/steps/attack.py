@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from advnerf_core.attack.search.search import SearchResult
 from advnerf_core.attack.spaces.space import Shown, Space, half_precision
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
-from advnerf_core.policies.policy_file import LoadedPolicy, load_policy
+from advnerf_core.policies.policy_file import LoadedPolicy
 from advnerf_core.report.conditions import CONTROLS, EMPTY, NONE
 from nodes.experiment.engine.stage_record import hash_of
 from nodes.experiment.engine.telling import telling
@@ -35,24 +34,29 @@ from nodes.experiment.plan.space_config import (
     MeshTextureConfig,
     PlacesConfig,
 )
+from nodes.experiment.plan.victims import TRAINED_PLAIN
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.drives import learned_drives, totals
 from nodes.experiment.show.learned_scene import baked_file, load_field, scene_sha256
 from nodes.experiment.show.spaces import over_the_world
+from nodes.experiment.show.victims import load_victim, told
 from nodes.experiment.steps.frozen import frozen_for, hardness_before
-from nodes.experiment.steps.policy import HARDENED, victim_file, victims
 from nodes.experiment.steps.search_files import ATTACK, SEARCHED
 
 _STATE = "state.safetensors"
 
 
 def cells(experiment: Experiment) -> list[Cell]:
-    """All cells in order: controls, then every seed against the hardened victim, the first also against the naive one; quick ones first."""
-    seeds, methods = experiment.config.attack.seeds, experiment.config.attack.methods
+    """All cells in order: controls, then every seed against each victim, the first alone against one that was trained plain; quick ones first."""
+    config, seeds, methods = (
+        experiment.config,
+        experiment.config.attack.seeds,
+        experiment.config.attack.methods,
+    )
     rows = [
         (victim, seed)
-        for victim in victims(experiment)
-        for seed in (seeds if victim == HARDENED else seeds[:1])
+        for victim, wanted in config.attacked.items()
+        for seed in (seeds[:1] if wanted == TRAINED_PLAIN and victim != config.main_victim else seeds)
     ]
     controls = CONTROLS if experiment.config.measure.no_object else (NONE,)
     # All seeds are measured from the same starts, so that a control is one cell for all of them.
@@ -84,7 +88,7 @@ def surrogate_part(
     if kept.exists():
         found: dict[str, Any] = read_json(kept)
         return found
-    policy = _victim(victim_file(experiment, cell.victim))
+    policy = load_victim(experiment, cell.victim)
     problem = attack_problem(experiment, space, policy, cell.scenario, cell.seed)
     attack_id, curve, seconds, values = None, [], 0.0, {}
     if cell.searched:
@@ -121,7 +125,7 @@ def surrogate_drives(experiment: Experiment, space: Space, cell: Cell, folder: P
     Returns:
         States ``[S, T + 1, n]``, commands ``[S, T]`` and metrics, as JSON data.
     """
-    policy = _victim(victim_file(experiment, cell.victim))
+    policy = load_victim(experiment, cell.victim)
     problem = attack_problem(experiment, space, policy, cell.scenario, cell.seed)
     shown = load_shown(space, folder, cell)
     measured = from_measured_starts(experiment, cell.scenario, past_field(experiment, problem, space, shown))
@@ -142,7 +146,8 @@ def attack_problem(
     attack, robustness = experiment.config.attack, experiment.config.attack.robustness
     # Drives of one start differ by what is drawn in them.
     starts = experiment.start_states(scenario, seed).repeat_interleave(robustness.repeats, dim=0)
-    goals, objective = _goals(experiment, scenario, len(starts)), load_objective(attack.objective)
+    goals = _goals(told(experiment, policy.policy, scenario), len(starts))
+    objective = load_objective(attack.objective)
     return AttackProblem(
         policy.policy,
         space.sensor,
@@ -163,15 +168,14 @@ def attack_problem(
     )
 
 
-def _goals(experiment: Experiment, scenario: str, count: int) -> torch.Tensor | None:
-    goal = experiment.goal(scenario)
+def _goals(goal: tuple[float, ...], count: int) -> torch.Tensor | None:
     return torch.tensor([goal], dtype=torch.float32).expand(count, -1) if goal else None
 
 
 def from_measured_starts(experiment: Experiment, scenario: str, problem: AttackProblem) -> AttackProblem:
     """The problem from the starts, and over the horizon, that are measured; nothing disturbs what is seen."""
     starts = experiment.measured_starts(scenario)
-    goals = _goals(experiment, scenario, len(starts))
+    goals = _goals(told(experiment, problem.policy, scenario), len(starts))
     return replace(problem.undisturbed(), start_states=starts, goals=goals, steps=experiment.config.horizon)
 
 
@@ -247,11 +251,6 @@ def _search(
     told = telling(method.evaluations(problem, settings), report, objective=problem.objective)
     run = SearchRun(cell.seed, folder / _STATE, told, settings_hash)
     return space.search(cell.code, on_chosen_device(problem), settings, run)
-
-
-@lru_cache(maxsize=4)
-def _victim(path: Path) -> LoadedPolicy:
-    return load_policy(path)
 
 
 def _attack_file(

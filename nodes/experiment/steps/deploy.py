@@ -13,7 +13,6 @@ import torch
 from advnerf_core.attack.spaces.space import Space
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
-from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.report.conditions import NONE
 from advnerf_core.report.evidence.kept import kept_drives
 from hardware.worlds.world import World
@@ -22,9 +21,9 @@ from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import DeployedDrive
 from nodes.experiment.show.drives import deployed_drives, totals
 from nodes.experiment.show.spaces import dress, shown_there
+from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.attack import load_found, load_shown
 from nodes.experiment.steps.live import LiveRun, as_drive, drive_until_it_counts
-from nodes.experiment.steps.policy import victim_file
 from nodes.experiment.steps.search_files import ATTACK, SEARCHED, THETA
 from nodes.lab.trials.tries import NotDrivenError
 
@@ -66,7 +65,7 @@ class ThroughWorld:
         """Drive in this process; see `Deployer.drive`."""
         del tell
         experiment = self.experiment
-        policy = load_policy(victim_file(experiment, cell.victim)).policy
+        policy = load_victim(experiment, cell.victim).policy
         shown = load_shown(space, folder, cell)
         there = dress(experiment, self.scene, shown)
         starts, colours = (

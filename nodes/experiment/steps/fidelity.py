@@ -26,7 +26,6 @@ from advnerf_core.documents import read_json
 from advnerf_core.driving.measured_car import CarResponse, RespondingCar, fit_response
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.geometry import Array, invert_transform, planar_poses, yaw_of
-from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.scene.fidelity import PicturePairs
 from advnerf_core.scene.surrogate import Surrogate
 from nodes.bags.reader import read_messages
@@ -38,10 +37,10 @@ from nodes.experiment.show.faces import face_space, has_face, on_screen, panel_o
 from nodes.experiment.show.images import as_uint8
 from nodes.experiment.show.objects import surrogate_of
 from nodes.experiment.show.spaces import dress, make_space, shown_there
+from nodes.experiment.show.victims import load_victim, told
 from nodes.experiment.steps import capture
 from nodes.experiment.steps.attack import attack_problem, from_measured_starts, load_found
 from nodes.experiment.steps.deploy import DRIVES, live_name
-from nodes.experiment.steps.policy import victim_file
 from nodes.experiment.steps.search_files import ATTACK
 from nodes.runtime.errors import BagError, RuntimeFault
 from nodes.runtime.messages import decode, ns_from_stamp, pose_matrix
@@ -55,8 +54,8 @@ _CAR, _IMAGE, _SAFETY = "/vicon/car", "/compositor/image", "/safety/state"
 
 def policy_of(experiment: Experiment, cell: Cell) -> tuple[Any, tuple[float, ...]]:
     """The victim and what it is told on its path, of the first where none is named."""
-    goal = experiment.goal(cell.scenario or experiment.config.scenarios[0])
-    return load_policy(victim_file(experiment, cell.victim)).policy, goal
+    policy = load_victim(experiment, cell.victim).policy
+    return policy, told(experiment, policy, cell.scenario or experiment.config.scenarios[0])
 
 
 def held_out(experiment: Experiment) -> PicturePairs:
@@ -136,7 +135,7 @@ def loop(
     found, plain = space.restored(attack), space.plain
     with_it, without = (each.seen_by(space.surrogate) for each in (found, plain))
     problem = attack_problem(
-        experiment, space, load_policy(victim_file(experiment, cell.victim)), cell.scenario, cell.seed
+        experiment, space, load_victim(experiment, cell.victim), cell.scenario, cell.seed
     )
     car, problem = _measured_car(experiment, clean), from_measured_starts(experiment, cell.scenario, problem)
     problem = replace(problem, dynamics=car, start_states=car.start(problem.start_states))

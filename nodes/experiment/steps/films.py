@@ -23,7 +23,6 @@ from nodes.experiment.show.spaces import dress, shown_there
 from nodes.experiment.steps.attack import load_found, load_shown
 from nodes.experiment.steps.deploy import DRIVES
 from nodes.experiment.steps.keys import driven_folder
-from nodes.experiment.steps.policy import HARDENED
 from nodes.experiment.steps.search_files import SEARCHED
 from nodes.lab.trials import evaluation
 
@@ -49,7 +48,9 @@ def film_scenario(
         scenario: Which drive.
         folder: Gets the film.
     """
-    attacked = Cell(scenario, HARDENED, strongest(experiment), experiment.config.attack.seeds[0])
+    attacked = Cell(
+        scenario, experiment.config.main_victim, strongest(experiment), experiment.config.attack.seeds[0]
+    )
     shown = load_shown(space, driven_folder(experiment, attacked), attacked)
     whole = Surrogate(load_background(experiment), experiment.camera, experiment.mount, shown.objects)
     every, rate_hz = filmed(experiment.config.dt_s)

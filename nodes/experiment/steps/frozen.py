@@ -7,14 +7,13 @@ from pathlib import Path
 
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
-from advnerf_core.policies.policy_file import policy_sha256
 from nodes.experiment.engine.stage_record import hash_of
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.faces import has_face, panel_of
 from nodes.experiment.show.learned_scene import scene_sha256
 from nodes.experiment.show.spaces import geometry_sha256
-from nodes.experiment.steps.policy import victim_file, victims
+from nodes.experiment.show.victims import victim_sha256
 from nodes.experiment.steps.search_files import FROZEN
 from nodes.experiment.steps.verdicts import passing_digest
 from nodes.runtime.errors import RuntimeFault
@@ -26,7 +25,7 @@ class FrozenChangedError(RuntimeFault):
 
 def frozen_hashes(experiment: Experiment) -> dict[str, str]:
     """What is fixed before the first attack: scene, victims, objects and their places, starts and seeds."""
-    policies = {f"policy_{name}": _policy_sha256(experiment, name) for name in victims(experiment)}
+    policies = {f"policy_{name}": victim_sha256(experiment, name) for name in experiment.config.attacked}
     starts = {
         f"{scenario} {seed}": experiment.start_states(scenario, seed).tolist()
         for scenario in experiment.config.scenarios
@@ -46,7 +45,7 @@ def frozen_for(experiment: Experiment, cell: Cell) -> dict[str, str]:
     """What is fixed before the search of a cell; other seeds and victims do not matter to it."""
     return {
         **_frozen_place(experiment),
-        "policy": _policy_sha256(experiment, cell.victim),
+        "policy": victim_sha256(experiment, cell.victim),
         "starts": hash_of(
             [
                 experiment.start_states(cell.scenario, cell.seed).tolist(),
@@ -54,10 +53,6 @@ def frozen_for(experiment: Experiment, cell: Cell) -> dict[str, str]:
             ]
         ),
     }
-
-
-def _policy_sha256(experiment: Experiment, victim: str) -> str:
-    return policy_sha256(victim_file(experiment, victim))
 
 
 def _frozen_place(experiment: Experiment) -> dict[str, str]:

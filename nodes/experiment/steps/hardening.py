@@ -12,7 +12,6 @@ from advnerf_core.attack.clean import clean_drive
 from advnerf_core.attack.methods import SearchRun, load_method
 from advnerf_core.attack.spaces.space import Space
 from advnerf_core.driving.metrics import mean_cte_limit_m
-from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.report.evidence.hardness import (
     FILE,
     FamilyHardness,
@@ -22,6 +21,7 @@ from advnerf_core.report.evidence.hardness import (
 )
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import make_space
+from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.attack import (
     attack_problem,
     cells,
@@ -30,7 +30,6 @@ from nodes.experiment.steps.attack import (
     planned_evaluations,
     search_settings,
 )
-from nodes.experiment.steps.policy import victim_file
 from nodes.experiment.steps.verdicts import TRAINED_ON, VALIDATED_ON, hardness_record
 
 _SEED = 20_000  # no search has it
@@ -56,7 +55,7 @@ def judge(experiment: Experiment, victim: str, textures: int = 0) -> HardnessVer
         HardnessError: A gradient search of this run folder has begun, or three other recipes were judged.
     """
     record = hardness_record(experiment)
-    policy = load_policy(victim_file(experiment, victim))
+    policy = load_victim(experiment, victim)
     known = next((each for each in record.verdicts if each.policy_sha256 == policy.sha256), None)
     if known is not None:
         return known
@@ -90,7 +89,7 @@ def family_hardness(
         textures: Drawn per family; all measured starts are driven with each.
     """
     space = make_space(experiment, None)
-    policy = load_policy(victim_file(experiment, victim))
+    policy = load_victim(experiment, victim)
     for scenario in experiment.config.scenarios:
         problem = attack_problem(experiment, space, policy, scenario, _SEED)
         problem = from_measured_starts(experiment, scenario, problem)

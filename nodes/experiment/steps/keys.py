@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from advnerf_core.attack.methods import require_method
+from advnerf_core.attack.methods import METHODS, black_box_methods, require_method
 from advnerf_core.attack.objectives import name_objective
 from advnerf_core.plugins import PluginError
 from advnerf_core.policies.policy_file import policy_sha256
@@ -14,9 +14,10 @@ from advnerf_core.report.conditions import EMPTY, NONE
 from nodes.experiment.engine.stage_record import hash_of, stage_digests
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.space_config import FaceConfig
+from nodes.experiment.plan.victims import RETRAINED
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.victims import given, given_in, victim_sha256, victim_spec
 from nodes.experiment.steps import bake
-from nodes.experiment.steps.policy import RETRAINED, attackable, victim_file
 from nodes.runtime.errors import RuntimeFault
 
 # The stages that cells need of their experiment; what comes after is the cells themselves.
@@ -29,6 +30,7 @@ _FREE: Mapping[str, bool | set[str]] = {
     "scenarios": True,
     "retrain": True,
     "gate": True,
+    "victims": True,
     "reference": True,
     "world": True,
     "attack": {"seeds", "methods", "cache_mib"},
@@ -64,11 +66,15 @@ def cell_inputs(experiment: Experiment, cell: Cell) -> dict[str, Any]:
     if not cell.searched:
         for key in _SEARCHED_WITH:
             inputs["config"]["attack"].pop(key, None)
-    kept = {name: digest for name, digest in experiment.kept.items() if name in NEEDED}
-    inputs["stages"] = {**kept, **stage_digests(experiment.folder, NEEDED)}
+    stages = [name for name in NEEDED if name != "policy" or cell.victim not in given_in(experiment.config)]
+    kept = {name: digest for name, digest in experiment.kept.items() if name in stages}
+    inputs["stages"] = {**kept, **stage_digests(experiment.folder, stages)}
+    if cell.victim in given_in(experiment.config):
+        inputs["config"].pop("policy")
+        return {**inputs, "victim": victim_sha256(experiment, cell.victim)}
     if cell.victim != RETRAINED:
         return inputs
-    file = victim_file(experiment, cell.victim)
+    file = Path(victim_spec(experiment, cell.victim))
     return {**inputs, "victim": policy_sha256(file) if file.exists() else None}
 
 
@@ -76,6 +82,8 @@ def registered_settings(experiment: Experiment) -> dict[str, Any]:
     """Settings that all cells of an experiment depend on, known before any stage is run: what a registration fixes."""
     config = experiment.config.model_dump(mode="json", exclude=_FREE)
     config["policy"] = experiment.config.policy.key()
+    if given_in(experiment.config):
+        config["view"] = experiment.view_settings
     name_objective(config["attack"])
     return {
         "version": VERSION,
@@ -96,9 +104,10 @@ def require_known(experiment: Experiment, cell: Cell) -> None:
     Raises:
         CellError: No such drive, victim or method.
     """
+    retrained = [] if experiment.config.retrain is None else [RETRAINED]
     known: tuple[tuple[str, str, Sequence[str]], ...] = (
         ("scenario", cell.scenario, experiment.config.scenarios),
-        ("victim", cell.victim, attackable(experiment)),
+        ("victim", cell.victim, [*experiment.config.attacked, *retrained]),
     )
     for what, value, choices in known:
         if value not in choices:
@@ -112,6 +121,19 @@ def require_known(experiment: Experiment, cell: Cell) -> None:
             require_method(cell.code)
         except PluginError as error:
             raise CellError(str(error)) from None
+    _require_gradient(experiment, cell)
+
+
+def _require_gradient(experiment: Experiment, cell: Cell) -> None:
+    """A built-in method that needs a gradient cannot attack a black box; users' methods are asked when they search."""
+    method = METHODS.get(cell.code)
+    if method is None or not method.needs_gradient or cell.victim not in given_in(experiment.config):
+        return
+    if not given(experiment)[cell.victim].declared.differentiable:
+        raise CellError(
+            f"expected methods that need no gradient against victim {cell.victim}, which declares that it has none, got {cell.method}; set "
+            f"attack.methods to some of {', '.join(black_box_methods())}"
+        )
 
 
 def clean_folder(experiment: Experiment, cell: Cell, folder: Path) -> Path:

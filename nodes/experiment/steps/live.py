@@ -15,14 +15,13 @@ import numpy as np
 
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.driving.metrics import DriveMetrics, Horizon, first_still_tick
-from advnerf_core.policies.policy_file import policy_sha256
 from hardware.worlds.lab.config import LabConfig
 from hardware.worlds.world import collided_with
 from nodes.control.stop_causes import is_stall
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import DeployedDrive
 from nodes.experiment.show.faces import on_screen, panel_of, wanted_face
-from nodes.experiment.steps.policy import HARDENED, victim_file
+from nodes.experiment.show.victims import victim_sha256, victim_spec
 from nodes.lab.trials.evaluation import attack_ids, counterfactual, score, timing, trajectory
 from nodes.lab.trials.trial import TrialPlan
 from nodes.lab.trials.trial_runner import run_trial
@@ -146,16 +145,16 @@ def blocked_tick(driven: dict[str, Any]) -> int | None:
 
 
 def extra_runs(experiment: Experiment) -> dict[str, LiveRun]:
-    """Runs of the hardened victim beside the cells: laps without attack, and a drive with the panel taken away, where they are asked for."""
+    """Runs of the main victim beside the cells: laps without attack, and a drive with the panel taken away, where they are asked for."""
     wanted, scenario = experiment.config.deploy, experiment.config.scenarios[0]
     start = experiment.references[scenario].drive_start
-    runs = {}
+    runs, main = {}, experiment.config.main_victim
     if wanted.laps:
         way_m = wanted.laps * experiment.paths[scenario].length_m
         ticks = round(way_m / experiment.car.speed_mps / experiment.config.dt_s)
-        runs["laps"] = LiveRun("laps", HARDENED, scenario, start, ticks=ticks)
+        runs["laps"] = LiveRun("laps", main, scenario, start, ticks=ticks)
     if wanted.empty_scene:
-        runs["empty"] = LiveRun("empty", HARDENED, scenario, start, empty=True)
+        runs["empty"] = LiveRun("empty", main, scenario, start, empty=True)
     return runs
 
 
@@ -170,12 +169,11 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
 
 def live_overrides(experiment: Experiment, live: LiveRun) -> list[str]:
     """What the launch file is told for a run: its calibration and room, its victim, its attack."""
-    policy = victim_file(experiment, live.victim)
     overrides = [
         f"params.calibration={experiment.calibration_folder}",
-        f"params.policy={policy}",
+        f"params.policy={victim_spec(experiment, live.victim)}",
         f"params.vicon_port={_free_udp_port()}",
-        f"policy.sha256={policy_sha256(policy)}",
+        f"policy.sha256={victim_sha256(experiment, live.victim)}",
         f"twin.lab={json.dumps(lab_of(experiment).model_dump(mode='json'))}",
     ]
     if not (effects := experiment.config.deploy.camera).ideal:

@@ -18,13 +18,12 @@ from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.memory import RETURNS_WHAT_IS_FREED, peak_mib, restart_peak
-from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.report.data import MemoryRow
 from advnerf_core.run_module import module_command
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.faces import face_space
+from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.attack import attack_problem
-from nodes.experiment.steps.policy import HARDENED, victim_file
 from nodes.runtime.progress import Report
 
 HORIZONS = (50, 200, 400)
@@ -48,7 +47,7 @@ def measure(experiment: Experiment, folder: Path, report: Report) -> tuple[Memor
 def peak_above_idle_mib(experiment: Experiment, ticks: int) -> float:
     """Peak above idle of one gradient over so many ticks [MiB]; the process must be fresh."""
     space = face_space(experiment, ideal=True)
-    policy, scenario = load_policy(victim_file(experiment, HARDENED)), experiment.config.scenarios[0]
+    policy, scenario = load_victim(experiment, experiment.config.main_victim), experiment.config.scenarios[0]
     problem = attack_problem(experiment, space, policy, scenario, experiment.config.attack.seeds[0])
     goals = None if problem.goals is None else problem.goals[:1]
     one = problem.start_states[:1]

@@ -31,6 +31,7 @@ from advnerf_core.learning.sources import FrameSource, RenderedSource, SceneSour
 from advnerf_core.policies.network import Policy, images_to_tensor
 from advnerf_core.policies.policy_file import load_policy
 from hardware.worlds.world import World
+from nodes.experiment.plan.victims import HARDENED, NAIVE
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import Dressed, seen_in
 from nodes.experiment.show.faces import PaintedScene, face_object, face_space, has_face
@@ -45,14 +46,12 @@ from nodes.experiment.show.objects import (
     random_theta,
     surrogate_of,
 )
+from nodes.experiment.show.victims import told
 from nodes.experiment.steps import capture
 from nodes.experiment.steps.elsewhere import plans_elsewhere
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import MeasuringReport, Point
 
-HARDENED, NAIVE, RETRAINED = "hardened", "naive", "retrained"
-VICTIMS = (HARDENED, NAIVE)
-FILES = {HARDENED: "policy.safetensors", NAIVE: "naive.safetensors"}
 # Poses that the policy learns from: as far from the path [m, of half a lane of 1.75 m] as a recovery may have to begin.
 _STILLS_M, _DRIVES_M, _GIVE_UP_M = 1.6, 0.8, 3.0
 # Of a face in training: as many pixels as its nearest view has.
@@ -118,23 +117,6 @@ def _telling(experiment: Experiment, report: MeasuringReport) -> ImitationProgre
         report(0.98 * fraction, text, point)
 
     return told
-
-
-def victims(experiment: Experiment) -> tuple[str, ...]:
-    """The policies that are attacked."""
-    return VICTIMS if experiment.config.policy.naive_steps else (HARDENED,)
-
-
-def attackable(experiment: Experiment) -> tuple[str, ...]:
-    """The policies that there are to attack: also the retrained one, where the experiment retrains."""
-    return (*victims(experiment), *([] if experiment.config.retrain is None else [RETRAINED]))
-
-
-def victim_file(experiment: Experiment, victim: str) -> Path:
-    """Policy file of a victim; the retrained one is that of the first round, as in the paper."""
-    if victim == RETRAINED:
-        return experiment.stage_folder("retrain") / "round0" / "policy.safetensors"
-    return experiment.stage_folder("policy") / FILES[victim]
 
 
 def plans(
@@ -276,19 +258,20 @@ def agreement(experiment: Experiment, policy: Policy | None = None) -> list[dict
 
     Args:
         experiment: With photographs and a scene.
-        policy: By default the experiment's hardened victim.
+        policy: By default the one that was trained with random textures.
     """
     views = load_transforms(experiment.stage_folder("capture") / capture.HELD_OUT / "transforms.json")
-    policy = policy or load_policy(victim_file(experiment, HARDENED)).policy
+    policy = policy or load_policy(experiment.stage_folder("policy") / "policy.safetensors").policy
     surrogate = surrogate_of(experiment, [])
-    goal = torch.tensor([experiment.goal(experiment.config.scenarios[0])], dtype=torch.float32)
+    goal = told(experiment, policy, experiment.config.scenarios[0])
+    goals = torch.tensor([goal], dtype=torch.float32) if goal else None
     rows = []
     for frame in views.frames:
         real = experiment.view.image(load_image(frame)[0])
         with torch.no_grad():
-            on_real = float(policy(images_to_tensor(real), goal)[0])
+            on_real = float(policy(images_to_tensor(real), goals)[0])
             on_surrogate = float(
-                policy(surrogate.render(frame.T_world_from_camera[None], None).images, goal)[0]
+                policy(surrogate.render(frame.T_world_from_camera[None], None).images, goals)[0]
             )
         rows.append({"real": on_real, "surrogate": on_surrogate})
     return rows

@@ -13,12 +13,11 @@ from advnerf_core.attack.pose_maps import landscape, places_over, robustness_map
 from advnerf_core.attack.pose_plots import draw_landscape, draw_robustness
 from advnerf_core.attack.spaces.placed_sensor import PlacedSensor
 from advnerf_core.files import write_atomically
-from advnerf_core.policies.policy_file import load_policy
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import make_space
+from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.attack import attack_problem
-from nodes.experiment.steps.policy import victim_file
 from nodes.runtime.progress import Report
 
 
@@ -70,7 +69,7 @@ def draw_maps(
     space = make_space(experiment, None)
     sensor, name = space.sensor, experiment.objects[number].name
     assert isinstance(sensor, PlacedSensor), "the space of places has this sensor"
-    victim = load_policy(victim_file(experiment, cell.victim))
+    victim = load_victim(experiment, cell.victim)
     problem = attack_problem(experiment, space, victim, cell.scenario, cell.seed)
     places = torch.tensor([each.placement for each in attack.objects], dtype=torch.float64)
     # In the unit box also where only the plain colours are meant.

@@ -41,10 +41,11 @@ from nodes.experiment.show.drives import deployed_drives
 from nodes.experiment.show.native import stand_in
 from nodes.experiment.show.objects import placed_objects
 from nodes.experiment.show.spaces import colour_space, random_placements
+from nodes.experiment.show.victims import load_victim, victim_spec
 from nodes.experiment.steps import retrain_plot
 from nodes.experiment.steps.attack import attack_problem, load_shown, surrogate_part
 from nodes.experiment.steps.frozen import freeze
-from nodes.experiment.steps.policy import HARDENED, plans, victim_file
+from nodes.experiment.steps.policy import plans
 from nodes.experiment.steps.steering_gate import require_same_steering
 from nodes.runtime.progress import Report
 
@@ -71,7 +72,8 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     assert wanted is not None, "the stage runs only where the experiment asks for it"
     require_same_steering(experiment)
     space = colour_space(experiment)
-    file, rounds, kept = victim_file(experiment, HARDENED), [], _old_frames(experiment)
+    main = experiment.config.main_victim
+    file, rounds, kept = Path(victim_spec(experiment, main)), [], _old_frames(experiment)
     victim = load_policy(file)
     thetas: list[torch.Tensor] = []
     with experiment.open_world() as scene:
@@ -153,7 +155,7 @@ def _first_attacks(
     """What the gradient's cells of the first seed find; they are searched here if they are not yet."""
     thetas: dict[str, torch.Tensor] = {}
     for index, name in enumerate(experiment.config.scenarios):
-        cell = Cell(name, HARDENED, "gradient", experiment.config.attack.seeds[0])
+        cell = Cell(name, experiment.config.main_victim, "gradient", experiment.config.attack.seeds[0])
         at = experiment.cell_folder(cell)
         freeze(experiment, cell, at)
 
@@ -312,7 +314,8 @@ def _under_old_attacks(
     experiment: Experiment, dressed: Dressed, folder: Path, first: Found
 ) -> dict[str, Any]:
     """The retrained policy past the attacks that it was trained on, from a start that nothing has seen, beside the original undisturbed."""
-    original, file = load_policy(victim_file(experiment, HARDENED)), folder / "policy.safetensors"
+    original = load_victim(experiment, experiment.config.main_victim)
+    file = folder / "policy.safetensors"
     retrained, rows = load_policy(file), {}
     for scenario, theta in first.thetas.items():
         start = unseen_start(experiment, scenario)

@@ -17,15 +17,17 @@ from advnerf_core.places import require_utf8
 from advnerf_core.plugins import name_in_results, unknown
 from advnerf_core.strict import validate
 from nodes.experiment.engine.reference import REFERENCE
-from nodes.experiment.engine.run_folder import run_to_end
+from nodes.experiment.engine.run_folder import require_own_folder, run_to_end
 from nodes.experiment.engine.stage_record import Stage, StageRecord
 from nodes.experiment.engine.stages import begun_with
 from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.plan.placed import PlacedObject, in_a_lane
 from nodes.experiment.plan.setting_file import read_setting
 from nodes.experiment.plan.space_config import FaceConfig
+from nodes.experiment.plan.victims import RETRAINED
 from nodes.experiment.show import objects
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.victims import VictimUnknownError, given_in, look_at_given, victim_spec
 from nodes.experiment.steps import bake, capture, live, policy, retrain, scene
 from nodes.experiment.steps.live import lab_of
 from nodes.lab.worlds.named import read_world
@@ -74,7 +76,11 @@ def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: 
         lab_of(experiment)
     if experiment.is_described:
         _check_places(experiment, document)
-    return replace(experiment, kept=REFERENCE.digests(stages_of(experiment), experiment.folder))
+    try:
+        stages = stages_of(experiment)
+    except VictimUnknownError:
+        return experiment  # nothing was run with its victims
+    return replace(experiment, kept=REFERENCE.digests(stages, experiment.folder))
 
 
 def _check_ticks(experiment: Experiment, document: Document) -> None:
@@ -118,7 +124,8 @@ def _check_places(experiment: Experiment, document: Document) -> None:
             f"{document.place(('capture',))}: expected capture.colour_pairs of at least 1, as the photographs of the world "
             f"{experiment.named_world.kind} have colours of their own, got 0; 12 will do"
         )
-    _ = experiment.view
+    if not given_in(experiment.config):  # policies that exist are looked at when the experiment is run
+        _ = experiment.view
 
 
 def make_ready(
@@ -128,13 +135,17 @@ def make_ready(
     anew: bool = False,
     watcher: StageDisplay | None = None,
 ) -> dict[str, StageRecord]:
-    """Run the stages that are not there yet: what cells need. Those that are kept with the code are there, unless all is to be made ``anew``.
+    """Look at victims that exist, and run the stages that are not there yet: what cells need. Those that are kept with the code are there, unless
+    all is to be made ``anew``.
 
     Raises:
         AdvnerfError: A stage failed, or the policy's architecture cannot be built.
     """
     reference = None if anew else REFERENCE
-    experiment.config.policy.network.check()
+    require_own_folder(experiment)
+    look_at_given(experiment)
+    if experiment.config.trains:
+        experiment.config.policy.network.check()
     return run_to_end(experiment, stages_of(experiment), _LIBRARIES, until, console, reference, watcher)
 
 
@@ -145,16 +156,16 @@ def prepare_victims(experiment: Experiment) -> None:
     """
     wanted = experiment.config.retrain
     if wanted is None:
-        make_ready(experiment, until="policy")
+        make_ready(experiment, until="policy" if experiment.config.trains else "object")
         return
     begun = begun_with(stages_of(experiment), experiment.folder, "retrain")
-    if begun is not None and policy.victim_file(experiment, policy.RETRAINED).exists():
+    if begun is not None and Path(victim_spec(experiment, RETRAINED)).exists():
         return
     # Its victim is that of the first round: the others are left to the experiment itself, which goes on from here.
     rounds = 1 if begun is None else begun["retrain"]["rounds"]
     config = experiment.config.model_copy(update={"retrain": wanted.model_copy(update={"rounds": rounds})})
     make_ready(replace(experiment, config=config), until="retrain")
-    if not policy.victim_file(experiment, policy.RETRAINED).exists():
+    if not Path(victim_spec(experiment, RETRAINED)).exists():
         raise ConfigError(
             f"expected a retrained policy in {experiment.stage_folder('retrain')}, got none: no attack reaches retrain.pays_ratio = "
             f"{wanted.pays_ratio:g} (see retrain.json there), so nothing was retrained; lower it, or leave the victim retrained out of the campaign"
@@ -203,7 +214,7 @@ def stages_of(experiment: Experiment) -> list[Stage]:
         name_in_results(each): code for each in config.attack.methods if (code := method_digest(each))
     }:
         searched["code"] = codes
-    view, space = part("view"), part("space")
+    view, space = experiment.view_settings, part("space")
     # What a screen shows while a scene is photographed, and what policies meet, is part of what is learned.
     shown = ("panel", "resolution", "plain_rgb")
     face = {"face": {name: space[name] for name in shown}} if isinstance(config.space, FaceConfig) else {}
@@ -234,20 +245,17 @@ def stages_of(experiment: Experiment) -> list[Stage]:
             ("capture", "scene"),
         ),
         stage("object", objects, {"object": part("object"), "kinds": kinds, **objects.version_of(kinds)}, ()),
-        stage(
-            "policy",
-            policy,
-            {
-                **driven,
-                **face,
-                "policy": config.policy.key(),
-                "sigma": config.attack.random_sigma,
-                "bake": bake.VERSION,
-            },
-            ("capture", "scene", "object"),
-            bulk=_TRAINING_FILES,
-        ),
     ]
+    if config.trains:
+        learned_from = {
+            **driven,
+            **face,
+            "policy": config.policy.key(),
+            "sigma": config.attack.random_sigma,
+            "bake": bake.VERSION,
+        }
+        after = ("capture", "scene", "object")
+        stages.append(stage("policy", policy, learned_from, after, bulk=_TRAINING_FILES))
     if config.retrain is not None:
         settings = {
             **driven,
@@ -270,7 +278,7 @@ def stages_of(experiment: Experiment) -> list[Stage]:
                 "live",
                 live,
                 {**driven, **face, "deploy": part("deploy"), "graph": graph},
-                ("capture", "policy"),
+                ("capture", "policy") if config.trains else ("capture",),
             )
         )
     return stages

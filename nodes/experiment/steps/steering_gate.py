@@ -6,12 +6,13 @@ A mean PSNR does not tell whether the wall by which the car steers was learned. 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 
 from advnerf_core.documents import read_json
-from nodes.experiment.engine.run_folder import RunFolder
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.victims import given_in, load_victim
+from nodes.experiment.steps.policy import agreement
 from nodes.runtime.errors import RuntimeFault
 
 STEERING = "steering"
@@ -20,12 +21,14 @@ MOST_DIFFERENCE, LEAST_CORRELATION = 0.25, 0.9
 
 
 def require_same_steering(
-    experiment: RunFolder[Any], may_go_on: bool = False, say: Callable[[str], None] = print
+    experiment: Experiment, may_go_on: bool = False, say: Callable[[str], None] = print
 ) -> None:
-    """Refuse a learned scene in which the hardened victim steers otherwise than on real pictures of the same places.
+    """Refuse a learned scene in which a victim steers otherwise than on real pictures of the same places.
+
+    Of the victims that are trained here the main one is judged, of those that exist each.
 
     Args:
-        experiment: With a trained policy; it is judged if its key ``gate`` is ``steering``, the default.
+        experiment: With scene and victims; it is judged if its key ``gate`` is ``steering``, the default.
         may_go_on: Whether a refusal is only told.
         say: Told of it.
 
@@ -34,13 +37,27 @@ def require_same_steering(
     """
     if experiment.config.gate != STEERING:
         return
-    kept = read_json(experiment.stage_folder("policy") / "policy.json")
-    wrong = other_steering(kept["on_held_out_views"], kept.get("control_unit", "rad"))
-    if not wrong:
-        return
-    if not may_go_on:
-        raise RuntimeFault(f"{wrong}; --no-gate, or gate: null in the experiment, attacks it all the same")
-    say(f"fidelity gate: {wrong}")
+    for victim, views in steering_of_victims(experiment).items():
+        wrong = other_steering(views, experiment.car.control_unit)
+        if wrong and not may_go_on:
+            raise RuntimeFault(
+                f"victim {victim}: {wrong}; --no-gate, or gate: null in the experiment, attacks it all the same"
+            )
+        if wrong:
+            say(f"fidelity gate: victim {victim}: {wrong}")
+
+
+def steering_of_victims(experiment: Experiment) -> dict[str, list[dict[str, float]]]:
+    """Control of victims on each held-out view, ``real``, and on the learned scene's image of it, ``surrogate``: of those that `require_same_steering` judges."""
+    found = {
+        name: agreement(experiment, load_victim(experiment, name).policy)
+        for name in given_in(experiment.config)
+    }
+    if experiment.config.trains:
+        kept = read_json(experiment.stage_folder("policy") / "policy.json")
+        trained = next(name for name in experiment.config.attacked if name not in found)
+        found = {trained: kept["on_held_out_views"], **found}
+    return found
 
 
 def other_steering(views: Sequence[dict[str, float]], unit: str) -> str:

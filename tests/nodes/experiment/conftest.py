@@ -19,10 +19,11 @@ from hardware.worlds.junction.car import DubinsCar
 from hardware.worlds.junction.config import DubinsConfig, IntersectionConfig
 from hardware.worlds.junction.scene import Intersection
 from hardware.worlds.world import World, WorldDescription
+from nodes.experiment.plan.victims import HARDENED, NAIVE
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.learned_scene import scene_file
 from nodes.experiment.show.objects import build, object_file
-from nodes.experiment.steps.policy import HARDENED, NAIVE, victim_file
+from nodes.experiment.show.victims import victim_spec
 from nodes.experiment.steps.run import load_experiment
 from tests.support.stage_versions import measured
 
@@ -67,7 +68,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
         save_object(object_file(experiment, kind), build(experiment, kind))
     for victim in (HARDENED, NAIVE):
         policy = PilotNet(3, 1.2, PilotNetConfiguration(hidden=(16, 8, 4))).eval()
-        save_policy(victim_file(experiment, victim), policy, experiment.view, {"victim": victim})
+        save_policy(Path(victim_spec(experiment, victim)), policy, experiment.view, {"victim": victim})
     return experiment
 
 

@@ -18,25 +18,25 @@ from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.search.search import SearchStateError
 from advnerf_core.driving.rollout import drive
 from advnerf_core.policies.network import images_to_tensor
-from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.report.transfer_page import text_table
 from advnerf_core.scene.surrogate import Surrogate
 from hardware.cameras.effects import CameraEffects
 from nodes.experiment.pages import page, report
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.robustness_config import RobustnessConfig
+from nodes.experiment.plan.victims import NAIVE
 from nodes.experiment.run.cell_kind import settings_hash
 from nodes.experiment.run.cells import run_cell, search_cell
 from nodes.experiment.run.kinds import load_kind
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.learned_scene import load_field
 from nodes.experiment.show.spaces import colour_space
+from nodes.experiment.show.victims import load_victim, victim_spec
 from nodes.experiment.steps import attack, frozen, run
 from nodes.experiment.steps.attack import cells, load_shown, surrogate_part
 from nodes.experiment.steps.deploy import DRIVES, ThroughWorld, cell_data
 from nodes.experiment.steps.films import film_cell
 from nodes.experiment.steps.keys import CellError, cell_inputs, clean_folder
-from nodes.experiment.steps.policy import NAIVE, victim_file
 from nodes.experiment.steps.shared_search import search_key, take_search
 from nodes.runtime.errors import ConfigError
 from tests.support.strangers import spiral_code, spiral_theta, write_spiral
@@ -95,9 +95,7 @@ def test_search_is_kept_and_its_file_brings_the_colours_back(fresh: Experiment, 
     assert len(found["curve_total_cte_m"]) == 2
     file = load_attack(folder / attack.ATTACK)
     theta = space.restored(file).colours
-    problem = attack.attack_problem(
-        fresh, space, attack._victim(victim_file(fresh, cell.victim)), cell.scenario, cell.seed
-    )
+    problem = attack.attack_problem(fresh, space, load_victim(fresh, cell.victim), cell.scenario, cell.seed)
     again = attack.past(problem, space, space.restored(file))
     _, _, scores = attack.learned_drives(fresh, again, theta)
     assert scores[0].total_cte_m == pytest.approx(
@@ -197,7 +195,7 @@ def test_without_objects_the_car_drives_as_in_the_bare_scene(fresh: Experiment, 
     )
     # The bare scene and policy, put together by hand.
     bare = Surrogate(load_field(fresh), fresh.view.pinhole, fresh.mount)
-    policy = load_policy(victim_file(fresh, control.victim)).policy
+    policy = load_victim(fresh, control.victim).policy
     starts = fresh.measured_starts(control.scenario)
     goals = torch.tensor([fresh.goal(control.scenario)], dtype=torch.float32).expand(len(starts), -1)
     driven = drive(policy, bare.observe(None), fresh.dynamics, starts, fresh.config.horizon, goals)
@@ -222,7 +220,7 @@ def test_a_search_bears_what_it_is_asked_to_and_is_measured_undisturbed(fresh: E
     bearing = changed(fresh, "attack", robustness=RobustnessConfig(**asked))
     space = colour_space(bearing)
     found = surrogate_part(bearing, space, GRADIENT, bearing.cell_folder(GRADIENT), silent)
-    victim = attack._victim(victim_file(bearing, GRADIENT.victim))
+    victim = load_victim(bearing, GRADIENT.victim)
     problem = attack.attack_problem(bearing, space, victim, "right", 0)
     starts = bearing.start_states("right", 0)
     assert torch.equal(problem.start_states, starts.repeat_interleave(2, dim=0))
@@ -347,7 +345,7 @@ def test_another_policy_after_the_attack_is_refused(fresh: Experiment) -> None:
     folder = fresh.cell_folder(GRADIENT)
     frozen.freeze(fresh, GRADIENT, folder)
     frozen.check_frozen(fresh, GRADIENT, folder)
-    shutil.copy(victim_file(fresh, NAIVE), victim_file(fresh, "hardened"))
+    shutil.copy(Path(victim_spec(fresh, NAIVE)), Path(victim_spec(fresh, "hardened")))
     with pytest.raises(frozen.FrozenChangedError, match="expected policy as frozen"):
         frozen.check_frozen(fresh, GRADIENT, folder)
 

@@ -32,11 +32,11 @@ from nodes.experiment.run.cells import run_cell
 from nodes.experiment.run.kinds import load_kind
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import make_space, mesh_objects
+from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps import attack, films, pose_maps, run
 from nodes.experiment.steps.attack import surrogate_part
 from nodes.experiment.steps.deploy import DRIVES, ThroughWorld, cell_data
 from nodes.experiment.steps.keys import CellError
-from nodes.experiment.steps.policy import victim_file
 from nodes.experiment.steps.pose_maps import PoseMapSettings
 from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError
@@ -101,7 +101,7 @@ def test_meshes_are_searched_over_the_pictures_of_the_world(
         attack.attack_problem(
             experiment,
             make_space(experiment, wall),
-            attack._victim(victim_file(experiment, "hardened")),
+            load_victim(experiment, "hardened"),
             "straight",
             0,
         ),
@@ -137,9 +137,7 @@ def test_places_are_searched_and_the_file_says_where_things_stand(
     assert 0.0 < np.abs(there - hand).max() <= ONE.move_m + 1e-9
     # The surrogate's own prediction is what is driven again, from where it was searched.
     space = make_space(experiment, wall)
-    problem = attack.attack_problem(
-        experiment, space, attack._victim(victim_file(experiment, "hardened")), "right", 0
-    )
+    problem = attack.attack_problem(experiment, space, load_victim(experiment, "hardened"), "right", 0)
     restored = space.restored(file)
     _, _, scores = attack.learned_drives(experiment, attack.past(problem, space, restored), restored.colours)
     assert np.mean([score.total_cte_m for score in scores]) == pytest.approx(

@@ -17,19 +17,19 @@ from advnerf_core.driving.dynamics import Dubins
 from advnerf_core.driving.metrics import DriveMetrics, drive_metrics
 from advnerf_core.driving.rollout import drive
 from advnerf_core.geometry import Array
-from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.report.clips import read_clip
 from hardware.worlds.junction.config import DubinsConfig
 from hardware.worlds.world import World
 from nodes.experiment.plan.cell import Cell
+from nodes.experiment.plan.victims import HARDENED
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import SelfDriving
 from nodes.experiment.show.objects import placed_objects, surrogate_of
 from nodes.experiment.show.spaces import colour_space
+from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.attack import attack_problem, surrogate_part
 from nodes.experiment.steps.deploy import DRIVES, ThroughWorld, cell_data
 from nodes.experiment.steps.films import film_cell, filmed
-from nodes.experiment.steps.policy import HARDENED, victim_file
 from nodes.experiment.steps.run import load_experiment
 from nodes.experiment.steps.search_files import SEARCHED
 
@@ -144,7 +144,7 @@ def test_the_gradient_is_what_a_turn_of_a_hundredth_of_a_second_is_worth(
         experiment, surrogate_of(experiment, placed_objects(experiment)).in_type(torch.float64)
     )
     surrogate = space.surrogate
-    loaded = load_policy(victim_file(experiment, HARDENED))
+    loaded = load_victim(experiment, HARDENED)
     loaded.policy.double()
     x_m, y_m, yaw_rad = experiment.references["straight"].start_pose
     aside = torch.tensor([[x_m, y_m + 0.5, yaw_rad]], dtype=torch.float64)  # where |CTE| has no kink

@@ -10,14 +10,14 @@ import pytest
 from advnerf_core.attack.adjoint import evaluate
 from advnerf_core.attack.search import textures
 from advnerf_core.fields.colour_grid import colour_grid
-from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.report.evidence.hardness import FILE, HardnessError, read_hardness
 from nodes.experiment.plan.cell import Cell
+from nodes.experiment.plan.victims import HARDENED
 from nodes.experiment.run.cells import search_cell
 from nodes.experiment.show.spaces import make_space
+from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.attack import attack_problem, from_measured_starts, past
 from nodes.experiment.steps.hardening import judge, margin_m
-from nodes.experiment.steps.policy import HARDENED, victim_file
 from nodes.experiment.steps.search_files import SEARCHED
 
 STARTS, TEXTURES = 3, 2
@@ -43,7 +43,7 @@ def test_the_worst_texture_is_the_largest_excess_of_drives_with_textures_drawn_a
     assert verdict.margin_m == margin_m(ours) == pytest.approx(0.1 * ours.limits.off_track_m)
     # Again, with textures of the family drawn here and driven one by one.
     space = make_space(ours, None)
-    problem = attack_problem(ours, space, load_policy(victim_file(ours, HARDENED)), "right", verdict.seed)
+    problem = attack_problem(ours, space, load_victim(ours, HARDENED), "right", verdict.seed)
     problem = from_measured_starts(ours, "right", problem)
     generator = torch.Generator().manual_seed(verdict.seed)
     grids = [colour_grid(field) for field in space.surrogate.objects]

@@ -11,12 +11,12 @@ import pytest
 
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.learning.frames import Frames, FrameStore
-from advnerf_core.policies.policy_file import load_policy
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.config import RetrainConfig
+from nodes.experiment.plan.victims import HARDENED, RETRAINED
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.victims import load_victim, victim_spec
 from nodes.experiment.steps import attack, retrain
-from nodes.experiment.steps.policy import HARDENED, RETRAINED, victim_file
 
 SMALL = RetrainConfig(rounds=1, pays_ratio=1e-6, stills=2, drives=1, drive_steps=2, placements=1, steps=2)
 
@@ -56,8 +56,8 @@ def test_a_round_of_retraining_and_the_attack_on_it(attacked: Experiment) -> Non
     retrain.run(attacked, folder, silent)
     found = json.loads((folder / "retrain.json").read_text())
     assert len(found["rounds"]) == 2  # the original, and the one that was retrained
-    assert found["rounds"][0]["victim"] == load_policy(victim_file(attacked, HARDENED)).sha256
-    retrained = load_policy(victim_file(attacked, RETRAINED))
+    assert found["rounds"][0]["victim"] == load_victim(attacked, HARDENED).sha256
+    retrained = load_victim(attacked, RETRAINED)
     assert found["rounds"][1]["victim"] == retrained.sha256
     assert found["final_policy"] == "retrain/round0/policy.safetensors"  # in the run folder, wherever that is
     assert retrained.metadata["fine_tuned_from"] == found["rounds"][0]["victim"]
@@ -79,10 +79,10 @@ def test_a_round_of_retraining_and_the_attack_on_it(attacked: Experiment) -> Non
     assert sorted(file.parent.name for file in folder.glob("*/ratios.json")) == ["round0", "round1"]
     # once more: everything is there, nothing is collected, trained or searched again
     times = {file: file.stat().st_mtime_ns for file in folder.rglob("*.npy")}
-    before = load_policy(victim_file(attacked, RETRAINED)).sha256
+    before = load_victim(attacked, RETRAINED).sha256
     retrain.run(attacked, folder, silent)
     assert {file: file.stat().st_mtime_ns for file in folder.rglob("*.npy")} == times
-    assert load_policy(victim_file(attacked, RETRAINED)).sha256 == before
+    assert load_victim(attacked, RETRAINED).sha256 == before
     # one more round goes on from the one that is there
     twice = SMALL.model_copy(update={"rounds": SMALL.rounds + 1, "pays_ratio": 1e-6})
     more = replace(attacked, config=attacked.config.model_copy(update={"retrain": twice}))
@@ -103,7 +103,7 @@ def test_an_attack_that_does_not_pay_ends_it(attacked: Experiment) -> None:
     found = json.loads((folder / "retrain.json").read_text())
     assert len(found["rounds"]) == 1
     assert found["old_attacks"] == {}
-    assert not victim_file(attacked, RETRAINED).exists()
+    assert not Path(victim_spec(attacked, RETRAINED)).exists()
     seed = attacked.config.attack.seeds[0]
     file = attacked.cell_folder(Cell("left", HARDENED, "gradient", seed)) / attack.ATTACK
     assert load_attack(file).objects

@@ -62,7 +62,7 @@ def test_a_refused_scene_ends_the_experiment_with_one_line_and_the_key(tiny_room
     monkeypatch.setattr(whole, "run_campaign", lambda *_: [])
     console = Console(record=True, width=400)
     whole.run_experiment(experiment, None, Options(here=True, gate=False), overrides=changes, console=console)
-    assert "fidelity gate: the learned scene lacks" in console.export_text()
+    assert "fidelity gate: victim hardened: the learned scene lacks" in console.export_text()
 
 
 def test_limits_of_ones_own_are_judged_by_the_campaign(tmp_path: Path):

@@ -1,0 +1,173 @@
+"""Policies that a user brings are attacked by an experiment: a file without a gradient and a module with one, none of them trained here."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+import pytest
+import yaml
+
+from advnerf_core.documents import read_json
+from advnerf_core.errors import AdvnerfError
+from advnerf_core.geometry import Array
+from advnerf_core.policies.load import load_adapted, load_any_policy
+from advnerf_core.policies.onnx_policy import export_onnx
+from hardware.worlds.lab.config import LabConfig
+from hardware.worlds.lab.lab_world import LabWorld
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.run.config import campaign_of
+from nodes.experiment.run.plan import statuses
+from nodes.experiment.run.whole import run_experiment
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.steps.attack import cells
+from nodes.experiment.steps.deploy import DRIVES
+from nodes.experiment.steps.keys import driven_folder
+from nodes.experiment.steps.run import load_experiment
+
+TICKS = 3
+MODULE = """
+import torch
+from advnerf_core import PolicyContract, PolicyView, adapt
+from hardware.worlds.lab.config import LabConfig
+
+def factory():
+    torch.manual_seed(0)
+    layers = torch.nn.Conv2d(3, 8, 5, 8), torch.nn.ELU(), torch.nn.Flatten(), torch.nn.Linear(1600, 1)
+    view = PolicyView(LabConfig().camera.pinhole, crop_top_px=20, crop_height_px=120, width=160, height=80)
+    normal = {"mean": (104.0, 117.0, 124.0), "std": (58.0, 57.0, 57.0), "value_max": 255.0}
+    return adapt(torch.nn.Sequential(*layers).eval(), PolicyContract(view, colour_space="BGR", **normal, output_unit="deg", positive="right"))
+"""
+FILE: dict[str, Any] = {
+    "name": "mine", "world": {"kind": "lab"}, "scenarios": ["track"], "held_cap_m": 1.5, "horizon": TICKS, "gate": None,
+    "victims": {"mine": {"policy": "my.onnx"}, "module": {"policy": "my_driver:factory"}},
+    "space": {"kind": "face", "panel": "board", "resolution": 8}, "measure": {"starts": 1},
+    "capture": {"photos": 9, "held_out": 3, "colour_pairs": 3}, "attack": {"methods": ["random"], "evaluations": 2},
+    "scene": {"steps": 20, "log2_entries": 10, "finest": 32, "occupancy": 32}, "settings": {"tiny": {}},
+}  # fmt: skip
+ONLY_THE_MODULE = ("victims={module: {policy: 'my_driver:factory'}}", "attack.methods=[random,gradient]")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A user's folder: a module with a policy, the same as an ONNX file, an experiment, and its run folder ``run``."""
+    found = tmp_path_factory.mktemp("user")
+    (found / "my_driver.py").write_text(MODULE)
+    (found / "mine.experiment.yaml").write_text(yaml.safe_dump(FILE))
+    with pytest.MonkeyPatch.context() as there:
+        there.chdir(found)
+        there.syspath_prepend(str(found))
+        policy, _ = load_adapted("my_driver:factory")
+        export_onnx(policy.network, policy.contract, found / "my.onnx")
+        run_experiment(loaded(found))
+    return found
+
+
+@pytest.fixture(autouse=True)
+def _in_the_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    monkeypatch.syspath_prepend(str(folder))
+
+
+def loaded(folder: Path, *overrides: str, run: str = "run") -> Experiment:
+    return load_experiment(folder / "mine.experiment.yaml", "tiny", overrides, folder / run)
+
+
+def test_both_are_attacked_and_nothing_was_trained(folder: Path) -> None:
+    experiment = loaded(folder)
+    assert [cell.name for cell in cells(experiment)] == [
+        "track_mine_none_0", "track_mine_random_0", "track_module_none_0", "track_module_random_0",
+    ]  # fmt: skip
+    assert not experiment.stage_folder("policy").exists()
+    hashes = {
+        victim: read_json(experiment.cell_result(Cell("track", victim, "random", 0)))["policy_sha256"]
+        for victim in ("mine", "module")
+    }
+    assert hashes == {
+        victim: load_any_policy(spec).sha256
+        for victim, spec in (("mine", "my.onnx"), ("module", "my_driver:factory"))
+    }
+    page = (experiment.folder / "report" / "report.html").read_text()
+    assert all(victim in page for victim in ("mine", "module"))
+
+
+def test_the_file_drives_as_the_runtime_of_onnx_says(folder: Path) -> None:
+    """A second implementation of camera, declaration and drive: OpenCV's own channel order, and ONNX Runtime asked directly."""
+    experiment, session = loaded(folder), onnxruntime.InferenceSession(folder / "my.onnx")
+    kept = read_json(driven_folder(experiment, Cell("track", "mine", "none", 0)) / DRIVES)
+    with LabWorld(LabConfig()) as world:
+        world.reset(*map(float, experiment.measured_starts("track")[0]))
+        for tick in range(TICKS):
+            steering = steering_rad(session, experiment.view.image(world.observe(depth=False)[0]))
+            assert kept["commands"][0][tick] == pytest.approx(steering, abs=1e-5)
+            world.step(steering, experiment.car.speed_mps, experiment.config.dt_s)
+
+
+def steering_rad(session: onnxruntime.InferenceSession, rgb: Array) -> float:
+    bgr = (rgb[..., ::-1].astype(np.float32) - (104, 117, 124)) / (58, 57, 57)
+    (answer,) = session.run(
+        None, {session.get_inputs()[0].name: np.moveaxis(bgr, -1, 0)[None].astype(np.float32)}
+    )
+    return -float(np.deg2rad(answer.ravel()[0]))
+
+
+def test_a_module_has_a_gradient_and_finished_cells_are_not_run_again(folder: Path) -> None:
+    experiment = loaded(folder, *ONLY_THE_MODULE)
+    ended = run_experiment(experiment, overrides=ONLY_THE_MODULE)
+    assert [end.name for end in ended] == ["track_module_gradient_0"]
+    found = statuses(campaign_of(loaded(folder), (), cells(loaded(folder))), cells(loaded(folder)))
+    assert {each.state for each in found} == {"done"}
+
+
+def test_a_black_box_has_no_gradient(folder: Path) -> None:
+    with pytest.raises(AdvnerfError, match=r"need no gradient against victim mine.*attack\.methods.*cem"):
+        run_experiment(loaded(folder, "attack.methods=[random,gradient]"))
+
+
+def test_another_policy_under_the_same_name_is_another_cell(folder: Path, tmp_path: Path) -> None:
+    """States of a run folder say so before the policy is ever loaded, and running looks at it again."""
+    shutil.copytree(folder / "run", tmp_path / "run")
+    text = (folder / "my_driver.py").read_text()
+    try:
+        (folder / "my_driver.py").write_text(text.replace("manual_seed(0)", "manual_seed(1)"))
+        changed = load_experiment(folder / "mine.experiment.yaml", "tiny", (), tmp_path / "run")
+        states = {
+            each.cell.victim: each.state
+            for each in statuses(campaign_of(changed, (), cells(changed)), cells(changed))
+        }
+    finally:
+        (folder / "my_driver.py").write_text(text)
+    assert states["module"] == "changed"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("victims={mine: {policy: no.onnx}}", r"victims\.mine\.policy: expected a policy file.*no\.onnx, which is not there"),
+        ("victims={mine: {policy: my_driver.py}}", r"my_driver\.py, which is none of these"),
+        ("victims={mine: {}}", r"victims\.mine\.train is missing"),
+        ("victims={mine: {policy: my.onnx, train: {}}}", r"unknown key victims\.mine\.train; valid keys here: policy"),
+        ("victims={retrained: {policy: my.onnx}}", r"other names than retrained"),
+        ("victims={a: {train: {}}, b: {train: {}}}", r"a, b, of which two would be the same policy"),
+        ("victims={my_own: {policy: my.onnx}}", r"should match pattern"),
+    ],
+)  # fmt: skip
+def test_victims_that_there_cannot_be(folder: Path, change: str, message: str) -> None:
+    with pytest.raises(AdvnerfError, match=message):
+        loaded(folder, change)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("view.crop_top_px=10", r"no section view with victims\.mine"),
+        (
+            "world.camera.width=320",
+            r"victims\.mine: expected a policy that was trained for the driving camera",
+        ),
+    ],
+)
+def test_a_policy_says_itself_what_it_sees(folder: Path, change: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(AdvnerfError, match=message):
+        run_experiment(load_experiment(folder / "mine.experiment.yaml", "tiny", (change,), tmp_path / "run"))
