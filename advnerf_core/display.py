@@ -8,13 +8,13 @@ power. All colours are in 0..1. `advnerf_core.attack.spaces.displayed` is the sa
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Array
+from advnerf_core.plain import Numbers, PlainData
 
 # Below this the camera's power has no finite slope.
 DARKEST = 1e-6
@@ -26,7 +26,7 @@ class DisplayModelError(AdvnerfError, ValueError):
 
 
 @dataclass(frozen=True, eq=False)
-class DisplayModel:
+class DisplayModel(PlainData):
     """A monitor before a camera.
 
     Attributes:
@@ -37,9 +37,10 @@ class DisplayModel:
         falloff: Power of the cosine of the angle to the panel's normal.
     """
 
-    curves: Array
-    mixing: Array
-    ambient: Array
+    _refusal = DisplayModelError
+    curves: Numbers
+    mixing: Numbers
+    ambient: Numbers
     response: float = 1.0
     falloff: float = 0.0
 
@@ -115,31 +116,3 @@ class DisplayModel:
         levels = np.linspace(0.0, 1.0, self.curves.shape[1])
         shown = np.stack([np.interp(light[..., c], self.curves[c], levels) for c in range(3)], axis=-1)
         return shown, float(np.mean(outside)) if outside.size else 0.0
-
-    def to_dict(self) -> dict[str, Any]:
-        """As JSON or YAML can hold it."""
-        return {
-            "curves": self.curves.tolist(),
-            "mixing": self.mixing.tolist(),
-            "ambient": self.ambient.tolist(),
-            "response": float(self.response),
-            "falloff": float(self.falloff),
-        }
-
-    @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> DisplayModel:
-        """Inverse of :meth:`to_dict`."""
-        try:
-            return cls(
-                np.array(values["curves"], np.float64),
-                np.array(values["mixing"], np.float64),
-                np.array(values["ambient"], np.float64),
-                float(values["response"]),
-                float(values["falloff"]),
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            if isinstance(error, DisplayModelError):
-                raise
-            raise DisplayModelError(
-                f"expected curves, mixing, ambient, response and falloff, got {error}"
-            ) from error

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from advnerf_core.driving.metrics import DriveMetrics, Horizon, drives, mean_cte_limit_m
+from advnerf_core.plain import PlainData
 
 
 @dataclass(frozen=True)
-class CleanDrive:
+class CleanDrive(PlainData):
     """How a policy drives where an attack is searched for, without the attack: one entry for each start pose.
 
     Attributes:
@@ -98,17 +98,3 @@ class CleanDrive:
     def lines(self) -> list[str]:
         """What is printed beside a result: the drive, and the warning if it is none."""
         return [self.in_words, *([self.warning] if self.warning else [])]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data from which `from_dict` makes the same."""
-        return {
-            name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()
-        }
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> CleanDrive:
-        """Rebuild it from `to_dict`."""
-        values: dict[str, Any] = {
-            key: tuple(value) if isinstance(value, list) else value for key, value in data.items()
-        }
-        return cls(**values)

@@ -8,11 +8,12 @@ squares in closed form, so a fit is deterministic.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize_scalar
+
+from advnerf_core.plain import PlainData
 
 _POWERS = (0.3, 3.0)
 # Twelve numbers and a power are fitted: more pairs change the result by less than 8 bits resolve, and cost minutes.
@@ -20,7 +21,7 @@ _MOST_PAIRS = 50_000
 
 
 @dataclass(frozen=True)
-class ColourMap:
+class ColourMap(PlainData):
     """Colours of one camera to those of another.
 
     Attributes:
@@ -40,21 +41,6 @@ class ColourMap:
         # Contiguous 2-d product: the sum of products then has one order whatever the image size.
         mapped = straight.reshape(-1, 3) @ matrix.T + offset
         return np.clip(mapped, np.float32(0.0), np.float32(1.0)).reshape(rgb.shape)
-
-    def to_dict(self) -> dict[str, Any]:
-        """As JSON can hold it."""
-        return {
-            "matrix": [list(row) for row in self.matrix],
-            "offset": list(self.offset),
-            "power": self.power,
-        }
-
-    @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> ColourMap:
-        """Inverse of ``to_dict``."""
-        a, b, c = (tuple(float(v) for v in row) for row in values["matrix"])
-        offset = tuple(float(v) for v in values["offset"])
-        return cls((a, b, c), (offset[0], offset[1], offset[2]), float(values["power"]))  # type: ignore[arg-type]
 
 
 IDENTITY = ColourMap(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.0))

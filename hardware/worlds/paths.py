@@ -1,18 +1,19 @@
-"""Reference paths as plain data: straight lines and circular arcs from a start pose, and poses along them. Numpy is not needed."""
+"""Reference paths as plain data: straight lines and circular arcs from a start pose, and poses along them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
+
+from advnerf_core.plain import PlainData
 
 Segment = tuple[Literal["line"], float] | tuple[Literal["arc"], float, float]
 Pose = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class ReferencePath:
+class ReferencePath(PlainData):
     """One drive: continuous in position and heading.
 
     `hardware.worlds.fitting.path_through` makes one from points.
@@ -95,49 +96,7 @@ class ReferencePath:
         begin = None if self.drive_from is None else turned_over(self.drive_from)
         return ReferencePath(turned_over(self.start_pose), turned, self.goal, self.closed, begin)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data (JSON types) from which :meth:`from_dict` makes the same path."""
-        return {
-            "start_pose": list(self.start_pose),
-            "segments": [list(segment) for segment in self.segments],
-            "goal": list(self.goal),
-            "closed": self.closed,
-            "drive_from": None if self.drive_from is None else list(self.drive_from),
-        }
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> ReferencePath:
-        """Rebuild a path from :meth:`to_dict`.
-
-        Raises:
-            KeyError, TypeError, ValueError: The data is something else.
-        """
-        segments = tuple(_segment(piece) for piece in data["segments"])
-        begin = data["drive_from"]
-        return cls(
-            _pose(data["start_pose"]),
-            segments,
-            tuple(map(float, data["goal"])),
-            bool(data["closed"]),
-            None if begin is None else _pose(begin),
-        )
-
 
 def segment_length_m(segment: Segment) -> float:
     """Length of one piece of a path [m]."""
     return segment[1] if segment[0] == "line" else segment[1] * abs(segment[2])
-
-
-def _pose(data: Any) -> Pose:
-    x, y, yaw = map(float, data)
-    return x, y, yaw
-
-
-def _segment(piece: Any) -> Segment:
-    if piece[0] == "line":
-        (length_m,) = piece[1:]
-        return "line", float(length_m)
-    if piece[0] != "arc":
-        raise ValueError(f"expected a line or an arc, got {piece!r}")
-    radius_m, angle_rad = piece[1:]
-    return "arc", float(radius_m), float(angle_rad)

@@ -10,7 +10,7 @@ the ground under the point whose x, y and heading are its state, x forward, y le
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Array, Pinhole, VehicleState
+from advnerf_core.plain import Numbers, PlainData
 from hardware.worlds.footprints import Footprint
 from hardware.worlds.paths import ReferencePath
 
@@ -38,7 +39,7 @@ class NotOpenError(AdvnerfError, RuntimeError):
 
 
 @dataclass(frozen=True)
-class CarDescription:
+class CarDescription(PlainData):
     """The car as an attack believes it to be: without lag and errors, which the world's own car may have.
 
     Attributes:
@@ -79,7 +80,7 @@ class CarDescription:
 
 
 @dataclass(frozen=True)
-class Box:
+class Box(PlainData):
     """The part of the world that is learned.
 
     Attributes:
@@ -102,7 +103,7 @@ class Box:
 
 
 @dataclass(frozen=True, eq=False)
-class Panel:
+class Panel(PlainData):
     """A flat rectangle in the world that can carry a texture: a board, or a screen.
 
     Attributes:
@@ -112,7 +113,7 @@ class Panel:
         screen_px: Width and height [px] of a screen, which shows pictures by itself (`Screens.show`); None for a board.
     """
 
-    T_world_from_face: Array
+    T_world_from_face: Numbers
     width_m: float
     height_m: float
     screen_px: tuple[int, int] | None = None
@@ -122,31 +123,9 @@ class Panel:
         """Side of the largest square in its middle [m]."""
         return min(self.width_m, self.height_m)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data (JSON types)."""
-        pixels = None if self.screen_px is None else list(self.screen_px)
-        pose = np.asarray(self.T_world_from_face, dtype=np.float64).tolist()
-        return {
-            "T_world_from_face": pose,
-            "width_m": self.width_m,
-            "height_m": self.height_m,
-            "screen_px": pixels,
-        }
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Panel:
-        """Rebuild a panel from :meth:`to_dict`."""
-        pixels = data["screen_px"]
-        return cls(
-            np.array(data["T_world_from_face"], dtype=np.float64),
-            float(data["width_m"]),
-            float(data["height_m"]),
-            None if pixels is None else (int(pixels[0]), int(pixels[1])),
-        )
-
 
 @dataclass(frozen=True, eq=False)
-class WorldDescription:
+class WorldDescription(PlainData):
     """What an experiment must know of a world, as plain data: it is kept beside the photographs, and read where the world is not open.
 
     Attributes:
@@ -164,14 +143,15 @@ class WorldDescription:
             junction a server found.
     """
 
+    _refusal = WorldError
     paths: Mapping[str, ReferencePath]
     off_track_m: float
     car: CarDescription
     camera: Pinhole
-    T_car_from_camera: Array
+    T_car_from_camera: Numbers
     box: Box
     lanes: tuple[ReferencePath, ...] = ()
-    road_edge: tuple[Array, ...] = ()
+    road_edge: tuple[Numbers, ...] = ()
     panels: Mapping[str, Panel] = field(default_factory=dict)
     fence_m: float | None = None
     facts: Mapping[str, Any] = field(default_factory=dict)
@@ -194,55 +174,6 @@ class WorldDescription:
             raise WorldError(f"expected T_car_from_camera to be a rigid transform [4, 4]; got {T.tolist()}")
         if not self.lanes:
             object.__setattr__(self, "lanes", tuple(self.paths.values()))
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data (JSON types) from which :meth:`from_dict` makes the same description."""
-        return {
-            "paths": {name: path.to_dict() for name, path in self.paths.items()},
-            "off_track_m": self.off_track_m,
-            "car": {**asdict(self.car), "control_limits": list(self.car.control_limits)},
-            "camera": asdict(self.camera),
-            "T_car_from_camera": np.asarray(self.T_car_from_camera, dtype=np.float64).tolist(),
-            "box": {
-                "min_m": list(self.box.min_m),
-                "max_m": list(self.box.max_m),
-                "contraction": self.box.contraction,
-            },
-            "lanes": [lane.to_dict() for lane in self.lanes],
-            "road_edge": [np.asarray(line, dtype=np.float64).tolist() for line in self.road_edge],
-            "panels": {name: panel.to_dict() for name, panel in self.panels.items()},
-            "fence_m": self.fence_m,
-            "facts": dict(self.facts),
-        }
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> WorldDescription:
-        """Rebuild a description from :meth:`to_dict`.
-
-        Raises:
-            WorldError: The data is something else.
-        """
-        try:
-            box, car = data["box"], data["car"]
-            return cls(
-                paths={str(name): ReferencePath.from_dict(path) for name, path in data["paths"].items()},
-                off_track_m=float(data["off_track_m"]),
-                car=CarDescription(**{**car, "control_limits": tuple(car["control_limits"])}),
-                camera=Pinhole(**data["camera"]),
-                T_car_from_camera=np.array(data["T_car_from_camera"], dtype=np.float64),
-                box=Box(tuple(box["min_m"]), tuple(box["max_m"]), bool(box["contraction"])),
-                lanes=tuple(map(ReferencePath.from_dict, data["lanes"])),
-                road_edge=tuple(
-                    np.array(line, dtype=np.float64).reshape(-1, 2) for line in data["road_edge"]
-                ),
-                panels={str(name): Panel.from_dict(panel) for name, panel in data["panels"].items()},
-                fence_m=None if data["fence_m"] is None else float(data["fence_m"]),
-                facts=dict(data["facts"]),
-            )
-        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-            raise WorldError(
-                f"expected a world as written by WorldDescription.to_dict; got something else: {error!r}"
-            ) from error
 
 
 @runtime_checkable

@@ -116,5 +116,5 @@ def test_round_trip_through_plain_numbers():
     np.testing.assert_array_equal(
         again.forward(LEVELS[:, None].repeat(3, 1)), MODEL.forward(LEVELS[:, None].repeat(3, 1))
     )
-    with pytest.raises(DisplayModelError, match="expected curves, mixing"):
+    with pytest.raises(DisplayModelError, match="expected curves, mixing, ambient"):
         DisplayModel.from_dict({"curves": [[0, 1]] * 3})

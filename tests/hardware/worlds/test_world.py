@@ -105,7 +105,7 @@ def test_cars_and_boxes_that_cannot_be_are_refused(make: Any) -> None:
     ],
 )
 def test_other_data_is_no_description(data: Any) -> None:
-    with pytest.raises(WorldError, match="expected a world as written"):
+    with pytest.raises(WorldError, match="as WorldDescription"):
         WorldDescription.from_dict(data)
 
 

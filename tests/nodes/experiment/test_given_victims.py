@@ -8,6 +8,7 @@ import numpy as np
 import onnxruntime
 import pytest
 import yaml
+from hardware.worlds.lab.lab_world import LabWorld
 
 from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
@@ -15,7 +16,6 @@ from advnerf_core.geometry import Array
 from advnerf_core.policies.load import load_adapted, load_any_policy
 from advnerf_core.policies.onnx_policy import export_onnx
 from hardware.worlds.lab.config import LabConfig
-from hardware.worlds.lab.lab_world import LabWorld
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.config import campaign_of
 from nodes.experiment.run.plan import statuses
