@@ -8,7 +8,6 @@ import numpy as np
 import onnxruntime
 import pytest
 import yaml
-from hardware.worlds.lab.lab_world import LabWorld
 
 from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
@@ -16,6 +15,7 @@ from advnerf_core.geometry import Array
 from advnerf_core.policies.load import load_adapted, load_any_policy
 from advnerf_core.policies.onnx_policy import export_onnx
 from hardware.worlds.lab.config import LabConfig
+from hardware.worlds.lab.lab import Lab
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.config import campaign_of
 from nodes.experiment.run.plan import statuses
@@ -96,7 +96,7 @@ def test_the_file_drives_as_the_runtime_of_onnx_says(folder: Path) -> None:
     """A second implementation of camera, declaration and drive: OpenCV's own channel order, and ONNX Runtime asked directly."""
     experiment, session = loaded(folder), onnxruntime.InferenceSession(folder / "my.onnx")
     kept = read_json(driven_folder(experiment, Cell("track", "mine", "none", 0)) / DRIVES)
-    with LabWorld(LabConfig()) as world:
+    with Lab(LabConfig()) as world:
         world.reset(*map(float, experiment.measured_starts("track")[0]))
         for tick in range(TICKS):
             steering = steering_rad(session, experiment.view.image(world.observe(depth=False)[0]))
