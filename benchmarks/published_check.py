@@ -15,6 +15,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from advnerf_core.documents import read_json
+from advnerf_core.errors import AdvnerfError
 from advnerf_core.scene.fidelity import reasons_against
 from benchmarks.first_build import PAGE as FIRST_BUILD
 from benchmarks.first_build import page_text
@@ -64,7 +65,11 @@ def row_page_problems(rows: list[dict[str, Any]], page: Path) -> Iterator[str]:
     """Pages that are not those of the rows, beside the index ``page`` too."""
     with TemporaryDirectory() as work:
         made = Path(work) / page.name
-        write_pages(rows, made, page.parent / "results")
+        try:
+            write_pages(rows, made, page.parent / "results")
+        except AdvnerfError as error:
+            yield f"{page}: cannot be written again: {error}"
+            return
         for file in [made, *sorted((made.parent / "results").iterdir())]:
             published = page.parent / file.relative_to(made.parent)
             if not published.exists() or published.read_text("utf-8") != file.read_text("utf-8"):

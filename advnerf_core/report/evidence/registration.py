@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path as FilePath
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, field_validator
 
 from advnerf_core.documents import read_json
 from advnerf_core.driving.metrics import Horizon
@@ -60,6 +60,15 @@ class RegisteredScenario(StrictModel):
     space: dict[str, Any]
     victims: dict[str, Any]
     drives_well_mean_cte_m: float
+
+    @field_validator("path")
+    @classmethod
+    def _is_a_path(cls, path: dict[str, Any]) -> dict[str, Any]:
+        try:
+            Path.from_dict(path)
+        except (KeyError, TypeError, AttributeError) as error:
+            raise ValueError(f"expected a path as Path.to_dict writes it, got {error!r}") from None
+        return path
 
     @property
     def horizon(self) -> Horizon:

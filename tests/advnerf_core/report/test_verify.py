@@ -92,6 +92,23 @@ def test_a_missing_cell_and_a_strange_file_are_named(copied):
     assert "track_hardened_other_4.json: is not listed" in problems
 
 
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda segments: segments[:-1], "expected a closed path to end at its start"),
+        (lambda segments: len(segments), "expected a path as"),
+    ],
+)
+def test_a_registered_path_that_is_none_is_said_and_ends_nothing(copied, change, says):
+    data = json.loads((copied / FILE).read_text())
+    path = next(iter(data["scenarios"].values()))["path"]
+    path["segments"] = change(path["segments"])
+    (copied / FILE).write_text(json.dumps(data))
+    with pytest.raises(RegistrationError, match=says):
+        read_registration(copied)
+    assert any(says in problem for problem in verify_set(copied).problems)
+
+
 def test_rows_are_metres_per_tick_over_the_same_starts(original):
     evidence = evidence_of(original)
     shown = {(each.scenario, each.method, each.domain): each for each in rows(evidence)}
