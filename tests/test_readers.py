@@ -60,7 +60,7 @@ OWN = {  # text that the same function has just written, or already read as a wh
     "advnerf_core/report/evidence/verifying/numbers.py": 1,
     "benchmarks/retraining.py": 1,
     "nodes/experiment/run/published.py": 1,
-    "nodes/experiment/run/cell_kind.py": 1,
+    "nodes/experiment/steps/keys.py": 1,
     "nodes/experiment/show/context.py": 1,
     "nodes/experiment/steps/run.py": 1,
     "nodes/experiment/engine/stages.py": 1,

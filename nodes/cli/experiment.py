@@ -119,9 +119,6 @@ def _say_code(choice: CellChoice) -> None:
     campaign = load_campaign(file, choice.folder, tuple(overrides))
     named: list[Any] = [{"methods": [cell.code for cell in campaign.cells]}]
     for scenario in campaign.scenarios.values():
-        named.append({"kind": scenario.kind})
-        if scenario.kind != "experiment":  # files of other kinds are read by their own code
-            continue
         inner = (file.parent / scenario.experiment).resolve()
         # Of the methods only those of the campaign are run.
         data = read_setting(inner, scenario.setting, scenario.set).data

@@ -24,9 +24,6 @@ def gate(
     file: File,
     setting: Annotated[str, typer.Option("--setting", help="Setting of the experiment file.")] = "full",
     run_folder: Annotated[Path | None, typer.Option("--run-folder", show_default="runs/<setting>")] = None,
-    kind: Annotated[
-        str, typer.Option("--kind", help="Kind of cells: experiment, or file.py:Class of your own.")
-    ] = "experiment",
     scenario: Annotated[
         str, typer.Option("--scenario", help="Which path; the views that are compared are of all.")
     ] = "",
@@ -55,13 +52,12 @@ def gate(
     from advnerf_core.scene.gate_limits import GateLimits
     from nodes.experiment.plan.cell import Cell
     from nodes.experiment.run.gate import judge_scene
-    from nodes.experiment.run.kinds import load_kind
+    from nodes.experiment.steps.run import load_experiment
 
-    found = load_kind(kind)
-    experiment = found.load(file, setting, overrides or [], run_folder or Path("runs") / setting)
+    experiment = load_experiment(file, setting, overrides or [], run_folder or Path("runs") / setting)
     wanted = {"psnr_db": psnr_db, "ssim": ssim, "steering": steering}
     limits = GateLimits.model_validate({name: value for name, value in wanted.items() if value is not None})
-    verdicts = judge_scene(found, experiment, Cell(scenario, victim, NONE, 0), limits, bag)
+    verdicts = judge_scene(experiment, Cell(scenario, victim, NONE, 0), limits, bag)
     if as_json:
         print(json.dumps({of: verdict.record() for of, verdict in verdicts}))
     else:

@@ -42,7 +42,7 @@ def measured(folder: Path) -> dict[str, dict[str, Any]]:
     from advnerf_core.objects.voxel.generators import GENERATORS
     from advnerf_core.objects.voxel.mesh import stand
     from nodes.experiment.plan.cell import Cell
-    from nodes.experiment.run.cells import ExperimentCells
+    from nodes.experiment.run.cells import Bench, run_cell
     from nodes.experiment.show import objects
     from nodes.experiment.steps import keys
     from nodes.experiment.steps.run import VERSIONS, make_ready
@@ -54,11 +54,13 @@ def measured(folder: Path) -> dict[str, dict[str, Any]]:
     baked = json.loads((experiment.stage_folder("bake") / "baked.json").read_text())
     policy = json.loads((experiment.stage_folder("policy") / "policy.json").read_text())
     hydrant = build_from_mesh(stand(GENERATORS["hydrant"]()), "hydrant", 12, 0, {}).placed(np.eye(4), 1.0)
-    kind, totals = ExperimentCells(), {}
-    with kind.hold(experiment):
+    totals = {}
+    with Bench(experiment) as bench:
         for method in ("none", "random", "gradient"):
             cell = Cell("track", "hardened", method, 0)
-            found = kind.run(experiment, cell, experiment.cell_folder(cell), lambda part, text="": None)
+            found = run_cell(
+                experiment, cell, experiment.cell_folder(cell), lambda part, text="": None, bench
+            )
             totals[f"{method}_surrogate_m"] = found["surrogate"]["total_cte_m"][0]
             totals[f"{method}_deployed_m"] = found["deployed"]["total_cte_m"][0]
     numbers: dict[str, dict[str, float]] = {

@@ -8,8 +8,8 @@ from pathlib import Path
 from advnerf_core.report.cells import CellResult
 from advnerf_core.report.conditions import NONE
 from nodes.experiment.plan.cell import Cell
+from nodes.experiment.run.cells import has_learned_scene
 from nodes.experiment.run.config import Campaign
-from nodes.experiment.run.kinds import load_kind
 from nodes.experiment.run.plan import read_experiment
 from nodes.experiment.run.store import store_of
 from nodes.runtime.errors import RuntimeFault
@@ -36,16 +36,16 @@ def past_the_gate(
 def _judge(campaign: Campaign, cell: Cell, leave_out: bool, say: Callable[[str], None]) -> bool:
     """Whether the cells of this one's scenario and victim may be run: by held-out views, and by a drive without attack where there is one."""
     scenario = campaign.scenario(cell)
-    kind, key = load_kind(campaign.kind(cell)), gate_key(cell)
+    experiment, key = read_experiment(campaign, cell), gate_key(cell)
     limits = scenario.gate or campaign.gate
-    if limits is None or not kind.judges(read_experiment(campaign, cell)):
+    if limits is None or not has_learned_scene(experiment):
         return True
     from nodes.experiment.run.gate import cached_verdict  # loads torch
 
     without = next(
         each for each in (*campaign.cells, cell.clean) if each.method == NONE and gate_key(each) == key
     )
-    which = (kind, read_experiment(campaign, cell), campaign.inside(without), limits)
+    which = (experiment, campaign.inside(without), limits)
     found = [cached_verdict(*which, gate_file(campaign.folder, key))]
     try:
         drive = store_of(campaign).work(without.name)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, nullcontext
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from advnerf_core.attack.artifact import PLACES, load_attack
 from advnerf_core.attack.spaces.space import Space
@@ -16,10 +15,9 @@ from nodes.experiment.engine.reference import ReferenceBuild
 from nodes.experiment.engine.stages import keep_stages
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.space_config import PlacesConfig
-from nodes.experiment.run.cell_kind import CellKind
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import make_space, over_the_world
-from nodes.experiment.steps import fidelity, pose_maps
+from nodes.experiment.steps import pose_maps
 from nodes.experiment.steps.attack import surrogate_part
 from nodes.experiment.steps.deploy import Deployer, ThroughNodes, ThroughWorld, cell_data
 from nodes.experiment.steps.films import film_cell, kept_film, with_film
@@ -27,19 +25,13 @@ from nodes.experiment.steps.frozen import check_frozen, freeze
 from nodes.experiment.steps.keys import (
     NEEDED,
     CellError,
-    cell_inputs,
     clean_folder,
-    registered_settings,
     require_known,
 )
-from nodes.experiment.steps.run import load_experiment, prepare_victims, stages_of
+from nodes.experiment.steps.run import stages_of
 from nodes.experiment.steps.search_files import ATTACK
 from nodes.experiment.steps.shared_search import take_search
 from nodes.runtime.progress import Report
-
-if TYPE_CHECKING:
-    from advnerf_core.scene.fidelity import PicturePairs
-    from nodes.experiment.run.cell_kind import Loop
 
 _SEARCHED = 0.9  # share of a cell's work
 
@@ -162,103 +154,28 @@ def draw_maps(experiment: Experiment, cell: Cell, number: int, folder: Path, rep
     return pose_maps.draw_maps(experiment, cell, attack, number, folder, report)
 
 
-class ExperimentCells(CellKind):
-    """Cells of experiment files; see `CellKind` for what each method does."""
+def keep_build(experiment: Experiment, reference: ReferenceBuild) -> list[Path]:
+    """Copy scene, objects and policies into a reference build, without what only their training read; returns the folders that are new there."""
+    needed = [stage for stage in stages_of(experiment) if stage.name in NEEDED]
+    return keep_stages(needed, experiment.folder, reference)
 
-    searches_apart = True
 
-    def __init__(self) -> None:
-        self._bench: Bench | None = None
+def needed_settings(experiment: Experiment) -> dict[str, Any]:
+    """Settings of the stages that cells need, by name: two experiments in one run folder must agree on them."""
+    return {stage.name: stage.settings for stage in stages_of(experiment) if stage.name in NEEDED}
 
-    def _bench_of(self, experiment: Experiment) -> Bench | None:
-        return self._bench if self._bench is not None and self._bench.experiment is experiment else None
 
-    def load(self, file: Path, setting: str, overrides: Sequence[str], folder: Path) -> Experiment:
-        """Read an experiment file; see `run.load_experiment`."""
-        return load_experiment(file, setting, list(overrides), folder)
+def runs_alone(experiment: Experiment) -> bool:
+    """Whether a cell needs the machine for itself, as live nodes measure time, or a server that steps one world at a time."""
+    deployed = traits_of(experiment.deployed_world.make())
+    return deployed.exclusive or experiment.traits.exclusive or experiment.config.deploy.live
 
-    def prepare(self, experiment: Experiment, report: Report) -> None:
-        """Make scene, objects and policies."""
-        del report  # the stages show their own progress
-        prepare_victims(experiment)
 
-    def keep(self, experiment: Experiment, reference: ReferenceBuild) -> list[Path]:
-        """Scene, objects and policies, without what only their training read."""
-        needed = [stage for stage in stages_of(experiment) if stage.name in NEEDED]
-        return keep_stages(needed, experiment.folder, reference)
+def has_learned_scene(experiment: Experiment) -> bool:
+    """Whether attacks are searched in a learned scene, which the fidelity gate judges."""
+    return not over_the_world(experiment)
 
-    def inputs(self, experiment: Experiment, cell: Cell) -> dict[str, Any]:
-        """See `cell_inputs`."""
-        return cell_inputs(experiment, cell)
 
-    def run(self, experiment: Experiment, cell: Cell, folder: Path, report: Report) -> dict[str, Any]:
-        """See `run_cell`."""
-        return run_cell(experiment, cell, folder, report, self._bench_of(experiment))
-
-    def search(self, experiment: Experiment, cell: Cell, folder: Path, report: Report) -> None:
-        """See `search_cell`."""
-        search_cell(experiment, cell, folder, report, self._bench_of(experiment))
-
-    @contextmanager
-    def hold(self, experiment: Experiment) -> Iterator[None]:
-        """Keep world and space open."""
-        with Bench(experiment) as bench:
-            self._bench = bench
-            try:
-                yield
-            finally:
-                self._bench = None
-
-    def runs_alone(self, experiment: Experiment) -> bool:
-        """Where a server steps one world at a time, or live nodes measure time."""
-        deployed = traits_of(experiment.deployed_world.make())
-        return deployed.exclusive or experiment.traits.exclusive or experiment.config.deploy.live
-
-    def needed_settings(self, experiment: Experiment) -> dict[str, Any]:
-        """Settings of capture, scene, object and policy."""
-        return {stage.name: stage.settings for stage in stages_of(experiment) if stage.name in NEEDED}
-
-    def registered_settings(self, experiment: Experiment) -> dict[str, Any]:
-        """See `keys.registered_settings`."""
-        return registered_settings(experiment)
-
-    def draw_maps(
-        self, experiment: Experiment, cell: Cell, number: int, folder: Path, report: Report
-    ) -> list[Path]:
-        """See `draw_maps`."""
-        return draw_maps(experiment, cell, number, folder, report)
-
-    def judges(self, experiment: Experiment) -> bool:
-        """Where attacks are searched in a learned scene."""
-        return not over_the_world(experiment)
-
-    def predicts(self, experiment: Experiment) -> bool:
-        """Where objects stay where they were placed by hand: a prediction composes them into pictures there."""
-        return self.judges(experiment) and not isinstance(experiment.config.space, PlacesConfig)
-
-    def policy_of(self, experiment: Experiment, cell: Cell) -> tuple[Any, tuple[float, ...]]:
-        """See `fidelity.policy_of`."""
-        return fidelity.policy_of(experiment, cell)
-
-    def held_out(self, experiment: Experiment, cell: Cell) -> PicturePairs:
-        """See `fidelity.held_out`."""
-        del cell  # views about all paths
-        return fidelity.held_out(experiment)
-
-    def driven(
-        self, experiment: Experiment, cell: Cell, folder: Path, bag: Path | None = None
-    ) -> PicturePairs:
-        """See `fidelity.driven`."""
-        return fidelity.driven(experiment, cell, clean_folder(experiment, cell, folder), bag)
-
-    def lacks(self, experiment: Experiment, cell: Cell, folder: Path) -> str:
-        """See `fidelity.lacks`."""
-        return fidelity.lacks(experiment, cell, folder, clean_folder(experiment, cell, folder))
-
-    def attacked(self, experiment: Experiment, cell: Cell, folder: Path) -> PicturePairs:
-        """See `fidelity.attacked`."""
-        return fidelity.attacked(experiment, cell, folder, clean_folder(experiment, cell, folder))
-
-    def loop(self, experiment: Experiment, cell: Cell, folder: Path) -> Loop:
-        """See `fidelity.loop`."""
-        return fidelity.loop(experiment, cell, folder, clean_folder(experiment, cell, folder))
+def is_predictable(experiment: Experiment) -> bool:
+    """Whether transfer can be predicted: a prediction composes objects into pictures where they were placed by hand."""
+    return has_learned_scene(experiment) and not isinstance(experiment.config.space, PlacesConfig)

@@ -20,7 +20,6 @@ from advnerf_core.strict import StrictModel
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.method_names import ConditionReference
 from nodes.experiment.plan.victims import HARDENED, NAIVE, VictimName
-from nodes.experiment.run.kinds import absolute_kind
 from nodes.runtime.config import load_config
 from nodes.runtime.errors import ConfigError
 
@@ -60,11 +59,6 @@ class _NothingTwice(StrictModel):
 class ScenarioConfig(_NothingTwice):
     """One scenario: an experiment, and how it is read."""
 
-    kind: str = Field(
-        default="experiment",
-        min_length=1,
-        description="experiment, or file.py:Class of your own that runs cells; see nodes/experiment/run/cell_kind.py.",
-    )
     experiment: Path = Field(description="Experiment file; relative to the campaign file.")
     setting: str = Field(default="full", description="Which of its settings.")
     run_folder: Path = Field(description="Run folder of the experiment; relative to the working folder.")
@@ -152,10 +146,6 @@ class Campaign:
     def inside(self, cell: Cell) -> Cell:
         """The cell as its experiment names it."""
         return replace(cell, scenario=self.scenario(cell).as_scenario or cell.scenario, placement="")
-
-    def kind(self, cell: Cell) -> str:
-        """The kind of a cell as another process understands it."""
-        return absolute_kind(self.scenario(cell).kind, self.file.parent)
 
     def experiment_file(self, cell: Cell) -> Path:
         """The experiment file of a cell."""
@@ -247,9 +237,8 @@ def _cells(config: CampaignConfig) -> Iterator[Cell]:
                 for victim in scenario.victims or config.victims:
                     for method in sorted(scenario.methods or config.methods, key=_order):
                         cell = Cell.of(name, victim, method, seed, placement)
-                        # All seeds of an experiment are measured from the same starts; cells of another kind may not be.
-                        shared = method in CONTROLS and scenario.kind == "experiment"
-                        if not shared:
+                        # All seeds are measured from the same starts.
+                        if method not in CONTROLS:
                             yield cell
                         elif number == 0:
                             yield replace(cell, seed=0)

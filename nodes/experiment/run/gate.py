@@ -1,4 +1,4 @@
-"""The fidelity gate of an experiment, and predictions of how its attacks transfer, for any kind of cells that has pictures."""
+"""The fidelity gate of an experiment, and predictions of how its attacks transfer."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ from advnerf_core.scene.fidelity import Effect, PicturePairs, SceneAgreement, Ve
 from advnerf_core.scene.gate_limits import GateLimits
 from nodes.experiment.engine.stage_record import hash_of, stage_digests
 from nodes.experiment.plan.cell import Cell
-from nodes.experiment.run.cell_kind import CellKind
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.steps import fidelity
+from nodes.experiment.steps.keys import NEEDED, clean_folder
 from nodes.lab.policy_data.evaluate import predict
 
 
@@ -39,28 +41,23 @@ def agreement_on(policy: Any, goal: tuple[float, ...], pictures: PicturePairs) -
 
 
 def judge_scene(
-    kind: CellKind, experiment: Any, cell: Cell, limits: GateLimits, bag: Path | None = None
+    experiment: Experiment, cell: Cell, limits: GateLimits, bag: Path | None = None
 ) -> list[tuple[str, Verdict]]:
-    """The gate's verdicts: on held-out views, and on a driven bag if one is given.
-
-    Raises:
-        NoPicturesError: The kind has no pictures to judge by.
-    """
-    policy, goal = kind.policy_of(experiment, cell)
-    sets = [kind.held_out(experiment, cell)]
+    """The gate's verdicts: on held-out views, and on a driven bag if one is given."""
+    policy, goal = fidelity.policy_of(experiment, cell)
+    sets = [fidelity.held_out(experiment)]
     if bag is not None:
-        sets.append(kind.driven(experiment, cell, Path(), bag))
+        sets.append(fidelity.driven(experiment, cell, Path(), bag))
     return [(each.of, judge(agreement_on(policy, goal, each), limits, each.of)) for each in sets]
 
 
 def cached_verdict(
-    kind: CellKind, experiment: Any, cell: Cell, limits: GateLimits, file: Path, drive: Path | None = None
+    experiment: Experiment, cell: Cell, limits: GateLimits, file: Path, drive: Path | None = None
 ) -> Verdict:
     """The verdict on held-out views, or on a drive; judged again only if scene, policy or limits changed.
 
     Args:
-        kind: Kind of the cell.
-        experiment: Its experiment.
+        experiment: The experiment of the cell.
         cell: The cell without attack whose drive is looked at, as the experiment names it.
         limits: What must be reached.
         file: Where the verdict is kept.
@@ -69,9 +66,9 @@ def cached_verdict(
     Raises:
         RuntimeFault: There is no such drive yet.
     """
-    policy, goal = kind.policy_of(experiment, cell)
+    policy, goal = fidelity.policy_of(experiment, cell)
     which = [cell.scenario, cell.victim, *(["drive", cell.seed] if drive else [])]
-    stages = stage_digests(experiment.folder, list(kind.needed_settings(experiment)))
+    stages = stage_digests(experiment.folder, NEEDED)
     key = hash_of([stages, _weights_sha256(policy), limits.model_dump(mode="json"), *which])
     try:
         kept = read_json(file)
@@ -79,7 +76,11 @@ def cached_verdict(
             return Verdict(kept["passed"], tuple(kept["reasons"]), kept["numbers"])
     except (OSError, ValueError, KeyError, TypeError):
         pass  # an unreadable verdict is judged again
-    pictures = kind.driven(experiment, cell, drive) if drive else kind.held_out(experiment, cell)
+    pictures = (
+        fidelity.driven(experiment, cell, clean_folder(experiment, cell, drive))
+        if drive
+        else fidelity.held_out(experiment)
+    )
     verdict = judge(agreement_on(policy, goal, pictures), limits, pictures.of)
     write_atomically(file, json.dumps({"key": key, **verdict.record()}, indent=1) + "\n")
     return verdict
@@ -93,9 +94,13 @@ def _weights_sha256(policy: Any) -> str:
     return digest.hexdigest()
 
 
+def lacks(experiment: Experiment, cell: Cell, folder: Path) -> str:
+    """What a prediction still needs, in words; empty if all is there."""
+    return fidelity.lacks(experiment, cell, folder, clean_folder(experiment, cell, folder))
+
+
 def predict_cell(
-    kind: CellKind,
-    experiment: Any,
+    experiment: Experiment,
     cell: Cell,
     folder: Path,
     draws: int = DEFAULT_DRAWS,
@@ -104,8 +109,7 @@ def predict_cell(
     """Predict the deployed drives of a cell whose search is finished, from pictures and the surrogate alone.
 
     Args:
-        kind: Kind of the cell.
-        experiment: Its experiment.
+        experiment: The experiment of the cell.
         cell: Which, as the experiment names it.
         folder: The cell's folder.
         draws: Drives per prediction.
@@ -114,11 +118,12 @@ def predict_cell(
     Returns:
         The prediction, and what it says of the drive without attack.
     """
-    policy, goal = kind.policy_of(experiment, cell)
-    without = clean.agreement if clean else agreement_on(policy, goal, kind.driven(experiment, cell, folder))
-    with_attack = agreement_on(policy, goal, kind.attacked(experiment, cell, folder))
+    policy, goal = fidelity.policy_of(experiment, cell)
+    at = clean_folder(experiment, cell, folder)
+    without = clean.agreement if clean else agreement_on(policy, goal, fidelity.driven(experiment, cell, at))
+    with_attack = agreement_on(policy, goal, fidelity.attacked(experiment, cell, folder, at))
     effect = Effect(with_attack.learned - without.learned, with_attack.real - without.real)
-    problem, images, starts, horizon = kind.loop(experiment, cell, folder)
+    problem, images, starts, horizon = fidelity.loop(experiment, cell, folder, at)
     none_m = clean.none_m if clean else None
     found = predict_transfer(problem, images, without, effect, starts, horizon, draws, cell.seed, none_m)
     return found, CleanDrive(without, found.none_m)

@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from advnerf_core.report.evidence.registration import read_registration
 from nodes.experiment.engine.reference import PUBLISHED
 from nodes.experiment.plan.cell import Cell
-from nodes.experiment.run.cell_kind import settings_hash
+from nodes.experiment.run.cells import runs_alone
 from nodes.experiment.run.config import Campaign
-from nodes.experiment.run.kinds import load_kind
 from nodes.experiment.run.registered import registered_under
 from nodes.experiment.run.store import CellStatus, store_of
 from nodes.experiment.run.worker import Job
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.steps.keys import registered_settings, settings_hash
+from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError, RuntimeFault
 
 
@@ -27,17 +28,15 @@ class Planned:
         cell: Which.
         job: How it is run; without threads and phase.
         live: Whether it drives a live graph.
-        searches: Whether it has a part that may run beside others.
     """
 
     cell: Cell
     job: Job
     live: bool
-    searches: bool
 
 
 def plan_cells(
-    campaign: Campaign, cells: Sequence[Cell], experiments: dict[tuple[str, str], Any] | None = None
+    campaign: Campaign, cells: Sequence[Cell], experiments: dict[tuple[str, str], Experiment] | None = None
 ) -> list[Planned]:
     """Settings of every cell as they are; reads experiments and digests of their stages, prepares nothing.
 
@@ -50,16 +49,14 @@ def plan_cells(
     registration = read_registration(PUBLISHED / campaign.name)
     planned = []
     for cell in cells:
-        kind = load_kind(campaign.kind(cell))
         key = (cell.scenario, cell.placement)
         if key not in experiments:
             experiments[key] = read_experiment(campaign, cell)
         inside = campaign.inside(cell)
-        digest = settings_hash(kind, experiments[key], inside)
+        digest = settings_hash(experiments[key], inside)
         job = Job(
             str(campaign.folder),
             cell.name,
-            campaign.kind(cell),
             str(campaign.experiment_file(cell)),
             campaign.scenario(cell).setting,
             tuple(campaign.overrides(cell)),
@@ -72,16 +69,16 @@ def plan_cells(
             cell.seed,
             digest,
             threads=1,
-            registration=registered_under(registration, cell, kind.registered_settings(experiments[key])),
+            registration=registered_under(registration, cell, registered_settings(experiments[key])),
         )
-        planned.append(Planned(cell, job, kind.runs_alone(experiments[key]), kind.searches_apart))
+        planned.append(Planned(cell, job, runs_alone(experiments[key])))
     return planned
 
 
 def statuses(campaign: Campaign, cells: Sequence[Cell]) -> list[CellStatus]:
     """Where every cell is; one whose experiment cannot be read, as it is not made yet, is missing."""
     store = store_of(campaign)
-    experiments: dict[tuple[str, str], Any] = {}
+    experiments: dict[tuple[str, str], Experiment] = {}
     return [
         store.status(cell, hash_as_it_is(campaign, cell, experiments), elsewhere(campaign, cell))
         for cell in cells
@@ -97,7 +94,9 @@ def elsewhere(campaign: Campaign, cell: Cell) -> list[Path]:
     ]
 
 
-def hash_as_it_is(campaign: Campaign, cell: Cell, experiments: dict[tuple[str, str], Any]) -> str | None:
+def hash_as_it_is(
+    campaign: Campaign, cell: Cell, experiments: dict[tuple[str, str], Experiment]
+) -> str | None:
     """Hash of everything that a cell depends on; None if it cannot be known yet, as what the cell needs is not made.
 
     Args:
@@ -106,7 +105,7 @@ def hash_as_it_is(campaign: Campaign, cell: Cell, experiments: dict[tuple[str, s
         experiments: As of `plan_cells`.
 
     Raises:
-        ConfigError: Its experiment or its kind is wrong.
+        ConfigError: Its experiment is wrong.
     """
     try:
         return plan_cells(campaign, [cell], experiments)[0].job.settings_hash
@@ -116,9 +115,9 @@ def hash_as_it_is(campaign: Campaign, cell: Cell, experiments: dict[tuple[str, s
         return None
 
 
-def read_experiment(campaign: Campaign, cell: Cell) -> Any:
-    """What the kind of a cell reads from the cell's experiment file, with the campaign's settings."""
-    return load_kind(campaign.kind(cell)).load(
+def read_experiment(campaign: Campaign, cell: Cell) -> Experiment:
+    """Read the experiment of a cell, with the campaign's settings."""
+    return load_experiment(
         campaign.experiment_file(cell),
         campaign.scenario(cell).setting,
         campaign.overrides(cell),

@@ -16,10 +16,11 @@ from advnerf_core.report.cells import CellResult
 from advnerf_core.report.conditions import CONTROLS
 from advnerf_core.report.transfer_prediction import Predicted
 from nodes.experiment.plan.cell import Cell
+from nodes.experiment.run.cells import is_predictable
 from nodes.experiment.run.config import Campaign
-from nodes.experiment.run.kinds import load_kind
 from nodes.experiment.run.plan import plan_cells
 from nodes.experiment.run.store import store_of
+from nodes.experiment.show.context import Experiment
 
 if TYPE_CHECKING:
     from nodes.experiment.run.gate import CleanDrive
@@ -41,19 +42,19 @@ def predict_campaign(
         say: Told what was predicted, and what was not and why.
         draws: Drives per prediction, `DEFAULT_DRAWS` unless told.
     """
-    from nodes.experiment.run.gate import DEFAULT_DRAWS, predict_cell  # loads torch
+    from nodes.experiment.run.gate import DEFAULT_DRAWS, lacks, predict_cell  # loads torch
 
     draws = DEFAULT_DRAWS if draws is None else draws
     store, made = store_of(campaign), 0
-    experiments: dict[tuple[str, str], Any] = {}
+    experiments: dict[tuple[str, str], Experiment] = {}
     clean: dict[tuple[str, str, str, int], CleanDrive] = {}
     for cell in cells:
         if not cell.searched:
             continue
         planned = plan_cells(campaign, [cell], experiments)[0]
-        kind = load_kind(planned.job.kind)
         # Work of other settings may hold a search too, of another attack.
-        if not kind.predicts(experiments[cell.scenario, cell.placement]):
+        experiment = experiments[cell.scenario, cell.placement]
+        if not is_predictable(experiment):
             continue
         file = prediction_file(campaign.folder, cell.name)
         kept = kept_prediction(file, planned.job.settings_hash)
@@ -63,13 +64,12 @@ def predict_campaign(
             if kept is not None or store.result(cell.name) is not None:
                 say(f"{cell.name}: not predicted, as its search is not in {store.work(cell.name)}")
             continue
-        experiment = experiments[cell.scenario, cell.placement]
         which = (experiment, campaign.inside(cell), store.work(cell.name))
-        if lacking := kind.lacks(*which):
+        if lacking := lacks(*which):
             say(f"{cell.name}: not predicted, as it lacks {lacking}")
             continue
         drive = (cell.scenario, cell.placement, cell.victim, cell.seed)
-        found, clean[drive] = predict_cell(kind, *which, draws, clean.get(drive))
+        found, clean[drive] = predict_cell(*which, draws, clean.get(drive))
         summary = clean[drive].agreement.summary()
         record = {"settings_hash": planned.job.settings_hash, **found.record(), "clean_drive": summary}
         write_atomically(file, json.dumps(record, indent=1) + "\n")

@@ -19,9 +19,9 @@ from nodes.experiment.engine.stage_record import RECORD, read_record
 from nodes.experiment.pages.table import wanted_rows
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.admission import gate_file, gate_key
+from nodes.experiment.run.cells import keep_build
 from nodes.experiment.run.config import Campaign
 from nodes.experiment.run.kept_attacks import publish_attacks
-from nodes.experiment.run.kinds import load_kind
 from nodes.experiment.run.plan import read_experiment
 from nodes.experiment.run.predictions import kept_prediction, prediction_file
 from nodes.experiment.run.store import FINISHED, CellStatus
@@ -119,7 +119,7 @@ def publish_build(
     written = [
         path
         for cell in experiments.values()
-        for path in load_kind(campaign.kind(cell)).keep(read_experiment(campaign, cell), reference)
+        for path in keep_build(read_experiment(campaign, cell), reference)
     ]
     removed = _prune_build(reference, folder) if prune else []
     size = sum(path.stat().st_size for path in reference.folder.rglob("*") if path.is_file())

@@ -20,7 +20,6 @@ from nodes.experiment.run.cells import Bench
 from nodes.experiment.run.config import Campaign
 from nodes.experiment.run.kept_attacks import attack_file
 from nodes.experiment.run.plan import read_experiment
-from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps.attack import surrogate_drives, surrogate_part
 from nodes.experiment.steps.run import prepare_victims
 from nodes.experiment.steps.search_files import ATTACK
@@ -62,7 +61,7 @@ def redrive(
         tell: Told which cell is driven.
 
     Raises:
-        RedriveError: The set's scene and victim were not kept, or a cell is not of an experiment file.
+        RedriveError: The set's scene and victim were not kept.
     """
     if not is_kept(published):
         raise RedriveError(f"{published.name} {LOST}")
@@ -81,8 +80,6 @@ def redrive(
 def _again(campaign: Campaign, cell: Cell, attack: Path) -> list[KeptDrive]:
     """Drives in the surrogate past the published attack; of a set without attacks, past what its search finds again."""
     experiment = read_experiment(campaign, cell)
-    if not isinstance(experiment, Experiment):
-        raise RedriveError(f"{cell.name}: expected a cell of an experiment file, got one of another kind")
     prepare_victims(experiment)
     with TemporaryDirectory() as work, Bench(experiment) as bench:
         inside, folder = campaign.inside(cell), Path(work)

@@ -31,9 +31,7 @@ from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.plan.placed import PANEL
 from nodes.experiment.plan.space_config import ColoursConfig, FaceConfig
-from nodes.experiment.run.cell_kind import CellKind
 from nodes.experiment.run.config import Campaign
-from nodes.experiment.run.kinds import load_kind
 from nodes.experiment.run.plan import read_experiment, statuses
 from nodes.experiment.run.registered import registered_cell
 from nodes.experiment.run.store import FINISHED
@@ -92,12 +90,7 @@ def _scenarios(campaign: Campaign) -> dict[str, RegisteredScenario]:
 
 
 def _experiment(campaign: Campaign, cell: Cell) -> Experiment:
-    kind: CellKind = load_kind(campaign.kind(cell))
     experiment = read_experiment(campaign, cell)
-    if not isinstance(experiment, Experiment):
-        raise RegistrationError(
-            f"{cell.name}: expected a cell of an experiment file, got one of {type(kind).__name__}, which cannot be registered"
-        )
     experiment.ask_world()
     return experiment
 

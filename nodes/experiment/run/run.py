@@ -14,14 +14,16 @@ from rich.console import Console
 
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.admission import past_the_gate
+from nodes.experiment.run.cells import Bench, needed_settings
 from nodes.experiment.run.config import Campaign
-from nodes.experiment.run.kinds import load_kind
 from nodes.experiment.run.plan import Planned, elsewhere, plan_cells, read_experiment
 from nodes.experiment.run.store import NOT_DRIVEN, Store, store_of
 from nodes.experiment.run.worker import Ended, Job, run_here, run_in_process
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.steps.run import prepare_victims
 from nodes.lab.trials.tries import allow_more_tries
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.progress import ProgressDisplay, Report, StageDisplay
+from nodes.runtime.progress import ProgressDisplay, StageDisplay
 
 Backend = Literal["local", "ray"]
 Say = Callable[[str], None]
@@ -61,7 +63,7 @@ def run_campaign(
     cells: Sequence[Cell],
     options: Options,
     say: Say,
-    experiments: dict[tuple[str, str], Any] | None = None,
+    experiments: dict[tuple[str, str], Experiment] | None = None,
     console: Console | None = None,
     watcher: StageDisplay | None = None,
 ) -> list[Ended]:
@@ -80,7 +82,7 @@ def run_campaign(
         How every cell that was run ended, in the order of their ends.
 
     Raises:
-        ConfigError: An experiment or a kind of scenario is wrong; nothing was run.
+        ConfigError: An experiment is wrong; nothing was run.
     """
     store, experiments = store_of(campaign), {} if experiments is None else experiments
     if not options.ready:
@@ -103,8 +105,6 @@ def run_campaign(
         )
         return []
     _require_positive(options)
-    if options.search_only:
-        wanted = _searching(wanted, say)
     if options.here:
         return _run_here(store, wanted, experiments, options, say, ProgressDisplay(console, watcher))
     jobs, threads = _shares(options)
@@ -115,9 +115,7 @@ def run_campaign(
         )
     say(f"{len(wanted)} of {len(cells)} cells to run, {_at_a_time(jobs, threads)}")
     beside = [replace(each.job, threads=threads) for each in wanted if not each.live]
-    beside += [
-        replace(each.job, threads=threads, phase="search") for each in wanted if each.live and each.searches
-    ]
+    beside += [replace(each.job, threads=threads, phase="search") for each in wanted if each.live]
     ended = _run_beside(beside, jobs, options, say)
     lost = {end.name for end in ended if end.how != "done"}
     searched = {job.name for job in beside if job.phase == "search"}
@@ -134,38 +132,23 @@ def run_campaign(
 def _run_here(
     store: Store,
     wanted: Sequence[Planned],
-    experiments: Mapping[tuple[str, str], Any],
+    experiments: Mapping[tuple[str, str], Experiment],
     options: Options,
     say: Say,
     display: ProgressDisplay,
 ) -> list[Ended]:
     """One cell after another in this process; those of one experiment share what it opens."""
     ended = []
-    kinds = {each.job.kind: load_kind(each.job.kind) for each in wanted}
-    for (kind_name, key), group in groupby(
-        wanted, lambda each: (each.job.kind, (each.cell.scenario, each.cell.placement))
-    ):
-        kind, experiment = kinds[kind_name], experiments[key]
-        with display, kind.hold(experiment):
+    for key, group in groupby(wanted, lambda each: (each.cell.scenario, each.cell.placement)):
+        experiment = experiments[key]
+        with display, Bench(experiment) as bench:
             for each in group:
                 job = replace(each.job, threads=_cores(), phase="search" if options.search_only else "whole")
-                ended.append(run_here(job, store, kind, experiment, display))
+                ended.append(run_here(job, store, experiment, bench, display))
     for end in ended:
         if end.how != "done" or end.text:
             say(f"{end.name}: {end.how}: {end.text}")
     return ended
-
-
-def _searching(wanted: Sequence[Planned], say: Say) -> list[Planned]:
-    """Those whose search can be run without their drives; the others wait."""
-    kinds = sorted({each.job.kind for each in wanted if not each.searches})
-    if found := [each for each in wanted if each.searches]:
-        for kind in kinds:
-            say(f"cells of kind {kind} search and drive in one and are left out")
-        return found
-    raise ConfigError(
-        f"expected cells whose search can be run alone, got kinds {', '.join(kinds)}; run them without --search-only"
-    )
 
 
 def _at_a_time(jobs: int, threads: int) -> str:
@@ -173,18 +156,17 @@ def _at_a_time(jobs: int, threads: int) -> str:
 
 
 def _prepare(campaign: Campaign, cells: Sequence[Cell], say: Say) -> None:
-    done: set[tuple[Path, str]] = set()
+    done: set[Path] = set()
     # All files are read before anything is made, so that a mistake in the last does not cost the hours of the first.
     experiments = {(cell.scenario, cell.placement): (cell, read_experiment(campaign, cell)) for cell in cells}
     _refuse_two_in_one_folder(campaign, cells)
     for cell, experiment in experiments.values():
         folder = campaign.run_folder(cell)
-        kind = campaign.kind(cell)  # kinds need different stages of one experiment
-        if (folder, kind) in done:
+        if folder in done:
             continue
-        done.add((folder, kind))
+        done.add(folder)
         say(f"{cell.scenario}{'.' * bool(cell.placement)}{cell.placement}: {folder}")
-        load_kind(kind).prepare(experiment, _PrintedReport(say))
+        prepare_victims(experiment)
 
 
 def _refuse_two_in_one_folder(campaign: Campaign, cells: Sequence[Cell]) -> None:
@@ -194,24 +176,13 @@ def _refuse_two_in_one_folder(campaign: Campaign, cells: Sequence[Cell]) -> None
     for cell in {(each.scenario, each.placement): each for each in campaign.cells}.values():
         if (folder := campaign.run_folder(cell)) not in folders:
             continue
-        needed = load_kind(campaign.kind(cell)).needed_settings(read_experiment(campaign, cell))
+        needed = needed_settings(read_experiment(campaign, cell))
         name, others = first.setdefault(folder, (cell.scenario, needed))
         if wrong := [stage for stage in needed.keys() & others.keys() if needed[stage] != others[stage]]:
             raise ConfigError(
                 f"{campaign.file}: expected scenarios {name} and {cell.scenario} to have the same settings of stage {', '.join(sorted(wrong))}, as "
                 f"both are in {folder}, got different ones; give one of them a run_folder of its own"
             )
-
-
-class _PrintedReport(Report):
-    def __init__(self, say: Say) -> None:
-        self._say, self._text = say, ""
-
-    def __call__(self, fraction: float, text: str = "") -> None:
-        """Say what is new."""
-        if text and text != self._text:
-            self._text = text
-            self._say(f"  {100 * fraction:.0f} % {text}")
 
 
 def _is_wanted(store: Store, each: Planned, elsewhere: Sequence[Path], options: Options, say: Say) -> bool:

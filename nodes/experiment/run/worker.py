@@ -14,8 +14,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -25,9 +24,11 @@ from advnerf_core.files import write_atomically
 from advnerf_core.run_module import module_command
 from nodes.experiment.engine.stage_record import stage_digests
 from nodes.experiment.plan.cell import Cell
-from nodes.experiment.run.cell_kind import CellKind, settings_hash
-from nodes.experiment.run.kinds import load_kind
+from nodes.experiment.run.cells import Bench, run_cell, runs_alone, search_cell
 from nodes.experiment.run.store import LOG, Store
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.steps.keys import NEEDED, settings_hash
+from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import RuntimeFault
 from nodes.runtime.locks import HeldError, hold
 from nodes.runtime.machine import machine_name
@@ -55,7 +56,6 @@ class Job:
     Attributes:
         campaign_folder: Where results go; the same folder on every machine.
         name: Name of the cell.
-        kind: Kind of its scenario.
         experiment: Experiment file.
         setting: Which of its settings.
         overrides: Changes of it.
@@ -74,7 +74,6 @@ class Job:
 
     campaign_folder: str
     name: str
-    kind: str
     experiment: str
     setting: str
     overrides: tuple[str, ...]
@@ -161,7 +160,7 @@ def run_in_process(job: Job) -> Ended:
     return Ended(job.name, "failed", said, seconds)
 
 
-def run_here(job: Job, store: Store, kind: CellKind, experiment: Any, display: StageDisplay) -> Ended:
+def run_here(job: Job, store: Store, experiment: Experiment, bench: Bench, display: StageDisplay) -> Ended:
     """Run a cell in this process; what ends it by an error is kept, and other cells go on."""
     began = time.monotonic()
     store.lock_file(job.name).parent.mkdir(parents=True, exist_ok=True)
@@ -172,7 +171,7 @@ def run_here(job: Job, store: Store, kind: CellKind, experiment: Any, display: S
     with lock:
         work, report = store.begin(job.name, job.settings_hash), display.start(job.name)
         try:
-            _run(job, store, work, kind, experiment, report)
+            _run(job, store, work, experiment, report, bench)
         except Exception as error:
             text = f"{type(error).__name__}: {' '.join(str(error).split())}"
             store.keep_error(job.name, job.settings_hash, text)
@@ -203,12 +202,12 @@ def _run_job() -> None:
     store = Store(Path(job.campaign_folder))
     store.lock_file(job.name).parent.mkdir(parents=True, exist_ok=True)
     with take_cell(store, job.name):
-        kind, experiment = _checked(job, store)
+        experiment = _checked(job, store)
         work = store.begin(job.name, job.settings_hash)
         with open(work / LOG, "a", encoding="utf-8", buffering=1) as log:
             os.dup2(log.fileno(), 1)
             try:
-                _run(job, store, work, kind, experiment, _log_progress())
+                _run(job, store, work, experiment, _log_progress())
             except Exception as error:
                 traceback.print_exc(file=log)
                 store.keep_error(
@@ -230,13 +229,12 @@ def take_cell(store: Store, name: str) -> TextIO:
             time.sleep(0.05)
 
 
-def _checked(job: Job, store: Store) -> tuple[CellKind, Any]:
-    """The kind and the experiment as they are now, before anything of the cell is touched."""
+def _checked(job: Job, store: Store) -> Experiment:
+    """The experiment as it is now, before anything of the cell is touched."""
     try:
-        kind = load_kind(job.kind)
         _use_threads(job.threads)
-        experiment = kind.load(Path(job.experiment), job.setting, job.overrides, Path(job.run_folder))
-        if settings_hash(kind, experiment, job.cell) != job.settings_hash:
+        experiment = load_experiment(Path(job.experiment), job.setting, job.overrides, Path(job.run_folder))
+        if settings_hash(experiment, job.cell) != job.settings_hash:
             raise ChangedError(
                 f"{job.name}: its settings or inputs changed after the campaign was started; run the campaign again"
             )
@@ -245,17 +243,19 @@ def _checked(job: Job, store: Store) -> tuple[CellKind, Any]:
             job.name, job.settings_hash, f"{type(error).__name__}: {' '.join(str(error).split())}"
         )
         raise SystemExit(_FAILED) from None
-    return kind, experiment
+    return experiment
 
 
-def _run(job: Job, store: Store, work: Path, kind: CellKind, experiment: Any, report: Report) -> None:
+def _run(
+    job: Job, store: Store, work: Path, experiment: Experiment, report: Report, bench: Bench | None = None
+) -> None:
     began = time.monotonic()
     if job.phase == "search":
-        kind.search(experiment, job.cell, work, report)
+        search_cell(experiment, job.cell, work, report, bench)
         _add_seconds(work, time.monotonic() - began)
         return
-    with _alone(kind, experiment):
-        found = kind.run(experiment, job.cell, work, report)
+    with _wait_for_live() if runs_alone(experiment) else nullcontext():
+        found = run_cell(experiment, job.cell, work, report, bench)
     ours = {
         "scenario": job.shown_scenario,
         "placement": job.placement,
@@ -264,7 +264,7 @@ def _run(job: Job, store: Store, work: Path, kind: CellKind, experiment: Any, re
         "seed": job.seed,
         "settings_hash": job.settings_hash,
         "registration": job.registration,
-        "stages": stage_digests(Path(job.run_folder), list(kind.needed_settings(experiment))),
+        "stages": stage_digests(Path(job.run_folder), NEEDED),
         "machine": found.get("machine") or machine_name(),
         "date": found.get("date") or datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }
@@ -273,14 +273,8 @@ def _run(job: Job, store: Store, work: Path, kind: CellKind, experiment: Any, re
     store.keep_result(job.name, {**found, **ours, "seconds": round(float(seconds), 1)})
 
 
-@contextmanager
-def _alone(kind: CellKind, experiment: Any) -> Iterator[None]:
+def _wait_for_live() -> TextIO:
     """A live graph measures time: of all campaigns on this machine only one cell at a time drives one."""
-    with _wait_for_live() if kind.runs_alone(experiment) else nullcontext():
-        yield
-
-
-def _wait_for_live() -> Any:
     path = Path(tempfile.gettempdir()) / _LIVE_LOCK
     while True:
         try:

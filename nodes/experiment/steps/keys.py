@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from advnerf_core.attack.methods import METHODS, black_box_methods, require_method
+from advnerf_core.attack.methods import METHODS, black_box_methods, method_digest, require_method
 from advnerf_core.attack.objectives import name_objective
 from advnerf_core.plugins import PluginError
 from advnerf_core.policies.policy_file import policy_sha256
@@ -96,6 +97,21 @@ def registered_settings(experiment: Experiment) -> dict[str, Any]:
             else {"deployed_world": experiment.deployed_world.settings}
         ),
     }
+
+
+def settings_hash(experiment: Experiment, cell: Cell) -> str:
+    """The key of a cell: a hash of everything that its result depends on; a change of it makes the cell run again."""
+    named = {
+        "scenario": cell.scenario,
+        "victim": cell.victim,
+        "method": cell.method,
+        "seed": cell.seed,
+        "inputs": cell_inputs(experiment, cell),
+    }
+    if code := method_digest(cell.code):
+        named["code"] = code
+    # Through JSON, so that tuples and lists, or paths that were not turned into text, cannot change the hash between processes.
+    return hash_of(json.loads(json.dumps(named, default=str)))
 
 
 def require_known(experiment: Experiment, cell: Cell) -> None:

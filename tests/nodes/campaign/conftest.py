@@ -1,4 +1,4 @@
-"""Campaigns over toy cells in real processes: the module of cells is written into a folder that the workers import from."""
+"""Campaigns over toy cells in real processes."""
 
 import os
 import subprocess
@@ -7,148 +7,40 @@ from pathlib import Path
 
 import pytest
 
-CELLS = """
-import os, time
-from pathlib import Path
-from types import SimpleNamespace
-from nodes.experiment.run.cell_kind import CellKind
-from advnerf_core.documents import read_yaml
+from nodes.experiment.run import (
+    admission,
+    gate,
+    maps,
+    plan,
+    predictions,
+    published,
+    run,
+    worker,
+)
+from tests.support import toy_cells, toy_pictures
 
-def _note(folder, text):
-    with open(folder.parent.parent / "calls.txt", "a") as file:
-        file.write(text + "\\n")
-
-class Toy(CellKind):
-    def load(self, file, setting, overrides, folder):
-        data = read_yaml(file).data
-        for text in overrides:
-            key, value = text.split("=")
-            data[key] = float(value)
-        return SimpleNamespace(folder=Path(folder), data=data)
-
-    def prepare(self, experiment, report):
-        experiment.folder.mkdir(parents=True, exist_ok=True)
-
-    def inputs(self, experiment, cell):
-        return dict(experiment.data)
-
-    def needed_settings(self, experiment):
-        return {"capture": {}, "policy": {}}
-
-    def run(self, experiment, cell, folder, report):
-        _note(folder, f"begin {cell.name} {os.environ.get('OMP_NUM_THREADS')}")
-        if (folder.parent.parent / "fail").exists() and cell.method == "cem":
-            raise RuntimeError("the search came to nothing")
-        done = folder / "half"
-        try:
-            while (folder.parent.parent / "hang").exists() and cell.method == "gradient" and not done.exists():
-                (folder / "pid").write_text(str(os.getpid()))
-                time.sleep(0.02)
-        except BaseException:
-            _note(folder, f"closed {cell.name}")
-            raise
-        _note(folder, f"end {cell.name}")
-        factor = {"none": 1.0, "random": 1.1, "cem": 2.0, "gradient": 3.0}[cell.method]
-        none = experiment.data["base"] + cell.seed
-        drives = {"total_cte_m": [factor * none], "off_track": [cell.method == "gradient"], "none_total_cte_m": [none]}
-        found = {"attack_id": None, "surrogate": drives, "deployed": drives, "extra": {}}
-        if (folder.parent.parent / "late").exists() and cell.method == "gradient":
-            found.pop("deployed")
-            return {**found, "not_driven_live": "live0 was spoiled 3 times, at last: late"}
-        return found
-"""
-
-
-PICTURES = """
-import numpy as np
-import torch
-
-from advnerf_core.attack.problem import AttackProblem
-from advnerf_core.driving.dynamics import Dubins
-from advnerf_core.driving.metrics import Horizon
-from advnerf_core.driving.path import Line
-from advnerf_core.driving.path import Path as DrivingPath
-from advnerf_core.scene.fidelity import PicturePairs
-from nodes.runtime.errors import RuntimeFault
-
-# Real pictures keep half of what the attack does on learned ones.
-TURN, KEPT = 0.2, 0.5
-START = torch.tensor([[0.0, 0.3, 0.0]], dtype=torch.float64)
-
-class Reads:
-    stateless = True
-
-    def __call__(self, images, goals=None):
-        return images[:, 0, 0, 0] - 0.5
-
-class Nothing:
-    theta_shape = (1,)
-
-def _pictures(of, real, learned):
-    grain = np.random.default_rng(0).uniform(0.0, 0.1, (len(real), 66, 200, 3))  # as SSIM of flat pictures says nothing
-    grain[:, 0, 0] = 0.0
-    show = lambda values: np.round(255 * (grain + np.asarray(values)[:, None, None, None])).astype(np.uint8)
-    return PicturePairs(of, show(real), show(learned))
-
-class Gated(Toy):
-    searches_apart = True
-
-    def judges(self, experiment):
-        return True
-
-    def search(self, experiment, cell, folder, report):
-        _note(folder, f"search {cell.name}")
-        (folder / "searched").touch()
-
-    def policy_of(self, experiment, cell):
-        return Reads(), ()
-
-    def held_out(self, experiment, cell):
-        with open(experiment.folder / "looked.txt", "a") as file:
-            file.write(cell.scenario + "\\n")
-        real = np.linspace(0.3, 0.6, 16)
-        return _pictures("held-out views", real, real + experiment.data.get("wrong", 0.0))
-
-    def driven(self, experiment, cell, folder, bag=None):
-        if experiment.data.get("late") and not folder.with_suffix(".json").exists():
-            raise RuntimeFault("expected a live drive, got none")
-        real = np.full(16, 0.5)
-        return _pictures("driven bag", real, real + experiment.data.get("wrong_drive", 0.0))
-
-    def lacks(self, experiment, cell, folder):
-        return "" if (folder / "searched").exists() else "its search"
-
-    def attacked(self, experiment, cell, folder):
-        return _pictures("attacked", np.full(16, 0.5 + KEPT * TURN), np.full(16, 0.5 + TURN))
-
-    def loop(self, experiment, cell, folder):
-        path = DrivingPath.from_segments((0.0, 0.0, 0.0), [Line(50.0)], closed=False)
-
-        def images(states, attacked):
-            return (0.5 - 0.5 * states[:, 1] - states[:, 2] + TURN * attacked)[:, None, None, None]
-
-        return AttackProblem(Reads(), Nothing(), Dubins(1.0, 0.1), path, START, 20), images, START, Horizon(20, 0.1, 0.4)
-"""
+MODULES = (admission, gate, maps, plan, predictions, published, run, worker)
 
 
 @pytest.fixture
-def gated(here):
-    """The bench with cells that also have searches apart, and real and learned pictures."""
-    here.code.write_text(CELLS + PICTURES)
-    here.kind = "toy_cells.py:Gated"
-    here.write("seeds: [0, 1]\nmethods: [gradient, none]\nvictims: [hardened]\n")
+def gated(here, monkeypatch):
+    """The bench with a learned scene: cells have real and learned pictures."""
+    (here.folder / "gated").touch()
+    monkeypatch.setattr(gate, "fidelity", toy_pictures)
     return here
 
 
 @pytest.fixture
-def bench(tmp_path):
-    """A folder with a kind of toy cells, an experiment and a campaign of one scenario, two seeds, three methods."""
+def bench(tmp_path, monkeypatch):
+    """A folder with an experiment of toy cells and a campaign of one scenario, two seeds, two methods."""
+    toy_cells.put_over(monkeypatch, MODULES)
+    monkeypatch.setattr(worker, "module_command", toy_cells.command)
     return Bench(tmp_path)
 
 
 @pytest.fixture
 def here(bench, monkeypatch):
-    """The bench, whose workers find the benchmarks too."""
+    """The bench, whose workers find the toy cells."""
     monkeypatch.setenv("PYTHONPATH", bench.environment["PYTHONPATH"])
     return bench
 
@@ -156,27 +48,30 @@ def here(bench, monkeypatch):
 class Bench:
     def __init__(self, folder):
         self.folder = folder
-        self.cells, self.kind, self.code = folder / "cells", "toy_cells.py:Toy", folder / "toy_cells.py"
-        self.code.write_text(CELLS)
-        (folder / "toy.experiment.yaml").write_text("base: 2.0\n")
+        self.cells = folder / "cells"
+        self.describe(none_m=2.0)
         self.file = folder / "toy.campaign.yaml"
         self.write("seeds: [0, 1]\nmethods: [gradient, none]\nvictims: [hardened]\n")
 
+    def describe(self, **values):
+        """Write the experiment; ``none_m`` is its total CTE without attack."""
+        lines = [f"{name}: {value}\n" for name, value in values.items()]
+        (self.folder / "toy.experiment.yaml").write_text("settings: {full: {}}\n" + "".join(lines))
+
     def write(self, head, scenarios=""):
-        scenario = f"{{kind: '{self.kind}', experiment: toy.experiment.yaml, setting: full, run_folder: {self.folder / 'run'}}}"
+        scenario = f"{{experiment: toy.experiment.yaml, setting: full, run_folder: {self.folder / 'run'}}}"
         self.file.write_text(
             f"name: toy\nfolder: {self.folder}\n{head}scenarios:\n  straight: {scenario}\n{scenarios}"
         )
 
     @property
     def environment(self):
-        root = Path(__file__).parents[3]  # for what a cell of a test takes from the benchmarks
+        root = Path(__file__).parents[3]
         path = os.pathsep.join([str(self.folder), str(root), *filter(None, [os.environ.get("PYTHONPATH")])])
         return {**os.environ, "PYTHONPATH": path}
 
     def start(self, *arguments):
-        # The process that plans and waits must not spend two seconds on libraries that only cells and plots need.
-        code = "import sys; sys.modules['torch'] = sys.modules['matplotlib'] = None; from nodes.cli.main import main; main()"
+        code = f"from {toy_cells.MODULE} import install; install(); from nodes.cli.main import main; main()"
         command = [sys.executable, "-c", code, *arguments]
         return subprocess.Popen(
             command, env=self.environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

@@ -7,7 +7,6 @@ from typer.testing import CliRunner
 from nodes.cli.main import app
 from nodes.experiment.plan.cell import select
 from nodes.experiment.run.config import load_campaign
-from nodes.experiment.run.kinds import load_kind
 from nodes.experiment.run.run import _refuse_two_in_one_folder
 from nodes.runtime.errors import ConfigError
 
@@ -102,14 +101,6 @@ def test_a_bad_file_is_told_with_its_line(file, old, new, says):
         load_campaign(file)
 
 
-def test_an_unknown_kind_is_told_with_what_there_is(tmp_path):
-    with pytest.raises(ConfigError, match=r"kind of cells of experiment; got 'moon'; .*file\.py:Name"):
-        load_kind("moon")
-    (tmp_path / "no.py").write_text("class Cells:\n    pass\n")
-    with pytest.raises(ConfigError, match=r"a subclass of nodes\.experiment\.run\.cell_kind\.CellKind"):
-        load_kind("no.py:Cells", tmp_path)
-
-
 TWICE = """name: twice
 seeds: [0]
 scenarios:
@@ -144,7 +135,7 @@ def test_a_page_of_some_cells_does_not_take_the_place_of_the_page_of_all(bench, 
         assert done.exit_code == 0, done.output
         return done.output
 
-    assert "of 4 cells; page: " in call("report")
+    assert "of 3 cells; page: " in call("report")
     whole = (bench.cells.parent / "table" / "table.json").read_text()
     assert {row["method"] for row in json.loads(whole)["rows"]} == {"none", "gradient"}
     said = call("table", "--only", "method=gradient")

@@ -13,18 +13,13 @@ from advnerf_core.driving.dynamics import Dubins
 from advnerf_core.driving.metrics import Horizon, drive_metrics
 from advnerf_core.driving.path import Line, Path
 from advnerf_core.driving.rollout import drive
-from advnerf_core.scene.gate_limits import GateLimits
 from nodes.cli.experiment import predict
 from nodes.cli.main import app
-from nodes.experiment.plan.cell import Cell
-from nodes.experiment.run.cell_kind import NoPicturesError
 from nodes.experiment.run.config import load_campaign
-from nodes.experiment.run.gate import judge_scene
-from nodes.experiment.run.kinds import load_kind
 from nodes.experiment.run.plan import statuses
 from nodes.experiment.run.predictions import predict_campaign, predicted
 from nodes.experiment.run.run import Options, run_campaign
-from nodes.runtime.errors import ConfigError
+from tests.support.toy_cells import load_experiment
 
 HEAD = "seeds: [0]\nmethods: [gradient, none]\nvictims: [hardened]\n"
 
@@ -39,7 +34,7 @@ def times_judged(bench):
 
 
 def test_a_surrogate_that_the_policy_reads_wrongly_has_its_cells_left_out(gated):
-    (gated.folder / "toy.experiment.yaml").write_text("base: 2.0\nwrong: 0.2\n")
+    gated.describe(none_m=2.0, wrong=0.2)
     gated.write(HEAD)
     ended, said = run(gated)
     assert ended == []
@@ -73,7 +68,7 @@ def test_a_verdict_is_made_again_only_for_other_limits(gated):
 
 def test_a_drive_without_attack_is_judged_too_as_soon_as_there_is_one(gated):
     gated.write(HEAD)
-    (gated.folder / "toy.experiment.yaml").write_text("base: 2.0\nlate: 1.0\nwrong_drive: 0.2\n")
+    gated.describe(none_m=2.0, late=1.0, wrong_drive=0.2)
     ended, said = run(gated)
     assert {end.how for end in ended} == {"done"}
     assert any(
@@ -89,7 +84,7 @@ def test_a_drive_without_attack_is_judged_too_as_soon_as_there_is_one(gated):
         "driven bag: mean steering difference 0.1961" in line and "--no-gate" in line for line in said
     )  # 128 and 178 of 255
     assert json.loads(verdict.read_text())["passed"] is False
-    assert len(run(gated, gate=False)[0]) == 2
+    assert len(run(gated, gate=False)[0]) == 1
 
 
 def test_transfer_is_predicted_from_the_search_before_any_drive(gated):
@@ -117,15 +112,10 @@ def test_transfer_is_predicted_from_the_search_before_any_drive(gated):
     assert pair.ratio == pytest.approx(kept["ratio"])
 
 
-def test_searches_are_not_run_alone_where_there_are_none_apart(bench):
-    with pytest.raises(ConfigError, match=r"toy_cells\.py:Toy; run them without --search-only"):
-        run(bench, search_only=True)
-
-
 def test_a_search_of_other_settings_is_not_predicted_from(gated):
     gated.write(HEAD)
     run(gated)
-    (gated.folder / "toy.experiment.yaml").write_text("base: 5.0\n")
+    gated.describe(none_m=5.0)
     campaign, said = load_campaign(gated.file), []
     assert predict_campaign(campaign, campaign.cells, said.append) == 0
     run(gated, search_only=True)  # its old result is still there
@@ -153,13 +143,12 @@ def driven(turn_radps):
 
 
 @pytest.mark.parametrize(("wrong", "code"), [(0.0, 0), (0.2, 1)])
-def test_the_gate_is_a_command_of_its_own_with_an_exit_code(gated, wrong, code):
-    (gated.folder / "toy.experiment.yaml").write_text(f"base: 2.0\nwrong: {wrong}\n")
+def test_the_gate_is_a_command_of_its_own_with_an_exit_code(gated, wrong, code, monkeypatch):
+    monkeypatch.setattr("nodes.experiment.steps.run.load_experiment", load_experiment)
+    gated.describe(none_m=2.0, wrong=wrong)
     (gated.folder / "run").mkdir()
     arguments = (
         str(gated.folder / "toy.experiment.yaml"),
-        "--kind",
-        f"{gated.code}:Gated",
         "--run-folder",
         str(gated.folder / "run"),
     )
@@ -168,13 +157,6 @@ def test_the_gate_is_a_command_of_its_own_with_an_exit_code(gated, wrong, code):
     verdicts = json.loads(found.stdout)
     assert [verdicts[of]["passed"] for of in ("held-out views", "driven bag")] == [code == 0, True]
     assert verdicts["held-out views"]["numbers"]["steering"] == pytest.approx(wrong, abs=0.002)
-
-
-def test_a_kind_without_pictures_has_no_gate(bench):
-    with pytest.raises(NoPicturesError, match="expected cells with real and learned pictures, got Toy"):
-        judge_scene(
-            load_kind(bench.kind, bench.folder), None, Cell("straight", "hardened", "none", 0), GateLimits()
-        )
 
 
 def test_the_command_draws_as_often_as_the_library_by_default_and_as_it_must():

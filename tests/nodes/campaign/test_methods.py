@@ -15,33 +15,9 @@ from nodes.experiment.run.run import Options, run_campaign
 from nodes.runtime.errors import ConfigError
 from tests.support.strangers import install_method, spiral_code, spiral_theta, write_spiral
 
-# Cells that really search, over a closed loop of two ticks.
-SEARCHES = """
-import torch
-from advnerf_core.attack.adjoint import evaluate
-from advnerf_core.attack.methods import SearchRun, SearchSettings, load_method
-from benchmarks.attack_toy import toy_problem
-
-class Searching(Toy):
-    def run(self, experiment, cell, folder, report):
-        _note(folder, f"begin {cell.scenario}_{cell.victim}_{cell.code}_{cell.seed}")
-        problem = toy_problem(2, dtype=torch.float32)
-        plain = evaluate(problem, problem.sensor.plain_theta())[1].protocol_cte_m.tolist()
-        found, theta = plain, None
-        if cell.method != "none":
-            chosen = load_method(cell.code)
-            settings = SearchSettings(3, population=4, options=chosen.options({}))
-            result = chosen.search(problem, settings, SearchRun(cell.seed))
-            found, theta = list(result.best.protocol_cte_m), result.theta.flatten().tolist()
-        drives = {"total_cte_m": found, "off_track": [False] * len(found), "none_total_cte_m": plain}
-        return {"attack_id": None, "surrogate": drives, "extra": {"theta": theta}}
-"""
-
 
 @pytest.fixture
 def searching(here):
-    here.code.write_text(here.code.read_text() + SEARCHES)
-    here.kind = "toy_cells.py:Searching"
     write_spiral(here.folder)
     here.write("seeds: [1]\nmethods: [spiral.py:Spiral, spiral, none]\nvictims: [hardened]\n")
     return here
@@ -62,7 +38,7 @@ def test_methods_of_a_file_and_of_a_package_run_in_worker_processes_and_appear_i
 ):
     install_method(searching.folder, monkeypatch, spiral_code())
     campaign = load_campaign(searching.file)
-    names = [f"straight_hardened_{method}_1" for method in ("none", "Spiral", "spiral")]
+    names = [f"straight_hardened_{method}" for method in ("none_0", "Spiral_1", "spiral_1")]
     assert [cell.name for cell in campaign.cells] == names
     assert [cell.name for cell in select(campaign.cells, "method=Spiral")] == [names[1]]
     elsewhere = tmp_path / "elsewhere"
@@ -70,7 +46,8 @@ def test_methods_of_a_file_and_of_a_package_run_in_worker_processes_and_appear_i
     monkeypatch.chdir(elsewhere)  # references are relative to the campaign file
     ended, _ = run(searching, jobs=2)
     assert {end.how for end in ended} == {"done"}
-    assert f"begin straight_hardened_{searching.folder / 'spiral.py'}:Spiral_1" in searching.calls
+    (begun,) = [line for line in searching.calls if line.startswith("begin straight_hardened_Spiral_1 ")]
+    assert begun.split()[2] == f"{searching.folder / 'spiral.py'}:Spiral"
     result = json.loads((searching.cells / f"{names[1]}.json").read_text())
     assert result["method"] == "Spiral"
     shape = toy_problem(2).sensor.theta_shape

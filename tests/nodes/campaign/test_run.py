@@ -32,7 +32,7 @@ def states(bench):
 def test_a_campaign_runs_once_and_only_what_changed_again(here):
     ended, _ = run(here)
     assert {end.how for end in ended} == {"done"}
-    assert len(ended) == 4
+    assert len(ended) == 3
     threads = max(1, len(os.sched_getaffinity(0)) // 2)  # of two jobs at a time
     assert all(line.endswith(f" {threads}") for line in here.calls if line.startswith("begin"))
     assert set(states(here).values()) == {"done"}
@@ -44,14 +44,14 @@ def test_a_campaign_runs_once_and_only_what_changed_again(here):
 
     here.write("seeds: [0, 1, 2]\nmethods: [none, gradient]\nvictims: [hardened]\n")
     ended, _ = run(here)
-    assert sorted(end.name for end in ended) == [f"straight_hardened_{m}_2" for m in ("gradient", "none")]
+    assert [end.name for end in ended] == ["straight_hardened_gradient_2"]
     assert all(here.cells.joinpath(name).stat().st_mtime_ns == stamp for name, stamp in before.items())
 
     began = time.monotonic()
-    (here.folder / "toy.experiment.yaml").write_text("base: 5.0\n")
+    here.describe(none_m=5.0)
     assert set(states(here).values()) == {"changed"}
     ended, _ = run(here)
-    assert len(ended) == 6
+    assert len(ended) == 4
     result = json.loads((here.cells / "straight_hardened_gradient_1.json").read_text())
     assert result["surrogate"]["total_cte_m"] == [18.0]
     assert result["scenario"] == "straight"
@@ -64,9 +64,9 @@ def test_a_cell_that_was_not_driven_live_ends_well_and_is_tried_again_only_on_re
     assert {end.how for end in ended} == {"done"}
     assert sum("not driven live: live0 was spoiled 3 times" in text for text in said) == 2
     assert states(here) == {
-        f"straight_hardened_{method}_{seed}": "done" if method == "none" else "not driven live"
-        for method in ("none", "gradient")
-        for seed in (0, 1)
+        "straight_hardened_none_0": "done",
+        "straight_hardened_gradient_0": "not driven live",
+        "straight_hardened_gradient_1": "not driven live",
     }
     ended, said = run(here)
     assert ended == []
@@ -105,7 +105,7 @@ def test_a_killed_campaign_takes_its_workers_along_and_goes_on(here):
     done = set(here.cells.glob("*.json"))
     (here.folder / "hang").unlink()
     ended, _ = run(here)
-    assert len(ended) == 4 - len(done)
+    assert len(ended) == 3 - len(done)
     assert set(states(here).values()) == {"done"}
 
 
@@ -119,7 +119,7 @@ def test_failed_cells_say_why_and_are_retried_when_asked(here):
     code, out, _ = here.call("status", str(here.file))
     assert code == 0
     assert "the search came to nothing" in out
-    assert "2 done, 2 failed of 4 cells" in out
+    assert "2 failed, 1 done of 3 cells" in out
     (here.folder / "fail").unlink()
     ended, said = run(here)
     assert ended == []
@@ -131,21 +131,21 @@ def test_failed_cells_say_why_and_are_retried_when_asked(here):
 
 @pytest.mark.slow
 def test_live_cells_run_alone_after_all_others(here):
-    alone = "class Live(Toy):\n    searches_apart = True\n    runs_alone = lambda self, experiment: True\n"
-    (here.folder / "toy_live.py").write_text(here.code.read_text() + alone)
     here.write(
         "seeds: [0, 1]\nmethods: [none, cem]\nvictims: [hardened]\n",
-        f"  live: {{kind: 'toy_live.py:Live', experiment: toy.experiment.yaml, run_folder: {here.folder / 'run'}}}\n",
+        f"  live: {{experiment: toy.experiment.yaml, run_folder: {here.folder / 'run'}, set: [alone=1]}}\n",
     )
     ended, _ = run(here)
     assert {end.how for end in ended} == {"done"}
-    calls = here.calls
-    first = next(index for index, line in enumerate(calls) if "live_" in line)
-    assert not any("straight_" in line for line in calls[first:])
+    searched = [index for index, line in enumerate(here.calls) if line.startswith("search live_")]
+    first = next(index for index, line in enumerate(here.calls) if line.startswith("begin live_"))
+    assert len(searched) == 3
+    assert max(searched) < first  # searches run beside others
+    assert not any("straight_" in line for line in here.calls[first:])
     # One after the other: whatever begins ends before the next begins.
-    lines = [line.split()[:2] for line in calls[first:]]
-    assert [kind for kind, _ in lines] == ["begin", "end"] * 4
-    assert all(lines[k][1] == lines[k + 1][1] for k in range(0, 8, 2))
+    lines = [line.split()[:2] for line in here.calls[first:]]
+    assert [kind for kind, _ in lines] == ["begin", "end"] * 3
+    assert all(lines[k][1] == lines[k + 1][1] for k in range(0, 6, 2))
 
 
 @pytest.fixture
@@ -170,7 +170,7 @@ def test_a_ray_cluster_of_several_workers_runs_the_cells(here, cluster):
     assert code == 0, err
     assert "Ray cluster with 2 cores" in out
     assert set(states(here).values()) == {"done"}
-    assert len(here.begun()) == 4
+    assert len(here.begun()) == 3
     code, out, _ = here.call("experiment", str(here.file), "--cluster", cluster.address)
     assert "nothing to do" in out
 
@@ -188,10 +188,10 @@ def test_a_lost_machine_costs_only_its_cells(here, cluster):
     lines = out.splitlines()
     again = lines.index("a machine of the cluster was lost: 1 cells are handed out again")
     # The other ends are reported before: each when it came.
-    assert sum("done after" in line for line in lines[:again]) == 3
+    assert sum("done after" in line for line in lines[:again]) == 2
     assert sum("done after" in line for line in lines[again:]) == 1
     assert set(states(here).values()) == {"done"}
-    assert len(here.begun()) == 4 + 1
+    assert len(here.begun()) == 3 + 1
 
 
 @pytest.mark.slow
@@ -239,12 +239,12 @@ def test_a_worker_that_is_asked_to_end_has_not_failed(here):
 def test_a_cell_that_fails_anew_is_failed_whatever_it_found_before(here):
     here.write("seeds: [0]\nmethods: [cem]\nvictims: [hardened]\n")
     assert [end.how for end in run(here)[0]] == ["done"]
-    (here.folder / "toy.experiment.yaml").write_text("base: 5.0\n")
+    here.describe(none_m=5.0)
     (here.folder / "fail").touch()
     assert [end.how for end in run(here)[0]] == ["failed"]
     assert states(here) == {"straight_hardened_cem_0": "failed"}
     assert run(here)[0] == []
-    (here.folder / "toy.experiment.yaml").write_text("base: 2.0\n")
+    here.describe(none_m=2.0)
     assert states(here) == {"straight_hardened_cem_0": "done"}
 
 

@@ -9,9 +9,9 @@ import yaml
 from advnerf_core.data.dataset import load_transforms
 from advnerf_core.report.clips import read_clip
 from nodes.experiment.plan.cell import Cell
-from nodes.experiment.run.cell_kind import settings_hash
-from nodes.experiment.run.kinds import load_kind
+from nodes.experiment.run.cells import runs_alone
 from nodes.experiment.run.whole import run_experiment
+from nodes.experiment.steps.keys import settings_hash
 from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError
 
@@ -97,13 +97,11 @@ def test_objects_are_held_against_the_lanes_once_these_are_known(as_carla, file,
 
 
 def test_the_servers_address_changes_no_cell_and_its_junction_does(as_carla, file, tmp_path):
-    kind = load_kind("experiment")
-    assert kind.runs_alone(kind.load(file, "tiny", [], tmp_path / "run"))
-    assert kind.searches_apart
+    assert runs_alone(load_experiment(file, "tiny", [], tmp_path / "run"))
 
     def of(*changes):
-        experiment = kind.load(file, "tiny", list(changes), tmp_path / "run")
-        return settings_hash(kind, experiment, Cell("right", "hardened", "gradient", 0))
+        experiment = load_experiment(file, "tiny", list(changes), tmp_path / "run")
+        return settings_hash(experiment, Cell("right", "hardened", "gradient", 0))
 
     assert of() == of("world.server.port=3000") == of("attack.seeds=[0,7]")
     assert of() != of("world.junction.beyond_m=31")

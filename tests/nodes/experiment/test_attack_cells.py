@@ -25,9 +25,7 @@ from nodes.experiment.pages import page, report
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.robustness_config import RobustnessConfig
 from nodes.experiment.plan.victims import NAIVE
-from nodes.experiment.run.cell_kind import settings_hash
 from nodes.experiment.run.cells import run_cell, search_cell
-from nodes.experiment.run.kinds import load_kind
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.learned_scene import load_field
 from nodes.experiment.show.spaces import colour_space
@@ -36,7 +34,7 @@ from nodes.experiment.steps import attack, frozen, run
 from nodes.experiment.steps.attack import cells, load_shown, surrogate_part
 from nodes.experiment.steps.deploy import DRIVES, ThroughWorld, cell_data
 from nodes.experiment.steps.films import film_cell
-from nodes.experiment.steps.keys import CellError, cell_inputs, clean_folder
+from nodes.experiment.steps.keys import CellError, cell_inputs, clean_folder, settings_hash
 from nodes.experiment.steps.shared_search import search_key, take_search
 from nodes.runtime.errors import ConfigError
 from tests.support.strangers import spiral_code, spiral_theta, write_spiral
@@ -141,7 +139,7 @@ def test_a_method_of_a_file_runs_a_cell_and_appears_in_the_tables(
 
     # What its code is decides, not where it lies.
     def digest() -> str:
-        return settings_hash(load_kind("experiment"), experiment, Cell.of(*PLACE, f"{spiral_file}:Spiral", 0))
+        return settings_hash(experiment, Cell.of(*PLACE, f"{spiral_file}:Spiral", 0))
 
     before = digest()
     spiral_file.write_text(spiral_code() + "# changed\n")
@@ -277,9 +275,7 @@ def test_an_attack_may_be_deployed_in_another_world_of_the_same_paths(fresh: Exp
     assert found["surrogate"] == here["surrogate"]
     assert found["deployed"] != here["deployed"]
     # It counts as what the cell depends on, and the search does not.
-    assert settings_hash(load_kind("experiment"), there, GRADIENT) != settings_hash(
-        load_kind("experiment"), fresh, GRADIENT
-    )
+    assert settings_hash(there, GRADIENT) != settings_hash(fresh, GRADIENT)
     assert search_key(there, GRADIENT) == search_key(fresh, GRADIENT)
     other = changed(fresh, "deploy", world={**fresh.config.world, "camera": {"horizontal_fov_deg": 60.0}})
     with pytest.raises(

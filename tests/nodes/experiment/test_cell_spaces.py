@@ -27,16 +27,14 @@ from nodes.experiment.plan.space_config import (
     PlacesConfig,
 )
 from nodes.experiment.run import cells
-from nodes.experiment.run.cell_kind import settings_hash
-from nodes.experiment.run.cells import run_cell
-from nodes.experiment.run.kinds import load_kind
+from nodes.experiment.run.cells import has_learned_scene, is_predictable, run_cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import make_space, mesh_objects
 from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps import attack, films, pose_maps, run
 from nodes.experiment.steps.attack import surrogate_part
 from nodes.experiment.steps.deploy import DRIVES, ThroughWorld, cell_data
-from nodes.experiment.steps.keys import CellError
+from nodes.experiment.steps.keys import CellError, settings_hash
 from nodes.experiment.steps.pose_maps import PoseMapSettings
 from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError
@@ -187,16 +185,16 @@ def test_places_alone_keep_the_plain_colours_and_are_filmed(
 
 
 def test_a_cell_depends_on_its_space_and_on_its_victim(trained: Experiment) -> None:
-    kind, experiment = load_kind("experiment"), searching(trained, ONE)
-    same = settings_hash(kind, experiment, PLACES)
-    assert settings_hash(kind, searching(trained, ONE), PLACES) == same
+    experiment = searching(trained, ONE)
+    same = settings_hash(experiment, PLACES)
+    assert settings_hash(searching(trained, ONE), PLACES) == same
     others = [
-        settings_hash(kind, searching(trained, ONE.model_copy(update={"move_m": 0.2})), PLACES),
-        settings_hash(kind, searching(trained, ONE.model_copy(update={"colours": False})), PLACES),
-        settings_hash(kind, experiment, Cell("right", "naive", "random", 0)),
-        settings_hash(kind, experiment, Cell("right", "hardened", "random", 1)),
-        settings_hash(kind, searching(trained, MESHES[0]), PLACES),
-        settings_hash(kind, searching(trained, ColoursConfig()), PLACES),
+        settings_hash(searching(trained, ONE.model_copy(update={"move_m": 0.2})), PLACES),
+        settings_hash(searching(trained, ONE.model_copy(update={"colours": False})), PLACES),
+        settings_hash(experiment, Cell("right", "naive", "random", 0)),
+        settings_hash(experiment, Cell("right", "hardened", "random", 1)),
+        settings_hash(searching(trained, MESHES[0]), PLACES),
+        settings_hash(searching(trained, ColoursConfig()), PLACES),
     ]
     assert len({same, *others}) == 7
     for wrong in (
@@ -205,15 +203,14 @@ def test_a_cell_depends_on_its_space_and_on_its_victim(trained: Experiment) -> N
         ("right", "hardened", "luck", 0),
     ):
         with pytest.raises(CellError, match="expected a"):
-            settings_hash(kind, experiment, Cell(*wrong))
+            settings_hash(experiment, Cell(*wrong))
 
 
 def test_a_cell_of_colours_depends_on_the_world_and_not_on_what_else_is_searched(trained: Experiment) -> None:
-    kind = load_kind("experiment")
 
     def digest(*changes: str, victim: str = "hardened") -> str:
-        experiment = kind.load(trained.file, "tiny", list(changes), trained.folder)
-        return settings_hash(kind, experiment, Cell("right", victim, "random", 0))
+        experiment = load_experiment(trained.file, "tiny", list(changes), trained.folder)
+        return settings_hash(experiment, Cell("right", victim, "random", 0))
 
     same = digest()
     for free in (
@@ -233,11 +230,12 @@ def test_a_cell_of_colours_depends_on_the_world_and_not_on_what_else_is_searched
 def test_the_gate_judges_learned_scenes_and_predictions_need_objects_where_they_were_placed(
     trained: Experiment,
 ) -> None:
-    kind = load_kind("experiment")
-    judged = {space.kind: kind.judges(searching(trained, space)) for space in (ColoursConfig(), ONE, *MESHES)}
+    judged = {
+        space.kind: has_learned_scene(searching(trained, space)) for space in (ColoursConfig(), ONE, *MESHES)
+    }
     assert judged == {"colours": True, "places": True, "mesh_texture": False, "mesh_shape": False}
     predicted = {
-        space.kind: kind.predicts(searching(trained, space)) for space in (ColoursConfig(), ONE, *MESHES)
+        space.kind: is_predictable(searching(trained, space)) for space in (ColoursConfig(), ONE, *MESHES)
     }
     assert predicted == {"colours": True, "places": False, "mesh_texture": False, "mesh_shape": False}
 
@@ -278,11 +276,11 @@ def test_a_wrong_space_is_one_clear_error(
 def test_the_retrained_victim_is_that_of_the_first_round(trained: Experiment, tmp_path: Path) -> None:
     folder = shutil.copytree(trained.folder, tmp_path / "run")
     experiment = replace(searching(trained, ONE, retrain=RetrainConfig()), folder=folder)
-    kind, asked = load_kind("experiment"), Cell("left", "retrained", "none", 0)
-    unknown = settings_hash(kind, experiment, asked)  # it is not trained yet
+    asked = Cell("left", "retrained", "none", 0)
+    unknown = settings_hash(experiment, asked)  # it is not trained yet
     (folder / "retrain" / "round0").mkdir(parents=True)
     shutil.copy(folder / "policy" / "naive.safetensors", folder / "retrain" / "round0" / "policy.safetensors")
-    assert settings_hash(kind, experiment, asked) != unknown
+    assert settings_hash(experiment, asked) != unknown
     cell = run_cell(experiment, asked, tmp_path / "retrained", silent)
     naive = run_cell(experiment, Cell("left", "naive", "none", 0), tmp_path / "naive", silent)
     assert json.dumps(naive["deployed"]) == json.dumps(cell["deployed"])  # the very same weights

@@ -5,7 +5,7 @@ from pathlib import Path
 from advnerf_core.attack.methods import METHODS, load_method
 from advnerf_core.plugins import name_in_results
 from nodes.experiment.plan.cell import Cell
-from nodes.experiment.run.cells import ExperimentCells
+from nodes.experiment.run.cells import runs_alone
 from nodes.experiment.steps.attack import search_settings
 from nodes.experiment.steps.keys import cell_inputs, clean_folder
 from nodes.experiment.steps.run import load_experiment
@@ -31,9 +31,8 @@ def test_methods_and_seeds_of_one_victim_share_the_live_drive_without_attack(tmp
 
 
 def test_live_nodes_have_the_machine_for_themselves(tmp_path):
-    kind = ExperimentCells()
-    assert kind.runs_alone(room(tmp_path))
-    assert not kind.runs_alone(room(tmp_path, "deploy.through=world"))
+    assert runs_alone(room(tmp_path))
+    assert not runs_alone(room(tmp_path, "deploy.through=world"))
 
 
 def test_what_changes_no_result_is_no_part_of_what_a_cell_depends_on(tmp_path):

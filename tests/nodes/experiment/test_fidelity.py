@@ -9,15 +9,15 @@ import pytest
 
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import run_cell, search_cell
-from nodes.experiment.run.gate import predict_cell
-from nodes.experiment.run.kinds import load_kind
+from nodes.experiment.run.gate import lacks, predict_cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import DressedScene
 from nodes.experiment.show.drives import deployed_drives
 from nodes.experiment.show.objects import placed_objects
+from nodes.experiment.steps import fidelity
+from nodes.experiment.steps.keys import clean_folder
 
 WHICH = Cell("right", "hardened", "random", 0)
-KIND = load_kind("experiment")
 
 
 def _quiet(fraction: float, text: str = "") -> None:
@@ -32,18 +32,18 @@ def searched(trained: Experiment, tmp_path_factory: pytest.TempPathFactory) -> t
     cell = folder / "cell"
     cell.mkdir()
     (folder / "none").mkdir()
-    assert KIND.lacks(experiment, WHICH, cell) == "its search"
+    assert lacks(experiment, WHICH, cell) == "its search"
     search_cell(experiment, WHICH, cell, _quiet)
-    assert "method=none" in KIND.lacks(experiment, WHICH, cell)
+    assert "method=none" in lacks(experiment, WHICH, cell)
     run_cell(experiment, WHICH.clean, folder / "none", _quiet)
-    assert KIND.lacks(experiment, WHICH, cell) == ""
+    assert lacks(experiment, WHICH, cell) == ""
     return experiment, cell
 
 
 def test_real_pictures_are_what_the_policy_saw_on_the_clean_drive(searched: tuple[Experiment, Path]) -> None:
     experiment, cell = searched
-    clean = KIND.driven(experiment, WHICH, cell)
-    policy, goal = KIND.policy_of(experiment, WHICH)
+    clean = fidelity.driven(experiment, WHICH, clean_folder(experiment, WHICH, cell))
+    policy, goal = fidelity.policy_of(experiment, WHICH)
     assert goal == experiment.goal("right")
     with experiment.open_world() as scene:
         dressed = DressedScene(scene, experiment.view, placed_objects(experiment))
@@ -58,8 +58,8 @@ def test_real_pictures_are_what_the_policy_saw_on_the_clean_drive(searched: tupl
 
 def test_an_attack_changes_only_where_objects_are(searched: tuple[Experiment, Path]) -> None:
     experiment, cell = searched
-    clean = KIND.driven(experiment, WHICH, cell)
-    attacked = KIND.attacked(experiment, WHICH, cell)
+    clean = fidelity.driven(experiment, WHICH, clean_folder(experiment, WHICH, cell))
+    attacked = fidelity.attacked(experiment, WHICH, cell, clean_folder(experiment, WHICH, cell))
     changed = [(a != b).any(-1) for a, b in ((clean.real, attacked.real), (clean.learned, attacked.learned))]
     for each in changed:
         assert 0.0 < each.mean() < 0.3
@@ -70,8 +70,8 @@ def test_an_attack_changes_only_where_objects_are(searched: tuple[Experiment, Pa
 def test_a_prediction_needs_no_drive_with_the_attack(searched: tuple[Experiment, Path]) -> None:
     experiment, cell = searched
     before = {path.name for path in cell.iterdir()}
-    found, clean = predict_cell(KIND, experiment, WHICH, cell, draws=9)
+    found, clean = predict_cell(experiment, WHICH, cell, draws=9)
     assert found.ratio > 0.0
     assert len(clean.agreement.real) == experiment.config.horizon
-    assert predict_cell(KIND, experiment, WHICH, cell, 9, clean)[0] == found
+    assert predict_cell(experiment, WHICH, cell, 9, clean)[0] == found
     assert {path.name for path in cell.iterdir()} == before

@@ -11,7 +11,7 @@ from advnerf_core.report.evidence.hardness import PUBLISHED_FILE
 from advnerf_core.report.evidence.kept_build import LOST
 from advnerf_core.report.evidence.verify import verify_set, write_set
 from nodes.experiment.engine.reference import BUILD, ReferenceBuild
-from nodes.experiment.run.cells import ExperimentCells
+from nodes.experiment.run.cells import keep_build
 from nodes.experiment.run.config import campaign_of
 from nodes.experiment.run.kept_attacks import attack_problems, with_attacks
 from nodes.experiment.run.plan import statuses
@@ -35,7 +35,7 @@ def campaign_in(folder):
 def published(tiny_room, tmp_path, monkeypatch):
     """Folder of a published set, of which only the published files are left."""
     build, results = ReferenceBuild(tmp_path / "trained"), tmp_path / "docs" / "results"
-    assert ExperimentCells().keep(tiny_experiment(tiny_room[0]), build)
+    assert keep_build(tiny_experiment(tiny_room[0]), build)
     monkeypatch.setattr(run, "REFERENCE", build)
     monkeypatch.chdir(tmp_path)
     campaign = campaign_in(tmp_path / "run")

@@ -7,10 +7,9 @@ import pytest
 
 from advnerf_core.attack.artifact import load_attack
 from nodes.experiment.plan.cell import Cell
-from nodes.experiment.run.cell_kind import settings_hash
-from nodes.experiment.run.cells import ExperimentCells
+from nodes.experiment.run.cells import run_cell
 from nodes.experiment.steps.attack import ATTACK
-from nodes.experiment.steps.keys import registered_settings
+from nodes.experiment.steps.keys import cell_inputs, registered_settings, settings_hash
 from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError
 from tests.support.stage_versions import ROOT, TINY
@@ -34,7 +33,7 @@ def experiment_of(folder, objective):
 
 
 def test_keys_follow_the_objective_where_something_is_searched(tmp_path):
-    kind, keys = ExperimentCells(), {}
+    keys = {}
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "mine.py").write_text(LEFT)
@@ -43,8 +42,8 @@ def test_keys_follow_the_objective_where_something_is_searched(tmp_path):
     for name, objective in {"cte": "cte", "peak": "peak", **own}.items():
         found = experiment_of(tmp_path / "run", objective)
         keys[name] = registered_settings(found)["config"]["attack"].get("objective")
-        assert kind.inputs(found, NONE) == kind.inputs(plain, NONE)
-        same = settings_hash(kind, found, RANDOM) == settings_hash(kind, plain, RANDOM)
+        assert cell_inputs(found, NONE) == cell_inputs(plain, NONE)
+        same = settings_hash(found, RANDOM) == settings_hash(plain, RANDOM)
         assert same == (name == "cte")
     assert keys["cte"] is None
     assert keys["peak"] == "peak"
@@ -58,9 +57,7 @@ def test_a_cell_is_searched_for_the_objective_of_a_file_without_a_change_of_the_
     shutil.copytree(tiny_room[0], folder, ignore=shutil.ignore_patterns("cells"))
     (tmp_path / "mine.py").write_text(LEFT)
     experiment = experiment_of(folder, f"{tmp_path / 'mine.py'}:Left")
-    kind = ExperimentCells()
-    with kind.hold(experiment):
-        found = kind.run(experiment, RANDOM, experiment.cell_folder(RANDOM), lambda part, text="": None)
+    found = run_cell(experiment, RANDOM, experiment.cell_folder(RANDOM), lambda part, text="": None)
     attack = load_attack(experiment.cell_folder(RANDOM) / ATTACK)
     curve = json.loads((experiment.cell_folder(RANDOM) / "surrogate.json").read_text())["curve_value"]
     assert attack.extra["objective"] == {"name": "Left", "unit": "m", "value": max(curve)}

@@ -6,9 +6,9 @@ import pytest
 
 from nodes.experiment.engine.reference import ReferenceBuild
 from nodes.experiment.plan.cell import Cell
-from nodes.experiment.run.cell_kind import settings_hash
-from nodes.experiment.run.cells import ExperimentCells
+from nodes.experiment.run.cells import Bench, keep_build, run_cell
 from nodes.experiment.steps import run
+from nodes.experiment.steps.keys import settings_hash
 from tests.support.stage_versions import RECORDED, tiny_experiment
 
 # Between processors sums are taken in another order; a change of what is computed is larger.
@@ -28,17 +28,17 @@ def test_what_stages_and_cells_make_is_of_their_versions(tiny_room):
 
 
 def test_a_machine_that_has_only_the_reference_build_runs_the_same_cells(tiny_room, tmp_path, monkeypatch):
-    ours, kind = tiny_experiment(tiny_room[0]), ExperimentCells()
+    ours = tiny_experiment(tiny_room[0])
     reference = ReferenceBuild(tmp_path / "build")
-    assert len(kind.keep(ours, reference)) == 4
+    assert len(keep_build(ours, reference)) == 4
     monkeypatch.setattr(run, "REFERENCE", reference)
     theirs = tiny_experiment(tmp_path / "theirs")
     cell = Cell("track", "hardened", "random", 0)
     # Known before anything is copied, and the same afterwards.
-    assert settings_hash(kind, theirs, cell) == settings_hash(kind, ours, cell)
+    assert settings_hash(theirs, cell) == settings_hash(ours, cell)
     run.make_ready(theirs, until="policy")
-    assert settings_hash(kind, theirs, cell) == settings_hash(kind, ours, cell)
+    assert settings_hash(theirs, cell) == settings_hash(ours, cell)
     assert not (theirs.stage_folder("policy") / "frames").exists()
-    with kind.hold(theirs):
-        found = kind.run(theirs, cell, theirs.cell_folder(cell), lambda part, text="": None)
+    with Bench(theirs) as bench:
+        found = run_cell(theirs, cell, theirs.cell_folder(cell), lambda part, text="": None, bench)
     assert found["surrogate"]["total_cte_m"][0] == tiny_room[1]["cells"]["numbers"]["random_surrogate_m"]

@@ -13,8 +13,7 @@ from advnerf_core.driving.metrics import drive_metrics
 from advnerf_core.report.results import read_results
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import run_cell
-from nodes.experiment.run.gate import predict_cell
-from nodes.experiment.run.kinds import load_kind
+from nodes.experiment.run.gate import lacks, predict_cell
 from nodes.experiment.run.run import Options
 from nodes.experiment.run.whole import run_experiment
 from nodes.experiment.steps import films, live
@@ -163,9 +162,9 @@ def test_a_cell_of_another_seed_is_searched_and_driven_live_once(tmp_path):
     assert (tmp_path / "cells" / cell["extra"]["clip"]).stat().st_size > 1000
     assert run_cell(*asked)["deployed"] == cell["deployed"]
     # What a prediction needs is there: the search, and the bag of the drive without attack.
-    kind, folder = load_kind("experiment"), tmp_path / "cells" / "one"
-    assert kind.lacks(experiment, replace(asked[1], seed=2), tmp_path / "cells" / "two") == "its search"
-    assert kind.lacks(experiment, asked[1], folder) == ""
-    found, clean = predict_cell(kind, experiment, asked[1], folder, draws=9)
+    folder = tmp_path / "cells" / "one"
+    assert lacks(experiment, replace(asked[1], seed=2), tmp_path / "cells" / "two") == "its search"
+    assert lacks(experiment, asked[1], folder) == ""
+    found, clean = predict_cell(experiment, asked[1], folder, draws=9)
     assert found.ratio > 0.0
     assert clean.agreement.summary()["views"] >= 10

@@ -12,7 +12,7 @@ import pytest
 
 from advnerf_core.report.clips import read_clip
 from nodes.experiment.pages import report
-from nodes.experiment.run.cells import ExperimentCells
+from nodes.experiment.run.cells import Bench, run_cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps.attack import cells
 
@@ -40,10 +40,9 @@ def test_all_cells_and_the_report(trained: Experiment, tmp_path: Path) -> None:
         json.dumps({"command": "advnerf experiment <it>", "config": config})
     )
 
-    kind = ExperimentCells()
-    with kind.hold(experiment):
+    with Bench(experiment) as bench:
         for cell in cells(experiment):
-            data = kind.run(experiment, cell, experiment.cell_folder(cell), silent)
+            data = run_cell(experiment, cell, experiment.cell_folder(cell), silent, bench)
             kept = {**data, "settings_hash": "h", "machine": "m", "date": "d"}
             experiment.cell_result(cell).write_text(json.dumps(kept))
     report.run(experiment, folder / "report", silent)

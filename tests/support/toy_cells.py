@@ -1,0 +1,166 @@
+"""Cells that cost nothing, in place of those of experiments: the processes, queues and files around them are the real ones.
+
+A test puts the functions below over those of `nodes.experiment` (`put_over`). A process of its own, which must not import what searches need,
+gets this module in place of theirs (`install`). Files in the campaign's folder say what goes wrong: ``fail``, ``hang``, ``late``.
+"""
+
+import os
+import sys
+import time
+from contextlib import nullcontext
+from pathlib import Path
+from types import SimpleNamespace
+
+from advnerf_core.documents import read_yaml
+from advnerf_core.run_module import module_command
+
+MODULE = "tests.support.toy_cells"
+REPLACED = ("run.cells", "steps.run", "steps.keys", "show.context")
+NEEDED = ("capture", "policy")
+FACTORS = {"none": 1.0, "random": 1.1, "cem": 2.0, "gradient": 3.0}
+Experiment = SimpleNamespace
+Bench = nullcontext
+
+
+def load_experiment(file, setting, overrides, folder):
+    data = read_yaml(file).data
+    del data["settings"]
+    for text in overrides:
+        key, value = text.split("=")
+        data[key] = float(value)
+    return SimpleNamespace(folder=Path(folder), data=data)
+
+
+def prepare_victims(experiment):
+    experiment.folder.mkdir(parents=True, exist_ok=True)
+
+
+def settings_hash(experiment, cell):
+    from advnerf_core.attack.methods import method_digest
+    from nodes.experiment.engine.stage_record import hash_of
+
+    code = method_digest(cell.code)
+    return hash_of([cell.scenario, cell.victim, cell.method, cell.seed, code, experiment.data])
+
+
+def registered_settings(experiment):
+    return dict(experiment.data)
+
+
+def needed_settings(experiment):
+    return {"capture": {}, "policy": {}}
+
+
+def keep_build(experiment, reference):
+    return []
+
+
+def runs_alone(experiment):
+    return "alone" in experiment.data
+
+
+def has_learned_scene(experiment):
+    return (experiment.folder.parent / "gated").exists()
+
+
+is_predictable = has_learned_scene
+
+
+def clean_folder(experiment, cell, folder):
+    return folder
+
+
+def search_cell(experiment, cell, folder, report, bench=None):
+    _note(folder, f"search {cell.name}")
+    (folder / "searched").touch()
+
+
+def run_cell(experiment, cell, folder, report, bench=None):
+    _note(folder, f"begin {cell.name} {cell.code} {os.environ.get('OMP_NUM_THREADS')}")
+    campaign = folder.parent.parent
+    if (campaign / "fail").exists() and cell.method == "cem":
+        raise RuntimeError("the search came to nothing")
+    try:
+        while (campaign / "hang").exists() and cell.method == "gradient":
+            (folder / "pid").write_text(str(os.getpid()))
+            time.sleep(0.02)
+    except BaseException:
+        _note(folder, f"closed {cell.name}")
+        raise
+    _note(folder, f"end {cell.name}")
+    if cell.method not in FACTORS:
+        return _searched(cell)
+    none = experiment.data["none_m"] + cell.seed
+    drives = {
+        "total_cte_m": [FACTORS[cell.method] * none],
+        "off_track": [cell.method == "gradient"],
+        "none_total_cte_m": [none],
+    }
+    found = {"attack_id": None, "surrogate": drives, "extra": {}}
+    if (campaign / "late").exists() and cell.method == "gradient":
+        return {**found, "not_driven_live": "live0 was spoiled 3 times, at last: late"}
+    return {**found, "deployed": drives}
+
+
+def _searched(cell):
+    """What a user's method really finds, over a closed loop of two ticks."""
+    import torch
+
+    from advnerf_core.attack.adjoint import evaluate
+    from advnerf_core.attack.methods import SearchRun, SearchSettings, load_method
+    from benchmarks.attack_toy import toy_problem
+
+    problem = toy_problem(2, dtype=torch.float32)
+    plain = evaluate(problem, problem.sensor.plain_theta())[1].protocol_cte_m.tolist()
+    chosen = load_method(cell.code)
+    settings = SearchSettings(3, population=4, options=chosen.options({}))
+    result = chosen.search(problem, settings, SearchRun(cell.seed))
+    found = list(result.best.protocol_cte_m)
+    drives = {"total_cte_m": found, "off_track": [False] * len(found), "none_total_cte_m": plain}
+    return {"attack_id": None, "surrogate": drives, "extra": {"theta": result.theta.flatten().tolist()}}
+
+
+def _note(folder, text):
+    with open(folder.parent.parent / "calls.txt", "a") as file:
+        file.write(text + "\n")
+
+
+def command(module, *arguments):
+    """The process of a toy cell, in place of that of a cell."""
+    return module_command(MODULE, *arguments)
+
+
+def put_over(monkeypatch, modules):
+    """Put the functions of this module over those that modules of `nodes.experiment.run` have imported."""
+    toys = {name: value for name, value in globals().items() if not name.startswith("_")}
+    for module in modules:
+        for name in toys.keys() & vars(module).keys() - {"annotations", "Path"}:
+            if str(getattr(vars(module)[name], "__module__", "nodes.experiment")).startswith(
+                "nodes.experiment"
+            ):
+                monkeypatch.setattr(module, name, toys[name])
+
+
+def install():
+    """Stand for the modules of experiments in this process, before they are imported."""
+    for name in REPLACED:
+        sys.modules[f"nodes.experiment.{name}"] = sys.modules[__name__]
+    from nodes.experiment.run import cluster, worker
+
+    worker.module_command = command
+    cluster.run_in_process = run_on_machine
+
+
+def run_on_machine(job):
+    """Run a toy cell from a process of a cluster."""
+    from nodes.experiment.run import worker
+
+    worker.module_command = command
+    return worker.run_in_process(job)
+
+
+if __name__ == "__main__":
+    install()
+    from nodes.experiment.run import worker
+
+    worker.main()
