@@ -13,7 +13,6 @@ from advnerf_core.report.evidence.about import SetAbout, read_about
 from advnerf_core.report.evidence.families import GRADIENT
 from advnerf_core.report.evidence.hardness import with_titles
 from advnerf_core.report.evidence.page import groups_of_searches
-from advnerf_core.report.evidence.results import DOMAINS
 from advnerf_core.report.evidence.strongest import strongest_random
 from advnerf_core.report.evidence.words import (
     NOT_DRIVEN,
@@ -24,6 +23,7 @@ from advnerf_core.report.evidence.words import (
     row_of,
     smaller_excess,
 )
+from advnerf_core.report.reference import DOMAINS
 
 # Worlds that this project did not write, or did not draw, by what the names of their sets contain.
 _FOREIGN = {

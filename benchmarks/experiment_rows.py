@@ -5,17 +5,13 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 from advnerf_core.documents import read_json
-from advnerf_core.driving.metrics import drives
-from advnerf_core.report.data import ReportData
-from advnerf_core.report.results import read_results
-from advnerf_core.report.tables import TransferRow, find_row, transfer_rows
 from benchmarks.results import record_row
 from nodes.bags.parts import bag_parts
 
@@ -23,85 +19,14 @@ COMMAND = "make experiment"
 Record = Callable[[str, float | str, str, str, bool | None, str], None]
 
 
-def record_fidelity(data: ReportData, record: Record) -> None:
-    assert data.fidelity is not None
-    views = f"{len(data.fidelity.views)} held-out views of the driving camera"
-    for name, key in (("336x188", "psnr_full_db"), ("200x66", "psnr_policy_db")):
-        value = data.fidelity.mean(key)
-        assert value is not None
-        record(f"surrogate on held-out lab views, {name}", value, "dB PSNR", ">= 27 dB", value >= 27.0, views)
-    difference = data.fidelity.steering_difference_rad
-    assert difference is not None
-    record(
-        "surrogate on held-out lab views, steering",
-        difference,
-        "rad mean abs",
-        "<= 0.03 rad",
-        difference <= 0.03,
-        views,
-    )
-
-
-def record_transfer(data: ReportData, record: Record) -> None:
-    rows = transfer_rows(data)
-    live = data.select(domain="deployed", condition="gradient", victim="hardened")
-    off = sum(run.off_track for run in live)
-    mean_abs = float(np.mean([run.mean_abs_cte_m for run in live]))
-    gradient = _row(rows, "surrogate", "gradient")
-    record(
-        "total CTE, gradient, surrogate",
-        gradient.ratio or 0.0,
-        "x no attack",
-        ">= 3.3 x",
-        (gradient.ratio or 0.0) >= 3.3,
-        _spread(gradient),
-    )
-    gradient = _row(rows, "deployed", "gradient")
-    met = (gradient.ratio or 0.0) >= 3.0 and mean_abs >= 0.25 and off >= 2
-    record(
-        "total CTE, gradient, live green screen",
-        gradient.ratio or 0.0,
-        "x no attack",
-        ">= 3.0 x, mean |CTE| >= 0.25 m, off-track in >= 2 of 3",
-        met,
-        f"mean |CTE| {mean_abs:.3f} m, off-track in {off} of {len(live)}; {_spread(gradient)}",
-    )
-    for domain in ("surrogate", "deployed"):
-        random = _row(rows, domain, "random")
-        met = (random.ratio or 0.0) <= 1.5 and (domain == "surrogate" or random.off_track == 0)
-        target = "<= 1.5 x" + ("" if domain == "surrogate" else ", never off-track")
-        plain = _row(rows, domain, "none")
-        note = f"best of {data.settings.random_evaluations}; off-track in {random.off_track} of {random.runs}; {_spread(random)}"
-        note += f"; no attack {plain.total_cte_mean_m:.2f} m"
-        if not met:
-            ticks = data.settings.horizon_steps
-            more_mm = 1e3 * (random.total_cte_mean_m - plain.total_cte_mean_m) / ticks
-            note += f": over {ticks} ticks the difference is {more_mm:.0f} mm a tick of a drive that is exact to {1e3 * plain.total_cte_mean_m / ticks:.0f} mm"
-        record(f"total CTE, best random, {domain}", random.ratio or 0.0, "x no attack", target, met, note)
-
-
-def record_live(data: ReportData, record: Record) -> None:
-    if data.laps is not None:
-        met = drives(data.laps.mean_abs_cte_m, data.laps.off_track, data.settings.off_track_m)
-        record(
-            "policy, no attack, laps live",
-            data.laps.mean_abs_cte_m,
-            "m mean |CTE|",
-            "<= 0.08 m, never off-track",
-            met,
-            f"{data.laps.laps} laps, off-track: {data.laps.off_track}, worst {np.abs(data.laps.cte_m).max():.3f} m",
-        )
-    assert data.latency is not None
-    overall = data.latency.overall
-    met = overall.p99_ms <= data.latency.camera_period_ms and data.latency.missed_ticks == 0
-    record(
-        "capture to serial write, live",
-        overall.p99_ms,
-        "ms p99",
-        "<= 100 ms, no tick missed",
-        met,
-        f"{overall.count} frames, p50 {overall.p50_ms:.1f} ms, worst {overall.max_ms:.1f} ms, {data.latency.missed_ticks} ticks missed",
-    )
+def record_targets(report: dict[str, Any], record: Record) -> None:
+    """One row for each target of the report that was measured."""
+    drives = ", ".join(f"{row['method']} {row['domain']} {row['drives']}" for row in report["rows"])
+    for target in report["targets"]:
+        if target["value"] is not None:
+            unit = target["measured"].partition(" ")[2]
+            limit = target["target"].replace("≥", ">=").replace("≤", "<=")
+            record(target["what"], target["value"], unit, limit, target["met"], f"drives: {drives}")
 
 
 def record_bags(folder: Path, record: Record) -> None:
@@ -137,19 +62,6 @@ def record_bags(folder: Path, record: Record) -> None:
     record("the bag", messages, "messages", "every topic decodes in both", bool(bags), note)
 
 
-def _row(rows: tuple[TransferRow, ...], domain: str, condition: str) -> TransferRow:
-    row = find_row(rows, domain, condition)  # type: ignore[arg-type]
-    if row is None:
-        raise SystemExit(
-            f"expected {domain} {condition} runs in the report, got none: run make experiment to its end"
-        )
-    return row
-
-
-def _spread(row: TransferRow) -> str:
-    return f"{row.runs} runs, total CTE {row.total_cte_mean_m:.1f} +- {row.total_cte_std_m or 0.0:.1f} m"
-
-
 def main() -> None:
     """Read a finished full run and record its rows."""
     parser = argparse.ArgumentParser(description=main.__doc__)
@@ -161,10 +73,10 @@ def main() -> None:
     parser.add_argument("--wall-s", type=float, help="how long the command took [s]")
     arguments = parser.parse_args()
     folder = arguments.run_folder
-    data = read_results(folder / "report" / "results.json")
-    if data.settings.name != "full":
+    setting = read_json(folder / "manifest.json")["setting"]
+    if setting != "full":
         raise SystemExit(
-            f"expected a run of the full setting in {folder}, got {data.settings.name}: use make experiment"
+            f"expected a run of the full setting in {folder}, got {setting}: use make experiment"
         )
 
     def record(line: str, value: float | str, unit: str, target: str, met: bool | None, note: str) -> None:
@@ -175,9 +87,7 @@ def main() -> None:
             f"{line}: {value if isinstance(value, str) else f'{value:.4g}'} {unit} (target {target}): {met}"
         )
 
-    record_fidelity(data, record)
-    record_transfer(data, record)
-    record_live(data, record)
+    record_targets(read_json(folder / "report" / "table.json"), record)
     record_bags(folder, record)
     if arguments.wall_s is not None:
         record_time(folder, record, arguments.wall_s)

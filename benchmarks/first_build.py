@@ -8,14 +8,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-
 from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import CellResult, read_cells
 from advnerf_core.report.conditions import CONTROLS, order_of, style_of
 from advnerf_core.report.evidence.registration import FILE
 from advnerf_core.report.evidence.words import DOMAIN_TITLES
-from advnerf_core.report.transfer import DOMAINS, drives_in
+from advnerf_core.report.result_table import Wanted, make_table
 from benchmarks.questions import LOST
 from benchmarks.results import REPOSITORY
 
@@ -54,26 +52,17 @@ def page_text() -> str:
 
 
 def _rows(cells: list[CellResult]) -> Iterator[str]:
-    groups: dict[tuple[str, str, str, str], list[CellResult]] = {}
+    seeds: dict[tuple[str, str, str, str], list[int]] = {}
     for cell in cells:
-        if cell.method not in CONTROLS and cell.extra.get("horizon"):
-            groups.setdefault((cell.scenario, cell.placement, cell.victim, cell.method), []).append(cell)
-    for key in sorted(groups, key=lambda key: (key[:3], order_of(key[3]))):
-        for domain in DOMAINS:
-            found = [
-                (cell, drives) for cell in groups[key] if (drives := drives_in(cell, domain)) is not None
-            ]
-            if not found:
-                continue
-            excess = [
-                np.subtract(drives.total_cte_m, drives.none_total_cte_m).mean() / cell.extra["horizon"]
-                for cell, drives in found
-            ]
-            off = [each for _, drives in found for each in drives.off_track]
-            place = " ".join(filter(None, key[:2]))
+        if cell.method not in CONTROLS and cell.ticks:
+            seeds.setdefault(cell.key, []).append(cell.seed)
+    keys = sorted(seeds, key=lambda key: (key[:3], order_of(key[3])))
+    for row in make_table([Wanted(*key, tuple(seeds[key])) for key in keys], cells).rows:
+        if row.excess is not None:
+            place = " ".join(filter(None, row.key[:2]))
             yield (
-                f"| {place} | {key[2]} | {style_of(key[3]).title} | {DOMAIN_TITLES[domain]} | {len(found)} | {np.mean(excess):.3f} "
-                f"| {sum(off)} of {len(off)} |\n"
+                f"| {place} | {row.victim} | {style_of(row.method).title} | {DOMAIN_TITLES[row.domain]} | {row.excess.searches} "
+                f"| {row.excess.excess_m:.3f} | {row.off_track} of {row.drives} |\n"
             )
 
 

@@ -6,7 +6,7 @@ The policy is `examples/ros2_policy.py`, plain rclpy, in an environment of its o
 
 Here the same program drives the simulated lab tick by tick, past the board in its plain colour and past the attack, from the same
 starts. The simulated time stands still while it is asked, so a busy machine changes nothing. The row has the mean excess of the total
-CTE over the starts and its bootstrap interval.
+CTE over the starts and its 95 % interval.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.fields.voxel_grid import cube_face_object
 from advnerf_core.policies.adapter import AdaptedPolicy
-from advnerf_core.report.statistics import bootstrap
+from advnerf_core.report.evidence import clustered_interval
 from benchmarks.rclpy_peer import RclpyPeer
 from benchmarks.results import REPOSITORY, record_row
 from calibration.schema import RoomCalibration, load_calibration
@@ -89,7 +89,7 @@ def main() -> None:
     finally:
         peer.close()
     excess_m = totals[:, 1] - totals[:, 0]
-    interval = bootstrap(lambda chosen: excess_m[chosen].mean(axis=1), len(excess_m))
+    interval = clustered_interval([excess_m])
     assert interval is not None, "expected at least two starts"
     note = (
         f"{interval.low:.2f} to {interval.high:.2f} m (95 %), {len(excess_m)} starts, {options.ticks} ticks; {totals[:, 0].mean():.2f} m without"

@@ -1,7 +1,7 @@
-"""Question: what does a campaign's table show, and does it meet the targets? ``python -m benchmarks.transfer_table [CAMPAIGN_FILE]``.
+"""Question: what did the campaigns of the first build show? ``python -m benchmarks.transfer_table [CAMPAIGN_FILE]``.
 
-It computes nothing anew: the cells in ``docs/results/<campaign>`` are what ``advnerf experiment`` finished and ``advnerf publish`` copied,
-with the verdicts of the fidelity gate and the predictions of transfer.
+Their cells in ``docs/results`` kept totals and no drives, some not even the number of ticks, so their rows of the ledger are ratios of total
+CTE to that past the plain object, as they were recorded. Tables and pages of today are in metres.
 """
 
 from __future__ import annotations
@@ -16,17 +16,18 @@ import numpy as np
 from advnerf_core.documents import read_json
 from advnerf_core.report.cells import CellResult, Drives
 from advnerf_core.report.conditions import style_of
-from advnerf_core.report.transfer import DOMAINS, Domain, TableRow, TransferTable, drives_in
-from advnerf_core.report.transfer_page import ran_into_something
-from advnerf_core.report.transfer_prediction import skill_of, skill_text
-from advnerf_core.report.transfer_targets import VICTIM, TableTarget, table_targets
+from advnerf_core.report.reference import DOMAINS, Domain, Limit
+from advnerf_core.report.result_table import ResultTable, TableRow
+from advnerf_core.report.targets import Target, evaluate
+from benchmarks.first_build_ratios import paper_ratio, seeds_interval, skill_text, transfer_ratio
 from benchmarks.results import LedgerRow
 from nodes.experiment.run.admission import gate_file, gate_key
 from nodes.experiment.run.config import load_campaign
 from nodes.experiment.run.plan import PUBLISHED
-from nodes.experiment.run.predictions import predicted, prediction_file
+from nodes.experiment.run.predictions import prediction_file
 from nodes.experiment.run.published import published_table
 
+VICTIM = "hardened"
 CAMPAIGN = Path("launch/paper.campaign.yaml")
 # Of targets that are missed: what was tried, and what it points to.
 _SMALL_BASE = "tried: the victim has learned from random textures; nothing was tuned after the first drive; points to the base: "
@@ -40,6 +41,12 @@ _BALLS = (
 )
 # Of three seeds the 27 resamples have the extreme seed alone more often than 2.5 %: the interval ends at the extremes.
 _RANGE_SEEDS = 3
+# What the ledger calls measures that are no ratio.
+_MEASURES = {
+    "spread": "std / mean",
+    "off_track": "drives off the track",
+    "off_track_share": "share of drives off the track",
+}
 MISSED: dict[tuple[str, str], str] = {
     ("straight", "random"): _SMALL_BASE + "the undisturbed car is that exact",
     ("green_screen", "random"): _SMALL_BASE + "the undisturbed car is that exact",
@@ -60,9 +67,9 @@ def line_of(row: TableRow, cells: Sequence[CellResult] = ()) -> str:
 
 def note_of(row: TableRow, cells: Sequence[CellResult] = ()) -> str:
     """What readers must know of a row."""
-    spread = "" if row.std_m is None else f" +- {row.std_m:.2f}"
+    spread = "" if row.total_std_m is None else f" +- {row.total_std_m:.2f}"
     parts = [
-        f"seeds {', '.join(map(str, row.seeds))}: total CTE {row.mean_m or 0.0:.2f}{spread} m"
+        f"seeds {', '.join(map(str, row.seeds))}: total CTE {row.total_m or 0.0:.2f}{spread} m"
         + (f" of {base_m(cells, row.domain):.2f} m" if cells else "")
         + f", off-track {row.off_track} of {row.drives}"
     ]
@@ -77,24 +84,25 @@ def note_of(row: TableRow, cells: Sequence[CellResult] = ()) -> str:
     if row.missing:
         parts.append(f"seeds {', '.join(map(str, row.missing))} are missing")
     parts.append(build_text(cells))
-    if row.ratio_interval is not None:
+    if (interval := seeds_interval(drives_of(cells, row.domain))) is not None:
         what = "95 % over resampled seeds" + (
             ", which of so few is their range," if len(row.seeds) <= _RANGE_SEEDS else ""
         )
-        parts.append(f"{what} {row.ratio_interval.low:.2f} to {row.ratio_interval.high:.2f}")
-    if row.transfer is not None and row.method != "none":
+        parts.append(f"{what} {interval[0]:.2f} to {interval[1]:.2f}")
+    if row.domain == "deployed" and row.method != "none" and (transfer := transfer_ratio(cells)) is not None:
         parts.append(
-            f"transfer ratio {row.transfer:.2f}" + (", from the same start" if starts_differ(cells) else "")
+            f"transfer ratio {transfer:.2f}" + (", from the same start" if starts_differ(cells) else "")
         )
-    if row.paper_ratio is not None:
-        parts.append(f"paper {row.paper_ratio:.2f} x its deployed drive without attack")
+    if (paper := paper_ratio(row.scenario, row.domain, row.method)) is not None:
+        parts.append(f"paper {paper:.2f} x its deployed drive without attack")
     return "; ".join(parts)
 
 
 def starts_differ(cells: Sequence[CellResult]) -> bool:
     """Whether a cell was searched from more starts than it was deployed from."""
     return any(
-        cell.deployed is not None and cell.shared_starts < len(cell.surrogate.total_cte_m) for cell in cells
+        cell.deployed is not None and len(cell.deployed.total_cte_m) < len(cell.surrogate.total_cte_m)
+        for cell in cells
     )
 
 
@@ -130,14 +138,14 @@ def builds_of(cells: Sequence[CellResult]) -> int:
     return len({tuple(sorted(cell.stages.items())) for cell in cells})
 
 
-def why_missed(target: TableTarget | None, row: TableRow, cells: Sequence[CellResult]) -> str:
+def why_missed(target: Target | None, row: TableRow, cells: Sequence[CellResult]) -> str:
     """By how much a target is missed, what that is on the road, what was tried and what it points to; empty where it is met."""
-    if target is None or target.met is not False or row.mean_m is None:
+    if target is None or target.met is not False or row.total_m is None:
         return ""
     text = f"; {target.verdict}"
-    ticks = cells[0].extra.get("horizon") if cells else None
-    if ticks is not None and row.method == "random":
-        off_mm, clean_mm = (1000 * each / ticks for each in (row.mean_m, base_m(cells, row.domain)))
+    ticks = cells[0].ticks if cells else 0
+    if ticks and row.method == "random":
+        off_mm, clean_mm = (1000 * each / ticks for each in (row.total_m, base_m(cells, row.domain)))
         text += f": {off_mm:.0f} mm off the path on average, {clean_mm:.0f} mm without attack"
     said = MISSED.get((row.scenario, row.method), "")
     return f"{text}; {said}" if said else text
@@ -146,7 +154,7 @@ def why_missed(target: TableTarget | None, row: TableRow, cells: Sequence[CellRe
 def drives_of(cells: Sequence[CellResult], domain: Domain) -> list[Drives]:
     """The drives of each cell in a domain, where there are any, by seed."""
     by_seed = sorted(cells, key=lambda each: each.seed)
-    return [drives for cell in by_seed if (drives := drives_in(cell, domain)) is not None]
+    return [drives for cell in by_seed if (drives := cell.drives(domain)) is not None]
 
 
 def ratios_of(cells: Sequence[CellResult], domain: Domain) -> list[float]:
@@ -164,21 +172,39 @@ def how_far(cells: Sequence[CellResult]) -> str:
     far = [cell.extra for cell in cells if "max_abs_cte_m" in cell.extra]
     if not far:
         return ""
-    ran = sum(ran_into_something(cell) for cell in cells)
+    ran = sum(any(cell.obstacles("deployed")) for cell in cells)
     text = f"; at most {max(each['max_abs_cte_m'] for each in far):.2f} m off the path, off-track is beyond {far[0]['off_track_m']:.2f} m"
     return text + (f"; ran into an obstacle, which held it there, in {ran} of {len(cells)}" if ran else "")
 
 
-def rows_of(table: TransferTable) -> list[tuple[TableRow, TableTarget | None]]:
-    """Rows with drives, none left out as it is 1 by definition, with the target on their ratio where there is one."""
-    ratios = (target for target in table_targets(table) if target.what == "ratio to no attack")
-    targets = {(t.scenario, t.victim, t.method, t.domain): t for t in ratios}
-    return [
-        (row, None if row.placement else targets.get((row.scenario, row.victim, row.method, row.domain)))
-        for domain in DOMAINS
-        for row in table.rows
-        if row.domain == domain and row.seeds and row.method != "none" and row.ratio is not None
-    ]
+def rows_of(table: ResultTable, limits: Sequence[Limit]) -> list[tuple[TableRow, str, Target | None]]:
+    """Rows with drives, none left out as it is 1 by definition, with the limit on their ratio in words and its target."""
+    ratios = {
+        (limit.scenario, limit.victim, limit.method, limit.domain): limit
+        for limit in limits
+        if limit.of == "ratio"
+    }
+    found: list[tuple[TableRow, str, Target | None]] = []
+    for domain in DOMAINS:
+        for row in table.rows:
+            if row.domain == domain and row.seeds and row.method != "none" and row.ratio is not None:
+                limit = ratios.get((row.scenario, row.victim, row.method, row.domain))
+                said, target = judged(table, limit) if limit and not row.placement else ("", None)
+                found.append((row, said, target))
+    return found
+
+
+def judged(table: ResultTable, limit: Limit) -> tuple[str, Target | None]:
+    """A limit as the ledger has it in words, and its target; None where the table lacks the row."""
+    target = next(iter(evaluate([limit], table)), None)
+    bound = (
+        f">= {limit.at_least:g}"
+        if limit.at_least is not None
+        else f"<= {limit.at_most:g}"
+        if limit.at_most is not None
+        else ""
+    )
+    return limit.said or bound or (target.target if target else ""), target
 
 
 def gate_rows(
@@ -202,29 +228,18 @@ def gate_rows(
     return rows
 
 
-def skill_rows(
-    folder: Path, cells: Sequence[CellResult], campaign: str
-) -> list[tuple[str, float, str, str, None, str, str]]:
+def skill_rows(folder: Path, cells: Sequence[CellResult], campaign: str) -> list[LedgerRow]:
     """How good the predictions of transfer were, and how alike pictures are along the deployed drives without attack."""
-    if not (pairs := predicted(folder, cells)):
+    if (found := skill_text(folder, cells)) is None:
         return []
-    skill, command = skill_of(pairs), f"advnerf predict {campaign}"
-    clean = [read_json(prediction_file(folder, pair.name))["clean_drive"] for pair in pairs]
+    factor, text, names = found
+    clean = [read_json(prediction_file(folder, name))["clean_drive"] for name in names]
     views = (
         f"along the drives without attack PSNR {min(c['psnr_db'] for c in clean):.1f} to {max(c['psnr_db'] for c in clean):.1f} dB, "
         f"steering differs by at most {max(c['steering'] for c in clean):.4f} on average"
     )
-    return [
-        (
-            "predicted against deployed ratio, median factor",
-            skill.factor or 0.0,
-            "x",
-            "",
-            None,
-            f"{skill_text(pairs)} {views}",
-            command,
-        )
-    ]
+    line, command = "predicted against deployed ratio, median factor", f"advnerf predict {campaign}"
+    return [LedgerRow(line, factor, "x", "", None, command, f"{text} {views}", **measured_where(cells))]
 
 
 def ledger_rows(file: Path, folder: Path | None = None) -> list[LedgerRow]:
@@ -237,43 +252,38 @@ def ledger_rows(file: Path, folder: Path | None = None) -> list[LedgerRow]:
     campaign = load_campaign(file)
     folder = folder or PUBLISHED / campaign.name
     table, run = published_table(folder, campaign), f"advnerf experiment {file}"
-    found = []
-    for row, target in rows_of(table):
+    limits, found = campaign.reference.targets, []
+    for row, said, target in rows_of(table, limits):
         cells = table.cells_of(row)
         note = note_of(row, cells) + why_missed(target, row, cells)
         note += how_far(cells) if row.domain == "deployed" else ""
-        limit, met = (f"{target.target} x", target.met) if target else ("", None)
+        limit, met = (f"{said} x", target.met) if target else ("", None)
         line = line_of(row, cells)
         found.append(
             LedgerRow(line, row.ratio or 0.0, "x no attack", limit, met, run, note, **measured_where(cells))
         )
-    found += _other_targets(table, run)
+    found += _other_targets(table, limits, run)
     for key, told in gate_rows(folder, sorted({gate_key(cell) for cell in campaign.cells})):
         where = measured_where([cell for cell in table.cells.values() if gate_key(cell) == key])
         line, psnr_db, unit, passes, passed, note = told
         found.append(LedgerRow(line, psnr_db, unit, passes, passed, run, note, **where))
     predicted_cells = [cell for cell in table.cells.values() if prediction_file(folder, cell.name).exists()]
-    for line, factor, unit, no_target, none, note, command in skill_rows(folder, predicted_cells, str(file)):
-        found.append(
-            LedgerRow(line, factor, unit, no_target, none, command, note, **measured_where(predicted_cells))
-        )
-    return found
+    return [*found, *skill_rows(folder, predicted_cells, str(file))]
 
 
-def _other_targets(table: TransferTable, run: str) -> list[LedgerRow]:
+def _other_targets(table: ResultTable, limits: Sequence[Limit], run: str) -> list[LedgerRow]:
     """Rows of targets that are not on a ratio."""
     found = []
-    for target in table_targets(table):
-        if target.what == "ratio to no attack" or target.value is None:
+    for limit in limits:
+        said, target = judged(table, limit)
+        row = table.find(limit.scenario, limit.victim, limit.method, limit.domain)
+        if limit.of == "ratio" or row is None or target is None or target.value is None:
             continue
-        line = f"{target.scenario}, {style_of(target.method).title}, {target.domain}: {target.what}"
-        row = table.find(target.scenario, target.victim, target.method, target.domain)
-        cells = table.cells_of(row) if row else []
-        note = f"{target.seeds} seeds" + (how_far(cells) if "off the track" in target.what else "")
-        note += why_missed(target, row, cells) if row else ""
-        found.append(
-            LedgerRow(line, target.value, "", target.target, target.met, run, note, **measured_where(cells))
-        )
+        measure, cells = _MEASURES[limit.of], table.cells_of(row)
+        line = f"{limit.scenario}, {style_of(limit.method).title}, {limit.domain}: {measure}"
+        note = f"{len(row.seeds)} seeds" + (how_far(cells) if "off the track" in measure else "")
+        note += why_missed(target, row, cells)
+        found.append(LedgerRow(line, target.value, "", said, target.met, run, note, **measured_where(cells)))
     return found
 
 

@@ -8,7 +8,7 @@ the steering on views without the attack. Then the loop is driven in the surroga
 
 where ``d`` and ``e`` are drawn from what was measured, in blocks of neighbouring views, as errors along a path are alike from tick to tick
 (block bootstrap, Kunsch 1989). Several draws give a distribution of the total CTE. The baseline without attack is predicted alike, so that
-a ratio and an excess are predicted too. The car is that of the problem: give it one with the deployed car's measured response
+the excess is predicted too. The car is that of the problem: give it one with the deployed car's measured response
 (`advnerf_core.driving.measured_car`). What the model does not know: obstacles but the fence, and states far from the held-out views.
 """
 
@@ -58,17 +58,6 @@ class TransferPrediction:
     ticks: int
 
     @property
-    def ratio(self) -> float:
-        """Expected ratio to no attack: of the means over the draws."""
-        return float(np.mean(self.attacked_m) / np.mean(self.none_m))
-
-    @property
-    def ratio_band(self) -> tuple[float, float]:
-        """Ratios that hold the attacked total of the next drive in 80 % of cases, to the mean without attack."""
-        low, high = _band(np.array(self.attacked_m) / np.mean(self.none_m))
-        return low, high
-
-    @property
     def excess_m_per_tick(self) -> tuple[float, float, float]:
         """Excess |CTE| per tick of one drive [m], each draw against its own without attack: low end of the 80 % band, mean, and high end."""
         excess = (np.array(self.attacked_m) - np.array(self.none_m)) / self.ticks
@@ -77,15 +66,11 @@ class TransferPrediction:
 
     def record(self) -> dict[str, Any]:
         """JSON-ready values."""
-        low, high = self.ratio_band
         excess_low_m, excess_m, excess_high_m = self.excess_m_per_tick
         return {
             "excess_low_m": excess_low_m,
             "excess_m": excess_m,
             "excess_high_m": excess_high_m,
-            "ratio": self.ratio,
-            "ratio_low": low,
-            "ratio_high": high,
             "retained": self.retained,
             "draws": len(self.attacked_m),
             "total_cte_m": float(np.mean(self.attacked_m)),

@@ -108,9 +108,27 @@ class CellResult(StrictModel):
         return cell_name(self.scenario, self.victim, self.method, self.seed, self.placement)
 
     @property
-    def shared_starts(self) -> int:
-        """From how many starts, the first ones, there are drives in both domains; 0 as long as it is not deployed."""
-        return min(len(self.surrogate.total_cte_m), len(self.deployed.total_cte_m)) if self.deployed else 0
+    def key(self) -> tuple[str, str, str, str]:
+        """Scenario, placement, victim and method: what a row of a table sums up over seeds."""
+        return self.scenario, self.placement, self.victim, self.method
+
+    @property
+    def ticks(self) -> int:
+        """Control ticks of a drive; 0 in cells from before they were kept."""
+        return int(self.extra.get("horizon") or 0)
+
+    def drives(self, domain: Domain) -> Drives | None:
+        """The drives in a domain; None where there are none."""
+        return self.surrogate if domain == "surrogate" else self.deployed
+
+    def obstacles(self, domain: Domain) -> list[str | None]:
+        """What each drive in a domain ran into; None where it ran into nothing."""
+        if kept := self.kept.get(domain):
+            return [drive.obstacle for drive in kept]
+        driven = self.drives(domain)
+        blocked = self.extra.get("blocked_tick") if domain == "deployed" else None
+        ticks = blocked or [None] * len(driven.total_cte_m if driven else ())
+        return [None if tick is None else "obstacle" for tick in ticks]
 
 
 def cell_name(scenario: str, victim: str, method: str, seed: int, placement: str = "") -> str:

@@ -1,53 +1,28 @@
-"""What a report is made of: plain records with units, filled by the experiment and read by the tables, plots and page.
+"""What the page of live drives is made of: plain records with units, filled by the experiment and read by the plots and the page.
 
-Everything optional may be missing; the page then says so. Images are ``[height, width, 3]`` uint8 RGB and are the only
-fields that ``results.json`` leaves out.
+Everything optional may be missing; the page then says so. Images are ``[height, width, 3]`` uint8 RGB.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from advnerf_core.geometry import transform_points
-from advnerf_core.report.measurements import Fidelity, FidelityView, Hop, Latency, MemoryRow
-from advnerf_core.report.record import Floats, Image, Record
-from advnerf_core.report.reference import LiveLimit
+from advnerf_core.report.reference import Domain
 
-Domain = Literal["surrogate", "deployed"]
-
-__all__ = [
-    "DOMAINS",
-    "Clip",
-    "Domain",
-    "Fidelity",
-    "FidelityView",
-    "Hop",
-    "Laps",
-    "Latency",
-    "LiveTries",
-    "LossCurve",
-    "Manifest",
-    "MemoryRow",
-    "ReportData",
-    "Run",
-    "Scene",
-    "Settings",
-    "StageTiming",
-    "Texture",
-    "face_segment",
-]
-
-DOMAINS: tuple[Domain, ...] = get_args(Domain)
+Floats = NDArray[np.float64]
+Image = NDArray[np.uint8]
+_TICKS_COMPARED = (50, 400)  # horizons whose memory is compared
 
 
 @dataclass(frozen=True, eq=False)
-class Settings(Record):
+class Settings:
     """The experiment's numbers.
 
     Attributes:
@@ -76,14 +51,9 @@ class Settings(Record):
     off_track_m: float = 0.4
     extra: Mapping[str, str | float | int | bool] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.check_choice("name", ("small", "full"))
-        self.set_floats("start_poses", None, 3)
-
 
 @dataclass(frozen=True, eq=False)
-class Run(Record):
+class Run:
     """One drive over the horizon.
 
     Attributes:
@@ -96,11 +66,6 @@ class Run(Record):
         states: Pose of the rear axle at the control ticks, ``[T + 1, 3]``: x [m], y [m], yaw [rad], world.
         cte_m: Signed cross-track error at the control ticks, left positive, ``[T + 1]`` [m].
         total_cte_m: Sum of ``|CTE|`` over the horizon [m].
-        mean_abs_cte_m: Mean of ``|CTE|`` [m].
-        off_track: Whether ``|CTE|`` exceeded `Settings.off_track_m`.
-        time_to_leave_s: When it first did [s]; None if never.
-        clip: First-person video of this run; None if not filmed.
-        attack_id: Short hash of the attack file; "" for none.
         note: What a reader must know, such as "stopped by the fence at 5.1 s".
     """
 
@@ -112,24 +77,11 @@ class Run(Record):
     states: Floats
     cte_m: Floats
     total_cte_m: float
-    mean_abs_cte_m: float
-    off_track: bool
-    time_to_leave_s: float | None = None
-    clip: Path | None = None
-    attack_id: str = ""
     note: str = ""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.check_choice("domain", DOMAINS)
-        self.check_named("condition")
-        self.check_named("victim")
-        self.set_floats("cte_m", None)
-        self.set_floats("states", len(self.cte_m), 3)
 
 
 @dataclass(frozen=True, eq=False)
-class Scene(Record):
+class Scene:
     """The room from above, all in world metres.
 
     Attributes:
@@ -152,16 +104,6 @@ class Scene(Record):
     tape_width_m: float = 0.05
     closed: bool = True
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        object.__setattr__(self, "room_m", tuple(float(v) for v in self.room_m))
-        self.set_floats("path_xy_m", None, 2)
-        if self.fence_m is not None:
-            self.set_floats("fence_m", None, 2)
-        for name in ("board_m", "monitor_m"):
-            if getattr(self, name) is not None:
-                self.set_floats(name, 2, 2)
-
 
 def face_segment(T_world_from_face: ArrayLike, width_m: float) -> NDArray[np.float64]:
     """Ends ``[2, 2]`` [m] of a face from above, for a frame at its centre with x its outward normal and z up."""
@@ -170,7 +112,7 @@ def face_segment(T_world_from_face: ArrayLike, width_m: float) -> NDArray[np.flo
 
 
 @dataclass(frozen=True, eq=False)
-class LossCurve(Record):
+class LossCurve:
     """Total CTE of each evaluation of one search, mean over the start poses, ``[E]`` [m], in order of evaluation."""
 
     method: str
@@ -178,15 +120,9 @@ class LossCurve(Record):
     total_cte_m: Floats
     victim: str = "hardened"
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.check_named("method")
-        self.check_named("victim")
-        self.set_floats("total_cte_m", None)
-
 
 @dataclass(frozen=True, eq=False)
-class Texture(Record):
+class Texture:
     """What the face shows: row 0 is its top, column 0 its left for a viewer in front of it."""
 
     label: str
@@ -196,15 +132,9 @@ class Texture(Record):
     seed: int = 0
     victim: str = "hardened"
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.check_named("condition")
-        self.check_named("victim")
-        self.check_image("image")
-
 
 @dataclass(frozen=True, eq=False)
-class Clip(Record):
+class Clip:
     """A video for the page, such as surrogate, deployed clean and deployed attacked side by side."""
 
     title: str
@@ -213,16 +143,15 @@ class Clip(Record):
 
 
 @dataclass(frozen=True, eq=False)
-class StageTiming(Record):
-    """Wall time of one stage [s]; `cached` means that its result was taken from an earlier run."""
+class StageTiming:
+    """Wall time of one stage [s]."""
 
     name: str
     wall_s: float
-    cached: bool = False
 
 
 @dataclass(frozen=True, eq=False)
-class Laps(Record):
+class Laps:
     """The live drive without attack: states ``[N, 3]`` (x [m], y [m], yaw [rad]) and signed CTE ``[N]`` [m] at the ticks."""
 
     laps: int
@@ -230,40 +159,116 @@ class Laps(Record):
     cte_m: Floats
     mean_abs_cte_m: float
     off_track: bool
-    note: str = ""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.set_floats("cte_m", None)
-        self.set_floats("states", len(self.cte_m), 3)
 
 
 @dataclass(frozen=True, eq=False)
-class LiveTries(Record):
-    """How often the live node graph drove one arm.
+class FidelityView:
+    """One held-out view of the driving camera: the real image against the surrogate's.
 
     Attributes:
-        condition: What the object showed.
-        victim: Which policy.
-        seed: Seed of the attack.
-        driven: Whether all drives counted in the end. Otherwise the arm is "not driven live" and has no deployed runs.
-        spoiled: Reasons of the tries that load or a fault of the stack spoiled, over all starts.
+        label: Name of the view.
+        psnr_full_db: PSNR at the camera's size [dB].
+        psnr_policy_db: PSNR at the policy's size, 200x66 [dB].
+        ssim_full: SSIM at the camera's size.
+        ssim_policy: SSIM at the policy's size.
+        steering_real_rad: The policy's output on the real image [rad].
+        steering_surrogate_rad: The policy's output on the surrogate's image [rad].
+        real: The real image, for the few views to be shown.
+        surrogate: The surrogate's image.
     """
 
-    condition: str
-    victim: str
-    seed: int
-    driven: bool
-    spoiled: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.check_named("condition")
-        self.check_named("victim")
+    label: str
+    psnr_full_db: float
+    psnr_policy_db: float
+    ssim_full: float | None = None
+    ssim_policy: float | None = None
+    steering_real_rad: float | None = None
+    steering_surrogate_rad: float | None = None
+    real: Image | None = None
+    surrogate: Image | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class Manifest(Record):
+class Fidelity:
+    """All held-out views; the aggregates are means over them, None where nothing was measured."""
+
+    views: tuple[FidelityView, ...]
+
+    def mean(self, name: str) -> float | None:
+        """Mean of one numeric field of `FidelityView` over the views that have it."""
+        values = [getattr(v, name) for v in self.views if getattr(v, name) is not None]
+        return float(np.mean(values)) if values else None
+
+    @property
+    def steering_rad(self) -> NDArray[np.float64]:
+        """Steering on the real and on the surrogate's image, ``[n, 2]`` [rad], of the views that have both."""
+        pairs = [
+            (v.steering_real_rad, v.steering_surrogate_rad)
+            for v in self.views
+            if v.steering_real_rad is not None and v.steering_surrogate_rad is not None
+        ]
+        return np.array(pairs, dtype=np.float64).reshape(-1, 2)
+
+    @property
+    def steering_difference_rad(self) -> float | None:
+        """Mean absolute difference of the steering on real and surrogate images [rad]."""
+        pairs = self.steering_rad
+        return float(np.abs(pairs[:, 0] - pairs[:, 1]).mean()) if len(pairs) else None
+
+
+@dataclass(frozen=True, eq=False)
+class Hop:
+    """Latency of one hop of the live path [ms]."""
+
+    name: str
+    count: int
+    p50_ms: float
+    p95_ms: float
+    p99_ms: float
+    max_ms: float
+
+    @classmethod
+    def from_samples(cls, name: str, samples_ms: ArrayLike) -> Hop:
+        """Percentiles of samples ``[n]`` [ms]."""
+        a = np.asarray(samples_ms, dtype=np.float64)
+        if a.size == 0:
+            raise ValueError(f"expected latency samples of hop {name!r}, got none")
+        p50, p95, p99 = np.percentile(a, [50, 95, 99])
+        return cls(name, a.size, float(p50), float(p95), float(p99), float(a.max()))
+
+
+@dataclass(frozen=True, eq=False)
+class Latency:
+    """Live timing.
+
+    Attributes:
+        capture_to_serial_ms: From the capture of an image to the serial write it caused, per frame, ``[n]`` [ms].
+        camera_period_ms: Time between frames [ms].
+        missed_ticks: Control ticks without a command; None if not counted.
+        hops: The same latency hop by hop.
+    """
+
+    capture_to_serial_ms: Floats
+    camera_period_ms: float = 100.0
+    missed_ticks: int | None = None
+    hops: tuple[Hop, ...] = ()
+
+    @property
+    def overall(self) -> Hop:
+        """Percentiles from capture to serial write."""
+        return Hop.from_samples("capture to serial write", self.capture_to_serial_ms)
+
+
+@dataclass(frozen=True, eq=False)
+class MemoryRow:
+    """Peak memory above idle of one adjoint gradient at one horizon [MiB]."""
+
+    horizon_steps: int
+    adjoint_mib: float
+
+
+@dataclass(frozen=True, eq=False)
+class Manifest:
     """How to make this report again.
 
     Attributes:
@@ -272,7 +277,6 @@ class Manifest(Record):
         hashes: Of scene, policy, config, attack files, code, ...
         versions: Of the software.
         machine: Processor, cores, memory, system.
-        wall_s: From the start of the command to the report [s], for a run with nothing cached; None if not measured.
     """
 
     command: str
@@ -280,15 +284,14 @@ class Manifest(Record):
     hashes: Mapping[str, str] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
     machine: Mapping[str, str] = field(default_factory=dict)
-    wall_s: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class ReportData(Record):
+class ReportData:
     """Everything the report needs.
 
     `not_measured` gives the reason why a part is missing; its keys are the field names of the parts
-    ("fidelity", "latency", "memory", "laps", "clips", ...). `limits` are what the report is held to.
+    ("fidelity", "latency", "memory", "laps", "clips", ...).
     """
 
     settings: Settings
@@ -303,27 +306,34 @@ class ReportData(Record):
     memory: tuple[MemoryRow, ...] = ()
     timings: tuple[StageTiming, ...] = ()
     laps: Laps | None = None
-    limits: tuple[LiveLimit, ...] = ()
-    live_tries: tuple[LiveTries, ...] = ()
     not_measured: Mapping[str, str] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        known = {f.name for f in fields(self)}
-        if unknown := sorted(set(self.not_measured) - known):
-            raise ValueError(
-                f"expected ReportData.not_measured keys among {', '.join(sorted(known))}, got {unknown}"
-            )
+    @property
+    def measured(self) -> dict[str, float | None]:
+        """Measures besides those of drives, by the name that a `Limit` has for them; None or absent where this run has none."""
+        found: dict[str, float | None] = {}
+        if self.fidelity is not None:
+            found |= {name: self.fidelity.mean(name) for name in ("psnr_full_db", "psnr_policy_db")}
+            found["steering_difference_rad"] = self.fidelity.steering_difference_rad
+        if self.laps is not None:
+            found |= {"laps": self.laps.laps, "laps_mean_abs_cte_m": self.laps.mean_abs_cte_m}
+            found["laps_off_track"] = float(self.laps.off_track)
+        if self.latency is not None:
+            found |= {
+                "latency_p99_ms": self.latency.overall.p99_ms,
+                "missed_ticks": self.latency.missed_ticks,
+            }
+        rows = {row.horizon_steps: row.adjoint_mib for row in self.memory}
+        short, long = (rows.get(ticks) for ticks in _TICKS_COMPARED)
+        return {**found, "memory_ratio": long / short} if short and long else found
 
     @property
     def victims(self) -> tuple[str, ...]:
         """Names of the policies that were driven, in the order of their first runs."""
         return tuple(dict.fromkeys(run.victim for run in self.runs))
 
-    def select(self, where: Callable[[Run], bool] | None = None, **equal: object) -> tuple[Run, ...]:
-        """Runs whose fields equal the given values, such as ``domain="deployed"``, and for which ``where`` holds."""
+    def select(self, **equal: object) -> tuple[Run, ...]:
+        """Runs whose fields equal the given values, such as ``domain="deployed"``."""
         return tuple(
-            r
-            for r in self.runs
-            if all(getattr(r, k) == v for k, v in equal.items()) and (where is None or where(r))
+            run for run in self.runs if all(getattr(run, key) == value for key, value in equal.items())
         )

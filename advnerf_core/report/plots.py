@@ -20,8 +20,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from advnerf_core.report.conditions import EMPTY, NONE, order_of, style_of
-from advnerf_core.report.data import Domain, Fidelity, Laps, Latency, MemoryRow, ReportData, Run
+from advnerf_core.report.data import Fidelity, Laps, Latency, MemoryRow, ReportData, Run
 from advnerf_core.report.palette import LIGHT, LINE_STYLES, themed_svg
+from advnerf_core.report.reference import Domain
 
 STYLE: dict[str, Any] = {
     "font.family": "DejaVu Sans",
@@ -180,31 +181,14 @@ def latency_histogram(latency: Latency) -> Figure:
 
 
 def memory_against_horizon(rows: Iterable[MemoryRow]) -> Figure:
-    """Peak memory above idle against the horizon."""
-    ordered = sorted(rows, key=lambda m: m.horizon_steps)
-    other = [m for m in ordered if m.backprop_mib is not None]
+    """Peak memory of the adjoint above idle against the horizon."""
+    ordered = sorted(rows, key=lambda row: row.horizon_steps)
     with new_axes(6.0, 3.0) as ax:
-        ax.plot(
-            [m.horizon_steps for m in ordered],
-            [m.adjoint_mib for m in ordered],
-            "-o",
-            ms=5,
-            color=LIGHT["gradient"],
-            label="adjoint, time batches",
-        )
-        if other:
-            ax.plot(
-                [m.horizon_steps for m in other],
-                [m.backprop_mib for m in other],
-                "--s",
-                ms=5,
-                color=LIGHT["muted"],
-                label="back-propagation",
-            )
+        horizons, peaks = zip(*((row.horizon_steps, row.adjoint_mib) for row in ordered), strict=True)
+        ax.plot(horizons, peaks, "-o", ms=5, color=LIGHT["gradient"])
         ax.set(xlabel="horizon T [control ticks]", ylabel="peak above idle [MiB]")
         ax.set_xlim(left=0.0)
         ax.set_ylim(bottom=0.0)
-        _legend_above(ax, ax.get_legend_handles_labels()[0])
     return ax.figure
 
 

@@ -1,21 +1,18 @@
-"""What a table is held against: totals of a publication, and limits. Both are data that a campaign file or an experiment file names."""
+"""What a report is held to: limits, as data that an experiment or campaign file names."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Literal
+from typing import Literal, get_args
 
 from pydantic import Field, model_validator
 
 from advnerf_core.strict import StrictModel
 
 Domain = Literal["surrogate", "deployed"]
-Measure = Literal["ratio", "spread", "off_track", "off_track_share"]
+DOMAINS: tuple[Domain, ...] = get_args(Domain)
+# Measures of drives, which a limit gives a method for.
+DriveMeasure = Literal["excess_m", "ratio", "mean_abs_cte_m", "spread", "off_track", "off_track_share"]
 LiveMeasure = Literal[
-    "ratio",
-    "mean_abs_cte_m",
-    "off_track",
-    "off_track_share",
     "laps",
     "laps_mean_abs_cte_m",
     "laps_off_track",
@@ -25,94 +22,67 @@ LiveMeasure = Literal[
     "psnr_policy_db",
     "steering_difference_rad",
     "memory_ratio",
-    "wall_min",
 ]
-_OF_DRIVES = ("ratio", "mean_abs_cte_m", "off_track", "off_track_share")
-# Mean, and standard deviation where there is one.
-Total = Annotated[tuple[float, ...], Field(min_length=1, max_length=2)]
 
 
 class Limit(StrictModel):
-    """What one line of a table must show.
+    """What one measure must be.
 
     Attributes:
-        method: Which method's line.
-        domain: Where.
-        victim: Whose line.
-        of: ``ratio`` to no attack, ``spread`` (standard deviation over mean), ``off_track`` drives, or their share.
+        of: The measure. ``excess_m`` is the excess |CTE| per tick over the plain object, ``ratio`` the total CTE over that past the plain
+            object (publications in other units give this), ``mean_abs_cte_m`` per tick, ``spread`` the standard deviation of the total over
+            its mean, ``memory_ratio`` the peak memory of the adjoint over 400 ticks against that over 50.
+        what: The measure in words; empty to put them together from the keys.
+        scenario: Whose drives; empty for the first scenario.
+        victim: Whose drives.
+        method: Whose drives.
+        domain: Where they were driven.
         at_least: Smallest value.
         at_most: Largest value.
         above: Another method, whose value must be exceeded.
         said: The limit in words; empty for the plain number.
+        setting: ``small`` or ``full`` if only that setting is held to it.
+        paper: What the publication has there, in words.
+        headline: Title among the key figures of the page; empty leaves it out there.
     """
 
-    method: str = Field(min_length=1)
-    domain: Domain = "deployed"
+    of: DriveMeasure | LiveMeasure = "ratio"
+    what: str = ""
+    scenario: str = ""
     victim: str = "hardened"
-    of: Measure = "ratio"
+    method: str = ""
+    domain: Domain = "deployed"
     at_least: float | None = None
     at_most: float | None = None
     above: str = ""
     said: str = ""
+    setting: Literal["", "small", "full"] = ""
+    paper: str = ""
+    headline: str = ""
+
+    @property
+    def of_drives(self) -> bool:
+        """Whether it is a measure of one method's drives."""
+        return self.of in get_args(DriveMeasure)
 
     @model_validator(mode="after")
     def _one_limit(self) -> Limit:
         given = (self.at_least is not None) + (self.at_most is not None) + bool(self.above)
         if given != 1:
             raise ValueError(f"expected one of at_least, at_most and above, got {given}")
-        return self
-
-
-class LiveLimit(StrictModel):
-    """What a live experiment must show.
-
-    Attributes:
-        what: What is measured, in words.
-        of: The measure. ``memory_ratio`` is the peak memory of the adjoint over 400 ticks against that over 50.
-        method: Which method's drives, of a measure of drives.
-        domain: Where, of a measure of drives.
-        at_least: Smallest value.
-        at_most: Largest value.
-        setting: ``small`` or ``full`` if it is a limit of one of them alone.
-        paper: What the paper has there, in words.
-        headline: What the page's head calls it; empty leaves it out there.
-    """
-
-    what: str = Field(min_length=1)
-    of: LiveMeasure
-    method: str = ""
-    domain: Domain = "deployed"
-    at_least: float | None = None
-    at_most: float | None = None
-    setting: Literal["", "small", "full"] = ""
-    paper: str = ""
-    headline: str = ""
-
-    @model_validator(mode="after")
-    def _one_limit(self) -> LiveLimit:
-        if (self.at_least is None) == (self.at_most is None):
-            raise ValueError("expected one of at_least and at_most")
-        if bool(self.method) != (self.of in _OF_DRIVES):
-            raise ValueError(f"expected a method with {', '.join(_OF_DRIVES)}, and with nothing else")
+        if self.of_drives != bool(self.method) or (self.above and not self.method):
+            raise ValueError(
+                f"expected a method with {', '.join(get_args(DriveMeasure))}, and with nothing else, got {self.of} of "
+                f"{self.method or 'no method'}"
+            )
         return self
 
 
 class Reference(StrictModel):
-    """What tables and reports are held against.
+    """A file of limits.
 
     Attributes:
-        paper: Totals of a publication by scenario, domain and method, in its own units.
-        targets: Limits by scenario.
-        live: Limits of one live experiment.
+        targets: The limits, in the order of the page.
     """
 
-    paper: Mapping[str, Mapping[Domain, Mapping[str, Total]]] = Field(default_factory=dict)
-    targets: Mapping[str, tuple[Limit, ...]] = Field(default_factory=dict)
-    live: tuple[LiveLimit, ...] = ()
-
-    def total(self, scenario: str, domain: Domain, method: str) -> tuple[float | None, float | None]:
-        """Mean and standard deviation of the publication; None where it has none."""
-        found = self.paper.get(scenario, {}).get(domain, {}).get(method)
-        if found is None:
-            return None, None
-        return found[0], found[1] if len(found) > 1 else None
+    targets: tuple[Limit, ...] = Field(default=())

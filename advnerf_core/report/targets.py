@@ -1,133 +1,175 @@
-"""The targets of a live experiment: what was promised, what was measured, and whether it was met. Nothing is rounded in our favour."""
+"""Targets: what was promised, what was measured, and whether it was met. Nothing is rounded in our favour."""
 
 # ruff: noqa: RUF001 (typography for readers: multiplication signs and dashes)
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from advnerf_core.report.data import ReportData
-from advnerf_core.report.reference import LiveLimit, LiveMeasure
-from advnerf_core.report.tables import Table, TransferRow, find_row, number, transfer_rows
-
-_NOT_MEASURED = "not measured in this run"
-_SHORT_TICKS, _LONG_TICKS = 50, 400  # horizons whose memory is compared
+from advnerf_core.report.conditions import style_of
+from advnerf_core.report.reference import Limit
+from advnerf_core.report.result_table import ResultTable, TableRow
+from advnerf_core.report.text_table import Table, count, number
 
 
 @dataclass(frozen=True)
 class Target:
-    """One target; `met` is None where this run did not measure it."""
+    """A limit and what was measured.
+
+    Attributes:
+        what: What is measured, in words.
+        target: The limit, in words.
+        value: What was measured; None where nothing was.
+        measured: The same in words.
+        met: Whether the limit is kept; None where nothing was measured, or seeds are missing.
+        verdict: The answer in words.
+        paper: What the publication has there.
+        headline: Title among the key figures of the page; empty leaves it out there.
+        method: Whose drives it is about; empty for other measures.
+    """
 
     what: str
     target: str
+    value: float | None
     measured: str
     met: bool | None
-    paper: str = ""
-    headline: str = ""
-    condition: str = ""
-
-    @property
-    def verdict(self) -> str:
-        """The answer in words."""
-        return {True: "met", False: "missed", None: "–"}[self.met]
+    verdict: str
+    paper: str
+    headline: str
+    method: str
 
     def record(self) -> dict[str, Any]:
-        """The target as JSON-ready values."""
+        """JSON-ready values, of which ``Target(**record)`` makes it again."""
         return asdict(self)
 
 
 @dataclass(frozen=True)
 class _Measure:
-    """How a measure is read off a report, and how its values are printed."""
+    """How a measure is called and printed."""
 
-    read: Callable[[ReportData, LiveLimit], float | None]
+    title: str
     digits: int
     unit: str = ""
-
-    def text(self, value: float) -> str:
-        return number(value, self.digits, self.unit)
+    of_row: Callable[[TableRow], float | None] = lambda row: None
 
 
-def evaluate_targets(data: ReportData) -> tuple[Target, ...]:
-    """All targets of the report's limits, in their order."""
-    return tuple(_target(data, limit) for limit in data.limits if limit.setting in ("", data.settings.name))
+_MEASURES: Mapping[str, _Measure] = {
+    "excess_m": _Measure("excess per tick", 3, " m", lambda row: row.excess.excess_m if row.excess else None),
+    "ratio": _Measure("total CTE", 2, " × plain object", lambda row: row.ratio),
+    "mean_abs_cte_m": _Measure("mean |CTE|", 3, " m", lambda row: row.mean_abs_cte_m),
+    "spread": _Measure("std / mean", 2, "", lambda row: row.spread),
+    "off_track": _Measure("drives off the track", 0, " drives", lambda row: float(row.off_track)),
+    "off_track_share": _Measure(
+        "share of drives off the track", 2, " of the drives", lambda row: row.off_track / row.drives
+    ),
+    "laps": _Measure("laps", 0, " laps"),
+    "laps_mean_abs_cte_m": _Measure("mean |CTE| of the laps", 3, " m"),
+    "laps_off_track": _Measure("laps off the track", 0, " drives"),
+    "latency_p99_ms": _Measure("latency, p99", 1, " ms"),
+    "missed_ticks": _Measure("missed ticks", 0, " ticks"),
+    "psnr_full_db": _Measure("PSNR of the camera's image", 1, " dB"),
+    "psnr_policy_db": _Measure("PSNR of the policy's image", 1, " dB"),
+    "steering_difference_rad": _Measure("steering difference", 4, " rad"),
+    "memory_ratio": _Measure("peak memory", 2, " ×"),
+}
 
 
-def targets_table(targets: Sequence[Target]) -> Table:
-    """The targets as text."""
-    cells = tuple((t.what, t.target, t.measured, t.verdict, t.paper) for t in targets)
-    classes = tuple({True: "met", False: "missed", None: "unmeasured"}[t.met] for t in targets)
-    return Table(
-        "Targets", ("what", "target", "measured", "verdict", "paper"), cells, (False,) * 5, classes=classes
-    )
+def evaluate(
+    limits: Iterable[Limit],
+    table: ResultTable,
+    measured: Mapping[str, float | None] | None = None,
+    setting: str = "",
+) -> list[Target]:
+    """The targets of some limits; those on rows that the table does not have are left out.
 
-
-def _target(data: ReportData, limit: LiveLimit) -> Target:
-    measure = _MEASURES[limit.of]
-    value = measure.read(data, limit)
-    sign, bound = ("≥", limit.at_least) if limit.at_least is not None else ("≤", limit.at_most)
-    assert bound is not None, "a limit has one bound"
-    met = None if value is None else value >= bound if sign == "≥" else value <= bound
-    measured = _NOT_MEASURED if value is None else measure.text(value)
-    said = f"{sign} {bound:g}{measure.unit}"
-    return Target(limit.what, said, measured, met, limit.paper, limit.headline, limit.method)
-
-
-def _of_row(read: Callable[[TransferRow], float | None]) -> Callable[[ReportData, LiveLimit], float | None]:
-    def found(data: ReportData, limit: LiveLimit) -> float | None:
-        row = find_row(transfer_rows(data), limit.domain, limit.method)
-        return None if row is None else read(row)
-
+    Args:
+        limits: What must be reached.
+        table: The drives.
+        measured: What was measured besides, by measure; None leaves these limits out.
+        setting: Which setting was run; limits of the other one are left out.
+    """
+    found = []
+    for limit in limits:
+        if limit.setting not in ("", setting):
+            continue
+        if not limit.of_drives:
+            if measured is not None:
+                found.append(_target(limit, measured.get(limit.of), limit.at_least, complete=True))
+        elif (row := _row(table, limit, limit.method)) is not None:
+            value, other = _value(row, limit), _row(table, limit, limit.above)
+            bound = limit.at_least if other is None else _value(other, limit)
+            complete = not row.missing and (other is None or not other.missing)
+            found.append(_target(limit, value, bound, complete, len(row.seeds)))
     return found
 
 
-def _of_fidelity(name: str) -> Callable[[ReportData, LiveLimit], float | None]:
-    return lambda data, limit: data.fidelity.mean(name) if data.fidelity else None
+def _row(table: ResultTable, limit: Limit, method: str) -> TableRow | None:
+    scenario = limit.scenario or next((row.scenario for row in table.rows), "")
+    return table.find(scenario, limit.victim, method, limit.domain)
 
 
-def _steering(data: ReportData, limit: LiveLimit) -> float | None:
-    return data.fidelity.steering_difference_rad if data.fidelity else None
+def _value(row: TableRow, limit: Limit) -> float | None:
+    return _MEASURES[limit.of].of_row(row) if row.seeds else None
 
 
-def _laps(read: Callable[[Any], float]) -> Callable[[ReportData, LiveLimit], float | None]:
-    return lambda data, limit: read(data.laps) if data.laps else None
+def _target(limit: Limit, value: float | None, lower: float | None, complete: bool, seeds: int = 0) -> Target:
+    measure = _MEASURES[limit.of]
+    bound = lower if limit.at_most is None else limit.at_most
+    if value is None or bound is None or not complete:
+        met, short = None, 0.0
+    else:
+        lacking = value - bound if limit.at_most is not None else bound - value
+        # A method that is as good as the one that it must exceed does not exceed it.
+        met = lacking < 0.0 if limit.above else lacking <= 0.0
+        short = max(lacking, 0.0) / (bound or 1.0)  # of a limit of zero any excess counts by its own size
+    if met is None:
+        verdict = "not measured" if value is None else f"{seeds} seed(s) so far"
+    else:
+        verdict = "met" if met else f"missed by {100 * short:.0f} %"
+    text = "not measured in this run" if value is None else number(value, measure.digits, measure.unit)
+    said = limit.said or _limit_text(limit, bound)
+    named = limit.paper, limit.headline, limit.method
+    return Target(_what(limit), said, value, text, met, verdict, *named)
 
 
-def _latency(data: ReportData, limit: LiveLimit) -> float | None:
-    return data.latency.overall.p99_ms if data.latency else None
+def _what(limit: Limit) -> str:
+    title = _MEASURES[limit.of].title
+    if limit.what or not limit.of_drives:
+        return limit.what or title
+    scenario = f"{limit.scenario}, " if limit.scenario else ""
+    victim = "" if limit.victim == "hardened" else f", victim {limit.victim}"
+    return f"{scenario}{style_of(limit.method).title}{victim}, {limit.domain}: {title}"
 
 
-def _missed_ticks(data: ReportData, limit: LiveLimit) -> float | None:
-    return data.latency.missed_ticks if data.latency else None
+def _limit_text(limit: Limit, bound: float | None) -> str:
+    unit = _MEASURES[limit.of].unit
+    if limit.above:
+        return f"> {limit.above}" + ("" if bound is None else f" {bound:.2f}")
+    return f"{'≤' if limit.at_most is not None else '≥'} {bound:g}{unit}"
 
 
-def _memory(data: ReportData, limit: LiveLimit) -> float | None:
-    rows = {m.horizon_steps: m.adjoint_mib for m in data.memory}
-    short, long = rows.get(_SHORT_TICKS), rows.get(_LONG_TICKS)
-    return None if short is None or long is None or short <= 0 else long / short
+def target_table(targets: Sequence[Target]) -> Table:
+    """The targets as text."""
+    cells = tuple((t.what, t.target, t.measured, t.verdict, t.paper) for t in targets)
+    classes = tuple({True: "met", False: "missed", None: "unmeasured"}[t.met] for t in targets)
+    columns = ("what", "target", "measured", "verdict", "paper")
+    return Table("Targets", columns, cells, (False,) * 5, classes=classes)
 
 
-def _wall_min(data: ReportData, limit: LiveLimit) -> float | None:
-    """Only of a run that made everything."""
-    cached = any(timing.cached for timing in data.timings)
-    return None if cached or data.manifest.wall_s is None else data.manifest.wall_s / 60
-
-
-_MEASURES: Mapping[LiveMeasure, _Measure] = {
-    "ratio": _Measure(_of_row(lambda row: row.ratio), 2, " × no attack"),
-    "mean_abs_cte_m": _Measure(_of_row(lambda row: row.mean_abs_cte_m), 3, " m"),
-    "off_track": _Measure(_of_row(lambda row: float(row.off_track)), 0, " drives"),
-    "off_track_share": _Measure(_of_row(lambda row: row.off_track / row.runs), 2, " of the drives"),
-    "laps": _Measure(_laps(lambda laps: laps.laps), 0, " laps"),
-    "laps_mean_abs_cte_m": _Measure(_laps(lambda laps: laps.mean_abs_cte_m), 3, " m"),
-    "laps_off_track": _Measure(_laps(lambda laps: float(laps.off_track)), 0, " drives"),
-    "latency_p99_ms": _Measure(_latency, 1, " ms"),
-    "missed_ticks": _Measure(_missed_ticks, 0, " ticks"),
-    "psnr_full_db": _Measure(_of_fidelity("psnr_full_db"), 1, " dB"),
-    "psnr_policy_db": _Measure(_of_fidelity("psnr_policy_db"), 1, " dB"),
-    "steering_difference_rad": _Measure(_steering, 4, " rad"),
-    "memory_ratio": _Measure(_memory, 2, " ×"),
-    "wall_min": _Measure(_wall_min, 1, " min"),
-}
+def verdict(targets: Sequence[Target]) -> str:
+    """Which targets were met, missed, and not measured, in words; empty without any."""
+    met, missed = ([target for target in targets if target.met is wanted] for wanted in (True, False))
+    judged = len(met) + len(missed)
+    if not targets:
+        return ""
+    if not judged:
+        return "No target was measured in this run."
+    text = f"{len(met)} of {count(judged, 'measured target')} {'was' if judged == 1 else 'were'} met."
+    if missed:
+        listed = "; ".join(f"{t.what}: {t.measured} (target {t.target})" for t in missed)
+        text += f" Missed: {listed}."
+    if len(targets) > judged:
+        text += f" {count(len(targets) - judged, 'target')} not measured in this run."
+    return text

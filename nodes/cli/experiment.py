@@ -18,7 +18,7 @@ from nodes.runtime.terminal import Device, Overrides, experiment_argument, print
 from nodes.runtime.termination import ends_in_order
 
 if TYPE_CHECKING:
-    from advnerf_core.report.transfer import TransferTable
+    from advnerf_core.report.result_table import ResultTable
     from nodes.experiment.engine.progress_record import ProgressRecord
     from nodes.experiment.plan.cell import Cell
     from nodes.experiment.run.config import Campaign
@@ -337,7 +337,7 @@ def _show_table(campaign: Campaign, cells: Sequence[Cell], output: Path | None) 
     _know_methods(campaign)  # titles are kept since cells were run
     found = statuses(campaign, cells)
     full = campaign_table(campaign, found)
-    page = _write_and_print(full, campaign.folder, campaign.folder / "cells", output)
+    page = _write_and_print(campaign, full, campaign.folder, campaign.folder / "cells", output)
     left_out = [each for each in found if each.state in ("changed", "unreadable")]
     for each in left_out:
         say_error(f"{each.cell.name} is left out: {each.text}")
@@ -349,34 +349,34 @@ def _show_published(campaign: Campaign, cells: Sequence[Cell], output: Path | No
 
     full = published_table(folder, campaign, list(cells))
     # Films are not published; those of the campaign's own cells may be of other drives.
-    _say_where(full, cells, _write_and_print(full, folder, folder, output))
+    _say_where(full, cells, _write_and_print(campaign, full, folder, folder, output))
 
 
 def _write_and_print(
-    full: TransferTable, folder: Path, clips_folder: Path, output: Path | None
+    campaign: Campaign, full: ResultTable, folder: Path, clips_folder: Path, output: Path | None
 ) -> Path | None:
     """Table, targets and the predictions in ``folder`` to the terminal, and the page into ``output`` if it is asked for."""
     from rich.console import Console
 
     from advnerf_core.files import write_atomically
-    from advnerf_core.report.transfer_page import target_table, text_table
-    from advnerf_core.report.transfer_prediction import prediction_section, prediction_table, skill_text
-    from advnerf_core.report.transfer_targets import table_targets
+    from advnerf_core.report.predictions import prediction_section, prediction_table, skill_text
+    from advnerf_core.report.result_page import text_table
+    from advnerf_core.report.targets import evaluate, target_table
     from nodes.experiment.pages.table import write_table
     from nodes.experiment.run.predictions import predicted
 
     pairs = predicted(folder, list(full.cells.values()))
+    targets = evaluate(campaign.reference.targets, full)
     page = None
     if output is not None:
         sections = [("Predicted and measured transfer", prediction_section(pairs))] if pairs else []
-        page = write_table(full, clips_folder, output, sections)
+        page = write_table(full, clips_folder, output, sections, targets=targets)
         if pairs:
-            write_atomically(
-                output / "predictions.json", json.dumps([pair.record() for pair in pairs], indent=1) + "\n"
-            )
+            records = [pair.record() for pair in pairs]
+            write_atomically(output / "predictions.json", json.dumps(records, indent=1) + "\n")
     console = Console(width=None if sys.stdout.isatty() else 200)
     console.print(text_table(full).rich())
-    if targets := table_targets(full):
+    if targets:
         console.print(target_table(targets).rich())
     if pairs:
         console.print(prediction_table(pairs).rich())
@@ -384,7 +384,7 @@ def _write_and_print(
     return page
 
 
-def _say_where(full: TransferTable, cells: Sequence[Cell], page: Path | None) -> None:
+def _say_where(full: ResultTable, cells: Sequence[Cell], page: Path | None) -> None:
     print(
         f"{len(full.cells)} of {len(cells)} cells; "
         + (f"page: {page}" if page else "advnerf report writes a page of them")

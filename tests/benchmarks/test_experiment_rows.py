@@ -8,18 +8,17 @@ import yaml
 
 from advnerf_core.report.cells import CellResult
 from advnerf_core.report.reference import Reference
-from advnerf_core.report.transfer import Wanted
-from advnerf_core.report.transfer import make_table as table_of
-from advnerf_core.report.transfer_targets import table_targets
-from benchmarks import black_box, retraining, transfer_table
+from advnerf_core.report.result_table import Wanted, make_table
+from advnerf_core.report.targets import evaluate
+from benchmarks import black_box, experiment_rows, first_build_ratios, retraining, transfer_table
 from benchmarks.black_box import Search
 
 ROOT = Path(__file__).parents[2]
 PAPER = Reference.model_validate(yaml.safe_load((ROOT / "launch" / "paper.reference.yaml").read_text()))
 
 
-def make_table(wanted, cells):
-    return table_of(wanted, cells, "", PAPER)
+def rows_of(table):
+    return transfer_table.rows_of(table, PAPER.targets)
 
 
 def cell(seed, method, deployed_m, none_m=2.0):
@@ -73,8 +72,8 @@ def test_rounds_and_their_curve_are_published_as_they_were_found(tmp_path):
 def test_a_row_of_the_table_has_its_machines_and_waits_for_its_seeds():
     cells = [CellResult.model_validate(cell(seed, "gradient", 9.0)) for seed in (0, 1)]
     table = make_table([Wanted("right", "", "hardened", "gradient", (0, 1, 2))], cells)
-    rows = transfer_table.rows_of(table)
-    assert [(row.domain, row.ratio, target.met) for row, target in rows] == [
+    rows = rows_of(table)
+    assert [(row.domain, row.ratio, target.met) for row, _, target in rows] == [
         ("surrogate", 4.5, None),
         ("deployed", 4.5, None),
     ]
@@ -90,7 +89,7 @@ def test_a_row_of_the_table_has_its_machines_and_waits_for_its_seeds():
     anew = [cells[0], cells[1].model_copy(update={"stages": {"scene": "s1"}})]
     assert "seeds are of 2 builds of scene and policies" in transfer_table.note_of(rows[0][0], anew)
     whole = make_table([Wanted("right", "", "hardened", "gradient", (0, 1))], cells)
-    assert [target.met for _, target in transfer_table.rows_of(whole)] == [True, True]
+    assert [target.met for _, _, target in rows_of(whole)] == [True, True]
 
 
 def test_a_miss_says_by_how_much_and_what_that_is_on_the_road():
@@ -100,7 +99,7 @@ def test_a_miss_says_by_how_much_and_what_that_is_on_the_road():
     table = make_table(
         [Wanted("right", "", "hardened", method, (0, 1)) for method in ("none", "random")], cells
     )
-    rows = dict((row.domain, (row, target)) for row, target in transfer_table.rows_of(table))
+    rows = dict((row.domain, (row, target)) for row, _, target in rows_of(table))
     row, target = rows["deployed"]
     why = transfer_table.why_missed(target, row, table.cells_of(row))
     assert "missed by 25 %: 50 mm off the path on average, 33 mm without attack" in why
@@ -122,7 +121,7 @@ def test_a_missed_target_says_by_how_much_and_what_it_points_to():
         for seed in (0, 1)
     ]
     table = make_table([Wanted("straight_shape_1m", "", "hardened", "gradient", (0, 1))], cells)
-    ((row, target),) = [pair for pair in transfer_table.rows_of(table) if pair[0].domain == "deployed"]
+    ((row, _, target),) = [each for each in rows_of(table) if each[0].domain == "deployed"]
     assert transfer_table.base_m(cells, "deployed") == 2.0
     text = transfer_table.why_missed(target, row, cells)
     assert text.startswith("; missed by 70 %; tried: ")
@@ -137,15 +136,15 @@ def test_places_must_beat_random_ones_on_the_retrained_victim():
     wanted = [Wanted("left_places", "", "retrained", method, (0,)) for method in ("random", "gradient")]
     for gradient_m, met in ((6.0, True), (4.0, False), (3.0, False)):
         table = make_table(wanted, [places("random", 4.0), places("gradient", gradient_m)])
-        found = {(row.method, row.domain): target for row, target in transfer_table.rows_of(table)}
+        found = {(row.method, row.domain): target for row, _, target in rows_of(table)}
         assert found["random", "deployed"] is found["gradient", "surrogate"] is None
         assert (found["gradient", "deployed"].target, found["gradient", "deployed"].met) == (
             "> random 2.00",
             met,
         )
-    assert [target.met for target in table_targets(make_table(wanted, []))] == [None]
+    assert [target.met for target in evaluate(PAPER.targets, make_table(wanted, []))] == [None]
     alone = make_table(wanted, [places("gradient", 9.0)])
-    assert [target.met for row, target in transfer_table.rows_of(alone) if row.domain == "deployed"] == [None]
+    assert [target.met for row, _, target in rows_of(alone) if row.domain == "deployed"] == [None]
 
 
 def test_rows_of_gate_and_predictions_come_from_what_was_published(tmp_path):
@@ -192,7 +191,30 @@ def test_rows_of_gate_and_predictions_come_from_what_was_published(tmp_path):
         "clean_drive": numbers,
     }
     (tmp_path / "predictions" / "right_hardened_gradient_0.json").write_text(json.dumps(expected))
-    ((_, factor, _, _, _, note, command),) = transfer_table.skill_rows(tmp_path, [deployed], "file")
-    assert factor == pytest.approx(2.0)  # 1.5 expected, 3 measured
-    assert "1 of 1 rightly said to work" in note
-    assert command == "advnerf predict file"
+    (row,) = transfer_table.skill_rows(tmp_path, [deployed], "file")
+    assert row.value == pytest.approx(2.0)  # 1.5 expected, 3 measured
+    assert "1 of 1 rightly said to work" in row.note
+    assert row.command == "advnerf predict file"
+
+
+def test_the_interval_of_few_seeds_is_their_range_and_the_transfer_is_from_shared_starts():
+    data = [cell(seed, "gradient", total) for seed, total in enumerate((6.0, 8.0, 9.0))]
+    cells = [CellResult.model_validate(each) for each in data]
+    assert first_build_ratios.seeds_interval([each.deployed for each in cells]) == (3.0, 4.5)
+    assert first_build_ratios.seeds_interval([cells[0].deployed]) is None
+    more = {"total_cte_m": [3.0, 90.0], "none_total_cte_m": [2.0, 1.0], "off_track": [True, True]}
+    longer = CellResult.model_validate({**data[0], "surrogate": more})
+    assert first_build_ratios.transfer_ratio([longer]) == 2.0
+    assert first_build_ratios.paper_ratio("straight", "deployed", "gradient") == 1702 / 1166
+    assert first_build_ratios.paper_ratio("nowhere", "deployed", "gradient") is None
+
+
+def test_every_measured_target_of_a_report_is_a_row():
+    target = {"what": "laps", "value": 3.0, "measured": "3 laps", "target": "≥ 3 laps", "met": True}
+    report = {
+        "rows": [{"method": "none", "domain": "deployed", "drives": 3}],
+        "targets": [target, {**target, "value": None}],
+    }
+    rows = []
+    experiment_rows.record_targets(report, lambda *row: rows.append(row))
+    assert rows == [("laps", 3.0, "laps", ">= 3 laps", True, "drives: none deployed 3")]

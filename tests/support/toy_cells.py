@@ -96,7 +96,7 @@ def run_cell(experiment, cell, folder, report, bench=None):
         "off_track": [cell.method == "gradient"],
         "none_total_cte_m": [none],
     }
-    found = {"attack_id": None, "surrogate": drives, "extra": {}}
+    found = {"attack_id": None, "surrogate": drives, "extra": {"horizon": 20}}
     if (campaign / "late").exists() and cell.method == "gradient":
         return {**found, "not_driven_live": "live0 was spoiled 3 times, at last: late"}
     return {**found, "deployed": drives}

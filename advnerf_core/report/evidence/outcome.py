@@ -20,15 +20,15 @@ class Outcome:
         excess_cte_m_per_tick: Mean |CTE| of the attacked drive minus that of the drive without attack [m].
         off_track: Whether |CTE| of the attacked drive ever exceeded the off-track limit.
         collided_with: Name of what the attacked car hit; None if it hit nothing.
-        time_to_leaving_s: Time of the first tick off the track [s]; None if the car never left it.
-        share_off_lane: Share of the ticks off the track, within 0..1.
+        time_to_leaving_s: Time of the first tick off the track [s]; None if the car never left it, or where only totals are kept.
+        share_off_lane: Share of the ticks off the track, within 0..1; None where only totals are kept.
     """
 
     excess_cte_m_per_tick: float
     off_track: bool
     collided_with: str | None
     time_to_leaving_s: float | None
-    share_off_lane: float
+    share_off_lane: float | None
 
 
 def drive_outcome(

@@ -5,11 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from advnerf_core.report.conditions import EMPTY, NONE, style_of
+from advnerf_core.report.conditions import style_of
 from advnerf_core.report.evidence.intervals import MEASURED_COVERAGE
 from advnerf_core.report.evidence.luck import luck_sentences
-from advnerf_core.report.evidence.words import DOMAIN_TITLES, NOT_DRIVEN, claim, ends, p_text, place_of
-from advnerf_core.report.tables import Table
+from advnerf_core.report.evidence.words import (
+    DOMAIN_TITLES,
+    claim,
+    collisions,
+    ends,
+    excess_cells,
+    p_text,
+    place_of,
+)
+from advnerf_core.report.text_table import Table
 
 _HEAD = """# Does it transfer?
 
@@ -268,10 +276,7 @@ def _lines(lines: Sequence[Mapping[str, str]]) -> str:
 
 
 def _cells(row: Mapping[str, Any]) -> dict[str, str]:
-    plain = f"{row['excess_m']:.3f}" if row["method"] != NONE else f"(mean abs. CTE {row['excess_m']:.3f})"
-    bare = "" if row["method"] == EMPTY else NOT_DRIVEN
-    if row["over_no_object_m"] is not None:
-        bare = f"{row['over_no_object_m']:.3f}"
+    plain, plain_ends, bare, bare_ends = excess_cells(row)
     return {
         "condition": place_of(row),
         "victim": row["victim"],
@@ -279,11 +284,11 @@ def _cells(row: Mapping[str, Any]) -> dict[str, str]:
         "driven in": DOMAIN_TITLES[row["domain"]],
         "searches x starts": f"{row['searches']} x {row['drives'] // row['searches']}",
         "excess over plain object [m per tick]": plain,
-        "95 %": ends(row["low_m"], row["high_m"]),
+        "95 %": plain_ends,
         "over no object": bare,
-        "95 % of it": ends(row["over_no_object_low_m"], row["over_no_object_high_m"]),
+        "95 % of it": bare_ends,
         "off track": f"{row['off_track']} of {row['drives']}",
-        "collided": _collisions(row["collided"]),
+        "collided": collisions(row["collided"]),
         "ticks off lane": f"{100 * row['off_lane_share']:.0f} %",
         "leaves after [s]": "" if row["leaving_s"] is None else f"{row['leaving_s']:.1f}",
     }
@@ -291,12 +296,6 @@ def _cells(row: Mapping[str, Any]) -> dict[str, str]:
 
 def _markdown(columns: tuple[str, ...], rows: tuple[tuple[str, ...], ...]) -> str:
     return Table("", columns, rows, (False,) * len(columns)).markdown()
-
-
-def _collisions(counts: Mapping[str, int]) -> str:
-    """How many drives ended against something, and against what: ``3 (2 board, 1 wall)``."""
-    what = ", ".join(f"{count} {name}" for name, count in counts.items())
-    return f"{sum(counts.values())} ({what})" if counts else "0"
 
 
 def _commands(name: str, registration: Mapping[str, Any]) -> str:

@@ -23,7 +23,7 @@ class Score:
     Attributes:
         held: Drives within their bands.
         drives: Drives.
-        score: Mean interval score [half lanes per tick]; smaller is better.
+        score: Mean interval score, in the unit of the bands; smaller is better.
     """
 
     held: int
@@ -39,7 +39,7 @@ def interval_score(low: ArrayLike, high: ArrayLike, measured: ArrayLike, level: 
 
 
 def score_bands(bands: Floats, measured: Floats, level: float = LEVEL) -> Score:
-    """Score bands ``[..., 2]`` of drives ``[...]``, both in half lanes per tick."""
+    """Score bands ``[..., 2]`` of drives ``[...]``, both in one unit."""
     low, high = bands[..., 0], bands[..., 1]
     held = int(((low <= measured) & (measured <= high)).sum())
     return Score(held, measured.size, float(interval_score(low, high, measured, level).mean()))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -11,15 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.driving.metrics import DriveMetrics
-from advnerf_core.report.cells import CellResult, cell_name
-from advnerf_core.report.conditions import CONTROLS, EMPTY, NONE
+from advnerf_core.report.cells import CellResult
+from advnerf_core.report.conditions import CONTROLS, NONE
 from advnerf_core.report.evidence.anytime import AnytimeTest, anytime_test
 from advnerf_core.report.evidence.exact import McNemar, holm, mcnemar_per_search, permutation_test
-from advnerf_core.report.evidence.intervals import (
-    ClusteredInterval,
-    clustered_interval,
-    difference_interval,
-)
+from advnerf_core.report.evidence.intervals import ClusteredInterval, difference_interval
 from advnerf_core.report.evidence.outcome import Outcome, drive_outcome
 from advnerf_core.report.evidence.registration import (
     PrimaryTest,
@@ -27,58 +22,10 @@ from advnerf_core.report.evidence.registration import (
     Registration,
     scenario_key,
 )
-from advnerf_core.report.reference import Domain
+from advnerf_core.report.evidence.rows import CellDrives, Key, Row, make_row
+from advnerf_core.report.reference import DOMAINS, Domain
 
 Floats = NDArray[np.float64]
-DOMAINS: tuple[Domain, ...] = ("surrogate", "deployed")
-Key = tuple[str, str, str, str]  # scenario, placement, victim, method
-
-
-@dataclass(frozen=True)
-class Row:
-    """One method against one victim in one domain, over its searches and their starts.
-
-    Attributes:
-        scenario: Name of the scenario.
-        placement: Name of the placement.
-        victim: Which policy.
-        method: Which search, or ``none``.
-        domain: surrogate or deployed.
-        searches: Number of searches.
-        drives: Number of drives.
-        excess_m: Mean excess |CTE| per tick over the plain object [m]; of ``none`` its mean |CTE|.
-        low_m: Lower end of its interval [m]; None where there are too few drives.
-        high_m: Upper end [m].
-        over_no_object_m: Mean excess over no object [m]; None where no drive without object was made, and of these drives themselves.
-        over_no_object_low_m: Lower end of its interval [m].
-        over_no_object_high_m: Upper end [m].
-        over: What the interval is over.
-        off_track: Drives that left the track.
-        collided: Drives that ended in a collision, by what the car ran into.
-        off_lane_share: Share of all ticks off the track.
-        leaving_s: Median time to leaving the track of the drives that left it [s].
-        registered: Whether all its cells were registered; else it is exploration.
-    """
-
-    scenario: str
-    placement: str
-    victim: str
-    method: str
-    domain: Domain
-    searches: int
-    drives: int
-    excess_m: float
-    low_m: float | None
-    high_m: float | None
-    over_no_object_m: float | None
-    over_no_object_low_m: float | None
-    over_no_object_high_m: float | None
-    over: str
-    off_track: int
-    collided: dict[str, int]
-    off_lane_share: float
-    leaving_s: float | None
-    registered: bool
 
 
 @dataclass(frozen=True)
@@ -132,7 +79,7 @@ class TestResult:
     mcnemar: tuple[McNemar, ...] = field(default=())
 
 
-class Evidence:
+class Evidence(CellDrives):
     """Outcomes of all drives of a registered set.
 
     Args:
@@ -141,14 +88,14 @@ class Evidence:
     """
 
     def __init__(self, registration: Registration, cells: Sequence[CellResult]) -> None:
-        self.registration = registration
-        self.cells = {
-            cell.name: cell
+        super().__init__(
+            cell
             for cell in cells
             if cell.kept
             and not cell.not_driven_live
             and registration.scenario(cell.scenario, cell.placement) is not None
-        }
+        )
+        self.registration, self.level = registration, registration.level
         self._named, self._digest = {cell.name for cell in registration.cells}, registration.digest
         self._paths = {name: each.reference_path() for name, each in registration.scenarios.items()}
         self._metrics: dict[tuple[str, Domain], list[DriveMetrics]] = {}
@@ -174,9 +121,17 @@ class Evidence:
             self._metrics[key] = [drive.metrics(path, horizon) for drive in cell.kept.get(domain, ())]
         return self._metrics[key]
 
-    def without(self, cell: CellResult, control: str = NONE) -> CellResult | None:
-        """The cell of the same drives past a control: the plain object (``none``) or no object (``empty``)."""
-        return self.cells.get(cell_name(cell.scenario, cell.victim, control, 0, cell.placement))
+    def has(self, cell: CellResult, domain: Domain) -> bool:
+        """Whether drives of a cell are kept."""
+        return bool(cell.kept.get(domain))
+
+    def share_starts(self, cells: Sequence[CellResult], domain: Domain) -> bool:
+        """Registered searches are measured from the same starts."""
+        return True
+
+    def mean_ctes_m(self, cell: CellResult, domain: Domain) -> list[float]:
+        """Mean |CTE| of each drive of a cell [m]."""
+        return [metrics.mean_cte_m for metrics in self.metrics(cell, domain)]
 
     def outcomes(self, cell: CellResult, domain: Domain, control: str = NONE) -> list[Outcome]:
         """Outcomes of the drives of a cell, each against the drive past a control from the same start; none without such drives."""
@@ -194,24 +149,14 @@ class Evidence:
             for attacked, none, drive in pairs
         ]
 
-    def searches(self, key: Key) -> list[CellResult]:
-        """The cells of one method against one victim, by seed."""
-        found = [
-            cell
-            for cell in self.cells.values()
-            if (cell.scenario, cell.placement, cell.victim, cell.method) == key
-        ]
-        return sorted(found, key=lambda cell: cell.seed)
-
 
 def rows(evidence: Evidence) -> list[Row]:
     """All rows, in the order of the registration; what was not registered comes last."""
     keys: dict[Key, None] = {}
     for cell in evidence.registration.cells:
         keys[cell.scenario, cell.placement, cell.victim, cell.method] = None
-    for found in evidence.cells.values():
-        keys[found.scenario, found.placement, found.victim, found.method] = None
-    made = [_row(evidence, key, domain) for key in keys for domain in DOMAINS]
+    keys |= dict.fromkeys(cell.key for cell in evidence.cells.values())
+    made = [make_row(evidence, key, domain) for key in keys for domain in DOMAINS]
     return sorted((row for row in made if row is not None), key=lambda row: not row.registered)
 
 
@@ -254,56 +199,6 @@ def search_list(evidence: Evidence) -> list[dict[str, Any]]:
     }
     keys = ("victim", "method", "seed", "attack_id")
     return [dict(zip(keys, each, strict=True)) for each in sorted(found)]
-
-
-def _row(evidence: Evidence, key: Key, domain: Domain) -> Row | None:
-    cells = [cell for cell in evidence.searches(key) if cell.kept.get(domain)]
-    outcomes = [evidence.outcomes(cell, domain) for cell in cells]
-    if not cells or not all(outcomes):
-        return None
-    values = [_values_m(evidence, cell, domain, found) for cell, found in zip(cells, outcomes, strict=True)]
-    interval = _interval(evidence, values)
-    bare = _over_no_object_m(evidence, cells, domain)
-    bare_interval = _interval(evidence, bare) if bare else None
-    flat = [outcome for found in outcomes for outcome in found]
-    leaving = [outcome.time_to_leaving_s for outcome in flat if outcome.time_to_leaving_s is not None]
-    return Row(
-        *key,
-        domain,
-        searches=len(cells),
-        drives=len(flat),
-        excess_m=float(np.mean([np.mean(each) for each in values])),
-        low_m=interval.low if interval else None,
-        high_m=interval.high if interval else None,
-        over_no_object_m=float(np.mean([np.mean(each) for each in bare])) if bare else None,
-        over_no_object_low_m=bare_interval.low if bare_interval else None,
-        over_no_object_high_m=bare_interval.high if bare_interval else None,
-        over=interval.over if interval else "",
-        off_track=sum(outcome.off_track for outcome in flat),
-        collided=dict(sorted(Counter(filter(None, (outcome.collided_with for outcome in flat))).items())),
-        off_lane_share=float(np.mean([outcome.share_off_lane for outcome in flat])),
-        leaving_s=float(np.median(leaving)) if leaving else None,
-        registered=all(evidence.is_registered(cell) for cell in cells),
-    )
-
-
-def _values_m(
-    evidence: Evidence, cell: CellResult, domain: Domain, outcomes: Sequence[Outcome]
-) -> list[float]:
-    if cell.method == NONE:  # its excess over itself is zero: what it is an excess over
-        return [metrics.mean_cte_m for metrics in evidence.metrics(cell, domain)]
-    return [outcome.excess_cte_m_per_tick for outcome in outcomes]
-
-
-def _over_no_object_m(evidence: Evidence, cells: Sequence[CellResult], domain: Domain) -> list[list[float]]:
-    """Excess of each drive over no object, by cell; empty where a cell has no drives to compare with, or is the control itself."""
-    found = [evidence.outcomes(cell, domain, EMPTY) for cell in cells if cell.method != EMPTY]
-    return [[each.excess_cte_m_per_tick for each in outcomes] for outcomes in found] if all(found) else []
-
-
-def _interval(evidence: Evidence, values: Sequence[Sequence[float]]) -> ClusteredInterval | None:
-    shared = len({len(each) for each in values}) == 1
-    return clustered_interval(values, evidence.registration.level, shared_starts=shared)
 
 
 def _test(evidence: Evidence, test: PrimaryTest) -> TestResult | None:
@@ -369,6 +264,3 @@ def _mean_excess_m(evidence: Evidence, cell: CellResult, domain: Domain) -> floa
 
 def _off_track(evidence: Evidence, cells: Sequence[CellResult]) -> list[list[bool]]:
     return [[outcome.off_track for outcome in evidence.outcomes(cell, "deployed")] for cell in cells]
-
-
-__all__ = ["DOMAINS", "Evidence", "Row", "TestResult", "as_data", "primary_tests", "rows"]

@@ -14,7 +14,9 @@ from advnerf_core.report.conditions import CONTROLS, style_of
 from advnerf_core.report.evidence.families import COARSE_SEARCHES, RANDOM_FAMILIES
 from advnerf_core.report.evidence.outcome import Outcome
 from advnerf_core.report.evidence.registration import read_registration
-from advnerf_core.report.evidence.results import DOMAINS, Evidence, Key
+from advnerf_core.report.evidence.results import Evidence
+from advnerf_core.report.evidence.rows import Key
+from advnerf_core.report.reference import DOMAINS
 
 
 @dataclass(frozen=True)

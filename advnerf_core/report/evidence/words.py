@@ -66,6 +66,22 @@ def ends(low_m: float | None, high_m: float | None) -> str:
     return "" if low_m is None or high_m is None else f"{low_m:.3f} to {high_m:.3f}"
 
 
+def excess_cells(row: Mapping[str, Any]) -> tuple[str, str, str, str]:
+    """Cells of a table: the excess of a row over the plain object, its interval, and the same over no object."""
+    plain = f"{row['excess_m']:.3f}" if row["method"] != NONE else f"(mean abs. CTE {row['excess_m']:.3f})"
+    bare = "" if row["method"] == EMPTY else NOT_DRIVEN
+    if row["over_no_object_m"] is not None:
+        bare = f"{row['over_no_object_m']:.3f}"
+    no_object_ends = ends(row["over_no_object_low_m"], row["over_no_object_high_m"])
+    return plain, ends(row["low_m"], row["high_m"]), bare, no_object_ends
+
+
+def collisions(counts: Mapping[str, int]) -> str:
+    """How many drives ended against something, and against what: ``3 (2 board, 1 wall)``."""
+    what = ", ".join(f"{count} {name}" for name, count in counts.items())
+    return f"{sum(counts.values())} ({what})" if counts else "0"
+
+
 def p_text(value: float) -> str:
     """A p-value as it is written on pages."""
     return f"{value:.4f}" if value >= 0.001 else f"{value:.1e}"

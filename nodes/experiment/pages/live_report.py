@@ -1,4 +1,4 @@
-"""What live drives add to the report: maps, films, textures, timing, memory, and `results.json` with all of it."""
+"""What live drives add to the report: maps, films, textures, timing, memory."""
 
 from __future__ import annotations
 
@@ -15,10 +15,7 @@ import numpy as np
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.documents import read_json
 from advnerf_core.report import data as rd
-from advnerf_core.report import summary, tables, targets
 from advnerf_core.report.cells import read_cell
-from advnerf_core.report.live_parts import LiveParts, live_parts
-from advnerf_core.report.results import read_results, write_results
 from nodes.experiment.engine.stage_record import read_record
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
@@ -40,29 +37,11 @@ SHOWN_VIEWS = 6
 _PATH_POINTS = 400
 
 
-def make_parts(experiment: Experiment, folder: Path, report: Report) -> LiveParts:
-    """Measure memory, cut films, and keep everything in ``results.json``."""
+def measure(experiment: Experiment, folder: Path, report: Report) -> rd.ReportData:
+    """Measure memory, cut films, and read everything that the page is made of."""
     rows = memory.measure(experiment, folder, lambda part, text="": report(0.6 * part, text))
     report(0.6, "cutting clips")
-    clips = _clips(experiment, folder)
-    report(0.9, "writing the page")
-    data = _report_data(experiment, clips, rows)
-    write_results(data, folder / "results.json")
-    return live_parts(data)
-
-
-def target_rows(experiment: Experiment) -> tables.Table:
-    """The targets of the finished report."""
-    return targets.targets_table(targets.evaluate_targets(_finished(experiment)))
-
-
-def not_driven(experiment: Experiment) -> str:
-    """Which arms of the finished report were not driven live; empty if all were."""
-    return summary.not_driven(_finished(experiment))
-
-
-def _finished(experiment: Experiment) -> rd.ReportData:
-    return read_results(experiment.stage_folder("report") / "results.json")
+    return _report_data(experiment, _clips(experiment, folder), rows)
 
 
 def _report_data(
@@ -98,16 +77,8 @@ def _report_data(
             laps["metrics"]["mean_cte_m"],
             laps["metrics"]["off_track"],
         ),
-        limits=experiment.held_to.live,
-        live_tries=tuple(_live_tries(experiment, cell) for cell in cells(experiment)),
         not_measured=_not_measured(experiment, driven, measured),
     )
-
-
-def _live_tries(experiment: Experiment, cell: Cell) -> rd.LiveTries:
-    result = read_cell(experiment.cell_result(cell))
-    spoiled = tuple(reason for each in result.extra.get("spoiled_tries", ()) for reason in each)
-    return rd.LiveTries(cell.method, cell.victim, cell.seed, not result.not_driven_live, spoiled)
 
 
 def _not_measured(
@@ -178,10 +149,6 @@ def _surrogate_runs(experiment: Experiment) -> Iterator[rd.Run]:
                 np.array(states)[:, :3],
                 path.project(xy).cte_m,
                 found["total_cte_m"][start],
-                found["mean_cte_m"][start],
-                found["off_track"][start],
-                found["time_to_leave_s"][start],
-                attack_id=found["attack_id"] or "",
             )
 
 
@@ -212,7 +179,7 @@ def _deployed_runs(
         if name == "empty"
     ]
     for condition, seed, start, result in rows:
-        outcome, metrics = result["outcome"], result["metrics"]
+        outcome = result["outcome"]
         stopped_s = (outcome["end_real_ns"] - outcome["start_real_ns"]) * 1e-9
         yield rd.Run(
             "deployed",
@@ -222,11 +189,7 @@ def _deployed_runs(
             start,
             np.array(result["states"]),
             np.array(result["cte_m"]),
-            metrics["total_cte_m"],
-            metrics["mean_cte_m"],
-            metrics["off_track"],
-            metrics["time_to_leaving_s"],
-            attack_id="".join(result["attack_ids"]),
+            result["metrics"]["total_cte_m"],
             note=f"stopped at {stopped_s:.1f} s: {outcome['stopped_early']}"
             if outcome["stopped_early"]
             else "",
@@ -242,9 +205,9 @@ def _curves(experiment: Experiment) -> Iterator[rd.LossCurve]:
 def _textures(experiment: Experiment) -> Iterator[rd.Texture]:
     for cell in _attacked(experiment):
         attack = load_attack(experiment.cell_folder(cell) / ATTACK)
-        naive = "" if cell.victim == experiment.config.main_victim else f", {cell.victim} victim"
+        whose = "" if cell.victim == experiment.config.main_victim else f", {cell.victim} victim"
         yield rd.Texture(
-            f"{cell.method}, seed {cell.seed}{naive}",
+            f"{cell.method}, seed {cell.seed}{whose}",
             cell.method,
             attack.required_face().texture,
             attack.attack_id,
@@ -311,7 +274,6 @@ def _manifest(experiment: Experiment) -> rd.Manifest:
         "memory": f"{memory_gib():.0f} GiB",
         "system": platform.platform(),
     }
-    # The wall time from a clean clone is not known here: benchmarks/newcomer measures it.
     return rd.Manifest(
         manifest["command"],
         datetime.now(timezone.utc).isoformat(timespec="seconds"),

@@ -1,8 +1,8 @@
-"""Stage report: the transfer table, what every drive did from above and from the driver's seat, and the textures as they were seen."""
+"""Stage report: the table of results, what every drive did from above and from the driver's seat, and the textures as they were seen."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from advnerf_core.attack.spaces.space import Space
+from advnerf_core.documents import read_json
 from advnerf_core.report.cells import read_cell
 from advnerf_core.report.conditions import NONE
-from advnerf_core.report.transfer import TransferTable, make_table
-from advnerf_core.report.transfer_page import text_table
+from advnerf_core.report.result_page import not_driven, text_table
+from advnerf_core.report.result_table import ResultTable, make_table
+from advnerf_core.report.targets import Target, evaluate, target_table
 from hardware.worlds.world import World
 from nodes.experiment.engine.run_folder import CELLS
 from nodes.experiment.pages import live_report, page
@@ -46,8 +48,17 @@ def run(experiment: Experiment, folder: Path, report: Report, notes: Sequence[st
     """
     know_methods_of(experiment.folder / CELLS, experiment.config.attack.method_names)
     if experiment.config.deploy.live:
-        parts = live_report.make_parts(experiment, folder, report)
-        _write(experiment, folder, parts.sections, (*notes, *parts.lead), parts.targets)
+        from advnerf_core.report.live_parts import live_sections, opening  # matplotlib
+
+        data, table = live_report.measure(experiment, folder, report), table_of(experiment)
+        report(0.9, "writing the page")
+        _write(
+            experiment,
+            folder,
+            live_sections(data, table),
+            (*notes, *opening(data, table, experiment.config.main_victim)),
+            data.measured,
+        )
         return
     films_of: list[Path] = []
     with experiment.open_deployed_world() as scene:
@@ -69,25 +80,28 @@ def _write(
     folder: Path,
     sections: Sequence[tuple[str, Markup]],
     lead: Sequence[str | Markup],
-    targets: Markup | None = None,
+    measured: Mapping[str, float | None] | None = None,
 ) -> None:
-    write_table(table_of(experiment), experiment.folder / CELLS, folder, sections, lead, PAGE, targets)
+    table = table_of(experiment)
+    targets = evaluate(experiment.held_to.targets, table, measured, experiment.setting)
+    write_table(table, experiment.folder / CELLS, folder, sections, lead, PAGE, targets)
 
 
 def print_summary(experiment: Experiment, console: Console) -> None:
-    """The transfer table, and where the page is."""
+    """The table, its targets, and where the page is."""
     wide = Console(
         file=console.file, width=max(console.width, _TABLE_WIDTH), force_terminal=console.is_terminal
     )
-    wide.print(text_table(table_of(experiment)).rich())
-    if experiment.config.deploy.live:
-        wide.print(live_report.target_rows(experiment).rich())
-        if text := live_report.not_driven(experiment):
-            console.print(text, highlight=False, markup=False, soft_wrap=True)
-    console.print(f"report: {experiment.stage_folder('report') / PAGE}", highlight=False, soft_wrap=True)
+    table, folder = table_of(experiment), experiment.stage_folder("report")
+    wide.print(text_table(table).rich())
+    if targets := [Target(**each) for each in read_json(folder / "table.json")["targets"]]:
+        wide.print(target_table(targets).rich())
+    if text := not_driven(table):
+        console.print(text, highlight=False, markup=False, soft_wrap=True)
+    console.print(f"report: {folder / PAGE}", highlight=False, soft_wrap=True)
 
 
-def table_of(experiment: Experiment) -> TransferTable:
+def table_of(experiment: Experiment) -> ResultTable:
     """The table of all cells that this experiment itself has run."""
     plan = cells(experiment)
     files = [experiment.cell_result(cell) for cell in plan]

@@ -10,8 +10,9 @@ from markupsafe import Markup
 
 from advnerf_core.files import write_atomically
 from advnerf_core.report.conditions import order_of
-from advnerf_core.report.transfer import TransferTable, Wanted
-from advnerf_core.report.transfer_page import as_csv, as_json, as_markdown, gather_clips, render_transfer_page
+from advnerf_core.report.result_page import as_csv, as_json, as_markdown, gather_clips, render_page
+from advnerf_core.report.result_table import ResultTable, Wanted
+from advnerf_core.report.targets import Target
 from nodes.experiment.plan.cell import Cell
 
 
@@ -30,13 +31,13 @@ def wanted_rows(cells: Sequence[Cell], scenarios: Sequence[str]) -> list[Wanted]
 
 
 def write_table(
-    table: TransferTable,
+    table: ResultTable,
     cells_folder: Path,
     folder: Path,
     sections: Sequence[tuple[str, Markup]] = (),
     lead: Sequence[str | Markup] = (),
     page: str = "index.html",
-    targets: Markup | None = None,
+    targets: Sequence[Target] = (),
 ) -> Path:
     """Write JSON, CSV, Markdown and the page with the clips beside it.
 
@@ -47,15 +48,17 @@ def write_table(
         sections: Further parts of the page.
         lead: Paragraphs before the table.
         page: Name of the page.
-        targets: Instead of those of the table.
+        targets: What it is held to.
 
     Returns:
         The page.
     """
     folder.mkdir(parents=True, exist_ok=True)
     clips = gather_clips(table, cells_folder, folder)
-    write_atomically(folder / "table.json", json.dumps(as_json(table), indent=1, allow_nan=False) + "\n")
+    write_atomically(
+        folder / "table.json", json.dumps(as_json(table, targets), indent=1, allow_nan=False) + "\n"
+    )
     write_atomically(folder / "table.csv", as_csv(table))
-    write_atomically(folder / "table.md", as_markdown(table))
-    write_atomically(folder / page, render_transfer_page(table, clips, sections, lead, targets))
+    write_atomically(folder / "table.md", as_markdown(table, targets))
+    write_atomically(folder / page, render_page(table, clips, sections, lead, targets))
     return folder / page

@@ -226,6 +226,7 @@ def campaign_of(experiment: Experiment, overrides: Sequence[str], cells: Sequenc
         tuple(cells),
         # By default the experiment itself judges, see `steering_gate`.
         experiment.config.gate if isinstance(experiment.config.gate, GateLimits) else None,
+        experiment.held_to,
     )
 
 

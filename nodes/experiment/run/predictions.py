@@ -1,11 +1,8 @@
 """Predicted against measured transfer: one prediction per attacked cell, made without its deployed drives, and how good they were."""
 
-# ruff: noqa: RUF001 (typography for readers: multiplication signs)
-
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +11,8 @@ from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import CellResult
 from advnerf_core.report.conditions import CONTROLS
-from advnerf_core.report.transfer_prediction import Predicted
+from advnerf_core.report.evidence.rows import CellDrives
+from advnerf_core.report.predictions import Predicted
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import is_predictable
 from nodes.experiment.run.config import Campaign
@@ -25,7 +23,7 @@ from nodes.experiment.show.context import Experiment
 if TYPE_CHECKING:
     from nodes.experiment.run.gate import CleanDrive
 
-_KEYS = {"ratio", "ratio_low", "ratio_high", "retained", "total_cte_m", "clean_drive"}
+_KEYS = {"excess_m", "excess_low_m", "excess_high_m", "retained", "clean_drive"}
 
 
 def predict_campaign(
@@ -74,7 +72,7 @@ def predict_campaign(
         record = {"settings_hash": planned.job.settings_hash, **found.record(), "clean_drive": summary}
         write_atomically(file, json.dumps(record, indent=1) + "\n")
         say(
-            f"{cell.name}: {found.ratio:.2f} × no attack expected, {100 * found.retained:.0f} % of the effect survives"
+            f"{cell.name}: excess of {found.excess_m_per_tick[1]:.3f} m per tick expected, {100 * found.retained:.0f} % of the effect survives"
         )
         made += 1
     return made
@@ -87,35 +85,26 @@ def predicted(folder: Path, results: Sequence[CellResult]) -> list[Predicted]:
         folder: Of the campaign, or of what was published of it.
         results: Its finished cells.
     """
-    pairs = []
+    pairs, drives = [], CellDrives(results)
     for cell in results:
-        if cell.deployed is None or cell.method in CONTROLS:
-            continue
         kept = kept_prediction(prediction_file(folder, cell.name), cell.settings_hash)
-        if kept is None:
+        deployed = drives.outcomes(cell, "deployed")
+        if kept is None or not deployed or cell.method in CONTROLS:
             continue
-        none_m = sum(cell.deployed.none_total_cte_m)
-        measured = sum(cell.deployed.total_cte_m) / none_m if none_m > 0.0 else math.nan
-        starts = cell.shared_starts
-        learned, learned_none = (
-            sum(each[:starts]) for each in (cell.surrogate.total_cte_m, cell.surrogate.none_total_cte_m)
-        )
+        learned = drives.outcomes(cell, "surrogate")[: len(deployed)]
         pairs.append(
             Predicted(
                 cell.name,
                 cell.method,
-                kept["ratio"],
-                kept["ratio_low"],
-                kept["ratio_high"],
-                measured,
+                kept["excess_m"],
+                kept["excess_low_m"],
+                kept["excess_high_m"],
                 kept["retained"],
-                kept["total_cte_m"],
-                cell.deployed.mean_m,
-                learned / learned_none if learned_none > 0.0 else math.nan,
-                learned / starts,
+                sum(each.excess_cte_m_per_tick for each in learned) / len(learned),
+                tuple(each.excess_cte_m_per_tick for each in deployed),
             )
         )
-    return [pair for pair in pairs if math.isfinite(pair.measured) and math.isfinite(pair.surrogate)]
+    return pairs
 
 
 def prediction_file(folder: Path, name: str) -> Path:

@@ -13,7 +13,7 @@ from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import CellResult, read_cell, read_cells
 from advnerf_core.report.evidence.hardness import FILE as HARDNESS
 from advnerf_core.report.evidence.hardness import PUBLISHED_FILE, merged, read_hardness, write_hardness
-from advnerf_core.report.transfer import TransferTable, make_table
+from advnerf_core.report.result_table import ResultTable, make_table
 from nodes.experiment.engine.reference import BUILD, ReferenceBuild
 from nodes.experiment.engine.stage_record import RECORD, read_record
 from nodes.experiment.pages.table import wanted_rows
@@ -171,7 +171,7 @@ def _publish_hardness(campaign: Campaign, folder: Path) -> None:
         write_hardness(folder / PUBLISHED_FILE, record)
 
 
-def published_table(folder: Path, campaign: Campaign, cells: Sequence[Cell] | None = None) -> TransferTable:
+def published_table(folder: Path, campaign: Campaign, cells: Sequence[Cell] | None = None) -> ResultTable:
     """The table of published cells, with all lines and seeds that are asked for.
 
     Args:
@@ -189,11 +189,10 @@ def published_table(folder: Path, campaign: Campaign, cells: Sequence[Cell] | No
         wanted_rows(campaign.cells if cells is None else cells, list(campaign.scenarios)),
         found,
         campaign.name,
-        campaign.reference,
     )
 
 
-def campaign_table(campaign: Campaign, found: Sequence[CellStatus]) -> TransferTable:
+def campaign_table(campaign: Campaign, found: Sequence[CellStatus]) -> ResultTable:
     """The table of the cells that are there.
 
     Args:
@@ -205,5 +204,4 @@ def campaign_table(campaign: Campaign, found: Sequence[CellStatus]) -> TransferT
         wanted_rows([each.cell for each in found], list(campaign.scenarios)),
         cells,
         campaign.name,
-        campaign.reference,
     )

@@ -67,7 +67,8 @@ def test_a_constant_disagreement_moves_the_clean_drive_by_its_size():
     found = predict_transfer(problem(), images, clean, effect, START, HORIZON, draws=9)
     assert found.none_m == pytest.approx([driven(-0.2)] * 9)
     assert found.attacked_m == pytest.approx([driven(TURN - 0.2)] * 9)
-    assert found.ratio == pytest.approx(driven(TURN - 0.2) / driven(-0.2))
+    excess_m = (driven(TURN - 0.2) - driven(-0.2)) / HORIZON.ticks
+    assert found.excess_m_per_tick == pytest.approx((excess_m,) * 3)
 
 
 def test_draws_differ_by_what_was_measured_and_repeat_with_the_seed():
@@ -77,9 +78,9 @@ def test_draws_differ_by_what_was_measured_and_repeat_with_the_seed():
     again = predict_transfer(problem(), images, clean, effect, START, HORIZON, draws=12, seed=3)
     assert first == again
     assert len(set(first.attacked_m)) == 12
-    low, high = first.ratio_band
-    assert low < first.ratio < high
-    assert set(first.record()) >= {"ratio", "ratio_low", "ratio_high", "retained", "draws"}
+    low, mean, high = first.excess_m_per_tick
+    assert low < mean < high
+    assert set(first.record()) >= {"excess_m", "excess_low_m", "excess_high_m", "retained", "draws"}
     other = Effect(effect.learned, 0.5 * effect.real)
     alone = predict_transfer(problem(), images, clean, other, START, HORIZON, draws=12, seed=3)
     assert alone.none_m == first.none_m != alone.attacked_m  # the drive without attack knows nothing of it

@@ -1,18 +1,15 @@
 import dataclasses
-import json
 import re
-import tempfile
 from html.parser import HTMLParser
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from advnerf_core.report.data import Clip, LiveTries, ReportData, Texture
-from advnerf_core.report.live_parts import live_parts
-from advnerf_core.report.results import read_results, results_dict, write_results
-from advnerf_core.report.transfer import TransferTable
-from advnerf_core.report.transfer_page import render_transfer_page
+from advnerf_core.report import live_parts
+from advnerf_core.report.data import Clip, Texture
+from advnerf_core.report.live_parts import live_sections, opening
+from advnerf_core.report.result_page import render_page
+from advnerf_core.report.result_table import ResultTable
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 
@@ -52,23 +49,16 @@ def check(page):
     return checker
 
 
-def render_page(data):
+NO_ROWS = ResultTable((), {}, "room")
+
+
+def page_of(data, table=NO_ROWS):
     """The one page, with the parts of an experiment whose drives were live."""
-    table = TransferTable((), {}, "room")
-    parts = live_parts(data)
-    return render_transfer_page(table, (), parts.sections, parts.lead, parts.targets)
+    return render_page(table, (), live_sections(data, table), opening(data, table))
 
 
-@pytest.fixture(scope="module")
-def written(report, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("out")
-    write_results(report, folder / "results.json")
-    (folder / "report.html").write_text(render_page(report), encoding="utf-8")
-    return folder / "report.html"
-
-
-def test_the_page_is_whole_and_loads_nothing(written):
-    page = written.read_text(encoding="utf-8")
+def test_the_page_is_whole_and_loads_nothing(report):
+    page = page_of(report)
     checker = check(page)
     assert checker.loads == []
     assert "script" not in checker.tags
@@ -88,28 +78,8 @@ def test_the_page_is_whole_and_loads_nothing(written):
     assert "Not measured in this run" not in page
 
 
-def test_results_round_trip(report, written):
-    content = json.loads((written.parent / "results.json").read_text(encoding="utf-8"))
-    back = read_results(written.parent / "results.json")
-    assert results_dict(back) == content == results_dict(report)
-    np.testing.assert_array_equal(back.runs[3].states, report.runs[3].states)
-    assert back.clips[0].path == report.clips[0].path
-    assert back.fidelity.steering_difference_rad == report.fidelity.steering_difference_rad
-    assert back.textures[0].image is None
-
-
-def test_results_of_another_version_are_refused(tmp_path):
-    path = tmp_path / "results.json"
-    path.write_text('{"schema": "other/9"}')
-    with pytest.raises(ValueError, match="expected schema 'advnerf-results/1'"):
-        read_results(path)
-    path.write_text("{")
-    with pytest.raises(ValueError, match="expected JSON"):
-        read_results(path)
-
-
 def test_missing_parts_are_named(bare_report):
-    page = render_page(bare_report)
+    page = page_of(bare_report)
     check(page)
     # runs, laps, clips, textures, fidelity, curves, latency, memory, timings
     assert page.count("Not measured in this run.") == 9
@@ -120,63 +90,47 @@ def test_text_from_outside_is_escaped(bare_report):
     evil = "<script>alert(1)</script>"
     textures = (Texture(evil, "gradient", np.zeros((4, 4, 3), np.uint8), evil),)
     manifest = dataclasses.replace(bare_report.manifest, command=evil, machine={evil: evil})
-    page = render_page(dataclasses.replace(bare_report, textures=textures, manifest=manifest))
+    page = page_of(dataclasses.replace(bare_report, textures=textures, manifest=manifest))
     assert "script" not in check(page).tags
     assert page.count("&lt;script&gt;") >= 5
 
 
 def test_one_victim_one_start_without_live_drives(make, bare_report):
     runs = tuple(make.drive("surrogate", c, a) for c, a in (("none", 0.02), ("gradient", 0.6)))
-    page = render_page(dataclasses.replace(bare_report, runs=runs))
+    page = page_of(dataclasses.replace(bare_report, runs=runs))
     check(page)
     assert "On the live drive it was not measured in this run." in page
 
 
-def test_single_drives_are_embedded_and_a_lost_clip_is_named(make, bare_report, report, tmp_path):
-    clip = report.clips[0].path
-    runs = (make.drive("deployed", "gradient", 0.6, clip=clip),)
-    assert "Single drives (1)" in render_page(dataclasses.replace(bare_report, runs=runs))
+def test_a_lost_clip_is_named_and_those_without_room_stay_beside(bare_report, report, monkeypatch, tmp_path):
     lost = dataclasses.replace(bare_report, clips=(Clip("lost", tmp_path / "no.mp4"),))
     with pytest.raises(FileNotFoundError, match="expected the clip 'lost'"):
-        render_page(lost)
+        page_of(lost)
+    monkeypatch.setattr(live_parts, "MAX_EMBEDDED_BYTES", 10)
+    page = page_of(dataclasses.replace(bare_report, clips=report.clips))
+    assert "Not embedded" in page
+    assert "<video" not in page
 
 
-def test_unknown_missing_part_is_refused(make):
-    with pytest.raises(ValueError, match=r"not_measured keys among .*, got \['latencies'\]"):
-        ReportData(make.settings(), make.scene(), (), make.manifest(), not_measured={"latencies": "x"})
-
-
-def test_tries_are_listed_and_an_arm_that_was_not_driven_live_is_named_first(report):
+def test_tries_are_listed_with_why_they_do_not_count(report, make):
     late = "the stack stopped the car: no pose of the car for 0.21 s"
-    tries = (LiveTries("none", "hardened", 0, True, (late,)), LiveTries("random", "hardened", 0, True))
-    driven = dataclasses.replace(report, live_tries=tries)
-    page = render_page(driven)
-    assert page.count(late) == 1
-    assert "NOT DRIVEN LIVE" not in page
-    given_up = LiveTries("gradient", "hardened", 0, False, (late,) * 3)
-    runs = tuple(run for run in report.runs if (run.domain, run.condition) != ("deployed", "gradient"))
-    missing = dataclasses.replace(driven, runs=runs, live_tries=(*tries, given_up))
-    page = render_page(missing)
-    assert check(page)
-    assert page.index("NOT DRIVEN LIVE: gradient") < page.index("A texture for one flat board")
-    assert "are no evidence of transfer" in page
-    assert "On the live drive it was not measured in this run" in page
+    drives = [("surrogate", "gradient", [9.0], [True]), ("surrogate", "none", [1.0], [False])]
+    table = make.table(drives, extra={"horizon": 60, "spoiled_tries": [[late]]}, not_driven_live=late)
+    bare = dataclasses.replace(report, latency=None, laps=None)
+    page = page_of(bare, table)
+    check(page)
+    assert page.count(f"<td>{late}</td>") == 2
+    assert page.index("NOT DRIVEN LIVE: ") < page.index("A texture for one flat board")
 
 
-def test_a_report_without_any_live_drive_is_a_whole_page(report):
-    given_up = tuple(
-        LiveTries(name, "hardened", 0, False, ("late",) * 3) for name in ("none", "random", "gradient")
-    )
-    runs = tuple(run for run in report.runs if run.domain == "surrogate")
-    bare = dataclasses.replace(report, runs=runs, live_tries=given_up, latency=None, laps=None)
-    page = render_page(bare)
-    assert check(page)
-    assert "NOT DRIVEN LIVE: " in page
-    assert [dataclasses.asdict(each) for each in read_results_of(bare)] == [
-        dataclasses.asdict(each) for each in given_up
+def test_the_opening_says_what_it_did_in_metres(report, make):
+    drives = [
+        (domain, method, totals, off_track)
+        for domain in ("surrogate", "deployed")
+        for method, totals, off_track in (("none", [1.0], [False]), ("gradient", [13.0], [True]))
     ]
-
-
-def read_results_of(data):
-    with tempfile.TemporaryDirectory() as folder:
-        return read_results(write_results(data, Path(folder) / "results.json")).live_tries
+    (text,) = opening(report, make.table(drives))
+    assert text.count("is 0.200 m per tick larger with the gradient texture than past the plain object") == 2
+    assert "(total 13.00 m against 1.00 m), and the car left the track in 1 of 1 drive" in text
+    bad = [(*each[:3], [True]) for each in drives]
+    assert "WITHOUT AN ATTACK THE POLICY DOES NOT DRIVE" in " ".join(opening(report, make.table(bad)))

@@ -1,48 +1,48 @@
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from advnerf_core.report.data import Fidelity, FidelityView, Laps, Latency, MemoryRow
-from advnerf_core.report.reference import LiveLimit
-from advnerf_core.report.summary import key_figures, opening, verdict
-from advnerf_core.report.targets import evaluate_targets
+from advnerf_core.report.live_parts import opening
+from advnerf_core.report.reference import Limit, Reference
+from advnerf_core.report.result_table import ResultTable
+from advnerf_core.report.targets import evaluate, verdict
+
+FILE = Path(__file__).parents[3] / "launch" / "room.reference.yaml"
+LIMITS = Reference.model_validate(yaml.safe_load(FILE.read_text())).targets
+NO_ROWS = ResultTable(())
 
 
-def verdicts(report):
-    return {t.what: t.met for t in evaluate_targets(report)}
+def verdicts(report, table=NO_ROWS):
+    return {t.what: t.met for t in evaluate(LIMITS, table, report.measured, report.settings.name)}
 
 
-def test_nothing_measured_is_neither_met_nor_missed(bare_report):
-    report = replace(bare_report, manifest=replace(bare_report.manifest, wall_s=None))
-    assert set(verdicts(report).values()) == {None}
-    assert verdict(evaluate_targets(report)) == "No target was measured in this run."
-    assert all(k.met is None for k in key_figures(report))
+def test_nothing_measured_is_neither_met_nor_missed(bare_report, make):
+    targets = evaluate(LIMITS, make.table([]), bare_report.measured, "small")
+    assert {target.met for target in targets} == {None}
+    assert len(targets) == len(LIMITS)
+    assert verdict(targets) == "No target was measured in this run."
 
 
 @pytest.mark.parametrize(("ratio", "met"), [(3.29, False), (3.3, True)])
 def test_surrogate_ratio(bare_report, make, ratio, met):
-    clean = replace(make.drive("surrogate", "none", 0.0), total_cte_m=1.0)
-    attacked = replace(make.drive("surrogate", "gradient", 0.0), total_cte_m=ratio)
-    assert (
-        verdicts(replace(bare_report, runs=(clean, attacked)))["gradient attack, surrogate: total CTE"] is met
-    )
+    table = make.table([("surrogate", "none", [1.0], [False]), ("surrogate", "gradient", [ratio], [False])])
+    assert verdicts(bare_report, table)["gradient attack, surrogate: total CTE"] is met
 
 
-@pytest.mark.parametrize(("off_track", "met"), [((True, True, False), True), ((True, False, False), False)])
+@pytest.mark.parametrize(("off_track", "met"), [([True, True, False], True), ([True, False, False], False)])
 def test_leaving_the_track_in_two_of_three(bare_report, make, off_track, met):
-    runs = tuple(
-        replace(make.drive("deployed", "gradient", 0.0, s), off_track=o) for s, o in enumerate(off_track)
-    )
-    name = "gradient attack, live: left the track"
-    assert verdicts(replace(bare_report, runs=runs))[name] is met
+    table = make.table([("deployed", "gradient", [5.0] * 3, off_track)])
+    assert verdicts(bare_report, table)["gradient attack, live: left the track"] is met
 
 
 @pytest.mark.parametrize(("ratio", "left"), [(1.4, False), (1.6, False), (1.4, True)])
 def test_random_may_neither_be_strong_nor_leave(bare_report, make, ratio, left):
-    clean = replace(make.drive("deployed", "none", 0.0), total_cte_m=1.0)
-    random = replace(make.drive("deployed", "random", 0.0), total_cte_m=ratio, off_track=left)
-    found = verdicts(replace(bare_report, runs=(clean, random)))
+    table = make.table([("deployed", "random", [ratio], [left])])
+    found = verdicts(bare_report, table)
     assert found["best random texture, live: total CTE"] is (ratio <= 1.5)
     assert found["best random texture, live: left the track"] is (not left)
 
@@ -84,33 +84,18 @@ def test_fidelity_and_laps(bare_report):
     assert found["policy without attack, live: laps"] is True
 
 
-def test_cached_stages_do_not_count_as_a_fresh_run(report):
-    name = "full setting, 2 cores"
-    report = replace(report, manifest=replace(report.manifest, wall_s=1500.0))
-    assert verdicts(report)[name] is True
-    stages = (replace(report.timings[0], cached=True), *report.timings[1:])
-    assert verdicts(replace(report, timings=stages))[name] is None
-
-
-def test_the_opening_names_every_miss(bare_report):
+def test_the_verdict_names_every_miss(bare_report, make):
     views = (FidelityView("fox photographs", 24.1, 24.1, None, None, 0.0, 0.0),)
-    limit = LiveLimit(what="fox photographs", of="psnr_full_db", at_least=26)
-    text = " ".join(opening(replace(bare_report, fidelity=Fidelity(views), limits=(limit,))))
-    assert "Missed:" in text
-    assert "fox photographs: 24.1 dB (target ≥ 26 dB)" in text
-    assert "small setting" in text
-
-
-def test_a_limit_has_one_bound_and_drives_a_method():
-    with pytest.raises(ValueError, match="one of at_least and at_most"):
-        LiveLimit(what="x", of="laps", at_least=1, at_most=2)
-    for of, method in (("ratio", ""), ("laps", "gradient")):
-        with pytest.raises(ValueError, match="expected a method with ratio"):
-            LiveLimit(what="x", of=of, method=method, at_least=1)
-
-
-def test_a_report_without_limits_says_nothing_of_targets(bare_report):
-    free = replace(bare_report, limits=())
-    assert evaluate_targets(free) == ()
+    limit = Limit(what="fox photographs", of="psnr_full_db", at_least=26)
+    measured = replace(bare_report, fidelity=Fidelity(views)).measured
+    text = verdict(evaluate([limit], NO_ROWS, measured))
+    assert text == "0 of 1 measured target was met. Missed: fox photographs: 24.1 dB (target ≥ 26 dB)."
     assert verdict(()) == ""
-    assert key_figures(free) == ()
+    assert "small setting" in " ".join(opening(bare_report, make.table([])))
+
+
+def test_limits_of_the_other_setting_and_of_what_a_table_has_not_are_left_out(bare_report):
+    full = Limit(of="laps", at_least=3, setting="full")
+    assert evaluate([full], NO_ROWS, bare_report.measured, "small") == []
+    assert len(evaluate([full], NO_ROWS, bare_report.measured, "full")) == 1
+    assert evaluate(LIMITS, NO_ROWS) == []

@@ -108,8 +108,11 @@ def test_transfer_is_predicted_from_the_search_before_any_drive(gated):
     run(gated)
     found = [each.result for each in statuses(campaign, campaign.cells) if each.result is not None]
     (pair,) = predicted(campaign.folder, found)
-    assert (pair.name, pair.measured) == ("straight_hardened_gradient_0", 3.0)
-    assert pair.ratio == pytest.approx(kept["ratio"])
+    assert pair.name == "straight_hardened_gradient_0"
+    assert pair.expected_m == pytest.approx(kept["excess_m"])
+    result = next(each for each in found if each.name == pair.name)
+    excess_m = (result.deployed.mean_m - result.deployed.none_total_cte_m[0]) / result.ticks
+    assert pair.drives_m == (pytest.approx(excess_m),)
 
 
 def test_a_search_of_other_settings_is_not_predicted_from(gated):

@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 
-from advnerf_core.report.transfer_page import text_table
+from advnerf_core.report.result_page import text_table
 from benchmarks.attack_toy import toy_problem
 from nodes.experiment.plan.cell import select
 from nodes.experiment.run.config import load_campaign

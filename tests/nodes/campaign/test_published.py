@@ -65,7 +65,7 @@ def test_a_cell_that_was_not_driven_live_is_shown_and_never_published(here, tmp_
     deployed, learned = (
         table.find("straight", "hardened", "gradient", domain) for domain in ("deployed", "surrogate")
     )
-    assert (deployed.drives, deployed.ratio, deployed.missing) == (0, None, (0, 1))
+    assert (deployed.drives, deployed.total_m, deployed.missing) == (0, None, (0, 1))
     assert learned.drives == 2
     written = publish(campaign, found, tmp_path / "kept").written
     assert set(written) == {each.cell.name for each in plan if each.cell.method == "none"}
@@ -159,7 +159,7 @@ def test_a_published_cell_whose_key_matches_is_done_on_any_machine(here, tmp_pat
     assert f"2 of 3 cells; page: {tmp_path / 'page' / 'index.html'}" in said.replace("\n", "")
     rows = list(csv.DictReader((tmp_path / "page" / "table.csv").open()))
     (attacked,) = [row for row in rows if (row["method"], row["domain"]) == ("gradient", "deployed")]
-    assert float(attacked["ratio"]) == 3.0
+    assert float(attacked["total_m"]) == 3.0 * float(attacked["plain_total_m"])
     assert not (here.folder / "table").exists()  # the page of all cells of this file
     assert run_campaign(campaign, cells, Options(here=True), lambda text: None) == []
     assert {each.text for each in statuses(campaign, cells)} == {

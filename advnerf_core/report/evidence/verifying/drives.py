@@ -10,8 +10,8 @@ import numpy as np
 from advnerf_core.report.cells import CellResult
 from advnerf_core.report.evidence.kept import Floats, KeptDrive
 from advnerf_core.report.evidence.registration import RegisteredScenario
-from advnerf_core.report.evidence.results import DOMAINS, Evidence
-from advnerf_core.report.reference import Domain
+from advnerf_core.report.evidence.results import Evidence
+from advnerf_core.report.reference import DOMAINS, Domain
 
 # Kept poses are rounded; a total of some hundred ticks then differs by less.
 _TOTAL_TOLERANCE_M = 2e-3

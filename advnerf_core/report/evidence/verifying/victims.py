@@ -12,7 +12,8 @@ import numpy as np
 from advnerf_core.files import write_atomically
 from advnerf_core.report.conditions import NONE
 from advnerf_core.report.evidence.registration import RegistrationError, read_reasons, scenario_key
-from advnerf_core.report.evidence.results import DOMAINS, Evidence
+from advnerf_core.report.evidence.results import Evidence
+from advnerf_core.report.reference import DOMAINS
 
 # In the folder of a set: victims that fail the rule, each with what its authors say about it.
 DECLARED = "set/does_not_drive_well.json"

@@ -1,3 +1,4 @@
+# ruff: noqa: RUF001 (typography for readers: multiplication signs and dashes)
 import csv
 import io
 import json
@@ -7,28 +8,29 @@ import pytest
 import yaml
 
 from advnerf_core.report.cells import CellError, CellResult, read_cell
+from advnerf_core.report.evidence.intervals import clustered_interval
+from advnerf_core.report.predictions import Predicted, prediction_section
 from advnerf_core.report.reference import Reference
-from advnerf_core.report.transfer import Wanted
-from advnerf_core.report.transfer import make_table as table_of
-from advnerf_core.report.transfer_page import (
+from advnerf_core.report.result_page import (
     as_csv,
     as_json,
     as_markdown,
     gather_clips,
     outcome_of,
-    render_transfer_page,
+    render_page,
     text_table,
 )
-from advnerf_core.report.transfer_prediction import Predicted, prediction_section, skill_of
-from advnerf_core.report.transfer_targets import table_targets
+from advnerf_core.report.result_table import Wanted, make_table
+from advnerf_core.report.targets import Target, evaluate
 
 ROOT = Path(__file__).parents[3]
 PAPER = Reference.model_validate(yaml.safe_load((ROOT / "launch" / "paper.reference.yaml").read_text()))
+TICKS = 10
 
 
-def make_table(wanted, cells, name=""):
-    """Held against what the shipped campaigns are held against."""
-    return table_of(wanted, cells, name, PAPER)
+def targets_of(table):
+    """What the shipped campaigns are held to."""
+    return evaluate(PAPER.targets, table)
 
 
 def wanted_of(cells):
@@ -51,7 +53,7 @@ def cell(scenario, method, seed, surrogate, deployed, clip=None, victim="hardene
         "seconds": 1.0,
         "machine": "m",
         "date": "2026-11-21",
-        "extra": {"clip": clip},
+        "extra": {"clip": clip, "horizon": TICKS},
     }
     for name, drives in (("surrogate", surrogate), ("deployed", deployed)):
         if drives is not None:
@@ -76,36 +78,57 @@ def table():
 def test_the_lines_by_hand(table):
     row = table.find("straight", "hardened", "gradient", "surrogate")
     assert (row.seeds, row.missing, row.drives, row.off_track) == ((0, 1), (2,), 4, 3)
-    assert row.mean_m == 12.0  # means of the seeds: 10 and 14
-    assert row.std_m == pytest.approx(8.0**0.5)
-    assert row.ratio == 4.0  # 48 over 12
-    assert (row.ratio_interval.low, row.ratio_interval.high) == (3.5, 5.0)
+    assert (row.total_m, row.plain_total_m) == (12.0, 3.0)
+    assert row.total_std_m == pytest.approx(8.0**0.5)  # of the seeds' means, 10 and 14
+    assert (row.ratio, row.mean_abs_cte_m) == (4.0, pytest.approx(1.2))
+    # Each drive against its own start, per tick: 0.7 and 0.9 of one search, 0.8 and 1.2 of the other.
+    assert row.excess.excess_m == pytest.approx(0.9)
     deployed = table.find("straight", "hardened", "gradient", "deployed")
-    assert deployed.ratio == 4.0
-    # Deployed from the first start only, so from that one in the surrogate: 16 over 4, and 21 over 6.
-    assert deployed.transfer == pytest.approx(4.0 / 3.5)
-    # Seed 0 alone: 3 over 4.5; seed 1 alone: 5 over 3.
-    assert (deployed.transfer_interval.low, deployed.transfer_interval.high) == pytest.approx(
-        (3.0 / 4.5, 5.0 / 3.0)
-    )
-    assert (deployed.paper_m, deployed.paper_std_m) == (1702, 160)
-    assert deployed.paper_ratio == pytest.approx(1702 / 1166)
+    assert deployed.excess.excess_m == pytest.approx((0.4 + 0.8) / 2)
     assert "elsewhere" not in {row.scenario for row in table.rows}
+
+
+def test_intervals_are_those_of_published_sets_and_starts_are_shared_only_if_they_are():
+    none = [2.0, 3.0, 4.0]
+    totals = [[9.0, 11.0, 15.0], [10.0, 14.0, 13.0], [12.0, 13.0, 20.0]]
+    cells = [
+        cell("left", "gradient", seed, (each, none, [True] * 3), None) for seed, each in enumerate(totals)
+    ]
+    found = make_table(wanted_of(cells), cells).rows[0].excess
+    values = [[(a - b) / TICKS for a, b in zip(each, none, strict=True)] for each in totals]
+    expected = clustered_interval(values)
+    assert (found.low_m, found.high_m, found.over) == (expected.low, expected.high, "searches and starts")
+    moved = [
+        cell("left", "gradient", seed, (each, [n + seed for n in none], [True] * 3), None)
+        for seed, each in enumerate(totals)
+    ]
+    found = make_table(wanted_of(moved), moved).rows[0].excess
+    values = [[v - seed / TICKS for v in each] for seed, each in enumerate(values)]
+    expected = clustered_interval(values, shared_starts=False)
+    assert (found.low_m, found.high_m) == pytest.approx((expected.low, expected.high))
+
+
+def test_the_excess_is_over_both_controls_where_no_object_was_driven():
+    cells = [
+        cell("left", "none", 0, ([2.0, 4.0], [2.0, 4.0], [False] * 2), None),
+        cell("left", "empty", 0, ([1.0, 2.0], [2.0, 4.0], [False] * 2), None),
+        cell("left", "gradient", 0, ([9.0, 12.0], [2.0, 4.0], [True] * 2), None),
+    ]
+    table = make_table(wanted_of(cells), cells)
+    row = table.find("left", "hardened", "gradient", "surrogate").excess
+    assert (row.excess_m, row.over_no_object_m) == (pytest.approx(0.75), pytest.approx(0.9))
+    plain = table.find("left", "hardened", "none", "surrogate").excess
+    assert (plain.excess_m, plain.over_no_object_m) == (pytest.approx(0.3), pytest.approx(0.15))
+    assert "(mean abs. CTE 0.300)" in as_markdown(table)
 
 
 def test_what_was_not_run_is_missing_and_never_a_number(table):
     row = table.find("straight", "hardened", "none", "deployed")
-    assert (row.mean_m, row.ratio, row.std_m, row.transfer, row.missing) == (
-        None,
-        None,
-        None,
-        None,
-        (0, 1, 2),
-    )
+    assert (row.total_m, row.ratio, row.total_std_m, row.excess) == (None, None, None, None)
+    assert row.missing == (0, 1, 2)
     assert "missing" in as_markdown(table)
-    assert "from the same starts" in as_markdown(table)
     line = next(r for r in csv.DictReader(io.StringIO(as_csv(table))) if r["method"] == "none")
-    assert line["mean_m"] == line["ratio"] == ""
+    assert line["total_m"] == line["excess_m"] == ""
     assert line["missing"] == "0 1 2"
     text_table(table).rich()  # its columns agree
 
@@ -114,23 +137,31 @@ def test_a_cell_without_deployment_counts_in_the_surrogate_only():
     half = cell("left", "gradient", 0, ([9.0], [3.0], [True]), None)
     rows = make_table(wanted_of([half]), [half]).rows
     assert [row.ratio for row in rows] == [3.0, None]
-    assert rows[1].transfer is None
+
+
+def test_a_cell_that_does_not_know_its_ticks_has_totals_and_no_excess():
+    old = cell("left", "gradient", 0, ([9.0], [3.0], [True]), None).model_copy(update={"extra": {}})
+    row = make_table(wanted_of([old]), [old]).rows[0]
+    assert (row.total_m, row.excess, row.mean_abs_cte_m) == (9.0, None, None)
 
 
 def test_targets_are_met_missed_or_not_measured(table):
-    found = {(t.method, t.domain): t for t in table_targets(table)}
+    found = {t.what: t for t in targets_of(table)}
     # A seed of each is missing: a value, and no verdict.
     assert {t.met for t in found.values()} == {None}
-    assert found["gradient", "surrogate"].value == 4.0
-    assert found["gradient", "surrogate"].verdict == "2 seed(s) so far"
+    learned = "straight, gradient, surrogate: total CTE"
+    assert found[learned].value == 4.0
+    assert found[learned].verdict == "2 seed(s) so far"
     whole = make_table(wanted_of(table.cells.values()), table.cells.values())
-    found = {(t.method, t.domain): t for t in table_targets(whole)}
-    assert found["gradient", "surrogate"].met
-    assert found["gradient", "deployed"].met
-    random = found["random", "deployed"]
+    found = {t.what: t for t in targets_of(whole)}
+    assert found[learned].met
+    assert found["straight, gradient, deployed: total CTE"].met
+    random = found["straight, best random, deployed: total CTE"]
     assert (random.value, random.met) == (1.4, False)
     assert random.verdict == "missed by 17 %"
-    empty = {t.verdict for t in table_targets(make_table(WANTED, []))}
+    assert (random.target, random.paper) == ("≤ 1.2 × plain object", "1193 ± 19, 1.02 ×")
+    assert Target(**json.loads(json.dumps(random.record()))) == random
+    empty = {t.verdict for t in targets_of(make_table(WANTED, []))}
     assert empty == {"not measured"}
 
 
@@ -143,21 +174,22 @@ def test_the_live_scenarios_have_targets_of_their_own():
         for seed in (0, 1)
     ]
     cells.append(cell("green_screen", "random", 0, ([2.0], [2.0], [False]), ([2.0], [2.0], [True])))
-    found = {(t.scenario, t.method, t.what): t for t in table_targets(make_table(wanted_of(cells), cells))}
-    assert found["monitor", "gradient", "share of drives off the track"].met
-    spread = found["green_screen", "gradient", "std / mean"]
+    found = {t.what: t for t in targets_of(make_table(wanted_of(cells), cells))}
+    assert found["monitor, gradient, deployed: share of drives off the track"].met
+    spread = found["green_screen, gradient, deployed: std / mean"]
     assert spread.value == pytest.approx(50**0.5 / 10.0)
     assert spread.met is False
-    assert found["green_screen", "random", "drives off the track"].met is False
+    assert found["green_screen, best random, deployed: drives off the track"].met is False
 
 
 def test_json_and_page_hold_the_same_numbers(table):
-    data = json.loads(json.dumps(as_json(table), allow_nan=False))
+    data = json.loads(json.dumps(as_json(table, targets_of(table)), allow_nan=False))
     assert len(data["rows"]) == 6
     assert data["targets"][0]["value"] == 4.0
     assert set(data["cells"]) == set(table.cells)
-    page = render_transfer_page(table)
-    assert "4.00" in page
+    page = render_page(table, targets=targets_of(table))
+    assert "0.900" in page
+    assert "4.00 × plain object" in page
     assert "missing" in page
     assert "http" not in page.replace("http-equiv", "")
 
@@ -211,24 +243,18 @@ def test_a_bad_cell_is_one_clear_error(tmp_path, damage, says):
         read_cell(file)
 
 
-def test_the_skill_of_predictions_by_hand():
+def test_predictions_are_scored_by_hand():
     pairs = [
-        Predicted("a", "gradient", 8.0, 7.0, 9.0, 4.0, 1.0, 8.0, 4.0, 12.0, 12.0),
-        Predicted("b", "random", 1.0, 0.9, 1.1, 1.0, 1.0, 2.0, 2.0, 1.6, 2.0),
-        Predicted("c", "cem", 3.0, 2.0, 4.0, 1.2, 1.0, 3.0, 3.0, 1.2, 3.0),
+        Predicted("a", "gradient", 0.4, 0.3, 0.5, 1.0, 0.6, (0.35, 0.45)),
+        Predicted("b", "random", 0.1, 0.0, 0.2, 0.8, 0.1, (0.3,)),
     ]
-    skill = skill_of(pairs)
-    assert (skill.count, skill.right) == (3, 2)
-    assert skill.factor == pytest.approx(2.0)  # factors 2, 1, 2.5
-    assert skill.factor_total == pytest.approx(1.0)
-    assert skill.rank_correlation == pytest.approx(1.0)
-    # What the search's own drives in the surrogate say: factors 3, 1.6, 1; ranks 3, 2, 1 of 3, 1, 2.
-    plain = skill_of([pair.unpredicted for pair in pairs])
-    assert plain.factor == pytest.approx(1.6)
-    assert plain.rank_correlation == pytest.approx(0.5)
-    assert plain.right == 2
-    assert "2 of 3 rightly said" in prediction_section(pairs)
-    assert "would be off by 1.60 and 1.00, rank correlation 0.50, 2 of 3 right" in prediction_section(pairs)
+    section = prediction_section(pairs)
+    # Two of three are within; the third is 0.1 outside: its score is 0.2 + 10 x 0.1, that of the others their width of 0.2.
+    assert "2 of 3 drives are within their 80 % bands" in section
+    assert "interval score is 0.533 m per tick" in section
+    # Expected is off by 0 and 0.2, the learned scene by 0.2 and 0.2.
+    assert "off by 0.100 m in the median" in section
+    assert "would be off by 0.200 m" in section
     assert "No attack was both" in prediction_section([])
 
 
@@ -238,15 +264,38 @@ def test_the_skill_of_predictions_by_hand():
         ({"method": "gradient"}, "one of at_least, at_most and above, got 0"),
         ({"method": "gradient", "at_least": 1, "above": "random"}, "got 2"),
         ({"method": "gradient", "at_least": 1, "of": "luck"}, "of"),
+        ({"of": "ratio", "at_least": 1}, "expected a method with excess_m"),
+        ({"of": "laps", "method": "gradient", "at_least": 1}, "and with nothing else, got laps of gradient"),
     ],
 )
 def test_a_limit_that_says_nothing_or_two_things_is_refused(limit, says):
     with pytest.raises(ValueError, match=says):
-        Reference.model_validate({"targets": {"straight": [limit]}})
+        Reference.model_validate({"targets": [limit]})
 
 
-def test_without_a_reference_there_is_neither_paper_nor_target(table):
-    bare = table_of(WANTED, table.cells.values())
-    assert table_targets(bare) == []
-    assert {row.paper_m for row in bare.rows} == {None}
-    assert "Targets" not in render_transfer_page(bare)
+def test_a_method_must_exceed_another_one_not_equal_it():
+    limits = Reference.model_validate(
+        {"targets": [{"method": "gradient", "of": "excess_m", "above": "random"}]}
+    )
+    for gradient_m, met in ((6.0, True), (4.0, False), (3.0, False)):
+        cells = [
+            cell("left", name, 0, ([1.0], [1.0], [False]), ([total], [1.0], [False]))
+            for name, total in (("random", 4.0), ("gradient", gradient_m))
+        ]
+        (target,) = evaluate(limits.targets, make_table(wanted_of(cells), cells))
+        assert (target.target, target.met) == ("> random 0.30", met)
+    alone = make_table(wanted_of(cells[1:]), cells[1:])
+    assert [target.met for target in evaluate(limits.targets, alone)] == [None]
+
+
+def test_without_limits_there_are_no_targets(table):
+    assert "Targets" not in render_page(table)
+    assert "Targets" not in as_markdown(table)
+
+
+def test_a_cell_that_was_not_driven_live_is_named_first():
+    late = cell("left", "gradient", 0, ([9.0], [3.0], [True]), None)
+    late = late.model_copy(update={"not_driven_live": "the stack stopped the car"})
+    page = render_page(make_table(wanted_of([late]), [late]), lead=("What was done.",))
+    assert page.index("NOT DRIVEN LIVE: gradient (hardened, seed 0)") < page.index("What was done.")
+    assert "are no evidence of transfer" in page

@@ -1,6 +1,4 @@
-"""The transfer table to look at: in the terminal, as CSV, Markdown and JSON, and as a page with the drives' clips."""
-
-# ruff: noqa: RUF001 (typography for readers: multiplication signs and dashes)
+"""The table of results to look at: in the terminal, as CSV, Markdown and JSON, and as a page with the drives' clips."""
 
 from __future__ import annotations
 
@@ -19,15 +17,15 @@ from markupsafe import Markup
 
 from advnerf_core.report.cells import CellResult
 from advnerf_core.report.conditions import NONE, style_of
+from advnerf_core.report.evidence.words import DOMAIN_TITLES, collisions, excess_cells
 from advnerf_core.report.palette import look_css
-from advnerf_core.report.statistics import Interval
-from advnerf_core.report.tables import Table, number, spread
-from advnerf_core.report.transfer import TableRow, TransferTable
-from advnerf_core.report.transfer_targets import TableTarget, table_targets
+from advnerf_core.report.result_table import ResultTable, TableRow
+from advnerf_core.report.targets import Target, target_table, verdict
+from advnerf_core.report.text_table import Table, number
 
-SCHEMA = "advnerf-transfer/1"
+SCHEMA = "advnerf-results/2"
 STRAYED_FROM = 1.5
-_LEAD = "Total cross-track error of every scenario, victim and method, in the learned scene and where it is deployed."
+_LEAD = "Every scenario, victim and method, in the learned scene and where it is deployed."
 OUTCOMES = (LEFT, RAN_INTO, STRAYED, HELD) = (
     "left the track",
     "ran into something",
@@ -40,12 +38,11 @@ _EXPLAINED = {
     STRAYED: f"Total CTE at least {STRAYED_FROM:g} times that of the same drive without attack, on the track.",
     HELD: "None of these; drives without attack belong here.",
 }
-_MISSING = "missing"
 LEGEND = (
-    "Total CTE [m]: mean over seeds ± standard deviation over seeds. × no attack: ratio of sums to the same starts without attack in the same domain. "
-    "Transfer: deployed ratio over surrogate ratio, from the same starts. 95 %: percentile bootstrap over seeds; of three seeds that is their range. "
-    "Seeds, and victims, may be of several builds of scene and policies: each cell's JSON has their digests, as far as they were kept. "
-    "Paper: its totals have units of their own per scenario, and its ratios are all to its deployed drive without attack."
+    "Total CTE: mean over all drives, and past the plain object from the same starts. Excess: mean |CTE| per tick minus that of a control from "
+    "the same start, past the plain object or with no object; the row of the plain object has its mean |CTE|. Intervals are nominal 95 % over "
+    "searches and starts, where there are enough. Seeds, and victims, may be of several builds of scene and policies: each cell's JSON has their "
+    "digests, as far as they were kept."
 )
 
 
@@ -77,149 +74,108 @@ def outcome_of(cell: CellResult) -> str:
     drives = cell.deployed or cell.surrogate
     if any(drives.off_track):
         return LEFT
-    if ran_into_something(cell):
+    if any(cell.obstacles("deployed")):
         return RAN_INTO
     strayed = sum(drives.total_cte_m) >= STRAYED_FROM * sum(drives.none_total_cte_m)
     return STRAYED if strayed and cell.method != NONE else HELD
 
 
-def ran_into_something(cell: CellResult) -> bool:
-    """Whether a deployed drive of a cell was held by an obstacle (``blocked_tick`` of its extra, one for each drive)."""
-    return cell.deployed is not None and any(tick is not None for tick in cell.extra.get("blocked_tick", []))
-
-
-def text_table(table: TransferTable) -> Table:
+def text_table(table: ResultTable) -> Table:
     """All lines as text."""
     columns = (
         "scenario",
         "victim",
         "object shows",
-        "domain",
+        "driven in",
         "seeds",
-        "total CTE",
-        "× no attack",
+        "total CTE [m]",
+        "plain object [m]",
+        "excess [m per tick]",
         "95 %",
-        "transfer",
-        "95 %",
-        "off-track",
-        "paper",
-        "paper ×",
+        "over no object",
+        "95 % of it",
+        "off track",
+        "collided",
     )
     cells, groups, classes = [], [], []
+    last: TableRow | None = None
     for index, row in enumerate(table.rows):
-        last = table.rows[index - 1] if index else None
-        new_scenario = last is None or (row.scenario, row.placement) != (last.scenario, last.placement)
-        new_victim = new_scenario or (last is not None and row.victim != last.victim)
+        new_scenario = last is None or row.key[:2] != last.key[:2]
+        new_victim = last is None or row.key[:3] != last.key[:3]
         if new_victim:
             groups.append(index)
         where = f"{row.scenario}, {row.placement}" if row.placement else row.scenario
         name = style_of(row.method).title if row.domain == "surrogate" else ""
         cells.append((where if new_scenario else "", row.victim if new_victim else "", name, *_numbers(row)))
         classes.append(row.method if row.seeds else "unmeasured")
+        last = row
     right = (False, False, False, False, *[True] * 9)
-    return Table("Transfer", columns, tuple(cells), right, tuple(groups), tuple(classes))
+    return Table("Results", columns, tuple(cells), right, tuple(groups), tuple(classes))
+
+
+def not_driven(table: ResultTable) -> str:
+    """Which cells live nodes could not drive, and what that means; empty if all were driven."""
+    missing = [cell for cell in table.cells.values() if cell.not_driven_live]
+    if not missing:
+        return ""
+    arms = ", ".join(f"{style_of(cell.method).title} ({cell.victim}, seed {cell.seed})" for cell in missing)
+    return (
+        f"NOT DRIVEN LIVE: {arms}. Load or a fault of the stack spoiled every try, at last: {missing[-1].not_driven_live}. These arms have only "
+        "the synchronous drives in the learned scene, which are no evidence of transfer. On a machine without other load, give the command "
+        "again with --retry."
+    )
 
 
 def _numbers(row: TableRow) -> tuple[str, ...]:
-    seeds = f"{len(row.seeds)} of {len(row.seeds) + len(row.missing)}"
+    begin = DOMAIN_TITLES[row.domain], f"{len(row.seeds)} of {len(row.seeds) + len(row.missing)}"
     if not row.seeds:
-        return (
-            row.domain,
-            seeds,
-            _MISSING,
-            "",
-            "",
-            "",
-            "",
-            "",
-            spread(row.paper_m, row.paper_std_m, 0),
-            number(row.paper_ratio),
-        )
-    return (
-        row.domain,
-        seeds,
-        spread(row.mean_m, row.std_m),
-        number(row.ratio),
-        _interval(row.ratio_interval),
-        "" if row.domain == "surrogate" or row.method == NONE else number(row.transfer),
-        "" if row.method == NONE else _interval(row.transfer_interval),
-        f"{row.off_track} of {row.drives}",
-        spread(row.paper_m, row.paper_std_m, 0),
-        number(row.paper_ratio),
-    )
+        return (*begin, "missing", *[""] * 7)
+    total = number(row.total_m) + ("" if row.total_std_m is None else f" ± {row.total_std_m:.2f}")
+    excess = excess_cells(vars(row.excess)) if row.excess else ("", "", "", "")
+    hit = collisions(row.excess.collided) if row.excess else ""
+    return (*begin, total, number(row.plain_total_m), *excess, f"{row.off_track} of {row.drives}", hit)
 
 
-def _interval(interval: Interval | None) -> str:
-    return "" if interval is None else f"{interval.low:.2f} – {interval.high:.2f}"
-
-
-def target_table(targets: Sequence[TableTarget]) -> Table:
-    """The targets as text."""
-    cells = tuple(
-        (
-            t.scenario,
-            style_of(t.method).title,
-            t.domain,
-            t.what,
-            t.target,
-            number(t.value),
-            str(t.seeds),
-            t.verdict,
-        )
-        for t in targets
-    )
-    classes = tuple({True: "met", False: "missed", None: "unmeasured"}[t.met] for t in targets)
-    columns = ("scenario", "object shows", "domain", "what", "target", "measured", "seeds", "verdict")
-    return Table(
-        "Targets", columns, cells, (False, False, False, False, True, True, True, False), classes=classes
-    )
-
-
-def as_json(table: TransferTable) -> dict[str, Any]:
+def as_json(table: ResultTable, targets: Sequence[Target] = ()) -> dict[str, Any]:
     """Lines, targets and cells as JSON-ready values."""
     return {
         "schema": SCHEMA,
         "name": table.name,
         "rows": [row.record() for row in table.rows],
-        "targets": [target.record() for target in table_targets(table)],
+        "targets": [target.record() for target in targets],
         "cells": {name: cell.model_dump(mode="json") for name, cell in table.cells.items()},
     }
 
 
-def as_csv(table: TransferTable) -> str:
+def as_csv(table: ResultTable) -> str:
     """The lines, one column per number; empty where there is none."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    plain = [name for name in TableRow.__dataclass_fields__ if not name.endswith("_interval")]
-    ends = ("ratio_low", "ratio_high", "transfer_low", "transfer_high")
-    writer.writerow([*plain, *ends])
-    for row in table.rows:
-        values = [getattr(row, name) for name in plain]
-        intervals = [row.ratio_interval, row.transfer_interval]
-        bounds = [value for each in intervals for value in ((each.low, each.high) if each else ("", ""))]
-        writer.writerow([_field(value) for value in (*values, *bounds)])
+    records = [row.record() for row in table.rows]
+    columns = list(records[0] if records else {})
+    writer.writerow(columns)
+    for record in records:
+        writer.writerow([_field(record[name]) for name in columns])
     return stream.getvalue()
 
 
 def _field(value: Any) -> Any:
     if isinstance(value, tuple):
         return " ".join(map(str, value))
+    if isinstance(value, dict):
+        return " ".join(f"{name}:{count}" for name, count in value.items())
     return "" if value is None else value
 
 
-def as_markdown(table: TransferTable) -> str:
+def as_markdown(table: ResultTable, targets: Sequence[Target] = ()) -> str:
     """Lines and targets as a Markdown page."""
-    parts = (
-        f"# {table.name or 'Transfer table'}\n",
-        f"{LEGEND}\n",
-        text_table(table).markdown(),
-        "## Targets\n",
-        target_table(table_targets(table)).markdown(),
-    )
+    parts = [f"# {table.name or 'Results'}\n", f"{LEGEND}\n", text_table(table).markdown()]
+    if targets:
+        parts += ["## Targets\n", target_table(targets).markdown()]
     return "\n".join(parts)
 
 
-def gather_clips(table: TransferTable, cells_folder: Path, page_folder: Path) -> list[ShownClip]:
+def gather_clips(table: ResultTable, cells_folder: Path, page_folder: Path) -> list[ShownClip]:
     """Put the cells' clips beside the page, in one folder per outcome; as links of the same file where the disk has them.
 
     Args:
@@ -245,23 +201,12 @@ def gather_clips(table: TransferTable, cells_folder: Path, page_folder: Path) ->
     return shown
 
 
-def _targets_html(table: TransferTable) -> Markup:
-    """The targets of a table with their caption; empty where it has none."""
-    found = table_targets(table)
-    if not found:
-        return Markup("")
-    caption = "Held against the hardened victim, for whom random textures are a fair baseline; places against the retrained one."
-    return Markup('<p class="caption">{}</p><div class="verdicts">{}</div>').format(
-        caption, target_table(found).html()
-    )
-
-
-def render_transfer_page(
-    table: TransferTable,
+def render_page(
+    table: ResultTable,
     clips: Sequence[ShownClip] = (),
     sections: Sequence[tuple[str, Markup]] = (),
     lead: Sequence[str | Markup] = (),
-    targets: Markup | None = None,
+    targets: Sequence[Target] = (),
 ) -> str:
     """The page as HTML text; it loads nothing but the clips beside it.
 
@@ -270,7 +215,7 @@ def render_transfer_page(
         clips: Clips beside the page.
         sections: Further parts: heading and HTML.
         lead: Paragraphs, or HTML, before the table; none: what such a table is.
-        targets: Instead of those of the table.
+        targets: What it is held to.
     """
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -279,12 +224,15 @@ def render_transfer_page(
     template = environment.from_string(resources.joinpath("page.html").read_text(encoding="utf-8"))
     groups = [(name, _EXPLAINED[name], [clip for clip in clips if clip.outcome == name]) for name in OUTCOMES]
     return template.render(
-        name=table.name or "Transfer table",
+        name=table.name or "Results",
         legend=LEGEND,
         style=Markup(resources.joinpath("page.css").read_text(encoding="utf-8")),
         look=Markup(look_css()),
         table=text_table(table).html(),
-        targets=targets or _targets_html(table),
+        targets=target_table(targets).html() if targets else "",
+        headlines=[target for target in targets if target.headline],
+        verdict=verdict(targets),
+        not_driven=not_driven(table),
         lead=lead or (_LEAD,),
         missing=sum(len(row.missing) for row in table.rows if row.domain == "surrogate"),
         cells=len(table.cells),

@@ -1,0 +1,175 @@
+"""The one row of results: a method against a victim in one domain, in metres per tick over both controls, with intervals."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from advnerf_core.report.cells import CellResult, cell_name
+from advnerf_core.report.conditions import EMPTY, NONE
+from advnerf_core.report.evidence.intervals import LEVEL, ClusteredInterval, clustered_interval
+from advnerf_core.report.evidence.outcome import Outcome
+from advnerf_core.report.reference import Domain
+
+Key = tuple[str, str, str, str]  # scenario, placement, victim, method
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method against one victim in one domain, over its searches and their starts.
+
+    Attributes:
+        scenario: Name of the scenario.
+        placement: Name of the placement.
+        victim: Which policy.
+        method: Which search, or ``none``.
+        domain: surrogate or deployed.
+        searches: Number of searches.
+        drives: Number of drives.
+        excess_m: Mean excess |CTE| per tick over the plain object [m]; of ``none`` its mean |CTE|.
+        low_m: Lower end of its interval [m]; None where there are too few drives.
+        high_m: Upper end [m].
+        over_no_object_m: Mean excess over no object [m]; None where no drive without object was made, and of these drives themselves.
+        over_no_object_low_m: Lower end of its interval [m].
+        over_no_object_high_m: Upper end [m].
+        over: What the interval is over.
+        off_track: Drives that left the track.
+        collided: Drives that ended in a collision, by what the car ran into.
+        off_lane_share: Share of all ticks off the track; None where only totals are kept.
+        leaving_s: Median time to leaving the track of the drives that left it [s].
+        registered: Whether all its cells were registered; else it is exploration.
+    """
+
+    scenario: str
+    placement: str
+    victim: str
+    method: str
+    domain: Domain
+    searches: int
+    drives: int
+    excess_m: float
+    low_m: float | None
+    high_m: float | None
+    over_no_object_m: float | None
+    over_no_object_low_m: float | None
+    over_no_object_high_m: float | None
+    over: str
+    off_track: int
+    collided: dict[str, int]
+    off_lane_share: float | None
+    leaving_s: float | None
+    registered: bool
+
+
+class CellDrives:
+    """Outcomes of the drives of cells, from the totals in them. `Evidence` computes them from kept poses.
+
+    Args:
+        cells: The cells.
+    """
+
+    level = LEVEL
+
+    def __init__(self, cells: Iterable[CellResult]) -> None:
+        self.cells = {cell.name: cell for cell in cells}
+
+    def searches(self, key: Key) -> list[CellResult]:
+        """The cells of one method against one victim, by seed."""
+        return sorted((cell for cell in self.cells.values() if cell.key == key), key=lambda cell: cell.seed)
+
+    def without(self, cell: CellResult, control: str = NONE) -> CellResult | None:
+        """The cell of the same drives past a control: the plain object (``none``) or no object (``empty``)."""
+        return self.cells.get(cell_name(cell.scenario, cell.victim, control, 0, cell.placement))
+
+    def is_registered(self, cell: CellResult) -> bool:
+        """Whether a cell was registered."""
+        return False
+
+    def has(self, cell: CellResult, domain: Domain) -> bool:
+        """Whether a cell was driven in a domain."""
+        return cell.drives(domain) is not None
+
+    def share_starts(self, cells: Sequence[CellResult], domain: Domain) -> bool:
+        """Whether the drives of all cells begin at the same starts; then those without attack are the same drives."""
+        return len({driven.none_total_cte_m for cell in cells if (driven := cell.drives(domain))}) == 1
+
+    def mean_ctes_m(self, cell: CellResult, domain: Domain) -> list[float]:
+        """Mean |CTE| of each drive of a cell [m]; none where the number of ticks is not known."""
+        driven = cell.drives(domain)
+        return [total / cell.ticks for total in driven.total_cte_m] if driven and cell.ticks else []
+
+    def outcomes(self, cell: CellResult, domain: Domain, control: str = NONE) -> list[Outcome]:
+        """Outcomes of the drives of a cell, each against the drive past a control from the same start; none without such drives."""
+        driven, clean = cell.drives(domain), self.without(cell, control)
+        against = clean.drives(domain) if clean else None
+        if driven is None or not cell.ticks or (control != NONE and against is None):
+            return []
+        # A cell has the drives past the plain object in itself.
+        totals_m = driven.none_total_cte_m if control == NONE or against is None else against.total_cte_m
+        return [
+            Outcome((attacked - other) / cell.ticks, off_track, hit, None, None)
+            for attacked, other, off_track, hit in zip(
+                driven.total_cte_m, totals_m, driven.off_track, cell.obstacles(domain), strict=False
+            )
+        ]
+
+
+def make_row(drives: CellDrives, key: Key, domain: Domain) -> Row | None:
+    """The row of one method against one victim; None where nothing was driven, or nothing that it can be compared with."""
+    cells = [cell for cell in drives.searches(key) if drives.has(cell, domain)]
+    outcomes = [drives.outcomes(cell, domain) for cell in cells]
+    if not cells or not all(outcomes):
+        return None
+    # The excess of the plain object over itself is zero: its row says what the others are an excess over.
+    values = [
+        drives.mean_ctes_m(cell, domain) if cell.method == NONE else _excesses_m(found)
+        for cell, found in zip(cells, outcomes, strict=True)
+    ]
+    shared = drives.share_starts(cells, domain)
+    interval = _interval(drives, values, shared)
+    bare = _over_no_object_m(drives, cells, domain)
+    bare_interval = _interval(drives, bare, shared) if bare else None
+    flat = [outcome for found in outcomes for outcome in found]
+    leaving = [outcome.time_to_leaving_s for outcome in flat if outcome.time_to_leaving_s is not None]
+    shares = [outcome.share_off_lane for outcome in flat if outcome.share_off_lane is not None]
+    return Row(
+        *key,
+        domain,
+        searches=len(cells),
+        drives=len(flat),
+        excess_m=_mean(values),
+        low_m=interval.low if interval else None,
+        high_m=interval.high if interval else None,
+        over_no_object_m=_mean(bare) if bare else None,
+        over_no_object_low_m=bare_interval.low if bare_interval else None,
+        over_no_object_high_m=bare_interval.high if bare_interval else None,
+        over=interval.over if interval else "",
+        off_track=sum(outcome.off_track for outcome in flat),
+        collided=dict(sorted(Counter(filter(None, (outcome.collided_with for outcome in flat))).items())),
+        off_lane_share=float(np.mean(shares)) if shares else None,
+        leaving_s=float(np.median(leaving)) if leaving else None,
+        registered=all(drives.is_registered(cell) for cell in cells),
+    )
+
+
+def _excesses_m(outcomes: Sequence[Outcome]) -> list[float]:
+    return [outcome.excess_cte_m_per_tick for outcome in outcomes]
+
+
+def _over_no_object_m(drives: CellDrives, cells: Sequence[CellResult], domain: Domain) -> list[list[float]]:
+    """Excess of each drive over no object, by cell; empty where a cell has no drives to compare with, or is the control itself."""
+    found = [drives.outcomes(cell, domain, EMPTY) for cell in cells if cell.method != EMPTY]
+    return [_excesses_m(outcomes) for outcomes in found] if all(found) else []
+
+
+def _mean(values: Sequence[Sequence[float]]) -> float:
+    return float(np.mean([np.mean(each) for each in values]))
+
+
+def _interval(
+    drives: CellDrives, values: Sequence[Sequence[float]], shared: bool
+) -> ClusteredInterval | None:
+    return clustered_interval(values, drives.level, shared and len({len(each) for each in values}) == 1)

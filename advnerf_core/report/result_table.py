@@ -1,0 +1,165 @@
+"""The table of results: every scenario, victim and method, in the surrogate and deployed, from finished cells.
+
+A row has totals and the excess in metres over both controls; `evidence.rows` computes it as for published sets. What was not run is
+missing, and says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from advnerf_core.report.cells import CellResult
+from advnerf_core.report.evidence.rows import CellDrives, Key, Row, make_row
+from advnerf_core.report.reference import DOMAINS, Domain
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """A row that a table should have, and how many seeds.
+
+    Attributes:
+        scenario: Name of the scenario.
+        placement: Name of the placement; empty for the scenario's own.
+        victim: Which policy.
+        method: Which search.
+        seeds: Its seeds.
+    """
+
+    scenario: str
+    placement: str
+    victim: str
+    method: str
+    seeds: tuple[int, ...]
+
+    @property
+    def key(self) -> Key:
+        """The same without seeds."""
+        return self.scenario, self.placement, self.victim, self.method
+
+
+@dataclass(frozen=True)
+class TableRow:
+    """One line of the table: all seeds of a scenario, victim and method in one domain. None where nothing was run.
+
+    Attributes:
+        scenario: Name of the scenario.
+        placement: Name of the placement.
+        victim: Which policy.
+        method: Which search.
+        domain: surrogate or deployed.
+        seeds: Seeds that are there.
+        missing: Seeds that are not.
+        drives: Number of drives.
+        off_track: Drives that left the track.
+        total_m: Mean total CTE [m].
+        total_std_m: Standard deviation over seeds of their mean totals [m]; None of one seed.
+        plain_total_m: Mean total CTE from the same starts past the plain object [m].
+        ticks: Control ticks of a drive; 0 where the cells do not say.
+        excess: Excess per tick over both controls; None where the ticks are not known.
+    """
+
+    scenario: str
+    placement: str
+    victim: str
+    method: str
+    domain: Domain
+    seeds: tuple[int, ...]
+    missing: tuple[int, ...]
+    drives: int = 0
+    off_track: int = 0
+    total_m: float | None = None
+    total_std_m: float | None = None
+    plain_total_m: float | None = None
+    ticks: int = 0
+    excess: Row | None = None
+
+    @property
+    def key(self) -> Key:
+        """Scenario, placement, victim and method."""
+        return self.scenario, self.placement, self.victim, self.method
+
+    @property
+    def ratio(self) -> float | None:
+        """Total CTE over that past the plain object."""
+        return self.total_m / self.plain_total_m if self.total_m is not None and self.plain_total_m else None
+
+    @property
+    def spread(self) -> float | None:
+        """Standard deviation over mean of the total CTE."""
+        return self.total_std_m / self.total_m if self.total_std_m is not None and self.total_m else None
+
+    @property
+    def mean_abs_cte_m(self) -> float | None:
+        """Mean |CTE| per tick [m]."""
+        return self.total_m / self.ticks if self.total_m is not None and self.ticks else None
+
+    def record(self) -> dict[str, Any]:
+        """JSON-ready values, those of the excess among them."""
+        own = {name: value for name, value in asdict(self).items() if name != "excess"}
+        excess = vars(self.excess) if self.excess else dict.fromkeys(Row.__dataclass_fields__)
+        return {**excess, **own}
+
+
+@dataclass(frozen=True)
+class ResultTable:
+    """All lines, and the cells they came from.
+
+    Attributes:
+        rows: The lines, in the order asked for.
+        cells: The cells, by name.
+        name: Name of the experiment or campaign.
+    """
+
+    rows: tuple[TableRow, ...]
+    cells: dict[str, CellResult] = field(default_factory=dict)
+    name: str = ""
+
+    def find(
+        self, scenario: str, victim: str, method: str, domain: Domain, placement: str = ""
+    ) -> TableRow | None:
+        """One line; None where it was not asked for."""
+        key = (scenario, placement, victim, method)
+        return next((row for row in self.rows if row.key == key and row.domain == domain), None)
+
+    def cells_of(self, row: TableRow) -> list[CellResult]:
+        """The cells that a line sums up."""
+        return [cell for cell in self.cells.values() if cell.key == row.key]
+
+
+def make_table(wanted: Sequence[Wanted], cells: Iterable[CellResult], name: str = "") -> ResultTable:
+    """Sum cells up.
+
+    Args:
+        wanted: What the table should have; it says what is missing.
+        cells: What is there; cells that were not asked for are left out.
+        name: Name of the experiment or campaign.
+    """
+    seeds = {want.key: want.seeds for want in wanted}
+    drives = CellDrives(cell for cell in cells if cell.seed in seeds.get(cell.key, ()))
+    rows = tuple(_row(want, drives, domain) for want in wanted for domain in DOMAINS)
+    return ResultTable(rows, drives.cells, name)
+
+
+def _row(want: Wanted, drives: CellDrives, domain: Domain) -> TableRow:
+    found = [(cell, driven) for cell in drives.searches(want.key) if (driven := cell.drives(domain))]
+    seeds = tuple(cell.seed for cell, _ in found)
+    missing = tuple(seed for seed in want.seeds if seed not in seeds)
+    row = TableRow(*want.key, domain, seeds, missing)
+    if not found:
+        return row
+    totals = [total for _, driven in found for total in driven.total_cte_m]
+    by_seed = [driven.mean_m for _, driven in found]
+    return replace(
+        row,
+        drives=len(totals),
+        off_track=sum(sum(driven.off_track) for _, driven in found),
+        total_m=float(np.mean(totals)),
+        total_std_m=float(np.std(by_seed, ddof=1)) if len(by_seed) > 1 else None,
+        plain_total_m=float(np.mean([total for _, driven in found for total in driven.none_total_cte_m])),
+        ticks=found[0][0].ticks,
+        excess=make_row(drives, want.key, domain),
+    )
