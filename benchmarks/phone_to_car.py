@@ -28,7 +28,6 @@ from advnerf_core.scene.train import TrainConfig, train_scene
 from benchmarks.lab_recordings import lab_with_phone, photograph, record_drive
 from benchmarks.results import record_row
 from benchmarks.structure_from_motion import say
-from calibration.phone_and_car import PlacingConfig
 from calibration.structure_from_motion import SfmConfig
 from hardware.worlds.lab.lab import Lab
 from hardware.worlds.lab.phone import video_poses
@@ -96,7 +95,7 @@ def make_scene(folder: Path, frames: int, steps: int) -> tuple[Path, str]:
         MediaConfig(KeyframeConfig()),
         BagConfig(0.15, math.radians(8.0)),
         SfmConfig(),
-        PlacingConfig(),
+        0.08,
         say,
     )
     placing, model = imported.report["placing"], imported.report["structure_from_motion"]

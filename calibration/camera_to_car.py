@@ -32,10 +32,24 @@ from calibration.degeneracy import (
     rotation_spread,
 )
 from calibration.measured import LensCalibration, rows_of
-from calibration.mount_problem import MountConfig, MountProblem
+from calibration.mount_problem import MountProblem
 from calibration.schema import CameraCalibration
 
 _CONTRADICTION = "did car and board stand still at the stamps, and is the subject the one the camera is on?"
+# Fewer agreeing views are refused.
+_MIN_VIEWS = 10
+# With an unknown pattern pose, the root mean square turn about the second axis must reach this [rad].
+_LEAST_SECOND_AXIS_RAD = 0.08
+# Number of robust standard deviations from the mean beyond which a view is excluded.
+_OUTLIER_FACTOR = 6.0
+# With a larger share left out the set is refused.
+_MOST_SHARE_LEFT_OUT = 0.4
+# A larger reprojection error through the whole chain is refused [px].
+_MOST_RMS_PX = 2.0
+# With a larger median angle between the views' mounting poses and their mean the set is refused [rad].
+_MOST_MEDIAN_RAD = 0.05
+# Or a larger median distance [m].
+_MOST_MEDIAN_M = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +119,6 @@ def calibrate_mount(
     views: Sequence[MountView],
     camera: LensCalibration,
     T_board_from_pattern: ArrayLike | None = None,
-    config: MountConfig | None = None,
 ) -> MountFit:
     """Find the mounting pose of the camera.
 
@@ -113,13 +126,11 @@ def calibrate_mount(
         views: Moments at which everything stood still; all with a tracked board, or none.
         camera: Its lens.
         T_board_from_pattern: Where the print is on the tracked board ``[4, 4]``, probed with a wand; None solves for it.
-        config: Gates.
 
     Raises:
         DegenerateDataError: Too few views, or rotations about one axis only with an unknown pattern pose.
         PoorFitError: The views contradict each other.
     """
-    config = config or MountConfig()
     tracked = all(view.T_world_from_board is not None for view in views)
     if T_board_from_pattern is not None and not tracked:
         raise DegenerateDataError(
@@ -129,25 +140,23 @@ def calibrate_mount(
     seen = [board_pose(view.found, matrix, distortion) for view in views]
     good = np.array([pose is not None for pose in seen], np.bool_)
     cure = "stop at more places, with the board near and slanted"
-    require_count(int(good.sum()), config.min_views, "views with an unambiguous board", cure)
+    require_count(int(good.sum()), _MIN_VIEWS, "views with an unambiguous board", cure)
     chosen = [view for view, keep in zip(views, good, strict=True) if keep]
     T_camera_from_pattern = np.stack([pose for pose in seen if pose is not None])
     T_base_from_car = np.stack([_base_from_car(view, tracked) for view in chosen])
     known = None if T_board_from_pattern is None else np.asarray(T_board_from_pattern, np.float64)
     if known is None:
-        _require_axes(T_base_from_car, tracked, config)
-    X, Y, inside = _start(T_base_from_car, T_camera_from_pattern, known, config)
-    problem = MountProblem(
-        T_base_from_car, [view.found for view in chosen], matrix, distortion, known, config
-    )
+        _require_axes(T_base_from_car, tracked)
+    X, Y, inside = _start(T_base_from_car, T_camera_from_pattern, known)
+    problem = MountProblem(T_base_from_car, [view.found for view in chosen], matrix, distortion, known)
     X, Y, turn_stddev, move_stddev = problem.solve(X, Y, inside)
     rms = problem.view_rms(X, Y)
     used, all_rms = np.zeros(len(views), np.bool_), np.full(len(views), np.nan)
     used[np.flatnonzero(good)[inside]], all_rms[good] = True, rms
     fit = MountFit(X, Y, used, all_rms, turn_stddev, move_stddev, _method(tracked, known is not None))
-    if fit.rms_px > config.most_rms_px:
+    if fit.rms_px > _MOST_RMS_PX:
         raise PoorFitError(
-            f"expected the chain from motion capture to the picture to close within {config.most_rms_px} px, got {fit.rms_px:.1f} px; did "
+            f"expected the chain from motion capture to the picture to close within {_MOST_RMS_PX} px, got {fit.rms_px:.1f} px; did "
             "car and board stand still, is the lens this camera's, the square size right, the subject's axes those of the car?"
         )
     return fit
@@ -166,9 +175,9 @@ def _base_from_car(view: MountView, tracked: bool) -> Array:
     return invert_transform(view.T_world_from_board) @ view.T_world_from_car
 
 
-def _require_axes(T_base_from_car: Array, tracked: bool, config: MountConfig) -> None:
+def _require_axes(T_base_from_car: Array, tracked: bool) -> None:
     spread = rotation_spread(T_base_from_car[:, :3, :3])
-    if spread[1] < config.least_second_axis_rad:
+    if spread[1] < _LEAST_SECOND_AXIS_RAD:
         first, second = np.degrees(spread[:2])
         cure = (
             "tilt the board into several directions, or give the pattern's pose on it"
@@ -177,12 +186,12 @@ def _require_axes(T_base_from_car: Array, tracked: bool, config: MountConfig) ->
         )
         raise DegenerateDataError(
             f"expected rotations about more than one axis, got planar ones: {first:.1f} degrees about the first and {second:.2f} about the "
-            f"second (at least {np.degrees(config.least_second_axis_rad):.1f}); height and the pattern's pose stay open: {cure}, or tilt the car by hand"
+            f"second (at least {np.degrees(_LEAST_SECOND_AXIS_RAD):.1f}); height and the pattern's pose stay open: {cure}, or tilt the car by hand"
         )
 
 
 def _start(
-    T_base_from_car: Array, T_camera_from_pattern: Array, known: Array | None, config: MountConfig
+    T_base_from_car: Array, T_camera_from_pattern: Array, known: Array | None
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Closed form, chordal means, and the views that agree with them."""
     inside: NDArray[np.bool_] = np.ones(len(T_base_from_car), np.bool_)
@@ -193,17 +202,17 @@ def _start(
         if known is None:
             Y = _mean_pose((T_base_from_car @ X @ T_camera_from_pattern)[inside])
             each = invert_transform(T_base_from_car) @ Y @ invert_transform(T_camera_from_pattern)
-        again = _agreeing(*_distances(each, X), config)
+        again = _agreeing(*_distances(each, X))
         if (again == inside).all():
             break
         inside = again
     turn, move = (float(np.median(error)) for error in _distances(each, X))
-    if turn > config.most_median_rad or move > config.most_median_m:
+    if turn > _MOST_MEDIAN_RAD or move > _MOST_MEDIAN_M:
         raise PoorFitError(
             f"expected views that agree on one mounting pose, got half of them more than {np.degrees(turn):.1f} degrees and "
             f"{1000.0 * move:.0f} mm from the mean; {_CONTRADICTION}"
         )
-    needed = max(config.min_views, int(np.ceil((1.0 - config.most_share_left_out) * len(inside))))
+    needed = max(_MIN_VIEWS, int(np.ceil((1.0 - _MOST_SHARE_LEFT_OUT) * len(inside))))
     if inside.sum() < needed:
         raise PoorFitError(
             f"expected at least {needed} of {len(inside)} views to agree on one mounting pose, got {int(inside.sum())}; {_CONTRADICTION}"
@@ -233,9 +242,9 @@ def _distances(each: Array, X: Array) -> tuple[Array, Array]:
     return turn, np.asarray(np.linalg.norm(each[:, :3, 3] - X[:3, 3], axis=1))
 
 
-def _agreeing(turn: Array, move: Array, config: MountConfig) -> NDArray[np.bool_]:
+def _agreeing(turn: Array, move: Array) -> NDArray[np.bool_]:
     inside = np.ones(len(turn), np.bool_)
     for error, floor in ((turn, np.radians(0.3)), (move, 0.004)):
         # Of a norm of three normal errors the median is 1.54 standard deviations.
-        inside &= error <= max(config.outlier_factor * float(np.median(error)) / 1.54, floor)
+        inside &= error <= max(_OUTLIER_FACTOR * float(np.median(error)) / 1.54, floor)
     return inside

@@ -25,6 +25,16 @@ from calibration.schema import Calibration
 LEVELS = 17
 UNCHANGED = "exposure and white balance locked"
 _SMOOTH = 0.002  # against a change of the curve's slope by a factor e from level to level
+# Fewer colours are refused.
+_MIN_COLOURS = 60
+# Every camera channel must change by this much between black and white.
+_LEAST_RANGE = 0.15
+# Share of the mixed colours that are kept out of the fit and judge it.
+_HELD_OUT = 0.3
+# A larger error on them is refused.
+_MOST_RMSE = 0.03
+# A larger change of repeated colours while measuring is refused.
+_MOST_DRIFT = 0.03
 
 
 class DisplayCalibration(Calibration):
@@ -49,27 +59,6 @@ class DisplayCalibration(Calibration):
     def display(self) -> DisplayModel:
         """Return the colour model."""
         return DisplayModel.from_dict(self.model)
-
-
-@dataclass(frozen=True)
-class DisplayConfig:
-    """Limits beyond which a fit is rejected.
-
-    Attributes:
-        min_colours: Fewer colours are refused.
-        least_free: With a smaller share of colours that leave every camera channel unsaturated the set is refused.
-        least_range: Every camera channel must change by this much between black and white.
-        held_out: Share of the mixed colours that are kept out of the fit and judge it.
-        most_rmse: A larger error on them is refused.
-        most_drift: A larger change of repeated colours while measuring is refused.
-    """
-
-    min_colours: int = 60
-    least_free: float = 0.6
-    least_range: float = 0.15
-    held_out: float = 0.3
-    most_rmse: float = 0.03
-    most_drift: float = 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +145,7 @@ def mean_colour(frames: Sequence[NDArray[np.uint8]], region: NDArray[np.bool_]) 
 
 
 def fit_display(
-    shown: Array, seen: Array, cos_angle: Array | float = 1.0, config: DisplayConfig | None = None
+    shown: Array, seen: Array, cos_angle: Array | float = 1.0, least_free: float = 0.6
 ) -> DisplayFit:
     """Fit a monitor.
 
@@ -164,13 +153,11 @@ def fit_display(
         shown: Colours in 0..1 ``[N, 3]``.
         seen: Camera means of them in 0..1 ``[N, 3]``.
         cos_angle: Cosine of the viewing angle of each, or of all; with a spread of it the falloff is fitted too.
-        config: Gates.
 
     Raises:
         DegenerateDataError: Too few colours, too many saturated, no change from black to white, a drift.
         PoorFitError: The held-out colours are predicted badly.
     """
-    config = config or DisplayConfig()
     shown, seen = np.asarray(shown, np.float64), np.asarray(seen, np.float64)
     angles = np.broadcast_to(np.asarray(cos_angle, np.float64), (len(shown),)).copy()
     if shown.shape != seen.shape or shown.shape[1:] != (3,):
@@ -178,24 +165,24 @@ def fit_display(
             f"expected one seen for every shown colour, got {seen.shape} and {shown.shape}"
         )
     require_count(
-        len(shown), config.min_colours, "colours", "show the whole sequence: ramps, primaries, mixed colours"
+        len(shown), _MIN_COLOURS, "colours", "show the whole sequence: ramps, primaries, mixed colours"
     )
-    drift = _require_usable(shown, seen, angles, config)
-    held_out = _choose_held_out(shown, config)
+    drift = _require_usable(shown, seen, angles, least_free)
+    held_out = _choose_held_out(shown)
     fitted = ~held_out
     model = _fit(shown[fitted], seen[fitted], angles[fitted])
     fit = DisplayFit(model, shown, seen, angles, held_out, drift)
-    if fit.rmse(True) > config.most_rmse:
+    if fit.rmse(True) > _MOST_RMSE:
         raise PoorFitError(
-            f"expected held-out colours within {100 * config.most_rmse:.1f} %, got {100 * fit.rmse(True):.1f} %: are exposure and white balance locked, "
+            f"expected held-out colours within {100 * _MOST_RMSE:.1f} %, got {100 * fit.rmse(True):.1f} %: are exposure and white balance locked, "
             "night light, dynamic contrast and local dimming off, and was every colour shown long enough?"
         )
     return fit
 
 
-def _require_usable(shown: Array, seen: Array, angles: Array, config: DisplayConfig) -> float:
+def _require_usable(shown: Array, seen: Array, angles: Array, least_free: float) -> float:
     free = ((seen > 0.01) & (seen < 0.98)).all(axis=1)
-    if free.mean() < config.least_free:
+    if free.mean() < least_free:
         over = float((seen >= 0.98).any(axis=1).mean())
         cure = (
             "shorten the exposure or dim the monitor"
@@ -203,15 +190,15 @@ def _require_usable(shown: Array, seen: Array, angles: Array, config: DisplayCon
             else "lengthen the exposure"
         )
         raise DegenerateDataError(
-            f"expected at least {100 * config.least_free:.0f} % of the colours without a saturated channel, got {100 * free.mean():.0f} %: {cure}"
+            f"expected at least {100 * least_free:.0f} % of the colours without a saturated channel, got {100 * free.mean():.0f} %: {cure}"
         )
     spread = np.ptp(seen, axis=0)
-    if spread.min() < config.least_range:
+    if spread.min() < _LEAST_RANGE:
         raise DegenerateDataError(
-            f"expected every camera channel to change by {config.least_range} or more over the colours, got {np.round(spread, 3).tolist()}: is this the screen?"
+            f"expected every camera channel to change by {_LEAST_RANGE} or more over the colours, got {np.round(spread, 3).tolist()}: is this the screen?"
         )
     if (
-        len(np.unique(np.round(shown, 3), axis=0)) < config.min_colours
+        len(np.unique(np.round(shown, 3), axis=0)) < _MIN_COLOURS
         or np.linalg.matrix_rank(shown - shown.mean(axis=0), tol=0.5) < 3
     ):
         raise DegenerateDataError(
@@ -222,25 +209,25 @@ def _require_usable(shown: Array, seen: Array, angles: Array, config: DisplayCon
     for key in np.unique(keys, axis=0):
         same = seen[(keys == key).all(axis=1)]
         drift = max(drift, float(np.ptp(same, axis=0).max()))
-    if drift > config.most_drift:
+    if drift > _MOST_DRIFT:
         raise DegenerateDataError(
-            f"expected the same colour to look the same at the start and at the end within {config.most_drift}, got {drift:.3f}: lock exposure and white "
+            f"expected the same colour to look the same at the start and at the end within {_MOST_DRIFT}, got {drift:.3f}: lock exposure and white "
             "balance, let the monitor warm up, keep the room's light constant"
         )
     return drift
 
 
-def _choose_held_out(shown: Array, config: DisplayConfig) -> NDArray[np.bool_]:
+def _choose_held_out(shown: Array) -> NDArray[np.bool_]:
     """Select held-out colours among the mixed ones. The fit needs the ramps and primaries."""
     mixed = (np.ptp(shown, axis=1) > 1e-6) & ((shown > 1e-6).sum(axis=1) == 3)
     rows = np.flatnonzero(mixed)
     held_out: NDArray[np.bool_] = np.zeros(len(shown), np.bool_)
     if len(rows):
-        every = max(2, round(1.0 / config.held_out))
+        every = max(2, round(1.0 / _HELD_OUT))
         held_out[rows[::every]] = True
     if held_out.sum() < 8:
         raise DegenerateDataError(
-            f"expected at least {8 * max(2, round(1.0 / config.held_out))} mixed colours, got {len(rows)}: show random colours too"
+            f"expected at least {8 * max(2, round(1.0 / _HELD_OUT))} mixed colours, got {len(rows)}: show random colours too"
         )
     return held_out
 

@@ -25,25 +25,14 @@ _FLAGS = {
 COVERAGE_CELLS = (8, 6)  # columns, rows
 # Seen face on only, a board as twice as far away in twice the focal length looks the same.
 _LEAST_TILT_RAD, _LEAST_TILTED = np.radians(12.0), 4
-
-
-@dataclass(frozen=True)
-class IntrinsicsConfig:
-    """Settings of the fit, and limits beyond which it is rejected.
-
-    Attributes:
-        model: Distortion: none, k1 k2 p1 p2, or these and k3.
-        min_views: Fewer pictures with a board are refused.
-        most_rms_px: A larger reprojection error is refused [px].
-        least_coverage: A smaller share of the picture's 8 x 6 cells with a corner in it is refused.
-        outlier_factor: Multiple of the median error beyond which an image is excluded.
-    """
-
-    model: Model = "two-radial"
-    min_views: int = 20
-    most_rms_px: float = 0.5
-    least_coverage: float = 0.6
-    outlier_factor: float = 3.0
+# Fewer pictures with a board are refused.
+_MIN_VIEWS = 20
+# A larger reprojection error is refused [px].
+_MOST_RMS_PX = 0.5
+# A smaller share of the picture's 8 x 6 cells with a corner in it is refused.
+_LEAST_COVERAGE = 0.6
+# Multiple of the median error beyond which an image is excluded.
+_OUTLIER_FACTOR = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,46 +55,45 @@ class IntrinsicsFit:
 
 
 def calibrate_intrinsics(
-    views: Sequence[Detection], size: tuple[int, int], config: IntrinsicsConfig | None = None
+    views: Sequence[Detection], size: tuple[int, int], model: Model = "two-radial"
 ) -> IntrinsicsFit:
     """Fit a camera to images of a board.
 
     Args:
         views: The board's corners in each picture.
         size: Width and height of the pictures [px].
-        config: Model and gates.
+        model: Distortion: none, k1 k2 p1 p2, or these and k3.
 
     Raises:
         DegenerateDataError: Too few pictures, too little of the picture covered, or the board never tilted.
         PoorFitError: The reprojection error is too large.
     """
-    config = config or IntrinsicsConfig()
     require_count(
-        len(views), config.min_views, "pictures with the board", "take more, from all distances and angles"
+        len(views), _MIN_VIEWS, "pictures with the board", "take more, from all distances and angles"
     )
-    _require_coverage(_coverage(views, size), config)
+    _require_coverage(_coverage(views, size))
     used = np.ones(len(views), np.bool_)
     for _ in range(3):  # a blurred picture spoils the median little; two rounds find them all
-        fit = _fit([view for view, keep in zip(views, used, strict=True) if keep], size, config.model)
-        limit = config.outlier_factor * float(np.median(fit.view_rms_px))
+        fit = _fit([view for view, keep in zip(views, used, strict=True) if keep], size, model)
+        limit = _OUTLIER_FACTOR * float(np.median(fit.view_rms_px))
         keep = fit.view_rms_px <= max(limit, 0.05)
         if keep.all():
             break
         used[np.flatnonzero(used)[~keep]] = False
         require_count(
-            int(used.sum()), config.min_views, "sharp pictures with the board", "hold board and camera still"
+            int(used.sum()), _MIN_VIEWS, "sharp pictures with the board", "hold board and camera still"
         )
     _require_tilt(fit.rotations)
-    if fit.rms_px > config.most_rms_px:
+    if fit.rms_px > _MOST_RMS_PX:
         raise PoorFitError(
-            f"expected a reprojection error below {config.most_rms_px} px, got {fit.rms_px:.2f} px over {int(used.sum())} pictures; "
+            f"expected a reprojection error below {_MOST_RMS_PX} px, got {fit.rms_px:.2f} px over {int(used.sum())} pictures; "
             "is the board flat, its size in squares right, the focus fixed, the picture sharp?"
         )
     rms = np.full(len(views), np.nan)
     rms[used] = fit.view_rms_px
     coverage = _coverage([view for view, keep in zip(views, used, strict=True) if keep], size)
-    _require_coverage(coverage, config)
-    return IntrinsicsFit(_calibration(fit, size, config, coverage), coverage, used, rms, fit.errors_px)
+    _require_coverage(coverage)
+    return IntrinsicsFit(_calibration(fit, size, model, coverage), coverage, used, rms, fit.errors_px)
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,12 +151,12 @@ def _coverage(views: Sequence[Detection], size: tuple[int, int]) -> NDArray[np.i
     return counts.astype(np.int64)
 
 
-def _require_coverage(coverage: NDArray[np.int64], config: IntrinsicsConfig) -> None:
+def _require_coverage(coverage: NDArray[np.int64]) -> None:
     share = float((coverage > 0).mean())
-    if share < config.least_coverage:
+    if share < _LEAST_COVERAGE:
         empty = _where_empty(coverage)
         raise DegenerateDataError(
-            f"expected corners in at least {100 * config.least_coverage:.0f} % of the picture's {coverage.size} cells, got "
+            f"expected corners in at least {100 * _LEAST_COVERAGE:.0f} % of the picture's {coverage.size} cells, got "
             f"{100 * share:.0f} %; hold the board {empty} too: distortion shows there"
         )
 
@@ -195,7 +183,7 @@ def _require_tilt(rotations: Array) -> None:
 
 
 def _calibration(
-    fit: _Fit, size: tuple[int, int], config: IntrinsicsConfig, coverage: NDArray[np.int64]
+    fit: _Fit, size: tuple[int, int], model: Model, coverage: NDArray[np.int64]
 ) -> LensCalibration:
     residuals = {
         "rms_px": fit.rms_px,
@@ -209,7 +197,7 @@ def _calibration(
     matrix, d = fit.matrix, [float(v) for v in fit.distortion]
     return LensCalibration(
         date=datetime.date.today(),
-        method=f"ChArUco board, {config.model} distortion",
+        method=f"ChArUco board, {model} distortion",
         views=len(fit.view_rms_px),
         residuals={key: round(value, 6) for key, value in residuals.items()},
         width=size[0],

@@ -9,38 +9,14 @@ from pydantic import Field, field_validator
 
 from advnerf_core.data.lens import Lens
 from advnerf_core.data.similarity import Similarity
-from advnerf_core.geometry import Array, Pinhole
-from calibration.schema import Calibration, Row4, require_rigid
+from advnerf_core.geometry import Array
+from calibration.schema import Calibration, Intrinsics, Row4, require_rigid
 
 
-class LensCalibration(Calibration):
-    """A camera's lens, without its pose on the car.
-
-    Attributes:
-        width: Image width [px].
-        height: Image height [px].
-        fx: Focal length [px].
-        fy: Focal length [px].
-        cx: Principal point, pixel centres at +0.5 [px].
-        cy: Principal point, pixel centres at +0.5 [px].
-        distortion: OpenCV's k1, k2, p1, p2, k3.
-        rms_px: Reprojection error of the fit [px].
-    """
+class LensCalibration(Intrinsics):
+    """A camera's lens, without its pose on the car."""
 
     kind: Literal["lens"] = "lens"
-    width: int = Field(gt=0)
-    height: int = Field(gt=0)
-    fx: float = Field(gt=0.0)
-    fy: float = Field(gt=0.0)
-    cx: float
-    cy: float
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    rms_px: float | None = Field(default=None, ge=0.0)
-
-    @property
-    def pinhole(self) -> Pinhole:
-        """Intrinsics."""
-        return Pinhole(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
 
     @property
     def lens(self) -> Lens:

@@ -17,26 +17,18 @@ from advnerf_core.geometry import Array
 from calibration.degeneracy import DegenerateDataError, PoorFitError, require_count
 from calibration.measured import SceneCalibration, rows_of
 
-
-@dataclass(frozen=True)
-class SceneFitLimits:
-    """Limits beyond which a fit is rejected.
-
-    Attributes:
-        min_cameras: Fewer cameras with a pose in both worlds are refused.
-        position_tolerance_m: Cameras farther from their motion-capture place are outliers [m].
-        rotation_tolerance_rad: Cameras turned farther are outliers [rad].
-        min_share: With a smaller share of inliers the set is refused.
-        folds: The cameras are left out in so many turns, to see how well the others place them.
-        most_held_out_m: A larger median error of left-out inliers is refused [m].
-    """
-
-    min_cameras: int = 12
-    position_tolerance_m: float = 0.08
-    rotation_tolerance_rad: float = float(np.radians(3.0))
-    min_share: float = 0.5
-    folds: int = 4
-    most_held_out_m: float = 0.05
+# Fewer cameras with a pose in both worlds are refused.
+_MIN_CAMERAS = 12
+# Cameras farther from their motion-capture place are outliers [m].
+_POSITION_TOLERANCE_M = 0.08
+# Cameras turned farther are outliers [rad].
+_ROTATION_TOLERANCE_RAD = float(np.radians(3.0))
+# With a smaller share of inliers the set is refused.
+_MIN_SHARE = 0.5
+# The cameras are left out in so many turns, to see how well the others place them.
+_FOLDS = 4
+# A larger median error of left-out inliers is refused [m].
+_MOST_HELD_OUT_M = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,54 +77,49 @@ class SceneFit:
 def place_scene(
     T_scene_from_camera: Mapping[str, Array],
     T_world_from_camera: Mapping[str, Array],
-    config: SceneFitLimits | None = None,
 ) -> SceneFit:
     """Find the similarity from a scene to the motion-capture world.
 
     Args:
         T_scene_from_camera: Poses ``[4, 4]`` in the scene, by image name.
         T_world_from_camera: Poses ``[4, 4]`` in the world, by image name; only names in both count.
-        config: Gates.
 
     Raises:
         DegenerateDataError: Too few cameras in both, or all of them on one line.
         PoorFitError: Too few agree, or left-out cameras are misplaced.
     """
-    config = config or SceneFitLimits()
     names = tuple(name for name in T_scene_from_camera if name in T_world_from_camera)
     cure = "the images of both must have the same file names; take more frames of the car into the scene's reconstruction"
-    require_count(len(names), config.min_cameras, "cameras with a pose in both worlds", cure)
+    require_count(len(names), _MIN_CAMERAS, "cameras with a pose in both worlds", cure)
     source = np.stack([np.asarray(T_scene_from_camera[name], np.float64) for name in names])
     target = np.stack([np.asarray(T_world_from_camera[name], np.float64) for name in names])
-    alignment = _align(source, target, config, config.min_share)
+    alignment = _align(source, target, _MIN_SHARE)
     inside = np.flatnonzero(alignment.inliers)
-    require_count(
-        len(inside), config.min_cameras, "cameras that agree", "take more frames on curves of the drive"
-    )
-    far, angle = _held_out(source[inside], target[inside], config)
-    if float(np.median(far)) > config.most_held_out_m:
+    require_count(len(inside), _MIN_CAMERAS, "cameras that agree", "take more frames on curves of the drive")
+    far, angle = _held_out(source[inside], target[inside])
+    if float(np.median(far)) > _MOST_HELD_OUT_M:
         raise PoorFitError(
-            f"expected cameras that were left out to be placed within {100 * config.most_held_out_m:.0f} cm, got {100 * np.median(far):.1f} cm in the "
+            f"expected cameras that were left out to be placed within {100 * _MOST_HELD_OUT_M:.0f} cm, got {100 * np.median(far):.1f} cm in the "
             "median: does the reconstruction bend, are the stamps right, is the mounting pose that of this camera?"
         )
     return SceneFit(alignment, names, far, angle, target, alignment.similarity.poses(source))
 
 
-def _align(source: Array, target: Array, config: SceneFitLimits, share: float) -> Alignment:
+def _align(source: Array, target: Array, share: float) -> Alignment:
     try:
-        return align_poses(source, target, config.position_tolerance_m, config.rotation_tolerance_rad, share)
+        return align_poses(source, target, _POSITION_TOLERANCE_M, _ROTATION_TOLERANCE_RAD, share)
     except SimilarityError as error:
         kind = DegenerateDataError if "line" in str(error) or "place" in str(error) else PoorFitError
         raise kind(str(error)) from error
 
 
-def _held_out(source: Array, target: Array, config: SceneFitLimits) -> tuple[Array, Array]:
+def _held_out(source: Array, target: Array) -> tuple[Array, Array]:
     """Errors of each camera under the similarity of the others, in blocks of neighbours: next-door frames know too much."""
-    fold = np.arange(len(source)) * config.folds // len(source)
+    fold = np.arange(len(source)) * _FOLDS // len(source)
     far, angle = np.empty(len(source)), np.empty(len(source))
-    for k in range(config.folds):
+    for k in range(_FOLDS):
         out = fold == k
-        moved = _align(source[~out], target[~out], config, 0.5).similarity.poses(source[out])
+        moved = _align(source[~out], target[~out], 0.5).similarity.poses(source[out])
         far[out] = np.linalg.norm(moved[:, :3, 3] - target[out, :3, 3], axis=1)
         angle[out] = rotation_angles(np.swapaxes(moved[:, :3, :3], 1, 2) @ target[out, :3, :3])
     return far, angle

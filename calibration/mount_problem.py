@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -15,34 +14,12 @@ from scipy.spatial.transform import Rotation
 from advnerf_core.geometry import Array, invert_transform, make_transform
 from calibration.charuco import Detection
 
-
-@dataclass(frozen=True)
-class MountConfig:
-    """Limits beyond which a fit is rejected.
-
-    Attributes:
-        min_views: Fewer agreeing views are refused.
-        least_second_axis_rad: With an unknown pattern pose, the root mean square turn about the second axis must reach this [rad].
-        outlier_factor: Number of robust standard deviations from the mean beyond which a view is excluded.
-        most_share_left_out: With a larger share left out the set is refused.
-        most_rms_px: A larger reprojection error through the whole chain is refused [px].
-        most_median_rad: With a larger median angle between the views' mounting poses and their mean the set is refused [rad].
-        most_median_m: Or a larger median distance [m].
-        corner_stddev_px: How well a corner is found, per axis [px].
-        mocap_stddev_m: How well motion capture places a body, per axis [m].
-        mocap_stddev_rad: How well it turns it, per axis [rad].
-    """
-
-    min_views: int = 10
-    least_second_axis_rad: float = 0.08
-    outlier_factor: float = 6.0
-    most_share_left_out: float = 0.4
-    most_rms_px: float = 2.0
-    most_median_rad: float = 0.05
-    most_median_m: float = 0.05
-    corner_stddev_px: float = 0.15
-    mocap_stddev_m: float = 0.0005
-    mocap_stddev_rad: float = 0.001
+# How well a corner is found, per axis [px].
+_CORNER_STDDEV_PX = 0.15
+# How well motion capture places a body, per axis [m].
+_MOCAP_STDDEV_M = 0.0005
+# How well it turns it, per axis [rad].
+_MOCAP_STDDEV_RAD = 0.001
 
 
 class MountProblem:
@@ -55,10 +32,9 @@ class MountProblem:
         matrix: Array,
         distortion: Array,
         known: Array | None,
-        config: MountConfig,
     ) -> None:
         self._T_base_from_car, self._found = T_base_from_car, found
-        self._matrix, self._distortion, self._known, self._config = matrix, distortion, known, config
+        self._matrix, self._distortion, self._known = matrix, distortion, known
 
     def solve(self, X: Array, Y: Array, inside: NDArray[np.bool_]) -> tuple[Array, Array, float, float]:
         """Refined X and Y, and the standard deviations of X's rotation [rad] and translation [m]."""
@@ -89,14 +65,14 @@ class MountProblem:
 
     def _factor(self, X: Array, Y: Array, row: int) -> Array:
         """Lower Cholesky factor of the covariance of a view's corners ``[2n, 2n]``: their own noise and that of both bodies' poses."""
-        config, A = self._config, self._T_base_from_car[row]
+        A = self._T_base_from_car[row]
         here = self._errors(X, Y, row).ravel()
-        covariance = config.corner_stddev_px**2 * np.eye(len(here))
+        covariance = _CORNER_STDDEV_PX**2 * np.eye(len(here))
         step = 1e-6
         for axis in range(6):
             p = np.zeros(6)
             p[axis] = step
-            stddev = config.mocap_stddev_rad if axis < 3 else config.mocap_stddev_m
+            stddev = _MOCAP_STDDEV_RAD if axis < 3 else _MOCAP_STDDEV_M
             # The car's frame moves, then the board's.
             for moved in (A @ small_motion(p), small_motion(p) @ A):
                 slope = (self._errors(X, Y, row, moved).ravel() - here) / step * stddev

@@ -28,21 +28,10 @@ _MEAN_PIECE_M = 0.5  # of more pieces than that a trace is noise, not a track
 _LEAST_LENGTH_M = 1.0
 _CLOSING_WEIGHT = 100.0
 _POINTS = 600
-
-
-@dataclass(frozen=True)
-class PathFitConfig:
-    """Settings of the path fit.
-
-    Attributes:
-        closed: Whether the path is a loop; None looks whether the trace comes back to its start.
-        closing_m: How near to its start a loop comes again [m].
-        worst_rms_m: A fit that leaves more is no fit [m].
-    """
-
-    closed: bool | None = None
-    closing_m: float = 0.3
-    worst_rms_m: float = 0.05
+# How near to its start a loop comes again [m].
+_CLOSING_M = 0.3
+# A fit that leaves more is no fit [m].
+_WORST_RMS_M = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,24 +61,23 @@ class PathFit:
         return float(np.abs(self.residuals_m).max())
 
 
-def fit_path(trace: ArrayLike, config: PathFitConfig | None = None) -> PathFit:
+def fit_path(trace: ArrayLike, closed: bool | None = None) -> PathFit:
     """Fit lines and arcs to a trace.
 
     Args:
         trace: Positions in the order of time ``[N, 2]`` [m]; standing still does no harm, a loop may be driven several times.
-        config: How it is read.
+        closed: Whether the path is a loop; None looks whether the trace comes back to its start.
 
     Raises:
         DegenerateDataError: The trace is too short, does not close where it should, or is not made of lines and arcs.
     """
-    settings = config or PathFitConfig()
     points = _thinned(np.asarray(trace, dtype=np.float64))
-    lap_ends = _returns(points, settings.closing_m)
-    closed = bool(lap_ends) if settings.closed is None else settings.closed
+    lap_ends = _returns(points, _CLOSING_M)
+    closed = bool(lap_ends) if closed is None else closed
     if closed and not lap_ends:
         gap_m = float(np.linalg.norm(points[-1] - points[0]))
         raise DegenerateDataError(
-            f"expected a trace that comes back to within {settings.closing_m:g} m of its start, its ends are {gap_m:.2f} m apart: "
+            f"expected a trace that comes back to within {_CLOSING_M:g} m of its start, its ends are {gap_m:.2f} m apart: "
             "drive the whole loop, or fit an open path"
         )
     first_lap = points[: lap_ends[0] + 1] if closed else points
@@ -103,9 +91,9 @@ def fit_path(trace: ArrayLike, config: PathFitConfig | None = None) -> PathFit:
     residuals = path.project(points[:, :2]).cte_m
     laps = len(points) * _STEP_M / path.length_m if closed else 1.0
     fit = PathFit(path, points, residuals, laps)
-    if fit.rms_m > settings.worst_rms_m:
+    if fit.rms_m > _WORST_RMS_M:
         raise DegenerateDataError(
-            f"lines and arcs leave {1000 * fit.rms_m:.0f} mm rms of this trace (limit {1000 * settings.worst_rms_m:.0f} mm): drive "
+            f"lines and arcs leave {1000 * fit.rms_m:.0f} mm rms of this trace (limit {1000 * _WORST_RMS_M:.0f} mm): drive "
             "or draw it smoothly along the tape, at walking pace, in one direction"
         )
     return fit

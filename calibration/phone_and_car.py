@@ -18,21 +18,10 @@ from advnerf_core.geometry import Array
 from calibration.structure_from_motion import Model, ReconstructionError
 
 _MIN_SHARED = 6
-
-
-@dataclass(frozen=True)
-class PlacingConfig:
-    """When a frame of the car counts as in the right place.
-
-    Attributes:
-        position_tolerance_m: Farthest from its motion-capture pose [m].
-        rotation_tolerance_rad: Largest angle from it [rad].
-        min_share: With a smaller share of the car's frames in place the result is refused.
-    """
-
-    position_tolerance_m: float = 0.08
-    rotation_tolerance_rad: float = math.radians(3.0)
-    min_share: float = 0.5
+# Largest angle of a frame from its motion-capture pose [rad].
+_TOLERANCE_RAD = math.radians(3.0)
+# With a smaller share of the car's frames in place the result is refused.
+_MIN_SHARE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,20 +58,19 @@ class Placed:
 
 
 def place_in_mocap(
-    model: Model, T_world_from_camera: Mapping[str, Array], config: PlacingConfig | None = None
+    model: Model, T_world_from_camera: Mapping[str, Array], tolerance_m: float = 0.08
 ) -> Placed:
     """Put a model into the world of motion capture.
 
     Args:
         model: Images of the phone and of the car.
         T_world_from_camera: Motion-capture pose ``[4, 4]`` of every frame of the car, by the name it has in the model.
-        config: Tolerances.
+        tolerance_m: Farthest that a frame in the right place is from its motion-capture pose [m].
 
     Raises:
         ReconstructionError: Too few of the car's frames are in the model.
         SimilarityError: Their poses fix no similarity: on one line, or too few agree.
     """
-    config = config or PlacingConfig()
     shared = [image for image in model.images if image.name in T_world_from_camera]
     if len(shared) < _MIN_SHARED:
         raise ReconstructionError(
@@ -92,9 +80,9 @@ def place_in_mocap(
     alignment = align_poses(
         np.stack([image.T_world_from_camera for image in shared]),
         np.stack([T_world_from_camera[image.name] for image in shared]),
-        config.position_tolerance_m,
-        config.rotation_tolerance_rad,
-        config.min_share,
+        tolerance_m,
+        _TOLERANCE_RAD,
+        _MIN_SHARE,
     )
     similarity = alignment.similarity
     return Placed(

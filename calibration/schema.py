@@ -65,8 +65,8 @@ def require_rigid(rows: tuple[Row4, ...]) -> tuple[Row4, ...]:
     return rows
 
 
-class CameraCalibration(Calibration):
-    """A camera on the car.
+class Intrinsics(Calibration):
+    """A lens in front of a sensor.
 
     Attributes:
         width: Image width [px].
@@ -77,11 +77,8 @@ class CameraCalibration(Calibration):
         cy: Principal point, pixel centres at +0.5 [px].
         distortion: OpenCV's k1, k2, p1, p2, k3.
         rms_px: Reprojection error of the fit [px]; None where nothing was fitted.
-        T_car_from_camera: Mounting pose, OpenCV camera axes.
-        latency_s: From exposure to the stamp, measured; subtracted by the camera node [s].
     """
 
-    kind: Literal["camera"] = "camera"
     width: int = Field(gt=0)
     height: int = Field(gt=0)
     fx: float = Field(gt=0.0)
@@ -90,6 +87,22 @@ class CameraCalibration(Calibration):
     cy: float
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     rms_px: float | None = Field(default=None, ge=0.0)
+
+    @property
+    def pinhole(self) -> Pinhole:
+        """Intrinsics."""
+        return Pinhole(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
+
+
+class CameraCalibration(Intrinsics):
+    """A camera on the car.
+
+    Attributes:
+        T_car_from_camera: Mounting pose, OpenCV camera axes.
+        latency_s: From exposure to the stamp, measured; subtracted by the camera node [s].
+    """
+
+    kind: Literal["camera"] = "camera"
     T_car_from_camera: tuple[Row4, Row4, Row4, Row4]
     latency_s: float = 0.0
 
@@ -97,11 +110,6 @@ class CameraCalibration(Calibration):
     @classmethod
     def _rigid(cls, rows: tuple[Row4, ...]) -> tuple[Row4, ...]:
         return require_rigid(rows)
-
-    @property
-    def pinhole(self) -> Pinhole:
-        """Intrinsics."""
-        return Pinhole(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
 
     @property
     def mount(self) -> Array:

@@ -28,29 +28,20 @@ _MOST_CORNERS, _LEAST_TRACKED = 300, 25
 _INLIER_RAD, _ROUNDS = 0.01, 8
 # Poses are smoothed over this long before they are differentiated; it is symmetric and moves nothing.
 _SMOOTH_S = 0.05
-
-
-@dataclass(frozen=True)
-class OffsetConfig:
-    """Settings of the search, and limits beyond which a fit is rejected.
-
-    Attributes:
-        largest_s: The offset is searched between minus and plus this [s].
-        step_s: Step of the search [s].
-        min_turns: Fewer pairs of frames with a known turn are refused.
-        least_turn_rad: The root mean square turn between frames must reach this [rad].
-        least_correlation: A lower correlation at the peak is refused.
-        most_second_peak: A second peak of more than this share of the first is ambiguous.
-        most_stddev_s: A larger standard deviation of the result is refused [s].
-    """
-
-    largest_s: float = 0.4
-    step_s: float = 0.005
-    min_turns: int = 40
-    least_turn_rad: float = 0.015
-    least_correlation: float = 0.9
-    most_second_peak: float = 0.97
-    most_stddev_s: float = 0.003
+# The offset is searched between minus and plus this [s].
+_LARGEST_S = 0.4
+# Step of the search [s].
+_STEP_S = 0.005
+# Fewer pairs of frames with a known turn are refused.
+_MIN_TURNS = 40
+# The root mean square turn between frames must reach this [rad].
+_LEAST_TURN_RAD = 0.015
+# A lower correlation at the peak is refused.
+_LEAST_CORRELATION = 0.9
+# A second peak of more than this share of the first is ambiguous.
+_MOST_SECOND_PEAK = 0.97
+# A larger standard deviation of the result is refused [s].
+_MOST_STDDEV_S = 0.003
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,40 +127,38 @@ def image_turns(frames: Iterable[tuple[float, NDArray[np.uint8]]], camera: Camer
     return Turns(table[:, 0], table[:, 1], table[:, 2])
 
 
-def fit_offset(turns: Turns, pose_s: Array, yaw_rad: Array, config: OffsetConfig | None = None) -> OffsetFit:
+def fit_offset(turns: Turns, pose_s: Array, yaw_rad: Array) -> OffsetFit:
     """Find the offset between both clocks.
 
     Args:
         turns: From the images.
         pose_s: Stamps of the poses, increasing ``[M]`` [s].
         yaw_rad: The car's yaw, unwrapped ``[M]`` [rad].
-        config: Search and gates.
 
     Raises:
         DegenerateDataError: Too few frames, too little turning, turning at one rate only, or a rhythm that fits at several shifts.
         PoorFitError: Image and motion capture do not agree at any shift.
     """
-    config = config or OffsetConfig()
     require_count(
         len(pose_s), 100, "poses of the car", "record motion capture with the camera, for ten seconds or more"
     )
-    reach = config.largest_s + _SMOOTH_S
+    reach = _LARGEST_S + _SMOOTH_S
     inside = (turns.start_s > pose_s[0] + reach) & (turns.end_s < pose_s[-1] - reach)
     turns = Turns(turns.start_s[inside], turns.end_s[inside], turns.yaw_rad[inside])
     require_count(
         len(turns.yaw_rad),
-        config.min_turns,
+        _MIN_TURNS,
         "pairs of frames with a tracked turn",
         "turn the car before a wall with something on it",
     )
-    _require_turning(turns, config)
+    _require_turning(turns)
     yaw = CubicSpline(pose_s, _smoothed(pose_s, yaw_rad))
-    count = round(config.largest_s / config.step_s)
-    shifts: Array = config.step_s * np.arange(-count, count + 1, dtype=np.float64)
+    count = round(_LARGEST_S / _STEP_S)
+    shifts: Array = _STEP_S * np.arange(-count, count + 1, dtype=np.float64)
     correlation = np.array(
         [_correlation(turns.yaw_rad, _car_turns(yaw, turns, float(shift))) for shift in shifts]
     )
-    peak = _peak(shifts, correlation, config)
+    peak = _peak(shifts, correlation)
 
     def residuals(p: Array) -> Array:
         return p[1] * _car_turns(yaw, turns, float(p[0])) + p[2] - turns.yaw_rad
@@ -180,9 +169,9 @@ def fit_offset(turns: Turns, pose_s: Array, yaw_rad: Array, config: OffsetConfig
     left = residuals(found.x)
     covariance = np.linalg.pinv(found.jac.T @ found.jac) * 2.0 * found.cost / max(len(left) - 3, 1)
     stddev = float(np.sqrt(covariance[0, 0]))
-    if stddev > config.most_stddev_s:
+    if stddev > _MOST_STDDEV_S:
         raise DegenerateDataError(
-            f"expected an offset known to {1000 * config.most_stddev_s:.0f} ms, got {1000 * found.x[0]:.0f} ms give or take {1000 * stddev:.1f} ms: turn "
+            f"expected an offset known to {1000 * _MOST_STDDEV_S:.0f} ms, got {1000 * found.x[0]:.0f} ms give or take {1000 * stddev:.1f} ms: turn "
             "the car to and fro faster, and longer"
         )
     rms = float(np.sqrt(np.mean(left**2)))
@@ -259,36 +248,34 @@ def _correlation(a: Array, b: Array) -> float:
     return float(a @ b) / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12)
 
 
-def _require_turning(turns: Turns, config: OffsetConfig) -> None:
+def _require_turning(turns: Turns) -> None:
     rms, spread = float(np.sqrt(np.mean(turns.yaw_rad**2))), float(np.std(turns.yaw_rad))
-    if rms < config.least_turn_rad:
+    if rms < _LEAST_TURN_RAD:
         raise DegenerateDataError(
-            f"expected turns of at least {config.least_turn_rad} rad from frame to frame, got {rms:.4f} rad in the mean: too little "
+            f"expected turns of at least {_LEAST_TURN_RAD} rad from frame to frame, got {rms:.4f} rad in the mean: too little "
             "excitation, turn the car to and fro by hand"
         )
-    if spread < 0.5 * config.least_turn_rad:
+    if spread < 0.5 * _LEAST_TURN_RAD:
         raise DegenerateDataError(
             f"expected turns to and fro, got a steady rate ({rms:.4f} rad per frame, varying by {spread:.4f}): it looks the same at any offset"
         )
 
 
-def _peak(shifts: Array, correlation: Array, config: OffsetConfig) -> float:
+def _peak(shifts: Array, correlation: Array) -> float:
     best = int(np.argmax(correlation))
-    if correlation[best] < config.least_correlation:
+    if correlation[best] < _LEAST_CORRELATION:
         raise PoorFitError(
             f"expected image and motion capture to turn alike, got a correlation of {correlation[best]:.2f} at best (needed "
-            f"{config.least_correlation}); is the subject the car the camera is on, is the scene static and lit?"
+            f"{_LEAST_CORRELATION}); is the subject the car the camera is on, is the scene static and lit?"
         )
     if best in (0, len(shifts) - 1):
         raise PoorFitError(
-            f"expected an offset within {config.largest_s} s, got the best agreement at the end of the search; set the clocks first"
+            f"expected an offset within {_LARGEST_S} s, got the best agreement at the end of the search; set the clocks first"
         )
     inner = correlation[1:-1]
     tops = np.flatnonzero((inner >= correlation[:-2]) & (inner > correlation[2:])) + 1
-    second = max(
-        (float(correlation[top]) for top in tops if abs(top - best) * config.step_s > 0.05), default=-1.0
-    )
-    if second > config.most_second_peak * correlation[best]:
+    second = max((float(correlation[top]) for top in tops if abs(top - best) * _STEP_S > 0.05), default=-1.0)
+    if second > _MOST_SECOND_PEAK * correlation[best]:
         raise DegenerateDataError(
             f"expected one offset that fits, got two peaks of the correlation ({correlation[best]:.3f} and {second:.3f}): turn the car "
             "irregularly, not in a rhythm"

@@ -23,6 +23,27 @@ from advnerf_core.geometry import Array
 from calibration.degeneracy import DegenerateDataError, PoorFitError, require_count
 from calibration.linear import line_stddev, linear_fit
 
+# After a change of command so much is left out [s].
+_SETTLE_S = 0.8
+# Shorter segments are left out [s].
+_LEAST_S = 0.5
+# Longer ones are cut, so that one long circle does not count as one measurement [s].
+_LONGEST_S = 3.0
+# Servo values this near are one.
+_SERVO_TOLERANCE = 0.004
+# Speed commands this near are one.
+_ERPM_TOLERANCE = 20.0
+# Slower segments are left out [m/s].
+_LEAST_SPEED_MPS = 0.15
+# Both left and right circles must be at least this tight [1/m].
+_LEAST_CURVATURE_1PM = 0.3
+# Circles wider than this count as straight [1/m].
+_STRAIGHT_1PM = 0.12
+# A larger scatter of the wheel angles about the line is refused [rad].
+_MOST_STEERING_RMS_RAD = 0.02
+# A larger relative scatter of the speeds about the line is refused.
+_MOST_SPEED_RMS = 0.05
+
 
 @dataclass(frozen=True, eq=False)
 class RecordedDrive:
@@ -43,35 +64,6 @@ class RecordedDrive:
     servo: Array
     erpm: Array
     pipeline_s: Array
-
-
-@dataclass(frozen=True)
-class GainsConfig:
-    """Definition of segments, and limits beyond which a fit is rejected.
-
-    Attributes:
-        settle_s: After a change of command so much is left out [s].
-        least_s: Shorter segments are left out [s].
-        longest_s: Longer ones are cut, so that one long circle does not count as one measurement [s].
-        servo_tolerance: Servo values this near are one.
-        erpm_tolerance: Speed commands this near are one.
-        least_speed_mps: Slower segments are left out [m/s].
-        least_curvature_1pm: Both left and right circles must be at least this tight [1/m].
-        straight_1pm: Circles wider than this count as straight [1/m].
-        most_steering_rms_rad: A larger scatter of the wheel angles about the line is refused [rad].
-        most_speed_rms: A larger relative scatter of the speeds about the line is refused.
-    """
-
-    settle_s: float = 0.8
-    least_s: float = 0.5
-    longest_s: float = 3.0
-    servo_tolerance: float = 0.004
-    erpm_tolerance: float = 20.0
-    least_speed_mps: float = 0.15
-    least_curvature_1pm: float = 0.3
-    straight_1pm: float = 0.12
-    most_steering_rms_rad: float = 0.02
-    most_speed_rms: float = 0.05
 
 
 @dataclass(frozen=True)
@@ -148,21 +140,19 @@ class GainsFit:
         return float(np.sqrt(np.mean((self.speed_of(erpm) - self.speed_mps) ** 2)))
 
 
-def fit_gains(drive: RecordedDrive, wheelbase_m: float, config: GainsConfig | None = None) -> GainsFit:
+def fit_gains(drive: RecordedDrive, wheelbase_m: float) -> GainsFit:
     """Fit the car's gains to a drive.
 
     Args:
         drive: Circles to both sides, straight runs, two speeds or more.
         wheelbase_m: Distance between the axles, by ruler [m].
-        config: Segments and gates.
 
     Raises:
         DegenerateDataError: Too few segments, one side only, no straight run, one speed only.
         PoorFitError: The segments lie on no line.
     """
-    config = config or GainsConfig()
-    segments = find_segments(drive, config)
-    _require_variety(segments, config)
+    segments = find_segments(drive)
+    _require_variety(segments)
     w = np.array([s.yaw_rate_radps for s in segments])
     vx, vy = (np.array([getattr(s, name) for s in segments]) for name in ("vx_mps", "vy_mps"))
     (ahead, turned), _ = linear_fit(np.stack([w, -vx], axis=1), vy)
@@ -194,27 +184,27 @@ def fit_gains(drive: RecordedDrive, wheelbase_m: float, config: GainsConfig | No
         steering,
         stddev,
     )
-    _require_lines(fit, config)
+    _require_lines(fit)
     return fit
 
 
-def find_segments(drive: RecordedDrive, config: GainsConfig) -> list[Segment]:
+def find_segments(drive: RecordedDrive) -> list[Segment]:
     """Stretches with constant commands, settled, with their twists."""
     if len(drive.command_s) < 2 or len(drive.pose_s) < 10:
         raise DegenerateDataError(
             f"expected commands and poses of a drive, got {len(drive.command_s)} commands and {len(drive.pose_s)} poses"
         )
     segments = []
-    for start, end, servo, erpm in _constant_stretches(drive, config):
-        begin = start + config.settle_s
-        pieces = max(1, int(np.ceil((end - begin) / config.longest_s)))
+    for start, end, servo, erpm in _constant_stretches(drive):
+        begin = start + _SETTLE_S
+        pieces = max(1, int(np.ceil((end - begin) / _LONGEST_S)))
         edges = np.linspace(begin, end, pieces + 1)
         for a, b in pairwise(edges):
             inside = (drive.pose_s >= a) & (drive.pose_s <= b)
-            if b - a < config.least_s or inside.sum() < 10:
+            if b - a < _LEAST_S or inside.sum() < 10:
                 continue
             vx, vy, w = twist(drive.pose_s[inside], drive.poses[inside])
-            if np.hypot(vx, vy) >= config.least_speed_mps:
+            if np.hypot(vx, vy) >= _LEAST_SPEED_MPS:
                 segments.append(Segment(float(a), float(b), servo, erpm, vx, vy, w))
     return segments
 
@@ -240,15 +230,15 @@ def twist(time_s: Array, poses: Array) -> tuple[float, float, float]:
     return vx, vy, w
 
 
-def _constant_stretches(drive: RecordedDrive, config: GainsConfig) -> list[tuple[float, float, float, float]]:
+def _constant_stretches(drive: RecordedDrive) -> list[tuple[float, float, float, float]]:
     """Start, end, mean servo and mean erpm of runs in which each command is near the run's first."""
     stretches, first = [], 0
     servo, erpm, when = drive.servo, drive.erpm, drive.command_s
     for row in range(1, len(when) + 1):
         same = (
             row < len(when)
-            and abs(servo[row] - servo[first]) <= config.servo_tolerance
-            and abs(erpm[row] - erpm[first]) <= config.erpm_tolerance
+            and abs(servo[row] - servo[first]) <= _SERVO_TOLERANCE
+            and abs(erpm[row] - erpm[first]) <= _ERPM_TOLERANCE
         )  # NaN is like nothing, itself included
         if same:
             continue
@@ -262,19 +252,19 @@ def _constant_stretches(drive: RecordedDrive, config: GainsConfig) -> list[tuple
     return stretches
 
 
-def _require_variety(segments: list[Segment], config: GainsConfig) -> None:
-    cure = f"hold each command for {config.settle_s + config.least_s:.1f} s or more: circles to both sides, straight runs, two speeds"
+def _require_variety(segments: list[Segment]) -> None:
+    cure = f"hold each command for {_SETTLE_S + _LEAST_S:.1f} s or more: circles to both sides, straight runs, two speeds"
     require_count(len(segments), 6, "stretches with constant commands", cure)
     curvature = np.array(
         [s.yaw_rate_radps / np.hypot(s.vx_mps, s.vy_mps) * np.sign(s.vx_mps) for s in segments]
     )
-    tight = config.least_curvature_1pm
+    tight = _LEAST_CURVATURE_1PM
     missing = [
         name
         for name, there in (
             ("left circle", (curvature > tight).any()),
             ("right circle", (curvature < -tight).any()),
-            ("straight run", (np.abs(curvature) < config.straight_1pm).any()),
+            ("straight run", (np.abs(curvature) < _STRAIGHT_1PM).any()),
         )
         if not there
     ]
@@ -303,15 +293,15 @@ def _speed_line(speed: Array, erpm: Array) -> tuple[float, float, float]:
     return 1.0 / slope, -at_zero / slope, slope_sd / slope**2
 
 
-def _require_lines(fit: GainsFit, config: GainsConfig) -> None:
-    if fit.steering_rms_rad > config.most_steering_rms_rad:
+def _require_lines(fit: GainsFit) -> None:
+    if fit.steering_rms_rad > _MOST_STEERING_RMS_RAD:
         raise PoorFitError(
-            f"expected wheel angles on a line within {config.most_steering_rms_rad:.3f} rad, got {fit.steering_rms_rad:.3f} rad; does the car "
+            f"expected wheel angles on a line within {_MOST_STEERING_RMS_RAD:.3f} rad, got {fit.steering_rms_rad:.3f} rad; does the car "
             "slip, is the servo at its end, are commands and poses on one clock?"
         )
     fast = float(np.abs(fit.speed_mps).max())
-    if fit.speed_rms_mps > config.most_speed_rms * fast:
+    if fit.speed_rms_mps > _MOST_SPEED_RMS * fast:
         raise PoorFitError(
-            f"expected speeds on a line within {100 * config.most_speed_rms:.0f} %, got {fit.speed_rms_mps:.3f} m/s at up to {fast:.2f} m/s; was the "
+            f"expected speeds on a line within {100 * _MOST_SPEED_RMS:.0f} %, got {fit.speed_rms_mps:.3f} m/s at up to {fast:.2f} m/s; was the "
             "floor level, the battery full, the car lifted?"
         )

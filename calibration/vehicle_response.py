@@ -26,23 +26,14 @@ _DELAYS_S = np.arange(0.0, 0.41, 0.02)
 _SLEW_RANGE = (0.3, 30.0)
 # A stop is not first order: what follows it counts again after this.
 _AFTER_STOP_S = 1.0
-
-
-@dataclass(frozen=True)
-class ResponseConfig:
-    """Limits beyond which a fit is rejected.
-
-    Attributes:
-        min_changes: Fewer changes of the command are refused.
-        least_steering_step_rad: A change of the wheel angle below this does not count [rad].
-        least_speed_step_mps: A change of the speed below this does not count [m/s].
-        most_unexplained: A larger share of the motion's variance left by the model is refused.
-    """
-
-    min_changes: int = 6
-    least_steering_step_rad: float = 0.08
-    least_speed_step_mps: float = 0.15
-    most_unexplained: float = 0.1
+# Fewer changes of the command are refused.
+_MIN_CHANGES = 6
+# A change of the wheel angle below this does not count [rad].
+_LEAST_STEERING_STEP_RAD = 0.08
+# A change of the speed below this does not count [m/s].
+_LEAST_SPEED_STEP_MPS = 0.15
+# A larger share of the motion's variance left by the model is refused.
+_MOST_UNEXPLAINED = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,19 +85,18 @@ class ResponseFit:
         )
 
 
-def fit_response(drive: RecordedDrive, gains: GainsFit, config: ResponseConfig | None = None) -> ResponseFit:
+def fit_response(drive: RecordedDrive, gains: GainsFit) -> ResponseFit:
     """Fit delay and lag to the drive whose gains are known.
 
     Raises:
         DegenerateDataError: The commands change too seldom or too little.
         PoorFitError: The model leaves too much of the motion unexplained.
     """
-    config = config or ResponseConfig()
     steering = gains.steering_of(drive.servo)
     stopped = ~np.isfinite(drive.erpm)
     speed = np.where(stopped, 0.0, gains.speed_of(np.where(stopped, 0.0, drive.erpm)))
-    _require_changes(steering, config.least_steering_step_rad, config.min_changes, "steering", "rad")
-    _require_changes(speed, config.least_speed_step_mps, max(config.min_changes // 2, 2), "speed", "m/s")
+    _require_changes(steering, _LEAST_STEERING_STEP_RAD, _MIN_CHANGES, "steering", "rad")
+    _require_changes(speed, _LEAST_SPEED_STEP_MPS, max(_MIN_CHANGES // 2, 2), "speed", "m/s")
     grid = np.arange(drive.pose_s[0], drive.pose_s[-1], GRID_S)
     yaw, travelled = _motion(drive, gains, grid)
     kept = _in_force(drive, stopped, grid)
@@ -120,8 +110,8 @@ def fit_response(drive: RecordedDrive, gains: GainsFit, config: ResponseConfig |
         return _integral(follow(drive.command_s + delay, speed, grid, lag, slew))
 
     return ResponseFit(
-        _fit(grid, yaw, turned, kept, True, "steering", config),
-        _fit(grid, travelled, moved, kept, False, "speed", config),
+        _fit(grid, yaw, turned, kept, True, "steering"),
+        _fit(grid, travelled, moved, kept, False, "speed"),
         float(np.nanmedian(drive.pipeline_s)) if np.isfinite(drive.pipeline_s).any() else 0.0,
     )
 
@@ -246,7 +236,6 @@ def _fit(
     kept: NDArray[np.bool_],
     with_slew: bool,
     what: str,
-    config: ResponseConfig,
 ) -> Followed:
     change = _windows(seen)[kept]
     if len(change) < 100:
@@ -270,9 +259,9 @@ def _fit(
         if limited.cost < 0.98 * plain.cost and np.exp(limited.x[2]) < 0.95 * _SLEW_RANGE[1]:
             found, slew = limited, float(np.exp(limited.x[2]))
     unexplained = float(2.0 * found.cost / np.sum((change - change.mean()) ** 2))
-    if unexplained > config.most_unexplained:
+    if unexplained > _MOST_UNEXPLAINED:
         raise PoorFitError(
-            f"expected delay and lag to explain all but {100 * config.most_unexplained:.0f} % of the {what}, got {100 * unexplained:.0f} % left; are "
+            f"expected delay and lag to explain all but {100 * _MOST_UNEXPLAINED:.0f} % of the {what}, got {100 * unexplained:.0f} % left; are "
             "commands and poses on one clock, and is /motor/sent what really went out?"
         )
     # Windows overlap WINDOW times, so that many fewer of them are independent.

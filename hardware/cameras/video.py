@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 
-from hardware.cameras.interface import Camera, Frame
+from hardware.cameras.played import PlayedCamera
 from hardware.errors import DeviceNotFound, LinkLost
 
 
-class VideoCamera(Camera):
+class VideoCamera(PlayedCamera):
     """Delivers the frames of a video file, stamped at their delivery instead of with the time in the video.
 
     Args:
@@ -25,13 +23,9 @@ class VideoCamera(Camera):
     def __init__(self, path: Path | str, rate_hz: float | None = None, loop: bool = True) -> None:
         if rate_hz is not None and not rate_hz > 0.0:
             raise ValueError(f"expected a rate > 0 Hz, got {rate_hz}")
-        self.path = Path(path)
+        super().__init__(path, loop)
         self._rate_hz = rate_hz
-        self._loop = loop
         self._video: Any = None
-        self._period_s = 0.0
-        self._sequence = 0
-        self._next_s = 0.0
 
     def open(self) -> None:
         """Open the file at its beginning."""
@@ -45,34 +39,21 @@ class VideoCamera(Camera):
             raise DeviceNotFound(
                 f"expected a video, cannot read {self.path}; convert it, for example to MP4 with H.264"
             )
-        self._video, self._period_s = video, 1.0 / (self._rate_hz or own_hz)
-        self._sequence, self._next_s = 0, time.monotonic()
+        self._video = video
+        self._begin(1.0 / (self._rate_hz or own_hz))
 
-    def read(self, timeout_s: float) -> Frame | None:
-        """Return the next frame when it is due, or None after ``timeout_s``."""
-        if self._video is None:
-            raise LinkLost(f"expected an open camera, but {self.path} is not open; call open() first")
-        wait_s = self._next_s - time.monotonic()
-        if wait_s > timeout_s:
-            time.sleep(timeout_s)
-            return None
-        time.sleep(max(wait_s, 0.0))
+    def close(self) -> None:
+        """Close the file."""
+        super().close()
+        if self._video is not None:
+            self._video.release()
+            self._video = None
+
+    def _next_bgr(self) -> Any:
         taken, bgr = self._video.read()
         if not taken and self._loop and self._sequence > 0:
             self._video.set(cv2.CAP_PROP_POS_FRAMES, 0)
             taken, bgr = self._video.read()
         if not taken:
             raise LinkLost(f"all {self._sequence} frames of {self.path} were played; set loop to repeat them")
-        rgb = np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8)
-        rgb.flags.writeable = False
-        frame = Frame(rgb, time.time_ns(), time.monotonic_ns(), self._sequence)
-        self._sequence += 1
-        # Scheduled from the current time, so that frames are never delivered in a burst.
-        self._next_s = max(self._next_s + self._period_s, time.monotonic())
-        return frame
-
-    def close(self) -> None:
-        """Close the file."""
-        if self._video is not None:
-            self._video.release()
-            self._video = None
+        return bgr

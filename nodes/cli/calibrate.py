@@ -117,7 +117,7 @@ def intrinsics(
 ) -> None:
     """Calibrate focal length, principal point and distortion from images of a ChArUco board."""
     from calibration.charuco import BoardDetector
-    from calibration.intrinsics import IntrinsicsConfig, calibrate_intrinsics
+    from calibration.intrinsics import calibrate_intrinsics
     from calibration.plots import intrinsics_plot
     from calibration.schema import CalibrationError
     from nodes.lab.wizards.bags import IMAGES, read_pictures
@@ -136,7 +136,7 @@ def intrinsics(
             views.append(found)
     step = max(1, -(-len(views) // most))
     print(f"board found in {len(views)} of {-(-seen // every)} images")
-    fit = calibrate_intrinsics(views[::step], size, IntrinsicsConfig(model=model))  # type: ignore[arg-type]
+    fit = calibrate_intrinsics(views[::step], size, model)  # type: ignore[arg-type]
     save_and_print(fit.calibration, output, intrinsics_plot(fit))
 
 

@@ -51,12 +51,12 @@ def room_path(
     ] = 0.8,
 ) -> None:
     """Fit the reference path to a trace of the car or the wand. The fence of an existing file is kept."""
-    from calibration.path_fit import PathFitConfig, fit_path
+    from calibration.path_fit import fit_path
     from calibration.plots import save_with_plot
     from calibration.room import clearance, fence_around, start_before_corner
 
     trace = _trace(bag, topic)
-    fit = fit_path(trace, PathFitConfig(closed=closed))
+    fit = fit_path(trace, closed)
     old = _old_room(output)
     fence = old.fence_m if old else fence_around(fit.path, fence_margin_m)
     room = _room(

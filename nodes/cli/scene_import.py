@@ -147,19 +147,26 @@ def from_phone_and_car(
 ) -> None:
     """Combine phone media and the frames of a bag into one model, metric and in the motion-capture world."""
     from advnerf_core.data.keyframes import KeyframeConfig
-    from calibration.phone_and_car import PlacingConfig
     from calibration.structure_from_motion import SfmConfig
     from nodes.lab.importing.data_set import from_phone_and_car as run
     from nodes.lab.importing.driven_bag import BagConfig
     from nodes.lab.importing.media import MediaConfig
 
     media_config = MediaConfig(KeyframeConfig(movement), most, one_camera)
-    bag_config, placing = BagConfig(step_m, math.radians(step_deg), most=most), PlacingConfig(tolerance_m)
+    bag_config = BagConfig(step_m, math.radians(step_deg), most=most)
     _run(
         "from-phone-and-car",
         output,
         lambda report: run(
-            media, bag, output, media_config, bag_config, SfmConfig(seed=seed), placing, report, calibration
+            media,
+            bag,
+            output,
+            media_config,
+            bag_config,
+            SfmConfig(seed=seed),
+            tolerance_m,
+            report,
+            calibration,
         ),
     )
 

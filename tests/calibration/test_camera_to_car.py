@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from advnerf_core.data.similarity import rotation_angles
 from advnerf_core.geometry import camera_mount, invert_transform, make_transform, planar_pose
-from calibration.camera_to_car import MountConfig, MountView, calibrate_mount
+from calibration.camera_to_car import MountView, calibrate_mount
 from calibration.degeneracy import DegenerateDataError, PoorFitError
 from calibration.measured import LensCalibration
 from calibration.schema import CameraCalibration, load_calibration, save_calibration
@@ -133,7 +133,7 @@ def test_too_few_views_are_refused():
 
 
 def test_the_file_is_a_camera_and_survives_a_round_trip(tmp_path):
-    fit = calibrate_mount(views(np.random.default_rng(9), 20), LENS, config=MountConfig(min_views=12))
+    fit = calibrate_mount(views(np.random.default_rng(9), 20), LENS)
     calibration = fit.calibration(LENS)
     save_calibration(calibration, tmp_path / "camera.yaml")
     loaded = load_calibration(CameraCalibration, tmp_path / "camera.yaml")

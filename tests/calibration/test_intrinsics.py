@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from calibration import intrinsics
 from calibration.charuco import Board, BoardDetector
 from calibration.degeneracy import DegenerateDataError, PoorFitError
-from calibration.intrinsics import IntrinsicsConfig, calibrate_intrinsics
+from calibration.intrinsics import calibrate_intrinsics
 from calibration.measured import LensCalibration
 from calibration.schema import CalibrationError, load_calibration, save_calibration
 from tests.support.boards import BOARD, board_views
@@ -50,12 +51,11 @@ def test_too_few_views_are_refused(views):
         calibrate_intrinsics(views[:19], SIZE)
 
 
-def test_a_board_always_in_one_corner_is_refused(views):
+def test_a_board_always_in_one_corner_is_refused(views, monkeypatch):
+    monkeypatch.setattr(intrinsics, "_MIN_VIEWS", 8)
     half = [type(v)(v.board_m[v.pixels[:, 0] < 330], v.pixels[v.pixels[:, 0] < 330]) for v in views]
     with pytest.raises(DegenerateDataError, match="at the right edge"):
-        calibrate_intrinsics(
-            [v for v in half if len(v.pixels) >= 6][:25], SIZE, IntrinsicsConfig(min_views=8)
-        )
+        calibrate_intrinsics([v for v in half if len(v.pixels) >= 6][:25], SIZE)
 
 
 def test_a_board_seen_face_on_only_is_refused():

@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 
 from advnerf_core.driving.path import Arc, Line, Path
+from calibration import path_fit
 from calibration.degeneracy import DegenerateDataError
-from calibration.path_fit import PathFitConfig, fit_path
+from calibration.path_fit import fit_path
 
 SQUARE = Path.rounded_square(4.0, 1.1)
 
@@ -70,11 +71,11 @@ def test_a_clockwise_circle_and_a_swaying_driver():
     assert 0.005 < swaying.rms_m < 0.03
 
 
-def test_traces_that_are_none_are_refused_with_the_reason():
+def test_traces_that_are_none_are_refused_with_the_reason(monkeypatch):
     with pytest.raises(DegenerateDataError, match="at least 1 m"):
         fit_path(np.random.default_rng(0).normal(0.0, 0.002, (500, 2)))
     with pytest.raises(DegenerateDataError, match=r"ends are \d.\d+ m apart"):
-        fit_path(driven(SQUARE, 0.6), PathFitConfig(closed=True))
+        fit_path(driven(SQUARE, 0.6), closed=True)
     with pytest.raises(DegenerateDataError, match="finite positions"):
         fit_path([[0.0, np.nan], [1.0, 1.0]])
     s = np.linspace(0.0, 6.0, 800)
@@ -82,5 +83,6 @@ def test_traces_that_are_none_are_refused_with_the_reason():
     with pytest.raises(DegenerateDataError, match=r"needs \d+ lines and arcs on"):
         fit_path(zigzag)
     wavy = np.stack([s, 0.1 * np.sin(s / 0.5)], axis=1)
+    monkeypatch.setattr(path_fit, "_WORST_RMS_M", 0.0005)
     with pytest.raises(DegenerateDataError, match="lines and arcs leave"):
-        fit_path(wavy, PathFitConfig(worst_rms_m=0.0005))
+        fit_path(wavy)

@@ -5,7 +5,7 @@ from scipy.spatial.transform import Rotation
 from advnerf_core.data.lens import Lens
 from advnerf_core.data.similarity import Similarity, SimilarityError
 from advnerf_core.geometry import Pinhole, camera_mount, make_transform, planar_pose
-from calibration.phone_and_car import PlacingConfig, place_in_mocap
+from calibration.phone_and_car import place_in_mocap
 from calibration.structure_from_motion import Model, ReconstructionError, Registered
 
 MOUNT = camera_mount(0.3, 0.0, 0.2, 0.17)
@@ -81,4 +81,4 @@ def test_a_straight_drive_and_too_few_shared_frames_are_refused():
 def test_poses_that_disagree_everywhere_are_refused():
     scrambled = mocap_of(drive()[np.random.default_rng(1).permutation(24)])
     with pytest.raises(SimilarityError, match=r"to agree within 0\.08 m"):
-        place_in_mocap(model_of(walk(), drive()), scrambled, PlacingConfig())
+        place_in_mocap(model_of(walk(), drive()), scrambled)

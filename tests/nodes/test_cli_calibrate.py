@@ -26,7 +26,7 @@ from hardware.worlds.lab.config import LabConfig
 from nodes.bags.reader import read_info
 from nodes.bags.writer import BagWriter
 from nodes.cli import main as cli
-from nodes.lab.wizards.bags import StillConfig, read_shown, still_views
+from nodes.lab.wizards.bags import read_shown, still_views
 from nodes.lab.wizards.live import record_live
 from nodes.lab.wizards.screen import show_and_watch
 from nodes.runtime.bus import Bus
@@ -228,7 +228,7 @@ def test_camera_to_car_from_a_bag_of_stops(tmp_path, capsys):
                 stamp,
                 k,
             )
-    views, frames = still_views(tmp_path / "bag", BoardDetector(board), "/vicon/board", StillConfig())
+    views, frames = still_views(tmp_path / "bag", BoardDetector(board), "/vicon/board")
     assert frames > 50
     assert 12 <= len(views) <= stops
     options = (

@@ -8,8 +8,8 @@ from typing import Literal
 from pydantic import Field
 
 from advnerf_core.strict import StrictModel
-from hardware.worlds.junction.config import DubinsConfig, PhotoConfig
-from hardware.worlds.lab.config import CameraConfig
+from hardware.worlds.junction.config import DubinsConfig
+from hardware.worlds.lab.config import CameraConfig, PhotoConfig
 
 _WHOLE_TICK_S = 1e-6
 

@@ -8,8 +8,7 @@ from typing import Literal
 from pydantic import Field
 
 from advnerf_core.strict import StrictModel
-from hardware.worlds.junction.config import PhotoConfig
-from hardware.worlds.lab.config import CameraConfig
+from hardware.worlds.lab.config import CameraConfig, PhotoConfig
 from hardware.worlds.remote_world import ServerDeadlines
 
 

@@ -6,10 +6,9 @@ import math
 
 from pydantic import Field, model_validator
 
-from advnerf_core.geometry import Pinhole
 from advnerf_core.strict import StrictModel
 from hardware.worlds.junction.paths import PathName, junction_paths
-from hardware.worlds.lab.config import CameraConfig
+from hardware.worlds.lab.config import CameraConfig, PhotoConfig
 from hardware.worlds.paths import ReferencePath
 from hardware.worlds.world import CarDescription
 
@@ -34,26 +33,6 @@ class RoadConfig(StrictModel):
     half_m: float = Field(default=60.0, ge=50.0, le=100.0)
     sky_m: float = Field(default=36.0, ge=20.0)
     seed: int = Field(default=11, ge=0)
-
-
-class PhotoConfig(StrictModel):
-    """The camera that photographs the scene for learning: same colours as the driving camera, wider and larger.
-
-    Attributes:
-        width: Image width [px].
-        height: Image height [px].
-        horizontal_fov_deg: Horizontal field of view [deg]; fixes fx = fy.
-    """
-
-    width: int = Field(default=640, gt=0)
-    height: int = Field(default=360, gt=0)
-    horizontal_fov_deg: float = Field(default=90.0, gt=0.0, lt=170.0)
-
-    @property
-    def pinhole(self) -> Pinhole:
-        """Intrinsics with a centred principal point and square pixels."""
-        focal_px = 0.5 * self.width / math.tan(0.5 * math.radians(self.horizontal_fov_deg))
-        return Pinhole(self.width, self.height, focal_px, focal_px, 0.5 * self.width, 0.5 * self.height)
 
 
 # Keys of a world with this car (``car:``) that change how it moves, and neither a picture nor its description.

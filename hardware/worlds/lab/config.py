@@ -52,13 +52,30 @@ class TrackConfig(StrictModel):
         return self
 
 
-class CameraConfig(StrictModel):
-    """The driving camera: like the left eye of a ZED at half VGA, without distortion.
+class PhotoConfig(StrictModel):
+    """A camera without distortion that photographs a scene for learning.
 
     Attributes:
-        width: Image width [px]; 366 for the paper's figure.
+        width: Image width [px].
         height: Image height [px].
         horizontal_fov_deg: Horizontal field of view [deg]; fixes fx = fy.
+    """
+
+    width: int = Field(default=640, gt=0)
+    height: int = Field(default=360, gt=0)
+    horizontal_fov_deg: float = Field(default=90.0, gt=0.0, lt=170.0)
+
+    @property
+    def pinhole(self) -> Pinhole:
+        """Intrinsics with a centred principal point and square pixels."""
+        focal_px = 0.5 * self.width / math.tan(0.5 * math.radians(self.horizontal_fov_deg))
+        return Pinhole(self.width, self.height, focal_px, focal_px, 0.5 * self.width, 0.5 * self.height)
+
+
+class CameraConfig(PhotoConfig):
+    """The driving camera: like the left eye of a ZED at half VGA; 366 pixels wide for the paper's figure.
+
+    Attributes:
         rate_hz: Frame rate of the live camera [Hz].
         x_m: Position ahead of the rear axle [m].
         y_m: Position left of the car's middle [m].
@@ -76,23 +93,15 @@ class CameraConfig(StrictModel):
     pitch_down_rad: float = math.radians(10.0)
 
     @property
-    def pinhole(self) -> Pinhole:
-        """Intrinsics with a centred principal point and square pixels."""
-        return _centred_pinhole(self.width, self.height, self.horizontal_fov_deg)
-
-    @property
     def T_car_from_camera(self) -> Array:
         """Mounting pose ``[4, 4]`` of the camera on the car."""
         return camera_mount(self.x_m, self.y_m, self.z_m, self.pitch_down_rad)
 
 
-class PhoneConfig(StrictModel):
+class PhoneConfig(PhotoConfig):
     """The camera that photographs the room: another field of view, resolution and colour response.
 
     Attributes:
-        width: Image width [px].
-        height: Image height [px].
-        horizontal_fov_deg: Horizontal field of view [deg].
         colour_matrix: Mixing of the driving camera's linearised channels into the phone's, row by row.
         gamma: Exponent of the phone's tone curve relative to the driving camera's.
         mount_height_m: Range of heights when the phone rides on the car [m].
@@ -106,11 +115,6 @@ class PhoneConfig(StrictModel):
     gamma: float = Field(default=0.95, gt=0.0)
     mount_height_m: tuple[float, float] = (0.19, 0.32)
     walk_height_m: tuple[float, float] = (0.9, 1.7)
-
-    @property
-    def pinhole(self) -> Pinhole:
-        """Intrinsics with a centred principal point and square pixels."""
-        return _centred_pinhole(self.width, self.height, self.horizontal_fov_deg)
 
 
 class PanelConfig(StrictModel):
@@ -297,8 +301,3 @@ class LabConfig(StrictModel):
     def start_pose(self) -> tuple[float, float, float]:
         """Nominal start of the experiments, 2 m before the bottom right corner: x [m], y [m], yaw [rad]."""
         return 0.5 * self.track.side_m - self.track.corner_radius_m - 2.0, -0.5 * self.track.side_m, 0.0
-
-
-def _centred_pinhole(width: int, height: int, horizontal_fov_deg: float) -> Pinhole:
-    focal_px = 0.5 * width / math.tan(0.5 * math.radians(horizontal_fov_deg))
-    return Pinhole(width, height, focal_px, focal_px, 0.5 * width, 0.5 * height)

@@ -13,7 +13,6 @@ from advnerf_core.display import DisplayModel
 from advnerf_core.geometry import invert_transform, planar_pose, transform_points
 from calibration.display_colour import (
     DisplayCalibration,
-    DisplayConfig,
     DisplayFit,
     colours_to_show,
     fit_display,
@@ -32,7 +31,7 @@ LIGHT = "panel_light.yaml"
 _INSIDE, _POSES, _LEAST_PX = 0.8, 3, 20
 _NAME = "light"
 # Without a room's glare on glass, black is black: primaries leave two channels dark.
-_GATES = DisplayConfig(least_free=0.4)
+_LEAST_FREE = 0.4
 
 
 def light_on_panels(experiment: Experiment) -> DisplayModel | None:
@@ -74,7 +73,7 @@ def measure_light(experiment: Experiment, world: World) -> DisplayFit:
     finally:
         world.add_panel(_NAME, panel, None)
     # Paint has no falloff: where it is seen from does not matter.
-    return fit_display(np.repeat(colours / 255.0, len(poses), axis=0), np.array(seen), config=_GATES)
+    return fit_display(np.repeat(colours / 255.0, len(poses), axis=0), np.array(seen), least_free=_LEAST_FREE)
 
 
 def _poses(experiment: Experiment, world: World, thing: PlacedObject) -> list[Pose]:

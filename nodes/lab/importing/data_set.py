@@ -15,7 +15,7 @@ from advnerf_core.data.lens import Lens
 from advnerf_core.data.similarity import Similarity, extent
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, Pinhole, make_transform
-from calibration.phone_and_car import Placed, PlacingConfig, place_in_mocap
+from calibration.phone_and_car import Placed, place_in_mocap
 from calibration.structure_from_motion import Model, PhotoSource, SfmConfig, reconstruct
 from nodes.lab.importing.driven_bag import CAR_CAMERA, BagConfig, DrivenFrames, take_frames
 from nodes.lab.importing.errors import ImportRecordingError
@@ -71,30 +71,22 @@ def from_media(
         extent_m: Largest distance between two camera positions [m].
         report: Progress callback.
     """
-    imported = build_beside(
-        output, media, lambda folder: _from_media(media, folder, media_config, sfm, extent_m, report)
-    )
-    return imported.moved_to(output)
 
+    def build(folder: Path) -> Imported:
+        sources = gather(
+            media, folder, media_config, lambda share, text="": report(_MEDIA_SHARE * share, text)
+        )
+        model = _reconstruct(folder, sources, sfm, report)
+        similarity = upright(model, extent_m)
+        poses, points = similarity.poses(model.poses), similarity.points(model.points)
+        facts = {
+            "structure_from_motion": model.summary(),
+            "scale": "not metric: the extent was assumed",
+            "extent_m": extent_m,
+        }
+        return _write(folder, model, poses, points, facts)
 
-def _from_media(
-    media: Sequence[Path],
-    output: Path,
-    media_config: MediaConfig,
-    sfm: SfmConfig,
-    extent_m: float,
-    report: Report,
-) -> Imported:
-    sources = gather(media, output, media_config, lambda share, text="": report(_MEDIA_SHARE * share, text))
-    model = _reconstruct(output, sources, sfm, report)
-    similarity = upright(model, extent_m)
-    poses, points = similarity.poses(model.poses), similarity.points(model.points)
-    facts = {
-        "structure_from_motion": model.summary(),
-        "scale": "not metric: the extent was assumed",
-        "extent_m": extent_m,
-    }
-    return _write(output, model, poses, points, facts)
+    return build_beside(output, media, build).moved_to(output)
 
 
 def from_bag(
@@ -115,25 +107,17 @@ def from_bag(
         report: Progress callback.
         calibration: Camera calibration file; None uses the one in the bag.
     """
-    imported = build_beside(
-        output,
-        (),
-        lambda folder: _from_bag(bag, folder, config, margin_m, report, calibration),
-        resumes=False,
-    )
-    return imported.moved_to(output)
 
+    def build(folder: Path) -> Imported:
+        frames = take_frames(bag, folder / IMAGES / CAR_CAMERA, config, report, calibration)
+        positions = frames.T_world_from_camera[:, :3, 3]
+        facts = {"bag": str(bag), **_bag_facts(frames), "scale": "metric: motion capture"}
+        reach = np.concatenate([positions - margin_m, positions + margin_m])
+        path = folder / TRANSFORMS
+        _write_car(path, frames, {**_box(reach, margin=0.0), "world": "mocap"})
+        return _finish(folder, (path,), facts)
 
-def _from_bag(
-    bag: Path, output: Path, config: BagConfig, margin_m: float, report: Report, calibration: Path | None
-) -> Imported:
-    frames = take_frames(bag, output / IMAGES / CAR_CAMERA, config, report, calibration)
-    positions = frames.T_world_from_camera[:, :3, 3]
-    facts = {"bag": str(bag), **_bag_facts(frames), "scale": "metric: motion capture"}
-    reach = np.concatenate([positions - margin_m, positions + margin_m])
-    path = output / TRANSFORMS
-    _write_car(path, frames, {**_box(reach, margin=0.0), "world": "mocap"})
-    return _finish(output, (path,), facts)
+    return build_beside(output, (), build, resumes=False).moved_to(output)
 
 
 def from_phone_and_car(
@@ -143,7 +127,7 @@ def from_phone_and_car(
     media_config: MediaConfig,
     bag_config: BagConfig,
     sfm: SfmConfig,
-    placing: PlacingConfig,
+    tolerance_m: float,
     report: Report,
     calibration: Path | None = None,
 ) -> Imported:
@@ -152,54 +136,42 @@ def from_phone_and_car(
     ``transforms.json`` has all registered images with the model's poses, ``transforms_phone.json`` only those of the phone (for
     training), ``transforms_car.json`` all frames of the car with their motion-capture poses (to fit colours and to compare).
     """
-    imported = build_beside(
-        output,
-        media,
-        lambda folder: _from_phone_and_car(
-            media, bag, folder, media_config, bag_config, sfm, placing, report, calibration
-        ),
-    )
-    return imported.moved_to(output)
 
-
-def _from_phone_and_car(
-    media: Sequence[Path],
-    bag: Path,
-    output: Path,
-    media_config: MediaConfig,
-    bag_config: BagConfig,
-    sfm: SfmConfig,
-    placing: PlacingConfig,
-    report: Report,
-    calibration: Path | None,
-) -> Imported:
-    frames = take_frames(
-        bag,
-        output / IMAGES / CAR_CAMERA,
-        bag_config,
-        lambda share, text="": report(0.1 * share, text),
-        calibration,
-    )
-    sources = gather(
-        media, output, media_config, lambda share, text="": report(0.1 + (_MEDIA_SHARE - 0.1) * share, text)
-    )
-    if any(source.camera_id == CAR_CAMERA for source in sources):
-        raise ImportRecordingError(
-            f"expected phone media with another name than {CAR_CAMERA!r}, which is the driving camera's; rename it"
+    def build(folder: Path) -> Imported:
+        frames = take_frames(
+            bag,
+            folder / IMAGES / CAR_CAMERA,
+            bag_config,
+            lambda share, text="": report(0.1 * share, text),
+            calibration,
         )
-    names = tuple(file.relative_to(output).as_posix() for file in frames.files)
-    camera = frames.calibration
-    car = PhotoSource(CAR_CAMERA, names, ordered=True, pinhole=camera.pinhole, lens=Lens(camera.distortion))
-    model = _reconstruct(output, [*sources, car], sfm, report)
-    placed = place_in_mocap(model, dict(zip(names, frames.T_world_from_camera, strict=True)), placing)
-    facts = {
-        "bag": str(bag),
-        **_bag_facts(frames),
-        "structure_from_motion": model.summary(),
-        "placing": placed.summary(),
-        "scale": "metric: motion capture",
-    }
-    return _write_joint(output, model, placed, frames, facts)
+        sources = gather(
+            media,
+            folder,
+            media_config,
+            lambda share, text="": report(0.1 + (_MEDIA_SHARE - 0.1) * share, text),
+        )
+        if any(source.camera_id == CAR_CAMERA for source in sources):
+            raise ImportRecordingError(
+                f"expected phone media with another name than {CAR_CAMERA!r}, which is the driving camera's; rename it"
+            )
+        names = tuple(file.relative_to(folder).as_posix() for file in frames.files)
+        camera = frames.calibration
+        car = PhotoSource(
+            CAR_CAMERA, names, ordered=True, pinhole=camera.pinhole, lens=Lens(camera.distortion)
+        )
+        model = _reconstruct(folder, [*sources, car], sfm, report)
+        placed = place_in_mocap(model, dict(zip(names, frames.T_world_from_camera, strict=True)), tolerance_m)
+        facts = {
+            "bag": str(bag),
+            **_bag_facts(frames),
+            "structure_from_motion": model.summary(),
+            "placing": placed.summary(),
+            "scale": "metric: motion capture",
+        }
+        return _write_joint(folder, model, placed, frames, facts)
+
+    return build_beside(output, media, build).moved_to(output)
 
 
 def upright(model: Model, extent_m: float) -> Similarity:

@@ -34,6 +34,14 @@ from nodes.runtime.topics import topic as topic_row
 Rgb = NDArray[np.uint8]
 IMAGES, CAR, SENT = "/camera/image_raw", "/vicon/car", "/motor/sent"
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+# Poses within this time before and after a frame are checked and averaged [s].
+_HALF_WINDOW_S = 0.15
+# Largest distance of a pose from their mean [m].
+_MOST_MOTION_M = 0.004
+# Largest angle of a pose from their mean [rad].
+_MOST_TURN_RAD = 0.008
+# Number of frames taken per stop.
+_PER_STOP = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,45 +134,24 @@ def read_drive(bag: Path) -> RecordedDrive:
     )
 
 
-@dataclass(frozen=True)
-class StillConfig:
-    """Criteria for standing still.
-
-    Attributes:
-        half_window_s: Poses within this time before and after a frame are checked and averaged [s].
-        most_motion_m: Largest distance of a pose from their mean [m].
-        most_turn_rad: Largest angle of a pose from their mean [rad].
-        per_stop: Number of frames taken per stop.
-    """
-
-    half_window_s: float = 0.15
-    most_motion_m: float = 0.004
-    most_turn_rad: float = 0.008
-    per_stop: int = 1
-
-
-def still_views(
-    bag: Path, detector: BoardDetector, board_topic: str | None, config: StillConfig | None = None
-) -> tuple[list[MountView], int]:
+def still_views(bag: Path, detector: BoardDetector, board_topic: str | None) -> tuple[list[MountView], int]:
     """Find the frames with a board in view while car and board stood still.
 
     Args:
         bag: Bag with frames and poses.
         detector: Detector of the board.
         board_topic: Topic of the board's poses; None if it is not tracked.
-        config: Criteria for standing still.
 
     Returns:
         The views, and the number of frames in the bag.
     """
-    config = config or StillConfig()
     car = read_poses(bag, CAR)
     board = None if board_topic is None else read_poses(bag, board_topic)
     stops: list[list[MountView]] = [[]]
     count = 0
     for stamp, image in read_frames(bag):
         count += 1
-        view = _still_view(stamp, image, car, board, detector, config)
+        view = _still_view(stamp, image, car, board, detector)
         if view is not None:
             stops[-1].append(view)
         elif stops[-1]:
@@ -172,7 +159,7 @@ def still_views(
     chosen = []
     for stop in stops:
         if stop:
-            middles = np.linspace(0, len(stop) - 1, min(config.per_stop, len(stop)) + 2)[1:-1]
+            middles = np.linspace(0, len(stop) - 1, min(_PER_STOP, len(stop)) + 2)[1:-1]
             chosen += [stop[round(i)] for i in middles]
     return chosen, count
 
@@ -233,24 +220,23 @@ def _still_view(
     car: PoseSeries,
     board: PoseSeries | None,
     detector: BoardDetector,
-    config: StillConfig,
 ) -> MountView | None:
-    T_car = _still_pose(car, stamp, config)
-    T_board = None if board is None else _still_pose(board, stamp, config)
+    T_car = _still_pose(car, stamp)
+    T_board = None if board is None else _still_pose(board, stamp)
     if T_car is None or (board is not None and T_board is None):
         return None
     found: Detection | None = detector.find(image)
     return None if found is None else MountView(T_car, T_board, found)
 
 
-def _still_pose(series: PoseSeries, stamp: int, config: StillConfig) -> Array | None:
-    poses = series.around(stamp, round(config.half_window_s * 1e9))
+def _still_pose(series: PoseSeries, stamp: int) -> Array | None:
+    poses = series.around(stamp, round(_HALF_WINDOW_S * 1e9))
     if poses is None:
         return None
     mean = make_transform(mean_rotation(poses[:, :3, :3]), poses[:, :3, 3].mean(axis=0))
     moved = float(np.linalg.norm(poses[:, :3, 3] - mean[:3, 3], axis=1).max())
     turned = float(rotation_angles(mean[:3, :3].T @ poses[:, :3, :3]).max())
-    return mean if moved <= config.most_motion_m and turned <= config.most_turn_rad else None
+    return mean if moved <= _MOST_MOTION_M and turned <= _MOST_TURN_RAD else None
 
 
 def _region(keyed: Sequence[tuple[tuple[float, ...], Path]], angle: float) -> NDArray[np.bool_]:
