@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 from advnerf_core.places import require_utf8
 
@@ -24,6 +25,11 @@ def write_atomically(path: Path, data: str | bytes) -> None:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write a JSON value that people read too, whole or not at all."""
+    write_atomically(path, json.dumps(data, indent=1) + "\n")
 
 
 def sha256_of(file: Path) -> str:

@@ -68,7 +68,7 @@ def test_every_file_of_the_packages_and_what_is_beside_them_rides_in_it(unpacked
 LOOK = """
 import json
 import advnerf_core, calibration, hardware, nodes
-from nodes.experiment.engine.reference import REFERENCE
+from nodes.experiment.engine.artefact import REFERENCE
 from nodes.launching.launch_file import load_launch
 from nodes.runtime.paths import named_file, shipped
 launches = [file.name.split(".")[0] for file in shipped("launch").glob("*.launch.yaml")]

@@ -37,7 +37,7 @@ def prepare_victims(experiment):
 
 def settings_hash(experiment, cell):
     from advnerf_core.attack.methods import method_digest
-    from nodes.experiment.engine.stage_record import hash_of
+    from nodes.experiment.engine.artefact import hash_of
 
     code = method_digest(cell.code)
     return hash_of([cell.scenario, cell.victim, cell.method, cell.seed, code, experiment.data])

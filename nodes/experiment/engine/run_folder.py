@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import platform
 import sys
 from collections.abc import Sequence
@@ -14,10 +13,9 @@ from typing import Any, Generic, TypeVar
 from rich.console import Console
 
 from advnerf_core.documents import read_json
-from advnerf_core.files import write_atomically
-from nodes.experiment.engine.reference import ReferenceBuild
-from nodes.experiment.engine.stage_record import Stage, StageRecord
-from nodes.experiment.engine.stages import check_until, run_stages
+from advnerf_core.files import write_json
+from nodes.experiment.engine.artefact import Artefact, ReferenceBuild
+from nodes.experiment.engine.stages import Stage, check_until, run_stages
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay, StageDisplay
 
@@ -56,7 +54,7 @@ def run_to_end(
     console: Console | None = None,
     reference: ReferenceBuild | None = None,
     watcher: StageDisplay | None = None,
-) -> dict[str, StageRecord]:
+) -> dict[str, Artefact]:
     """Run the stages that are not there yet.
 
     Args:
@@ -116,4 +114,4 @@ def _write_manifest(experiment: RunFolder[Any], libraries: Sequence[str]) -> Non
         "versions": {"advnerf": version("advnerf"), "python": platform.python_version()}
         | {name: found for name in libraries if (found := _installed(name))},
     }
-    write_atomically(experiment.folder / _MANIFEST, json.dumps(manifest, indent=1) + "\n")
+    write_json(experiment.folder / _MANIFEST, manifest)

@@ -12,29 +12,79 @@ from __future__ import annotations
 import json
 import shutil
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from advnerf_core.errors import AdvnerfError
-from nodes.experiment.engine.reference import ReferenceBuild
-from nodes.experiment.engine.stage_record import (
+from nodes.experiment.engine.artefact import (
     RECORD,
-    Stage,
-    StageRecord,
+    Artefact,
+    ReferenceBuild,
     digest_of,
-    key_of,
-    read_record,
-    write_record,
+    hash_of,
+    read_artefact,
+    write_artefact,
 )
 from nodes.runtime.locks import HeldError, hold
-from nodes.runtime.progress import StageDisplay
+from nodes.runtime.progress import MeasuringReport, StageDisplay
 
 
 class StageError(AdvnerfError):
     """A stage was asked for that does not exist, or whose inputs are not there."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One step of a job.
+
+    Attributes:
+        name: Name of the stage and of its folder.
+        run: Does the work, writing only below the given folder.
+        settings: The part of the configuration that the result depends on (JSON types).
+        after: Stages whose outputs this one reads.
+        version: Raised when the meaning of the stage's output changes.
+        goes_on_from: Other settings whose result is a part of this one, as fewer rounds are: their folder is gone on from, not wiped.
+        bulk: Patterns of files that only the making of other stages reads, or of this one: a reference build leaves them out.
+        reads_bulk_of: Stages whose bulk this one reads.
+    """
+
+    name: str
+    run: Callable[[Path, MeasuringReport], None]
+    settings: Mapping[str, Any]
+    after: Sequence[str] = ()
+    version: int = 1
+    goes_on_from: Sequence[Mapping[str, Any]] = ()
+    bulk: Sequence[str] = ()
+    reads_bulk_of: Sequence[str] = ()
+
+
+def key_of(stage: Stage, records: Mapping[str, Artefact]) -> str:
+    """Hash over a stage's settings and version, and the digests of what the stages before it wrote."""
+    inputs = {name: records[name].digest for name in stage.after}
+    return hash_of(
+        {"name": stage.name, "version": stage.version, "settings": stage.settings, "inputs": inputs}
+    )
+
+
+def stage_digests(stages: Sequence[Stage], folder: Path, reference: ReferenceBuild) -> dict[str, str]:
+    """Digests of what stages wrote, as far as a run folder has them, or else a reference build.
+
+    Args:
+        stages: The stages, each after those it names in ``after``.
+        folder: The run folder.
+        reference: The reference build.
+    """
+    records: dict[str, Artefact] = {}
+    for stage in stages:
+        if any(name not in records for name in stage.after):
+            continue
+        found = read_artefact(folder / stage.name) or reference.find(stage.name, key_of(stage, records))
+        if found is not None and found.digest is not None:
+            records[stage.name] = found
+    return {name: str(record.digest) for name, record in records.items()}
 
 
 def run_stages(
@@ -43,7 +93,7 @@ def run_stages(
     display: StageDisplay,
     until: str | None = None,
     reference: ReferenceBuild | None = None,
-) -> dict[str, StageRecord]:
+) -> dict[str, Artefact]:
     """Run the stages in order, skipping those whose result is there and still fits.
 
     Args:
@@ -62,7 +112,7 @@ def run_stages(
     check_until(stages, until)
     wanted = stages if until is None else stages[: [stage.name for stage in stages].index(until) + 1]
     whole = _read_whole(wanted, folder, reference)
-    records: dict[str, StageRecord] = {}
+    records: dict[str, Artefact] = {}
     for stage in wanted:
         at = _Place(folder / stage.name, reference, stage.name in whole)
         records[stage.name] = _run_or_reuse(stage, at, records, display)
@@ -87,15 +137,15 @@ def check_until(stages: Sequence[Stage], until: str | None) -> None:
 
 def _current(
     stages: Sequence[Stage], folder: Path, reference: ReferenceBuild | None = None
-) -> dict[str, StageRecord]:
+) -> dict[str, Artefact]:
     """Stages that are finished, as are all that they build on, and are what would be run now."""
-    records: dict[str, StageRecord] = {}
+    records: dict[str, Artefact] = {}
     for stage in stages:
         if any(earlier not in records for earlier in stage.after):
             continue
-        record, key = read_record(folder / stage.name), key_of(stage, records)
+        record, key = read_artefact(folder / stage.name), key_of(stage, records)
         if record is None or record.digest is None or record.key != key:
-            record = None if reference is None else reference.record(stage, key)
+            record = None if reference is None else reference.find(stage.name, key)
         if record is not None:
             records[stage.name] = record
     return records
@@ -105,7 +155,7 @@ def begun_with(stages: Sequence[Stage], folder: Path, name: str) -> Mapping[str,
     """The settings that a stage's folder was begun with, if running the stage now would go on from there; None if it would not."""
     records = _current(stages, folder)
     stage = next(each for each in stages if each.name == name)
-    record = read_record(folder / name)
+    record = read_artefact(folder / name)
     if record is None or any(earlier not in records for earlier in stage.after):
         return None
     known = (stage.settings, *stage.goes_on_from)
@@ -118,7 +168,7 @@ def keep_stages(stages: Sequence[Stage], folder: Path, reference: ReferenceBuild
     """Copy stages that are finished and current from a run folder into a reference build; returns what is new there."""
     records = _current(stages, folder)
     found = [
-        reference.keep(stage, records[stage.name].key, folder / stage.name)
+        reference.keep(stage.name, records[stage.name].key, folder / stage.name, stage.bulk)
         for stage in stages
         if stage.name in records
     ]
@@ -135,8 +185,8 @@ class _Place:
 
 
 def _run_or_reuse(
-    stage: Stage, at: _Place, records: Mapping[str, StageRecord], display: StageDisplay
-) -> StageRecord:
+    stage: Stage, at: _Place, records: Mapping[str, Artefact], display: StageDisplay
+) -> Artefact:
     missing = [name for name in stage.after if name not in records]
     if missing:
         raise StageError(f"stage '{stage.name}' needs {', '.join(missing)} to run before it")
@@ -150,8 +200,8 @@ def _run_or_reuse(
         return _go_on_or_begin(stage, at, key, records, display)
 
 
-def _finished(at: _Place, key: str, display: StageDisplay) -> StageRecord | None:
-    record = read_record(at.folder)
+def _finished(at: _Place, key: str, display: StageDisplay) -> Artefact | None:
+    record = read_artefact(at.folder)
     if record is None or record.key != key or record.digest is None:
         return None
     if at.whole and record.kept is not None:
@@ -175,14 +225,14 @@ def _alone(folder: Path) -> Iterator[None]:
 
 
 def _go_on_or_begin(
-    stage: Stage, at: _Place, key: str, records: Mapping[str, StageRecord], display: StageDisplay
-) -> StageRecord:
-    folder, old = at.folder, read_record(at.folder)
+    stage: Stage, at: _Place, key: str, records: Mapping[str, Artefact], display: StageDisplay
+) -> Artefact:
+    folder, old = at.folder, read_artefact(at.folder)
     parts = [key_of(replace(stage, settings=settings), records) for settings in stage.goes_on_from]
     resumed = old is not None and old.kept is None and old.key in (key, *parts)
-    if at.reference is not None and not at.whole and at.reference.record(stage, key) is not None:
+    if at.reference is not None and not at.whole and at.reference.find(stage.name, key) is not None:
         _require_ours(folder)
-        if (taken := at.reference.take(stage, key, folder)) is not None:
+        if (taken := at.reference.take(stage.name, key, folder)) is not None:
             display.finish(stage.name, taken.seconds, cached=True)
             return taken
     if not resumed and folder.exists():
@@ -200,18 +250,18 @@ def _require_ours(folder: Path) -> None:
         )
 
 
-def _run(stage: Stage, folder: Path, key: str, earlier_s: float, display: StageDisplay) -> StageRecord:
+def _run(stage: Stage, folder: Path, key: str, earlier_s: float, display: StageDisplay) -> Artefact:
     folder.mkdir(parents=True, exist_ok=True)
     settings = json.loads(json.dumps(stage.settings))
-    write_record(folder, StageRecord(key, None, earlier_s, settings))
+    write_artefact(folder, Artefact(key, None, earlier_s, settings))
     report = display.start(stage.name)
     begin = time.monotonic()
     try:
         stage.run(folder, report)
     except BaseException:
-        write_record(folder, StageRecord(key, None, earlier_s + time.monotonic() - begin, settings))
+        write_artefact(folder, Artefact(key, None, earlier_s + time.monotonic() - begin, settings))
         raise
-    record = StageRecord(key, digest_of(folder), earlier_s + time.monotonic() - begin, settings)
-    write_record(folder, record)
+    record = Artefact(key, digest_of(folder), earlier_s + time.monotonic() - begin, settings)
+    write_artefact(folder, record)
     display.finish(stage.name, record.seconds, cached=False)
     return record

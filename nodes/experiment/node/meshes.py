@@ -16,7 +16,7 @@ from advnerf_core.objects.voxel.generators import GENERATORS
 from advnerf_core.objects.voxel.mesh import stand
 from advnerf_core.objects.voxel.mesh_files import load_mesh
 from advnerf_core.scene.surrogate import Surrogate, split_theta
-from nodes.experiment.engine.stage_record import hash_of
+from nodes.experiment.engine.artefact import hash_of
 from nodes.experiment.node.mesh_request import MeshRequest, ShapeRequest
 
 

@@ -30,7 +30,7 @@ from advnerf_core.attack.search.search import SearchResult
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.files import write_atomically
 from advnerf_core.render.soft_pose import placement_of
-from nodes.experiment.engine.stage_record import hash_of
+from nodes.experiment.engine.artefact import hash_of
 from nodes.experiment.engine.telling import telling
 from nodes.experiment.node.pose_request import PosesRequest
 from nodes.experiment.node.prepare import Prepared, prepare

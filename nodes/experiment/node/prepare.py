@@ -42,7 +42,7 @@ from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.surrogate import Surrogate, split_theta
 from calibration.display_colour import DisplayCalibration
 from calibration.schema import CameraCalibration, RoomCalibration, VehicleCalibration, load_calibration
-from nodes.experiment.engine.stage_record import hash_of
+from nodes.experiment.engine.artefact import hash_of
 from nodes.experiment.node.meshes import found_meshes, shape_sensor
 from nodes.experiment.node.objects import PlacedObject, place
 from nodes.experiment.node.request import AttackRequest

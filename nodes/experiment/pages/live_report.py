@@ -16,7 +16,7 @@ from advnerf_core.attack.artifact import load_attack
 from advnerf_core.documents import read_json
 from advnerf_core.report import data as rd
 from advnerf_core.report.cells import read_cell
-from nodes.experiment.engine.stage_record import read_record
+from nodes.experiment.engine.artefact import read_artefact
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.learned_scene import FIDELITY
@@ -259,7 +259,7 @@ def _latency(experiment: Experiment, results: list[dict[str, Any]]) -> rd.Latenc
 
 def _timings(experiment: Experiment) -> Iterator[rd.StageTiming]:
     for name in ("capture", "scene", "bake", "policy", "object", "live"):
-        record = read_record(experiment.stage_folder(name))
+        record = read_artefact(experiment.stage_folder(name))
         if record is not None:
             yield rd.StageTiming(name, record.seconds)
     results = [experiment.cell_result(cell) for cell in cells(experiment)]

@@ -17,7 +17,7 @@ from advnerf_core.report.clips import data_uri, image_uri
 from advnerf_core.report.conditions import style_of
 from advnerf_core.report.palette import LIGHT, LINE_STYLES
 from advnerf_core.report.plots import new_axes, svg
-from nodes.experiment.engine.stage_record import read_record
+from nodes.experiment.engine.artefact import read_artefact
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.learned_scene import FIDELITY
@@ -157,7 +157,7 @@ def _how(experiment: Experiment) -> Markup:
     manifest = read_json(experiment.folder / "manifest.json")
     frozen = frozen_hashes(experiment)
     records = {
-        name: read_record(experiment.stage_folder(name))
+        name: read_artefact(experiment.stage_folder(name))
         for name in ("capture", "scene", "bake", "object", "policy")
     }
     times = ", ".join(

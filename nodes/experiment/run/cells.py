@@ -11,7 +11,7 @@ from advnerf_core.attack.artifact import PLACES, load_attack
 from advnerf_core.attack.spaces.space import Space
 from advnerf_core.report.conditions import NONE
 from hardware.worlds.world import World, traits_of
-from nodes.experiment.engine.reference import ReferenceBuild
+from nodes.experiment.engine.artefact import ReferenceBuild
 from nodes.experiment.engine.stages import keep_stages
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.space_config import PlacesConfig

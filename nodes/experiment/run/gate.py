@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from advnerf_core.attack.transfer import DEFAULT_DRAWS, TransferPrediction, predict_transfer
-from advnerf_core.documents import read_json
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_json
 from advnerf_core.scene.fidelity import Effect, PicturePairs, SceneAgreement, Verdict, agreement, judge
 from advnerf_core.scene.gate_limits import GateLimits
-from nodes.experiment.engine.stage_record import hash_of, stage_digests
+from nodes.experiment.engine.artefact import digests_in, hash_of, read_current
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps import fidelity
@@ -68,21 +66,17 @@ def cached_verdict(
     """
     policy, goal = fidelity.policy_of(experiment, cell)
     which = [cell.scenario, cell.victim, *(["drive", cell.seed] if drive else [])]
-    stages = stage_digests(experiment.folder, NEEDED)
+    stages = digests_in(experiment.folder, NEEDED)
     key = hash_of([stages, _weights_sha256(policy), limits.model_dump(mode="json"), *which])
-    try:
-        kept = read_json(file)
-        if kept["key"] == key:
-            return Verdict(kept["passed"], tuple(kept["reasons"]), kept["numbers"])
-    except (OSError, ValueError, KeyError, TypeError):
-        pass  # an unreadable verdict is judged again
+    if (kept := read_current(file, key=key)) is not None:
+        return Verdict(kept["passed"], tuple(kept["reasons"]), kept["numbers"])
     pictures = (
         fidelity.driven(experiment, cell, clean_folder(experiment, cell, drive))
         if drive
         else fidelity.held_out(experiment)
     )
     verdict = judge(agreement_on(policy, goal, pictures), limits, pictures.of)
-    write_atomically(file, json.dumps({"key": key, **verdict.record()}, indent=1) + "\n")
+    write_json(file, {"key": key, **verdict.record()})
     return verdict
 
 

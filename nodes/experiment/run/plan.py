@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from advnerf_core.report.evidence.registration import read_registration
-from nodes.experiment.engine.reference import PUBLISHED
+from advnerf_core.report.evidence.registration import RegisteredCell, Registration, read_registration
+from nodes.experiment.engine.artefact import PUBLISHED, hash_of
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import runs_alone
 from nodes.experiment.run.config import Campaign
-from nodes.experiment.run.registered import registered_under
 from nodes.experiment.run.store import CellStatus, store_of
 from nodes.experiment.run.worker import Job
 from nodes.experiment.show.context import Experiment
@@ -73,6 +73,32 @@ def plan_cells(
         )
         planned.append(Planned(cell, job, runs_alone(experiments[key])))
     return planned
+
+
+def registered_under(registration: Registration | None, cell: Cell, settings: dict[str, Any]) -> str:
+    """Digest of the registration that a cell is run under; empty if it, with these settings, is not registered.
+
+    Args:
+        registration: Of the campaign or experiment; None if there is none.
+        cell: Which, as the campaign names it.
+        settings: What `registered_settings` says of its experiment.
+    """
+    if registration is None or registered_cell(cell) not in registration.cells:
+        return ""
+    scenario = registration.scenario(cell.scenario, cell.placement)
+    same = scenario is not None and scenario.settings_sha256 == hash_of(settings)
+    return registration.digest if same else ""
+
+
+def registered_cell(cell: Cell) -> RegisteredCell:
+    """The cell as a registration names it."""
+    return RegisteredCell(
+        scenario=cell.scenario,
+        placement=cell.placement,
+        victim=cell.victim,
+        method=cell.method,
+        seed=cell.seed,
+    )
 
 
 def statuses(campaign: Campaign, cells: Sequence[Cell]) -> list[CellStatus]:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from advnerf_core.documents import read_json
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_json
 from advnerf_core.report.cells import CellResult
 from advnerf_core.report.conditions import CONTROLS
 from advnerf_core.report.evidence.rows import CellDrives
 from advnerf_core.report.predictions import Predicted
+from nodes.experiment.engine.artefact import read_current
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import is_predictable
 from nodes.experiment.run.config import Campaign
@@ -70,7 +69,7 @@ def predict_campaign(
         found, clean[drive] = predict_cell(*which, draws, clean.get(drive))
         summary = clean[drive].agreement.summary()
         record = {"settings_hash": planned.job.settings_hash, **found.record(), "clean_drive": summary}
-        write_atomically(file, json.dumps(record, indent=1) + "\n")
+        write_json(file, record)
         say(
             f"{cell.name}: excess of {found.excess_m_per_tick[1]:.3f} m per tick expected, {100 * found.retained:.0f} % of the effect survives"
         )
@@ -114,8 +113,5 @@ def prediction_file(folder: Path, name: str) -> Path:
 
 def kept_prediction(file: Path, settings_hash: str) -> dict[str, Any] | None:
     """A prediction that was made of a cell with these settings; None where there is none."""
-    try:
-        kept: dict[str, Any] = read_json(file)
-    except (OSError, ValueError):
-        return None
-    return kept if kept.get("settings_hash") == settings_hash and kept.keys() >= _KEYS else None
+    kept = read_current(file, settings_hash=settings_hash)
+    return kept if kept is not None and kept.keys() >= _KEYS else None

@@ -9,13 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from advnerf_core.documents import read_json
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_atomically, write_json
 from advnerf_core.report.cells import CellResult, read_cell, read_cells
 from advnerf_core.report.evidence.hardness import FILE as HARDNESS
 from advnerf_core.report.evidence.hardness import PUBLISHED_FILE, merged, read_hardness, write_hardness
 from advnerf_core.report.result_table import ResultTable, make_table
-from nodes.experiment.engine.reference import BUILD, ReferenceBuild
-from nodes.experiment.engine.stage_record import RECORD, read_record
+from nodes.experiment.engine.artefact import BUILD, RECORD, ReferenceBuild, read_artefact
 from nodes.experiment.pages.table import wanted_rows
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.admission import gate_file, gate_key
@@ -129,7 +128,9 @@ def publish_build(
 def _prune_build(reference: ReferenceBuild, published: Path) -> list[Path]:
     found = [read_json(file) for file in published.glob("*/*.json")]
     used = {digest for each in found if "stages" in each for digest in each["stages"].values()}
-    records = {file.parent: read_record(file.parent) for file in sorted(reference.folder.glob(f"*/{RECORD}"))}
+    records = {
+        file.parent: read_artefact(file.parent) for file in sorted(reference.folder.glob(f"*/{RECORD}"))
+    }
     kept = {
         stage: record for stage, record in records.items() if record is not None and record.digest in used
     }
@@ -154,7 +155,7 @@ def _publish_beside(campaign: Campaign, done: Sequence[CellStatus], folder: Path
         assert each.result is not None, "a finished cell has a result"
         kept = kept_prediction(prediction_file(campaign.folder, each.cell.name), each.result.settings_hash)
         if kept is not None:
-            write_atomically(prediction_file(folder, each.cell.name), json.dumps(kept, indent=1) + "\n")
+            write_json(prediction_file(folder, each.cell.name), kept)
     for key in sorted({gate_key(each.cell) for each in done}):
         for drive in (False, True):
             if (verdict := gate_file(campaign.folder, key, drive)).exists():

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from datetime import datetime, timezone
 from importlib.metadata import version
 from pathlib import Path
 
 from advnerf_core.driving.metrics import mean_cte_limit_m
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_json
 from advnerf_core.report.evidence.families import (
     COARSE_BASELINES,
     COARSE_GRADIENT,
@@ -26,14 +25,13 @@ from advnerf_core.report.evidence.registration import (
     read_registration,
     scenario_key,
 )
-from nodes.experiment.engine.stage_record import hash_of
+from nodes.experiment.engine.artefact import hash_of
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.plan.placed import PANEL
 from nodes.experiment.plan.space_config import ColoursConfig, FaceConfig
 from nodes.experiment.run.config import Campaign
-from nodes.experiment.run.plan import read_experiment, statuses
-from nodes.experiment.run.registered import registered_cell
+from nodes.experiment.run.plan import read_experiment, registered_cell, statuses
 from nodes.experiment.run.store import FINISHED
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.victims import given
@@ -76,7 +74,7 @@ def register(campaign: Campaign, setting: str, overrides: Sequence[str], publish
             "published beside it, to register anew"
         )
     _refuse_late(campaign)
-    write_atomically(folder / FILE, json.dumps(found.model_dump(mode="json"), indent=1) + "\n")
+    write_json(folder / FILE, found.model_dump(mode="json"))
     return found
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,9 +9,9 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Literal
 
-from advnerf_core.documents import read_json
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_json
 from advnerf_core.report.cells import CellError, CellResult, cell_from, read_cell
+from nodes.experiment.engine.artefact import has_key, read_current, write_key
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.config import Campaign
 from nodes.runtime.locks import HeldError, hold
@@ -70,23 +69,20 @@ class Store:
     def keep_result(self, name: str, data: dict[str, Any]) -> CellResult:
         """Check a cell's result and write it; the error of an earlier attempt goes."""
         result = cell_from(data, f"the result of {name}")
-        write_atomically(self.result_file(name), json.dumps(data, indent=1) + "\n")
+        write_json(self.result_file(name), data)
         (self.work(name) / _ERROR).unlink(missing_ok=True)
         return result
 
     def error(self, name: str, settings_hash: str) -> str:
         """Why the cell failed with these settings; empty if it did not."""
-        try:
-            data = read_json(self.work(name) / _ERROR)
-            return str(data["error"]) if data["settings_hash"] == settings_hash else ""
-        except (OSError, ValueError, KeyError, TypeError):
-            return ""
+        kept = read_current(self.work(name) / _ERROR, settings_hash=settings_hash)
+        return "" if kept is None else str(kept.get("error", ""))
 
     def keep_error(self, name: str, settings_hash: str, error: str) -> None:
         """Note that the cell failed."""
         date = datetime.now(timezone.utc).isoformat(timespec="seconds")
         data = {"error": error, "settings_hash": settings_hash, "date": date}
-        write_atomically(self.work(name) / _ERROR, json.dumps(data, indent=1) + "\n")
+        write_json(self.work(name) / _ERROR, data)
 
     def begin(self, name: str, settings_hash: str) -> Path:
         """The cell's folder, empty unless work on the same settings was begun there."""
@@ -94,12 +90,12 @@ class Store:
         if not self.has_begun(name, settings_hash):
             shutil.rmtree(work, ignore_errors=True)
         (work / _ERROR).unlink(missing_ok=True)
-        write_atomically(work / _KEY, settings_hash + "\n")
+        write_key(work / _KEY, settings_hash)
         return work
 
     def has_begun(self, name: str, settings_hash: str) -> bool:
         """Whether what is in the cell's folder is of these settings."""
-        return self._begun_with(name) == settings_hash
+        return has_key(self.work(name) / _KEY, settings_hash)
 
     def status(self, cell: Cell, settings_hash: str | None, elsewhere: Sequence[Path] = ()) -> CellStatus:
         """Where a cell is.
@@ -130,12 +126,6 @@ class Store:
             return CellStatus(cell, "changed", "of other settings", result)
         begun = settings_hash is not None and self.has_begun(name, settings_hash)
         return CellStatus(cell, "begun" if begun else "missing", self._last_line(name) if begun else "")
-
-    def _begun_with(self, name: str) -> str:
-        try:
-            return (self.work(name) / _KEY).read_text(encoding="utf-8").strip()
-        except OSError:
-            return ""
 
     def _is_held(self, name: str) -> bool:
         if not self.lock_file(name).exists():

@@ -14,8 +14,7 @@ from advnerf_core.files import sha256_of
 from advnerf_core.plugins import name_in_results
 from nodes.experiment.engine.progress_record import ProgressRecord
 from nodes.experiment.engine.run_folder import require_own_folder
-from nodes.experiment.engine.stage_record import Stage
-from nodes.experiment.engine.stages import check_until, run_stages
+from nodes.experiment.engine.stages import Stage, check_until, run_stages
 from nodes.experiment.pages import report
 from nodes.experiment.plan.cell import Cell, select
 from nodes.experiment.run.config import Campaign, campaign_of

@@ -22,7 +22,7 @@ from typing import Any, Literal, TextIO
 
 from advnerf_core.files import write_atomically
 from advnerf_core.run_module import module_command
-from nodes.experiment.engine.stage_record import stage_digests
+from nodes.experiment.engine.artefact import digests_in
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import Bench, run_cell, runs_alone, search_cell
 from nodes.experiment.run.store import LOG, Store
@@ -264,7 +264,7 @@ def _run(
         "seed": job.seed,
         "settings_hash": job.settings_hash,
         "registration": job.registration,
-        "stages": stage_digests(Path(job.run_folder), NEEDED),
+        "stages": digests_in(Path(job.run_folder), NEEDED),
         "machine": found.get("machine") or machine_name(),
         "date": found.get("date") or datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }

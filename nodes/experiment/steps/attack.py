@@ -23,7 +23,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.policy_file import LoadedPolicy
 from advnerf_core.report.conditions import CONTROLS, EMPTY, NONE
-from nodes.experiment.engine.stage_record import hash_of
+from nodes.experiment.engine.artefact import hash_of
 from nodes.experiment.engine.telling import telling
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.method_names import keep_title

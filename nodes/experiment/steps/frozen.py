@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 from advnerf_core.documents import read_json
-from advnerf_core.files import write_atomically
-from nodes.experiment.engine.stage_record import hash_of
+from advnerf_core.files import write_json
+from nodes.experiment.engine.artefact import hash_of
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.faces import has_face, panel_of
@@ -73,7 +72,7 @@ def freeze(experiment: Experiment, cell: Cell, folder: Path) -> None:
     if not (folder / FROZEN).exists():
         fixed = frozen_for(experiment, cell)
         fixed["hardness"] = passing_digest(experiment, fixed["policy"])
-        write_atomically(folder / FROZEN, json.dumps(fixed, indent=1) + "\n")
+        write_json(folder / FROZEN, fixed)
 
 
 def hardness_before(folder: Path) -> str:

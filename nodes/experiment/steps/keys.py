@@ -12,7 +12,7 @@ from advnerf_core.attack.objectives import name_objective
 from advnerf_core.plugins import PluginError
 from advnerf_core.policies.policy_file import policy_sha256
 from advnerf_core.report.conditions import EMPTY, NONE
-from nodes.experiment.engine.stage_record import hash_of, stage_digests
+from nodes.experiment.engine.artefact import digests_in, hash_of
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.space_config import FaceConfig
 from nodes.experiment.plan.victims import RETRAINED
@@ -69,7 +69,7 @@ def cell_inputs(experiment: Experiment, cell: Cell) -> dict[str, Any]:
             inputs["config"]["attack"].pop(key, None)
     stages = [name for name in NEEDED if name != "policy" or cell.victim not in given_in(experiment.config)]
     kept = {name: digest for name, digest in experiment.kept.items() if name in stages}
-    inputs["stages"] = {**kept, **stage_digests(experiment.folder, stages)}
+    inputs["stages"] = {**kept, **digests_in(experiment.folder, stages)}
     if cell.victim in given_in(experiment.config):
         inputs["config"].pop("policy")
         return {**inputs, "victim": victim_sha256(experiment, cell.victim)}

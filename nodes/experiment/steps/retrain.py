@@ -33,7 +33,7 @@ from advnerf_core.learning.retrain import FineTuneConfig, fine_tune
 from advnerf_core.learning.sources import PolicyImages, steer_with
 from advnerf_core.policies.policy_file import LoadedPolicy, load_policy
 from hardware.worlds.world import World
-from nodes.experiment.engine.stage_record import hash_of
+from nodes.experiment.engine.artefact import hash_of
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import Dressed

@@ -16,10 +16,9 @@ from advnerf_core.documents import Document
 from advnerf_core.places import require_utf8
 from advnerf_core.plugins import name_in_results, unknown
 from advnerf_core.strict import validate
-from nodes.experiment.engine.reference import REFERENCE
+from nodes.experiment.engine.artefact import REFERENCE, Artefact
 from nodes.experiment.engine.run_folder import require_own_folder, run_to_end
-from nodes.experiment.engine.stage_record import Stage, StageRecord
-from nodes.experiment.engine.stages import begun_with
+from nodes.experiment.engine.stages import Stage, begun_with, stage_digests
 from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.plan.placed import PlacedObject, in_a_lane
 from nodes.experiment.plan.setting_file import read_setting
@@ -80,7 +79,7 @@ def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: 
         stages = stages_of(experiment)
     except VictimUnknownError:
         return experiment  # nothing was run with its victims
-    return replace(experiment, kept=REFERENCE.digests(stages, experiment.folder))
+    return replace(experiment, kept=stage_digests(stages, experiment.folder, REFERENCE))
 
 
 def _check_ticks(experiment: Experiment, document: Document) -> None:
@@ -134,7 +133,7 @@ def make_ready(
     console: Console | None = None,
     anew: bool = False,
     watcher: StageDisplay | None = None,
-) -> dict[str, StageRecord]:
+) -> dict[str, Artefact]:
     """Look at victims that exist, and run the stages that are not there yet: what cells need. Those that are kept with the code are there, unless
     all is to be made ``anew``.
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 from advnerf_core.attack.methods import method_digest
 from advnerf_core.attack.objectives import ON_THE_PATH
 from advnerf_core.files import write_atomically
-from nodes.experiment.engine.stage_record import hash_of
+from nodes.experiment.engine.artefact import has_key, hash_of, write_key
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps.keys import cell_inputs
@@ -42,23 +41,21 @@ def take_search(experiment: Experiment, cell: Cell, folder: Path) -> Path | None
     Returns:
         The folder that it was copied from.
     """
-    own = folder / _KEY
     key = search_key(experiment, cell)
-    if own.exists() and own.read_text().strip() == key:
+    if has_key(folder / _KEY, key):
         return None
-    found = next(_finished(folder, key), None)
-    if found is not None:
+    if (found := _finished(folder, key)) is not None:
         # The drives come last: without them the search counts as unfinished.
         for name in (ATTACK, SEARCHED):
             if (found / name).exists():
                 write_atomically(folder / name, (found / name).read_bytes())
-    write_atomically(own, key + "\n")
+    write_key(folder / _KEY, key)
     return found
 
 
-def _finished(folder: Path, key: str) -> Iterator[Path]:
-    """Folders beside a cell's with the same search, finished."""
-    for file in sorted(folder.parent.glob(f"*/{_KEY}")):
-        at = file.parent
-        if at != folder and (at / SEARCHED).exists() and file.read_text().strip() == key:
-            yield at
+def _finished(folder: Path, key: str) -> Path | None:
+    """A folder beside a cell's with the same search, finished."""
+    beside = sorted(file for file in folder.parent.glob(f"*/{_KEY}") if file.parent != folder)
+    return next(
+        (each.parent for each in beside if has_key(each, key) and (each.parent / SEARCHED).exists()), None
+    )

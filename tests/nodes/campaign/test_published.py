@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from advnerf_core.report.evidence.registration import RegistrationError
 from nodes.cli.main import app
-from nodes.experiment.engine.reference import BUILD
+from nodes.experiment.engine.artefact import BUILD
 from nodes.experiment.pages.table import write_table
 from nodes.experiment.plan.cell import select
 from nodes.experiment.run.config import load_campaign

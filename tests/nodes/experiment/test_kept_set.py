@@ -10,7 +10,7 @@ from advnerf_core.report.cells import read_cells
 from advnerf_core.report.evidence.hardness import PUBLISHED_FILE
 from advnerf_core.report.evidence.kept_build import LOST
 from advnerf_core.report.evidence.verify import verify_set, write_set
-from nodes.experiment.engine.reference import BUILD, ReferenceBuild
+from nodes.experiment.engine.artefact import BUILD, ReferenceBuild
 from nodes.experiment.run.cells import keep_build
 from nodes.experiment.run.config import campaign_of
 from nodes.experiment.run.kept_attacks import attack_problems, with_attacks

@@ -4,14 +4,15 @@ import json
 import subprocess
 from pathlib import Path
 
-from nodes.experiment.engine.reference import BUILD, PUBLISHED, ReferenceBuild
-from nodes.experiment.engine.stage_record import (
+from nodes.experiment.engine.artefact import (
+    BUILD,
+    PUBLISHED,
     RECORD,
-    Stage,
-    StageRecord,
+    Artefact,
+    ReferenceBuild,
     digest_of,
-    read_record,
-    write_record,
+    read_artefact,
+    write_artefact,
 )
 from nodes.experiment.steps.run import load_experiment
 
@@ -25,11 +26,11 @@ def test_it_is_whole_and_small_enough():
     assert stages
     assert sorted(KEPT.iterdir()) == stages
     for stage in stages:
-        record = read_record(stage)
+        record = read_artefact(stage)
         files = stage.with_name(record.files_in or stage.name)
         assert digest_of(files) == record.kept, f"{files} is not as it was kept"
         assert not record.files_in or [file.name for file in stage.iterdir()] == [RECORD]
-    kept = [read_record(stage) for stage in stages]
+    kept = [read_artefact(stage) for stage in stages]
     large = [
         (stage.name[:5], each.kept)
         for stage, each in zip(stages, kept, strict=True)
@@ -62,18 +63,17 @@ def test_two_stages_with_the_same_files_are_kept_once_and_both_are_taken(tmp_pat
     build, work = ReferenceBuild(tmp_path / "build"), tmp_path / "run" / "scene"
     work.mkdir(parents=True)
     (work / "scene.bin").write_bytes(b"the same")
-    stage = Stage("scene", lambda folder, report: None, {})
     for key in ("a" * 64, "b" * 64):
-        write_record(work, StageRecord(key, digest_of(work), 1.0, {}))
-        assert build.keep(stage, key, work) == build.folder / f"scene_{key[:16]}"
-        assert build.keep(stage, key, work) is None
+        write_artefact(work, Artefact(key, digest_of(work), 1.0, {}))
+        assert build.keep("scene", key, work) == build.folder / f"scene_{key[:16]}"
+        assert build.keep("scene", key, work) is None
     assert sorted(file.name for file in build.folder.rglob("*") if file.is_file()) == [
         "scene.bin",
         RECORD,
         RECORD,
     ]
     for key in ("a" * 64, "b" * 64):
-        taken = build.take(stage, key, tmp_path / key)
+        taken = build.take("scene", key, tmp_path / key)
         assert (taken.key, taken.files_in) == (key, "")
         assert (tmp_path / key / "scene.bin").read_bytes() == b"the same"
-        assert read_record(tmp_path / key).key == key
+        assert read_artefact(tmp_path / key).key == key

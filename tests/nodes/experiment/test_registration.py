@@ -7,8 +7,7 @@ import pytest
 
 from advnerf_core.report.evidence.registration import FILE, RegistrationError, read_registration
 from nodes.experiment.run.config import campaign_of
-from nodes.experiment.run.plan import plan_cells
-from nodes.experiment.run.registered import registered_under
+from nodes.experiment.run.plan import plan_cells, registered_under
 from nodes.experiment.run.registering import primary_tests, register
 from nodes.experiment.steps.attack import cells
 from nodes.experiment.steps.keys import registered_settings

@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 
 from nodes.experiment.engine.run_folder import RunFolder, run_to_end
-from nodes.experiment.engine.stage_record import Stage
+from nodes.experiment.engine.stages import Stage
 from nodes.runtime.errors import ConfigError
 
 

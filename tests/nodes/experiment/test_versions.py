@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from nodes.experiment.engine.reference import ReferenceBuild
+from nodes.experiment.engine.artefact import ReferenceBuild
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import Bench, keep_build, run_cell
 from nodes.experiment.steps import run

@@ -3,9 +3,15 @@ import os
 import pytest
 
 from advnerf_core.files import write_atomically
-from nodes.experiment.engine.reference import ReferenceBuild, ReferenceBuildError
-from nodes.experiment.engine.stage_record import Stage, digest_of, read_record
-from nodes.experiment.engine.stages import StageError, begun_with, keep_stages, run_stages
+from nodes.experiment.engine.artefact import ReferenceBuild, ReferenceBuildError, digest_of, read_artefact
+from nodes.experiment.engine.stages import (
+    Stage,
+    StageError,
+    begun_with,
+    keep_stages,
+    run_stages,
+    stage_digests,
+)
 from nodes.runtime.locks import hold
 
 pytestmark = pytest.mark.live
@@ -73,7 +79,7 @@ def test_an_interrupted_stage_finds_its_own_partial_work(tmp_path):
     stages = [Stage("long", work, {})]
     with pytest.raises(KeyboardInterrupt):
         run_and_note(tmp_path, stages)
-    assert read_record(tmp_path / "long").digest is None
+    assert read_artefact(tmp_path / "long").digest is None
     assert run_and_note(tmp_path, stages) == ["long"]
     assert seen == [False, True]
 
@@ -196,7 +202,9 @@ def test_a_machine_with_a_reference_build_goes_on_from_it(tmp_path):
     assert ran == ["first", "second", "third"]
     assert [each.name.split("_")[0] for each in keep_stages(photographed(), ours, reference)] == ran
     assert keep_stages(photographed(), ours, reference) == []
-    assert reference.digests(photographed(), theirs) == {name: each.digest for name, each in records.items()}
+    assert stage_digests(photographed(), theirs, reference) == {
+        name: each.digest for name, each in records.items()
+    }
     ran, again = run_with(reference, theirs, photographed())
     assert ran == []
     assert [each.digest for each in again.values()] == [each.digest for each in records.values()]

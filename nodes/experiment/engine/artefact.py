@@ -1,0 +1,214 @@
+"""An artefact: files that are kept with the key under which they were made, and with their digest.
+
+A stage, a search, a cell, a verdict and a prediction are artefacts: one whose key is that of now is not made again. A key is a hash over
+settings, the version of what makes it, and the digests of its inputs.
+
+A reference build keeps finished stages with the code. With it a machine that has only the repository goes on where another stopped: it
+has the very scene, victims and objects that the published cells were run with.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from advnerf_core.documents import read_json
+from advnerf_core.errors import AdvnerfError
+from advnerf_core.files import write_atomically, write_json
+from advnerf_core.report.evidence import kept_build
+from nodes.runtime.paths import shipped
+
+RECORD = kept_build.RECORD
+# Where cells and stages are kept with the code.
+PUBLISHED = Path("docs/results")
+BUILD = kept_build.BUILD
+_KEY_DIGITS = 16
+
+
+class ReferenceBuildError(AdvnerfError):
+    """A reference build is damaged."""
+
+
+@dataclass(frozen=True)
+class Artefact:
+    """What is remembered of a folder of files.
+
+    Attributes:
+        key: Hash of all that it depends on.
+        digest: Of its files, once it is finished.
+        seconds: How long it took.
+        settings: A part of the key already; apart from it they say what a folder was made with.
+        kept: Of a stage from a reference build, which has no bulk: digest of the files that it does have.
+        files_in: Of a stage in a reference build: folder beside it that has the same files, which are kept once; empty where its own folder has them.
+    """
+
+    key: str
+    digest: str | None
+    seconds: float
+    settings: Mapping[str, Any]
+    kept: str | None = None
+    files_in: str = ""
+
+
+def hash_of(value: Any) -> str:
+    """SHA-256 of a JSON value, independent of the order of keys."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def digest_of(folder: Path) -> str:
+    """SHA-256 over the names and contents of all files below a folder, its own record excepted."""
+    digest = hashlib.sha256()
+    for path in sorted(p for p in folder.rglob("*") if p.is_file() and p != folder / RECORD):
+        digest.update(path.relative_to(folder).as_posix().encode() + b"\0")
+        with path.open("rb") as stream:
+            while block := stream.read(1 << 20):
+                digest.update(block)
+    return digest.hexdigest()
+
+
+def read_artefact(folder: Path) -> Artefact | None:
+    """The record in a folder; None if there is none that can be read, as then its contents are unknown."""
+    try:
+        return Artefact(**read_json(folder / RECORD))
+    except (FileNotFoundError, ValueError, TypeError):
+        return None
+
+
+def write_artefact(folder: Path, artefact: Artefact) -> None:
+    """Write the record of a folder into it, atomically."""
+    known = asdict(replace(artefact, seconds=round(artefact.seconds, 3)))
+    write_json(
+        folder / RECORD,
+        {name: each for name, each in known.items() if name == "digest" or each not in (None, "")},
+    )
+
+
+def digests_in(folder: Path, names: Sequence[str]) -> dict[str, str]:
+    """Digests of the finished artefacts of some names below a folder."""
+    found = {name: read_artefact(folder / name) for name in names}
+    return {name: each.digest for name, each in found.items() if each is not None and each.digest}
+
+
+def read_current(file: Path, **key: str) -> dict[str, Any] | None:
+    """A JSON object, if its entries ``key`` are these; None if there is none that can be read, or it was made under another key."""
+    try:
+        found = read_json(file)
+    except (OSError, ValueError):
+        return None
+    same = isinstance(found, dict) and all(found.get(name) == value for name, value in key.items())
+    return found if same else None
+
+
+def has_key(file: Path, key: str) -> bool:
+    """Whether the files beside a file were made under this key."""
+    try:
+        return file.read_text(encoding="utf-8").strip() == key
+    except OSError:
+        return False
+
+
+def write_key(file: Path, key: str) -> None:
+    """Note under which key the files beside a file are made."""
+    write_atomically(file, key + "\n")
+
+
+@dataclass(frozen=True)
+class ReferenceBuild:
+    """A folder of stages that are kept with the code, one folder each, named by stage and key.
+
+    Bulk is left out, as photographs and training frames are, which only the making of another stage reads.
+
+    Attributes:
+        folder: Holds one folder for each; need not exist.
+        shipped: Where stages are read that are not in ``folder``.
+    """
+
+    folder: Path
+    shipped: Path | None = None
+
+    def find(self, name: str, key: str) -> Artefact | None:
+        """What is known of the stage of a name with a key; None if it is not here."""
+        found = read_artefact(self._source(name, key))
+        return found if found is not None and found.key == key else None
+
+    def take(self, name: str, key: str, folder: Path) -> Artefact | None:
+        """Copy a stage from here into its folder in a run folder, replacing what is there.
+
+        Returns:
+            Its record; None if it is not here.
+
+        Raises:
+            ReferenceBuildError: Its files are not those that were kept.
+        """
+        source, found = self._source(name, key), self.find(name, key)
+        if found is None:
+            return None
+        if found.files_in:
+            source = source.with_name(found.files_in)
+            found = replace(found, files_in="")
+        if digest_of(source) != found.kept:
+            raise ReferenceBuildError(
+                f"expected the files in {source} as they were kept, got others; restore them (git checkout -- {source}), or remove the folder to "
+                "have the stage made anew"
+            )
+        _copy(source, folder, (), found)
+        return found
+
+    def keep(self, name: str, key: str, folder: Path, bulk: Sequence[str] = ()) -> Path | None:
+        """Copy a finished stage from its folder in a run folder to here, without the files that fit a pattern of ``bulk``.
+
+        Returns:
+            Where it is now; None if it was here, or the folder has no finished stage of this key.
+        """
+        found, target = read_artefact(folder), self._at(name, key)
+        if found is None or found.key != key or found.digest is None or self.find(name, key) is not None:
+            return None
+        _copy(folder, target, bulk, found)
+        self._share(target)
+        return target
+
+    def _share(self, target: Path) -> None:
+        """Keep the files of a stage once, where another folder of the same stage has the same ones."""
+        ours = read_artefact(target)
+        assert ours is not None, "it was kept"
+        for file in sorted(self.folder.glob(f"{target.name.rpartition('_')[0]}_*/{RECORD}")):
+            other = read_artefact(file.parent)
+            if (
+                file.parent != target
+                and other is not None
+                and (other.kept, other.files_in) == (ours.kept, "")
+            ):
+                shutil.rmtree(target)
+                write_artefact(target, replace(ours, files_in=file.parent.name))
+                return
+
+    def _source(self, name: str, key: str) -> Path:
+        at = self._at(name, key)
+        return at if self.shipped is None or at.exists() else self.shipped / at.name
+
+    def _at(self, name: str, key: str) -> Path:
+        return self.folder / f"{name}_{key[:_KEY_DIGITS]}"
+
+
+REFERENCE = ReferenceBuild(PUBLISHED / BUILD, shipped(str(PUBLISHED / BUILD)))
+
+
+def _copy(source: Path, target: Path, without: Sequence[str], artefact: Artefact) -> None:
+    """Copy files, all or none, with a record that says which they are."""
+    partial = target.with_name(f".{target.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    left_out = {path for pattern in without for path in source.glob(pattern)} | {source / RECORD}
+    partial.mkdir(parents=True)
+    for path in sorted(source.rglob("*")):
+        if path.is_file() and left_out.isdisjoint([path, *path.parents]):
+            at = partial / path.relative_to(source)
+            at.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, at)
+    write_artefact(partial, replace(artefact, kept=digest_of(partial)))
+    shutil.rmtree(target, ignore_errors=True)
+    partial.rename(target)
