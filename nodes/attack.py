@@ -61,8 +61,6 @@ class AttackNode(Node):
     """Request in; progress, pictures and the attack file out.
 
     Args:
-        config: Its configuration.
-        folder: Where requests are kept.
         subscribers: How many listen to a topic.
     """
 
@@ -258,10 +256,5 @@ def _fresh(state: str, text: str) -> dict[str, Any]:
     }
 
 
-def main() -> int:
-    """Run the node as a process."""
-    return run_node_main(AttackNodeConfig, AttackNode.build)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_node_main(AttackNodeConfig, AttackNode.build))

@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from pydantic import Field
 
@@ -25,7 +24,6 @@ from nodes.runtime.node import (
     FAULT,
     STARTING,
     Inbox,
-    MessageInfo,
     Node,
     NodeContext,
     Now,
@@ -114,10 +112,6 @@ class CameraNode(Node):
         node._reader.start()
         return node
 
-    def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """Do nothing: the node has no subscriptions."""
-        return []
-
     def receive(self, item: Frame, now: Now) -> list[Out]:
         """Publish a frame."""
         expected = (self._calibration.height, self._calibration.width)
@@ -190,10 +184,5 @@ class CameraNode(Node):
         self._sequence = frame.sequence
 
 
-def main() -> int:
-    """Run the node as a process."""
-    return run_node_main(CameraNodeConfig, CameraNode.build)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_node_main(CameraNodeConfig, CameraNode.build))

@@ -62,11 +62,7 @@ class CollectConfig(StrictModel):
 
 
 class CollectNode(Node):
-    """Runs one trial after the other.
-
-    Args:
-        plans: The drives.
-    """
+    """Runs one trial after the other."""
 
     tick_rate_hz = TrialNode.tick_rate_hz
     publications = TrialNode.publications
@@ -119,10 +115,5 @@ class CollectNode(Node):
         return {"drives": self._drives - len(self._waiting), "stopped_early": len(self._stopped_early)}
 
 
-def main() -> int:
-    """Run the node as a process."""
-    return run_node_main(CollectConfig, CollectNode.build)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_node_main(CollectConfig, CollectNode.build))

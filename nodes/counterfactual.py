@@ -218,10 +218,5 @@ def build_to_give_way(config: CounterfactualConfig, context: NodeContext) -> Cou
     return node
 
 
-def main() -> int:
-    """Run the node as a process."""
-    return run_node_main(CounterfactualConfig, build_to_give_way)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_node_main(CounterfactualConfig, build_to_give_way))

@@ -258,10 +258,5 @@ class ExpertNode(Node):
             self._speed_trim = min(max(speed_trim, -config.speed_trim_limit), config.speed_trim_limit)
 
 
-def main() -> int:
-    """Run the node as a process."""
-    return run_node_main(ExpertNodeConfig, ExpertNode.build)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_node_main(ExpertNodeConfig, ExpertNode.build))

@@ -170,10 +170,5 @@ class GatewayNode(Node):
         self._link.close()
 
 
-def main() -> int:
-    """Run the node as a process."""
-    return run_node_main(GatewayConfig, GatewayNode.build)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_node_main(GatewayConfig, GatewayNode.build))

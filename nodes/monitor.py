@@ -313,10 +313,5 @@ def _open(config: ScreenConfig | TwinScreenConfig) -> Display:
     return PygameDisplay(config.index, edid.size_px if edid else None, edid)
 
 
-def main() -> int:
-    """Run the node as a process."""
-    return run_node_main(MonitorConfig, MonitorNode.build)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_node_main(MonitorConfig, MonitorNode.build))

@@ -338,10 +338,5 @@ def drive_limits(car: VehicleCalibration, current_max_a: float | None) -> DriveL
     return replace(limits, current_max_a=min(limits.current_max_a, current_max_a))
 
 
-def main() -> int:
-    """Run the node as a process."""
-    return run_node_main(MotorConfig, MotorNode.build)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_node_main(MotorConfig, MotorNode.build))

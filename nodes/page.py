@@ -303,10 +303,5 @@ def _write_door(file: Path, text: str) -> None:
     write_atomically(file, text)
 
 
-def main() -> int:
-    """Run the node as a process."""
-    return run_node_main(PageConfig, PageNode.build)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_node_main(PageConfig, PageNode.build))

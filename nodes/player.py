@@ -322,10 +322,5 @@ def _require_free(names: Iterable[str]) -> None:
         )
 
 
-def main() -> int:
-    """Run the node as a process."""
-    return run_node_main(PlayerConfig, PlayerNode.build)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_node_main(PlayerConfig, PlayerNode.build))

@@ -170,10 +170,5 @@ class PolicyNode(Node):
         self._trouble, self._fault = trouble, counter == "dropped_bad"
 
 
-def main() -> int:
-    """Run the node as a process."""
-    return run_node_main(PolicyNodeConfig, PolicyNode.build)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_node_main(PolicyNodeConfig, PolicyNode.build))

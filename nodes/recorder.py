@@ -50,7 +50,6 @@ class RecorderNode(Node):
     """Writes received bytes to a bag without decoding.
 
     Args:
-        writer: The bag.
         topics: Topics to subscribe to.
         queue: Messages that may wait per topic.
     """
@@ -145,10 +144,5 @@ def _read_attachments(paths: list[Path], must_exist: bool) -> dict[str, bytes]:
     return contents
 
 
-def main() -> int:
-    """Run the node as a process."""
-    return run_node_main(RecorderConfig, RecorderNode.build)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_node_main(RecorderConfig, RecorderNode.build))

@@ -103,7 +103,6 @@ class Ros2Node(Node):
 
     Args:
         config: Configuration.
-        side: The DDS end.
         inbox: Queue of batches from the DDS end.
         wheelbase_m: Distance of the axles [m].
         on_this_host: Whether every publisher runs on this computer, so that its clock is ours.
@@ -323,10 +322,5 @@ def require_local(config: Ros2Config, local: bool) -> None:
         )
 
 
-def main() -> int:
-    """Run the node as a process."""
-    return run_node_main(Ros2Config, Ros2Node.build)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_node_main(Ros2Config, Ros2Node.build))

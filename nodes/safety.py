@@ -152,7 +152,6 @@ class SafetyNode(Node):
     Args:
         limits: Limits of the checks.
         poses: The check of the car's poses.
-        stall: The stall check.
         hand: The check of the held button.
         clocks: The check of other hosts' clocks.
     """
@@ -335,10 +334,5 @@ class SafetyNode(Node):
         return Out("/safety/state", message)
 
 
-def main() -> int:
-    """Run the node as a process."""
-    return run_node_main(SafetyConfig, SafetyNode.build)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_node_main(SafetyConfig, SafetyNode.build))

@@ -176,10 +176,5 @@ def _layout(path: Path, axes: tuple[int, int] | None) -> GamepadLayout | None:
     return replace(usual, throttle=axes[0], steering=axes[1])
 
 
-def main() -> int:
-    """Run the node as a process."""
-    return run_node_main(TeleopConfig, TeleopNode.build)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_node_main(TeleopConfig, TeleopNode.build))

@@ -78,10 +78,5 @@ class TwinNode(Node):
         self._claim.close()
 
 
-def main() -> int:
-    """Run the node as a process."""
-    return run_node_main(TwinConfig, TwinNode.build)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_node_main(TwinConfig, TwinNode.build))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from typing import Any
 
 from pydantic import Field, field_validator
 
@@ -18,7 +17,6 @@ from nodes.runtime.node import (
     FAULT,
     STARTING,
     Inbox,
-    MessageInfo,
     Node,
     NodeContext,
     Now,
@@ -98,10 +96,6 @@ class ViconNode(Node):
         """UDP port on which the node listens; 0 with the library."""
         return self._receiver.port if isinstance(self._receiver, ViconReceiver) else 0
 
-    def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """Do nothing: the node has no subscriptions."""
-        return []
-
     def receive(self, item: list[SubjectPose], now: Now) -> list[Out]:
         """Publish poses."""
         outs = []
@@ -178,10 +172,5 @@ def _receiver(config: ViconNodeConfig) -> ViconReceiver | LibraryReceiver:
     )
 
 
-def main() -> int:
-    """Run the node as a process."""
-    return run_node_main(ViconNodeConfig, ViconNode.build)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_node_main(ViconNodeConfig, ViconNode.build))

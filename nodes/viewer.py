@@ -117,10 +117,5 @@ def _channel(foxglove: Any, name: str, context: Any) -> Any:
     return foxglove.Channel(name, schema=schema, message_encoding="cdr", context=context)
 
 
-def main() -> int:
-    """Run the node as a process."""
-    return run_node_main(ViewerConfig, ViewerNode.build)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_node_main(ViewerConfig, ViewerNode.build))

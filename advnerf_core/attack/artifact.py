@@ -196,7 +196,6 @@ class AttackFile:
             corners_in_subject: As of `AttackFace`, ``[4, 3]`` [m].
             T_world_from_object: Its pose ``[4, 4]``.
             texture: The face as it is displayed, ``[H, W, 3]`` uint8 sRGB; made of ``theta`` if it is not given.
-            name: What it is called.
             sha256: Hash of its geometry.
             others: The other attributes of an attack file.
         """
@@ -304,8 +303,6 @@ def save_attack(path: str | os.PathLike[str], attack: AttackFile, small: bool = 
     """Write an attack file atomically and return its id.
 
     Args:
-        path: Where it goes.
-        attack: What is written.
         small: Leave out what follows from the rest, see `advnerf_core.attack.packed`; `load_attack` reads both.
     """
     header = {"format": FILE_FORMAT, "sha256": attack.sha256, "metadata": _canonical(attack._metadata())}

@@ -118,7 +118,6 @@ def closed_loop_cosine(
         gradient: The adjoint's gradient there, of the same shape.
         directions: Random directions beside the gradient; at most as many as there are dimensions beside it.
         steps: Steps of the central differences in theta, along unit directions.
-        seed: Of the random directions.
         told: Called with the share that is done.
 
     Raises:

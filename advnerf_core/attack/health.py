@@ -35,11 +35,7 @@ _SATURATED = 1e-3
 
 
 class RememberedFrames:
-    """A surrogate that prepares each camera pose once: for many thetas on the same poses.
-
-    Args:
-        surrogate: What renders.
-    """
+    """A surrogate that prepares each camera pose once: for many thetas on the same poses."""
 
     def __init__(self, surrogate: Surrogate) -> None:
         self._surrogate = surrogate

@@ -31,7 +31,6 @@ def draw_health(
         closed: The cosine to the true closed loop, over the steps of the finite differences.
         ticks: Over time.
         memory_mib: Peak above idle by horizon; may be empty.
-        split: Where the time goes.
     """
     figure = Figure(figsize=(11.0, 6.0), layout="constrained", facecolor=LIGHT["paper"])
     axes = figure.subplots(2, 3).ravel()

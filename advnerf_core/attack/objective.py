@@ -85,7 +85,6 @@ class Objective:
 
     Attributes:
         title: What it is, in one line for lists.
-        unit: Of the value.
         needs_solids: Whether it needs a place with solids.
     """
 

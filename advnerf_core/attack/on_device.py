@@ -53,7 +53,6 @@ class PolicyThere:
 
     Args:
         policy: In eval mode.
-        device: Where the images are.
     """
 
     def __init__(self, policy: Any, device: torch.device) -> None:

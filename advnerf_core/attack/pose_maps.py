@@ -40,7 +40,6 @@ class Landscape:
     """Total CTE over the place of one object, the others and all colours held.
 
     Attributes:
-        object: Its number.
         x_m: ``[X]``.
         y_m: ``[Y]``.
         yaw_rad: ``[R]``.
@@ -110,7 +109,6 @@ def landscape(
         problem: With a `PlacedSensor`.
         theta: Placements of all objects, and colours.
         grid: x [m], y [m] and yaw [rad] of the object's origin.
-        number: Which object is moved.
         file: Finished cells are kept here; if it exists, the map goes on from it.
         on_cell: Called after every cell.
         settings_hash: Hash of scene, policy and configuration; a file of another one is refused.
@@ -157,7 +155,6 @@ def robustness_map(
         theta: What was found: placements and colours.
         starts: Start poses ``[S, 3]``: x [m], y [m], yaw [rad].
         moves: Of the object, ``[M, 3]``: x [m], y [m], yaw [rad].
-        number: Which object is moved.
         file: Finished rows are kept here; if it exists, the map goes on from it.
         on_cell: Called after every row of the map.
         settings_hash: Hash of scene, policy and configuration; a file of another one is refused.

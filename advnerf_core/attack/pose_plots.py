@@ -28,7 +28,6 @@ def draw_landscape(
     """PNG of a landscape, one panel for each yaw, seen from above; grey is the lane that stays free.
 
     Args:
-        found: The landscape.
         paths: Reference paths, drawn over it.
         marked: Places to mark by name, ``(x_m, y_m)``.
     """
@@ -108,7 +107,6 @@ def draw_placements(
     """PNG of where objects stand, seen from above: bounds, footprints before and after, paths and drives.
 
     Args:
-        space: Where they may stand.
         placements: Where they stand now ``[K, 4]``.
         paths: Reference paths.
         drives: Positions ``[T + 1, 2]`` of drives by name.

@@ -30,7 +30,6 @@ class FaceOverlay:
         texture: The face as displayed, ``[h, w, 3]`` uint8; row 0 on top and column 0 left for a viewer in front of it.
         corners_in_subject: Corners ``[4, 3]`` of the rectangle in the frame of the subject that carries it: top left, top
             right, bottom right, bottom left for that viewer [m].
-        camera: Intrinsics of the images.
         distortion: OpenCV distortion coefficients of the images, empty for none.
         supersample: Samples along each side of a pixel.
     """

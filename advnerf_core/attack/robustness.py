@@ -50,7 +50,6 @@ class Disturbances:
         brightness: Of a drive's additive brightness, in 0..1.
         jitter_m: Of the camera's position along each of its axes, anew in each frame [m].
         jitter_rad: Of the camera's rotation about each of its axes, anew in each frame [rad].
-        seed: Of all draws.
     """
 
     noise: float = 0.0

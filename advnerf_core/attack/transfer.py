@@ -93,13 +93,11 @@ def predict_transfer(
 
     Args:
         problem: Policy, dynamics, path, goals and limits; its start states are not used.
-        images: What the surrogate shows.
         clean: Agreement of the steering on held-out views without attack, in the order of the path.
         effect: Effect of this attack on the same views.
         starts: Start states ``[S, n]`` of the deployed drives; the draws take turns.
         horizon: Over which a drive is measured.
         draws: Drives of each kind.
-        seed: Of what is drawn.
         none_m: The draws without attack, where a prediction with the same clean views, starts, draws and seed made them; they do not
             depend on the attack.
 

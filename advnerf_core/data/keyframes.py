@@ -64,11 +64,7 @@ class Candidate:
 
 
 class KeyframeSelector:
-    """Takes frames one after another and says which to keep; holds at most two of them.
-
-    Args:
-        config: How to choose.
-    """
+    """Takes frames one after another and says which to keep; holds at most two of them."""
 
     def __init__(self, config: KeyframeConfig | None = None) -> None:
         self._config = config or KeyframeConfig()

@@ -81,7 +81,6 @@ def straightening(pinhole: Pinhole, lens: Lens, keep_all: bool = False) -> Strai
 
     Args:
         pinhole: Intrinsics of the distorted images.
-        lens: Their distortion.
         keep_all: Whether to keep every pixel of the image and say which of the new ones are valid; otherwise the largest
             window without missing pixels is kept.
 

@@ -14,12 +14,10 @@ class PosedImage:
     """One photograph on disk.
 
     Attributes:
-        path: The image file.
         pinhole: Intrinsics for the listed size.
         lens: Distortion.
         T_world_from_camera: Pose ``[4, 4]``, OpenCV axes.
         mask: File whose black pixels are to be left out; None if all count.
-        camera_id: Which camera took it.
         split: ``train``, ``val`` or ``test`` where the data set says so.
     """
 

@@ -27,9 +27,7 @@ def write_posed_images(
     """Write ``images/00000.<suffix>`` and so on and, when all are there, their ``transforms.json``; no poses, no files.
 
     Args:
-        folder: Where to.
         poses: ``T_world_from_camera [4, 4]`` of each picture, OpenCV axes.
-        pinhole: Intrinsics of all.
         see: Takes the picture ``[h, w, 3]`` of an index.
         suffix: ``png`` where pixels are compared, ``jpg`` where a scene is learned from them.
         keep: Do not take pictures that are there: for a capture that goes on. The caller sees to it that they belong to these poses.

@@ -32,7 +32,6 @@ def write_transforms(
     """Write a ``transforms.json``, whole or not at all; images are written by the caller.
 
     Args:
-        path: The file.
         image_paths: Image files: absolute, or relative to the file's folder.
         T_world_from_camera: ``[N, 4, 4]``, OpenCV axes.
         pinhole: One for all images, or one each.

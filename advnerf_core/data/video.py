@@ -75,9 +75,7 @@ def keep_keyframes(
     """Write the frames of a video worth keeping as JPEG files; what an earlier run finished is used again.
 
     Args:
-        path: The video.
         folder: Where the files go, named by their number in the video.
-        config: How to choose.
         most: At most so many, evenly thinned out.
         report: Told of the finished share and how many are kept.
 

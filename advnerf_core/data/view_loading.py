@@ -27,7 +27,6 @@ class LoadedView:
         rgb: ``[H, W, 3]`` uint8; behind full transparency it means nothing.
         alpha: Opacity ``[H, W]`` uint8; None for a photograph.
         valid: ``[H, W]`` bool: pixels to learn from; None when all are.
-        pinhole: Intrinsics.
     """
 
     rgb: Rgb

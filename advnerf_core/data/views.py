@@ -32,7 +32,6 @@ class ImageSet:
 
     Attributes:
         rgb: ``[N, H, W, 3]`` uint8.
-        pinholes: Intrinsics of each image.
         T_world_from_camera: ``[N, 4, 4]``.
         alpha: Opacity ``[N, H, W]`` uint8; None when all are opaque.
         valid: ``[N, H, W]`` bool, pixels to learn from and to compare with; None when all are.

@@ -50,7 +50,6 @@ class RespondingCar:
 
     Args:
         ideal: The surrogate's car; its speed is replaced by the measured one.
-        response: What was measured.
     """
 
     state_size = 5
@@ -81,7 +80,6 @@ def fit_response(poses: Sequence[Array], controls: Sequence[Array], ideal: Dubin
     Args:
         poses: Of each drive, poses ``[T + 1, 3]`` at the ticks; headings may wrap.
         controls: Of each drive, what was commanded ``[T]``.
-        ideal: The surrogate's car.
 
     Raises:
         ValueError: No drive has two ticks.

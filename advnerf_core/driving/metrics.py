@@ -88,7 +88,6 @@ def drive_metrics(
         path: Reference path.
         states: ``[K, >= 2]`` rear-axle positions, ``states[0]`` at the start (not counted). Fewer than ``ticks + 1`` mean
             that the car stopped after the last one; more are ignored.
-        horizon: What is summed.
         stopped_tick: The car stands from this tick on, if known (see :func:`first_still_tick`).
     """
     limits = horizon or Horizon()

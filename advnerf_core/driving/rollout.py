@@ -69,7 +69,6 @@ class Remembering:
 
     Args:
         policy: Called as ``policy(images, goals, memory) -> (steering, memory)``; it has ``initial_memory(batch)``.
-        batch: How many cars drive.
     """
 
     stateless = True

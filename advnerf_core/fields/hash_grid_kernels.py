@@ -162,10 +162,8 @@ def encode_level(
         points: ``[>= count, 3]`` in [0, 1]; outside, coordinates are clamped.
         count: Number of points.
         table: ``[entries, F]``, F even.
-        level: Which level.
         levels: ``[L, 4]``.
         rows: Of `chunk_scratch`, used by one thread at a time.
-        weights: The same.
         out: Tiles ``[tiles, L * F, T]``; only the rows of this level are written.
     """
     features, tile = table.shape[1], out.shape[2]
@@ -193,10 +191,8 @@ def scatter_level(
         points: ``[>= count, 3]`` in [0, 1].
         count: Number of points.
         grad_out: Tiles ``[tiles, L * F, T]``.
-        level: Which level.
         levels: ``[L, 4]``.
         rows: Of `chunk_scratch`, used by one thread at a time.
-        weights: The same.
         grad_table: ``[entries, F]``, accumulated into.
     """
     features, tile = grad_table.shape[1], grad_out.shape[2]

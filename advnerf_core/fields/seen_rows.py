@@ -22,7 +22,6 @@ class SeenRows:
     """Rows of an object's colour vector.
 
     Args:
-        field: The object.
         rows: Which rows, ascending, ``[V]`` int64.
     """
 

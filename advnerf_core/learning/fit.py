@@ -37,9 +37,7 @@ class FitConfig:
         batch_size: Frames per step.
         learning_rate: Peak; linear warm-up, then a half cosine to a hundredth of it.
         warm_up_steps: Length of the warm-up.
-        weight_decay: Of AdamW.
         huber_rad: Errors beyond this count linearly [rad].
-        seed: Of batches and augmentation.
         checkpoint_every: Steps between checkpoints.
         augment: Image augmentation.
     """
@@ -67,7 +65,6 @@ def fit(
     Args:
         policy: The network; its weights are the start unless the checkpoint holds a later step.
         frames: Training frames.
-        config: Settings.
         checkpoint: File to continue from and to write every ``checkpoint_every`` steps and at the end.
         report: Told the step and the running mean square error [rad^2].
     """

@@ -72,7 +72,6 @@ def train_policy(
     """Collect, clone, and improve by DAgger; writes ``policy.safetensors`` (and ``naive.safetensors``) into ``out_dir``.
 
     Args:
-        config: Settings.
         plans: At least one source with the amount to take from it; their names differ. Plans with goals and experts of their own make
             one policy that learns several paths.
         expert: The teacher of plans without one; its path is where poses are drawn about.

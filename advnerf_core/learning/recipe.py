@@ -20,7 +20,6 @@ class SourcePlan:
     """How much is taken from one source.
 
     Attributes:
-        source: The domain.
         stills: States that are looked at before the first training.
         drives: Drives in each DAgger round.
         drive_steps: Ticks of each of these drives.
@@ -109,10 +108,8 @@ class TrainedPolicy:
 
     Attributes:
         path: Policy file.
-        sha256: Its hash.
         validation_mae_rad: Mean absolute steering error on held-out frames [rad].
         naive_path: File of the policy that never saw a random texture, if one was asked for.
-        naive_sha256: Its hash.
         naive_validation_mae_rad: Its error on held-out plain frames [rad].
         frames: Number of collected frames.
         seconds: Time spent in this call on each part: collect, train [s].

@@ -32,7 +32,6 @@ class FineTuneConfig:
         new_share: Share of the training frames that is new, by repeating them; 0.5 weighs old and new alike. None takes the frames as many as
             they are.
         holdout_every: One block of frames in so many is kept out of the training and judges it.
-        seed: Of batches and augmentation.
         augment: Image augmentation.
     """
 
@@ -55,7 +54,6 @@ class Retrained:
 
     Attributes:
         path: Policy file.
-        sha256: Its hash.
         old_mae_rad: Mean absolute error on held-out old frames, before and after [rad].
         new_mae_rad: The same on held-out new frames [rad].
     """
@@ -117,7 +115,6 @@ def fine_tune(
         policy: Where to begin; it is not changed.
         old: Shards it was trained on.
         new: Shards that were seen with the found objects, labelled by the expert.
-        config: Settings.
         out_file: Policy file to write.
         report: Told the step and the running mean square error [rad^2].
 

@@ -20,12 +20,8 @@ class AdaptedPolicy(nn.Module):
         network: Called as ``network(images)``, with goals as ``network(images, goals)``, and if it is not stateless as
             ``network(images, goals, memory) -> (output, memory)``; then it also has ``initial_memory(batch)``. A network that asks another
             program has an attribute ``identity``, a text that names that program.
-        contract: Its declaration.
 
     Attributes:
-        stateless: As declared.
-        differentiable: As declared.
-        goal_size: As declared.
         identity: The program that is asked; empty for a network that runs here. Such a policy is not fixed: the program may change.
     """
 

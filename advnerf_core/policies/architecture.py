@@ -98,7 +98,6 @@ class BuiltIn:
         module: Module of `advnerf_core.policies` that holds the class.
         name: Name of the class.
         title: One line for lists.
-        Configuration: Its settings.
     """
 
     module: str
@@ -245,7 +244,6 @@ def require_architecture(
     Args:
         reference: As of `load_architecture`.
         folder: Folder that a relative ``file.py`` is relative to; the working folder if it is not given.
-        configuration: Its settings.
 
     Raises:
         PluginError: There is no such architecture.

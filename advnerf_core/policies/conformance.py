@@ -36,7 +36,6 @@ class Finding:
     """One line of the report.
 
     Attributes:
-        name: What was looked at.
         verdict: ``ok``, ``warning`` or ``failure``.
         text: What was found, and what to change.
     """

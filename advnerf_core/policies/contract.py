@@ -234,7 +234,6 @@ class PolicyContract:
 
         Args:
             data: The declaration's keys and values.
-            source: What errors call it.
             **implied: Values of keys that the declaration leaves out.
         """
         if not isinstance(data, Mapping) or "view" not in data:
@@ -257,7 +256,6 @@ def declaration_beside(path: Path, embedded: str | None, **implied: Any) -> Poli
     """The declaration of a file: the YAML file ``<path>.policy.yaml`` if there is one, else what the file carries.
 
     Args:
-        path: The policy file.
         embedded: JSON that the file carries; None or empty if it carries none.
         **implied: What the file itself says about keys that the declaration leaves out.
     """

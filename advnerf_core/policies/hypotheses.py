@@ -52,8 +52,6 @@ class Judgement:
 
     Attributes:
         declared_error: Mean error over that of always steering the expert's median; below 1 is better than no policy.
-        best: The most likely hypothesis.
-        best_error: Its error, likewise.
         deviations: Mean of the frames' differences in error between the two, over its standard error.
     """
 

@@ -232,11 +232,7 @@ def load_driver(spec: str | os.PathLike[str], expected_sha256: str | None = None
 
 
 class OnnxDriver:
-    """Drives by an ONNX file.
-
-    Args:
-        network: The file.
-    """
+    """Drives by an ONNX file."""
 
     def __init__(self, network: Any) -> None:
         self._network = network

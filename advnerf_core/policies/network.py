@@ -40,7 +40,6 @@ class SteeringNetwork(nn.Module):
         Configuration: Dataclass or pydantic model of the architecture's own settings, all with defaults and of values that JSON can hold;
             None if it has no settings.
         stateless: True: the steering depends on the current image and goal only.
-        configuration: The settings in use.
         reference: Name of the architecture, or ``file.py:Class`` with an absolute path; empty if the class was called directly.
         code_sha256: Hash of the code behind a user's architecture, when it was loaded; empty for a built-in one.
         code_files: Python files of ``file.py:Class`` when it was loaded: the file, and the modules beside it that it imports.

@@ -29,10 +29,6 @@ _OPSET = 17
 class OnnxNetwork:
     """An ONNX file as a function of arrays.
 
-    Args:
-        path: The file.
-        threads: Of one inference.
-
     Attributes:
         contract: Its declaration, with ``differentiable`` False whatever it says.
         sha256: Hash of the file, of files that it keeps weights in, and of the declaration.

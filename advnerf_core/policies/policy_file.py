@@ -66,7 +66,6 @@ def save_policy(
 
     Args:
         path: Target, by convention ``*.safetensors``.
-        policy: The network.
         view: How camera images become its input.
         metadata: Anything JSON can hold: training settings, data, measured errors.
 

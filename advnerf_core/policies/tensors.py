@@ -18,7 +18,6 @@ class TensorInfo:
     """An input or output of a policy file.
 
     Attributes:
-        name: As in the file.
         shape: Its dimensions; a text or None is a dimension that is not fixed. None if the file does not say.
         kind: Type of its elements, as numpy calls it.
     """
@@ -45,7 +44,6 @@ class Tensors:
         outputs: In the file's order.
         image: The input that takes the images.
         goal: The input that takes the goals; None for a policy without a goal.
-        steering: The output that steers.
     """
 
     inputs: tuple[TensorInfo, ...]

@@ -12,11 +12,7 @@ from advnerf_core.policies.policy_file import LoadedPolicy
 
 
 class TorchDriver:
-    """Drives by a torch policy, and keeps the memory of one that has any from image to image.
-
-    Args:
-        loaded: The policy.
-    """
+    """Drives by a torch policy, and keeps the memory of one that has any from image to image."""
 
     def __init__(self, loaded: LoadedPolicy) -> None:
         self._policy = loaded.policy

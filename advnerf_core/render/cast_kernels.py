@@ -155,7 +155,6 @@ def _set_out(R: Any, o: Any, edges: Any, sizes: Any, aims: Any, count: int, soli
         edges: ``[3]``.
         sizes: Voxels along each axis.
         aims: ``x`` and ``y`` of each ray at unit depth, and between which depths it may meet something ``[4, N]``.
-        count: Of rays.
         solid: One sample where the ray enters.
         one_sided: Only rays through the ``+x`` face count.
         step: Object units between samples.
@@ -313,7 +312,6 @@ def cast_window(R: Any, o: Any, edges: Any, window: Any, intrinsics: Any, neares
         window: First row, end row, first column, end column ``[4]``.
         intrinsics: ``fx, fy, cx, cy`` ``[4]``.
         nearest_m: From `reach_of_bricks`.
-        furthest_m: The same.
         width: Pixels in a row of the image.
         supersample: Rays along each side of a pixel.
         slots: ``[nx, ny, nz]`` int32.
@@ -330,7 +328,6 @@ def cast_window(R: Any, o: Any, edges: Any, window: Any, intrinsics: Any, neares
         depths: ``[P]``, written.
         ends: Where each pixel's weights end ``[P]``, written.
         indices: Slots of the weights, written.
-        values: The weights, written.
 
     Returns:
         Whether the window is done; if not, there was no room left in ``indices`` and ``values``: give more and call again.

@@ -90,7 +90,6 @@ def cast_objects(
     """Cast objects into a batch of cameras, on all threads; each pixel's result does not depend on the others.
 
     Args:
-        fields: The objects.
         T_world_from_camera: Camera poses ``[B, 4, 4]``, OpenCV axes; one that is not finite sees nothing.
         pinhole: Intrinsics of all of them.
         supersample: Rays along each side of a pixel.

@@ -90,7 +90,6 @@ class Marcher:
 
     Args:
         capacity: Samples of a batch that fit. Rays that begin after so many are left out.
-        config: How samples are placed.
         box_high: High corner of the box in box coordinates ``[3]``.
         contracted: Whether the field is contracted: rays then go on outside the box.
     """

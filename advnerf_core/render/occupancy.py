@@ -64,7 +64,6 @@ class OccupancyGrid:
         """Probe cells at random places inside them and keep ``max(decay * old, probed)``.
 
         Args:
-            log_density: The field.
             step: Training step; with the seed it fixes the random numbers, so that a resumed run goes on alike.
             share: Share of the cells to probe, 1 for all; chosen at random.
             decay: Factor on the old estimates, of all cells: one that is not probed for long is given up.
@@ -108,7 +107,6 @@ def refine_occupied(
     Args:
         occupied: ``[X, Y, Z]``.
         box_high: High corner of the box in box coordinates ``[3]``.
-        log_density: The field.
         least_depth: Optical depth of crossing a part, at the largest density found in it, from which it is kept.
         factor: Parts along each side of a cell.
         probes: Random places in each part where density is looked at.

@@ -108,7 +108,6 @@ def soft_layer(
         placement: ``(x_m, y_m, yaw_rad, scale)``, finite, with a positive scale.
         colours: Its colour vector ``[rows, 3]`` (``VoxelGridObject.colours``).
         T_world_from_camera: ``[B, 4, 4]``.
-        pinhole: Intrinsics.
         supersample: Rays along each side of a pixel.
         least_transmittance: A ray is followed until so little light is left.
 
@@ -156,9 +155,7 @@ def render_soft(
     Args:
         field: The object; must have a density.
         placement: ``(x_m, y_m, yaw_rad, scale)`` ``[4]``, finite, with a positive scale.
-        theta: Its parameters.
         T_world_from_camera: ``[B, 4, 4]``.
-        pinhole: Intrinsics.
         supersample: Rays along each side of a pixel.
         least_transmittance: A ray is followed until so little light is left.
 

@@ -34,7 +34,6 @@ def bake(
     Every occupied cell gets values at its corners. A cell that is seen from near by also gets a brick of finer ones.
 
     Args:
-        source: The field.
         T_world_from_camera: Poses ``[N, 4, 4]`` like those that will be rendered: bricks are made where these look.
         pinhole: The camera that will be rendered.
         part_px: Length of a brick's part in pixels, where it is seen from nearest.

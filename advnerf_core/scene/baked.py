@@ -64,9 +64,6 @@ class BakedScene:
     Samples lie where the field's renderer has them. Colours are mixed along a ray; the field mixes features, and decodes them once.
 
     Args:
-        config: Of the field.
-        march: How samples are placed.
-        leaps: Where something is.
         least_transmittance: A ray stops when so little light would still come through.
         voxels: From `bake`.
     """

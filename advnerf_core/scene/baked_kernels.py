@@ -60,7 +60,6 @@ def bake_points(
         d2: ``[4]``.
         matrix: Of the colour map ``[3, 3]``.
         offset: Of the colour map ``[3]``.
-        power: Of the colour map.
         values: ``[N, 4]``, written.
     """
     channels = w2.shape[0] - 1

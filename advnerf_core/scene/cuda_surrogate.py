@@ -34,7 +34,6 @@ class _Textures:
         version: Torch's count of changes of ``given``.
         leaf: The same on the device.
         colours: All objects' colour vectors ``[N, V, 3]``, with history to ``leaf``.
-        shown: The same without.
     """
 
     given: Tensor

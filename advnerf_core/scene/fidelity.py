@@ -100,7 +100,6 @@ class Verdict:
     Attributes:
         passed: Whether attacks may go on.
         reasons: What was not reached, in words; empty if all was.
-        numbers: What was measured.
     """
 
     passed: bool
@@ -116,8 +115,6 @@ def judge(found: SceneAgreement, limits: GateLimits, of: str = "held-out views")
     """Hold what was measured against the limits.
 
     Args:
-        found: The comparison.
-        limits: What must be reached.
         of: What was compared, for the reasons.
     """
     numbers = found.summary()

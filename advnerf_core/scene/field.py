@@ -207,8 +207,6 @@ def save_scene(
     one part in 2048 in each feature.
 
     Args:
-        path: The file.
-        scene: The field.
         occupancy: Cells where something is ``[X, Y, Z]``.
         metadata: Anything JSON can hold: how it was trained, figures.
 

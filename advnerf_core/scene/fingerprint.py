@@ -25,7 +25,6 @@ def training_fingerprint(
     Args:
         images: Training images.
         field: Sizes of the field.
-        config: How to train.
         march: The intervals as they were chosen: they also depend on the cameras and on the rule.
     """
     training = {**asdict(config), "march": asdict(march)}

@@ -16,11 +16,7 @@ _MOST_PIXELS = 1 << 20
 
 
 class LearningCheck:
-    """Says once if a training does not learn.
-
-    Args:
-        images: What is learned.
-    """
+    """Says once if a training does not learn."""
 
     def __init__(self, images: ImageSet) -> None:
         self._one_colour_db = one_colour_db(images)

@@ -43,7 +43,6 @@ class ManyTextures:
 
     Args:
         surrogate: The scene with its objects.
-        count: How many textures.
         starts: Start poses of each.
     """
 

@@ -69,7 +69,6 @@ class FieldRenderer:
         """Renderer of a scene file.
 
         Args:
-            path: The file.
             colour_map: Instead of the one in the file, if any.
             behind: Colour behind a scene that was learned from images with alpha.
             interval_scale: Sample intervals in those of the training, which a field looks best with. Longer ones are quicker.
@@ -88,7 +87,6 @@ class FieldRenderer:
 
         Args:
             T_world_from_camera: Poses ``[B, 4, 4]``.
-            pinhole: Intrinsics of all views.
 
         Returns:
             Colours ``[B, H, W, 3]`` in 0..1, planar depth ``[B, H, W]`` [m] (infinite where nothing is) and opacity

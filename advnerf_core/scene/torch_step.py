@@ -175,7 +175,6 @@ def render_rays(scene: SceneField, rays: Tensor, samples: Samples) -> tuple[Tens
     Args:
         scene: The field, on any device.
         rays: ``[R, 6]`` in box coordinates.
-        samples: Their samples.
 
     Returns:
         Colours ``[R, 3]``, weights of the samples ``[N]`` and opacity of the rays ``[R]``.

@@ -44,7 +44,6 @@ class Trainer:
         images: Training images. Their alpha counts if the field has no learned background: each ray is then compared before a
             random colour, so that nothing but the true opacity fits.
         field_config: Sizes of the field, and its box.
-        config: How to train.
 
     Attributes:
         march: How samples are placed, in training and for rendering.
@@ -294,7 +293,6 @@ def train_scene(
     Args:
         images: Training images.
         field_config: Sizes of the field, and its box.
-        config: How to train.
         checkpoint: File to save to and resume from.
         progress: Called every 50 steps.
     """

@@ -117,7 +117,6 @@ class TrainedScene:
     """A trained field with what a renderer needs.
 
     Attributes:
-        scene: The field.
         occupied: Cells where something is ``[X, Y, Z]``, finer than in training.
         march: How samples were placed, and are for rendering.
         history: One row per report: step, elapsed [s], PSNR [dB].

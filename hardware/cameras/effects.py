@@ -115,8 +115,6 @@ class ImperfectCamera:
     """A camera on one drive.
 
     Args:
-        effects: Its imperfections.
-        pinhole: Its ideal intrinsics.
         drive: Number of the drive; two drives of one number see the same draws.
     """
 

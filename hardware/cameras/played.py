@@ -17,7 +17,6 @@ class PlayedCamera(Camera):
     """Delivers recorded images, stamped at their delivery.
 
     Args:
-        path: The recording.
         loop: Start over after the last image. Otherwise the device is lost, like an unplugged camera.
     """
 

@@ -14,7 +14,6 @@ class SteadyCamera:
     """Reads a camera that may be absent at first, or disconnect and return. Used by one thread, the read thread.
 
     Args:
-        camera: The camera.
         stall_s: Time without a frame after which it is reopened [s].
         first_frame_s: The same time for the first frame after opening [s].
         repeats: Number of identical images in a row that count as a stall; 0 for never. Sensor noise makes real images differ.

@@ -63,13 +63,11 @@ class VideoDevice:
     Attributes:
         formats: Sizes by pixel format.
         rates: Frames per second that it can do.
-        controls: Its controls by number.
         metadata_only: It is the second device of a webcam, which delivers no pictures.
         padding_bytes: Unused bytes at the end of every row.
         stamp_flags: Clock and event of its stamps, as in ``v4l2_buffer.flags``.
         after_start: What it does to itself when the stream starts.
         extension: Answers requests to the extension units of a UVC device: unit, selector, query, data.
-        card: Its name.
     """
 
     formats: dict[str, list[tuple[int, int]]] = field(

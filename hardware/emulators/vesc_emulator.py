@@ -33,7 +33,6 @@ class VescEmulator:
     """The pty, the firmware behind it, and the car behind that. The physics loop calls `advance`.
 
     Args:
-        config: Settings of the controller.
         vehicle: The car; from now on only this object may move it.
         link: Path for a symbolic link to the terminal, e.g. ``<run_dir>/vesc``; an old link is replaced.
         log: CSV file for the wire log; None keeps it in memory only.
@@ -221,7 +220,6 @@ def read_wire_log(path: Path, offset: int = 0) -> list[tuple[WireEvent, float, f
     """Events of a log file, each with the car's speed [m/s] and odometer [m] at that moment.
 
     Args:
-        path: The file.
         offset: Where to begin [bytes]; what a size of the file was earlier gives what came since. Lines cut short are left out.
     """
     with path.open("rb") as log:

@@ -102,8 +102,6 @@ class VescFirmware:
     """Decodes commands, drives the plant, answers, and brakes after its time-out when commands stop.
 
     Args:
-        config: Settings of the controller.
-        plant: What it controls.
         erpm_per_mps: Electrical rpm per speed of the plant, for the tachometer [1/(m/s)].
 
     Attributes:

@@ -26,7 +26,6 @@ class Keyboard:
     """The terminal on a file descriptor, in raw mode while it is open.
 
     Args:
-        fd: A terminal.
         mono_ns: Monotonic clock [ns].
         late_s: A repeat that comes later than this after the one before is no repeat [s].
     """

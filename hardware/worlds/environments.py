@@ -24,8 +24,6 @@ class Environment:
     """What a foreign world needs to run.
 
     Attributes:
-        name: The world's kind.
-        title: What is installed.
         licence: What whoever installs it agrees to.
         pythons: Versions of Python that it runs on, the preferred one first.
         size_mb: About how much is installed [MB].

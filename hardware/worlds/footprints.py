@@ -59,7 +59,6 @@ def touched_by(body: Footprint, obstacles: Iterable[Footprint], half_m: float, e
     """Name of what a body stands against: the nearest thing within 0.2 m, as a car stops just before it; empty if there is none.
 
     Args:
-        body: The car's.
         obstacles: Named footprints.
         half_m: The world ends at plus and minus this [m].
         edge: Name of that end, such as wall.

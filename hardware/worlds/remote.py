@@ -59,7 +59,6 @@ class RemoteServer:
     """The process of one simulator.
 
     Args:
-        name: What messages call it.
         python: Interpreter of its environment.
         simulator: Its file, which ``serve.py`` loads.
         server: What serves it; another one than ``serve.py`` only in tests.

@@ -107,8 +107,6 @@ def depth_in(
     """Planar depth ``[H, W]`` [m] out of an answer: within the camera's range or infinite, and not under the ground.
 
     Args:
-        arrays: Of the answer.
-        pinhole: The camera.
         T_world_from_camera: Where it is ``[4, 4]``.
         range_m: Nearest and farthest depth [m].
         lowest_m: Height of the lowest ground [m].

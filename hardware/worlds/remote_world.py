@@ -54,7 +54,6 @@ class RemoteWorld(ABC):
     A subclass says which interpreter runs it (`python`), what its map is (`description_of`), and from where it is photographed.
 
     Args:
-        name: What messages call it.
         simulator: The simulator's file, for ``serve.py``.
         settings: What the simulator is opened with, as JSON data.
         cameras: Intrinsics of the driving camera, and of the camera of `photograph`.

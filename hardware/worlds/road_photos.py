@@ -28,10 +28,8 @@ def road_photo_poses(
     that a street of model cars is photographed as a street of cars.
 
     Args:
-        paths: What is driven.
         lane_width_m: Width of a lane [m].
         camera: Driving camera.
-        count: How many.
         rng: Source of all randomness.
 
     Returns:

@@ -58,7 +58,6 @@ def messages_in_order(
     """Yield the messages of some channels from a log time on, in order of log time.
 
     Args:
-        file: The file.
         summary: Summary of the file.
         channels: Ids of the channels to read.
         start_ns: First log time [ns since 1970].

@@ -69,7 +69,6 @@ def stored_messages(
     """Yield messages in order of their log time.
 
     Args:
-        path: The file.
         form: Format of the file.
         numbers: Numbers of the topics to read.
         start_ns: First log time [ns since 1970].

@@ -64,7 +64,6 @@ def require_mcap(path: Path, verb: str) -> None:
     """Refuse a bag of another format, for operations that only work with MCAP.
 
     Args:
-        path: The file.
         verb: Participle of the operation for the message, for example ``repaired``.
     """
     if (found := recognise(path)) is not BagFormat.MCAP:

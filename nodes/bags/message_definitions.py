@@ -71,7 +71,6 @@ class Definition:
         """Fields of an advnerf type that this definition lacks, for example ``drive.speed``.
 
         Args:
-            typename: The advnerf type.
             own: The type of this definition to compare with it; None for its main type.
         """
         have = {name.lower(): kind for name, kind in self._fields(own or self.typename)}
@@ -192,7 +191,6 @@ def as_our_message(fields: Mapping[str, Any], typename: str) -> Any:
 
     Args:
         fields: Fields by lower-case names, because ROS 1 wrote some in capitals.
-        typename: The advnerf type.
     """
     ours = fields_of(typename) or []
     return message_class(typename)(

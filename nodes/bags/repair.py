@@ -52,7 +52,6 @@ class Repaired:
     """Result of a repair.
 
     Attributes:
-        path: The file.
         messages: Number of messages in the repaired file.
         cut_bytes: Number of bytes that could not be kept.
         was_whole: Whether the file was intact, so that it was not changed.

@@ -44,7 +44,6 @@ def next_record(buffer: Any, at: int, limit: int, channels: Collection[int], mes
     """Return the next offset after ``at`` from which valid records follow; None if there is none.
 
     Args:
-        buffer: The file.
         at: Offset of the damage.
         limit: End of the data.
         channels: Valid channel ids of messages; empty for any.

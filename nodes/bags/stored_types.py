@@ -49,8 +49,6 @@ def converter(recorded: RecordedTopic, expected: str, source: str) -> Convert | 
 
     Args:
         recorded: The topic in the bag.
-        expected: The expected type.
-        source: The bag, for errors.
 
     Raises:
         BagError: The topic has a type that cannot be converted to the expected one.

@@ -27,7 +27,6 @@ class ExperimentPage:
     """The server's process. Whatever happens to it, the experiment goes on.
 
     Args:
-        folder: The run folder.
         port: TCP port; 0 selects a free one.
 
     Raises:
@@ -88,7 +87,6 @@ def run_with_page(
     """Run an experiment while its page is served, then serve it until Ctrl-C.
 
     Args:
-        experiment: The experiment.
         port: TCP port; 0 selects a free one.
         run: Runs it, with what keeps its progress.
         say: Told the address, and what to do at the end.

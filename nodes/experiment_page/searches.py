@@ -48,7 +48,6 @@ def read_search(folder: Path, state: str = STATE) -> Search | None:
     """The search of a cell's folder; None if there is none yet.
 
     Args:
-        folder: Of the cell.
         state: Name of the state file that a running search keeps.
     """
     for name, read in ((SEARCHED, _finished), (state, _running)):
@@ -82,11 +81,7 @@ def has_texture(space: str) -> bool:
 
 
 def texture_png(folder: Path) -> bytes | None:
-    """Texture of the best evaluation so far of a cell, as a PNG file; None if there is none.
-
-    Args:
-        folder: Of the cell.
-    """
+    """Texture of the best evaluation so far of a cell, as a PNG file; None if there is none."""
     try:
         pictures = (
             _attack_pictures(folder / ATTACK)

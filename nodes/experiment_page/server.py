@@ -41,7 +41,6 @@ class RequestHandler:
     """Answers the requests of browsers.
 
     Args:
-        folder: The run folder.
         clock_s: Seconds since 1970.
     """
 

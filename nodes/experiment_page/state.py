@@ -22,7 +22,6 @@ def read_state(folder: Path, now_s: float) -> dict[str, Any]:
     """What the page shows now.
 
     Args:
-        folder: The run folder.
         now_s: Seconds since 1970.
     """
     record = read_progress(folder)

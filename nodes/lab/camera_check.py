@@ -38,7 +38,6 @@ class CameraBench:
     """A closed camera under test. Every check opens it and leaves it closed.
 
     Attributes:
-        camera: The camera.
         produce: Makes an emulated device expose a frame.
         shows: Colour of what stands before the camera, of `COLOURS`; empty if that is not known.
         seen: Frames that the checks took; the last one is for a person to look at.

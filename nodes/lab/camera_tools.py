@@ -81,7 +81,6 @@ class SourceTrial:
         age_ms: Age of the frames on arrival: median and worst [ms].
         brightness: Mean of all pixels of the last frame, 0 to 255.
         counters: Counters of device and driver.
-        picture: The last frame.
     """
 
     frames: int

@@ -80,7 +80,6 @@ class MethodBench:
     """A method under test.
 
     Attributes:
-        method: The method.
         settings: Budget and the method's own options.
         folder: An empty folder, where states are kept.
     """
@@ -100,7 +99,6 @@ class MethodBench:
         """Result of a search, and the evaluations that it called back with.
 
         Args:
-            seed: Of the search.
             state: Name of its state file; empty for none.
             stop_after: Evaluations after which it is killed; 0 for never.
             settings_hash: Of what must stay the same.
@@ -246,7 +244,6 @@ def check_method(reference: str, options: Mapping[str, Any] | None = None) -> li
 
     Args:
         reference: A built-in name, an entry point's name, or ``file.py:Name``.
-        options: The method's own options.
 
     Raises:
         PluginError: There is no such method, or it cannot be loaded.

@@ -40,7 +40,6 @@ class PluginRow:
     """One thing that can be named.
 
     Attributes:
-        name: Its name.
         line: What it is, in one sentence.
         origin: ``built in``, or package and version.
     """

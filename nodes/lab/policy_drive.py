@@ -52,7 +52,6 @@ def drive_round(
         policy: A policy in eval mode.
         see: Renders the policy's images.
         room: Path, fence and off-track limit.
-        vehicle: The car.
         goal: Goal vector of a goal-conditioned policy.
     """
     path, count = room.reference_path, _STARTS

@@ -158,7 +158,6 @@ def from_scene(
     Args:
         scene: Scene file.
         calibration: Folder with ``camera.yaml``, ``room.yaml`` and ``vehicle.yaml``.
-        view: The policy's view.
         count: Number of frames.
         seed: Random seed of the offsets from the path.
     """

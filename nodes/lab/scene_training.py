@@ -168,8 +168,6 @@ def scene_field(request: TrainingRequest, listed: PosedImages, transparent: bool
     """Make the field configuration of a request.
 
     Args:
-        request: The request.
-        listed: The training images.
         transparent: Whether the images have alpha.
 
     Raises:

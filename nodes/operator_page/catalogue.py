@@ -21,8 +21,6 @@ class CatalogueEntry:
     """An attack that can be shown.
 
     Attributes:
-        attack_id: Its short hash.
-        file: Its file.
         facts: What the page shows about it: name, method, seed, predicted total CTE with and without it [m].
         png: Its texture, as a small picture.
     """

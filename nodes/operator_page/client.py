@@ -43,7 +43,6 @@ class ClientAct:
     Attributes:
         client: Number of the connection.
         address: Address of the browser.
-        act: The act.
         frame_ns: Capture stamp of the newest picture on its screen [ns]; 0 without one.
         picture_ns: When the node received that picture, monotonic [ns]; 0 without one.
         session: Public name of the browser's session.
@@ -93,7 +92,6 @@ class Client:
     Args:
         number: Number of the connection.
         address: Address of the browser.
-        socket: The accepted WebSocket.
         session: Public name of the browser's session.
     """
 

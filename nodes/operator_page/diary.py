@@ -44,8 +44,6 @@ class Diary:
             now: Current time.
             operator: Name of the operator.
             address: Address of the browser.
-            act: The act.
-            detail: What it was about.
             frame_ns: Capture stamp of the newest picture that the operator saw [ns].
             answer: Why the act was refused; empty if it was granted.
         """

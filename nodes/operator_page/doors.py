@@ -44,7 +44,6 @@ class Sessions:
 
     Attributes:
         code_s: Time for which a code is valid [s].
-        code: The current code.
         codes: Number of codes made so far.
         refused: Number of refused codes.
     """

@@ -50,9 +50,6 @@ class Parts:
 
     Attributes:
         desk: Lease, button and e-stop.
-        board: The newest messages.
-        diary: The log.
-        trial: The trial.
         recording: The recorder that the operator starts.
         catalogue: Attacks by id.
         launched: Facts of the launch.
@@ -75,7 +72,6 @@ class Operation:
     """Decides acts.
 
     Args:
-        parts: What it works with.
         answer: Sends the answer to an act to a browser, by the number of its connection.
     """
 

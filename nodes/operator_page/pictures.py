@@ -28,7 +28,6 @@ class Picture:
         channel: ``CAMERA``, ``ATTACKED`` or ``POLICY``.
         stamp_ns: Capture time of the image, which names it [ns].
         received_ns: When the node received the image, monotonic [ns].
-        jpeg: The compressed pixels.
     """
 
     channel: int

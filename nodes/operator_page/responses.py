@@ -35,7 +35,6 @@ class Guard:
     """Refuses requests for another host, and adds to every response the security headers that it does not set itself.
 
     Args:
-        application: The application behind it.
         names: Further names of this computer.
         refused: Called for every refused request.
     """

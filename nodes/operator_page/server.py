@@ -73,12 +73,10 @@ class PageServer:
     """Serves the page.
 
     Attributes:
-        settings: Where.
         inbox: Receives the acts of browsers, and `Gone`.
         png_of: Returns the picture of an attack by its id; None if there is none.
         welcome: Returns what a new browser is told first.
         stops: Returns the number of requests to stop, and the number up to which they are confirmed.
-        counts: What was refused.
     """
 
     settings: ServerSettings

@@ -105,7 +105,6 @@ class Golden:
     """Compares a replay with a golden bag, message by message.
 
     Args:
-        path: The golden bag.
         tolerances: Tolerances of numbers.
         topics: Topics to compare; none means all.
     """

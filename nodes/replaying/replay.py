@@ -42,7 +42,6 @@ class Replay:
 
     Args:
         bag: Bag folder or file.
-        choice: The selection of nodes.
         whole: Also yield messages of the bag to which no node subscribes (to write another bag).
 
     Topics that are not in the topic table are skipped and listed in `left_out`. Iterate once; then `summary` is complete. Use it as a

@@ -36,7 +36,6 @@ def look(
     Args:
         name: Part of the contract.
         check: Returns what was found, or raises `NotMet`.
-        bench: What it looks at.
         lets_through: Errors that end the whole report. Any other error is a part that is not met.
     """
     try:

@@ -77,7 +77,6 @@ def rgb_of_samples(samples: NDArray[Any], layout: str) -> NDArray[np.uint8]:
     """Convert samples ``[H, W, C]``, uint8 or uint16, to RGB ``[H, W, 3]`` uint8.
 
     Args:
-        samples: The image.
         layout: ``grey``, ``rgb``, ``bgr``, ``rgba``, ``bgra``, or a Bayer pattern such as ``bayer_rggb``.
     """
     if layout in _DEMOSAIC:

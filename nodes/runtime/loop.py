@@ -56,7 +56,6 @@ class NodeLoop:
         name: Name of the node in the launch file.
         node: The node; the loop does not close it.
         bus: The node's bus, on which the loop opens the node's sockets.
-        clock: The clock to read.
     """
 
     def __init__(self, name: str, node: Node, bus: Bus, clock: Clock) -> None:

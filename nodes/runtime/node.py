@@ -6,7 +6,6 @@ A node gets messages and time as arguments and everything else through its const
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -50,7 +49,7 @@ class NodeContext:
     subscribers: Callable[[str], int] = field(default=lambda topic: 0)
 
 
-class Node(ABC):
+class Node:
     """Base class of nodes. It is not thread-safe: only its loop calls it.
 
     Attributes:
@@ -69,9 +68,9 @@ class Node(ABC):
     raw: bool = False
     queues: Mapping[str, int] = {}
 
-    @abstractmethod
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Handle a message, whose arrays are read-only, and return the messages to publish."""
+        raise NotImplementedError(f"{type(self).__name__} has subscriptions but no handle(); implement it")
 
     def receive(self, item: Any, now: Now) -> list[Out]:
         """Handle an item of the inbox and return the messages to publish."""
@@ -90,5 +89,5 @@ class Node(ABC):
         """Return the numbers to report with the status."""
         return {}
 
-    def close(self) -> None:  # noqa: B027 - most nodes have nothing to release
+    def close(self) -> None:
         """Make the device safe and release it. Called once, also after an exception."""

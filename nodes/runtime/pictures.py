@@ -33,7 +33,6 @@ def compressed_image_message(rgb: NDArray[np.uint8], stamp_ns: int, frame_id: st
     """Make a ``sensor_msgs/CompressedImage`` from pixels ``[H, W, 3]`` uint8.
 
     Args:
-        rgb: The image.
         stamp_ns: Capture time, real time [ns].
         frame_id: Frame of the camera.
         quality: JPEG quality, 1 to 100.

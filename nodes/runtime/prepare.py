@@ -10,11 +10,7 @@ from nodes.runtime.priority import take_share_of
 
 
 class SteadyStream:
-    """A text stream whose errors are ignored: a full disk under the log must not end a node.
-
-    Args:
-        stream: The stream.
-    """
+    """A text stream whose errors are ignored: a full disk under the log must not end a node."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream

@@ -68,7 +68,6 @@ def run_node(
         build: Makes the node and opens its devices.
         name: Name of the node, whose status is published on ``/status/<name>``.
         run_dir: Folder of the run.
-        clock: The clock to read.
         on_loop: Called with the loop before it runs, so that a test can stop it.
 
     Returns:

@@ -43,8 +43,6 @@ class FileSender:
     """Sends the pieces of a file, one a tick: some rounds, and one more for each receiver that begins to listen.
 
     Args:
-        chunks: The pieces.
-        rounds: How often.
         pause_ns: Time between two rounds [ns].
     """
 

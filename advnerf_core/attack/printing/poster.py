@@ -69,7 +69,6 @@ def poster_of(attack: AttackFile, name: str | None = None, edge_m: float | None 
     """The texture of an attack that can be printed.
 
     Args:
-        attack: The attack.
         name: The object, by name or number; None if only one can be printed.
         edge_m: Edge of a square panel [m], for attack files that do not hold it.
 

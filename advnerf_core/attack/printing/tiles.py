@@ -79,7 +79,6 @@ def layout_of(size_mm: tuple[float, float], paper: Paper, margin_mm: float, over
     """The fewest pages that hold a poster, upright or on their side.
 
     Args:
-        size_mm: Of the poster.
         paper: Paper size; ``none`` is one page as large as the poster.
         margin_mm: White on every side [mm].
         overlap_mm: Of neighbouring tiles [mm].

@@ -73,11 +73,9 @@ class BlackBoxSearch:
 
     Attributes:
         method: See the module.
-        learning_rate: Of Adam on theta.
         probes: Antithetic pairs of textures asked about at every visited frame, after every drive. ``distilled`` uses them as lessons only.
         probe_sigma: Root mean square of a probe's change of theta.
         cells: Cells along an edge of the random textures; see `Coarse`.
-        distillation: How the student learns.
         student: Makes it.
     """
 

@@ -41,7 +41,6 @@ def dead_leaves(places: Tensor, generator: torch.Generator) -> Tensor:
 
     Args:
         places: Float, in two dimensions or three.
-        generator: Of all leaves.
     """
     values = places.new_zeros(len(places), 3)
     uncovered = torch.arange(len(places))

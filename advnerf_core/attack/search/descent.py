@@ -14,7 +14,6 @@ class Descent:
 
     Args:
         tensors: ``theta`` to begin with, or all `tensors` of a descent that is to go on; copied.
-        learning_rate: Of Adam.
 
     Attributes:
         theta: Where it is; each step changes it in place.

@@ -38,7 +38,6 @@ class Distillation:
         steps: Optimiser steps after each drive, at most; never more than two passes over all lessons.
         memory_pairs: Pairs that are kept; fresh ones then replace others at random.
         batch_pairs: Pairs of one step.
-        learning_rate: Of Adam.
         difference_weight: Weight of the squared error of a pair's difference, beside that of its two values.
         place_sigma: Spread of the random places about the first drive [m and rad].
         texture_sigma: Spread of the random textures' theta.
@@ -162,15 +161,11 @@ class Student:
     """A network, its optimiser and what it learns from; everything it knows is in tensors.
 
     Args:
-        lessons: What it begins with.
-        settings: How it learns.
-        seed: Of its first weights.
         factory: Makes the network.
         bound_rad: Bound of its steering [rad]; twice the greatest answer of the first lessons if None.
 
     Attributes:
         network: In eval mode but while it learns.
-        lessons: What it learns from.
     """
 
     stateless = True

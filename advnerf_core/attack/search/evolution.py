@@ -32,7 +32,6 @@ class Evolution:
 
     Attributes:
         sigma: Spread of candidates around the mean, which starts grey.
-        learning_rate: Of Adam.
     """
 
     sigma: float = _SIGMA

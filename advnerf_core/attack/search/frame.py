@@ -80,7 +80,6 @@ class CleanFrames:
 
         Args:
             theta: Colours, ``theta_shape``.
-            draw: Of the disturbances.
 
         Returns:
             Sum over ticks and mean over starts of steering minus clean steering [rad], and its gradient, ``theta_shape``.

@@ -41,9 +41,7 @@ def gradient_attack(
     Each iteration is one evaluation: a closed-loop rollout and its gradient. Iteration 0 evaluates the start.
 
     Args:
-        problem: What is attacked.
         iterations: Evaluations in all, those of a resumed state included.
-        learning_rate: Of Adam.
         run: Seed of the starting noise, state file and callback.
     """
     return climb(problem, adjoint_slope, iterations, learning_rate, run, method="gradient")
@@ -55,7 +53,6 @@ class Slope:
 
     Attributes:
         loss_m: Loss of the closed-loop drive [m].
-        totals: Of the same drive.
         gradient: Against which theta moves, ``theta_shape``.
     """
 
@@ -86,10 +83,8 @@ def climb(
     """Follow a gradient with Adam from the sensor's start, and keep the best theta by the objective's value.
 
     Args:
-        problem: What is attacked.
         slope_of: Gives drive and gradient.
         evaluations: In all, those of a resumed state included.
-        learning_rate: Of Adam.
         run: Seed of the starting noise, state file and callback.
         cells: Of the coarse texture that is searched instead of theta, see `Coarse`; 0 searches theta.
         settings: What else a state file must agree in, the method's name among it.

@@ -101,7 +101,6 @@ def population_search(
     """Minimise the loss without its gradient, generation by generation; the best by the objective's value is kept.
 
     Args:
-        problem: What is attacked.
         strategy: How candidates are drawn, such as `cem.CrossEntropy` or `evolution.Evolution`.
         evaluations: Rollouts in all, those of a resumed state included; a last generation may stay unfinished.
         population: Candidates of a generation.

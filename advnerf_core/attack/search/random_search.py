@@ -36,7 +36,6 @@ def random_search(
     """Draw grid values from ``N(0, sigma^2)`` and keep the best by the objective's value.
 
     Args:
-        problem: What is attacked.
         evaluations: Textures in all, those of a resumed state included.
         sigma: Spread of theta; 5 matches what gradient attacks end at.
         run: Seed of the textures, state file and callback.
@@ -59,7 +58,6 @@ def best_drawn(
     """Evaluate thetas that are drawn one after the other, and keep the best.
 
     Args:
-        problem: What is attacked.
         draw: Draws one; all its randomness is the generator's.
         evaluations: Thetas in all, those of a resumed state included.
         run: Seed, state file and callback.

@@ -193,7 +193,6 @@ def begin_drawing(
 
     Args:
         run: Seed and state file.
-        fingerprint: Of the search.
         fresh: Tensors of a search that begins; those that it draws come from the generator.
     """
     generator = torch.Generator().manual_seed(run.seed)
@@ -213,9 +212,7 @@ def go_on(
     """Evaluate until a state has so many evaluations.
 
     Args:
-        state: Of the search.
         run: Where the state is kept, and its callback, which is called when the state is on disk.
-        fingerprint: Of the search.
         evaluations: In all, those of a resumed state included.
         step: Makes and records the next evaluation, and leaves the tensors to go on with in the state.
     """
@@ -266,7 +263,6 @@ def evaluate_theta(
     """The next evaluation of a search that asks for no gradient: driven, recorded, on disk, then told.
 
     Args:
-        problem: What is attacked.
         theta: What is evaluated, of the sensor's ``theta_shape``.
         state: Of the search; its tensors must be those to go on with.
         run: Where the state is kept and who is told.

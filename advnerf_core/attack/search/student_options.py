@@ -16,7 +16,6 @@ class StudentOptions:
 
     Attributes:
         student: Architecture of the student: a name, or ``file.py:Class`` relative to the working folder.
-        configuration: Settings of that architecture.
     """
 
     student: str = PILOTNET

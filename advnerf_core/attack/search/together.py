@@ -47,7 +47,6 @@ class _Batch:
 
     Attributes:
         problem: All starts of all seeds, without the regulariser.
-        each: The problems.
         starts: Start poses of each.
     """
 
@@ -101,9 +100,7 @@ def gradient_attacks(
     Args:
         problems: One for each seed; they differ in start poses and disturbances only. Of the disturbances the first one's seed is
             used, with other numbers for every drive.
-        seeds: Of the starting noise.
         iterations: Evaluations of each seed in all, those of a resumed state included.
-        learning_rate: Of Adam.
         state_path: One state file for all, written after every iteration; if it exists, the attack goes on from it.
         on_evaluation: Called after every iteration, once for each seed.
         settings_hash: Hash of scene, policy and configuration; a state file of another one is refused.

@@ -36,7 +36,6 @@ class Visited:
     A disturbed problem, or a sensor that cannot keep frames, renders each again: the same images, more slowly.
 
     Args:
-        problem: Whose sensor looks.
         ticks: Numbers of the ticks.
         states: ``[ticks * B, n]``, ordered by tick.
     """
@@ -71,7 +70,6 @@ class VisitedDrive:
     Half of the problem's cache budget is for frames without colours, half for the renders that the first gradient takes.
 
     Attributes:
-        rollout: Its states and controls.
         cache: Renders with ``theta``, for ``gradient_pass``.
     """
 

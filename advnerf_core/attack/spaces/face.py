@@ -40,7 +40,6 @@ class FaceSpace:
     Args:
         surrogate: The scene with the face as its only object.
         named: What attack files say of the face.
-        mount: Where it is.
         display: What a screen and the room do to its colours; None for a board, or for a screen that is taken for ideal.
         cos_angle: Cosine of the angle at which the camera looks at a screen; see `DisplayedSensor`.
     """

@@ -134,7 +134,6 @@ class PoseSpace:
 
     Args:
         objects: The objects where they stand now.
-        bounds: Of each.
         keep_out: Where none may stand; None allows everything within the bounds.
 
     Raises:

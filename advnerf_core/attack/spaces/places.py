@@ -28,7 +28,6 @@ class PlaceLimits:
     """Where objects may stand.
 
     Attributes:
-        bounds: Of each object.
         keep_out: Lanes that stay free; None allows everything within the bounds.
         colours: Whether colours are searched too; else the objects keep their own.
     """
@@ -44,7 +43,6 @@ class PlaceSpace:
     Args:
         surrogate: The scene with the objects where they stand without an attack.
         named: What attack files say of them, in their order.
-        limits: Where they may stand.
         budget: Placements that are drawn, and steps of each.
 
     Raises:

@@ -65,7 +65,6 @@ class NamedObject:
     """What an attack file says of an object beside what was found.
 
     Attributes:
-        name: What it is called.
         sha256: Hash of its geometry and fixed colours.
     """
 

@@ -34,11 +34,7 @@ class Hits:
 
 
 class RayCaster:
-    """A mesh that rays can be cast at; both sides of a triangle are hit.
-
-    Args:
-        mesh: The surface.
-    """
+    """A mesh that rays can be cast at; both sides of a triangle are hit."""
 
     def __init__(self, mesh: TexturedMesh) -> None:
         mi = engine().mi

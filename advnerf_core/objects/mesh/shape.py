@@ -70,7 +70,6 @@ class ShapeSensor:
 
     Args:
         surrogate: Scene and camera, with the meshes in their plain shape; nothing but meshes (`MeshField`).
-        limits: How shapes may change.
         colours: Colours of the meshes, of ``surrogate.theta_shape``; their plain ones if not given.
     """
 

@@ -59,7 +59,6 @@ def fit_grids(
     Memory does not grow with the pictures: each step makes only its own rays.
 
     Args:
-        views: The pictures.
         start: Where to begin; voxels further than two from any with density stay empty.
         steps: Optimiser steps; 0 leaves the start as it is.
         rays: Rays per step.

@@ -40,8 +40,6 @@ class ObjectModel:
     """An object that can be placed.
 
     Attributes:
-        name: What it is.
-        grids: Its density and colours.
         about: Where it comes from: source, resolution, fit, software version (JSON types).
     """
 

@@ -37,7 +37,6 @@ class PosedRgba:
     Attributes:
         images: Premultiplied ``[N, H, W, 4]``, float32 in 0..1 (drawn pictures) or uint8 in 0..255 (photographs).
         T_object_from_camera: ``[N, 4, 4]``, OpenCV axes.
-        pinholes: Intrinsics of each.
     """
 
     images: NDArray[np.float32] | NDArray[np.uint8]
@@ -88,7 +87,6 @@ def load_pictures(listed: PosedImages, size: tuple[int, int] | None = None) -> P
     """Read cut-out pictures of a data set into one array of bytes.
 
     Args:
-        listed: The data set.
         size: ``(width, height)`` [px] to bring all pictures to by area averaging; None keeps the size on disk.
 
     Raises:
@@ -140,7 +138,6 @@ class RayBatches:
     rays that miss the box are dropped.
 
     Args:
-        views: The pictures.
         low: Low corner of the box ``[3]`` [m].
         high: High corner ``[3]`` [m].
         seed: Seed of the draws.

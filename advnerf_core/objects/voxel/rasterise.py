@@ -25,10 +25,8 @@ def draw_mesh(
     """Premultiplied pictures ``[B, H, W, 4]`` (red, green, blue, coverage) in 0..1.
 
     Args:
-        mesh: The mesh.
         T_object_from_camera: Camera poses in the mesh's frame ``[B, 4, 4]``, OpenCV axes. Triangles that reach behind a camera
             are left out: stay outside the object.
-        pinhole: Intrinsics.
         supersample: Rays along each side of a pixel.
     """
     poses = np.asarray(T_object_from_camera, dtype=np.float64).reshape(-1, 4, 4)

@@ -71,7 +71,6 @@ def fit_in_stages(
     """Carve the visual hull and fit it on finer and finer grids.
 
     Args:
-        views: The pictures.
         resolution: Voxels along the longest side at the end.
         steps: Optimiser steps over all stages.
         progress: Called with the finished fraction and a text.

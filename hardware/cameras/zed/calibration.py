@@ -43,7 +43,6 @@ def load_factory_calibration(path: Path | str, mode: str = "VGA", eye: str = "le
     """Read one eye's intrinsics for one mode from ``SN<serial>.conf``.
 
     Args:
-        path: The file.
         mode: One of `EYE_SIZES`.
         eye: ``left`` or ``right``.
 
@@ -106,7 +105,6 @@ class Rectifier:
     The field of view of the ideal camera lies within that of the real one, so there are no black corners.
 
     Args:
-        calibration: The real camera.
         size: Width and height of the result [px].
 
     Attributes:

@@ -70,9 +70,6 @@ class ExtensionUnit:
     """Reads and writes the registers of an open ZED.
 
     Args:
-        port: The system calls.
-        fd: The open device.
-        path: Its path, for messages.
         sleep: Waits [s].
     """
 

@@ -26,7 +26,6 @@ class CarlaCar:
     Args:
         world: A ``carla.World``.
         library: The ``carla`` module.
-        frame: The scene's frame.
         config: Body, bounds, labels of what is solid.
         undo: Gets what removes the body.
 

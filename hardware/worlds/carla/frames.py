@@ -112,7 +112,6 @@ class SceneFrame:
 
     Attributes:
         T_mirrored_from_world: From our world to CARLA's with y mirrored ``[4, 4]``.
-        yaw_rad: As given.
     """
 
     def __init__(self, x_m: float, y_m: float, z_m: float, yaw_rad: float) -> None:

@@ -25,9 +25,7 @@ def photo_poses(
     road, so no camera goes farther from a lane's middle than about a lane's width.
 
     Args:
-        drives: The drives.
         config: Driving camera.
-        count: How many.
         rng: Source of all randomness.
 
     Returns:

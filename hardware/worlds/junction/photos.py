@@ -23,8 +23,6 @@ def photo_poses(config: IntersectionConfig, count: int, rng: np.random.Generator
     and looks elsewhere, and two from 3 to 7 m above the ground looking at the junction.
 
     Args:
-        config: The intersection.
-        count: How many.
         rng: Source of all randomness.
 
     Returns:

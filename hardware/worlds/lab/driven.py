@@ -12,9 +12,6 @@ from hardware.worlds.lab.furniture import vehicle_in_room
 class DrivenCar:
     """The car among the room's furniture, commanded the way of the real driver's. Two that get the same calls move identically to the bit.
 
-    Args:
-        config: The lab.
-
     Attributes:
         time_s: Lab time since the last reset [s].
     """

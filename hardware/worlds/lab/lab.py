@@ -110,7 +110,7 @@ class Lab(SeenWorld):
         )
 
     def photo_poses(self, count: int, rng: np.random.Generator) -> list[Array]:
-        """From the car, and on a walk around the room, in turn."""
+        """Poses ``T_world_from_camera [4, 4]`` from the car, and on a walk around the room, in turn."""
         driven = car_mounted_poses(self.config, (count + 1) // 2, rng)
         walked = walk_around_poses(self.config, count // 2, rng)
         # Each list goes round once: shuffled, so that any prefix covers the track.
@@ -186,7 +186,7 @@ class Lab(SeenWorld):
             self._renderer.place("car", np.eye(4), hidden_groups=(CAR_GROUP,))
 
     def show(self, panel: str, rgb: Rgb | None) -> None:
-        """Show a picture on the monitor.
+        """Show a picture ``[h, w, 3]`` on the monitor.
 
         Raises:
             WorldError: The panel is no screen.
@@ -215,7 +215,6 @@ class Lab(SeenWorld):
         A new picture on a panel that stands there takes no time; anything else builds the room again. Nothing collides with it.
 
         Args:
-            name: Of the panel.
             panel: Pose and size.
             rgb: Texture ``[h, w, 3]`` uint8, row 0 on top; None takes the panel out.
         """

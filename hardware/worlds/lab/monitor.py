@@ -22,8 +22,6 @@ class ScreenOptics:
     """Turns shown pictures into what the camera sees.
 
     Args:
-        config: The monitor's numbers.
-        panel: Where it stands.
         pixels: Width and height at which pictures are computed [px].
     """
 

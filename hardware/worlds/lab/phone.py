@@ -51,7 +51,6 @@ def walk_around_poses(config: LabConfig, count: int, rng: np.random.Generator) -
 
     Args:
         config: The lab; the phone stays clear of its furniture.
-        count: How many.
         rng: Source of all randomness.
 
     Returns:
@@ -82,7 +81,6 @@ def video_poses(config: LabConfig, count: int) -> list[Array]:
     Neighbours overlap, as structure from motion needs, and the last lap sees what a driving camera sees.
 
     Args:
-        config: The lab.
         count: How many frames over all laps.
 
     Returns:
@@ -114,8 +112,6 @@ def car_mounted_poses(config: LabConfig, count: int, rng: np.random.Generator) -
     Places where the car's body would not fit are left out.
 
     Args:
-        config: The lab.
-        count: How many.
         rng: Source of all randomness.
 
     Returns:

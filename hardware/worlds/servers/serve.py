@@ -38,7 +38,6 @@ class Server:
 
     Args:
         open_simulator: Called with the configuration, the cameras and the arrays of ``open``.
-        socket: A connected PAIR socket.
     """
 
     def __init__(self, open_simulator: Callable[..., Any], socket: zmq.Socket[bytes]) -> None:

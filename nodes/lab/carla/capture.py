@@ -30,7 +30,6 @@ class CaptureRequest:
     Attributes:
         photos: Photographs that the scene is learned from; the paper has 1800.
         held_out: Views of the driving camera along the drives.
-        seed: Of the poses.
     """
 
     photos: int = 1800
@@ -46,8 +45,6 @@ def capture(
     A capture that was stopped goes on: pictures that are there are kept. They are in the scene's frame: right-handed, metres, z up.
 
     Args:
-        config: The scene.
-        request: What to photograph.
         folder: Where to; one that holds another capture is refused.
         report: Gets the share done and what is being done.
         library: The ``carla`` module; None imports it.

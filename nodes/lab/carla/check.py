@@ -33,7 +33,6 @@ class CarlaCheck:
     """One thing that was looked at.
 
     Attributes:
-        name: What.
         state: Whether it is as it must be.
         text: What was found, and if it is wrong what to do.
     """
@@ -49,7 +48,6 @@ def check_server(config: CarlaConfig, library: Any = None, pictures: Path | None
     The map is not changed. If everything else is right a scene is opened for a few ticks and put back.
 
     Args:
-        config: What the experiment wants.
         library: The ``carla`` module; None imports it.
         pictures: Folder for what the driving camera sees, to be looked at by a person.
     """

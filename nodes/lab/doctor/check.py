@@ -28,7 +28,6 @@ class CheckResult:
         check: Name of the check.
         state: ``ok``; ``absent`` (missing, but only some users need it); ``warning`` (something will not work as it should);
             ``failure`` (the requested function cannot work).
-        found: What was found.
         do: What to do about it; empty if no action is needed.
     """
 

@@ -69,7 +69,6 @@ def from_media(
         media_config: Selection of frames.
         sfm: Settings of structure from motion.
         extent_m: Largest distance between two camera positions [m].
-        report: Progress callback.
     """
 
     def build(folder: Path) -> Imported:
@@ -104,7 +103,6 @@ def from_bag(
         output: Folder of the data set.
         config: Selection of frames.
         margin_m: Margin of the scene box around the camera's trajectory [m].
-        report: Progress callback.
         calibration: Camera calibration file; None uses the one in the bag.
     """
 

@@ -56,7 +56,6 @@ class DrivenFrames:
         files: Image files in order of time.
         stamps_ns: Capture stamps [ns since 1970].
         T_world_from_camera: ``[N, 4, 4]`` in the motion-capture world.
-        calibration: The camera.
         recorded: Number of frames in the bag.
         without_pose: Number of frames that were skipped because motion capture had a gap.
         unchecked: Why damage to the bag may go unnoticed; empty if checksums cover it.
@@ -80,7 +79,6 @@ def take_frames(
         bag: Bag folder or file.
         folder: Folder for the files, which are named by their capture stamps.
         config: Selection of frames.
-        report: Progress callback.
         calibration: Camera calibration file; None uses the one attached to the bag.
 
     Raises:

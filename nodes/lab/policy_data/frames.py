@@ -134,7 +134,6 @@ def frames_of_log(
     """Take the frames of a foreign log: a CSV file with a header and one row per image. Image paths are relative to the file.
 
     Args:
-        log: The CSV file.
         view: View that converts its images to policy images; None uses the same crop fraction as for advnerf's camera.
         image_column: Column with the image files.
         steering_column: Column with the steering.

@@ -25,7 +25,6 @@ def standing_poses(
 
     Args:
         run_dir: Folder of the running launch.
-        topic: The subject's topic.
         period_s: Time between two results [s].
         window_s: Averaging window [s].
     """

@@ -79,7 +79,6 @@ def measure_drive(
     """Evaluate one drive as plain data: trajectory, cross-track errors, latency, shown attacks.
 
     Args:
-        bag: The recording.
         span: Time span of the drive.
         path: Reference path.
         horizon: Ticks over which errors are summed.

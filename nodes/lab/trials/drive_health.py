@@ -20,21 +20,12 @@ from nodes.runtime.topics import STATUS_PREFIX
 from nodes.runtime.topics import topic as topic_row
 
 _SENT = "/motor/sent"
-
-
-@dataclass(frozen=True)
-class HealthLimits:
-    """What a drive may lack and still count.
-
-    Attributes:
-        tick_share: Share of control ticks that may have no new command, or a late one.
-        late_s: Time from the capture of an image to its command beyond which the command is late [s]. It is two control periods.
-        loop_share: Share of its own ticks that the loop of a node may miss.
-    """
-
-    tick_share: float = 0.1
-    late_s: float = 0.2
-    loop_share: float = 0.25
+# Share of control ticks that may have no new command, or a late one.
+_TICK_SHARE = 0.1
+# Time from the capture of an image to its command beyond which the command is late [s]. It is two control periods.
+_LATE_S = 0.2
+# Share of its own ticks that the loop of a node may miss.
+_LOOP_SHARE = 0.25
 
 
 @dataclass(frozen=True)
@@ -56,19 +47,18 @@ class DriveHealth:
     loops: Mapping[str, float] = field(default_factory=dict)
 
 
-def spoiled_by(health: DriveHealth, limits: HealthLimits | None = None) -> str:
+def spoiled_by(health: DriveHealth) -> str:
     """Return why a drive measures nothing; empty if it counts."""
-    limits = limits or HealthLimits()
     if not is_result(health.stopped):
         return f"the stack stopped the car: {health.stopped}"
-    most = max(1, int(limits.tick_share * health.ticks))
+    most = max(1, int(_TICK_SHARE * health.ticks))
     if health.unserved > most:
         return f"{health.unserved} of {health.ticks} control ticks had no new command; at most {most} may"
     if health.late > most:
-        return f"{health.late} of {health.ticks} commands were older than {limits.late_s:g} s; at most {most} may"
+        return f"{health.late} of {health.ticks} commands were older than {_LATE_S:g} s; at most {most} may"
     for node, share in sorted(health.loops.items()):
-        if share > limits.loop_share:
-            return f"node {node} missed {100 * share:.0f} % of its ticks; at most {100 * limits.loop_share:.0f} % may be missed"
+        if share > _LOOP_SHARE:
+            return f"node {node} missed {100 * share:.0f} % of its ticks; at most {100 * _LOOP_SHARE:.0f} % may be missed"
     return ""
 
 
@@ -78,10 +68,8 @@ def read_health(
     end_real_ns: int,
     stopped: str,
     tick_s: float,
-    limits: HealthLimits | None = None,
 ) -> DriveHealth:
     """Read the health of a drive between two times [ns, CLOCK_REALTIME] from its bag."""
-    limits = limits or HealthLimits()
     # An image that was captured less than a tick before the end may find the car disarmed.
     last_ns = end_real_ns - round(tick_s * NS_PER_S)
     ticks = max(0, int((last_ns - start_real_ns) / NS_PER_S / tick_s + 1e-6))
@@ -93,7 +81,7 @@ def read_health(
         if name.startswith(STATUS_PREFIX)
         and (share := _missed_share(bag, name, start_real_ns, end_real_ns)) is not None
     }
-    late = int(np.count_nonzero(ages_s > limits.late_s))
+    late = int(np.count_nonzero(ages_s > _LATE_S))
     return DriveHealth(stopped, ticks, max(0, ticks - len(ages_s)), late, loops)
 
 

@@ -90,7 +90,6 @@ class TrialsPlan:
         start_pose: Start pose of each drive: x [m], y [m], yaw [rad].
         room_sha256: Hash of the room file.
         policy_sha256: Hash of the policy file; empty if the launch file names none.
-        runs: The runs, in order.
         host: Host of the launch file that drives the trials; None if it has no hosts.
     """
 

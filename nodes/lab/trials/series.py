@@ -44,7 +44,6 @@ class Series:
 
     Attributes:
         folder: Folder for the plan, the results and one folder per run.
-        plan: The plan.
         room: Reference path and limits.
         nodes: Nodes that must be ready before anything moves.
     """
@@ -120,7 +119,6 @@ def drive_series(
     """Drive the runs that are not finished.
 
     Args:
-        series: The trials.
         ready_timeout_s: Longest time for a graph to become ready [s].
         begin: Called before each run.
         guide: Called with instructions for the operator.

@@ -111,7 +111,6 @@ class TrialNode(Node):
     """The operator of one trial.
 
     Args:
-        plan: The plan.
         trouble: Called at every tick. It returns why the graph has failed, which ends the trial, or an empty text.
         guide: Called several times a second with instructions for the human operator.
     """

@@ -35,11 +35,9 @@ def show_and_watch(
     """Record a folder for `nodes.lab.wizards.bags.read_shown`.
 
     Args:
-        display: The screen.
         frames: Endless stream of stamps [ns since 1970] and RGB images ``[H, W, 3]``.
         colours: Colours to show, 0..255.
         folder: New or empty folder.
-        report: Progress callback.
         now_ns: Returns the real time [ns].
 
     Raises:

@@ -23,8 +23,6 @@ class WorldBench:
     """An open world under test.
 
     Attributes:
-        named: Its name and configuration.
-        world: The world, open.
         description: What it said about itself when it was opened.
         step_s: Whole multiples of this may pass in a step [s]; None for any duration.
     """

@@ -64,7 +64,6 @@ def check_world(
     """Look at everything that can be told of a world from the outside.
 
     Args:
-        named: The world.
         pictures: Folder for what the driving camera and a photograph show, for a person to look at.
         only: Parts of the contract to look at, beside the first ones; all of them if empty.
 

@@ -68,10 +68,8 @@ def drive_expert(
     """Drive from a start pose; the expert knows the true state, no picture is taken.
 
     Args:
-        scene: Where.
         expert: Who, and on which path.
         start: x [m], y [m], yaw [rad].
-        ticks: How many commands.
         dt_s: How long each [s].
     """
     scene.reset(*start)

@@ -28,7 +28,6 @@ def install(environment: Environment, say: Callable[[str], None], python: Path |
     The environment counts only once the last step has written its marker, so that one that was interrupted is made again.
 
     Args:
-        environment: Which.
         say: Told of each step.
         python: Interpreter that it is made with; None looks for one of a version that it runs on.
 

@@ -28,7 +28,6 @@ class NamedWorld:
     Attributes:
         kind: Its name: built in, an entry point, or ``file.py:Class`` with the file's name alone.
         world_class: What the name stands for.
-        config: Its checked configuration.
         source_sha256: Hash of the code of a ``file.py:Class`` or an entry point; empty for a built-in name.
     """
 
