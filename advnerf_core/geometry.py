@@ -254,3 +254,26 @@ def interpolate_transform(T_start: ArrayLike, T_end: ArrayLike, fraction: float)
     else:
         q = (np.sin((1.0 - fraction) * angle) * qa + np.sin(fraction * angle) * qb) / np.sin(angle)
     return make_transform(rotation_from_quaternion(q), a[:3, 3] + fraction * (b[:3, 3] - a[:3, 3]))
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """An oriented rectangle on the ground.
+
+    Attributes:
+        x_m: Centre [m].
+        y_m: Centre [m].
+        half_length_m: Half of the extent along its own x axis [m].
+        half_width_m: Half of the extent along its own y axis [m].
+        yaw_rad: Heading of its x axis [rad].
+    """
+
+    x_m: float
+    y_m: float
+    half_length_m: float
+    half_width_m: float
+    yaw_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (self.half_length_m > 0.0 and self.half_width_m > 0.0):
+            raise ValueError(f"expected a rectangle with half extents above 0 m, got {self}")

@@ -7,28 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-
-@dataclass(frozen=True)
-class Rectangle:
-    """An oriented rectangle on the ground.
-
-    Attributes:
-        x_m: Centre [m].
-        y_m: Centre [m].
-        half_length_m: Half of the extent along its own x axis [m].
-        half_width_m: Half of the extent along its own y axis [m].
-        yaw_rad: Heading of its x axis [rad].
-    """
-
-    x_m: float
-    y_m: float
-    half_length_m: float
-    half_width_m: float
-    yaw_rad: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not (self.half_length_m > 0.0 and self.half_width_m > 0.0):
-            raise ValueError(f"expected a rectangle with half extents above 0 m, got {self}")
+from advnerf_core.geometry import Rectangle
 
 
 @dataclass(frozen=True)

@@ -6,27 +6,19 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
+from advnerf_core.geometry import Rectangle
+
 _REACHES_M = (0.02, 0.05, 0.1, 0.2)
 
 
 @dataclass(frozen=True)
-class Footprint:
-    """An oriented rectangle on the floor: an obstacle, or the car's body.
+class Footprint(Rectangle):
+    """An obstacle, or the car's body.
 
     Attributes:
-        x_m: Centre [m].
-        y_m: Centre [m].
-        half_length_m: Half of the extent along its own x axis [m].
-        half_width_m: Half of the extent along its own y axis [m].
-        yaw_rad: Heading of its x axis [rad].
         name: What it is, for reports.
     """
 
-    x_m: float
-    y_m: float
-    half_length_m: float
-    half_width_m: float
-    yaw_rad: float = 0.0
     name: str = ""
 
     def overlaps(self, other: Footprint) -> bool:

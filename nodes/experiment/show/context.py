@@ -18,7 +18,7 @@ from advnerf_core.driving.dynamics import Ackermann, Dubins
 from advnerf_core.driving.expert import Expert, ExpertConfig
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.driving.path import Path
-from advnerf_core.driving.solids import Rectangle, Solids
+from advnerf_core.driving.solids import Solids
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, Pinhole
 from advnerf_core.plugins import unknown
@@ -89,11 +89,7 @@ class Experiment(RunFolder[ExperimentConfig]):
         world = self.named_world.make()
         if not isinstance(world, HasSolids):
             return None
-        rectangles = [
-            Rectangle(each.x_m, each.y_m, each.half_length_m, each.half_width_m, each.yaw_rad)
-            for each in (world.car_body, *world.solids)
-        ]
-        return Solids(tuple(rectangles[1:]), rectangles[0]) if rectangles[1:] else None
+        return Solids(tuple(world.solids), world.car_body) if world.solids else None
 
     @property
     def seen_settings(self) -> dict[str, Any]:
