@@ -16,6 +16,9 @@ from advnerf_core.driving.path import Array, Path
 # The protocol's rule of what drives without an attack, in metres: the car never leaves the track, and its mean |CTE| is at most
 # this share of the off-track limit: 0.08 m in the lab, where the limit is 0.4 m.
 MEAN_CTE_SHARE = 0.2
+_STILL_M, _STILL_TICKS = 0.005, 3
+# A tick inside a longer gap of a pose stream is an error [s].
+_MAX_GAP_S = 0.5
 LAB_OFF_TRACK_M = 0.4
 
 
@@ -113,18 +116,15 @@ def drive_metrics(
     )
 
 
-def first_still_tick(states: ArrayLike, tolerance_m: float = 0.005, at_least_ticks: int = 3) -> int | None:
+def first_still_tick(states: ArrayLike) -> int | None:
     """First tick from which the car stands still until the end of ``states [K, >= 2]``; None if it is still moving.
 
-    Args:
-        states: Positions at the control ticks.
-        tolerance_m: Greatest distance from the last position that counts as standing [m].
-        at_least_ticks: Fewer still ticks than this at the end do not count as a stop.
+    The car stands within 5 mm of its last position; fewer than three still ticks at the end are no stop.
     """
     xy = np.asarray(states, dtype=np.float64)[:, :2]
-    moving = np.flatnonzero(np.linalg.norm(xy - xy[-1], axis=1) > tolerance_m)
+    moving = np.flatnonzero(np.linalg.norm(xy - xy[-1], axis=1) > _STILL_M)
     first = int(moving[-1]) + 1 if moving.size else 0
-    return first if len(xy) - first >= at_least_ticks else None
+    return first if len(xy) - first >= _STILL_TICKS else None
 
 
 def states_at_ticks(
@@ -132,7 +132,6 @@ def states_at_ticks(
     poses: ArrayLike,
     start_ns: int,
     horizon: Horizon | None = None,
-    max_gap_s: float = 0.5,
 ) -> Array:
     """Resample a pose stream (motion capture) at the control ticks.
 
@@ -141,7 +140,6 @@ def states_at_ticks(
         poses: ``[N, 3]`` x [m], y [m], yaw [rad]; yaw may be wrapped.
         start_ns: Stamp of tick 0, on the same clock, not before the first pose.
         horizon: Ticks wanted.
-        max_gap_s: A tick inside a longer gap of the stream is an error [s].
 
     Returns:
         ``[K, 3]`` states at the ticks 0..K-1, linear in time between poses, continuous yaw; shorter than the horizon if
@@ -164,17 +162,17 @@ def states_at_ticks(
         raise ValueError(
             f"expected a stream that covers the start {start_ns}, got {stamps[0]}..{stamps[-1]} ns"
         )
-    _require_no_gap(stamps, ticks_ns, max_gap_s)
+    _require_no_gap(stamps, ticks_ns)
     values[:, 2] = np.unwrap(values[:, 2])
     seconds, wanted = (stamps - start_ns) * 1e-9, (ticks_ns - start_ns) * 1e-9
     return np.stack([np.interp(wanted, seconds, values[:, k]) for k in range(3)], axis=1)
 
 
-def _require_no_gap(stamps: NDArray[np.int64], ticks_ns: NDArray[np.int64], max_gap_s: float) -> None:
+def _require_no_gap(stamps: NDArray[np.int64], ticks_ns: NDArray[np.int64]) -> None:
     after = np.searchsorted(stamps, ticks_ns, side="left")
     before = np.maximum(after - 1, 0)
     gaps_s = np.where(stamps[after] == ticks_ns, 0, stamps[after] - stamps[before]) * 1e-9
-    if gaps_s.max() > max_gap_s:
+    if gaps_s.max() > _MAX_GAP_S:
         raise ValueError(
-            f"expected no gap over {max_gap_s} s in the pose stream, got {gaps_s.max():.2f} s: the car was not tracked; repeat"
+            f"expected no gap over {_MAX_GAP_S} s in the pose stream, got {gaps_s.max():.2f} s: the car was not tracked; repeat"
         )

@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from advnerf_core.parallel import KERNEL_OPTIONS
 from advnerf_core.render.contraction import radial_stretch
 
+# Random places in each part of a cell where density is looked at.
+_PROBES = 6
+
 Array32 = NDArray[np.float32]
 LogDensity = Callable[[Array32], Array32]
 """Points ``[N, 3]`` in box coordinates to the logarithm of density ``[N]``."""
@@ -97,9 +100,6 @@ def refine_occupied(
     box_high: Array32,
     log_density: LogDensity,
     least_depth: float = 0.05,
-    factor: int = 2,
-    probes: int = 6,
-    seed: int = 0,
     contracted: bool = False,
 ) -> NDArray[np.bool_]:
     """Split occupied cells and keep the parts that a ray would notice.
@@ -108,16 +108,13 @@ def refine_occupied(
         occupied: ``[X, Y, Z]``.
         box_high: High corner of the box in box coordinates ``[3]``.
         least_depth: Optical depth of crossing a part, at the largest density found in it, from which it is kept.
-        factor: Parts along each side of a cell.
-        probes: Random places in each part where density is looked at.
-        seed: Seed of those places.
         contracted: Whether the grid is over the cube of a contracted field.
 
     Returns:
-        ``[factor * X, factor * Y, factor * Z]``.
+        ``[2 X, 2 Y, 2 Z]``.
     """
-    fine = occupied.repeat(factor, 0).repeat(factor, 1).repeat(factor, 2)
-    rng = np.random.Generator(np.random.Philox(key=[seed, 1]))
+    fine = occupied.repeat(2, 0).repeat(2, 1).repeat(2, 2)
+    rng = np.random.Generator(np.random.Philox(key=[0, 1]))
     cells = np.array(fine.shape) / np.asarray(box_high)
     least = least_depth * cells.max()
     stretch = (
@@ -127,7 +124,7 @@ def refine_occupied(
     for part in np.array_split(np.flatnonzero(fine), max(1, int(fine.sum()) // 262144)):
         index = np.stack(np.unravel_index(part, fine.shape), axis=-1)
         largest: NDArray[np.float32] = np.full(len(part), -np.inf, np.float32)
-        for _ in range(probes):
+        for _ in range(_PROBES):
             places = (index + rng.random((len(part), 3), dtype=np.float32)) / cells
             largest = np.maximum(largest, log_density(places.astype(np.float32)))
         # The cube is two inner regions wide: a part of the inner region is twice as long as its share of the cube.

@@ -6,49 +6,50 @@ import contextlib
 import datetime
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from pydantic import Field, model_validator
 
 from advnerf_core.geometry import Pinhole
 from hardware.cameras.interface import Camera, Frame
+from hardware.cameras.source import Source
 from hardware.cameras.stamping import Stamper
 from hardware.errors import DeviceBusy, DeviceNotFound, HardwareError, LinkLost, ProtocolError
 
 _ISO_DEFAULT = 400
 
 
-@dataclass(frozen=True)
-class OakSettings:
-    """Settings of an OAK.
+class OakSource(Source):
+    """An OAK camera (depthai 3), undistorted by the device.
 
     Attributes:
-        device: Id, IP address or USB port of the device; empty for the only one.
-        socket: Board socket of the camera, for example ``CAM_A``.
-        width: Width [px].
-        height: Height [px].
-        fps: Frame rate [Hz].
-        undistort: Let the device remove the distortion with its factory calibration.
+        kind: ``oak``.
+        device: Its id, IP address or USB port; empty for the only one.
+        socket: Board socket of the camera.
+        width: Columns [px].
+        height: Rows [px].
+        fps: Frames per second [Hz].
+        undistort: Let the device take the distortion out.
         exposure_us: Exposure time to fix [us]; None for automatic.
         iso: Sensitivity that goes with it.
         white_balance_k: Colour temperature to fix [K]; None for automatic.
     """
 
+    kind: Literal["oak"] = "oak"
     device: str = ""
     socket: str = "CAM_A"
-    width: int = 336
-    height: int = 188
-    fps: float = 10.0
+    width: int = Field(default=336, gt=0)
+    height: int = Field(default=188, gt=0)
+    fps: float = Field(default=10.0, gt=0.0)
     undistort: bool = True
     exposure_us: int | None = None
     iso: int | None = None
     white_balance_k: int | None = None
+    repeats: int = Field(default=15, ge=0)
 
-    def __post_init__(self) -> None:
-        if self.width <= 0 or self.height <= 0 or not self.fps > 0.0:
-            raise ValueError(
-                f"expected a size and a rate above zero, got {self.width} x {self.height} at {self.fps} Hz"
-            )
+    @model_validator(mode="after")
+    def _possible(self) -> OakSource:
         if self.iso is not None and self.exposure_us is None:
             raise ValueError("expected exposure_us and iso together, got one; give both or none")
         for name, value, low, high in (
@@ -58,6 +59,15 @@ class OakSettings:
         ):
             if value is not None and not low <= value <= high:
                 raise ValueError(f"expected {name} of {low} to {high}, got {value}")
+        return self
+
+    def period_s(self) -> float:
+        """Time between two frames [s]."""
+        return 1.0 / self.fps
+
+    def camera(self) -> OakCamera:
+        """Make the camera."""
+        return OakCamera(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +98,8 @@ class OakCamera(Camera):
 
     def __init__(
         self,
-        settings: OakSettings,
-        build: Callable[[Any, OakSettings], OakStream] | None = None,
+        settings: OakSource,
+        build: Callable[[Any, OakSource], OakStream] | None = None,
         stamper: Stamper | None = None,
     ) -> None:
         self.settings = settings
@@ -163,7 +173,7 @@ class OakCamera(Camera):
         return rgb
 
 
-def device_stream(depthai: Any, settings: OakSettings) -> OakStream:
+def device_stream(depthai: Any, settings: OakSource) -> OakStream:
     """Make the pipeline of a real device: camera, undistortion, scaling, and one queue of length 1."""
     info = find_device(depthai, settings.device)
     try:
@@ -197,7 +207,7 @@ def device_stream(depthai: Any, settings: OakSettings) -> OakStream:
     return OakStream(pipeline, queue, pinhole, device)
 
 
-def fix_controls(control: Any, settings: OakSettings) -> None:
+def fix_controls(control: Any, settings: OakSource) -> None:
     """Write exposure and white balance to a ``depthai.CameraControl``."""
     if settings.exposure_us is not None:
         control.setManualExposure(settings.exposure_us, settings.iso or _ISO_DEFAULT)

@@ -11,7 +11,7 @@ from pydantic import Field, ValidationInfo, ValidatorFunctionWrapHandler, WrapVa
 
 from hardware.cameras.file import FileCamera
 from hardware.cameras.foreign import foreign_source
-from hardware.cameras.oak import OakCamera, OakSettings
+from hardware.cameras.oak import OakSource
 from hardware.cameras.pixels import PIXEL_FORMATS
 from hardware.cameras.socket import SocketCamera
 from hardware.cameras.source import Source
@@ -144,48 +144,6 @@ class ZedSource(_ControlledSource):
             exposure,
             self._controls(),
         )
-
-
-class OakSource(Source):
-    """An OAK camera (depthai 3), undistorted by the device.
-
-    Attributes:
-        kind: ``oak``.
-        device: Its id, IP address or USB port; empty for the only one.
-        socket: Board socket of the camera.
-        width: Columns [px].
-        height: Rows [px].
-        fps: Frames per second [Hz].
-        undistort: Let the device take the distortion out.
-        exposure_us: Exposure time to fix [us]; None for automatic.
-        iso: Sensitivity that goes with it.
-        white_balance_k: Colour temperature to fix [K]; None for automatic.
-    """
-
-    kind: Literal["oak"] = "oak"
-    device: str = ""
-    socket: str = "CAM_A"
-    width: Positive = 336
-    height: Positive = 188
-    fps: float = Field(default=10.0, gt=0.0)
-    undistort: bool = True
-    exposure_us: int | None = None
-    iso: int | None = None
-    white_balance_k: int | None = None
-    repeats: int = Field(default=15, ge=0)
-
-    @model_validator(mode="after")
-    def _possible(self) -> OakSource:
-        self.camera()
-        return self
-
-    def period_s(self) -> float:
-        """Time between two frames [s]."""
-        return 1.0 / self.fps
-
-    def camera(self) -> OakCamera:
-        """Make the camera."""
-        return OakCamera(OakSettings(**self.model_dump(exclude={"kind", "stall_s", "repeats"})))
 
 
 class SocketSource(Source):

@@ -8,7 +8,7 @@ import numpy as np
 
 from hardware.cameras.file import FileCamera
 from hardware.cameras.interface import Frame
-from hardware.cameras.oak import OakCamera, OakSettings, OakStream, find_device
+from hardware.cameras.oak import OakCamera, OakSource, OakStream, find_device
 from hardware.cameras.socket import SocketCamera
 from hardware.cameras.v4l2.driver import V4l2Camera
 from hardware.cameras.v4l2.negotiation import Mode
@@ -143,7 +143,7 @@ class OakRig:
                 find_device(NothingPluggedIn, settings.device)
             return build(dai, settings)
 
-        self.camera = OakCamera(OakSettings(), plugged)
+        self.camera = OakCamera(OakSource(), plugged)
 
     def produce(self):
         self.feed.put((self.count, np.full(SHAPE, 40 + self.count, np.uint8)))
@@ -162,7 +162,7 @@ class OakRig:
         self.gone = False
 
     def missing(self, tmp_path):
-        return OakCamera(OakSettings(device="14442C10D13EABCE00"))
+        return OakCamera(OakSource(device="14442C10D13EABCE00"))
 
     def close(self):
         self.camera.close()

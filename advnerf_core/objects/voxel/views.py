@@ -8,6 +8,8 @@ from numpy.typing import ArrayLike
 from advnerf_core.geometry import Array, Pinhole
 
 FIELD_OF_VIEW_RAD = np.deg2rad(35.0)
+# Elevations of the cameras of a ring, and of a dome.
+_RING_RAD, _LOWEST_RAD, _HIGHEST_RAD = 0.25, -0.1, 1.1
 
 
 def look_at(eye: Array, target: Array) -> Array:
@@ -28,22 +30,16 @@ def viewing_lens(pixels: int) -> Pinhole:
     return Pinhole(pixels, pixels, f, f, pixels / 2, pixels / 2)
 
 
-def ring(box: tuple[Array, Array], count: int, elevation_rad: float = 0.25, phase: float = 0.0) -> Array:
-    """Poses ``[count, 4, 4]`` on a circle around a box that they hold in view; ``phase`` in 0..1 turns by a part of a step."""
-    azimuth = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False) + 2.0 * np.pi * phase / count
-    return _poses(box, azimuth, np.full(count, elevation_rad, dtype=np.float64))
+def ring(box: tuple[Array, Array], count: int) -> Array:
+    """Poses ``[count, 4, 4]`` on a circle around a box that they hold in view."""
+    azimuth = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+    return _poses(box, azimuth, np.full(count, _RING_RAD, dtype=np.float64))
 
 
-def dome(
-    box: tuple[Array, Array],
-    count: int,
-    lowest_rad: float = -0.1,
-    highest_rad: float = 1.1,
-    phase: float = 0.0,
-) -> Array:
+def dome(box: tuple[Array, Array], count: int, phase: float = 0.0) -> Array:
     """Poses ``[count, 4, 4]`` spread evenly over the part of a sphere that a car's camera and a person's see (a golden spiral)."""
     k = (np.arange(count) + 0.5) / count
-    sine = np.sin(lowest_rad) + k * (np.sin(highest_rad) - np.sin(lowest_rad))
+    sine = np.sin(_LOWEST_RAD) + k * (np.sin(_HIGHEST_RAD) - np.sin(_LOWEST_RAD))
     azimuth = 2.0 * np.pi * ((np.arange(count) + phase) * 0.6180339887498949 % 1.0)
     return _poses(box, azimuth, np.asarray(np.arcsin(sine), dtype=np.float64))
 
