@@ -17,7 +17,7 @@ from advnerf_core.geometry import Array, Pinhole
 def write_posed_images(
     folder: Path,
     poses: Sequence[Array],
-    pinhole: Pinhole,
+    pinhole: Pinhole | Sequence[Pinhole],
     see: Callable[[int], NDArray[np.uint8]],
     suffix: Literal["jpg", "png"],
     *,
@@ -28,6 +28,7 @@ def write_posed_images(
 
     Args:
         poses: ``T_world_from_camera [4, 4]`` of each picture, OpenCV axes.
+        pinhole: Intrinsics of all, or of each.
         see: Takes the picture ``[h, w, 3]`` of an index.
         suffix: ``png`` where pixels are compared, ``jpg`` where a scene is learned from them.
         keep: Do not take pictures that are there: for a capture that goes on. The caller sees to it that they belong to these poses.

@@ -27,6 +27,7 @@ class Wanted:
         victim: Which policy.
         method: Which search.
         seeds: Its seeds.
+        deployed: Whether it is driven where it is deployed.
     """
 
     scenario: str
@@ -34,6 +35,12 @@ class Wanted:
     victim: str
     method: str
     seeds: tuple[int, ...]
+    deployed: bool = True
+
+    @property
+    def domains(self) -> tuple[Domain, ...]:
+        """Where it is driven."""
+        return tuple(each for each in DOMAINS if self.deployed or each == "surrogate")
 
     @property
     def key(self) -> Key:
@@ -140,7 +147,7 @@ def make_table(wanted: Sequence[Wanted], cells: Iterable[CellResult], name: str 
     """
     seeds = {want.key: want.seeds for want in wanted}
     drives = CellDrives(cell for cell in cells if cell.seed in seeds.get(cell.key, ()))
-    rows = tuple(_row(want, drives, domain) for want in wanted for domain in DOMAINS)
+    rows = tuple(_row(want, drives, domain) for want in wanted for domain in want.domains)
     return ResultTable(rows, drives.cells, name)
 
 

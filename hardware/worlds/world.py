@@ -9,7 +9,7 @@ the ground under the point whose x, y and heading are its state, x forward, y le
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -185,14 +185,17 @@ class World(Protocol):
 
     Its class has an attribute ``Config``, a pydantic model or a dataclass, and is called with one: ``Intersection(Intersection.Config())``. All of the
     configuration counts as something that results depend on, but fields with ``exclude=True``: a server's address, or its patience.
-
-    Attributes:
-        camera_pinhole: Intrinsics of the driving camera.
-        photo_pinhole: Intrinsics of the camera of ``photograph``.
     """
 
-    camera_pinhole: Pinhole
-    photo_pinhole: Pinhole
+    @property
+    def camera_pinhole(self) -> Pinhole:
+        """Intrinsics of the driving camera."""
+        ...
+
+    @property
+    def photo_pinhole(self) -> Pinhole:
+        """Intrinsics of the camera of ``photograph``."""
+        ...
 
     @property
     def T_car_from_camera(self) -> Array:
@@ -343,6 +346,28 @@ def require_depth(view: View) -> tuple[Rgb, Depth]:
     return rgb, depth_m
 
 
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """A photograph that was taken before.
+
+    Attributes:
+        T_world_from_camera: Its pose ``[4, 4]``.
+        look: Reads it: colours ``[h, w, 3]``, undistorted, and their intrinsics.
+    """
+
+    T_world_from_camera: Array
+    look: Callable[[], tuple[Rgb, Pinhole]]
+
+
+@runtime_checkable
+class Photographed(Protocol):
+    """A place that is known by photographs alone: no others can be taken, and nothing drives there."""
+
+    def photographs(self, held_out: int, /) -> tuple[Sequence[Photograph], Sequence[Photograph]]:
+        """Photographs to learn from, and as many views of the driving camera as are asked for, which nothing learns from."""
+        ...
+
+
 def collided_with(world: World, pose: ArrayLike) -> str:
     """Name of what the car ran into that was stopped at a pose (x [m], y [m], yaw [rad]); ``obstacle`` where the world names nothing there."""
     x_m, y_m, yaw_rad = map(float, np.asarray(pose)[:3])
@@ -357,7 +382,7 @@ def traits_of(world: World) -> Traits:
 def members_of_a_world() -> tuple[str, ...]:
     """Names of everything that a world must have."""
     named = [name for name in vars(World) if not name.startswith("_") or name in ("__enter__", "__exit__")]
-    return tuple(sorted({*named, *World.__annotations__}))
+    return tuple(sorted(named))
 
 
 @runtime_checkable

@@ -57,8 +57,9 @@ def world_check(
 def world_list() -> None:
     """Name the worlds that there are: built in, and of installed packages; of simulators of other people, whether they are installed."""
     from advnerf_core.plugins import known_names
-    from hardware.worlds import ENTRY_POINTS, WORLDS
+    from hardware.worlds import ENTRY_POINTS
     from hardware.worlds.environments import ENVIRONMENTS
+    from nodes.lab.worlds.named import WORLDS
 
     rows = table("", "", "")
     for name in known_names(WORLDS, ENTRY_POINTS):

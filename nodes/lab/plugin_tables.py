@@ -57,7 +57,7 @@ def _methods() -> Mapping[str, str]:
 
 
 def _worlds() -> Mapping[str, str]:
-    from hardware.worlds import WORLDS
+    from nodes.lab.worlds.named import WORLDS
 
     return {name: one_line(load()) for name, load in WORLDS.items()}
 

@@ -10,9 +10,9 @@ from typer.testing import CliRunner
 from advnerf_core.attack.methods import METHODS
 from advnerf_core.code_files import file_sha256
 from hardware.cameras.sources import CAMERAS
-from hardware.worlds import WORLDS
 from nodes.cli.main import app
 from nodes.lab.plugin_tables import TABLES, named_code, rows_of
+from nodes.lab.worlds.named import WORLDS
 from tests.support.strangers import install_method, spiral_code, write_spiral
 
 ROOT = Path(__file__).parents[2]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,29 +26,33 @@ from nodes.experiment.steps.attack import cells
 from nodes.experiment.steps.frozen import frozen_hashes
 from nodes.experiment.steps.steering_gate import steering_of_victims
 
+# Around the drives [m, at 6 m/s].
 _MARGIN_M, _SHOWN_VIEWS = 3.0, 3
 
 
 def sections(
     experiment: Experiment,
-    overview: NDArray[np.uint8],
-    clips: Sequence[Path],
     seen: Mapping[str, Mapping[str, NDArray[np.uint8]]],
+    overview: NDArray[np.uint8] | None = None,
+    clips: Mapping[str, Path] | None = None,
 ) -> list[tuple[str, Markup]]:
     """Parts of the page about one experiment: headings and HTML.
 
     Args:
         experiment: With all stages and cells before finished.
-        overview: The world from above.
-        clips: One film per drive.
-        seen: Per drive and method, what the camera saw of the objects.
+        seen: Per path and method, what the camera saw of the objects.
+        overview: The world from above; None where it cannot be seen so.
+        clips: One film per path; None where nothing was deployed.
     """
     caption = "Paths of the drives, and the places of the objects"
-    found = [("The world", _picture(overview, caption))]
-    for name, clip in zip(experiment.config.scenarios, clips, strict=True):
-        found.append((name.capitalize(), Markup("\n").join(_drive(experiment, name, clip, seen[name]))))
+    world = [] if overview is None else [("The world", _picture(overview, caption))]
+    drives = [
+        (name.capitalize(), Markup("\n").join(_drive(experiment, name, (clips or {}).get(name), seen[name])))
+        for name in experiment.config.scenarios
+    ]
     return [
-        *found,
+        *world,
+        *drives,
         ("The learned scene", Markup("\n").join(_fidelity(experiment))),
         ("How it was made", _how(experiment)),
     ]
@@ -61,12 +65,17 @@ def opening(experiment: Experiment) -> str:
     counts = Counter(thing.kind.replace("_", " ") for thing in things)
     named = " and ".join(f"{count} {kind}{'s' if count > 1 else ''}" for kind, count in counts.items())
     return (
-        f"One goal-conditioned policy drives {', '.join(experiment.config.scenarios)}. "
+        f"Policies ({', '.join(experiment.config.attacked)}) drive {', '.join(experiment.config.scenarios)}. "
         f"{experiment.config.space.searched.format(named)} ({methods}; {attack.evaluations} evaluations each, "
-        f"{len(attack.seeds)} seed(s), {attack.starts} start(s), T = {experiment.config.horizon} ticks of {experiment.config.dt_s:g} s), then the opaque objects are put into the "
-        f"world {experiment.named_world.kind} by depth. Total CTE is the sum of |CTE| over the drive's ticks; ratios are to the same start past the plain "
+        f"{len(attack.seeds)} seed(s), {attack.starts} start(s), T = {experiment.config.horizon} ticks of {experiment.config.dt_s:g} s){_then(experiment)}. Total CTE is the sum of |CTE| over the drive's ticks; ratios are to the same start past the plain "
         "objects in the same domain."
     )
+
+
+def _then(experiment: Experiment) -> str:
+    if experiment.config.deploy.through == "nothing":
+        return "; nothing was driven in the place itself"
+    return f", then the opaque objects are put into the world {experiment.named_world.kind} by depth"
 
 
 def _picture(image: NDArray[np.uint8], caption: str) -> Markup:
@@ -76,20 +85,21 @@ def _picture(image: NDArray[np.uint8], caption: str) -> Markup:
 
 
 def _drive(
-    experiment: Experiment, name: str, clip: Path, seen: Mapping[str, NDArray[np.uint8]]
+    experiment: Experiment, name: str, clip: Path | None, seen: Mapping[str, NDArray[np.uint8]]
 ) -> list[Markup]:
-    text = f"Drives ({name}) from above: dashed in the learned scene, solid deployed"
+    text = f"Drives ({name}) from above: dashed in the learned scene{', solid deployed' * (clip is not None)}"
     parts = [
         Markup("<figure>{}<figcaption>{}</figcaption></figure>").format(
             Markup(svg(trajectories(experiment, name), text)), text
         ),
-        Markup('<video controls loop muted src="{}"></video>').format(data_uri(clip)),
     ]
+    if clip is not None:
+        parts.append(Markup('<video controls loop muted src="{}"></video>').format(data_uri(clip)))
     return [*parts, *(_picture(image, f"Objects seen: {style_of(key).title}") for key, image in seen.items())]
 
 
 def trajectories(experiment: Experiment, name: str) -> Figure:
-    """All drives of the hardened victim on one path, from above."""
+    """All drives of the main victim on one path, from above."""
     path = experiment.paths[name]
     line = path.pose_at(np.linspace(0.0, path.length_m, 300))[:, :2]
     found = [
@@ -100,11 +110,12 @@ def trajectories(experiment: Experiment, name: str) -> Figure:
     drives = [
         (cell, domain, states)
         for cell in found
-        for domain in films.DOMAINS
+        for domain in films.DOMAINS[: 1 if experiment.config.deploy.through == "nothing" else 2]
         for states in films.drives_of(experiment, domain, cell)
     ]
     every = np.concatenate([states[:, :2] for _, _, states in drives])
-    low, high = every.min(axis=0) - _MARGIN_M, every.max(axis=0) + _MARGIN_M
+    margin_m = experiment.along_m(_MARGIN_M)
+    low, high = every.min(axis=0) - margin_m, every.max(axis=0) + margin_m
     with new_axes(6.4, float(np.clip(5.6 * (high - low)[1] / (high - low)[0], 2.2, 6.0)) + 0.9) as ax:
         _ground(ax, experiment)
         ax.plot(*line.T, color=LIGHT["tape"], lw=7.0, alpha=0.25, zorder=1)
@@ -143,7 +154,7 @@ def _fidelity(experiment: Experiment) -> list[Markup]:
     difference = float(np.mean([abs(row["real"] - row["surrogate"]) for row in controls]))
     mean, views = scene["mean"], scene["views"]
     text = (
-        f"Held-out views of the driving camera: {mean['psnr_full_db']:.1f} dB at full size, {mean['psnr_policy_db']:.1f} dB at 200x66; "
+        f"Held-out views of the driving camera: {mean['psnr_full_db']:.1f} dB at full size, {mean['psnr_policy_db']:.1f} dB as the policy sees it; "
         f"the policy's control on true and learned views differs by {difference:.3f} {experiment.car.control_unit} on average."
     )
     parts = [Markup("<p>{}</p>").format(text)]

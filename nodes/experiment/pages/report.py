@@ -6,12 +6,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from markupsafe import Markup
 from numpy.typing import NDArray
 from rich.console import Console
 
-from advnerf_core.attack.spaces.space import Space
+from advnerf_core.attack.spaces.space import Shown, Space
 from advnerf_core.documents import read_json
+from advnerf_core.geometry import planar_poses
 from advnerf_core.report.cells import read_cell
 from advnerf_core.report.conditions import NONE
 from advnerf_core.report.result_page import not_driven, text_table
@@ -24,6 +26,7 @@ from nodes.experiment.pages.table import wanted_rows, write_table
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.method_names import know_methods_of
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.images import as_uint8
 from nodes.experiment.show.overview import from_above
 from nodes.experiment.show.spaces import dress, make_space, shown_there
 from nodes.experiment.steps import films
@@ -35,6 +38,8 @@ PAGE = "report.html"
 _TABLE_WIDTH = 160
 # Where along a drive its objects are shown [m, at 6 m/s]: most of them are in view, some close.
 _SEEN_AT_M = (9.0, 14.0)
+# In the learned scene, of so many places of a drive those are shown where most of the objects is seen.
+_LOOKED_AT, _SHOWN = 12, 2
 
 
 def run(experiment: Experiment, folder: Path, report: Report, notes: Sequence[str] = ()) -> None:
@@ -60,18 +65,24 @@ def run(experiment: Experiment, folder: Path, report: Report, notes: Sequence[st
             data.measured,
         )
         return
-    films_of: list[Path] = []
+    if experiment.config.deploy.through == "nothing":
+        report(0.1, "drawing what the policy sees")
+        space = make_space(experiment, None)
+        found = {name: seen_where_learned(experiment, space, name) for name in experiment.config.scenarios}
+        _write(experiment, folder, page.sections(experiment, found), (*notes, page.opening(experiment)))
+        return
+    films_of: dict[str, Path] = {}
     with experiment.open_deployed_world() as scene:
         space = make_space(experiment, scene)
         overview = from_above(experiment, scene)
         for index, name in enumerate(experiment.config.scenarios):
             report(0.1 + 0.8 * index / len(experiment.config.scenarios), f"filming {name}")
-            films_of.append(films.film_scenario(experiment, scene, space, name, folder))
+            films_of[name] = films.film_scenario(experiment, scene, space, name, folder)
         seen: dict[str, dict[str, NDArray[np.uint8]]] = {
             name: textures_seen(experiment, scene, space, name) for name in experiment.config.scenarios
         }
     report(0.95, "writing the page")
-    sections = page.sections(experiment, overview, films_of, seen)
+    sections = page.sections(experiment, seen, overview, films_of)
     _write(experiment, folder, sections, (*notes, page.opening(experiment)))
 
 
@@ -106,7 +117,31 @@ def table_of(experiment: Experiment) -> ResultTable:
     plan = cells(experiment)
     files = [experiment.cell_result(cell) for cell in plan]
     found = [read_cell(file) for file in files if file.exists()]
-    return make_table(wanted_rows(plan, experiment.config.scenarios), found, experiment.config.name)
+    return make_table(
+        wanted_rows(plan, experiment.config.scenarios, experiment.config.deploy.through != "nothing"),
+        found,
+        experiment.config.name,
+    )
+
+
+def seen_where_learned(experiment: Experiment, space: Space, scenario: str) -> dict[str, NDArray[np.uint8]]:
+    """What the policy sees in the learned scene past the plain, random and attacked objects of the first seed, where most of them is in view."""
+    victim, seed = experiment.config.main_victim, experiment.config.attack.seeds[0]
+    driven = films.drives_of(experiment, "surrogate", Cell(scenario, victim, NONE, 0))[0]
+    states = driven[np.linspace(0, len(driven) - 1, min(_LOOKED_AT, len(driven))).astype(int)]
+    poses = planar_poses(states) @ experiment.mount
+
+    def rendered(shown: Shown) -> torch.Tensor:
+        return shown.seen_by(space.surrogate).render(poses, shown.colours).images
+
+    changed = (rendered(space.plain) - rendered(Shown((), torch.zeros(0, 3)))).abs().sum(dim=(1, 2, 3))
+    best = changed.argsort(descending=True, stable=True)[:_SHOWN].sort().values
+    seen = {}
+    for method in (NONE, *experiment.config.attack.method_names):
+        cell = Cell(scenario, victim, method, 0 if method == NONE else seed)
+        pictures = rendered(load_shown(space, driven_folder(experiment, cell), cell))[best]
+        seen[method] = np.concatenate([as_uint8(each) for each in pictures], axis=1)
+    return seen
 
 
 def textures_seen(

@@ -16,8 +16,8 @@ from advnerf_core.report.targets import Target
 from nodes.experiment.plan.cell import Cell
 
 
-def wanted_rows(cells: Sequence[Cell], scenarios: Sequence[str]) -> list[Wanted]:
-    """The lines that cells fill, in the order of their scenarios."""
+def wanted_rows(cells: Sequence[Cell], scenarios: Sequence[str], deployed: bool = True) -> list[Wanted]:
+    """The lines that cells fill, in the order of their scenarios; in the learned scene alone where nothing is deployed."""
     seeds: dict[tuple[str, str, str, str], list[int]] = {}
     for cell in cells:
         seeds.setdefault((cell.scenario, cell.placement, cell.victim, cell.method), []).append(cell.seed)
@@ -27,7 +27,7 @@ def wanted_rows(cells: Sequence[Cell], scenarios: Sequence[str]) -> list[Wanted]
         seeds,
         key=lambda key: (scenarios.index(key[0]), key[1], victims.index(key[2]), order_of(key[3])),
     )
-    return [Wanted(*key, tuple(seeds[key])) for key in order]
+    return [Wanted(*key, tuple(seeds[key]), deployed) for key in order]
 
 
 def write_table(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +10,12 @@ from numpy.typing import NDArray
 
 from advnerf_core.data.posed_images import write_posed_images
 from advnerf_core.files import write_atomically
-from advnerf_core.geometry import Array, planar_pose
+from advnerf_core.geometry import Array, Pinhole, planar_pose
 from advnerf_core.learning.imitation import recovery_states
 from calibration.by_construction import write_twin_calibrations
 from calibration.schema import save_calibration
 from hardware.worlds.lab.lab import Lab
-from hardware.worlds.world import World
+from hardware.worlds.world import Photograph, Photographed, World
 from nodes.experiment.show.context import CALIBRATION, PLACED, Experiment
 from nodes.experiment.show.faces import DISPLAY, on_screen, panel_of, plain_screen, wanted_face
 from nodes.experiment.show.learned_scene import HELD_OUT
@@ -34,6 +35,9 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     rng = np.random.default_rng(config.seed)
     with experiment.open_world() as scene:
         experiment.keep_world(scene)
+        if isinstance(scene, Photographed):
+            _take_over(scene, config.held_out, folder, report)
+            return
         if experiment.has_rules:
             report(0.0, "placing objects")
             write_atomically(folder / PLACED, as_text(place_by_rule(experiment, scene)))
@@ -59,6 +63,28 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         ):
             if count:
                 _driving_views(experiment, scene, name, count, rng, done, folder, report)
+
+
+def _take_over(place: Photographed, held_out: int, folder: Path, report: Report) -> None:
+    """Both sets of a place that was photographed before."""
+    learned, views = place.photographs(held_out)
+    total = len(learned) + len(views)
+    _write(folder / PHOTOS, learned, counted(report, PHOTOS, len(learned), 0, total))
+    _write(folder / HELD_OUT, views, counted(report, HELD_OUT, len(views), len(learned), total))
+
+
+def _write(folder: Path, photographs: Sequence[Photograph], told: Callable[[int], None]) -> None:
+    pinholes: list[Pinhole] = []  # known once a photograph is undistorted
+
+    def look(index: int) -> NDArray[np.uint8]:
+        rgb, pinhole = photographs[index].look()
+        pinholes.append(pinhole)
+        return rgb
+
+    # What is written is learned from and compared with, so that nothing is lost again.
+    write_posed_images(
+        folder, [each.T_world_from_camera for each in photographs], pinholes, look, "png", told=told
+    )
 
 
 def _driving_views(

@@ -16,6 +16,7 @@ from advnerf_core.documents import Document
 from advnerf_core.places import require_utf8
 from advnerf_core.plugins import name_in_results, unknown
 from advnerf_core.strict import validate
+from hardware.worlds.world import Photographed
 from nodes.experiment.engine.artefact import REFERENCE, Artefact
 from nodes.experiment.engine.run_folder import require_own_folder, run_to_end
 from nodes.experiment.engine.stages import Stage, begun_with, stage_digests
@@ -107,6 +108,8 @@ def _check_places(experiment: Experiment, document: Document) -> None:
         if name not in experiment.world.paths:
             message = unknown(name, "scenario", experiment.world.paths)
             raise ConfigError(f"{document.place(('scenarios', index))}: scenarios: {message}")
+    if isinstance(experiment.named_world.make(), Photographed):
+        _check_photographed(experiment, document)
     by_hand = [
         index for index, each in enumerate(experiment.config.objects) if isinstance(each, PlacedObject)
     ]
@@ -125,6 +128,29 @@ def _check_places(experiment: Experiment, document: Document) -> None:
         )
     if not given_in(experiment.config):  # policies that exist are looked at when the experiment is run
         _ = experiment.view
+
+
+def _check_photographed(experiment: Experiment, document: Document) -> None:
+    """Nothing drives in a place that is known by photographs alone, so that policies must exist and objects stand by hand."""
+    config = experiment.config
+    refused: tuple[tuple[tuple[str, ...], bool, str], ...] = (
+        (("deploy", "through"), config.deploy.through != "nothing", "deploy.through nothing"),
+        (("victims",), config.trains, "victims that exist ({policy: ...})"),
+        (
+            ("objects",),
+            experiment.has_rules or not config.objects,
+            "objects whose places are given (x_m, y_m, yaw_rad)",
+        ),
+        (("space", "kind"), config.space.kind not in ("colours", "places"), "space.kind colours or places"),
+        (("capture", "colour_pairs"), config.capture.colour_pairs > 0, "capture.colour_pairs 0"),
+        (("object", "panel_light"), config.object.panel_light != "ideal", "object.panel_light ideal"),
+    )
+    for key, wrong, wanted in refused:
+        if wrong:
+            raise ConfigError(
+                f"{document.place(key)}: expected {wanted} in a place that is known by photographs alone, as nothing can be driven or "
+                "photographed there"
+            )
 
 
 def make_ready(

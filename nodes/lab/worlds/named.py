@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -14,11 +14,22 @@ from pydantic import BaseModel, TypeAdapter
 from advnerf_core.documents import Document
 from advnerf_core.plugins import PluginError, absolute_reference, code_sha256, is_file_reference, resolve
 from advnerf_core.strict import validate
-from hardware.worlds import ENTRY_POINTS, WORLDS
+from hardware.worlds import ENTRY_POINTS
+from hardware.worlds import WORLDS as DRIVEN
 from hardware.worlds.world import World, WorldClass, members_of_a_world
 from nodes.runtime.errors import ConfigError
 
 _PAGE = "docs/worlds.md"
+
+
+def _photographs() -> WorldClass:
+    from nodes.lab.worlds.photographs.world import Photographs
+
+    return Photographs
+
+
+WORLDS: Mapping[str, Callable[[], WorldClass]] = {**DRIVEN, "photographs": _photographs}
+"""Loaders of the worlds' classes by name: those that can be driven, and a place of photographs alone."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +95,7 @@ def read_world(document: Document, folder: Path) -> NamedWorld:
     except PluginError as error:
         raise ConfigError(f"{document.place(('kind',))}: {error}") from None
     changes = {key: value for key, value in document.data.items() if key != "kind"}
-    config = validate(world_class.Config, Document(changes, document.source, document.places))
+    config = validate(world_class.Config, Document(changes, document.source, document.places), folder)
     code = code_sha256(kind, WORLDS, ENTRY_POINTS, folder)
     if is_file_reference(kind):
         kind = Path(absolute_reference(kind, folder)).name

@@ -1,0 +1,1 @@
+"""A place that is known by posed photographs alone."""

@@ -1,0 +1,136 @@
+"""What must be said of a place that is known by photographs: the pictures, the path, the car and its camera."""
+
+from __future__ import annotations
+
+import hashlib
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import AfterValidator, Field, ValidationInfo, computed_field, model_validator
+from pydantic_core import PydanticCustomError
+
+from advnerf_core.data.dataset import PosedImages, load_transforms
+from advnerf_core.files import sha256_of
+from advnerf_core.geometry import Pinhole
+from advnerf_core.places import expanded
+from advnerf_core.strict import COMPLETE, StrictModel
+
+DRIVEN = "driven"
+AboveZero = Annotated[float, Field(gt=0.0)]
+
+
+def _located(name: str, info: ValidationInfo) -> str:
+    if name == DRIVEN:
+        return name
+    path = ((info.context or {}).get("folder") or Path.cwd()) / expanded(name)
+    if not path.exists():
+        raise PydanticCustomError(
+            COMPLETE,
+            "{text}",
+            {"text": f"expected a file or folder relative to this file, got {name}, which is not there"},
+        )
+    return str(path.resolve())
+
+
+Located = Annotated[str, AfterValidator(_located)]
+
+
+class DrivenCarConfig(StrictModel):
+    """The car that is to drive there.
+
+    Attributes:
+        speed_mps: Speed of all drives [m/s].
+        wheelbase_m: Distance between the axles [m].
+        max_steering_rad: Largest angle of the front wheels to either side [rad].
+    """
+
+    speed_mps: AboveZero
+    wheelbase_m: AboveZero
+    max_steering_rad: float = Field(gt=0.0, lt=1.5)
+
+
+class MountedCameraConfig(StrictModel):
+    """The driving camera on that car.
+
+    Attributes:
+        x_m: Ahead of the rear axle [m].
+        y_m: Left of the car's middle [m].
+        z_m: Above the ground [m].
+        pitch_down_rad: Optical axis below the horizon [rad]; None: as the driven photographs were taken.
+        pinhole: Its intrinsics; None: those of the photographs, undistorted.
+    """
+
+    x_m: float = 0.0
+    y_m: float = 0.0
+    z_m: AboveZero
+    pitch_down_rad: float | None = None
+    pinhole: Pinhole | None = None
+
+
+class PhotographsConfig(StrictModel):
+    """A place that is known by photographs.
+
+    Attributes:
+        images: ``transforms.json`` of posed images, or its folder, in metres with z up; ``advnerf scene from-...`` makes one.
+        path: ``driven``: the photographs were taken while driving, in the order in which they are listed; or the ``.json`` file of those
+            that were, as ``transforms_car.json``; or a CSV file of x [m], y [m] in driving order, in the frame of the photographs.
+        closed: Whether the path goes round.
+        off_track_m: Half the width of the lane [m].
+        ground_z_m: Height of the ground in the frame of the photographs [m]; None: below the driven ones, by the camera's height.
+        car: The car.
+        camera: Its camera.
+    """
+
+    images: Located = Field(exclude=True)
+    path: Located = Field(default=DRIVEN, exclude=True)
+    closed: bool = False
+    off_track_m: AboveZero
+    ground_z_m: float | None = None
+    car: DrivenCarConfig
+    camera: MountedCameraConfig
+
+    @model_validator(mode="after")
+    def _ground_is_known(self) -> PhotographsConfig:
+        if not self.shows_path and (self.ground_z_m is None or self.camera.pitch_down_rad is None):
+            raise ValueError(
+                "expected ground_z_m and camera.pitch_down_rad with a path from a file, as photographs that nobody drove for do not show them"
+            )
+        return self
+
+    @property
+    def shows_path(self) -> bool:
+        """Whether photographs show the path, and not a file of points."""
+        return self.path == DRIVEN or self.path.endswith(".json")
+
+    @property
+    def driven(self) -> PosedImages:
+        """The photographs that were taken while driving, in their order; where nobody drove, all of them."""
+        return read_images(self.path if self.path.endswith(".json") else self.images)
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def content_sha256(self) -> str:
+        """Hash of the photographs, their poses and the path, wherever they lie."""
+        listed = read_images(self.images)
+        files = {each.path for each in listed.frames} | {each.mask for each in listed.frames if each.mask}
+        files |= {listed.file} if listed.file else set()
+        if self.path != DRIVEN:
+            files |= {Path(self.path), *(each.path for each in self.driven.frames)}
+        digests = [_digest(each, each.stat().st_mtime_ns) for each in sorted(files)]
+        return hashlib.sha256("".join(digests).encode()).hexdigest()
+
+
+def read_images(images: str) -> PosedImages:
+    """The posed images that a path names, all of which must be there.
+
+    Raises:
+        DatasetError: They cannot be read.
+    """
+    return load_transforms(Path(images), require_all=True)
+
+
+@lru_cache(maxsize=4096)
+def _digest(file: Path, changed_ns: int) -> str:
+    del changed_ns
+    return sha256_of(file)

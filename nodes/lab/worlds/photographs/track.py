@@ -1,0 +1,109 @@
+"""The path that a car drove, from the poses of its camera."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from advnerf_core.geometry import Array
+from hardware.worlds.fitting import path_through
+from hardware.worlds.paths import ReferencePath
+from hardware.worlds.world import WorldError
+
+# Between two photographs of one drive the way is at most so many times the usual one, and leads so far forward (cosine).
+_LONGEST_STEPS, _FORWARD = 5.0, 0.5
+# Of half a lane: distance of the points that the path passes, and by how much it may miss them.
+_SPACING, _MISS = 0.5, 0.04
+
+
+def driven_track(cars: Array) -> Array:
+    """The longest part of a drive that leads on without a leap.
+
+    Args:
+        cars: ``T_world_from_car [N, 4, 4]`` in the order of the photographs.
+
+    Returns:
+        x [m], y [m] ``[M, 2]``.
+
+    Raises:
+        WorldError: The photographs show no drive.
+    """
+    points, ahead = cars[:, :2, 3], cars[:, :2, 0]
+    steps = np.diff(points, axis=0)
+    lengths_m = np.linalg.norm(steps, axis=1)
+    usual_m = float(np.median(lengths_m)) if len(steps) else 0.0
+    goes_on = (lengths_m <= _LONGEST_STEPS * usual_m) & (
+        np.einsum("ij,ij->i", steps, ahead[:-1]) >= _FORWARD * lengths_m * np.linalg.norm(ahead[:-1], axis=1)
+    )
+    parts = np.split(np.arange(len(points)), np.flatnonzero(~goes_on) + 1)
+    best = max(parts, key=lambda part: float(lengths_m[part[:-1]].sum()))
+    if len(best) < 3:
+        raise WorldError(
+            f"expected at least three photographs one after the other along a drive, got {len(points)} of which {len(best)} are; give the path "
+            "as a CSV file of x [m], y [m]"
+        )
+    return points[best]
+
+
+def points_of(file: Path) -> Array:
+    """x [m], y [m] ``[N, 2]`` of a CSV file; a first line of words is a header.
+
+    Raises:
+        WorldError: It holds something else.
+    """
+    rows: list[tuple[float, float]] = []
+    with file.open(newline="", encoding="utf-8-sig") as stream:
+        for number, row in enumerate(csv.reader(stream), start=1):
+            try:
+                x_m, y_m = map(float, row)
+            except ValueError:
+                if number == 1:
+                    continue
+                raise WorldError(
+                    f"{file}:{number}: expected two numbers, x [m] and y [m], got {', '.join(row)!r:.80}"
+                ) from None
+            rows.append((x_m, y_m))
+    return np.array(rows, dtype=np.float64).reshape(-1, 2)
+
+
+def path_along(points: Array, off_track_m: float, closed: bool) -> ReferencePath:
+    """A path along measured points: these are averaged, as poses from pictures are off by millimetres to centimetres.
+
+    Args:
+        points: x [m], y [m] ``[N, 2]`` in driving order.
+        off_track_m: Half the width of the lane [m].
+        closed: Whether it goes on from the last point to the first.
+
+    Raises:
+        WorldError: They are on no smooth way.
+    """
+    try:
+        averaged = _averaged(points, _SPACING * off_track_m, closed)
+        return path_through(averaged, closed=closed, tolerance_m=_MISS * off_track_m)
+    except (ValueError, np.linalg.LinAlgError) as error:
+        raise WorldError(
+            f"expected points on one smooth way, at most {_SPACING * off_track_m:g} m apart, got {len(points)} points: {error}"
+        ) from None
+
+
+def _averaged(points: Array, spacing_m: float, closed: bool) -> Array:
+    """Points at equal distances, each on the parabola through its neighbours that a Gaussian weighs.
+
+    Its width is half the distance, or that of the measured points if they are farther apart; a parabola does not cut corners.
+    """
+    lengths_m = np.linalg.norm(np.diff(points, axis=0, append=points[:1]), axis=1)
+    along_m = np.concatenate([[0.0], np.cumsum(lengths_m[:-1])])
+    round_m = along_m[-1] + lengths_m[-1]
+    width_m = max(0.5 * spacing_m, float(np.median(lengths_m[:-1])))
+    count = max(3, int(np.ceil((round_m if closed else along_m[-1]) / spacing_m)) + (not closed))
+    wanted_m = np.linspace(0.0, round_m if closed else along_m[-1], count, endpoint=not closed)
+    if closed:
+        points = np.concatenate([points, points, points])
+        along_m = np.concatenate([along_m - round_m, along_m, along_m + round_m])
+    away = (along_m[None] - wanted_m[:, None]) / width_m
+    powers = away[..., None] ** np.arange(3)
+    weighted = np.exp(-0.5 * away**2)[..., None] * powers
+    normal, wanted = np.einsum("kni,knj->kij", weighted, powers), np.einsum("kni,nd->kid", weighted, points)
+    return np.linalg.solve(normal, wanted)[:, 0]

@@ -1,0 +1,226 @@
+"""A place that is known by posed photographs alone: attacks are searched in what is learned from them, and nothing is driven there."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar, NoReturn
+
+import cv2
+import numpy as np
+
+from advnerf_core.data.dataset import PosedImage, load_image
+from advnerf_core.geometry import Array, Pinhole, VehicleState, camera_mount, invert_transform, make_transform
+from hardware.worlds.world import Box, CarDescription, Photograph, Rgb, WorldDescription, WorldError
+from nodes.lab.worlds.photographs.config import PhotographsConfig, read_images
+from nodes.lab.worlds.photographs.track import driven_track, path_along, points_of
+
+PATH = "track"
+# The learned box reaches beyond cameras and path by this share of their extent; what lies outside is learned with less detail.
+_BESIDE, _BELOW_M = 0.5, 0.1
+_HALF_PX = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+
+
+class Photographs:
+    """A place of photographs. Its frame is that of the photographs, moved up or down so that the ground is at z = 0.
+
+    Args:
+        config: The photographs, the path, the car and its camera.
+    """
+
+    Config: ClassVar[type[PhotographsConfig]] = PhotographsConfig
+
+    def __init__(self, config: PhotographsConfig) -> None:
+        self.config = config
+
+    @cached_property
+    def T_car_from_camera(self) -> Array:
+        """Where the driving camera sits on the car ``[4, 4]``."""
+        camera = self.config.camera
+        pitch = camera.pitch_down_rad
+        if pitch is None:
+            axes = np.stack([each.T_world_from_camera[:3, 2] for each in self._driven])
+            pitch = float(np.median(np.arcsin(np.clip(-axes[:, 2], -1.0, 1.0))))
+        return camera_mount(camera.x_m, camera.y_m, camera.z_m, pitch)
+
+    @cached_property
+    def camera_pinhole(self) -> Pinhole:
+        """Intrinsics of the driving camera."""
+        return self.config.camera.pinhole or load_image(self._driven[0])[1]
+
+    @cached_property
+    def photo_pinhole(self) -> Pinhole:
+        """Intrinsics of the first photograph; each has its own, see `photographs`."""
+        return load_image(self._all[0])[1]
+
+    @cached_property
+    def _driven(self) -> tuple[PosedImage, ...]:
+        return self._checked(self.config.driven.frames)
+
+    @cached_property
+    def _all(self) -> tuple[PosedImage, ...]:
+        return self._checked(read_images(self.config.images).frames)
+
+    def _checked(self, frames: tuple[PosedImage, ...]) -> tuple[PosedImage, ...]:
+        if masked := [each.path.name for each in frames if each.mask is not None]:
+            raise WorldError(
+                f"expected photographs without masks, got {len(masked)} with one, first {masked[0]}; remove the masks"
+            )
+        return frames
+
+    @cached_property
+    def _cars(self) -> Array:
+        """``T_images_from_car [N, 4, 4]`` of the driven photographs."""
+        poses = np.stack([each.T_world_from_camera for each in self._driven])
+        return poses @ invert_transform(self.T_car_from_camera)
+
+    @cached_property
+    def _T_world_from_images(self) -> Array:
+        ground_m = self.config.ground_z_m
+        if ground_m is None:
+            ground_m = float(np.median(self._cars[:, 2, 3]))
+        return make_transform(np.eye(3), [0.0, 0.0, -ground_m])
+
+    def describe(self) -> WorldDescription:
+        """What an experiment must know: the path is that of the photographs that were taken while driving, or of the file."""
+        config, car = self.config, self.config.car
+        points = driven_track(self._cars) if config.shows_path else points_of(Path(config.path))
+        path = path_along(points, config.off_track_m, config.closed)
+        return WorldDescription(
+            paths={PATH: path},
+            off_track_m=config.off_track_m,
+            car=CarDescription(
+                "ackermann", car.speed_mps, (-car.max_steering_rad, car.max_steering_rad), car.wheelbase_m
+            ),
+            camera=self.camera_pinhole,
+            T_car_from_camera=self.T_car_from_camera,
+            box=self._box(points),
+            facts={"photographs": len(self._all)},
+        )
+
+    def _box(self, points: Array) -> Box:
+        poses = np.stack([each.T_world_from_camera for each in self._all])
+        cameras = (self._T_world_from_images @ poses)[:, :3, 3]
+        seen = np.concatenate([cameras, np.column_stack([points, np.zeros(len(points))])])
+        low, high = seen.min(axis=0), seen.max(axis=0)
+        beside_m = _BESIDE * float((high - low).max())
+        x, y, z = (high + beside_m).tolist()
+        return Box(
+            (float(low[0] - beside_m), float(low[1] - beside_m), -_BELOW_M), (x, y, z), contraction=True
+        )
+
+    def photographs(self, held_out: int) -> tuple[list[Photograph], list[Photograph]]:
+        """Photographs to learn from, and views of the driving camera that nothing learns from.
+
+        Args:
+            held_out: So many of those that were taken while driving, or nearest to the path, equally spaced.
+
+        Raises:
+            WorldError: There are too few.
+        """
+        along = self._driven if self.config.shows_path else self._nearest()
+        if not 3 <= held_out <= len(along) // 3:
+            raise WorldError(
+                f"expected capture.held_out from 3 to a third of the {len(along)} photographs along the path, got {held_out}"
+            )
+        chosen = [along[index] for index in np.linspace(0, len(along) - 1, held_out + 2).astype(int)[1:-1]]
+        left_out = {each.path for each in chosen}
+        learned = [each for each in self._all if each.path not in left_out]
+        return [self._photograph(each, None) for each in learned], [
+            self._photograph(each, self.camera_pinhole) for each in chosen
+        ]
+
+    def _nearest(self) -> list[PosedImage]:
+        """The half of the photographs whose cameras are nearest to the points of the path, in their order."""
+        points = points_of(Path(self.config.path))
+        places = np.stack([each.T_world_from_camera[:2, 3] for each in self._all])
+        away_m = np.linalg.norm(places[:, None] - points[None], axis=2).min(axis=1)
+        near = np.sort(np.argsort(away_m, kind="stable")[: (len(away_m) + 1) // 2])
+        return [self._all[index] for index in near]
+
+    def _photograph(self, image: PosedImage, pinhole: Pinhole | None) -> Photograph:
+        """One, undistorted; in the driving camera's intrinsics if they are given."""
+        pose = self._T_world_from_images @ image.T_world_from_camera
+
+        def look() -> tuple[Rgb, Pinhole]:
+            rgb, own = load_image(image)
+            return (rgb, own) if pinhole is None else (_through(pinhole, rgb, own, image.path), pinhole)
+
+        return Photograph(pose, look)
+
+    @property
+    def state(self) -> VehicleState:
+        """There is no car."""
+        self._refuse()
+
+    @property
+    def blocked(self) -> bool:
+        """There is no car."""
+        self._refuse()
+
+    def photo_poses(self, count: int, rng: np.random.Generator) -> list[Array]:
+        """Where the photographs were taken, however many are asked for."""
+        del count, rng
+        return [self._T_world_from_images @ each.T_world_from_camera for each in self._all]
+
+    def reset(self, x_m: float, y_m: float, yaw_rad: float) -> VehicleState:
+        """Nothing is driven here."""
+        del x_m, y_m, yaw_rad
+        self._refuse()
+
+    def step(self, control: float, speed_mps: float, duration_s: float) -> VehicleState:
+        """Nothing is driven here."""
+        del control, speed_mps, duration_s
+        self._refuse()
+
+    def observe(self, depth: bool = True) -> Any:
+        """Nothing is driven here."""
+        del depth
+        self._refuse()
+
+    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True) -> Any:
+        """No other pictures can be taken."""
+        del x_m, y_m, yaw_rad, depth
+        self._refuse()
+
+    def photograph(self, T_world_from_camera: Array) -> Rgb:
+        """No other pictures can be taken."""
+        del T_world_from_camera
+        self._refuse()
+
+    def _refuse(self) -> NoReturn:
+        raise WorldError(
+            "expected a place that can be driven and photographed anew, got one that is known by photographs alone; attacks are searched in "
+            "what is learned from them"
+        )
+
+    def __enter__(self) -> Photographs:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        return
+
+
+def _through(pinhole: Pinhole, rgb: Rgb, own: Pinhole, file: Path) -> Rgb:
+    """A photograph as a camera with other intrinsics would have taken it from the same pose.
+
+    Raises:
+        WorldError: It does not show all that that camera sees.
+    """
+    if pinhole == own:
+        return rgb
+    own_from_wanted = own.matrix @ np.linalg.inv(pinhole.matrix)
+    corners = np.array([[x, y, 1.0] for x in (0.5, pinhole.width - 0.5) for y in (0.5, pinhole.height - 0.5)])
+    seen = corners @ own_from_wanted.T
+    if (seen < 0.0).any() or (seen[:, :2] > [own.width, own.height]).any():
+        raise WorldError(
+            f"expected photographs that show all that the driving camera {pinhole} sees, got {file.name} with {own}; take wider ones, or "
+            "correct camera.pinhole"
+        )
+    # OpenCV counts pixels from their centres.
+    index_map = np.linalg.inv(_HALF_PX) @ own_from_wanted @ _HALF_PX
+    size = (pinhole.width, pinhole.height)
+    warped = cv2.warpPerspective(
+        rgb, index_map, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE
+    )
+    return np.asarray(warped, dtype=np.uint8)

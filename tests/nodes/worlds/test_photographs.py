@@ -1,0 +1,179 @@
+"""A place of photographs: its path, ground and camera are those of the car that took them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from advnerf_core.data.posed_images import write_posed_images
+from advnerf_core.documents import Document
+from advnerf_core.errors import AdvnerfError
+from advnerf_core.geometry import (
+    Array,
+    Pinhole,
+    camera_mount,
+    make_transform,
+    planar_pose,
+    rotation_z,
+    transform_points,
+)
+from advnerf_core.strict import validate
+from hardware.worlds.paths import ReferencePath
+from hardware.worlds.world import WorldError
+from nodes.lab.worlds.expert_drive import as_path
+from nodes.lab.worlds.photographs.config import PhotographsConfig
+from nodes.lab.worlds.photographs.track import driven_track, path_along, points_of
+from nodes.lab.worlds.photographs.world import Photographs
+
+MOUNT = camera_mount(0.3, 0.02, 0.2, 0.17)
+# The frame of the photographs is turned about z and lies 1.2 m below the ground.
+T_IMAGES_FROM_WORLD = make_transform(rotation_z(0.5), [3.0, -2.0, 1.2])
+LOOP = ReferencePath(
+    (0.0, -2.0, 0.0), (("line", 1.8), ("arc", 1.1, np.pi / 2)) * 4, closed=True
+)  # 4 x (1.8 + 1.73) m
+PINHOLE = Pinhole(64, 48, 40.0, 40.0, 32.0, 24.0)
+
+
+def bearings(T: Array, pinhole: Pinhole) -> Array:
+    """A world that is infinitely far: every pixel ``[h, w, 3]`` uint8 shows its direction in the world, smoothly."""
+    columns, rows = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
+    rays = np.stack(
+        [(columns - pinhole.cx) / pinhole.fx, (rows - pinhole.cy) / pinhole.fy, np.ones_like(rows)], -1
+    )
+    rays = rays @ T[:3, :3].T
+    return np.round(127.5 * (1.0 + rays / np.linalg.norm(rays, axis=-1, keepdims=True))).astype(np.uint8)
+
+
+def photographs(folder: Path, count: int = 40, noise_m: float = 0.0, path: ReferencePath = LOOP) -> Path:
+    """Pictures of one lap, in the order of the drive."""
+    rng = np.random.default_rng(0)
+    cars = [planar_pose(*path.pose_at(path.length_m * index / count)) for index in range(count)]
+    poses = [T_IMAGES_FROM_WORLD @ car @ MOUNT for car in cars]
+    for pose in poses:
+        pose[:3, 3] += noise_m * rng.standard_normal(3)
+    write_posed_images(folder, poses, PINHOLE, lambda index: bearings(poses[index], PINHOLE), "png")
+    return folder
+
+
+def place(folder: Path, **changes: object) -> Photographs:
+    data = {
+        "images": "images_of_mine", "closed": True, "off_track_m": 0.25,
+        "car": {"speed_mps": 0.8, "wheelbase_m": 0.3, "max_steering_rad": 0.4},
+        "camera": {"x_m": 0.3, "y_m": 0.02, "z_m": 0.2}, **changes,
+    }  # fmt: skip
+    return Photographs(validate(PhotographsConfig, Document(data, "mine"), folder))
+
+
+@pytest.mark.parametrize(
+    ("count", "noise_m", "within_m"),
+    [(40, 0.0, 0.02), (120, 0.0, 0.012), (120, 0.005, 0.02)],  # of half a lane of 0.25 m
+)
+def test_path_ground_and_pitch_are_those_of_the_drive(
+    tmp_path: Path, count: int, noise_m: float, within_m: float
+) -> None:
+    photographs(tmp_path / "images_of_mine", count, noise_m)
+    found = place(tmp_path)
+    described = found.describe()
+    assert np.allclose(described.T_car_from_camera, MOUNT, atol=1e-6)
+    along_m = np.linspace(0.0, LOOP.length_m, 500)
+    flat = np.column_stack([as_path(LOOP).pose_at(along_m)[:, :2], np.zeros(500)])
+    true = transform_points(T_IMAGES_FROM_WORLD, flat)
+    assert np.abs(as_path(described.paths["track"]).project(true[:, :2]).cte_m).max() < within_m
+    assert described.paths["track"].length_m == pytest.approx(LOOP.length_m, rel=0.01)
+    learned, held_out = found.photographs(6)
+    assert (len(learned), len(held_out)) == (count - 6, 6)
+    for each in held_out:
+        assert each.T_world_from_camera[2, 3] == pytest.approx(0.2, abs=4 * noise_m + 1e-6)
+
+
+def test_content_and_not_the_folder_is_what_results_depend_on(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        photographs(tmp_path / name / "images_of_mine", count=12)
+    first, second = (place(tmp_path / name).config for name in ("a", "b"))
+    assert first.model_dump() == second.model_dump()
+    picture = tmp_path / "b" / "images_of_mine" / "images" / "00003.png"
+    picture.write_bytes((picture.parent / "00009.png").read_bytes())
+    assert place(tmp_path / "b").config.content_sha256 != first.content_sha256
+
+
+def test_a_view_of_the_driving_camera_is_cut_out_of_a_wider_photograph(tmp_path: Path) -> None:
+    photographs(tmp_path / "images_of_mine", count=12)
+    camera = Pinhole(40, 24, 50.0, 50.0, 20.0, 12.0)
+    _, held_out = place(
+        tmp_path, camera={"x_m": 0.3, "y_m": 0.02, "z_m": 0.2, "pinhole": vars(camera)}
+    ).photographs(3)
+    for each in held_out:
+        rgb, pinhole = each.look()
+        assert pinhole == camera
+        pose = make_transform(each.T_world_from_camera[:3, :3], np.zeros(3))
+        # Interpolated between pixels of 1.4 degrees, rounded twice.
+        assert np.abs(rgb.astype(int) - bearings(pose, camera)).max() <= 2
+    wide = vars(Pinhole(40, 24, 10.0, 10.0, 20.0, 12.0))
+    _, held_out = place(tmp_path, camera={"x_m": 0.3, "z_m": 0.2, "pinhole": wide}).photographs(3)
+    with pytest.raises(WorldError, match="show all that the driving camera"):
+        held_out[0].look()
+
+
+def test_a_leap_ends_a_drive_and_the_longest_part_is_taken() -> None:
+    cars = np.stack([planar_pose(0.1 * index, 0.0, 0.0) for index in range(20)])
+    elsewhere = np.stack([planar_pose(5.0, 0.1 * index, np.pi / 2) for index in range(8)])
+    assert np.allclose(driven_track(np.concatenate([elsewhere, cars]))[:, 0], 0.1 * np.arange(20))
+    back = np.stack([planar_pose(1.9 - 0.1 * index, 0.0, 0.0) for index in range(1, 12)])
+    assert len(driven_track(np.concatenate([cars, back]))) == 20, "a car does not drive backwards"
+    with pytest.raises(WorldError, match=r"at least three photographs.*CSV"):
+        driven_track(cars[[0, 9]])
+
+
+def test_an_open_path_from_a_file(tmp_path: Path) -> None:
+    photographs(tmp_path / "images_of_mine", count=12)
+    file = tmp_path / "way.csv"
+    angle_rad = np.linspace(0.0, 1.0, 40)
+    rows = np.column_stack([3.0 * np.sin(angle_rad), 3.0 * (1.0 - np.cos(angle_rad))])  # a circle of 3 m
+    file.write_text("x_m,y_m\n" + "\n".join(f"{x},{y}" for x, y in rows))
+    found = place(
+        tmp_path, path="way.csv", closed=False, ground_z_m=1.2, camera={"z_m": 0.2, "pitch_down_rad": 0.17}
+    )
+    path = as_path(found.describe().paths["track"])
+    assert (
+        np.abs(
+            np.hypot(*(path.pose_at(np.linspace(0.0, path.length_m, 99))[:, :2] - [0.0, 3.0]).T) - 3.0
+        ).max()
+        < 0.01
+    )
+    assert path.length_m == pytest.approx(3.0, abs=0.02)
+    file.write_text("0,0\n1;2\n")
+    with pytest.raises(WorldError, match=r"way\.csv:2: expected two numbers"):
+        points_of(file)
+    with pytest.raises(WorldError, match="one smooth way"):
+        path_along(np.zeros((4, 2)), 0.25, False)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"images": "not_there"}, "images: expected a file or folder relative to this file, got not_there"),
+        ({"path": "images_of_mine/transforms.json", "camera": {"z_m": 0}}, "camera.z_m"),
+        ({"path": "images_of_mine/images/00000.png"}, "expected ground_z_m and camera.pitch_down_rad"),
+        ({"car": {}}, "car.speed_mps is missing"),
+    ],
+)
+def test_what_is_missing_is_said(tmp_path: Path, changes: dict[str, object], message: str) -> None:
+    photographs(tmp_path / "images_of_mine", count=12)
+    with pytest.raises(AdvnerfError, match=message):
+        place(tmp_path, **changes)
+
+
+def test_nothing_can_be_driven_or_photographed_anew(tmp_path: Path) -> None:
+    photographs(tmp_path / "images_of_mine", count=12)
+    found = place(tmp_path)
+    for ask in (
+        lambda: found.reset(0.0, 0.0, 0.0),
+        lambda: found.step(0.0, 1.0, 0.1),
+        lambda: found.observe_at(0.0, 0.0, 0.0),
+        lambda: found.photograph(np.eye(4)),
+        lambda: found.state,
+    ):
+        with pytest.raises(WorldError, match="known by photographs alone"):
+            ask()
+    with pytest.raises(WorldError, match=r"capture\.held_out from 3 to a third of the 12"):
+        found.photographs(5)
