@@ -30,8 +30,7 @@ def arm(run_dir: RunDir = None, reason: Reason = "") -> None:
 
 def disarm(
     run_dir: Annotated[
-        Path | None,
-        typer.Option("--run-dir", help="Folder of the run.", show_default="all running launches"),
+        Path | None, typer.Option(help="Folder of the run.", show_default="all running launches")
     ] = None,
     reason: Reason = "",
 ) -> None:

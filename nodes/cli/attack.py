@@ -140,14 +140,11 @@ def attack_print(
         typer.Option(help="Paper of the PDF's tiles; none: one page as large as the poster."),
     ] = "a4",
     dpi: Annotated[float, typer.Option(min=10, max=2400, help="Pixels per inch.")] = 200.0,
-    margin_mm: Annotated[float, typer.Option("--margin-mm", help="White on every side of a page.")] = 8.0,
-    overlap_mm: Annotated[
-        float, typer.Option("--overlap-mm", help="Strip that neighbouring tiles share, for glue.")
-    ] = 5.0,
+    margin_mm: Annotated[float, typer.Option(help="White on every side of a page.")] = 8.0,
+    overlap_mm: Annotated[float, typer.Option(help="Strip that neighbouring tiles share, for glue.")] = 5.0,
     name: Annotated[str | None, typer.Option("--object", help="Name or number of the object.")] = None,
     size_m: Annotated[
-        float | None,
-        typer.Option("--size-m", min=0.01, help="Edge of a panel, for attack files that do not hold it."),
+        float | None, typer.Option(min=0.01, help="Edge of a panel, for attack files that do not hold it.")
     ] = None,
 ) -> None:
     """Write a face's or panel's texture at its true size: a PDF in tiles with marks to cut and glue, or one PNG."""
@@ -169,9 +166,7 @@ def attack_check(
             "--output", "-o", help="Folder of check.json and check.png.", show_default="runs/<name>"
         ),
     ] = None,
-    directions: Annotated[
-        int, typer.Option("--directions", min=2, help="Random directions of each comparison.")
-    ] = 8,
+    directions: Annotated[int, typer.Option(min=2, help="Random directions of each comparison.")] = 8,
     memory: Annotated[bool, typer.Option(help="Also measure peak memory against the horizon.")] = True,
     overrides: Overrides = None,
 ) -> None:

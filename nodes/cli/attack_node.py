@@ -57,7 +57,7 @@ def attack_cancel(
     request_id: Annotated[
         str, typer.Option("--id", help="Only this request.", show_default="whichever it is")
     ] = "",
-    reason: Annotated[str, typer.Option("--reason", help="Why, for the record.")] = "",
+    reason: Annotated[str, typer.Option(help="Why, for the record.")] = "",
 ) -> None:
     """End the search of a running attack node; what was found so far stays in its folder."""
     from nodes.experiment.node.client import cancel_attack

@@ -159,7 +159,7 @@ def bag_record(
 @app.command("play")
 def bag_play(
     bag: Annotated[Path, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file.", exists=True)],
-    rate: Annotated[float, typer.Option("--rate", min=0.001, help="Speed relative to the recording.")] = 1.0,
+    rate: Annotated[float, typer.Option(min=0.001, help="Speed relative to the recording.")] = 1.0,
     loop: Annotated[bool, typer.Option("--loop", help="Start over at the end.")] = False,
     offset_s: Annotated[
         float,
@@ -171,7 +171,7 @@ def bag_play(
     topics: Topics = None,
     remap: Annotated[
         list[str] | None,
-        typer.Option("--remap", metavar="OLD:=NEW", help="Play a topic under another name. May be repeated."),
+        typer.Option(metavar="OLD:=NEW", help="Play a topic under another name. May be repeated."),
     ] = None,
     paused: Annotated[bool, typer.Option("--paused", help="Start paused.")] = False,
     clock_hz: Annotated[
@@ -183,10 +183,7 @@ def bag_play(
     wait_for: Annotated[
         list[str] | None,
         typer.Option(
-            "--wait-for",
-            metavar="TOPIC",
-            help="Wait until this topic has a subscriber.",
-            show_default="any topic",
+            metavar="TOPIC", help="Wait until this topic has a subscriber.", show_default="any topic"
         ),
     ] = None,
     no_wait: Annotated[

@@ -107,12 +107,10 @@ def intrinsics(
     source: Annotated[
         Path | None, typer.Argument(help="Bag, or folder of images.", exists=True, show_default="--live")
     ] = None,
-    every: Annotated[int, typer.Option("--every", min=1, help="Use only every N-th frame.")] = 1,
-    most: Annotated[
-        int, typer.Option("--most", min=20, help="Use at most this many images, evenly spread.")
-    ] = 80,
+    every: Annotated[int, typer.Option(min=1, help="Use only every N-th frame.")] = 1,
+    most: Annotated[int, typer.Option(min=20, help="Use at most this many images, evenly spread.")] = 80,
     model: Annotated[
-        str, typer.Option("--model", help="Distortion model: none, two-radial (k1 k2 p1 p2) or three-radial.")
+        str, typer.Option(help="Distortion model: none, two-radial (k1 k2 p1 p2) or three-radial.")
     ] = "two-radial",
 ) -> None:
     """Calibrate focal length, principal point and distortion from images of a ChArUco board."""
@@ -149,7 +147,7 @@ def camera_to_car(
     live: LiveOptions,
     source: Source = None,
     board_topic: Annotated[
-        str, typer.Option("--board-topic", help="Topic with the poses of the tracked board.")
+        str, typer.Option(help="Topic with the poses of the tracked board.")
     ] = "/vicon/board",
     untracked: Annotated[
         bool,
@@ -161,7 +159,6 @@ def camera_to_car(
     pattern: Annotated[
         Path | None,
         typer.Option(
-            "--pattern",
             exists=True,
             help="Text file with four rows: the pose of the print on the tracked board.",
             show_default="estimated",
@@ -219,10 +216,7 @@ def mocap_to_scene(
 def vehicle(
     output: Output,
     before: Annotated[
-        Path,
-        typer.Option(
-            "--before", exists=True, help="Vehicle file with the servo range and limits, which are kept."
-        ),
+        Path, typer.Option(exists=True, help="Vehicle file with the servo range and limits, which are kept.")
     ],
     live: LiveOptions,
     source: Source = None,
@@ -260,7 +254,7 @@ def vehicle(
 @with_groups
 def time_offset(
     output: Output,
-    camera: Annotated[Path, typer.Option("--camera", exists=True, help="Camera file.")],
+    camera: Annotated[Path, typer.Option(exists=True, help="Camera file.")],
     live: LiveOptions,
     source: Source = None,
     update: Annotated[

@@ -24,9 +24,9 @@ def display_colours(
             "--output", "-o", help="Folder for the images to show and for shown.csv, which you complete."
         ),
     ],
-    width: Annotated[int, typer.Option("--width", min=16, help="Width of the monitor [px].")] = 1920,
-    height: Annotated[int, typer.Option("--height", min=16, help="Height of the monitor [px].")] = 1080,
-    seed: Annotated[int, typer.Option("--seed", help="Random seed of the mixed colours.")] = 0,
+    width: Annotated[int, typer.Option(min=16, help="Width of the monitor [px].")] = 1920,
+    height: Annotated[int, typer.Option(min=16, help="Height of the monitor [px].")] = 1080,
+    seed: Annotated[int, typer.Option(help="Random seed of the mixed colours.")] = 0,
 ) -> None:
     """Write the sequence of plain-colour images to show full-screen for ``calibrate display``."""
     import cv2
@@ -61,19 +61,15 @@ def display(
     screen: Annotated[
         int | None,
         typer.Option(
-            "--screen",
-            min=0,
-            help="Show the colours on this screen and take the camera images from the running launch.",
+            min=0, help="Show the colours on this screen and take the camera images from the running launch."
         ),
     ] = None,
     twin: Annotated[
         Path | None,
-        typer.Option(
-            "--twin", exists=True, help="Socket of the simulated lab: show the colours on its monitor."
-        ),
+        typer.Option(exists=True, help="Socket of the simulated lab: show the colours on its monitor."),
     ] = None,
     conditions: Annotated[
-        str, typer.Option("--conditions", help="Lighting, exposure and monitor settings, stored in the file.")
+        str, typer.Option(help="Lighting, exposure and monitor settings, stored in the file.")
     ] = "exposure and white balance locked",
     run_dir: RunDir = None,
 ) -> None:

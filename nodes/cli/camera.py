@@ -32,8 +32,8 @@ def camera_try(
             help="Source as in a launch file, for example '{kind: v4l2, device: /dev/v4l/by-id/...}'."
         ),
     ],
-    frames: Annotated[int, typer.Option("--frames", min=2, help="Number of frames to read.")] = 50,
-    out: Annotated[Path | None, typer.Option("--out", help="Save the last image here (.png, .jpg).")] = None,
+    frames: Annotated[int, typer.Option(min=2, help="Number of frames to read.")] = 50,
+    out: Annotated[Path | None, typer.Option(help="Save the last image here (.png, .jpg).")] = None,
     timeout_s: Annotated[
         float, typer.Option("--timeout", min=0.5, help="Give up after this many seconds.")
     ] = 15.0,
@@ -65,12 +65,10 @@ def camera_check(
     overrides: Overrides = None,
     shows: Annotated[
         Literal["red", "green", "blue"] | None,
-        typer.Option(
-            "--shows", help="Colour of what is held before the camera; checks the order of colours."
-        ),
+        typer.Option(help="Colour of what is held before the camera; checks the order of colours."),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", help="Save the last image here (.png, .jpg): look at it.")
+        Path | None, typer.Option(help="Save the last image here (.png, .jpg): look at it.")
     ] = None,
 ) -> None:
     """Hold cameras against the contract: form of the images, stamps, reopening, timeouts, stalls.
@@ -100,15 +98,11 @@ def camera_check(
 @app.command("factory")
 def camera_factory(
     factory: Annotated[Path, typer.Argument(help="Factory calibration of the ZED, SN<serial>.conf.")],
-    mount: Annotated[
-        Path, typer.Option("--mount", help="Camera file from which the pose on the car is copied.")
-    ],
-    out: Annotated[Path, typer.Option("--out", help="Path of the camera.yaml to write.")],
-    mode: Annotated[str, typer.Option("--mode", help="Camera mode: 2K, HD1080, HD720 or VGA.")] = "VGA",
-    width: Annotated[int, typer.Option("--width", min=1, help="Width of the delivered images [px].")] = 336,
-    height: Annotated[
-        int, typer.Option("--height", min=1, help="Height of the delivered images [px].")
-    ] = 188,
+    mount: Annotated[Path, typer.Option(help="Camera file from which the pose on the car is copied.")],
+    out: Annotated[Path, typer.Option(help="Path of the camera.yaml to write.")],
+    mode: Annotated[str, typer.Option(help="Camera mode: 2K, HD1080, HD720 or VGA.")] = "VGA",
+    width: Annotated[int, typer.Option(min=1, help="Width of the delivered images [px].")] = 336,
+    height: Annotated[int, typer.Option(min=1, help="Height of the delivered images [px].")] = 188,
 ) -> None:
     """Write the calibration file of a ZED's rectified left eye from its factory calibration."""
     from calibration.schema import save_calibration

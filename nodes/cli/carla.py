@@ -39,7 +39,7 @@ def carla_check(
     config: ConfigFile = None,
     overrides: Overrides = None,
     pictures: Annotated[
-        Path | None, typer.Option("--pictures", help="Folder for what the driving camera sees: look at it.")
+        Path | None, typer.Option(help="Folder for what the driving camera sees: look at it.")
     ] = None,
 ) -> None:
     """Say what is right and what is wrong with a server; the world is left as it was."""
@@ -63,9 +63,7 @@ def carla_junctions(
     port: Port = None,
     opendrive: Annotated[
         Path | None,
-        typer.Option(
-            "--opendrive", help="Read this OpenDRIVE file (.xodr) instead of asking a server.", exists=True
-        ),
+        typer.Option(help="Read this OpenDRIVE file (.xodr) instead of asking a server.", exists=True),
     ] = None,
 ) -> None:
     """List a map's junctions: id, place, roads, and how many sets of drives straight, right and left they have."""
@@ -97,9 +95,9 @@ def carla_capture(
     port: Port = None,
     config: ConfigFile = None,
     overrides: Overrides = None,
-    photos: Annotated[int, typer.Option("--photos", min=1, help="Photographs to learn from.")] = 1800,
-    held_out: Annotated[int, typer.Option("--held-out", min=0, help="Views that nothing learns from.")] = 60,
-    seed: Annotated[int, typer.Option("--seed")] = 0,
+    photos: Annotated[int, typer.Option(min=1, help="Photographs to learn from.")] = 1800,
+    held_out: Annotated[int, typer.Option(min=0, help="Views that nothing learns from.")] = 60,
+    seed: Annotated[int, typer.Option()] = 0,
 ) -> None:
     """Photograph a junction along its lanes: transforms.json for `advnerf scene train --open`, and the reference paths."""
     from nodes.lab.carla.capture import CaptureRequest, capture
@@ -119,8 +117,8 @@ def carla_drive(
     port: Port = None,
     config: ConfigFile = None,
     overrides: Overrides = None,
-    path: Annotated[Literal["straight", "right", "left"], typer.Option("--path")] = "straight",
-    seconds: Annotated[float, typer.Option("--seconds", min=0.1, help="How long to drive.")] = 6.0,
+    path: Annotated[Literal["straight", "right", "left"], typer.Option()] = "straight",
+    seconds: Annotated[float, typer.Option(min=0.1, help="How long to drive.")] = 6.0,
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", help="JSON file for states, turn rates and cross-track errors."),

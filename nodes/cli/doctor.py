@@ -29,13 +29,13 @@ def doctor(
             metavar="[FILE|NAME]", help="Check only what this *.launch.yaml needs.", parser=launch_argument
         ),
     ] = None,
-    folder: Annotated[Path, typer.Option("--folder", help="Folder for results.")] = Path("runs"),
-    vicon_port: Annotated[int, typer.Option("--vicon-port", min=1, max=65535)] = 51001,
+    folder: Annotated[Path, typer.Option(help="Folder for results.")] = Path("runs"),
+    vicon_port: Annotated[int, typer.Option(min=1, max=65535)] = 51001,
     vesc: Annotated[
-        str | None, typer.Option("--vesc", help="Serial device of the VESC.", show_default="detected")
+        str | None, typer.Option(help="Serial device of the VESC.", show_default="detected")
     ] = None,
     host: Annotated[
-        str | None, typer.Option("--host", help="Host of the launch file that this computer is, or all.")
+        str | None, typer.Option(help="Host of the launch file that this computer is, or all.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
     overrides: Overrides = None,

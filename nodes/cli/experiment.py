@@ -132,7 +132,6 @@ def experiment(
     until: Annotated[
         str | None,
         typer.Option(
-            "--until",
             metavar="STAGE",
             help="Stop after this stage: capture, scene, bake, object, policy, retrain or live.",
         ),
@@ -140,22 +139,17 @@ def experiment(
     jobs: Annotated[
         int | None,
         typer.Option(
-            "--jobs",
             min=1,
             help="Cells at a time, each in a process of its own.",
             show_default="one per core; of an experiment with one seed, one after another in this process",
         ),
     ] = None,
     threads: Annotated[
-        int | None,
-        typer.Option(
-            "--threads", min=1, help="Threads per cell.", show_default="cores shared among the jobs"
-        ),
+        int | None, typer.Option(min=1, help="Threads per cell.", show_default="cores shared among the jobs")
     ] = None,
     cluster: Annotated[
         str | None,
         typer.Option(
-            "--cluster",
             metavar="ADDRESS",
             help="Run cells on the Ray cluster at host:port; auto: the one in RAY_ADDRESS, or one started here.",
         ),
@@ -189,7 +183,7 @@ def experiment(
         ),
     ] = False,
     page_port: Annotated[
-        int, typer.Option("--page-port", min=0, max=65535, help="Port of the page; 0 selects a free one.")
+        int, typer.Option(min=0, max=65535, help="Port of the page; 0 selects a free one.")
     ] = 8091,
 ) -> None:
     """Run an experiment, from the photographs to the report: every stage and every cell that is not there yet. It may be stopped at any time."""
@@ -393,7 +387,7 @@ def _say_where(full: ResultTable, cells: Sequence[Cell], page: Path | None) -> N
 
 def predict(
     choice: CellChoice,
-    draws: Annotated[int, typer.Option("--draws", min=9, help="Drives per prediction.")] = 20,
+    draws: Annotated[int, typer.Option(min=9, help="Drives per prediction.")] = 20,
 ) -> None:
     """Predict how the attacks transfer from pictures without a deployed drive with them; the table then says how good that was."""
     os.environ.setdefault("MUJOCO_GL", "egl")
@@ -420,9 +414,7 @@ def maps(
 
 def publish(
     choice: CellChoice,
-    to: Annotated[Path, typer.Option("--to", help="Gets a folder with the campaign's name.")] = Path(
-        "docs/results"
-    ),
+    to: Annotated[Path, typer.Option(help="Gets a folder with the campaign's name.")] = Path("docs/results"),
     prune: Annotated[
         bool, typer.Option("--prune", help="Remove cells there that other settings have made.")
     ] = False,
@@ -435,7 +427,6 @@ def publish(
     withdraw: Annotated[
         list[str] | None,
         typer.Option(
-            "--withdraw",
             metavar="SCENARIO=REASON",
             help="Give a registered scenario up of which nothing was published; the page says so, and why.",
         ),
@@ -443,7 +434,6 @@ def publish(
     declare: Annotated[
         list[str] | None,
         typer.Option(
-            "--declare",
             metavar="SCENARIO.VICTIM=REASON",
             help="Say that a victim breaks the registered rule of what drives well, and why it is shown; the page says so.",
         ),

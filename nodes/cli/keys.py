@@ -38,9 +38,7 @@ def keys_allow(
     right: Annotated[
         str, typer.Option("--to", help="Right to grant: watch, or drive (which includes watch).")
     ] = "watch",
-    public: Annotated[
-        str | None, typer.Option("--public", help="Public key, if this host does not have it yet.")
-    ] = None,
+    public: Annotated[str | None, typer.Option(help="Public key, if this host does not have it yet.")] = None,
     folder: Folder = None,
 ) -> None:
     """Allow a key to watch or to drive. A running launch accepts the key at its next connection attempt."""

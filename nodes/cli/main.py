@@ -113,16 +113,13 @@ def launch(
     file: LaunchFile,
     overrides: Overrides = None,
     run_dir: Annotated[
-        Path | None,
-        typer.Option(
-            "--run-dir", help="Folder for logs, sockets and bag.", show_default="runs/<name>-<time>"
-        ),
+        Path | None, typer.Option(help="Folder for logs, sockets and bag.", show_default="runs/<name>-<time>")
     ] = None,
     duration_s: Annotated[
         float | None, typer.Option("--duration", min=0.0, help="Stop after this many seconds.")
     ] = None,
     host: Annotated[
-        str | None, typer.Option("--host", help="Host of the launch file that this computer is, or all.")
+        str | None, typer.Option(help="Host of the launch file that this computer is, or all.")
     ] = None,
     check: Annotated[
         bool,

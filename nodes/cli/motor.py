@@ -56,12 +56,7 @@ def info(port: Port = "/dev/vesc") -> None:
 def set_timeout(
     timeout_ms: Annotated[
         int,
-        typer.Option(
-            "--timeout-ms",
-            min=50,
-            max=2000,
-            help="Time without commands after which the controller brakes [ms].",
-        ),
+        typer.Option(min=50, max=2000, help="Time without commands after which the controller brakes [ms]."),
     ] = 250,
     brake_current_a: Annotated[
         float, typer.Option("--brake-current", min=0.0, max=60.0, help="Amperes.")

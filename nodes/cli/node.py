@@ -40,7 +40,7 @@ def node_list(run_dir: RunDir = None) -> None:
 
 def top(
     period_s: Annotated[float, typer.Option("--period", min=0.5, help="Time between two tables [s].")] = 2.0,
-    count: Annotated[int | None, typer.Option("--count", min=1, help="Stop after this many tables.")] = None,
+    count: Annotated[int | None, typer.Option(min=1, help="Stop after this many tables.")] = None,
     run_dir: RunDir = None,
 ) -> None:
     """Show the load of each node: CPU, memory, rate, dropped messages, missed ticks, queue, restarts."""

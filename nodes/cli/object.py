@@ -32,13 +32,11 @@ def object_build(
         Path | None, typer.Argument(help="Mesh file: GLB, OBJ, PLY or STL.", exists=True, dir_okay=False)
     ] = None,
     generate: Annotated[
-        str | None,
-        typer.Option("--generate", help="Generate an object instead of reading FILE: hydrant or car."),
+        str | None, typer.Option(help="Generate an object instead of reading FILE: hydrant or car.")
     ] = None,
     images: Annotated[
         Path | None,
         typer.Option(
-            "--images",
             exists=True,
             help="Learn from images with an alpha channel instead of reading FILE: their transforms.json.",
         ),
@@ -47,22 +45,17 @@ def object_build(
         Path | None,
         typer.Option("--output", "-o", help="Object file.", show_default="<name>.object.safetensors"),
     ] = None,
-    resolution: Annotated[
-        int, typer.Option("--resolution", min=8, max=128, help="Voxels along the longest side.")
-    ] = 64,
+    resolution: Annotated[int, typer.Option(min=8, max=128, help="Voxels along the longest side.")] = 64,
     height_m: Annotated[float | None, typer.Option("--height", help="Scale to this height [m].")] = None,
     up: Annotated[
         str | None,
         typer.Option(
-            "--up",
-            help="Axis of the file that points up: z or y.",
-            show_default="y for GLB and glTF, z for others",
+            help="Axis of the file that points up: z or y.", show_default="y for GLB and glTF, z for others"
         ),
     ] = None,
     unit: Annotated[
         str | None,
         typer.Option(
-            "--unit",
             help="Unit of length of the file: mm, cm, m or in.",
             show_default="m for GLB and glTF; others need it, or --height",
         ),
@@ -70,22 +63,16 @@ def object_build(
     steps: Annotated[
         int | None,
         typer.Option(
-            "--steps",
-            min=0,
-            help="Optimiser steps of the fit.",
-            show_default="400 for a mesh, 600 for images",
+            min=0, help="Optimiser steps of the fit.", show_default="400 for a mesh, 600 for images"
         ),
     ] = None,
     minutes: Annotated[
         float | None,
-        typer.Option(
-            "--minutes", min=0.01, help="With --images: fit for this many minutes instead of --steps."
-        ),
+        typer.Option(min=0.01, help="With --images: fit for this many minutes instead of --steps."),
     ] = None,
     size: Annotated[
         tuple[int, int] | None,
         typer.Option(
-            "--size",
             min=1,
             help="With --images: resize the images to this width and height. For the object itself, see --resolution.",
             show_default="as they are",

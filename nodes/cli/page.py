@@ -28,12 +28,9 @@ def page(
     ] = None,
     run_dir: RunDir = None,
     port: Annotated[
-        int,
-        typer.Option(
-            "--port", min=0, max=65535, help="TCP port of a recording's page; 0 selects a free one."
-        ),
+        int, typer.Option(min=0, max=65535, help="TCP port of a recording's page; 0 selects a free one.")
     ] = 8090,
-    rate: Annotated[float, typer.Option("--rate", min=0.001, help="Speed relative to the recording.")] = 1.0,
+    rate: Annotated[float, typer.Option(min=0.001, help="Speed relative to the recording.")] = 1.0,
 ) -> None:
     """Show the address of the running operator page, and the code for a phone. With a bag: show the recording on a page."""
     if bag is None:

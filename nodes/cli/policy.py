@@ -32,7 +32,6 @@ def policy_check(
     run_folder: Annotated[
         Path | None,
         typer.Option(
-            "--run-folder",
             exists=True,
             help="Run folder of an experiment: check on the camera frames of its capture and on drives in its learned scene.",
         ),
@@ -40,34 +39,26 @@ def policy_check(
     scene: Annotated[
         Path | None,
         typer.Option(
-            "--scene",
-            exists=True,
-            help="Learned scene: check on its views and on drives in it. Needs --calibration.",
+            exists=True, help="Learned scene: check on its views and on drives in it. Needs --calibration."
         ),
     ] = None,
     calibration: Annotated[
         Path | None,
-        typer.Option(
-            "--calibration",
-            exists=True,
-            help="Folder with camera.yaml, room.yaml and vehicle.yaml of the scene.",
-        ),
+        typer.Option(exists=True, help="Folder with camera.yaml, room.yaml and vehicle.yaml of the scene."),
     ] = None,
     bag: Annotated[
-        Path | None, typer.Option("--bag", exists=True, help="Bag of a drive: check on its frames and poses.")
+        Path | None, typer.Option(exists=True, help="Bag of a drive: check on its frames and poses.")
     ] = None,
     room: Annotated[
         Path,
         typer.Option(
-            "--room",
             exists=True,
             help="Room calibration with the path that the expert follows in the bag.",
             show_default="the simulated lab's",
         ),
     ] = _TWIN_ROOM,
     goal: Annotated[
-        list[float] | None,
-        typer.Option("--goal", help="One number of the goal vector. Repeat for each number."),
+        list[float] | None, typer.Option(help="One number of the goal vector. Repeat for each number.")
     ] = None,
 ) -> None:
     """Check a policy's adapter and whether the policy drives. Without a source option, the simulated lab is used.
@@ -123,11 +114,9 @@ def _reference(
 @app.command("export")
 def policy_export(
     policy: PolicyName,
-    onnx: Annotated[
-        Path | None, typer.Option("--onnx", help="Write an ONNX file, which runs without torch.")
-    ] = None,
+    onnx: Annotated[Path | None, typer.Option(help="Write an ONNX file, which runs without torch.")] = None,
     pt2: Annotated[
-        Path | None, typer.Option("--pt2", help="Write a torch.export program, which keeps the gradient.")
+        Path | None, typer.Option(help="Write a torch.export program, which keeps the gradient.")
     ] = None,
 ) -> None:
     """Export a policy and its declaration to a file that does not need the policy's source code."""

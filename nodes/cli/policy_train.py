@@ -105,16 +105,13 @@ class LogOptions:
 def train(
     out: Annotated[
         Path,
-        typer.Option(
-            "--out", help="Folder of the policy. Run the same command again to resume a stopped training."
-        ),
+        typer.Option(help="Folder of the policy. Run the same command again to resume a stopped training."),
     ],
     expert_options: ExpertOptions,
     log_options: LogOptions,
     bags: Annotated[
         list[Path] | None,
         typer.Option(
-            "--bags",
             exists=True,
             help="Bag of a drive; may be repeated. The expert labels it, no matter which driver recorded it.",
         ),
@@ -125,37 +122,29 @@ def train(
     ] = None,
     labels: Annotated[
         Labels,
-        typer.Option(
-            "--labels",
-            help="Source of the labels: the expert at the measured pose, or the recorded commands.",
-        ),
+        typer.Option(help="Source of the labels: the expert at the measured pose, or the recorded commands."),
     ] = "expert",
     image_topic: ImageTopic = None,
     camera: Camera = None,
     surrogate: Annotated[
         Path | None,
         typer.Option(
-            "--surrogate",
             exists=True,
             help="Run folder of an experiment. Views of its learned room are added to the training data.",
         ),
     ] = None,
     experiment: Annotated[
-        Path,
-        typer.Option(
-            "--experiment", help="Experiment file of that run, or its name.", parser=experiment_argument
-        ),
+        Path, typer.Option(help="Experiment file of that run, or its name.", parser=experiment_argument)
     ] = Path("room"),
-    setting: Annotated[str, typer.Option("--setting", help="Setting of that run.")] = "demo",
-    steps: Annotated[int, typer.Option("--steps", min=1, help="Optimiser steps.")] = 800,
-    seed: Annotated[int, typer.Option("--seed")] = 0,
+    setting: Annotated[str, typer.Option(help="Setting of that run.")] = "demo",
+    steps: Annotated[int, typer.Option(min=1, help="Optimiser steps.")] = 800,
+    seed: Annotated[int, typer.Option()] = 0,
     architecture: Annotated[
-        str, typer.Option("--architecture", help="pilotnet, resnet, vit_tiny, or file.py:Class of your own.")
+        str, typer.Option(help="pilotnet, resnet, vit_tiny, or file.py:Class of your own.")
     ] = "pilotnet",
     configuration: Annotated[
         list[str] | None,
         typer.Option(
-            "--configuration",
             metavar="KEY=VALUE",
             help="Setting of the architecture, for example 'widths=[16, 32]'; may be repeated.",
         ),
@@ -208,14 +197,11 @@ def evaluate(
     ],
     expert_options: ExpertOptions,
     log_options: LogOptions,
-    out: Annotated[
-        Path | None, typer.Option("--out", help="Folder for the plot and the saliency maps.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the plot and the saliency maps.")] = None,
     labels: Annotated[
         Labels,
         typer.Option(
-            "--labels",
-            help="Source of the reference steering: the expert at the measured pose, or the recorded commands.",
+            help="Source of the reference steering: the expert at the measured pose, or the recorded commands."
         ),
     ] = "recorded",
     image_topic: ImageTopic = None,
@@ -224,8 +210,7 @@ def evaluate(
     ] = 8,
     video: Annotated[bool, typer.Option("--video", help="Also write all saliency maps as a video.")] = False,
     goal: Annotated[
-        list[float] | None,
-        typer.Option("--goal", help="One number of the goal vector. Repeat for each number."),
+        list[float] | None, typer.Option(help="One number of the goal vector. Repeat for each number.")
     ] = None,
 ) -> None:
     """Compare the steering of a policy with a recording: table, plot and saliency maps."""

@@ -29,40 +29,27 @@ def add_to(app: typer.Typer) -> None:
 def replay(
     bag: Annotated[Path, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file.", exists=True)],
     nodes: Annotated[
-        str,
-        typer.Option(
-            "--nodes", metavar="NAME,...", help="Nodes of the recorded launch to run, comma-separated."
-        ),
+        str, typer.Option(metavar="NAME,...", help="Nodes of the recorded launch to run, comma-separated.")
     ] = "",
     replace: Annotated[
         list[str] | None,
-        typer.Option(
-            "--replace", metavar="NODE=MODULE[:CLASS]", help="Run a node with other code. May be repeated."
-        ),
+        typer.Option(metavar="NODE=MODULE[:CLASS]", help="Run a node with other code. May be repeated."),
     ] = None,
     launch: Annotated[
-        Path | None,
-        typer.Option("--launch", help="Launch file to use instead of the one in the bag.", exists=True),
+        Path | None, typer.Option(help="Launch file to use instead of the one in the bag.", exists=True)
     ] = None,
     overrides: Overrides = None,
     attack: Annotated[
-        Path | None,
-        typer.Option("--attack", help="Attack file to apply to the recording.", exists=True, dir_okay=False),
+        Path | None, typer.Option(help="Attack file to apply to the recording.", exists=True, dir_okay=False)
     ] = None,
-    policy: Annotated[str, typer.Option("--policy", help="Policy to use instead of the recorded one.")] = "",
-    golden: Annotated[
-        Path | None, typer.Option("--golden", help="Golden bag (.mcap) to compare with.")
-    ] = None,
+    policy: Annotated[str, typer.Option(help="Policy to use instead of the recorded one.")] = "",
+    golden: Annotated[Path | None, typer.Option(help="Golden bag (.mcap) to compare with.")] = None,
     update_golden: Annotated[
         bool, typer.Option("--update-golden", help="Write the golden bag instead of comparing with it.")
     ] = False,
     tolerance: Annotated[
         list[str] | None,
-        typer.Option(
-            "--tolerance",
-            metavar="[TOPIC:FIELD=]VALUE",
-            help="Allow differences up to VALUE. May be repeated.",
-        ),
+        typer.Option(metavar="[TOPIC:FIELD=]VALUE", help="Allow differences up to VALUE. May be repeated."),
     ] = None,
     topics: Topics = None,
     output: Annotated[
@@ -71,9 +58,7 @@ def replay(
     json_file: Annotated[
         Path | None, typer.Option("--json", help="With --attack: write the result as JSON.")
     ] = None,
-    plot: Annotated[
-        Path | None, typer.Option("--plot", help="With --attack: plot the steering (.png).")
-    ] = None,
+    plot: Annotated[Path | None, typer.Option(help="With --attack: plot the steering (.png).")] = None,
 ) -> None:
     """Replay a bag through nodes in lockstep. The same bag gives the same bytes. With --attack, compare the steering."""
     from nodes.runtime.errors import BagError

@@ -34,9 +34,7 @@ def room_path(
     closed: Annotated[
         bool | None, typer.Option("--closed/--open", help="A loop or not.", show_default="looks")
     ] = None,
-    corner: Annotated[
-        int, typer.Option("--corner", help="Corner of the attack: number of the arc, from 1.")
-    ] = 1,
+    corner: Annotated[int, typer.Option(help="Corner of the attack: number of the arc, from 1.")] = 1,
     before_m: Annotated[
         float, typer.Option("--before", help="Distance of the start pose before that corner [m].")
     ] = 2.0,
@@ -117,22 +115,22 @@ def room_fence(
 @app.command("target")
 def room_target(
     output: Annotated[Path, typer.Option("--output", "-o", help="YAML file to write.")],
-    subject: Annotated[str, typer.Option("--subject", help="Motion-capture subject: board or monitor.")],
+    subject: Annotated[str, typer.Option(help="Motion-capture subject: board or monitor.")],
     bag: Annotated[
         Path | None, typer.Argument(help="Bag in which a wand touches the corners.", exists=True)
     ] = None,
     size: Annotated[
-        str | None, typer.Option("--size", metavar="WxH", help="Width x height instead of a bag [m].")
+        str | None, typer.Option(metavar="WxH", help="Width x height instead of a bag [m].")
     ] = None,
     centre: Annotated[
-        str, typer.Option("--centre", metavar="X,Y,Z", help="Centre of the face in the subject's frame [m].")
+        str, typer.Option(metavar="X,Y,Z", help="Centre of the face in the subject's frame [m].")
     ] = "0,0,0",
     yaw_deg: Annotated[
         float, typer.Option("--yaw", help="Direction of the face, about the subject's z axis [deg].")
     ] = 0.0,
-    wand: Annotated[str, typer.Option("--wand", help="Topic of the wand.")] = "/vicon/wand",
+    wand: Annotated[str, typer.Option(help="Topic of the wand.")] = "/vicon/wand",
     tip: Annotated[
-        str, typer.Option("--tip", metavar="X,Y,Z", help="Tip of the wand in the wand's frame [m].")
+        str, typer.Option(metavar="X,Y,Z", help="Tip of the wand in the wand's frame [m].")
     ] = "0,0,0",
 ) -> None:
     """Measure the pose of a face in its subject's frame, with a ruler or by touching its corners with a wand.
@@ -180,13 +178,11 @@ def room_place(
     request: Annotated[
         Path | None,
         typer.Option(
-            "--request",
-            help="The attack's *.attack.yaml. A copy for the measured pose is written.",
-            exists=True,
+            help="The attack's *.attack.yaml. A copy for the measured pose is written.", exists=True
         ),
     ] = None,
-    tolerance_cm: Annotated[float, typer.Option("--tolerance-cm", min=0.1)] = 2.0,
-    tolerance_deg: Annotated[float, typer.Option("--tolerance-deg", min=0.1)] = 2.0,
+    tolerance_cm: Annotated[float, typer.Option(min=0.1)] = 2.0,
+    tolerance_deg: Annotated[float, typer.Option(min=0.1)] = 2.0,
     once: Annotated[
         bool, typer.Option("--once", help="Measure once. Exit code 1 if the target is out of place.")
     ] = False,

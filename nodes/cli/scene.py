@@ -79,9 +79,7 @@ def scene_render(
     scene: SceneFile,
     transforms: DataSet,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the rendered images.")],
-    video: Annotated[
-        Path | None, typer.Option("--video", help="Also write a video (MP4) through all views.")
-    ] = None,
+    video: Annotated[Path | None, typer.Option(help="Also write a video (MP4) through all views.")] = None,
     size: Size = None,
     held_out: Annotated[
         bool, typer.Option("--held-out", help="Render only the cameras of held-out images.")
@@ -113,14 +111,11 @@ def scene_view(
         list[Path] | None, typer.Option("--object", exists=True, help="Object file to place at the origin.")
     ] = None,
     room: Annotated[
-        Path | None, typer.Option("--room", help="Room calibration whose path is drawn.", exists=True)
+        Path | None, typer.Option(help="Room calibration whose path is drawn.", exists=True)
     ] = None,
-    port: Annotated[int, typer.Option("--port", min=1, max=65535)] = 8080,
+    port: Annotated[int, typer.Option(min=1, max=65535)] = 8080,
     host: Annotated[
-        str,
-        typer.Option(
-            "--host", help="Address to serve on. 0.0.0.0 lets other computers on the network connect."
-        ),
+        str, typer.Option(help="Address to serve on. 0.0.0.0 lets other computers on the network connect.")
     ] = "127.0.0.1",
 ) -> None:
     """Fly through a scene in the browser."""

@@ -22,26 +22,22 @@ def add_to(app: typer.Typer) -> None:
 
 def gate(
     file: File,
-    setting: Annotated[str, typer.Option("--setting", help="Setting of the experiment file.")] = "full",
-    run_folder: Annotated[Path | None, typer.Option("--run-folder", show_default="runs/<setting>")] = None,
-    scenario: Annotated[
-        str, typer.Option("--scenario", help="Which path; the views that are compared are of all.")
-    ] = "",
-    victim: Annotated[str, typer.Option("--victim", help="Victim: hardened or naive.")] = "hardened",
+    setting: Annotated[str, typer.Option(help="Setting of the experiment file.")] = "full",
+    run_folder: Annotated[Path | None, typer.Option(show_default="runs/<setting>")] = None,
+    scenario: Annotated[str, typer.Option(help="Which path; the views that are compared are of all.")] = "",
+    victim: Annotated[str, typer.Option(help="Victim: hardened or naive.")] = "hardened",
     bag: Annotated[
-        Path | None,
-        typer.Option("--bag", help="Bag of a drive without an attack, to compare as well.", exists=True),
+        Path | None, typer.Option(help="Bag of a drive without an attack, to compare as well.", exists=True)
     ] = None,
     psnr_db: Annotated[
         float | None,
         typer.Option("--psnr", help="Lowest accepted mean PSNR at the policy's image size [dB]."),
     ] = None,
     ssim: Annotated[
-        float | None, typer.Option("--ssim", help="Lowest accepted mean SSIM at the policy's image size.")
+        float | None, typer.Option(help="Lowest accepted mean SSIM at the policy's image size.")
     ] = None,
     steering: Annotated[
-        float | None,
-        typer.Option("--steering", help="Largest accepted mean steering difference [rad or rad/s]."),
+        float | None, typer.Option(help="Largest accepted mean steering difference [rad or rad/s].")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
     overrides: Overrides = None,

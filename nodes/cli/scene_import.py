@@ -128,7 +128,7 @@ def from_bag(
 def from_phone_and_car(
     media: Media,
     output: Output,
-    bag: Annotated[Path, typer.Option("--bag", help="Bag of a drive through the same room.", exists=True)],
+    bag: Annotated[Path, typer.Option(help="Bag of a drive through the same room.", exists=True)],
     calibration: Calibration = None,
     movement: Movement = 0.06,
     step_m: StepM = 0.15,
@@ -188,9 +188,7 @@ def match_colours(
             "--output", "-o", help="Scene file to write, with the colour map.", show_default="the scene file"
         ),
     ] = None,
-    most: Annotated[
-        int, typer.Option("--most", min=1, help="Use at most this many frames, evenly spread.")
-    ] = 16,
+    most: Annotated[int, typer.Option(min=1, help="Use at most this many frames, evenly spread.")] = 16,
 ) -> None:
     """Fit the map from the colours of a scene to those of the driving camera, and store it in the scene file."""
     from nodes.lab.importing.colours import match_colours as run

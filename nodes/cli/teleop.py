@@ -10,14 +10,9 @@ import typer
 
 def teleop(
     device: Annotated[
-        str,
-        typer.Option(
-            "--device", help="keyboard, or the path of a gamepad: /dev/input/by-id/...-event-joystick."
-        ),
+        str, typer.Option(help="keyboard, or the path of a gamepad: /dev/input/by-id/...-event-joystick.")
     ] = "keyboard",
-    run_dir: Annotated[
-        Path | None, typer.Option("--run-dir", show_default="the launch that is running")
-    ] = None,
+    run_dir: Annotated[Path | None, typer.Option(show_default="the launch that is running")] = None,
     speed_mps: Annotated[
         float, typer.Option("--speed", min=0.05, max=2.0, help="Speed at full throttle [m/s].")
     ] = 0.8,

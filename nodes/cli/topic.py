@@ -52,9 +52,7 @@ def topic_hz(
 @app.command("echo")
 def topic_echo(
     topic: str,
-    count: Annotated[
-        int | None, typer.Option("--count", min=1, help="Stop after this many messages.")
-    ] = None,
+    count: Annotated[int | None, typer.Option(min=1, help="Stop after this many messages.")] = None,
     duration_s: Annotated[
         float | None, typer.Option("--duration", min=0.1, help="Stop after this many seconds.")
     ] = None,

@@ -25,27 +25,22 @@ def trial(
     file: LaunchFile,
     attack: Annotated[
         list[str] | None,
-        typer.Option(
-            "--attack", metavar="CONDITION=FILE", help="Attack file of a condition. May be repeated."
-        ),
+        typer.Option(metavar="CONDITION=FILE", help="Attack file of a condition. May be repeated."),
     ] = None,
     folder: Annotated[
-        Path,
-        typer.Option("--folder", help="Folder of plan, results and bags. The same folder resumes the trial."),
+        Path, typer.Option(help="Folder of plan, results and bags. The same folder resumes the trial.")
     ] = Path("runs/trials"),
-    repeats: Annotated[int, typer.Option("--repeats", min=1, help="Number of runs per condition.")] = 5,
-    seed: Annotated[int, typer.Option("--seed", help="Random seed of the order of runs.")] = 0,
-    ticks: Annotated[int, typer.Option("--ticks", min=1, help="Control ticks per drive, at 10 Hz.")] = 60,
+    repeats: Annotated[int, typer.Option(min=1, help="Number of runs per condition.")] = 5,
+    seed: Annotated[int, typer.Option(help="Random seed of the order of runs.")] = 0,
+    ticks: Annotated[int, typer.Option(min=1, help="Control ticks per drive, at 10 Hz.")] = 60,
     start: Annotated[
-        str | None,
-        typer.Option("--start", metavar="X,Y,YAW", help="Start pose [m, rad].", show_default="the room's"),
+        str | None, typer.Option(metavar="X,Y,YAW", help="Start pose [m, rad].", show_default="the room's")
     ] = None,
     ready_timeout_s: Annotated[float, typer.Option("--ready-timeout", min=1.0)] = 60.0,
     host: Annotated[
         str | None,
         typer.Option(
-            "--host",
-            help="Host of the launch file that this computer is, or all. The other host must be running.",
+            help="Host of the launch file that this computer is, or all. The other host must be running."
         ),
     ] = None,
     show: Annotated[
@@ -92,11 +87,9 @@ def evaluate(
         list[Path], typer.Argument(help="Bag folders, or .mcap, .db3 or .bag files.", exists=True)
     ],
     room: Annotated[
-        Path | None, typer.Option("--room", help="Room file.", show_default="the one in the bag", exists=True)
+        Path | None, typer.Option(help="Room file.", show_default="the one in the bag", exists=True)
     ] = None,
-    ticks: Annotated[
-        int, typer.Option("--ticks", min=1, help="Number of control ticks to evaluate, at 10 Hz.")
-    ] = 60,
+    ticks: Annotated[int, typer.Option(min=1, help="Number of control ticks to evaluate, at 10 Hz.")] = 60,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print everything as JSON, one line per drive.")
     ] = False,

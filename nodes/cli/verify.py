@@ -58,7 +58,7 @@ def verify(
         int,
         typer.Option("--redrive", min=0, help="Also drive so many cells again, in the surrogate."),
     ] = 0,
-    seed: Annotated[int, typer.Option("--seed", help="Which cells are drawn for that.")] = 0,
+    seed: Annotated[int, typer.Option(help="Which cells are drawn for that.")] = 0,
 ) -> None:
     """Compute every published number again from the kept drives, and check digests, registration, completeness and the history in git."""
     from advnerf_core.report.evidence.kept_build import LOST, is_kept

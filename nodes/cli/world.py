@@ -26,11 +26,10 @@ def world_check(
     world: Name,
     overrides: Overrides = None,
     pictures: Annotated[
-        Path | None, typer.Option("--pictures", help="Folder for what the cameras see: look at it.")
+        Path | None, typer.Option(help="Folder for what the cameras see: look at it.")
     ] = None,
     only: Annotated[
-        list[str] | None,
-        typer.Option("--only", metavar="PART", help="A part to look at alone; again for another."),
+        list[str] | None, typer.Option(metavar="PART", help="A part to look at alone; again for another.")
     ] = None,
 ) -> None:
     """Hold a world against the contract: handedness, metric depth, colour order, lateness, determinism, its car and its paths.
@@ -81,9 +80,7 @@ def world_install(
     python: Annotated[
         Path | None,
         typer.Option(
-            "--python",
-            help="Interpreter to make it with.",
-            show_default="one of a fitting version on the path",
+            help="Interpreter to make it with.", show_default="one of a fitting version on the path"
         ),
     ] = None,
 ) -> None:

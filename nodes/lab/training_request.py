@@ -26,12 +26,10 @@ class TrainingRequest:
         Path, typer.Option("--output", "-o", help="Folder of the results. A stopped training resumes there.")
     ]
     steps: Annotated[
-        int | None,
-        typer.Option("--steps", min=1, show_default="1000 without --minutes; presets with a time: none"),
+        int | None, typer.Option(min=1, show_default="1000 without --minutes; presets with a time: none")
     ] = None
     minutes: Annotated[
-        float | None,
-        typer.Option("--minutes", min=0.01, help="Train for this many minutes instead of --steps."),
+        float | None, typer.Option(min=0.01, help="Train for this many minutes instead of --steps.")
     ] = None
     box_low: Corner = None
     box_high: Corner = None
@@ -40,17 +38,16 @@ class TrainingRequest:
         typer.Option(help="Resize the images to this width and height.", show_default="their size"),
     ] = None
     open_scene: Annotated[bool, typer.Option("--open", help="Outdoor scene: rays may leave the box.")] = False
-    every: Annotated[int, typer.Option("--every", min=2, help="Hold out every N-th image.")] = 8
+    every: Annotated[int, typer.Option(min=2, help="Hold out every N-th image.")] = 8
     near: Annotated[
         float | None,
         typer.Option(
-            "--near",
             min=0.0,
             help="Learn nothing closer to a camera than this, in the unit of the file.",
             show_default="1/80 of the box's longest side",
         ),
     ] = None
-    seed: Annotated[int, typer.Option("--seed")] = 0
+    seed: Annotated[int, typer.Option()] = 0
     checkpoint_every_s: Annotated[
         float,
         typer.Option(
@@ -70,17 +67,15 @@ class TrainingRequest:
     preset: Annotated[
         str,
         typer.Option(
-            "--preset",
             help="room: for rooms and for training on a CPU (8 levels of 4 features, 2^17 entries, view-independent colours unless "
             "--open or --unbounded). instant-ngp: default sizes of instant-ngp (16 levels of 2 features, 2^19 entries, finest "
             "2048 x aabb_scale, directions to degree 4), for detail and comparisons; slower. minutes, best: for photographs of "
-            "any place, sizes and training for 3 and 10 minutes on two cores (view-dependent colours); --minutes changes the time.",
+            "any place, sizes and training for 3 and 10 minutes on two cores (view-dependent colours); --minutes changes the time."
         ),
     ] = "room"
     interval_px: Annotated[
         float | None,
         typer.Option(
-            "--interval-px",
             help="Length of a sample interval in image pixels. Smaller values are finer and slower.",
             show_default="4; 1.5 if all cameras stand outside the box",
         ),
@@ -88,18 +83,13 @@ class TrainingRequest:
     interval: Annotated[
         tuple[float, float] | None,
         typer.Option(
-            "--interval",
             help="Shortest and longest sample interval, in the unit of the file.",
             show_default="1/1024 and 1/64 of the box",
         ),
     ] = None
     interval_growth: Annotated[
         float | None,
-        typer.Option(
-            "--interval-growth",
-            help="Sample interval per distance.",
-            show_default="--interval-px / focal length",
-        ),
+        typer.Option(help="Sample interval per distance.", show_default="--interval-px / focal length"),
     ] = None
     exposure: Annotated[
         bool,
