@@ -1,4 +1,4 @@
-"""What the page of live drives is made of: plain records with units, filled by the experiment and read by the plots and the page.
+"""What the page of an experiment is made of: plain records with units, filled by the experiment and read by the plots and the page.
 
 Everything optional may be missing; the page then says so. Images are ``[height, width, 3]`` uint8 RGB.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,37 +21,6 @@ _TICKS_COMPARED = (50, 400)  # horizons whose memory is compared
 
 
 @dataclass(frozen=True, eq=False)
-class Settings:
-    """The experiment's numbers.
-
-    Attributes:
-        name: "small" (``make demo``) or "full" (``make experiment``).
-        horizon_steps: T, control ticks per run.
-        control_period_s: Time between control ticks [s].
-        iterations: Gradient steps of the attack.
-        random_evaluations: Textures tried by the random search.
-        start_poses: Start of each run, ``[S, 3]``: x [m], y [m], yaw [rad]; `Run.start` indexes it.
-        seeds: Seeds of the attack.
-        speed_mps: Driving speed [m/s].
-        learning_rate: Of Adam, on the colour grid.
-        off_track_m: Off-track means ``|CTE|`` above this [m].
-        extra: Anything else worth printing, name to value.
-    """
-
-    name: Literal["small", "full"]
-    horizon_steps: int
-    control_period_s: float
-    iterations: int
-    random_evaluations: int
-    start_poses: Floats
-    seeds: tuple[int, ...]
-    speed_mps: float
-    learning_rate: float = 0.1
-    off_track_m: float = 0.4
-    extra: Mapping[str, str | float | int | bool] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, eq=False)
 class Run:
     """One drive over the horizon.
 
@@ -62,7 +30,7 @@ class Run:
             see `conditions`.
         victim: Name of the policy: "hardened" has seen random textures in training, "naive" has not, others are a user's.
         seed: Seed of the attack; 0 where nothing is random.
-        start: Index into `Settings.start_poses`.
+        start: Number of its start.
         states: Pose of the rear axle at the control ticks, ``[T + 1, 3]``: x [m], y [m], yaw [rad], world.
         cte_m: Signed cross-track error at the control ticks, left positive, ``[T + 1]`` [m].
         total_cte_m: Sum of ``|CTE|`` over the horizon [m].
@@ -82,27 +50,25 @@ class Run:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The room from above, all in world metres.
+    """What a map shows besides drives, all in world metres.
 
     Attributes:
         path_xy_m: Reference path, ``[N, 2]``.
         off_track_m: Half width of the band around it that counts as on track [m].
-        room_m: Walls: x min, y min, x max, y max [m].
-        fence_m: Corners of the geofence, ``[M, 2]``; None without one.
-        board_m: Ends of the attacked face seen from above, ``[2, 2]``; its front is on the right of first to second.
-        monitor_m: The same of the monitor.
-        tape_width_m: Width of the tape [m].
         closed: Whether the path is a loop.
+        edges_m: Lines ``[N, 2]`` where the road or the room ends.
+        objects_m: Corners ``[N, 2]`` of each object from above.
+        faces_m: Ends ``[2, 2]`` of faces from above, by name; the front is on the right of first to second.
+        fence_m: Corners of the geofence, ``[M, 2]``; None without one.
     """
 
     path_xy_m: Floats
     off_track_m: float
-    room_m: tuple[float, float, float, float]
-    fence_m: Floats | None = None
-    board_m: Floats | None = None
-    monitor_m: Floats | None = None
-    tape_width_m: float = 0.05
     closed: bool = True
+    edges_m: tuple[Floats, ...] = ()
+    objects_m: tuple[Floats, ...] = ()
+    faces_m: Mapping[str, Floats] = field(default_factory=dict)
+    fence_m: Floats | None = None
 
 
 def face_segment(T_world_from_face: ArrayLike, width_m: float) -> NDArray[np.float64]:
@@ -134,20 +100,37 @@ class Texture:
 
 
 @dataclass(frozen=True, eq=False)
-class Clip:
-    """A video for the page, such as surrogate, deployed clean and deployed attacked side by side."""
+class Drives:
+    """All drives of one scenario.
 
-    title: str
-    path: Path
-    caption: str = ""
+    Attributes:
+        scenario: Its name.
+        scene: What its maps show.
+        dt_s: Time between control ticks [s].
+        runs: The drives.
+        curves: Of the searches.
+        film: What the driving camera saw; None without one.
+        seen: What the camera saw of the objects, by method.
+    """
 
+    scenario: str
+    scene: Scene
+    dt_s: float
+    runs: tuple[Run, ...]
+    curves: tuple[LossCurve, ...] = ()
+    film: Path | None = None
+    seen: Mapping[str, Image] = field(default_factory=dict)
 
-@dataclass(frozen=True, eq=False)
-class StageTiming:
-    """Wall time of one stage [s]."""
+    @property
+    def victims(self) -> tuple[str, ...]:
+        """Names of the policies that were driven, in the order of their first runs."""
+        return tuple(dict.fromkeys(run.victim for run in self.runs))
 
-    name: str
-    wall_s: float
+    def select(self, **equal: object) -> tuple[Run, ...]:
+        """Runs whose fields equal the given values, such as ``domain="deployed"``."""
+        return tuple(
+            run for run in self.runs if all(getattr(run, key) == value for key, value in equal.items())
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,9 +173,10 @@ class FidelityView:
 
 @dataclass(frozen=True, eq=False)
 class Fidelity:
-    """All held-out views; the aggregates are means over them, None where nothing was measured."""
+    """All held-out views; the aggregates are means over them, None where nothing was measured. ``unit`` is that of the policy's control."""
 
     views: tuple[FidelityView, ...]
+    unit: str = "rad"
 
     def mean(self, name: str) -> float | None:
         """Mean of one numeric field of `FidelityView` over the views that have it."""
@@ -277,6 +261,8 @@ class Manifest:
         hashes: Of scene, policy, config, attack files, code, ...
         versions: Of the software.
         machine: Processor, cores, memory, system.
+        settings: What was run, name to text.
+        timings: Wall time of each stage [s].
     """
 
     command: str
@@ -284,27 +270,35 @@ class Manifest:
     hashes: Mapping[str, str] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
     machine: Mapping[str, str] = field(default_factory=dict)
+    settings: Mapping[str, str] = field(default_factory=dict)
+    timings: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
 class ReportData:
-    """Everything the report needs.
+    """Everything that the sections of an experiment's page need.
 
-    `not_measured` gives the reason why a part is missing; its keys are the field names of the parts
-    ("fidelity", "latency", "memory", "laps", "clips", ...).
+    Attributes:
+        drives: By scenario.
+        manifest: How to make the page again.
+        overview: The world from above; None where it has no picture of itself.
+        textures: What faces show.
+        fidelity: How true the learned scene is.
+        live: Whether the drives were live; then what follows is shown, or named as missing.
+        latency: Live timing.
+        memory: Of the adjoint.
+        laps: The live drive without attack.
+        not_measured: Why a part is missing, by the name of its field.
     """
 
-    settings: Settings
-    scene: Scene
-    runs: tuple[Run, ...]
+    drives: tuple[Drives, ...]
     manifest: Manifest
-    curves: tuple[LossCurve, ...] = ()
+    overview: Image | None = None
     textures: tuple[Texture, ...] = ()
-    clips: tuple[Clip, ...] = ()
     fidelity: Fidelity | None = None
+    live: bool = False
     latency: Latency | None = None
     memory: tuple[MemoryRow, ...] = ()
-    timings: tuple[StageTiming, ...] = ()
     laps: Laps | None = None
     not_measured: Mapping[str, str] = field(default_factory=dict)
 
@@ -326,14 +320,3 @@ class ReportData:
         rows = {row.horizon_steps: row.adjoint_mib for row in self.memory}
         short, long = (rows.get(ticks) for ticks in _TICKS_COMPARED)
         return {**found, "memory_ratio": long / short} if short and long else found
-
-    @property
-    def victims(self) -> tuple[str, ...]:
-        """Names of the policies that were driven, in the order of their first runs."""
-        return tuple(dict.fromkeys(run.victim for run in self.runs))
-
-    def select(self, **equal: object) -> tuple[Run, ...]:
-        """Runs whose fields equal the given values, such as ``domain="deployed"``."""
-        return tuple(
-            run for run in self.runs if all(getattr(run, key) == value for key, value in equal.items())
-        )

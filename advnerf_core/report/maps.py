@@ -1,4 +1,4 @@
-"""The room from above: track, furniture of the experiment, and where the car went."""
+"""A place from above: path, edges and objects, and where the car went."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.patches import PathPatch, Polygon, Rectangle
+from matplotlib.patches import PathPatch, Polygon
 from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 
-from advnerf_core.report.data import Laps, ReportData, Run, Scene
+from advnerf_core.report.data import Drives, Laps, Run, Scene
 from advnerf_core.report.palette import LIGHT
 from advnerf_core.report.plots import add_run_legend, end_style, new_axes, run_style
 
@@ -20,12 +20,12 @@ Floats = NDArray[np.float64]
 _MARGIN_M = 0.15  # white around what a map shows
 
 
-def trajectory_map(data: ReportData, zoom: bool = False, victim: str = "hardened") -> Figure:
-    """All drives of one victim from above: the whole room, or only where the car went."""
-    runs = data.select(victim=victim)
-    box = _driven_box(data.scene, runs) if zoom else np.reshape(data.scene.room_m, (2, 2))
+def trajectory_map(drives: Drives, victim: str, zoom: bool = True) -> Figure:
+    """All drives of one victim from above: only where the car went, or everything that the scene has."""
+    runs = drives.select(victim=victim)
+    box = _driven_box(drives.scene, runs) if zoom else _whole_box(drives.scene)
     with new_axes(6.0, _height_in(box, legend=zoom)) as ax:
-        _draw_scene(ax, data.scene)
+        _draw_scene(ax, drives.scene)
         for run in runs:
             ax.plot(run.states[:, 0], run.states[:, 1], **run_style(run))
             ax.plot(*run.states[-1, :2], **end_style(run))
@@ -38,7 +38,7 @@ def trajectory_map(data: ReportData, zoom: bool = False, victim: str = "hardened
 
 def laps_map(laps: Laps, scene: Scene) -> Figure:
     """The drive without attack from above."""
-    box = np.reshape(scene.room_m, (2, 2))
+    box = _whole_box(scene)
     with new_axes(6.0, _height_in(box)) as ax:
         _draw_scene(ax, scene)
         ax.plot(laps.states[:, 0], laps.states[:, 1], color=LIGHT["laps"], lw=1.2)
@@ -65,24 +65,23 @@ def band_outline(scene: Scene) -> Outline:
 
 
 def _draw_scene(ax: Any, scene: Scene) -> None:
-    x_min, y_min, x_max, y_max = scene.room_m
     ax.grid(False)
     ax.add_patch(PathPatch(band_outline(scene), fc=LIGHT["band"], ec="none", zorder=0.5))
-    ax.add_patch(
-        Rectangle((x_min, y_min), x_max - x_min, y_max - y_min, fill=False, ec=LIGHT["ink"], lw=1.6, zorder=1)
-    )
+    for edge in scene.edges_m:
+        ax.plot(*edge.T, color=LIGHT["ink"], lw=1.2, zorder=1)
+    for corners in scene.objects_m:
+        ax.add_patch(Polygon(corners, closed=True, fc=LIGHT["grid"], ec=LIGHT["ink"], lw=1.0, zorder=1.5))
     path = np.concatenate([scene.path_xy_m, scene.path_xy_m[:1]]) if scene.closed else scene.path_xy_m
     ax.plot(
         path[:, 0], path[:, 1], color=LIGHT["tape"], lw=2.6, alpha=0.55, zorder=1.1, solid_joinstyle="round"
     )
-    _note(ax, path[len(path) * 5 // 8], "tape, on-track band", (0, 12))
+    _note(ax, path[len(path) * 5 // 8], "path, on-track band", (0, 12))
     if scene.fence_m is not None:
         ax.add_patch(Polygon(scene.fence_m, fill=False, ec=LIGHT["muted"], lw=1.0, ls=(0, (1, 2)), zorder=1))
         corner = scene.fence_m[np.argmin(scene.fence_m @ [1.0, -1.0])]
         _note(ax, corner, "fence", (4, -9), ha="left")
-    for segment, name in ((scene.board_m, "board"), (scene.monitor_m, "monitor")):
-        if segment is not None:
-            _draw_face(ax, segment, name)
+    for name, segment in scene.faces_m.items():
+        _draw_face(ax, segment, name)
     ax.set(xlabel="x [m]", ylabel="y [m]")
     ax.set_aspect("equal")
 
@@ -142,10 +141,15 @@ def _note(ax: Any, at: Floats, text: str, offset_pt: tuple[float, float], ha: st
 
 
 def _driven_box(scene: Scene, runs: Sequence[Run]) -> Floats:
-    """Corners ``[2, 2]`` of the part of the room that holds all drives and the board [m]."""
-    points = [r.states[:, :2] for r in runs] + ([scene.board_m] if scene.board_m is not None else [])
-    xy = np.concatenate(points) if points else np.reshape(scene.room_m, (2, 2))
-    return np.stack([xy.min(axis=0) - 0.45, xy.max(axis=0) + 0.35])
+    """Corners ``[2, 2]`` of the part that holds all drives and the attacked face, with a margin of half a lane [m]."""
+    xy = np.concatenate([*(run.states[:, :2] for run in runs), *list(scene.faces_m.values())[:1]])
+    return np.stack([xy.min(axis=0) - scene.off_track_m, xy.max(axis=0) + scene.off_track_m])
+
+
+def _whole_box(scene: Scene) -> Floats:
+    """Corners ``[2, 2]`` of everything that stays where it is [m]."""
+    xy = np.concatenate([scene.path_xy_m, *scene.edges_m])
+    return np.stack([xy.min(axis=0), xy.max(axis=0)])
 
 
 def _height_in(box: Floats, legend: bool = False) -> float:

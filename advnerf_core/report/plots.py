@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from advnerf_core.report.conditions import EMPTY, NONE, order_of, style_of
-from advnerf_core.report.data import Fidelity, Laps, Latency, MemoryRow, ReportData, Run
+from advnerf_core.report.data import Drives, Fidelity, Laps, Latency, MemoryRow, Run
 from advnerf_core.report.palette import LIGHT, LINE_STYLES, themed_svg
 from advnerf_core.report.reference import Domain
 
@@ -62,23 +62,23 @@ def new_axes(width_in: float = 6.0, height_in: float = 3.4) -> Iterator[Any]:
         yield Figure(figsize=(width_in, height_in), layout="constrained").add_subplot()
 
 
-def cte_over_time(data: ReportData, domain: Domain, victim: str = "hardened") -> Figure:
+def cte_over_time(drives: Drives, domain: Domain, victim: str) -> Figure:
     """Signed cross-track error of all drives in one domain; the axis is shared by both domains."""
-    period = data.settings.control_period_s
-    everything = [abs(r.cte_m).max() for r in data.select(victim=victim)]
-    limit = max([data.settings.off_track_m * 1.25, *everything]) * 1.08
+    off_track_m = drives.scene.off_track_m
+    everything = [abs(r.cte_m).max() for r in drives.select(victim=victim)]
+    limit = max([off_track_m * 1.25, *everything]) * 1.08
     with new_axes() as ax:
-        ax.axhspan(-data.settings.off_track_m, data.settings.off_track_m, color=LIGHT["band"], lw=0, zorder=0)
+        ax.axhspan(-off_track_m, off_track_m, color=LIGHT["band"], lw=0, zorder=0)
         ax.axhline(0.0, color=LIGHT["tape"], lw=1.2, zorder=1)
-        runs = data.select(domain=domain, victim=victim)
+        runs = drives.select(domain=domain, victim=victim)
         for run in runs:
-            ax.plot(np.arange(len(run.cte_m)) * period, run.cte_m, **run_style(run))
-            ax.plot((len(run.cte_m) - 1) * period, run.cte_m[-1], **end_style(run))
+            ax.plot(np.arange(len(run.cte_m)) * drives.dt_s, run.cte_m, **run_style(run))
+            ax.plot((len(run.cte_m) - 1) * drives.dt_s, run.cte_m[-1], **end_style(run))
         ax.set(xlabel="time [s]", ylabel="cross-track error, left + [m]", ylim=(-limit, limit), title=domain)
         ax.set_xlim(left=0.0)
         ax.annotate(
             "on track",
-            (1, data.settings.off_track_m),
+            (1, off_track_m),
             xycoords=("axes fraction", "data"),
             xytext=(-4, -4),
             textcoords="offset points",
@@ -91,10 +91,10 @@ def cte_over_time(data: ReportData, domain: Domain, victim: str = "hardened") ->
     return ax.figure
 
 
-def loss_curves(data: ReportData, victim: str = "hardened") -> Figure:
+def loss_curves(drives: Drives, victim: str) -> Figure:
     """Total CTE per evaluation of the searches; the no-attack level of the surrogate as reference."""
-    curves = [c for c in data.curves if c.victim == victim]
-    clean = [r.total_cte_m for r in data.select(domain="surrogate", condition=NONE, victim=victim)]
+    curves = [c for c in drives.curves if c.victim == victim]
+    clean = [r.total_cte_m for r in drives.select(domain="surrogate", condition=NONE, victim=victim)]
     handles = []
     with new_axes() as ax:
         for curve in curves:
@@ -128,24 +128,24 @@ def loss_curves(data: ReportData, victim: str = "hardened") -> Figure:
     return ax.figure
 
 
-def steering_agreement(fidelity: Fidelity, tolerance_rad: float = 0.03) -> Figure:
-    """The policy's steering on the surrogate's image against that on the real image."""
+def steering_agreement(fidelity: Fidelity, tolerance: float = 0.03) -> Figure:
+    """The policy's control on the surrogate's image against that on the real image."""
     pairs = fidelity.steering_rad
     low, high = float(pairs.min()), float(pairs.max())
-    margin = max(0.06 * (high - low), tolerance_rad)
+    margin = max(0.06 * (high - low), tolerance)
     line = np.array([low - margin, high + margin])
     with new_axes(4.2, 3.9) as ax:
-        ax.fill_between(line, line - tolerance_rad, line + tolerance_rad, color=LIGHT["band"], lw=0)
+        ax.fill_between(line, line - tolerance, line + tolerance, color=LIGHT["band"], lw=0)
         ax.plot(line, line, color=LIGHT["tape"], lw=1.0)
         ax.plot(pairs[:, 0], pairs[:, 1], "o", ms=4, mew=0, alpha=0.75, color=LIGHT["ink"])
         ax.set(
-            xlabel="steering on the real image [rad]",
-            ylabel="steering on the surrogate's image [rad]",
+            xlabel=f"control on the real image [{fidelity.unit}]",
+            ylabel=f"control on the surrogate's image [{fidelity.unit}]",
             xlim=line,
             ylim=line,
         )
         ax.set_aspect("equal")
-        text = f"mean |difference| {fidelity.steering_difference_rad:.4f} rad\nband: ± {tolerance_rad:g} rad, n = {len(pairs)}"
+        text = f"mean |difference| {fidelity.steering_difference_rad:.4f} {fidelity.unit}\nband: ± {tolerance:g} {fidelity.unit}, n = {len(pairs)}"
         ax.text(0.04, 0.96, text, transform=ax.transAxes, va="top", size=8.5)
     return ax.figure
 

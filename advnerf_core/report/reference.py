@@ -41,7 +41,6 @@ class Limit(StrictModel):
         at_most: Largest value.
         above: Another method, whose value must be exceeded.
         said: The limit in words; empty for the plain number.
-        setting: ``small`` or ``full`` if only that setting is held to it.
         paper: What the publication has there, in words.
         headline: Title among the key figures of the page; empty leaves it out there.
     """
@@ -56,7 +55,6 @@ class Limit(StrictModel):
     at_most: float | None = None
     above: str = ""
     said: str = ""
-    setting: Literal["", "small", "full"] = ""
     paper: str = ""
     headline: str = ""
 

@@ -80,7 +80,6 @@ def evaluate(
     limits: Iterable[Limit],
     table: ResultTable,
     measured: Mapping[str, float | None] | None = None,
-    setting: str = "",
 ) -> list[Target]:
     """The targets of some limits; those on rows that the table does not have are left out.
 
@@ -88,12 +87,9 @@ def evaluate(
         limits: What must be reached.
         table: The drives.
         measured: What was measured besides, by measure; None leaves these limits out.
-        setting: Which setting was run; limits of the other one are left out.
     """
     found = []
     for limit in limits:
-        if limit.setting not in ("", setting):
-            continue
         if not limit.of_drives:
             if measured is not None:
                 found.append(_target(limit, measured.get(limit.of), limit.at_least, complete=True))

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
-from markupsafe import Markup
 from numpy.typing import NDArray
 from rich.console import Console
 
@@ -15,13 +15,15 @@ from advnerf_core.attack.spaces.space import Shown, Space
 from advnerf_core.documents import read_json
 from advnerf_core.geometry import planar_poses
 from advnerf_core.report.cells import read_cell
-from advnerf_core.report.conditions import NONE
+from advnerf_core.report.conditions import NONE, style_of
+from advnerf_core.report.data import ReportData
 from advnerf_core.report.result_page import not_driven, text_table
 from advnerf_core.report.result_table import ResultTable, make_table
 from advnerf_core.report.targets import Target, evaluate, target_table
+from advnerf_core.report.text_table import count
 from hardware.worlds.world import World
 from nodes.experiment.engine.run_folder import CELLS
-from nodes.experiment.pages import live_report, page
+from nodes.experiment.pages.gather import gather
 from nodes.experiment.pages.table import wanted_rows, write_table
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.method_names import know_methods_of
@@ -29,7 +31,7 @@ from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.images import as_uint8
 from nodes.experiment.show.overview import from_above
 from nodes.experiment.show.spaces import dress, make_space, shown_there
-from nodes.experiment.steps import films
+from nodes.experiment.steps import films, memory
 from nodes.experiment.steps.attack import cells, load_found, load_shown
 from nodes.experiment.steps.keys import driven_folder
 from nodes.runtime.progress import Report
@@ -51,51 +53,58 @@ def run(experiment: Experiment, folder: Path, report: Report, notes: Sequence[st
         report: Progress callback.
         notes: Paragraphs at the top of the page, such as what is left out.
     """
-    know_methods_of(experiment.folder / CELLS, experiment.config.attack.method_names)
-    if experiment.config.deploy.live:
-        from advnerf_core.report.live_parts import live_sections, opening  # matplotlib
+    from advnerf_core.report.sections import page_sections, what_it_did  # matplotlib
 
-        data, table = live_report.measure(experiment, folder, report), table_of(experiment)
-        report(0.9, "writing the page")
-        _write(
-            experiment,
-            folder,
-            live_sections(data, table),
-            (*notes, *opening(data, table, experiment.config.main_victim)),
-            data.measured,
-        )
-        return
+    know_methods_of(experiment.folder / CELLS, experiment.config.attack.method_names)
+    data, table = _measure(experiment, folder, report), table_of(experiment)
+    report(0.95, "writing the page")
+    lead = (*notes, opening(experiment), *what_it_did(data, table, experiment.config.main_victim))
+    targets = evaluate(experiment.held_to.targets, table, data.measured)
+    sections = page_sections(data, table)
+    write_table(table, experiment.folder / CELLS, folder, sections, lead, PAGE, targets)
+
+
+def _measure(experiment: Experiment, folder: Path, report: Report) -> ReportData:
+    """Cut films, and see the objects where the deployed world can be opened; of live drives measure memory."""
+    names = experiment.config.scenarios
+    if experiment.config.deploy.live:
+        rows = memory.measure(experiment, folder, lambda part, text="": report(0.6 * part, text))
+        report(0.6, "cutting films")
+        space = make_space(experiment, None)
+        filmed = {name: films.film_scenario(experiment, None, space, name, folder) for name in names}
+        return gather(experiment, filmed, {}, memory=rows)
     if experiment.config.deploy.through == "nothing":
         report(0.1, "drawing what the policy sees")
         space = make_space(experiment, None)
-        found = {name: seen_where_learned(experiment, space, name) for name in experiment.config.scenarios}
-        _write(experiment, folder, page.sections(experiment, found), (*notes, page.opening(experiment)))
-        return
-    films_of: dict[str, Path] = {}
+        return gather(experiment, {}, {name: seen_where_learned(experiment, space, name) for name in names})
+    filmed, seen = {}, {}
     with experiment.open_deployed_world() as scene:
         space = make_space(experiment, scene)
-        overview = from_above(experiment, scene)
-        for index, name in enumerate(experiment.config.scenarios):
-            report(0.1 + 0.8 * index / len(experiment.config.scenarios), f"filming {name}")
-            films_of[name] = films.film_scenario(experiment, scene, space, name, folder)
-        seen: dict[str, dict[str, NDArray[np.uint8]]] = {
-            name: textures_seen(experiment, scene, space, name) for name in experiment.config.scenarios
-        }
-    report(0.95, "writing the page")
-    sections = page.sections(experiment, seen, overview, films_of)
-    _write(experiment, folder, sections, (*notes, page.opening(experiment)))
+        for index, name in enumerate(names):
+            report(0.1 + 0.8 * index / len(names), f"filming {name}")
+            filmed[name] = films.film_scenario(experiment, scene, space, name, folder)
+            seen[name] = textures_seen(experiment, scene, space, name)
+        return gather(experiment, filmed, seen, from_above(experiment, scene))
 
 
-def _write(
-    experiment: Experiment,
-    folder: Path,
-    sections: Sequence[tuple[str, Markup]],
-    lead: Sequence[str | Markup],
-    measured: Mapping[str, float | None] | None = None,
-) -> None:
-    table = table_of(experiment)
-    targets = evaluate(experiment.held_to.targets, table, measured, experiment.setting)
-    write_table(table, experiment.folder / CELLS, folder, sections, lead, PAGE, targets)
+def opening(experiment: Experiment) -> str:
+    """What was done, in one paragraph."""
+    config, attack = experiment.config, experiment.config.attack
+    methods = ", ".join(style_of(name).title for name in attack.method_names)
+    kinds = Counter(thing.kind.replace("_", " ") for thing in experiment.objects)
+    named = " and ".join(count(number, kind) for kind, number in kinds.items())
+    return (
+        f"Policies ({', '.join(config.attacked)}) drive {', '.join(config.scenarios)}. {config.space.searched.format(named)} ({methods}; {attack.evaluations} evaluations "
+        f"each, {count(len(attack.seeds), 'seed')}, {count(attack.starts, 'start')}, T = {config.horizon} ticks of {config.dt_s:g} s){_then(experiment)}."
+    )
+
+
+def _then(experiment: Experiment) -> str:
+    if experiment.config.deploy.live:
+        return ", then shown to the driving car, frame by frame, by the live node graph"
+    if experiment.config.deploy.through == "nothing":
+        return "; nothing was driven in the place itself"
+    return f", then put into the world {experiment.deployed_world.kind}"
 
 
 def print_summary(experiment: Experiment, console: Console) -> None:
@@ -124,26 +133,6 @@ def table_of(experiment: Experiment) -> ResultTable:
     )
 
 
-def seen_where_learned(experiment: Experiment, space: Space, scenario: str) -> dict[str, NDArray[np.uint8]]:
-    """What the policy sees in the learned scene past the plain, random and attacked objects of the first seed, where most of them is in view."""
-    victim, seed = experiment.config.main_victim, experiment.config.attack.seeds[0]
-    driven = films.drives_of(experiment, "surrogate", Cell(scenario, victim, NONE, 0))[0]
-    states = driven[np.linspace(0, len(driven) - 1, min(_LOOKED_AT, len(driven))).astype(int)]
-    poses = planar_poses(states) @ experiment.mount
-
-    def rendered(shown: Shown) -> torch.Tensor:
-        return shown.seen_by(space.surrogate).render(poses, shown.colours).images
-
-    changed = (rendered(space.plain) - rendered(Shown((), torch.zeros(0, 3)))).abs().sum(dim=(1, 2, 3))
-    best = changed.argsort(descending=True, stable=True)[:_SHOWN].sort().values
-    seen = {}
-    for method in (NONE, *experiment.config.attack.method_names):
-        cell = Cell(scenario, victim, method, 0 if method == NONE else seed)
-        pictures = rendered(load_shown(space, driven_folder(experiment, cell), cell))[best]
-        seen[method] = np.concatenate([as_uint8(each) for each in pictures], axis=1)
-    return seen
-
-
 def textures_seen(
     experiment: Experiment, scene: World, space: Space, scenario: str
 ) -> dict[str, NDArray[np.uint8]]:
@@ -161,4 +150,24 @@ def textures_seen(
             shown_there(experiment, shown, load_found(folder, cell)),
         )
         seen[method] = np.concatenate([dressed.camera_image(state, colours) for state in states], axis=1)
+    return seen
+
+
+def seen_where_learned(experiment: Experiment, space: Space, scenario: str) -> dict[str, NDArray[np.uint8]]:
+    """What the policy sees in the learned scene past the plain, random and attacked objects of the first seed, where most of them is in view."""
+    victim, seed = experiment.config.main_victim, experiment.config.attack.seeds[0]
+    driven = films.drives_of(experiment, "surrogate", Cell(scenario, victim, NONE, 0))[0]
+    states = driven[np.linspace(0, len(driven) - 1, min(_LOOKED_AT, len(driven))).astype(int)]
+    poses = planar_poses(states) @ experiment.mount
+
+    def rendered(shown: Shown) -> torch.Tensor:
+        return shown.seen_by(space.surrogate).render(poses, shown.colours).images
+
+    changed = (rendered(space.plain) - rendered(Shown((), torch.zeros(0, 3)))).abs().sum(dim=(1, 2, 3))
+    best = changed.argsort(descending=True, stable=True)[:_SHOWN].sort().values
+    seen = {}
+    for method in (NONE, *experiment.config.attack.method_names):
+        cell = Cell(scenario, victim, method, 0 if method == NONE else seed)
+        pictures = rendered(load_shown(space, driven_folder(experiment, cell), cell))[best]
+        seen[method] = np.concatenate([as_uint8(each) for each in pictures], axis=1)
     return seen

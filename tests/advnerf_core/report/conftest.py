@@ -134,32 +134,23 @@ def colour_grid(seed, scale):
     )
 
 
-def settings(name="full", starts=2, seeds=(0, 1, 2)):
-    poses = [[-1.1 + 0.05 * i, -2.0, 0.0] for i in range(starts)]
-    return rd.Settings(
-        name,
-        60,
-        PERIOD,
-        50,
-        50,
-        np.array(poses),
-        seeds,
-        SPEED,
-        extra={"policy": "PilotNet, 200x66", "workers": 2},
-    )
-
-
 def scene():
     path = np.stack([pose_at(s)[:2] for s in np.linspace(0, LENGTH, 240, endpoint=False)])
     monitor = make_transform(rotation_z(-2.4), np.array([3.0, 3.0, 0.5]))
+    square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]])
+    faces = {"board": rd.face_segment(BOARD, 0.8), "monitor": rd.face_segment(monitor, 0.5977)}
     return rd.Scene(
         path,
         OFF_TRACK,
-        (-4, -4, 4, 4),
-        np.array([[-3.5, -3.5], [3.5, -3.5], [3.5, 3.5], [-3.5, 3.5]]),
-        rd.face_segment(BOARD, 0.8),
-        rd.face_segment(monitor, 0.5977),
+        edges_m=(4.0 * square,),
+        objects_m=(0.3 * square[:4],),
+        faces_m=faces,
+        fence_m=3.5 * square[:4],
     )
+
+
+def drives(runs=(), curves=(), film=None):
+    return rd.Drives("track", scene(), PERIOD, tuple(runs), tuple(curves), film)
 
 
 def fidelity(count=24, shown=3):
@@ -231,6 +222,8 @@ def manifest():
         {"scene": "b1946ac92492d2347c6235b4d2611184", "policy": "591785b794601e212b260e25925636fd"},
         {"advnerf": "0.1.0", "numpy": np.__version__},
         {"processor": "x86_64, 2 cores", "memory": "8 GiB"},
+        {"setting": "full", "horizon": "T = 60 control ticks of 0.1 s"},
+        {"capture": 41.0, "scene": 610.0, "policy": 700.2, "cells": 3200.0},
     )
 
 
@@ -262,21 +255,14 @@ def full_report(folder: Path, steps=60):
     ]
     textures.append(rd.Texture("best random", "random", colour_grid(9, 5.0), "41b07e"))
     return rd.ReportData(
-        settings(),
-        scene(),
-        all_runs(),
+        (drives(all_runs(), curves, make_clip(folder, steps)),),
         manifest(),
-        tuple(curves),
-        tuple(textures),
-        (rd.Clip("Surrogate and live drive", make_clip(folder, steps), "Start 1, seed 0."),),
-        fidelity(),
-        latency(),
-        tuple(rd.MemoryRow(t, 180 + 0.01 * t) for t in (50, 100, 200, 400)),
-        tuple(
-            rd.StageTiming(n, w)
-            for n, w in (("capture", 41.0), ("scene", 610.0), ("policy", 700.2), ("attack", 3200.0))
-        ),
-        laps(),
+        textures=tuple(textures),
+        fidelity=fidelity(),
+        live=True,
+        latency=latency(),
+        memory=tuple(rd.MemoryRow(t, 180 + 0.01 * t) for t in (50, 100, 200, 400)),
+        laps=laps(),
     )
 
 
@@ -289,10 +275,9 @@ def report(tmp_path_factory):
 def bare_report():
     """Only what a report cannot do without."""
     return rd.ReportData(
-        settings("small", 1, (0,)),
-        scene(),
-        (),
-        manifest(),
+        (drives(),),
+        rd.Manifest("advnerf experiment", "2025-03-02T10:11:12+00:00"),
+        live=True,
         not_measured={"latency": "No <live> drive."},
     )
 
@@ -305,7 +290,7 @@ def make():
     return types.SimpleNamespace(
         table=table,
         drive=drive,
-        settings=settings,
+        drives=drives,
         scene=scene,
         manifest=manifest,
         ray_cast=ray_cast,

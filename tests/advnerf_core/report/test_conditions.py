@@ -10,8 +10,8 @@ import numpy as np
 from advnerf_core.report import plots
 from advnerf_core.report.conditions import CONDITIONS, SPARE, know_methods, order_of, style_of
 from advnerf_core.report.data import LossCurve, ReportData
-from advnerf_core.report.live_parts import live_sections
 from advnerf_core.report.palette import DARK, LIGHT
+from advnerf_core.report.sections import page_sections
 
 ROOT = Path(__file__).parents[3]
 STYLES = {**CONDITIONS, **SPARE}
@@ -84,14 +84,18 @@ def test_a_stranger_appears_in_the_report(make):
         LossCurve("Spiral", 0, np.array([1.0, 3.0, 2.0])),
         LossCurve("gradient", 0, np.array([1.0, 2.0, 3.0])),
     )
-    data = ReportData(make.settings(), make.scene(), runs, make.manifest(), curves=curves)
+    drives = make.drives(runs, curves)
     shown = ["plain object", "cross-entropy", "gradient", "Spiral"]
-    legend = [text.get_text() for text in plots.cte_over_time(data, "surrogate").legends[0].get_texts()]
+    legend = [
+        text.get_text()
+        for text in plots.cte_over_time(drives, "surrogate", "hardened").legends[0].get_texts()
+    ]
     assert legend == [f"{name}, surrogate" for name in shown]
-    legend = [text.get_text() for text in plots.loss_curves(data).legends[0].get_texts()]
+    legend = [text.get_text() for text in plots.loss_curves(drives, "hardened").legends[0].get_texts()]
     assert legend == [
         "gradient, one line per seed",
         "Spiral: each texture, best so far",
         "no attack, surrogate",
     ]
-    assert any("Spiral" in body for _, body in live_sections(data, make.table([])))
+    data = ReportData((drives,), make.manifest())
+    assert any("Spiral" in body for _, body in page_sections(data, make.table([])))

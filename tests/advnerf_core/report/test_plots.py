@@ -83,7 +83,7 @@ def cv2_inside(ring, points):
 
 
 def test_svg_follows_the_theme_and_loads_nothing(report):
-    text = plots.svg(plots.cte_over_time(report, "deployed"), 'drives & "errors" \\1')
+    text = plots.svg(plots.cte_over_time(report.drives[0], "deployed", "hardened"), 'drives & "errors" \\1')
     assert "var(--gradient)" in text
     assert not any(colour in text for colour in LIGHT.values())
     assert "http" not in text
@@ -91,11 +91,14 @@ def test_svg_follows_the_theme_and_loads_nothing(report):
 
 
 def test_figures_of_both_domains_share_the_error_axis(report):
-    limits = {plots.cte_over_time(report, d).axes[0].get_ylim() for d in ("surrogate", "deployed")}
+    limits = {
+        plots.cte_over_time(report.drives[0], d, "hardened").axes[0].get_ylim()
+        for d in ("surrogate", "deployed")
+    }
     assert len(limits) == 1
 
 
 def test_png_is_written_whole(report, tmp_path):
-    path = plots.write_png(maps.trajectory_map(report, zoom=True), tmp_path / "map.png", dpi=50)
+    path = plots.write_png(maps.trajectory_map(report.drives[0], "hardened"), tmp_path / "map.png", dpi=50)
     assert cv2.imread(str(path)).shape[1] == pytest.approx(300, abs=30)
     assert [p.name for p in tmp_path.iterdir()] == ["map.png"]

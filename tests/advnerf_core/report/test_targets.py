@@ -6,7 +6,6 @@ import pytest
 import yaml
 
 from advnerf_core.report.data import Fidelity, FidelityView, Laps, Latency, MemoryRow
-from advnerf_core.report.live_parts import opening
 from advnerf_core.report.reference import Limit, Reference
 from advnerf_core.report.result_table import ResultTable
 from advnerf_core.report.targets import evaluate, verdict
@@ -17,11 +16,11 @@ NO_ROWS = ResultTable(())
 
 
 def verdicts(report, table=NO_ROWS):
-    return {t.what: t.met for t in evaluate(LIMITS, table, report.measured, report.settings.name)}
+    return {t.what: t.met for t in evaluate(LIMITS, table, report.measured)}
 
 
 def test_nothing_measured_is_neither_met_nor_missed(bare_report, make):
-    targets = evaluate(LIMITS, make.table([]), bare_report.measured, "small")
+    targets = evaluate(LIMITS, make.table([]), bare_report.measured)
     assert {target.met for target in targets} == {None}
     assert len(targets) == len(LIMITS)
     assert verdict(targets) == "No target was measured in this run."
@@ -84,18 +83,14 @@ def test_fidelity_and_laps(bare_report):
     assert found["policy without attack, live: laps"] is True
 
 
-def test_the_verdict_names_every_miss(bare_report, make):
+def test_the_verdict_names_every_miss(bare_report):
     views = (FidelityView("fox photographs", 24.1, 24.1, None, None, 0.0, 0.0),)
     limit = Limit(what="fox photographs", of="psnr_full_db", at_least=26)
     measured = replace(bare_report, fidelity=Fidelity(views)).measured
     text = verdict(evaluate([limit], NO_ROWS, measured))
     assert text == "0 of 1 measured target was met. Missed: fox photographs: 24.1 dB (target ≥ 26 dB)."
     assert verdict(()) == ""
-    assert "small setting" in " ".join(opening(bare_report, make.table([])))
 
 
-def test_limits_of_the_other_setting_and_of_what_a_table_has_not_are_left_out(bare_report):
-    full = Limit(of="laps", at_least=3, setting="full")
-    assert evaluate([full], NO_ROWS, bare_report.measured, "small") == []
-    assert len(evaluate([full], NO_ROWS, bare_report.measured, "full")) == 1
+def test_limits_on_what_a_table_has_not_are_left_out():
     assert evaluate(LIMITS, NO_ROWS) == []

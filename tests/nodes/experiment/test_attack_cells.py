@@ -21,7 +21,7 @@ from advnerf_core.policies.network import images_to_tensor
 from advnerf_core.report.result_page import text_table
 from advnerf_core.scene.surrogate import Surrogate
 from hardware.cameras.effects import CameraEffects
-from nodes.experiment.pages import page, report
+from nodes.experiment.pages import report
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.robustness_config import RobustnessConfig
 from nodes.experiment.plan.victims import NAIVE
@@ -135,7 +135,7 @@ def test_a_method_of_a_file_runs_a_cell_and_appears_in_the_tables(
     assert film_cell(experiment, wall, space, spiral, out, out).exists()
     table = text_table(report.table_of(experiment))
     assert [row[2] for row in table.rows if row[2]] == ["plain object", "gradient", "Spiral"]
-    assert "Spiral" in page.opening(experiment)
+    assert "Spiral" in report.opening(experiment)
 
     # What its code is decides, not where it lies.
     def digest() -> str:

@@ -30,14 +30,14 @@ def test_all_cells_and_the_report(trained: Experiment, tmp_path: Path) -> None:
     picture = np.full((188, 336, 3), 90, np.uint8)
     for name in ("real", "surrogate"):
         cv2.imwrite(str(folder / f"{name}.png"), picture)
-    view = {"real_image": "real.png", "surrogate_image": "surrogate.png"}
-    means = {"psnr_full_db": 28.0, "psnr_policy_db": 27.5}
-    (folder / "scene" / "fidelity.json").write_text(json.dumps({"mean": means, "views": [view]}))
+    view = {"label": "view", "real_image": "real.png", "surrogate_image": "surrogate.png"}
+    view |= {"psnr_full_db": 28.0, "psnr_policy_db": 27.5, "ssim_full": 0.9, "ssim_policy": 0.9}
+    (folder / "scene" / "fidelity.json").write_text(json.dumps({"views": [view]}))
     rates = [{"real": 0.1, "surrogate": 0.12}]
     (folder / "policy" / "policy.json").write_text(json.dumps({"on_held_out_views": rates}))
     config = experiment.config.model_dump(mode="json")
     (folder / "manifest.json").write_text(
-        json.dumps({"command": "advnerf experiment <it>", "config": config})
+        json.dumps({"command": "advnerf experiment <it>", "config": config, "versions": {}})
     )
 
     with Bench(experiment) as bench:
@@ -60,6 +60,7 @@ def test_all_cells_and_the_report(trained: Experiment, tmp_path: Path) -> None:
         assert len(read_clip(folder / "report" / f"{name}.mp4")) == 4  # three ticks and the start
     page = (folder / "report" / "report.html").read_text()
     assert "&lt;it&gt;" in page  # what it quotes is escaped
-    assert page.count("<svg") == 3
+    # Of each drive and victim a map, errors in both domains and the searches; and the steering.
+    assert page.count("<svg") == 3 * 2 * 4 + 1
     assert page.count("<video") == 3 + 24  # a film of each drive, and one of each cell
     assert "://" not in page.replace("http://www.w3.org", "")

@@ -51,7 +51,7 @@ def test_every_stage_runs_in_a_strangers_world(
         assert len(read_clip(run / "report" / f"{name}.mp4")) == 5  # four ticks and the start
     page = (run / "report" / "report.html").read_text()
     assert "world_warehouse.py:Warehouse" in page
-    assert " rad on average" in page
+    assert "mean |control difference| [rad]" in page
     capsys.readouterr()
     # Once more: nothing is done again. With another lag the photographs and the scene are kept.
     times = {stage.parent.name: stage.stat().st_mtime_ns for stage in run.glob("*/stage.json")}

@@ -5,11 +5,11 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from advnerf_core.report import live_parts
-from advnerf_core.report.data import Clip, Texture
-from advnerf_core.report.live_parts import live_sections, opening
+from advnerf_core.report import sections
+from advnerf_core.report.data import Texture
 from advnerf_core.report.result_page import render_page
 from advnerf_core.report.result_table import ResultTable
+from advnerf_core.report.sections import page_sections, what_it_did
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 
@@ -53,8 +53,8 @@ NO_ROWS = ResultTable((), {}, "room")
 
 
 def page_of(data, table=NO_ROWS):
-    """The one page, with the parts of an experiment whose drives were live."""
-    return render_page(table, (), live_sections(data, table), opening(data, table))
+    """The one page, with the sections of an experiment."""
+    return render_page(table, (), page_sections(data, table), what_it_did(data, table, "hardened"))
 
 
 def test_the_page_is_whole_and_loads_nothing(report):
@@ -66,11 +66,10 @@ def test_the_page_is_whole_and_loads_nothing(report):
     assert "://" not in page
     assert "default-src 'none'" in page
     assert checker.ids == [
-        "where-the-car-went",
-        "what-the-camera-saw",
+        "track",
         "what-the-panel-showed",
-        "how-true-the-surrogate-is",
-        "the-search",
+        "how-true-the-learned-scene-is",
+        "laps-without-attack",
         "live-timing",
         "memory-against-the-horizon",
         "how-to-make-this-page-again",
@@ -81,8 +80,8 @@ def test_the_page_is_whole_and_loads_nothing(report):
 def test_missing_parts_are_named(bare_report):
     page = page_of(bare_report)
     check(page)
-    # runs, laps, clips, textures, fidelity, curves, latency, memory, timings
-    assert page.count("Not measured in this run.") == 9
+    # drives, fidelity, laps, latency, memory, timings
+    assert page.count("Not measured in this run.") == 6
     assert "No &lt;live&gt; drive." in page
 
 
@@ -97,17 +96,35 @@ def test_text_from_outside_is_escaped(bare_report):
 
 def test_one_victim_one_start_without_live_drives(make, bare_report):
     runs = tuple(make.drive("surrogate", c, a) for c, a in (("none", 0.02), ("gradient", 0.6)))
-    page = page_of(dataclasses.replace(bare_report, runs=runs))
+    page = page_of(dataclasses.replace(bare_report, drives=(make.drives(runs),)))
     check(page)
-    assert "On the live drive it was not measured in this run." in page
+    assert "Deployed it was not measured in this run." in page
 
 
-def test_a_lost_clip_is_named_and_those_without_room_stay_beside(bare_report, report, monkeypatch, tmp_path):
-    lost = dataclasses.replace(bare_report, clips=(Clip("lost", tmp_path / "no.mp4"),))
-    with pytest.raises(FileNotFoundError, match="expected the clip 'lost'"):
+def test_a_page_without_live_drives_has_the_world_and_what_was_seen_and_no_live_parts(make, bare_report):
+    picture = np.zeros((4, 8, 3), np.uint8)
+    driven = dataclasses.replace(
+        make.drives([make.drive("surrogate", "none", 0.02)]), seen={"random": picture}
+    )
+    page = page_of(dataclasses.replace(bare_report, drives=(driven,), overview=picture, live=False))
+    assert check(page).ids == [
+        "the-world",
+        "track",
+        "how-true-the-learned-scene-is",
+        "how-to-make-this-page-again",
+    ]
+    assert page.count('<img src="data:image') == 2
+    assert "Objects seen: best random" in page
+
+
+def test_a_lost_film_is_named_and_one_without_room_stays_beside(
+    make, bare_report, report, monkeypatch, tmp_path
+):
+    lost = dataclasses.replace(bare_report, drives=(make.drives(film=tmp_path / "no.mp4"),))
+    with pytest.raises(FileNotFoundError, match="expected the film"):
         page_of(lost)
-    monkeypatch.setattr(live_parts, "MAX_EMBEDDED_BYTES", 10)
-    page = page_of(dataclasses.replace(bare_report, clips=report.clips))
+    monkeypatch.setattr(sections, "MAX_EMBEDDED_BYTES", 10)
+    page = page_of(dataclasses.replace(bare_report, drives=(make.drives(film=report.drives[0].film),)))
     assert "Not embedded" in page
     assert "<video" not in page
 
@@ -120,7 +137,7 @@ def test_tries_are_listed_with_why_they_do_not_count(report, make):
     page = page_of(bare, table)
     check(page)
     assert page.count(f"<td>{late}</td>") == 2
-    assert page.index("NOT DRIVEN LIVE: ") < page.index("A texture for one flat board")
+    assert page.index("NOT DRIVEN LIVE: ") < page.index("in the learned scene the cross-track error")
 
 
 def test_the_opening_says_what_it_did_in_metres(report, make):
@@ -129,8 +146,10 @@ def test_the_opening_says_what_it_did_in_metres(report, make):
         for domain in ("surrogate", "deployed")
         for method, totals, off_track in (("none", [1.0], [False]), ("gradient", [13.0], [True]))
     ]
-    (text,) = opening(report, make.table(drives))
+    (text,) = what_it_did(report, make.table(drives), "hardened")
     assert text.count("is 0.200 m per tick larger with the gradient texture than past the plain object") == 2
     assert "(total 13.00 m against 1.00 m), and the car left the track in 1 of 1 drive" in text
     bad = [(*each[:3], [True]) for each in drives]
-    assert "WITHOUT AN ATTACK THE POLICY DOES NOT DRIVE" in " ".join(opening(report, make.table(bad)))
+    assert "WITHOUT AN ATTACK THE POLICY DOES NOT DRIVE" in " ".join(
+        what_it_did(report, make.table(bad), "hardened")
+    )

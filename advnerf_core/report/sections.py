@@ -1,11 +1,12 @@
-"""Parts of the page about an experiment whose drives were live: maps, films, textures, timing, memory."""
+"""Sections of an experiment's page: maps, films, textures, fidelity, and of live drives their timing and memory."""
 
 # ruff: noqa: RUF001 (typography for readers: dashes)
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import jinja2
@@ -16,60 +17,46 @@ from advnerf_core.driving.metrics import drives, mean_cte_limit_m
 from advnerf_core.report import maps, plots
 from advnerf_core.report.clips import Frames, data_uri, film_strip, image_uri
 from advnerf_core.report.conditions import NONE, style_of
-from advnerf_core.report.data import Clip, Hop, ReportData
+from advnerf_core.report.data import Drives, Hop, ReportData
 from advnerf_core.report.reference import DOMAINS, Domain
 from advnerf_core.report.result_table import ResultTable, TableRow
 from advnerf_core.report.text_table import Table, count, number
 
-# Videos beyond this stay beside the page: browsers open a 20 MB page at once, a 200 MB page not.
+# Films beyond this stay beside the page: browsers open a 20 MB page at once, a 200 MB page not.
 MAX_EMBEDDED_BYTES = 12_000_000
 _SHOWN_VIEWS = 6
 _DIFFERENCE_GAIN = 4
 
 
-_PARTS = (
-    ("trajectories", "Where the car went"),
-    ("clips", "What the camera saw"),
-    ("texture", "What the panel showed"),
-    ("fidelity", "How true the surrogate is"),
-    ("search", "The search"),
-    ("timing", "Live timing"),
-    ("memory", "Memory against the horizon"),
-    ("manifest", "How to make this page again"),
-)
-
-
-def live_sections(data: ReportData, table: ResultTable) -> list[tuple[str, Markup]]:
-    """Headings and HTML of an experiment whose drives were live; missing parts are named as such."""
+def page_sections(data: ReportData, table: ResultTable) -> list[tuple[str, Markup]]:
+    """Headings and HTML; parts that were not measured are named as such."""
     drawn = _fragments(data, table)
-    return [(heading, Markup(getattr(drawn, name)())) for name, heading in _PARTS]
+    parts = [("overview", "The world")] if data.overview is not None else []
+    made = [(heading, Markup(getattr(drawn, name)())) for name, heading in parts]
+    made += [(each["drives"].scenario.capitalize(), Markup(drawn.driven(each))) for each in _driven(data)]
+    parts = [("texture", "What the panel showed")] if data.textures else []
+    parts.append(("fidelity", "How true the learned scene is"))
+    if data.live:
+        parts += [("laps", "Laps without attack"), ("timing", "Live timing")]
+        parts.append(("memory", "Memory against the horizon"))
+    parts.append(("manifest", "How to make this page again"))
+    return [*made, *((heading, Markup(getattr(drawn, name)())) for name, heading in parts)]
 
 
-def opening(data: ReportData, table: ResultTable, victim: str = "hardened") -> tuple[str, ...]:
-    """The opening paragraphs as plain text: what was done, and what it did to one victim."""
-    s = data.settings
-    live = any(row.domain == "deployed" and row.method == "gradient" and row.seeds for row in table.rows)
-    shown = (
-        " Both were then shown to the driving car, frame by frame, by the live node graph." if live else ""
-    )
-    effects = [_effect(table, victim, domain, s.off_track_m) for domain in DOMAINS]
-    story = (
-        f"A texture for one flat board was searched for in a learned scene of the room: {s.iterations} gradient steps over "
-        f"{s.horizon_steps} control ticks ({s.horizon_steps * s.control_period_s:g} s) from {count(len(s.start_poses), 'start pose')} with "
-        f"{count(len(s.seeds), 'seed')}, against the best of {s.random_evaluations} random textures.{shown} In the learned scene the "
-        f"cross-track error (CTE, the distance from the tape) {effects[0]}. On the live drive it {effects[1]}."
-    )
-    small = (
-        "This is the small setting: it shows that the whole chain works, and its numbers rest on very few drives. The targets are stated for "
-        "the full setting (make experiment)."
-    )
-    return (story,) if s.name == "full" else (story, small)
+def what_it_did(data: ReportData, table: ResultTable, victim: str) -> list[str]:
+    """What the attack did to one victim in each scenario, as plain text."""
+    deployed = any(row.domain == "deployed" for row in table.rows)
+    return [
+        f"{each.scenario.capitalize()}: in the learned scene the cross-track error (CTE, the distance from the path) "
+        f"{_effect(table, each, victim, 'surrogate')}."
+        + (f" Deployed it {_effect(table, each, victim, 'deployed')}." if deployed else "")
+        for each in data.drives
+    ]
 
 
-def _effect(table: ResultTable, victim: str, domain: Domain, off_track_m: float) -> str:
-    scenario = next((row.scenario for row in table.rows), "")
+def _effect(table: ResultTable, driven: Drives, victim: str, domain: Domain) -> str:
     plain, attacked, random = (
-        table.find(scenario, victim, method, domain) for method in (NONE, "gradient", "random")
+        table.find(driven.scenario, victim, method, domain) for method in (NONE, "gradient", "random")
     )
     if plain is None or attacked is None or not (plain.excess and attacked.excess):
         return "was not measured in this run"
@@ -83,7 +70,7 @@ def _effect(table: ResultTable, victim: str, domain: Domain, off_track_m: float)
             f"; with the best random texture it is {random.excess.excess_m:.3f} m per tick larger, and the car left in {random.off_track} "
             f"of {random.drives}"
         )
-    return text + _warning(plain, off_track_m)
+    return text + _warning(plain, driven.scene.off_track_m)
 
 
 def _warning(plain: TableRow, off_track_m: float) -> str:
@@ -104,45 +91,64 @@ def _fragments(data: ReportData, table: ResultTable) -> Any:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    text = files("advnerf_core.report").joinpath("live.html").read_text(encoding="utf-8")
-    embedded, beside = _chosen(data.clips)
+    text = files("advnerf_core.report").joinpath("sections.html").read_text(encoding="utf-8")
     return environment.from_string(text).make_module(
         {
             "data": data,
             "style_of": style_of,
+            "image": lambda picture: image_uri(picture, quality=88),
             "hops": _hop_table(data).html(),
             "live_tries": _tries_table(table),
             "memory_rows": _memory_table(data).html(),
             "timings": _timing_table(data).html(),
-            "settings": _settings(data),
             "figures": _figures(data),
-            "videos": [_video(clip) for clip in embedded],
-            "beside": beside,
             "textures": [(t, image_uri(t.image)) for t in data.textures if t.image is not None],
             "views": _views(data),
             "fidelity_rows": _fidelity_numbers(data),
-            "notes": [r for r in data.runs if r.note],
             "missing": lambda part: data.not_measured.get(part, ""),
         }
     )
 
 
+def _driven(data: ReportData) -> Iterator[dict[str, Any]]:
+    """What the section of each scenario shows; films are embedded while there is room."""
+    room = MAX_EMBEDDED_BYTES
+    for each in data.drives:
+        size = _size(each.film)
+        fits = size <= room
+        room -= size if fits else 0
+        yield {
+            "drives": each,
+            "pictures": [
+                (victim, _run_figures(each, victim, data.overview is None and bool(each.scene.edges_m)))
+                for victim in each.victims
+            ],
+            "notes": [run for run in each.runs if run.note],
+            "film": _video(each.film) if each.film and fits else None,
+            "beside": "" if each.film is None or fits else each.film.name,
+        }
+
+
+def _size(film: Path | None) -> int:
+    if film is None:
+        return 0
+    if not film.is_file():
+        raise FileNotFoundError(f"expected the film {film}, got no such file; run the report stage again")
+    return film.stat().st_size
+
+
 def _figures(data: ReportData) -> dict[str, Any]:
     """Inline SVG of all figures whose data there is, by name."""
-    figures: dict[str, Any] = {"victims": []}
-    for victim in data.victims:
-        figures["victims"].append((victim, _run_figures(data, victim)))
+    figures: dict[str, Any] = {}
     if data.laps is not None:
-        s = data.settings
-        figures["laps_map"] = _svg(
-            maps.laps_map(data.laps, data.scene), "The drive without attack from above"
-        )
+        scene, dt_s = data.drives[0].scene, data.drives[0].dt_s
+        figures["laps_map"] = _svg(maps.laps_map(data.laps, scene), "The drive without attack from above")
         figures["laps_cte"] = _svg(
-            plots.laps_cte(data.laps, s.control_period_s, s.off_track_m), "Its cross-track error over time"
+            plots.laps_cte(data.laps, dt_s, scene.off_track_m), "Its cross-track error over time"
         )
     if data.fidelity is not None and len(data.fidelity.steering_rad):
         figures["steering"] = _svg(
-            plots.steering_agreement(data.fidelity), "Steering on surrogate against real images"
+            plots.steering_agreement(data.fidelity), "Control on learned against real images"
         )
     if data.latency is not None:
         figures["latency"] = _svg(
@@ -153,26 +159,18 @@ def _figures(data: ReportData) -> dict[str, Any]:
     return figures
 
 
-def _run_figures(data: ReportData, victim: str) -> dict[str, Markup]:
-    out = {
-        "room": _svg(
-            maps.trajectory_map(data, victim=victim),
-            f"The room from above with all drives of the {victim} policy",
-        ),
-        "zoom": _svg(
-            maps.trajectory_map(data, zoom=True, victim=victim),
-            f"The drives of the {victim} policy, enlarged",
-        ),
-    }
+def _run_figures(driven: Drives, victim: str, whole: bool) -> dict[str, Markup]:
+    text = f"All drives of the victim {victim} from above"
+    out = {"zoom": _svg(maps.trajectory_map(driven, victim), text)}
+    if whole:
+        out["whole"] = _svg(maps.trajectory_map(driven, victim, zoom=False), f"{text}, in the whole place")
     for domain in DOMAINS:
-        if data.select(victim=victim, domain=domain):
-            out[domain] = _svg(
-                plots.cte_over_time(data, domain, victim), f"Cross-track error over time, {domain}"
-            )
-    if any(c.victim == victim for c in data.curves):
-        out["curves"] = _svg(
-            plots.loss_curves(data, victim), "Total cross-track error per evaluation of the searches"
-        )
+        if driven.select(victim=victim, domain=domain):
+            figure = plots.cte_over_time(driven, domain, victim)
+            out[domain] = _svg(figure, f"Cross-track error over time, {domain}")
+    if any(c.victim == victim for c in driven.curves):
+        figure = plots.loss_curves(driven, victim)
+        out["curves"] = _svg(figure, "Total cross-track error per evaluation of the searches")
     return out
 
 
@@ -180,29 +178,11 @@ def _svg(figure: Any, description: str) -> Markup:
     return Markup(plots.svg(figure, description))
 
 
-def _chosen(clips: tuple[Clip, ...]) -> tuple[list[Clip], list[Clip]]:
-    """Clips to embed while there is room, and the others."""
-    embedded: list[Clip] = []
-    beside: list[Clip] = []
-    room = MAX_EMBEDDED_BYTES
-    for clip in clips:
-        if not clip.path.is_file():
-            raise FileNotFoundError(
-                f"expected the clip {clip.title!r} at {clip.path}, got no such file; run the deploy stage again"
-            )
-        fits = (size := clip.path.stat().st_size) <= room
-        room -= size if fits else 0
-        (embedded if fits else beside).append(clip)
-    return embedded, beside
-
-
-def _video(clip: Clip) -> dict[str, Any]:
-    stills = film_strip(clip.path)
+def _video(film: Path) -> dict[str, Any]:
+    stills = film_strip(film)
     height, width = stills[0].shape[:2]
     return {
-        "title": clip.title,
-        "caption": clip.caption,
-        "uri": data_uri(clip.path),
+        "uri": data_uri(film),
         "width": width,
         "height": height,
         "poster": image_uri(stills[-1], quality=80),
@@ -245,14 +225,14 @@ def _fidelity_numbers(data: ReportData) -> Markup:
             "–",
         ),
         (
-            "policy's view, 200x66",
+            "policy's image",
             str(len(f.views)),
             number(f.mean("psnr_policy_db"), 2),
             number(f.mean("ssim_policy"), 3),
             difference,
         ),
     )
-    columns = ("size", "held-out views", "PSNR [dB]", "SSIM", "mean |steering difference| [rad]")
+    columns = ("size", "held-out views", "PSNR [dB]", "SSIM", f"mean |control difference| [{f.unit}]")
     return Table("Surrogate fidelity", columns, rows, (False, *[True] * 4)).html()
 
 
@@ -287,23 +267,7 @@ def _memory_table(data: ReportData) -> Table:
 
 def _timing_table(data: ReportData) -> Table:
     """Wall time of the stages and their sum."""
-    cells = [(t.name, number(t.wall_s, 1)) for t in data.timings]
-    if cells:
-        cells.append(("all stages", number(sum(t.wall_s for t in data.timings), 1)))
+    timings = data.manifest.timings
+    cells = [(name, number(wall_s, 1)) for name, wall_s in timings.items()]
+    cells.append(("all stages", number(sum(timings.values()), 1)))
     return Table("Stages", ("stage", "wall time [s]"), tuple(cells), (False, True), (len(cells) - 1,))
-
-
-def _settings(data: ReportData) -> Mapping[str, str]:
-    s = data.settings
-    poses = "; ".join(f"({x:.2f} m, {y:.2f} m, {np.degrees(yaw):.1f}°)" for x, y, yaw in s.start_poses)
-    return {
-        "setting": s.name,
-        "horizon": f"T = {s.horizon_steps} control ticks of {s.control_period_s:g} s",
-        "gradient attack": f"{s.iterations} iterations, Adam, learning rate {s.learning_rate:g}",
-        "random search": f"best of {s.random_evaluations}",
-        "start poses (x, y, yaw)": poses,
-        "seeds": ", ".join(str(seed) for seed in s.seeds),
-        "speed": f"{s.speed_mps:g} m/s",
-        "off-track": f"|CTE| > {s.off_track_m:g} m",
-        **{name: str(value) for name, value in s.extra.items()},
-    }

@@ -1,0 +1,306 @@
+"""Reads what the sections of the report are made of from the run folder: drives, searches, fidelity, and what live drives measured."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Iterator, Mapping
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.attack.artifact import load_attack
+from advnerf_core.documents import read_json
+from advnerf_core.report import data as rd
+from advnerf_core.report.cells import read_cell
+from advnerf_core.report.conditions import EMPTY
+from advnerf_core.report.reference import DOMAINS, Domain
+from nodes.experiment.engine.artefact import read_artefact
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.plan.space_config import FaceConfig
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.learned_scene import FIDELITY
+from nodes.experiment.steps.attack import cells
+from nodes.experiment.steps.deploy import DRIVES
+from nodes.experiment.steps.frozen import frozen_hashes
+from nodes.experiment.steps.keys import driven_folder
+from nodes.experiment.steps.live import extra_runs, lab_of
+from nodes.experiment.steps.search_files import ATTACK, SEARCHED
+from nodes.experiment.steps.steering_gate import steering_of_victims
+from nodes.lab.trials import evaluation
+from nodes.runtime.machine import memory_gib, processor_name
+
+SHOWN_VIEWS = 6
+_PATH_POINTS = 400
+
+
+def gather(
+    experiment: Experiment,
+    films: Mapping[str, Path],
+    seen: Mapping[str, Mapping[str, NDArray[np.uint8]]],
+    overview: NDArray[np.uint8] | None = None,
+    memory: tuple[rd.MemoryRow, ...] = (),
+) -> rd.ReportData:
+    """Everything that the page is made of.
+
+    Args:
+        experiment: With all stages and cells before finished.
+        films: By scenario, where something was deployed.
+        seen: By scenario and method, what the camera saw of the objects.
+        overview: The world from above.
+        memory: Of the adjoint, where it was measured.
+    """
+    live = experiment.config.deploy.live
+    return rd.ReportData(
+        drives=tuple(
+            _drives(experiment, name, films.get(name), seen.get(name, {}))
+            for name in experiment.config.scenarios
+        ),
+        manifest=_manifest(experiment),
+        overview=overview,
+        textures=tuple(_textures(experiment)) if isinstance(experiment.config.space, FaceConfig) else (),
+        fidelity=_fidelity(experiment),
+        live=live,
+        memory=memory,
+        **(_live_parts(experiment) if live else {}),
+    )
+
+
+def _drives(
+    experiment: Experiment, scenario: str, film: Path | None, seen: Mapping[str, NDArray[np.uint8]]
+) -> rd.Drives:
+    plan = [cell for cell in cells(experiment) if cell.scenario == scenario]
+    runs = [run for domain in DOMAINS for cell in plan for run in _runs(experiment, cell, domain)]
+    if scenario == experiment.config.scenarios[0] and (empty := _extra(experiment, EMPTY)) is not None:
+        runs.append(
+            rd.Run(
+                "deployed",
+                EMPTY,
+                empty["victim"],
+                experiment.config.attack.seeds[0],
+                0,
+                np.array(empty["states"])[:, :3],
+                np.array(empty["cte_m"]),
+                empty["metrics"]["total_cte_m"],
+                _note(empty),
+            )
+        )
+    curves = [
+        rd.LossCurve(
+            cell.method, cell.seed, np.array(_searched(experiment, cell)["curve_total_cte_m"]), cell.victim
+        )
+        for cell in plan
+        if cell.searched
+    ]
+    scene = _scene(experiment, scenario)
+    return rd.Drives(scenario, scene, experiment.config.dt_s, tuple(runs), tuple(curves), film, seen)
+
+
+def _runs(experiment: Experiment, cell: Cell, domain: Domain) -> Iterator[rd.Run]:
+    file = driven_folder(experiment, cell) / (SEARCHED if domain == "surrogate" else DRIVES)
+    if domain == "deployed" and read_cell(experiment.cell_result(cell)).deployed is None:
+        return  # also of an arm that was driven live, when the one that it is compared with was not
+    found = read_json(file)
+    notes = [_note(each) for each in found.get("live", ())] or [""] * len(found["states"])
+    for start, (states, total_m, note) in enumerate(
+        zip(found["states"], found["total_cte_m"], notes, strict=True)
+    ):
+        poses = np.array(states)[:, :3]
+        cte_m = experiment.paths[cell.scenario].project(poses[:, :2]).cte_m
+        yield rd.Run(domain, cell.method, cell.victim, cell.seed, start, poses, cte_m, total_m, note)
+
+
+def _note(live: Mapping[str, Any]) -> str:
+    outcome = live["outcome"]
+    stopped_s = (outcome["end_real_ns"] - outcome["start_real_ns"]) * 1e-9
+    return f"stopped at {stopped_s:.1f} s: {outcome['stopped_early']}" if outcome["stopped_early"] else ""
+
+
+def _extra(experiment: Experiment, name: str) -> dict[str, Any] | None:
+    """A live drive beside those of the cells; None where it was not asked for, or every try was spoiled."""
+    run = extra_runs(experiment).get(name) if experiment.config.deploy.live else None
+    file = experiment.stage_folder("live") / f"{name}.json"
+    found: dict[str, Any] | None = read_json(file) if run is not None and file.exists() else None
+    return found
+
+
+def _live_parts(experiment: Experiment) -> dict[str, Any]:
+    """Latency and laps of live drives, and why they are missing."""
+    driven = {name: extra for name in ("laps", EMPTY) if (extra := _extra(experiment, name)) is not None}
+    measured = [
+        *driven.values(),
+        *(each for cell in cells(experiment) for each in _live_results(experiment, cell)),
+    ]
+    found: dict[str, Any] = {
+        "latency": _latency(experiment, measured),
+        "not_measured": _not_measured(experiment, driven, measured),
+    }
+    if "laps" in driven:
+        laps = driven["laps"]
+        found["laps"] = rd.Laps(
+            experiment.config.deploy.laps,
+            np.array(laps["states"]),
+            np.array(laps["cte_m"]),
+            laps["metrics"]["mean_cte_m"],
+            laps["metrics"]["off_track"],
+        )
+    return found
+
+
+def _not_measured(
+    experiment: Experiment, driven: dict[str, dict[str, Any]], measured: list[dict[str, Any]]
+) -> dict[str, str]:
+    """Why parts of the report are missing."""
+    found = {}
+    if "laps" not in driven:
+        wanted = experiment.config.deploy.laps
+        found["laps"] = (
+            f"all tries were spoiled; remove {experiment.stage_folder('live')} to drive the laps again"
+            if wanted
+            else "this setting drives no laps; make experiment does"
+        )
+    if not measured:
+        found["latency"] = "no live drive counts"
+    return found
+
+
+def _settings(experiment: Experiment) -> dict[str, str]:
+    config, attack = experiment.config, experiment.config.attack
+    starts = {name: experiment.measured_starts(name).tolist() for name in config.scenarios}
+    poses = {
+        f"measured starts, {name} (x, y, yaw)": "; ".join(
+            f"({x:.2f} m, {y:.2f} m, {np.degrees(yaw):.1f}°)" for x, y, yaw in found
+        )
+        for name, found in starts.items()
+    }
+    return {
+        "setting": experiment.setting,
+        "horizon": f"T = {config.horizon} control ticks of {config.dt_s:g} s, {experiment.searched_ticks} of them optimised",
+        "searches": f"{attack.evaluations} evaluations each, learning rate {attack.learning_rate:g}, time batch {attack.time_batch}",
+        "space": ", ".join(f"{name} {value}" for name, value in config.space.model_dump().items()),
+        **poses,
+        "seeds": ", ".join(str(seed) for seed in attack.seeds),
+        "speed": f"{experiment.car.speed_mps:g} m/s",
+        "off-track": f"|CTE| > {experiment.limits.off_track_m:g} m",
+    }
+
+
+def _scene(experiment: Experiment, scenario: str) -> rd.Scene:
+    path, world, fence_m = experiment.paths[scenario], experiment.world, experiment.world.fence_m
+    square = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)], np.float64)
+    edges, faces = [np.asarray(edge) for edge in world.road_edge], {}
+    if experiment.config.deploy.live:
+        lab = lab_of(experiment)
+        edges.append(0.5 * lab.room.side_m * square)
+        faces = {
+            name: rd.face_segment(face.T_world_from_face, face.width_m)
+            for name, face in (("board", lab.board), ("monitor", lab.monitor))
+        }
+    return rd.Scene(
+        path_xy_m=path.pose_at(np.linspace(0.0, path.length_m, _PATH_POINTS))[:, :2],
+        off_track_m=experiment.limits.off_track_m,
+        closed=path.closed,
+        edges_m=tuple(edges),
+        objects_m=tuple(np.asarray(thing.corners_m()) for thing in experiment.objects),
+        faces_m=faces,
+        fence_m=None if fence_m is None else fence_m * square[:4],
+    )
+
+
+def _searched(experiment: Experiment, cell: Cell) -> dict[str, Any]:
+    found: dict[str, Any] = read_json(driven_folder(experiment, cell) / SEARCHED)
+    return found
+
+
+def _live_results(experiment: Experiment, cell: Cell) -> list[dict[str, Any]]:
+    file = driven_folder(experiment, cell) / DRIVES
+    if read_cell(experiment.cell_result(cell)).not_driven_live:
+        return []  # of an arm that was driven, when the one that it is compared with was not
+    found: list[dict[str, Any]] = read_json(file)["live"]
+    return found
+
+
+def _textures(experiment: Experiment) -> Iterator[rd.Texture]:
+    for cell in filter(lambda each: each.searched, cells(experiment)):
+        attack = load_attack(experiment.cell_folder(cell) / ATTACK)
+        whose = "" if cell.victim == experiment.config.main_victim else f", {cell.victim} victim"
+        yield rd.Texture(
+            f"{cell.method}, seed {cell.seed}{whose}",
+            cell.method,
+            attack.required_face().texture,
+            attack.attack_id,
+            cell.seed,
+            cell.victim,
+        )
+
+
+def _fidelity(experiment: Experiment) -> rd.Fidelity:
+    scene = read_json(experiment.stage_folder("scene") / FIDELITY)
+    steering = steering_of_victims(experiment)[experiment.config.main_victim]
+    shown = {int(i) for i in np.linspace(0, len(scene["views"]) - 1, SHOWN_VIEWS).round()}
+    views = []
+    for index, (view, angles) in enumerate(zip(scene["views"], steering, strict=True)):
+        images = {
+            name: _read_rgb(experiment.folder / view[f"{name}_image"]) if index in shown else None
+            for name in ("real", "surrogate")
+        }
+        views.append(
+            rd.FidelityView(
+                view["label"],
+                view["psnr_full_db"],
+                view["psnr_policy_db"],
+                view["ssim_full"],
+                view["ssim_policy"],
+                angles["real"],
+                angles["surrogate"],
+                **images,
+            )
+        )
+    return rd.Fidelity(tuple(views), experiment.car.control_unit)
+
+
+def _latency(experiment: Experiment, results: list[dict[str, Any]]) -> rd.Latency | None:
+    if not results:
+        return None
+    samples = np.concatenate([r["capture_to_serial_ms"] for r in results])
+    hops = tuple(
+        rd.Hop.from_samples(f"capture to {name}", np.concatenate([r["hops_ms"][name] for r in results]))
+        for name in evaluation.HOPS
+    )
+    period_ms = 1e3 * experiment.config.dt_s
+    return rd.Latency(samples, period_ms, sum(r["missed"] for r in results), hops)
+
+
+def _timings(experiment: Experiment) -> dict[str, float]:
+    names = ("capture", "scene", "bake", "policy", "object", "live")
+    records = {name: read_artefact(experiment.stage_folder(name)) for name in names}
+    results = [experiment.cell_result(cell) for cell in cells(experiment)]
+    seconds = {name: record.seconds for name, record in records.items() if record is not None}
+    return {**seconds, "cells": sum(read_json(file)["seconds"] for file in results)}
+
+
+def _manifest(experiment: Experiment) -> rd.Manifest:
+    manifest = read_json(experiment.folder / "manifest.json")
+    machine = {
+        "processor": processor_name(),
+        "cores": str(len(os.sched_getaffinity(0))),
+        "memory": f"{memory_gib():.0f} GiB",
+        "system": platform.platform(),
+    }
+    return rd.Manifest(
+        manifest["command"],
+        datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        frozen_hashes(experiment),
+        manifest["versions"],
+        machine,
+        _settings(experiment),
+        _timings(experiment),
+    )
+
+
+def _read_rgb(path: Path) -> Any:
+    return np.ascontiguousarray(cv2.cvtColor(np.asarray(cv2.imread(str(path))), cv2.COLOR_BGR2RGB))
