@@ -96,7 +96,7 @@ def test_text_from_outside_is_escaped(bare_report):
 
 def test_one_victim_one_start_without_live_drives(make, bare_report):
     runs = tuple(make.drive("surrogate", c, a) for c, a in (("none", 0.02), ("gradient", 0.6)))
-    page = page_of(dataclasses.replace(bare_report, drives=(make.drives(runs),)))
+    page = page_of(dataclasses.replace(bare_report, drives=(make.drives(runs),)), make.table([]))
     check(page)
     assert "Deployed it was not measured in this run." in page
 
