@@ -32,7 +32,7 @@ from advnerf_core.attack.methods import SearchRun, load_method
 from advnerf_core.attack.search.search import Evaluation
 from advnerf_core.documents import read_json
 from advnerf_core.geometry import planar_poses
-from advnerf_core.learning.imitation import recovery_states
+from advnerf_core.learning.recipe import recovery_states
 from advnerf_core.objects.voxel.model import load_object, save_object
 from advnerf_core.scene.bake import bake
 from advnerf_core.scene.surrogate import BackgroundRenderer

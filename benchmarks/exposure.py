@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from advnerf_core.data.dataset import ImageSet
+from advnerf_core.data.views import ImageSet
 from advnerf_core.geometry import Array
 from advnerf_core.scene.metrics import gain_fitted, psnr
 from advnerf_core.scene.presets import PHOTOGRAPH_BANDS, PRESETS

@@ -17,13 +17,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from advnerf_core.data.dataset import load_transforms
 from advnerf_core.data.lens import Lens
+from advnerf_core.data.transforms import load_transforms
 from advnerf_core.geometry import Pinhole
 from benchmarks.painted_corner import poses_of, some_camera, write_photographs
 from benchmarks.results import record_row
 from benchmarks.structure_from_motion import say
-from calibration.structure_from_motion import PhotoSource, ReconstructionError, SfmConfig, reconstruct
+from calibration.photo_model import PhotoSource, ReconstructionError, SfmConfig
+from calibration.structure_from_motion import reconstruct
 
 COMMAND = "python -m benchmarks.few_photographs"
 TEN_PERCENT, ELEVEN_PERCENT = 5.0, 1.0

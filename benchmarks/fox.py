@@ -14,7 +14,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from advnerf_core.data.dataset import ImageSet, load_transforms
+from advnerf_core.data.transforms import load_transforms
+from advnerf_core.data.views import ImageSet
 from advnerf_core.parallel import thread_count
 from advnerf_core.scene.field import SceneFieldConfig
 from advnerf_core.scene.metrics import psnr

@@ -11,7 +11,8 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from advnerf_core.data.dataset import ImageSet, PosedImages, load_transforms
+from advnerf_core.data.transforms import load_transforms
+from advnerf_core.data.views import ImageSet, PosedImages
 from advnerf_core.scene.field import SceneFieldConfig
 from advnerf_core.scene.presets import PHOTOGRAPH_BANDS, scene_preset
 from advnerf_core.scene.train import train_scene

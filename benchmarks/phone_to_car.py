@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from advnerf_core.data.dataset import load_image, load_transforms
 from advnerf_core.data.keyframes import KeyframeConfig
+from advnerf_core.data.transforms import load_transforms
+from advnerf_core.data.view_loading import load_image
 from advnerf_core.policies.network import images_to_tensor
 from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.scene.colour import IDENTITY
@@ -28,7 +29,7 @@ from advnerf_core.scene.train import TrainConfig, train_scene
 from benchmarks.lab_recordings import lab_with_phone, photograph, record_drive
 from benchmarks.results import record_row
 from benchmarks.structure_from_motion import say
-from calibration.structure_from_motion import SfmConfig
+from calibration.photo_model import SfmConfig
 from hardware.worlds.lab.lab import Lab
 from hardware.worlds.lab.phone import video_poses
 from nodes.lab.importing.colours import match_colours

@@ -20,7 +20,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.driving.expert import Expert, ExpertConfig
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.files import write_atomically
-from advnerf_core.learning.imitation import ImitationConfig
+from advnerf_core.learning.recipe import ImitationConfig
 from advnerf_core.policies.view import PolicyView
 from benchmarks.results import record_row
 from calibration.schema import CameraCalibration, RoomCalibration, load_calibration

@@ -19,7 +19,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from advnerf_core.data.dataset import ImageSet, load_transforms
+from advnerf_core.data.transforms import load_transforms
+from advnerf_core.data.views import ImageSet
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.geometry import Array, Pinhole
 from advnerf_core.objects.voxel.generators import small_car

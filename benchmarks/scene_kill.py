@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from advnerf_core.data.dataset import ImageSet
+from advnerf_core.data.views import ImageSet
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Pinhole

@@ -17,7 +17,8 @@ import numpy as np
 from advnerf_core.data.similarity import align_poses
 from benchmarks.lab_recordings import lab_with_phone, photograph
 from benchmarks.results import record_row
-from calibration.structure_from_motion import PhotoSource, SfmConfig, reconstruct
+from calibration.photo_model import PhotoSource, SfmConfig
+from calibration.structure_from_motion import reconstruct
 from hardware.worlds.lab.lab import Lab
 from hardware.worlds.lab.phone import video_poses
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from advnerf_core.data.dataset import ImageSet
+from advnerf_core.data.views import ImageSet
 from advnerf_core.fields.hash_grid import HashGrid, encode_reference
 from advnerf_core.parallel import thread_count
 from advnerf_core.policies.view import PolicyView

@@ -15,7 +15,7 @@ import numpy as np
 
 from advnerf_core.data.similarity import Alignment, align_poses
 from advnerf_core.geometry import Array
-from calibration.structure_from_motion import Model, ReconstructionError
+from calibration.photo_model import Model, ReconstructionError
 
 _MIN_SHARED = 6
 # Largest angle of a frame from its motion-capture pose [rad].

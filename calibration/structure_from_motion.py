@@ -17,26 +17,12 @@ from advnerf_core.run_module import module_command
 from calibration.colmap_messages import pack_job, unpack_answer
 from calibration.photo_model import (
     MIN_IMAGES,
-    FoundCamera,
-    LeftOut,
     Model,
     PhotoSource,
     ReconstructionError,
-    Registered,
     Report,
     SfmConfig,
 )
-
-__all__ = [
-    "FoundCamera",
-    "LeftOut",
-    "Model",
-    "PhotoSource",
-    "ReconstructionError",
-    "Registered",
-    "SfmConfig",
-    "reconstruct",
-]  # fmt: skip
 
 
 def reconstruct(

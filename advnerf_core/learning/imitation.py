@@ -29,16 +29,6 @@ from advnerf_core.policies.network import SteeringNetwork
 from advnerf_core.policies.policy_file import save_policy
 from advnerf_core.policies.view import PolicyView
 
-__all__ = [
-    "ImitationConfig",
-    "ImitationProgress",
-    "Learned",
-    "SourcePlan",
-    "TrainedPolicy",
-    "recovery_states",
-    "train_policy",
-]
-
 
 class Learned(NamedTuple):
     """How well a network in training fits its frames.

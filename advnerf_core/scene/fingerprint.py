@@ -8,7 +8,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from advnerf_core.data.dataset import ImageSet
+from advnerf_core.data.views import ImageSet
 from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.field import SceneFieldConfig
 from advnerf_core.scene.train_config import TrainConfig

@@ -199,7 +199,7 @@ def mocap_to_scene(
     ],
 ) -> None:
     """Calibrate scale and pose of a scene in the motion-capture world, from images with poses in both frames."""
-    from advnerf_core.data.dataset import load_transforms
+    from advnerf_core.data.transforms import load_transforms
     from calibration.mocap_to_scene import place_scene
     from calibration.plots import scene_plot
 

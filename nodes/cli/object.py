@@ -197,7 +197,7 @@ def _from_images(
     coarse_to_fine: bool,
     report: Report,
 ) -> ObjectModel:
-    from advnerf_core.data.dataset import load_transforms
+    from advnerf_core.data.transforms import load_transforms
     from advnerf_core.objects.voxel.build import build_from_images
     from advnerf_core.objects.voxel.pictures import load_pictures
 

@@ -14,7 +14,7 @@ from nodes.runtime.terminal import PolicyName, experiment_argument, print_table,
 
 if TYPE_CHECKING:
     from advnerf_core.driving.expert import Expert
-    from advnerf_core.learning.imitation import SourcePlan
+    from advnerf_core.learning.recipe import SourcePlan
     from advnerf_core.policies.architecture import Architecture
     from advnerf_core.policies.view import PolicyView
     from nodes.lab.policy_data.frames import RecordedFrames
@@ -151,7 +151,7 @@ def train(
     ] = None,
 ) -> None:
     """Train a policy on recordings: laps of the expert, relabelled drives of the policy (DAgger), logs of other cars."""
-    from advnerf_core.learning.imitation import ImitationConfig
+    from advnerf_core.learning.recipe import ImitationConfig
     from nodes.lab.policy_data.train import train_from_recordings
     from nodes.runtime.errors import ConfigError
     from nodes.runtime.progress import ProgressDisplay

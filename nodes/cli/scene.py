@@ -66,7 +66,7 @@ def scene_eval(
     interval_scale: IntervalScale = 1.0,
 ) -> None:
     """Evaluate a scene on the held-out images of a data set."""
-    from advnerf_core.data.dataset import load_transforms
+    from advnerf_core.data.transforms import load_transforms
     from advnerf_core.scene.render_field import FieldRenderer
     from nodes.lab.scene_training import evaluate
 
@@ -88,7 +88,7 @@ def scene_render(
     interval_scale: IntervalScale = 1.0,
 ) -> None:
     """Render a scene from the cameras of a data set: colour, depth and, optionally, a video."""
-    from advnerf_core.data.dataset import load_transforms
+    from advnerf_core.data.transforms import load_transforms
     from advnerf_core.scene.render_field import FieldRenderer
     from nodes.lab.scene_training import render
     from nodes.runtime.progress import ProgressDisplay

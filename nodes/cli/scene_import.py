@@ -147,7 +147,7 @@ def from_phone_and_car(
 ) -> None:
     """Combine phone media and the frames of a bag into one model, metric and in the motion-capture world."""
     from advnerf_core.data.keyframes import KeyframeConfig
-    from calibration.structure_from_motion import SfmConfig
+    from calibration.photo_model import SfmConfig
     from nodes.lab.importing.data_set import from_phone_and_car as run
     from nodes.lab.importing.driven_bag import BagConfig
     from nodes.lab.importing.media import MediaConfig
@@ -203,7 +203,7 @@ def _from_media(
     media: list[Path], output: Path, movement: float, most: int, one_camera: bool, extent_m: float, seed: int
 ) -> None:
     from advnerf_core.data.keyframes import KeyframeConfig
-    from calibration.structure_from_motion import SfmConfig
+    from calibration.photo_model import SfmConfig
     from nodes.lab.importing.data_set import from_media as run
     from nodes.lab.importing.media import MediaConfig
 

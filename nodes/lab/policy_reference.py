@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from advnerf_core.data.dataset import load_image, load_transforms
+from advnerf_core.data.transforms import load_transforms
+from advnerf_core.data.view_loading import load_image
 from advnerf_core.driving.clean_drive import CleanDrive
 from advnerf_core.driving.expert import Expert
 from advnerf_core.geometry import invert_transform, yaw_of

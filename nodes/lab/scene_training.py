@@ -13,8 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from advnerf_core.data.dataset import ImageSet, PosedImages, load_transforms
 from advnerf_core.data.image_files import OPAQUE
+from advnerf_core.data.transforms import load_transforms
+from advnerf_core.data.views import ImageSet, PosedImages
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array

@@ -20,7 +20,8 @@ import viser
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from advnerf_core.data.dataset import ImageSet, load_transforms
+from advnerf_core.data.transforms import load_transforms
+from advnerf_core.data.views import ImageSet
 from advnerf_core.geometry import Array, Pinhole
 from advnerf_core.objects.voxel.model import load_object
 from advnerf_core.scene.render_field import FieldRenderer

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from advnerf_core.data.dataset import ImageSet
+from advnerf_core.data.views import ImageSet
 from advnerf_core.geometry import Pinhole
 from benchmarks.exposure import exposed, known_gains
 

@@ -6,7 +6,7 @@ from advnerf_core.data.lens import Lens
 from advnerf_core.data.similarity import Similarity, SimilarityError
 from advnerf_core.geometry import Pinhole, camera_mount, make_transform, planar_pose
 from calibration.phone_and_car import place_in_mocap
-from calibration.structure_from_motion import Model, ReconstructionError, Registered
+from calibration.photo_model import Model, ReconstructionError, Registered
 
 MOUNT = camera_mount(0.3, 0.0, 0.2, 0.17)
 # How the model's world lies in motion capture's.

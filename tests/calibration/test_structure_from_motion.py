@@ -13,7 +13,8 @@ from advnerf_core.data.lens import Lens
 from advnerf_core.data.similarity import align_poses
 from advnerf_core.geometry import Pinhole, look_at
 from benchmarks.painted_corner import WALL_M, WALLS, photograph, poses_of, some_camera, write_photographs
-from calibration.structure_from_motion import PhotoSource, ReconstructionError, SfmConfig, reconstruct
+from calibration.photo_model import PhotoSource, ReconstructionError, SfmConfig
+from calibration.structure_from_motion import reconstruct
 
 PHONE = Pinhole(400, 300, 330.0, 330.0, 200.0, 150.0)
 CAR = Pinhole(320, 200, 210.0, 210.0, 160.0, 100.0)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from advnerf_core.data.dataset import write_transforms
+from advnerf_core.data.transforms_write import write_transforms
 from advnerf_core.geometry import camera_mount, make_transform, planar_pose
 from calibration.by_construction import twin_calibrations
 from calibration.charuco import Board, BoardDetector

@@ -167,7 +167,7 @@ def test_mistakes_are_one_line(command, pictures, tmp_path, arguments, message):
 
 
 def test_masks_decide_what_is_learned_from(pictures, tmp_path):
-    from advnerf_core.data.dataset import load_transforms
+    from advnerf_core.data.transforms import load_transforms
     from advnerf_core.errors import AdvnerfError
     from advnerf_core.scene.field import SceneFieldConfig
     from advnerf_core.scene.train import TrainConfig, Trainer

@@ -11,7 +11,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from advnerf_core.data.dataset import load_transforms
+from advnerf_core.data.transforms import load_transforms
 from advnerf_core.geometry import Array, Pinhole, look_at
 from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.field import load_scene, save_scene

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from advnerf_core.data.dataset import ImageSet
+from advnerf_core.data.views import ImageSet
 from advnerf_core.geometry import Array, Pinhole, look_at
 
 HALF = np.array([1.0, 1.0, 0.5])

@@ -37,7 +37,7 @@ def measured(folder: Path) -> dict[str, dict[str, Any]]:
         folder: Gets the run folder.
     """
     os.environ.setdefault("MUJOCO_GL", "egl")
-    from advnerf_core.data.dataset import load_transforms
+    from advnerf_core.data.transforms import load_transforms
     from advnerf_core.objects.voxel.build import build_from_mesh
     from advnerf_core.objects.voxel.generators import GENERATORS
     from advnerf_core.objects.voxel.mesh import stand

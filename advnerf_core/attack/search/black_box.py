@@ -30,7 +30,7 @@ from torch import Tensor
 
 from advnerf_core.attack.adjoint import AdjointResult, gradient_pass
 from advnerf_core.attack.methods import FRESH_RUN, SearchRun, SearchSettings
-from advnerf_core.attack.problem import AttackProblem
+from advnerf_core.attack.problem import AttackProblem, SearchDivergedError
 from advnerf_core.attack.search.distil import (
     ArchitectureStudent,
     Distillation,
@@ -44,7 +44,6 @@ from advnerf_core.attack.search.population import Coarse
 from advnerf_core.attack.search.query_count import CountedPolicy, calls_per_evaluation
 from advnerf_core.attack.search.search import (
     Evaluation,
-    SearchDivergedError,
     SearchResult,
     SearchState,
     begin_drawing,

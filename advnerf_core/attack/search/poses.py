@@ -38,12 +38,6 @@ from advnerf_core.attack.search.search import (
     without_gradient,
 )
 from advnerf_core.attack.spaces.placed_sensor import PlacedSensor
-from advnerf_core.attack.spaces.placement import KeepOut, PoseBounds, PoseBoundsError, PoseSpace, placed
-
-__all__ = [
-    "KeepOut", "MultiStart", "PlacedSensor", "PoseBounds", "PoseBoundsError", "PoseSpace", "judge", "multi_start", "placed", "placed_problem",
-    "random_poses",
-]  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -29,12 +29,6 @@ from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
 from advnerf_core.places import open_tensors
 
-__all__ = [
-    "Evaluation", "OnEvaluation", "SearchDivergedError", "SearchResult", "SearchState", "SearchStateError", "begin",
-    "begin_drawing", "draw_start_states", "evaluate_theta", "evaluation_from_json", "go_on", "gradient_step", "load_state", "random_spread", "require_finite", "search_fingerprint",
-    "without_gradient",
-]  # fmt: skip
-
 _FORMAT = "advnerf-search-1"
 
 

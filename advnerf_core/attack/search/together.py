@@ -20,10 +20,10 @@ from safetensors.torch import save
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem, Sensor, Totals, adjoint_gradient
+from advnerf_core.attack.problem import SearchDivergedError
 from advnerf_core.attack.search.descent import Descent
 from advnerf_core.attack.search.search import (
     Evaluation,
-    SearchDivergedError,
     SearchResult,
     SearchState,
     SearchStateError,

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from advnerf_core.data.dataset import load_transforms
 from advnerf_core.data.image_files import write_image
+from advnerf_core.data.transforms import load_transforms
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.baked import BakedScene

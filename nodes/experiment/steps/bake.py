@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from advnerf_core.data.dataset import load_transforms
+from advnerf_core.data.transforms import load_transforms
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, planar_poses

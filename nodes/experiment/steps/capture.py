@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from advnerf_core.data.posed_images import write_posed_images
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, Pinhole, planar_pose
-from advnerf_core.learning.imitation import recovery_states
+from advnerf_core.learning.recipe import recovery_states
 from calibration.by_construction import write_twin_calibrations
 from calibration.schema import save_calibration
 from hardware.worlds.lab.lab import Lab

@@ -21,7 +21,7 @@ from advnerf_core.attack.projection import FaceOverlay
 from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.attack.spaces.space import Shown, Space
 from advnerf_core.attack.transfer import AttackableScene
-from advnerf_core.data.dataset import load_transforms
+from advnerf_core.data.transforms import load_transforms
 from advnerf_core.documents import read_json
 from advnerf_core.driving.measured_car import CarResponse, RespondingCar, fit_response
 from advnerf_core.driving.metrics import Horizon

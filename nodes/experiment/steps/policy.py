@@ -14,19 +14,15 @@ import torch
 
 from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.attack.spaces.face import FaceSpace
-from advnerf_core.data.dataset import load_image, load_transforms
 from advnerf_core.data.image_files import write_image
+from advnerf_core.data.transforms import load_transforms
+from advnerf_core.data.view_loading import load_image
 from advnerf_core.driving.path import Array
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import planar_pose
-from advnerf_core.learning.imitation import (
-    ImitationConfig,
-    ImitationProgress,
-    Learned,
-    SourcePlan,
-    train_policy,
-)
+from advnerf_core.learning.imitation import ImitationProgress, Learned, train_policy
+from advnerf_core.learning.recipe import ImitationConfig, SourcePlan
 from advnerf_core.learning.sources import FrameSource, RenderedSource, SceneSource, Show
 from advnerf_core.policies.network import Policy, images_to_tensor
 from advnerf_core.policies.policy_file import load_policy

@@ -28,7 +28,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.driving.path import Array
 from advnerf_core.files import write_atomically
 from advnerf_core.learning.frames import Frames, FrameStore
-from advnerf_core.learning.imitation import SourcePlan, recovery_states
+from advnerf_core.learning.recipe import SourcePlan, recovery_states
 from advnerf_core.learning.retrain import FineTuneConfig, fine_tune
 from advnerf_core.learning.sources import PolicyImages, steer_with
 from advnerf_core.policies.policy_file import LoadedPolicy, load_policy

@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from advnerf_core.data.dataset import ImageSet, load_transforms
+from advnerf_core.data.transforms import load_transforms
+from advnerf_core.data.views import ImageSet
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.scene.colour import ColourMap, fit_colour_map
 from advnerf_core.scene.field import SceneFieldConfig, save_scene

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from advnerf_core.data.dataset import ImageSet, load_transforms
+from advnerf_core.data.transforms import load_transforms
+from advnerf_core.data.views import ImageSet
 from advnerf_core.scene.colour import IDENTITY, ColourMap, fit_colour_map
 from advnerf_core.scene.field import load_scene, save_scene
 from advnerf_core.scene.metrics import psnr

@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from advnerf_core.data.dataset import write_transforms
 from advnerf_core.data.lens import Lens
 from advnerf_core.data.similarity import Similarity, extent
+from advnerf_core.data.transforms_write import write_transforms
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, Pinhole, make_transform
 from calibration.phone_and_car import Placed, place_in_mocap
-from calibration.structure_from_motion import Model, PhotoSource, SfmConfig, reconstruct
+from calibration.photo_model import Model, PhotoSource, SfmConfig
+from calibration.structure_from_motion import reconstruct
 from nodes.lab.importing.driven_bag import CAR_CAMERA, BagConfig, DrivenFrames, take_frames
 from nodes.lab.importing.errors import ImportRecordingError
 from nodes.lab.importing.media import IMAGES, MediaConfig, gather

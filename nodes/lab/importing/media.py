@@ -16,7 +16,7 @@ from advnerf_core.data import image_bytes, image_files, video
 from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.keyframes import KeyframeConfig
 from advnerf_core.files import write_atomically
-from calibration.structure_from_motion import PhotoSource
+from calibration.photo_model import PhotoSource
 from nodes.lab.importing.errors import ImportRecordingError
 from nodes.runtime.progress import Report
 

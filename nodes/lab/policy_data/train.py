@@ -17,7 +17,8 @@ from advnerf_core.driving.expert import Expert
 from advnerf_core.files import write_atomically
 from advnerf_core.learning.fit import FitConfig, fit, mean_absolute_error
 from advnerf_core.learning.frames import FrameSet, FrameStore
-from advnerf_core.learning.imitation import ImitationConfig, ImitationProgress, SourcePlan, train_policy
+from advnerf_core.learning.imitation import ImitationProgress, train_policy
+from advnerf_core.learning.recipe import ImitationConfig, SourcePlan
 from advnerf_core.places import require_utf8
 from advnerf_core.policies.policy_file import copy_policy, save_policy
 from advnerf_core.policies.view import PolicyView

@@ -8,10 +8,11 @@ import torch
 
 from advnerf_core.attack.adjoint import BlackBoxError, adjoint_gradient
 from advnerf_core.attack.methods import SearchRun
+from advnerf_core.attack.problem import SearchDivergedError
 from advnerf_core.attack.search.cem import CrossEntropy
 from advnerf_core.attack.search.evolution import Evolution, rank_utilities
 from advnerf_core.attack.search.population import Coarse, population_search
-from advnerf_core.attack.search.search import SearchDivergedError, SearchStateError
+from advnerf_core.attack.search.search import SearchStateError
 from benchmarks.attack_toy import random_policy, toy_problem
 
 STRATEGIES = [CrossEntropy(), Evolution()]

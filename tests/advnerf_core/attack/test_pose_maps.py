@@ -9,7 +9,7 @@ import torch
 from advnerf_core.attack.adjoint import evaluate
 from advnerf_core.attack.pose_maps import PoseMapError, landscape, robustness_map
 from advnerf_core.attack.pose_plots import draw_landscape, draw_placements, draw_robustness
-from advnerf_core.attack.search.poses import placed
+from advnerf_core.attack.spaces.placement import placed
 from tests.support.placed_toy import SQUARE, moving
 
 GRID = ([2.2, 2.7, 3.2], [-2.0, -1.4], [2.9])

@@ -10,21 +10,17 @@ from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
 from advnerf_core.attack.artifact import AttackFile, AttackFileError
 from advnerf_core.attack.health import central_slopes, frozen_loss, random_directions, slopes_of
 from advnerf_core.attack.methods import SearchRun, SearchSettings
-from advnerf_core.attack.search.poses import (
+from advnerf_core.attack.search.poses import MultiStart, judge, multi_start, placed_problem, random_poses
+from advnerf_core.attack.search.search import SearchStateError
+from advnerf_core.attack.spaces.placed_sensor import PlacedSensor
+from advnerf_core.attack.spaces.placement import (
     KeepOut,
-    MultiStart,
-    PlacedSensor,
     PoseBounds,
     PoseBoundsError,
     PoseSpace,
-    judge,
-    multi_start,
+    footprint,
     placed,
-    placed_problem,
-    random_poses,
 )
-from advnerf_core.attack.search.search import SearchStateError
-from advnerf_core.attack.spaces.placement import footprint
 from advnerf_core.attack.spaces.places import PlaceLimits, PlaceSpace, randomly_placed
 from advnerf_core.attack.spaces.space import NamedObject, SpaceError
 from advnerf_core.fields.soft_edges import with_soft_edges

@@ -6,15 +6,10 @@ import torch
 
 from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
 from advnerf_core.attack.methods import SearchRun
+from advnerf_core.attack.problem import SearchDivergedError
 from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.search.random_search import random_search
-from advnerf_core.attack.search.search import (
-    SearchDivergedError,
-    SearchState,
-    SearchStateError,
-    draw_start_states,
-    load_state,
-)
+from advnerf_core.attack.search.search import SearchState, SearchStateError, draw_start_states, load_state
 from advnerf_core.scene.surrogate import Rendered
 from benchmarks.attack_toy import toy_problem
 

@@ -14,7 +14,8 @@ from advnerf_core.driving.path import Arc, Line
 from advnerf_core.driving.path import Path as Track
 from advnerf_core.geometry import Pinhole
 from advnerf_core.learning.frames import FrameStore
-from advnerf_core.learning.imitation import ImitationConfig, SourcePlan, recovery_states, train_policy
+from advnerf_core.learning.imitation import train_policy
+from advnerf_core.learning.recipe import ImitationConfig, SourcePlan, recovery_states
 from advnerf_core.learning.sources import RenderedSource
 from advnerf_core.policies.architecture import Architecture
 from advnerf_core.policies.pilotnet import PilotNet

@@ -16,7 +16,8 @@ from advnerf_core.geometry import Pinhole, VehicleState, camera_mount, planar_po
 from advnerf_core.learning import imitation
 from advnerf_core.learning.fit import FitConfig, fit, mean_absolute_error
 from advnerf_core.learning.frames import Frames, FrameSet, FrameStore, FrameStoreError
-from advnerf_core.learning.imitation import ImitationConfig, SourcePlan, recovery_states, train_policy
+from advnerf_core.learning.imitation import train_policy
+from advnerf_core.learning.recipe import ImitationConfig, SourcePlan, recovery_states
 from advnerf_core.learning.sources import RenderedSource, SceneSource, steer_with
 from advnerf_core.policies.architecture import Architecture
 from advnerf_core.policies.pilotnet import PilotNet

@@ -149,7 +149,7 @@ import resource, sys, tracemalloc
 from pathlib import Path
 from advnerf_core.objects.voxel.build import build_from_images
 from advnerf_core.objects.voxel.pictures import load_pictures
-from advnerf_core.data.dataset import load_transforms
+from advnerf_core.data.transforms import load_transforms
 listed = load_transforms(Path(sys.argv[1]))
 warm = load_pictures(listed, (64, 64))
 build_from_images(warm, "warm", resolution=16, steps=1)

@@ -4,8 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from advnerf_core.data.dataset import DatasetError, Lens, load_transforms
-from advnerf_core.data.lens import straightening
+from advnerf_core.data.errors import DatasetError
+from advnerf_core.data.lens import Lens, straightening
+from advnerf_core.data.transforms import load_transforms
 from advnerf_core.geometry import Pinhole
 
 SIZE = (160, 120)

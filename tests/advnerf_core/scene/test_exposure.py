@@ -8,7 +8,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from advnerf_core.data.dataset import ImageSet
+from advnerf_core.data.views import ImageSet
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.geometry import Array
 from advnerf_core.render.march import MarchConfig, Samples

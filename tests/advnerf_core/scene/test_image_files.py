@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image, ImageOps
 
-from advnerf_core.data.dataset import DatasetError, load_transforms
+from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.image_bytes import is_damaged
 from advnerf_core.data.image_files import image_size, read_mask, read_stored, read_upright
+from advnerf_core.data.transforms import load_transforms
 from nodes.lab.policy_data.frames import frames_of_log
 from nodes.lab.wizards.bags import read_picture
 

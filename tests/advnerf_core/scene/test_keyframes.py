@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
-from advnerf_core.data.dataset import DatasetError
+from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.keyframes import KeyframeConfig, KeyframeSelector, sharpness, work_image
 from advnerf_core.data.video import keep_keyframes, read_video
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from advnerf_core.data.dataset import ImageSet
+from advnerf_core.data.views import ImageSet
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.geometry import Pinhole, look_at
 from advnerf_core.render.march import MarchConfig, Marcher

@@ -5,7 +5,10 @@ import cv2
 import numpy as np
 import pytest
 
-from advnerf_core.data.dataset import DatasetError, Lens, load_transforms, write_transforms
+from advnerf_core.data.errors import DatasetError
+from advnerf_core.data.lens import Lens
+from advnerf_core.data.transforms import load_transforms
+from advnerf_core.data.transforms_write import write_transforms
 from advnerf_core.geometry import OPENGL_FROM_OPENCV, Pinhole, look_at
 
 FOX = Path("../shared/data/fox")

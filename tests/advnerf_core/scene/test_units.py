@@ -7,7 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from advnerf_core.data.dataset import DatasetError, ImageSet, load_transforms
+from advnerf_core.data.errors import DatasetError
+from advnerf_core.data.transforms import load_transforms
+from advnerf_core.data.views import ImageSet
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.geometry import Pinhole
 from advnerf_core.scene.bake import NotBakedError, bake

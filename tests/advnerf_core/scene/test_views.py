@@ -4,9 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from advnerf_core.data.dataset import DatasetError, load_transforms
+from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.image_bytes import is_damaged
 from advnerf_core.data.image_files import image_size, read_stored
+from advnerf_core.data.transforms import load_transforms
 
 EYE = np.eye(4).tolist()
 

@@ -4,7 +4,7 @@ import pathlib
 
 import numpy as np
 
-from advnerf_core.attack.search.poses import KeepOut, PoseBounds, PoseSpace
+from advnerf_core.attack.spaces.placement import KeepOut, PoseBounds, PoseSpace
 from advnerf_core.driving.path import Path
 from advnerf_core.objects.voxel.build import build_from_mesh
 from advnerf_core.objects.voxel.generators import GENERATORS

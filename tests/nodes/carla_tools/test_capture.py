@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from advnerf_core.data.dataset import load_transforms
+from advnerf_core.data.transforms import load_transforms
 from advnerf_core.geometry import transform_points
 from hardware.worlds.carla import CarlaConfig, CarlaUnreachable
 from hardware.worlds.carla.drives import JunctionDrives

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import yaml
 
-from advnerf_core.data.dataset import load_transforms
+from advnerf_core.data.transforms import load_transforms
 from advnerf_core.report.clips import read_clip
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import runs_alone

@@ -9,7 +9,8 @@ import pytest
 import yaml
 
 from advnerf_core.driving.expert import Expert
-from advnerf_core.learning.imitation import ImitationConfig, SourcePlan, train_policy
+from advnerf_core.learning.imitation import train_policy
+from advnerf_core.learning.recipe import ImitationConfig, SourcePlan
 from advnerf_core.policies.architecture import Architecture
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps.elsewhere import plans_elsewhere

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import yaml
 
-from advnerf_core.data.dataset import load_transforms
 from advnerf_core.data.posed_images import write_posed_images
+from advnerf_core.data.transforms import load_transforms
 from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import make_transform, planar_pose, rotation_z

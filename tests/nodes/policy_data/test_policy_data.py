@@ -7,7 +7,7 @@ import torch
 
 from advnerf_core.driving.expert import Expert
 from advnerf_core.driving.path import Path as DrivingPath
-from advnerf_core.learning.imitation import ImitationConfig
+from advnerf_core.learning.recipe import ImitationConfig
 from advnerf_core.policies.policy_file import load_policy
 from nodes.lab.policy_data.evaluate import compare, saliency
 from nodes.lab.policy_data.frames import frames_of_log, view_for_size

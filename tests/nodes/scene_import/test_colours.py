@@ -4,7 +4,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from advnerf_core.data.dataset import write_transforms
+from advnerf_core.data.transforms_write import write_transforms
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.geometry import Pinhole, look_at
 from advnerf_core.scene.colour import IDENTITY, ColourMap

@@ -5,12 +5,12 @@ import sys
 import numpy as np
 import pytest
 
-from advnerf_core.data.dataset import load_transforms
 from advnerf_core.data.lens import Lens
 from advnerf_core.data.similarity import Similarity, align_poses, extent
+from advnerf_core.data.transforms import load_transforms
 from advnerf_core.geometry import Pinhole, look_at, make_transform, rotation_x, rotation_z
 from benchmarks.lab_recordings import lab_with_phone, photograph, record_drive
-from calibration.structure_from_motion import Model, Registered, SfmConfig
+from calibration.photo_model import Model, Registered, SfmConfig
 from hardware.worlds.lab.lab import Lab
 from hardware.worlds.lab.phone import video_poses
 from nodes.lab.importing.data_set import from_media, upright

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from advnerf_core.data.dataset import load_transforms
+from advnerf_core.data.transforms import load_transforms
 from advnerf_core.geometry import camera_mount, planar_pose
 from hardware.worlds.lab.config import LabConfig
 from nodes.cli import main as cli

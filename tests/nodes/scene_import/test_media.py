@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from advnerf_core.data.dataset import DatasetError
+from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.image_files import read_stored
 from nodes.lab.importing.errors import ImportRecordingError
 from nodes.lab.importing.media import MediaConfig, gather, photographs_in

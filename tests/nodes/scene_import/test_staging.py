@@ -7,8 +7,8 @@ import cv2
 import psutil
 import pytest
 
-from advnerf_core.data.dataset import load_transforms
 from advnerf_core.data.lens import Lens
+from advnerf_core.data.transforms import load_transforms
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Pinhole
 from benchmarks.painted_corner import poses_of, write_photographs

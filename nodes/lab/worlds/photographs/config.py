@@ -10,7 +10,8 @@ from typing import Annotated
 from pydantic import AfterValidator, Field, ValidationInfo, computed_field, model_validator
 from pydantic_core import PydanticCustomError
 
-from advnerf_core.data.dataset import PosedImages, load_transforms
+from advnerf_core.data.transforms import load_transforms
+from advnerf_core.data.views import PosedImages
 from advnerf_core.files import sha256_of
 from advnerf_core.geometry import Pinhole
 from advnerf_core.places import expanded

@@ -9,7 +9,8 @@ from typing import Any, ClassVar, NoReturn
 import cv2
 import numpy as np
 
-from advnerf_core.data.dataset import PosedImage, load_image
+from advnerf_core.data.posed_image import PosedImage
+from advnerf_core.data.view_loading import load_image
 from advnerf_core.geometry import Array, Pinhole, VehicleState, camera_mount, invert_transform, make_transform
 from hardware.worlds.world import Box, CarDescription, Photograph, Rgb, WorldDescription, WorldError
 from nodes.lab.worlds.photographs.config import PhotographsConfig, read_images
