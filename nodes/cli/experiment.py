@@ -78,21 +78,21 @@ _COLOURS = {
 _FAILURE_EXIT = 1
 
 
-def load_cells(choice: CellChoice) -> tuple[Campaign, list[Cell]]:
-    """The cells of a file, all and those that are wanted."""
+def load_cells(choice: CellChoice, executes: bool = True) -> tuple[Campaign, list[Cell]]:
+    """The cells of a file, all and those that are wanted; see `load_experiment` for ``executes``."""
     os.environ.setdefault("MUJOCO_GL", "egl")
     from nodes.experiment.plan.cell import select
     from nodes.experiment.run.config import campaign_of, is_campaign, load_campaign
 
     overrides = choice.overrides or []
     if is_campaign(choice.file):
-        campaign = load_campaign(choice.file, choice.folder, tuple(overrides))
+        campaign = replace(load_campaign(choice.file, choice.folder, tuple(overrides)), executes=executes)
     else:
         from nodes.experiment.steps.attack import cells
         from nodes.experiment.steps.run import load_experiment
 
         folder = choice.folder or Path("runs") / choice.setting
-        experiment = load_experiment(choice.file, choice.setting, overrides, folder)
+        experiment = load_experiment(choice.file, choice.setting, overrides, folder, executes)
         campaign = campaign_of(experiment, overrides, cells(experiment))
     _know_methods(campaign)
     return campaign, select(campaign.cells, choice.only)
@@ -259,7 +259,7 @@ def status(
     """Say which cells are done, running, failed (and why), made with other settings, or missing."""
     from nodes.experiment.run.plan import statuses
 
-    campaign, cells = load_cells(choice)
+    campaign, cells = load_cells(choice, executes=False)
     found = statuses(campaign, cells)
     rows = table("cell", "state", "")
     for each in found:
@@ -285,7 +285,7 @@ def table_command(
     ] = None,
 ) -> None:
     """Print the table of all cells, and the targets."""
-    campaign, cells = load_cells(choice)
+    campaign, cells = load_cells(choice, executes=False)
     _show(campaign, cells, None, source)
 
 
@@ -309,7 +309,7 @@ def report(
         raise ConfigError(
             "expected --output with --only, as the page of some cells would replace that of all"
         )
-    campaign, cells = load_cells(choice)
+    campaign, cells = load_cells(choice, executes=False)
     _show(campaign, cells, output or _page_folder(campaign), source)
 
 

@@ -22,7 +22,7 @@ Experiment = SimpleNamespace
 Bench = nullcontext
 
 
-def load_experiment(file, setting, overrides, folder):
+def load_experiment(file, setting, overrides, folder, executes=True):
     data = read_yaml(file).data
     del data["settings"]
     for text in overrides:

@@ -10,7 +10,7 @@ from typing import Any
 from advnerf_core.attack.artifact import PLACES, load_attack
 from advnerf_core.attack.spaces.space import Space
 from advnerf_core.report.conditions import NONE
-from hardware.worlds.world import World, traits_of
+from hardware.worlds.world import World
 from nodes.experiment.engine.artefact import ReferenceBuild
 from nodes.experiment.engine.stages import keep_stages
 from nodes.experiment.plan.cell import Cell
@@ -167,8 +167,8 @@ def needed_settings(experiment: Experiment) -> dict[str, Any]:
 
 def runs_alone(experiment: Experiment) -> bool:
     """Whether a cell needs the machine for itself, as live nodes measure time, or a server that steps one world at a time."""
-    deployed = traits_of(experiment.deployed_world.make())
-    return deployed.exclusive or experiment.traits.exclusive or experiment.config.deploy.live
+    exclusive = experiment.deployed_traits.exclusive or experiment.traits.exclusive
+    return exclusive or experiment.config.deploy.live
 
 
 def has_learned_scene(experiment: Experiment) -> bool:

@@ -128,6 +128,7 @@ class Campaign:
         gate: What a learned scene must reach; None judges none.
         reference: What the table is held against.
         contrasts: Conditions that are told apart.
+        executes: As of `Experiment`.
     """
 
     name: str
@@ -138,6 +139,7 @@ class Campaign:
     gate: GateLimits | None = None
     reference: Reference = field(default_factory=Reference)
     contrasts: tuple[Contrast, ...] = ()
+    executes: bool = True
 
     def scenario(self, cell: Cell) -> ScenarioConfig:
         """The scenario of a cell."""
@@ -227,6 +229,7 @@ def campaign_of(experiment: Experiment, overrides: Sequence[str], cells: Sequenc
         # By default the experiment itself judges, see `steering_gate`.
         experiment.config.gate if isinstance(experiment.config.gate, GateLimits) else None,
         experiment.held_to,
+        executes=experiment.executes,
     )
 
 

@@ -148,4 +148,5 @@ def read_experiment(campaign: Campaign, cell: Cell) -> Experiment:
         campaign.scenario(cell).setting,
         campaign.overrides(cell),
         campaign.run_folder(cell),
+        campaign.executes,
     )

@@ -32,12 +32,12 @@ from hardware.worlds.world import (
     Traits,
     World,
     WorldDescription,
-    traits_of,
 )
 from nodes.experiment.engine.run_folder import CELLS, RunFolder
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.plan.placed import PlacedObject, in_a_lane
+from nodes.experiment.show.kept_worlds import KeptWorld, is_users, kept_world
 from nodes.experiment.show.victims import given, given_in
 from nodes.lab.worlds.expert_drive import as_path
 from nodes.lab.worlds.named import NamedWorld, read_world, without
@@ -57,9 +57,11 @@ class Experiment(RunFolder[ExperimentConfig]):
 
     Attributes:
         kept: Digests of what its stages wrote that are kept with the code, and those of the run folder before them, when it was read.
+        executes: Whether worlds of a user's code may be executed; else what the run folder keeps of them is read.
     """
 
     kept: Mapping[str, str] = field(default_factory=dict)
+    executes: bool = True
 
     @classmethod
     def resolved_in(cls, folder: FilePath) -> Experiment:
@@ -70,18 +72,37 @@ class Experiment(RunFolder[ExperimentConfig]):
 
     @cached_property
     def named_world(self) -> NamedWorld:
-        """The world as the file names it, with its changes."""
+        """The world as the file names it, with its changes; its code is executed."""
         return read_world(Document(self.config.world, str(self.file)), self.file.parent)
 
     @property
     def world_settings(self) -> dict[str, Any]:
         """What of the world's configuration the results depend on, as JSON data."""
-        return self.named_world.settings
+        return self._known_world.settings
+
+    @cached_property
+    def _known_world(self) -> NamedWorld | KeptWorld:
+        return self._known(self.config.world)
+
+    def _known(self, section: dict[str, Any]) -> NamedWorld | KeptWorld:
+        if self.executes or not is_users(section):
+            return read_world(Document(section, str(self.file)), self.file.parent)
+        return kept_world(self.folder, section, self.file.parent)
 
     @cached_property
     def traits(self) -> Traits:
         """What is known of the world without opening it."""
-        return traits_of(self.named_world.make())
+        return self._known_world.traits
+
+    @cached_property
+    def deployed_traits(self) -> Traits:
+        """What is known of the world where attacks are deployed, without opening it."""
+        return self._known(self.config.deploy.world or self.config.world).traits
+
+    @property
+    def deployed_settings(self) -> dict[str, Any]:
+        """What of the configuration of the world where attacks are deployed the results depend on, as JSON data."""
+        return self._known(self.config.deploy.world or self.config.world).settings
 
     @cached_property
     def solids(self) -> Solids | None:
@@ -104,12 +125,12 @@ class Experiment(RunFolder[ExperimentConfig]):
             ConfigError: It must be asked, and nothing is captured yet.
         """
         try:
-            return self.named_world.make().describe()
+            return self._known_world.describe()
         except NotOpenError:
             kept = self._captured()
             if kept is None or kept["settings"] != self.seen_settings:
                 raise ConfigError(
-                    f"expected {self._kept_world} of this configuration, which the capture stage writes when the world {self.named_world.kind} is "
+                    f"expected {self._kept_world} of this configuration, which the capture stage writes when the world {self.world_settings['kind']} is "
                     "open; run that stage first"
                 ) from None
             return WorldDescription.from_dict(kept["description"])
@@ -160,6 +181,13 @@ class Experiment(RunFolder[ExperimentConfig]):
             if wanted is None
             else read_world(Document(wanted, str(self.file)), self.file.parent)
         )
+
+    @property
+    def named_worlds(self) -> list[tuple[dict[str, Any], NamedWorld]]:
+        """The sections of the file that name a world, each with that world."""
+        deployed = self.config.deploy.world
+        found = [(self.config.world, self.named_world)]
+        return found if deployed is None else [*found, (deployed, self.deployed_world)]
 
     @contextmanager
     def open_deployed_world(self) -> Iterator[World]:

@@ -92,9 +92,7 @@ def registered_settings(experiment: Experiment) -> dict[str, Any]:
         "config": config,
         "world": experiment.world_settings,
         **(
-            {}
-            if experiment.config.deploy.world is None
-            else {"deployed_world": experiment.deployed_world.settings}
+            {} if experiment.config.deploy.world is None else {"deployed_world": experiment.deployed_settings}
         ),
     }
 

@@ -27,6 +27,7 @@ from nodes.experiment.plan.space_config import FaceConfig
 from nodes.experiment.plan.victims import RETRAINED
 from nodes.experiment.show import objects
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.kept_worlds import WorldUnknownError, is_users, keep_worlds
 from nodes.experiment.show.victims import VictimUnknownError, given_in, look_at_given, victim_spec
 from nodes.experiment.steps import bake, capture, live, policy, retrain, scene
 from nodes.experiment.steps.live import lab_of
@@ -53,7 +54,9 @@ _WHOLE_STEP_S = 1e-6
 _TRAINING_FILES = ("frames", "*.checkpoint.safetensors", "*.shards.json", "settings.json")
 
 
-def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: Path) -> Experiment:
+def load_experiment(
+    file: Path, setting: str, overrides: Sequence[str], folder: Path, executes: bool = True
+) -> Experiment:
     """Resolve an experiment file.
 
     Args:
@@ -61,6 +64,7 @@ def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: 
         setting: Which of its settings to lay over its values.
         overrides: ``section.key=value`` texts, applied last.
         folder: The run folder.
+        executes: Whether a world of a user's code may be executed; else the file's values are not checked against that world.
 
     Raises:
         ConfigError: With file, line and the valid keys.
@@ -68,19 +72,25 @@ def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: 
     require_utf8(folder.absolute())
     document = read_setting(file, setting, overrides)
     config = validate(ExperimentConfig, document, file.parent)
-    read_world(document.part(("world",)), file.resolve().parent)
-    experiment = Experiment(config, file.resolve(), folder.resolve(), setting)
+    experiment = Experiment(config, file.resolve(), folder.resolve(), setting, executes=executes)
+    if executes or not is_users(config.world):
+        _check_world(experiment, document)
+    try:
+        stages = stages_of(experiment)
+    except (VictimUnknownError, WorldUnknownError):
+        return experiment  # nothing was run with its victims or its world
+    return replace(experiment, kept=stage_digests(stages, experiment.folder, REFERENCE))
+
+
+def _check_world(experiment: Experiment, document: Document) -> None:
+    """Refuse what does not fit the world, with the line of the file."""
+    read_world(document.part(("world",)), experiment.file.parent)
     _check_ticks(experiment, document)
     _check_objective(experiment, document)
-    if config.deploy.live:
+    if experiment.config.deploy.live:
         lab_of(experiment)
     if experiment.is_described:
         _check_places(experiment, document)
-    try:
-        stages = stages_of(experiment)
-    except VictimUnknownError:
-        return experiment  # nothing was run with its victims
-    return replace(experiment, kept=stage_digests(stages, experiment.folder, REFERENCE))
 
 
 def _check_ticks(experiment: Experiment, document: Document) -> None:
@@ -169,6 +179,7 @@ def make_ready(
     reference = None if anew else REFERENCE
     require_own_folder(experiment)
     look_at_given(experiment)
+    keep_worlds(experiment.folder, experiment.named_worlds)
     if experiment.config.trains:
         experiment.config.policy.network.check()
     return run_to_end(experiment, stages_of(experiment), _LIBRARIES, until, console, reference, watcher)

@@ -16,7 +16,7 @@ from advnerf_core.plugins import PluginError, absolute_reference, code_sha256, i
 from advnerf_core.strict import validate
 from hardware.worlds import ENTRY_POINTS
 from hardware.worlds import WORLDS as DRIVEN
-from hardware.worlds.world import World, WorldClass, members_of_a_world
+from hardware.worlds.world import Traits, World, WorldClass, WorldDescription, members_of_a_world, traits_of
 from nodes.runtime.errors import ConfigError
 
 _PAGE = "docs/worlds.md"
@@ -62,6 +62,19 @@ class NamedWorld:
                 f"world {self.kind}: expected {', '.join(missing)}, which it lacks; {_PAGE} says what a world must have"
             )
         return world
+
+    @property
+    def traits(self) -> Traits:
+        """What is known of it before it is opened."""
+        return traits_of(self.make())
+
+    def describe(self) -> WorldDescription:
+        """What it says about itself before it is opened.
+
+        Raises:
+            NotOpenError: It must be open for it.
+        """
+        return self.make().describe()
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -1,0 +1,107 @@
+"""What worlds of a user's code said of themselves when an experiment was run: states and tables of a run folder execute none of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from advnerf_core.documents import read_json
+from advnerf_core.files import write_json
+from advnerf_core.plain import PlainData
+from advnerf_core.plugins import code_sha256
+from hardware.worlds import ENTRY_POINTS
+from hardware.worlds.world import NotOpenError, Traits, WorldDescription
+from nodes.lab.worlds.named import WORLDS, NamedWorld
+from nodes.runtime.errors import RuntimeFault
+
+KEPT = "worlds.json"
+
+
+class WorldUnknownError(RuntimeFault):
+    """The experiment was not run yet with a world, or its code is another since."""
+
+
+@dataclass(frozen=True)
+class KeptWorld(PlainData):
+    """What is known of a world without its code.
+
+    Attributes:
+        section: The section of the experiment file that names it.
+        source_sha256: Hash of its code.
+        settings: As `NamedWorld.settings` says.
+        traits: As `NamedWorld.traits` says.
+        description: What it says about itself; None where it must be open for it.
+    """
+
+    section: dict[str, Any]
+    source_sha256: str
+    settings: dict[str, Any]
+    traits: Traits
+    description: WorldDescription | None
+
+    def describe(self) -> WorldDescription:
+        """What it says about itself.
+
+        Raises:
+            NotOpenError: It must be open for it.
+        """
+        if self.description is None:
+            raise NotOpenError(f"the world {self.settings['kind']} must be open to say this")
+        return self.description
+
+
+def is_users(section: Mapping[str, Any]) -> bool:
+    """Whether a section names a world that is not built in."""
+    return section.get("kind") not in WORLDS
+
+
+def keep_worlds(folder: Path, worlds: Iterable[tuple[dict[str, Any], NamedWorld]]) -> None:
+    """Write down what worlds of a user's code say, in a run folder.
+
+    Args:
+        folder: The run folder.
+        worlds: Sections of the experiment file, and the worlds that they name.
+    """
+    found = [
+        KeptWorld(section, world.source_sha256, world.settings, world.traits, _description(world)).to_dict()
+        for section, world in worlds
+        if is_users(section)
+    ]
+    sections = [each["section"] for each in found]
+    if found:
+        write_json(
+            folder / KEPT, [*found, *(each for each in _read(folder) if each["section"] not in sections)]
+        )
+
+
+def _read(folder: Path) -> list[dict[str, Any]]:
+    return read_json(folder / KEPT) if (folder / KEPT).exists() else []
+
+
+def _description(world: NamedWorld) -> WorldDescription | None:
+    try:
+        return world.describe()
+    except NotOpenError:
+        return None
+
+
+def kept_world(folder: Path, section: Mapping[str, Any], beside: Path) -> KeptWorld:
+    """What is kept in a run folder of the world that a section names; nothing of it is executed.
+
+    Args:
+        folder: The run folder.
+        section: The section of the experiment file.
+        beside: What a relative ``file.py:Class`` is relative to.
+
+    Raises:
+        WorldUnknownError: Nothing is kept of this section with this code.
+    """
+    code = code_sha256(section["kind"], WORLDS, ENTRY_POINTS, beside)
+    for each in _read(folder):
+        if (each["section"], each["source_sha256"]) == (section, code):
+            return KeptWorld.from_dict(each)
+    raise WorldUnknownError(
+        f"expected the world {section['kind']} as it was when the experiment in {folder} was last run, got another, or none; run the experiment"
+    )
