@@ -1,108 +1,28 @@
-"""The commands of experiments: run one, or many in one table; say how far they are; print the table; write the page."""
+"""The command ``advnerf experiment``, which runs cells, and those that look at finished searches: ``predict`` and ``maps``."""
 
 from __future__ import annotations
 
-import json
 import os
-import sys
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from nodes.cli.cell_choice import CellChoice, load_cells
+from nodes.cli.cell_tables import page_folder, report, show_table, status, table_command
+from nodes.cli.publish import publish
 from nodes.runtime.options import with_groups
-from nodes.runtime.terminal import Device, Overrides, experiment_argument, print_table, say_error, table
+from nodes.runtime.terminal import Device, say_error
 from nodes.runtime.termination import ends_in_order
 
 if TYPE_CHECKING:
-    from advnerf_core.report.result_table import ResultTable
     from nodes.experiment.engine.progress_record import ProgressRecord
-    from nodes.experiment.plan.cell import Cell
-    from nodes.experiment.run.config import Campaign
-    from nodes.experiment.run.published import PublishedBuild
     from nodes.experiment.run.run import Options
     from nodes.experiment.run.worker import Ended
 
-File = Annotated[
-    Path,
-    typer.Argument(
-        metavar="FILE|NAME",
-        help="A *.experiment.yaml file, or a *.campaign.yaml file that lists several, or the name of one.",
-        parser=experiment_argument,
-    ),
-]
-Setting = Annotated[
-    str, typer.Option("--setting", help="Which of the experiment file's settings; a campaign names them.")
-]
-Folder = Annotated[
-    Path | None,
-    typer.Option(
-        "--run-folder",
-        help="Folder of all results.",
-        show_default="runs/<setting>; of a campaign the file's, or runs/campaigns/<name>",
-    ),
-]
-Only = Annotated[
-    str,
-    typer.Option(
-        "--only",
-        metavar="KEY=VALUE,...",
-        help="Only these cells, e.g. scenario=straight+left,method=gradient.",
-    ),
-]
-
-
-@dataclass(frozen=True)
-class CellChoice:
-    """Which cells of a file."""
-
-    file: File
-    setting: Setting = "demo"
-    folder: Folder = None
-    only: Only = ""
-    overrides: Overrides = None
-
-
-_COLOURS = {
-    "done": "green",
-    "not driven live": "yellow",
-    "failed": "red",
-    "unreadable": "red",
-    "changed": "yellow",
-    "running": "cyan",
-    "begun": "cyan",
-}
 _FAILURE_EXIT = 1
-
-
-def load_cells(choice: CellChoice, executes: bool = True) -> tuple[Campaign, list[Cell]]:
-    """The cells of a file, all and those that are wanted; see `load_experiment` for ``executes``."""
-    os.environ.setdefault("MUJOCO_GL", "egl")
-    from nodes.experiment.plan.cell import select
-    from nodes.experiment.run.config import campaign_of, is_campaign, load_campaign
-
-    overrides = choice.overrides or []
-    if is_campaign(choice.file):
-        campaign = replace(load_campaign(choice.file, choice.folder, tuple(overrides)), executes=executes)
-    else:
-        from nodes.experiment.steps.attack import cells
-        from nodes.experiment.steps.run import load_experiment
-
-        folder = choice.folder or Path("runs") / choice.setting
-        experiment = load_experiment(choice.file, choice.setting, overrides, folder, executes)
-        campaign = campaign_of(experiment, overrides, cells(experiment))
-    _know_methods(campaign)
-    return campaign, select(campaign.cells, choice.only)
-
-
-def _know_methods(campaign: Campaign) -> None:
-    from nodes.experiment.engine.run_folder import CELLS
-    from nodes.experiment.plan.method_names import know_methods_of
-
-    know_methods_of(campaign.folder / CELLS, {cell.method for cell in campaign.cells})
 
 
 def _say_code(choice: CellChoice) -> None:
@@ -241,7 +161,7 @@ def _run_many(choice: CellChoice, options: Options) -> None:
     with ends_in_order():
         ended = run_campaign(campaign, cells, options, lambda text: print(text, flush=True))
     if not options.search_only:
-        _show_table(campaign, campaign.cells, _page_folder(campaign))
+        show_table(campaign, campaign.cells, page_folder(campaign))
     _say_wrong(ended)
 
 
@@ -251,138 +171,6 @@ def _say_wrong(ended: Sequence[Any]) -> None:
         say_error(f"{end.name}: {end.text}")
     if wrong:
         raise typer.Exit(_FAILURE_EXIT)
-
-
-def status(
-    choice: CellChoice,
-) -> None:
-    """Say which cells are done, running, failed (and why), made with other settings, or missing."""
-    from nodes.experiment.run.plan import statuses
-
-    campaign, cells = load_cells(choice, executes=False)
-    found = statuses(campaign, cells)
-    rows = table("cell", "state", "")
-    for each in found:
-        colour = _COLOURS.get(each.state, "dim")
-        rows.add_row(each.cell.name, f"[{colour}]{each.state}[/]", each.text)
-    print_table(rows)
-    counts: Any = Counter(each.state for each in found)
-    print(
-        ", ".join(f"{count} {state}" for state, count in counts.most_common())
-        + f" of {len(found)} cells in {campaign.folder}"
-    )
-
-
-def table_command(
-    choice: CellChoice,
-    source: Annotated[
-        Path | None,
-        typer.Option(
-            "--from",
-            help="Show the cells that were published there, e.g. in docs/results, of whatever settings.",
-            show_default="those of these settings",
-        ),
-    ] = None,
-) -> None:
-    """Print the table of all cells, and the targets."""
-    campaign, cells = load_cells(choice, executes=False)
-    _show(campaign, cells, None, source)
-
-
-def report(
-    choice: CellChoice,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output", "-o", help="Folder of the page.", show_default="table in the folder of the cells"
-        ),
-    ] = None,
-    source: Annotated[
-        Path | None,
-        typer.Option("--from", help="Of the cells that were published there.", show_default="the own cells"),
-    ] = None,
-) -> None:
-    """Write the table as JSON, CSV, Markdown and a page with the films by outcome, and print it."""
-    from nodes.runtime.errors import ConfigError
-
-    if choice.only and output is None:
-        raise ConfigError(
-            "expected --output with --only, as the page of some cells would replace that of all"
-        )
-    campaign, cells = load_cells(choice, executes=False)
-    _show(campaign, cells, output or _page_folder(campaign), source)
-
-
-def _show(campaign: Campaign, cells: Sequence[Cell], output: Path | None, source: Path | None) -> None:
-    if source is None:
-        _show_table(campaign, cells, output)
-    else:
-        _show_published(campaign, cells, output, source / campaign.name)
-
-
-def _page_folder(campaign: Campaign) -> Path:
-    return campaign.folder / "table"
-
-
-def _show_table(campaign: Campaign, cells: Sequence[Cell], output: Path | None) -> None:
-    from nodes.experiment.run.plan import statuses
-    from nodes.experiment.run.published import campaign_table
-
-    _know_methods(campaign)  # titles are kept since cells were run
-    found = statuses(campaign, cells)
-    full = campaign_table(campaign, found)
-    page = _write_and_print(campaign, full, campaign.folder, campaign.folder / "cells", output)
-    left_out = [each for each in found if each.state in ("changed", "unreadable")]
-    for each in left_out:
-        say_error(f"{each.cell.name} is left out: {each.text}")
-    _say_where(full, cells, page)
-
-
-def _show_published(campaign: Campaign, cells: Sequence[Cell], output: Path | None, folder: Path) -> None:
-    from nodes.experiment.run.published import published_table
-
-    full = published_table(folder, campaign, list(cells))
-    # Films are not published; those of the campaign's own cells may be of other drives.
-    _say_where(full, cells, _write_and_print(campaign, full, folder, folder, output))
-
-
-def _write_and_print(
-    campaign: Campaign, full: ResultTable, folder: Path, clips_folder: Path, output: Path | None
-) -> Path | None:
-    """Table, targets and the predictions in ``folder`` to the terminal, and the page into ``output`` if it is asked for."""
-    from rich.console import Console
-
-    from advnerf_core.files import write_atomically
-    from advnerf_core.report.predictions import prediction_section, prediction_table, skill_text
-    from advnerf_core.report.result_page import text_table
-    from advnerf_core.report.targets import evaluate, target_table
-    from nodes.experiment.pages.table import write_table
-    from nodes.experiment.run.predictions import predicted
-
-    pairs = predicted(folder, list(full.cells.values()))
-    targets = evaluate(campaign.reference.targets, full)
-    page = None
-    if output is not None:
-        sections = [("Predicted and measured transfer", prediction_section(pairs))] if pairs else []
-        page = write_table(full, clips_folder, output, sections, targets=targets)
-        if pairs:
-            records = [pair.record() for pair in pairs]
-            write_atomically(output / "predictions.json", json.dumps(records, indent=1) + "\n")
-    console = Console(width=None if sys.stdout.isatty() else 200)
-    console.print(text_table(full).rich())
-    if targets:
-        console.print(target_table(targets).rich())
-    if pairs:
-        console.print(prediction_table(pairs).rich())
-        print(skill_text(pairs))
-    return page
-
-
-def _say_where(full: ResultTable, cells: Sequence[Cell], page: Path | None) -> None:
-    print(
-        f"{len(full.cells)} of {len(cells)} cells; "
-        + (f"page: {page}" if page else "advnerf report writes a page of them")
-    )
 
 
 def predict(
@@ -410,98 +198,6 @@ def maps(
     campaign, cells = load_cells(choice)
     for picture in map_cells(campaign, cells, number):
         print(picture)
-
-
-def publish(
-    choice: CellChoice,
-    to: Annotated[Path, typer.Option(help="Gets a folder with the campaign's name.")] = Path("docs/results"),
-    prune: Annotated[
-        bool, typer.Option("--prune", help="Remove cells there that other settings have made.")
-    ] = False,
-    build: Annotated[
-        bool,
-        typer.Option(
-            "--build/--no-build", help="Keep the scenes and victims too, some 20 MB for each place."
-        ),
-    ] = True,
-    withdraw: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="SCENARIO=REASON",
-            help="Give a registered scenario up of which nothing was published; the page says so, and why.",
-        ),
-    ] = None,
-    declare: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="SCENARIO.VICTIM=REASON",
-            help="Say that a victim breaks the registered rule of what drives well, and why it is shown; the page says so.",
-        ),
-    ] = None,
-) -> None:
-    """Copy the finished cells, and the scenes, victims and objects that they were run with, to where they are kept with the code."""
-    from advnerf_core.report.evidence import registration
-    from advnerf_core.report.evidence.above import write_above_of
-    from advnerf_core.report.evidence.publishing import write_numbers, write_page
-    from advnerf_core.report.evidence.verifying import victims
-    from advnerf_core.report.evidence.verifying.digests import write_beside
-    from nodes.experiment.run.plan import statuses
-    from nodes.experiment.run.published import publish as copy_cells
-    from nodes.experiment.run.published import publish_build
-    from nodes.experiment.run.set_film import write_film
-    from nodes.experiment.run.store import NOT_DRIVEN
-    from nodes.runtime.errors import ConfigError
-
-    campaign, cells = load_cells(choice)
-    registered = (to / campaign.name / registration.FILE).exists()
-    if registered and not build:
-        raise ConfigError(
-            f"expected to publish the registered set {campaign.name} with its scene and victim, got --no-build; leave it out: without them nobody "
-            "can drive the set again"
-        )
-    found_here = statuses(campaign, cells)
-    for each in found_here:
-        if each.state == NOT_DRIVEN:
-            say_error(
-                f"{each.cell.name} is no evidence and is not published: it was not driven live: {each.text}"
-            )
-    found = copy_cells(campaign, found_here, to, prune)
-    for name in found.written:
-        print(f"{to / campaign.name / name}.json")
-    if withdraw:
-        registration.withdraw(to / campaign.name, dict(_scenario_and_reason(each) for each in withdraw))
-    if declare:
-        victims.declare(to / campaign.name, dict(_scenario_and_reason(each) for each in declare))
-    if build:  # before the page, which says whether the set can be driven again
-        _say_build(publish_build(campaign, cells, to, prune))
-    if registered:
-        print(write_numbers(to / campaign.name))
-        if (film := write_film(campaign, to / campaign.name)) is not None:
-            print(film)
-            print(write_above_of(to / campaign.name))  # with frames of the film
-        print(write_page(to))
-    else:
-        write_beside(to)
-    unfinished = len(cells) - len(found.written) - len(found.same)
-    print(f"{len(found.written)} cells written, {len(found.same)} were there, {unfinished} are not finished")
-    if found.stale:
-        what = "were made with other settings and " + (
-            "are removed" if prune else "stay, until --prune removes them"
-        )
-        print(f"{len(found.stale)} of those there {what}: {', '.join(found.stale)}")
-
-
-def _scenario_and_reason(text: str) -> tuple[str, str]:
-    scenario, _, reason = text.partition("=")
-    return scenario, reason
-
-
-def _say_build(build: PublishedBuild) -> None:
-    for each in build.written:
-        print(each)
-    for each in build.removed:
-        print(f"{each}: removed, as no published cell was run with it")
-    print(f"{build.folder}: {build.size_bytes / 1e6:.1f} MB")
 
 
 def add_to(app: typer.Typer) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from nodes.cli.experiment import File
+from nodes.cli.cell_choice import File
 from nodes.runtime.terminal import Overrides, print_table, table
 
 _REFUSED_EXIT = 1

@@ -21,7 +21,8 @@ def demo(
     ] = False,
 ) -> None:
     """Run the whole experiment in its small setting on the simulated lab, from the photographs to the report (six to twelve minutes on 2 cores)."""
-    from nodes.cli.experiment import CellChoice, experiment
+    from nodes.cli.cell_choice import CellChoice
+    from nodes.cli.experiment import experiment
     from nodes.runtime.paths import shipped
 
     experiment(CellChoice(shipped("launch/room.experiment.yaml"), "demo", folder), anew=True, page=page)

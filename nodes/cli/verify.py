@@ -13,7 +13,7 @@ import typer
 
 from advnerf_core.documents import parse_json
 from advnerf_core.run_module import module_command
-from nodes.cli.experiment import CellChoice, File, Folder, Only, Setting, load_cells
+from nodes.cli.cell_choice import CellChoice, File, Folder, Only, Setting, load_cells
 from nodes.runtime.terminal import Overrides, say_error
 
 Published = Annotated[

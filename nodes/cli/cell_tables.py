@@ -1,0 +1,160 @@
+"""The commands ``advnerf status``, ``table`` and ``report``: how far cells are, and their table."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from nodes.cli.cell_choice import CellChoice, know_methods, load_cells
+from nodes.runtime.terminal import print_table, say_error, table
+
+if TYPE_CHECKING:
+    from advnerf_core.report.result_table import ResultTable
+    from nodes.experiment.plan.cell import Cell
+    from nodes.experiment.run.config import Campaign
+
+_COLOURS = {
+    "done": "green",
+    "not driven live": "yellow",
+    "failed": "red",
+    "unreadable": "red",
+    "changed": "yellow",
+    "running": "cyan",
+    "begun": "cyan",
+}
+
+
+def status(choice: CellChoice) -> None:
+    """Say which cells are done, running, failed (and why), made with other settings, or missing."""
+    from nodes.experiment.run.plan import statuses
+
+    campaign, cells = load_cells(choice, executes=False)
+    found = statuses(campaign, cells)
+    rows = table("cell", "state", "")
+    for each in found:
+        colour = _COLOURS.get(each.state, "dim")
+        rows.add_row(each.cell.name, f"[{colour}]{each.state}[/]", each.text)
+    print_table(rows)
+    counts: Any = Counter(each.state for each in found)
+    print(
+        ", ".join(f"{count} {state}" for state, count in counts.most_common())
+        + f" of {len(found)} cells in {campaign.folder}"
+    )
+
+
+def table_command(
+    choice: CellChoice,
+    source: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            help="Show the cells that were published there, e.g. in docs/results, of whatever settings.",
+            show_default="those of these settings",
+        ),
+    ] = None,
+) -> None:
+    """Print the table of all cells, and the targets."""
+    campaign, cells = load_cells(choice, executes=False)
+    _show(campaign, cells, None, source)
+
+
+def report(
+    choice: CellChoice,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", help="Folder of the page.", show_default="table in the folder of the cells"
+        ),
+    ] = None,
+    source: Annotated[
+        Path | None,
+        typer.Option("--from", help="Of the cells that were published there.", show_default="the own cells"),
+    ] = None,
+) -> None:
+    """Write the table as JSON, CSV, Markdown and a page with the films by outcome, and print it."""
+    from nodes.runtime.errors import ConfigError
+
+    if choice.only and output is None:
+        raise ConfigError(
+            "expected --output with --only, as the page of some cells would replace that of all"
+        )
+    campaign, cells = load_cells(choice, executes=False)
+    _show(campaign, cells, output or page_folder(campaign), source)
+
+
+def _show(campaign: Campaign, cells: Sequence[Cell], output: Path | None, source: Path | None) -> None:
+    if source is None:
+        show_table(campaign, cells, output)
+    else:
+        _show_published(campaign, cells, output, source / campaign.name)
+
+
+def page_folder(campaign: Campaign) -> Path:
+    """Where the page of all cells of a campaign goes."""
+    return campaign.folder / "table"
+
+
+def show_table(campaign: Campaign, cells: Sequence[Cell], output: Path | None) -> None:
+    """Print the table of cells of the settings of now; write its page into ``output`` if it is given."""
+    from nodes.experiment.run.plan import statuses
+    from nodes.experiment.run.published import campaign_table
+
+    know_methods(campaign)  # titles are kept since cells were run
+    found = statuses(campaign, cells)
+    full = campaign_table(campaign, found)
+    page = _write_and_print(campaign, full, campaign.folder, campaign.folder / "cells", output)
+    left_out = [each for each in found if each.state in ("changed", "unreadable")]
+    for each in left_out:
+        say_error(f"{each.cell.name} is left out: {each.text}")
+    _say_where(full, cells, page)
+
+
+def _show_published(campaign: Campaign, cells: Sequence[Cell], output: Path | None, folder: Path) -> None:
+    from nodes.experiment.run.published import published_table
+
+    full = published_table(folder, campaign, list(cells))
+    # Films are not published; those of the campaign's own cells may be of other drives.
+    _say_where(full, cells, _write_and_print(campaign, full, folder, folder, output))
+
+
+def _write_and_print(
+    campaign: Campaign, full: ResultTable, folder: Path, clips_folder: Path, output: Path | None
+) -> Path | None:
+    """Table, targets and the predictions in ``folder`` to the terminal, and the page into ``output`` if it is asked for."""
+    from rich.console import Console
+
+    from advnerf_core.files import write_json
+    from advnerf_core.report.predictions import prediction_section, prediction_table, skill_text
+    from advnerf_core.report.result_page import text_table
+    from advnerf_core.report.targets import evaluate, target_table
+    from nodes.experiment.pages.table import write_table
+    from nodes.experiment.run.predictions import predicted
+
+    pairs = predicted(folder, list(full.cells.values()))
+    targets = evaluate(campaign.reference.targets, full)
+    page = None
+    if output is not None:
+        sections = [("Predicted and measured transfer", prediction_section(pairs))] if pairs else []
+        page = write_table(full, clips_folder, output, sections, targets=targets)
+        if pairs:
+            write_json(output / "predictions.json", [pair.record() for pair in pairs])
+    console = Console(width=None if sys.stdout.isatty() else 200)
+    console.print(text_table(full).rich())
+    if targets:
+        console.print(target_table(targets).rich())
+    if pairs:
+        console.print(prediction_table(pairs).rich())
+        print(skill_text(pairs))
+    return page
+
+
+def _say_where(full: ResultTable, cells: Sequence[Cell], page: Path | None) -> None:
+    print(
+        f"{len(full.cells)} of {len(cells)} cells; "
+        + (f"page: {page}" if page else "advnerf report writes a page of them")
+    )

@@ -1,0 +1,106 @@
+"""The command ``advnerf publish``: finished cells, and what they were run with, go to where they are kept with the code."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from nodes.cli.cell_choice import CellChoice, load_cells
+from nodes.runtime.terminal import say_error
+
+if TYPE_CHECKING:
+    from nodes.experiment.run.published import PublishedBuild
+
+
+def publish(
+    choice: CellChoice,
+    to: Annotated[Path, typer.Option(help="Gets a folder with the campaign's name.")] = Path("docs/results"),
+    prune: Annotated[
+        bool, typer.Option("--prune", help="Remove cells there that other settings have made.")
+    ] = False,
+    build: Annotated[
+        bool,
+        typer.Option(
+            "--build/--no-build", help="Keep the scenes and victims too, some 20 MB for each place."
+        ),
+    ] = True,
+    withdraw: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="SCENARIO=REASON",
+            help="Give a registered scenario up of which nothing was published; the page says so, and why.",
+        ),
+    ] = None,
+    declare: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="SCENARIO.VICTIM=REASON",
+            help="Say that a victim breaks the registered rule of what drives well, and why it is shown; the page says so.",
+        ),
+    ] = None,
+) -> None:
+    """Copy the finished cells, and the scenes, victims and objects that they were run with, to where they are kept with the code."""
+    from advnerf_core.report.evidence import registration
+    from advnerf_core.report.evidence.above import write_above_of
+    from advnerf_core.report.evidence.publishing import write_numbers, write_page
+    from advnerf_core.report.evidence.verifying import victims
+    from advnerf_core.report.evidence.verifying.digests import write_beside
+    from nodes.experiment.run.plan import statuses
+    from nodes.experiment.run.published import publish as copy_cells
+    from nodes.experiment.run.published import publish_build
+    from nodes.experiment.run.set_film import write_film
+    from nodes.experiment.run.store import NOT_DRIVEN
+    from nodes.runtime.errors import ConfigError
+
+    campaign, cells = load_cells(choice)
+    registered = (to / campaign.name / registration.FILE).exists()
+    if registered and not build:
+        raise ConfigError(
+            f"expected to publish the registered set {campaign.name} with its scene and victim, got --no-build; leave it out: without them nobody "
+            "can drive the set again"
+        )
+    found_here = statuses(campaign, cells)
+    for each in found_here:
+        if each.state == NOT_DRIVEN:
+            say_error(
+                f"{each.cell.name} is no evidence and is not published: it was not driven live: {each.text}"
+            )
+    found = copy_cells(campaign, found_here, to, prune)
+    for name in found.written:
+        print(f"{to / campaign.name / name}.json")
+    if withdraw:
+        registration.withdraw(to / campaign.name, dict(_scenario_and_reason(each) for each in withdraw))
+    if declare:
+        victims.declare(to / campaign.name, dict(_scenario_and_reason(each) for each in declare))
+    if build:  # before the page, which says whether the set can be driven again
+        _say_build(publish_build(campaign, cells, to, prune))
+    if registered:
+        print(write_numbers(to / campaign.name))
+        if (film := write_film(campaign, to / campaign.name)) is not None:
+            print(film)
+            print(write_above_of(to / campaign.name))  # with frames of the film
+        print(write_page(to))
+    else:
+        write_beside(to)
+    unfinished = len(cells) - len(found.written) - len(found.same)
+    print(f"{len(found.written)} cells written, {len(found.same)} were there, {unfinished} are not finished")
+    if found.stale:
+        what = "were made with other settings and " + (
+            "are removed" if prune else "stay, until --prune removes them"
+        )
+        print(f"{len(found.stale)} of those there {what}: {', '.join(found.stale)}")
+
+
+def _scenario_and_reason(text: str) -> tuple[str, str]:
+    scenario, _, reason = text.partition("=")
+    return scenario, reason
+
+
+def _say_build(build: PublishedBuild) -> None:
+    for each in build.written:
+        print(each)
+    for each in build.removed:
+        print(f"{each}: removed, as no published cell was run with it")
+    print(f"{build.folder}: {build.size_bytes / 1e6:.1f} MB")
