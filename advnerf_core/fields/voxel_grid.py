@@ -24,7 +24,7 @@ from scipy import sparse
 from scipy.sparse.linalg import lsqr
 from torch import Tensor
 
-from advnerf_core.geometry import Array, transform_points
+from advnerf_core.geometry import Array
 
 # Inverse squash of exactly 0 or 1 is infinite; half an 8-bit step is as far as a display can show.
 _SATURATION = 0.5 / 255.0
@@ -190,12 +190,6 @@ class VoxelGridObject:
         other = replace(self, T_world_from_object=pose, scale=self.scale if scale is None else scale)
         object.__setattr__(other, "derived", self.derived)
         return other
-
-    def corners_in_world(self, low: Array | None = None, high: Array | None = None) -> Array:
-        """The eight corners of the box, or of the part of it from ``low`` to ``high`` in object units; ``[8, 3]`` [m]."""
-        low, high = self.box_min if low is None else low, self.box_max if high is None else high
-        unit = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)
-        return transform_points(self.T_world_from_object, self.scale * (low + unit * (high - low)))
 
 
 def _check_pose(T_world_from_object: Array, scale: float) -> None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -114,8 +113,3 @@ def _encode_block(frame_number: int, objects: list[ObjectPose], block_bytes: int
             raise ValueError(f"expected a subject name of 1 to {_NAME_BYTES} bytes, got {item.name!r}")
         parts.append(_ITEM.pack(0, _ITEM_DATA_BYTES, name, *item.translation_mm, *item.rotation_rad))
     return b"".join(parts).ljust(block_bytes, b"\0")
-
-
-def object_poses(T_world_from_subject: Mapping[str, NDArray[np.float64]]) -> list[ObjectPose]:
-    """Wire forms of several poses."""
-    return [object_pose(name, T) for name, T in T_world_from_subject.items()]

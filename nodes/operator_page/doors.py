@@ -66,10 +66,6 @@ class Sessions:
         self.codes += 1
         return True
 
-    def code_left_s(self, mono_ns: int) -> float:
-        """Time for which the current code is still valid [s]."""
-        return max(0.0, self.code_s - (mono_ns - self._code_ns) / NS_PER_S)
-
     def wait_s(self, address: str, mono_ns: int) -> float:
         """Time that this address must wait after its wrong codes before another one is looked at [s]; 0 if it need not wait."""
         guesser = self._guessers.get(_network(address))

@@ -18,7 +18,6 @@ BACK_M, BACK_RGB = 0.005, (0.2, 0.2, 0.2)
 # What MuJoCo 4 lights a scene with whose lights have no intensities of their own [lux]: its environment, and all lights together.
 _ENVIRONMENT_LX, _LIGHTS_LX = 5000.0, 80000.0
 _COLOURS, _NUMBERS = mjrf.PixelFormat.PIXEL_FORMAT_RGB8, mjrf.PixelFormat.PIXEL_FORMAT_R32F
-_GEOM = mujoco.mjtObj.mjOBJ_GEOM
 Reply = tuple[dict[str, Any], dict[str, np.ndarray]]
 
 
