@@ -6,7 +6,6 @@ Conditions keep their colour in every figure; the surrogate is dashed, the deplo
 from __future__ import annotations
 
 import io
-import os
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -19,6 +18,7 @@ from markupsafe import escape
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from advnerf_core.files import write_atomically
 from advnerf_core.report.conditions import EMPTY, NONE, order_of, style_of
 from advnerf_core.report.data import Drives, Fidelity, Laps, Latency, MemoryRow, Run
 from advnerf_core.report.palette import LIGHT, LINE_STYLES, themed_svg
@@ -265,12 +265,8 @@ def svg(figure: Figure, description: str) -> str:
 
 def write_png(figure: Figure, path: Path, dpi: int = 160) -> Path:
     """Write a figure as a picture on white, atomically."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with matplotlib.rc_context(STYLE):
-            figure.savefig(temporary, format="png", dpi=dpi, facecolor="white")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    buffer = io.BytesIO()
+    with matplotlib.rc_context(STYLE):
+        figure.savefig(buffer, format="png", dpi=dpi, facecolor="white")
+    write_atomically(path, buffer.getvalue())
     return path

@@ -18,7 +18,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_json
 from advnerf_core.report.cells import CellResult, read_cell
 from advnerf_core.strict import StrictModel
 
@@ -187,7 +187,7 @@ def read_hardness(file: Path) -> HardnessRecord:
 
 def write_hardness(file: Path, record: HardnessRecord) -> None:
     """Write a record of verdicts."""
-    write_atomically(file, json.dumps(record.model_dump(mode="json"), indent=1) + "\n")
+    write_json(file, record.model_dump(mode="json"))
 
 
 def merged(records: Iterable[HardnessRecord]) -> HardnessRecord:

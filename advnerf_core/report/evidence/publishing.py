@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 from advnerf_core.documents import read_json
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_atomically, write_json
 from advnerf_core.report.evidence.about import read_about
 from advnerf_core.report.evidence.families import families_note
 from advnerf_core.report.evidence.hardness import with_titles
@@ -48,7 +47,7 @@ def write_numbers(folder: Path) -> Path:
     numbers = published_numbers(evidence, withdrawn, declared)
     named = {key: numbers.pop(key) for key in ("format", "name", "registration")}
     data = {**named, "files": digests_of(folder), **numbers}
-    write_atomically(folder / SET, json.dumps(data, indent=1) + "\n")
+    write_json(folder / SET, data)
     write_known_digest(folder)
     write_picture(evidence, folder, folder.parent)
     from advnerf_core.report.evidence.above import write_above_of  # loads matplotlib

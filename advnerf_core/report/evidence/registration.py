@@ -14,7 +14,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.driving.path import Path
 from advnerf_core.errors import AdvnerfError
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_json
 from advnerf_core.report.cells import cell_name
 from advnerf_core.report.reference import Domain
 from advnerf_core.strict import StrictModel
@@ -264,5 +264,4 @@ def withdraw(folder: FilePath, scenarios: Mapping[str, str]) -> None:
             raise RegistrationError(
                 f"{scenario} cannot be withdrawn, as {there[0]} was published; publish all of it"
             )
-    text = json.dumps({**read_withdrawn(folder), **scenarios}, indent=1) + "\n"
-    write_atomically(folder / WITHDRAWN, text)
+    write_json(folder / WITHDRAWN, {**read_withdrawn(folder), **scenarios})

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_json
 from advnerf_core.report.conditions import NONE
 from advnerf_core.report.evidence.registration import RegistrationError, read_reasons, scenario_key
 from advnerf_core.report.evidence.results import Evidence
@@ -65,8 +64,7 @@ def declare(folder: Path, victims: Mapping[str, str]) -> None:
     for victim, reason in victims.items():
         if not reason.strip():
             raise RegistrationError(f"expected a reason for showing {victim}; give {victim}=REASON")
-    text = json.dumps({**read_declared(folder), **victims}, indent=1) + "\n"
-    write_atomically(folder / DECLARED, text)
+    write_json(folder / DECLARED, {**read_declared(folder), **victims})
 
 
 def declaration_problems(evidence: Evidence, declared: Mapping[str, str]) -> Iterator[str]:
