@@ -77,6 +77,11 @@ class Remembering:
         self._policy = policy
         self.memories: list[Tensor] = [policy.initial_memory(batch)]
 
+    @staticmethod
+    def afresh(policy: Any, batch: int) -> Policy:
+        """A policy at the start of a drive: itself if it has no memory."""
+        return policy if getattr(policy, "stateless", True) else Remembering(policy, batch)
+
     def __call__(self, images: Tensor, goals: Tensor | None = None) -> Tensor:
         """Controls ``[B]`` of images ``[B, 3, H, W]``; the memory goes on."""
         steering: Tensor

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 _FACTORY = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 POLICY_SUFFIXES = (".safetensors", ".onnx", ".pt2")
+_ADDRESS = re.compile(r"grpcs?://")
 _CODE_OF_MODULES: WeakKeyDictionary[ModuleType, str] = WeakKeyDictionary()
 
 
@@ -41,7 +42,12 @@ def is_factory(spec: str | os.PathLike[str]) -> bool:
 
 def is_code(spec: str | os.PathLike[str]) -> bool:
     """Whether a policy is named as something that is executed or asked, and not as a file."""
-    return is_factory(spec)
+    return is_factory(spec) or is_address(spec)
+
+
+def is_address(spec: str | os.PathLike[str]) -> bool:
+    """Whether a policy is named as the address of a driver: ``grpc://HOST:PORT``, or ``grpcs://`` by TLS."""
+    return _ADDRESS.match(str(spec)) is not None
 
 
 def load_any_policy(spec: str | os.PathLike[str], expected_sha256: str | None = None) -> LoadedPolicy:
@@ -75,6 +81,10 @@ def load_adapted(spec: str | os.PathLike[str]) -> tuple[AdaptedPolicy, str]:
 
     if is_factory(spec):
         return _from_factory(str(spec))
+    if is_address(spec):
+        raise PolicyContractError(
+            f"expected a policy that is loaded, got the driver {spec}: it must be told its camera and car, which an experiment does (victims)"
+        )
     path = Path(spec)
     if path.suffix == ".onnx":
         from advnerf_core.policies.onnx_policy import OnnxNetwork, TensorNetwork
@@ -174,6 +184,8 @@ def source_sha256(spec: str | os.PathLike[str]) -> str:
     Raises:
         PolicyContractError: A file is missing, or the module of a factory cannot be found.
     """
+    if is_address(spec):
+        return hashlib.sha256(str(spec).encode()).hexdigest()
     if not is_code(spec):
         return policy_file_sha256(Path(spec))
     search_working_folder_last()

@@ -17,6 +17,7 @@ _EXTRA_OF = dict.fromkeys(("torch", "numba", "scipy", "matplotlib", "jinja2", "a
     "drjit": "mesh",
     "ray": "cluster",
     "carla": "carla",
+    "carla_driver_interface": "egodriver",
     "starlette": "page",
     "uvicorn": "page",
     "cryptography": "page",

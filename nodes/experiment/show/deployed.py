@@ -290,7 +290,7 @@ def drive_deployed(
     goals = torch.tensor([tuple(goal)], dtype=torch.float32) if goal else None
     first = torch.from_numpy(np.array(start, dtype=np.float64))[None]
     seen = _ideally(dressed, theta, car) if camera is None else _through(camera, dressed, theta, limits.dt_s)
-    driver: Policy = policy if getattr(policy, "stateless", True) else Remembering(policy, 1)
+    driver = Remembering.afresh(policy, 1)
     rollout = drive(
         driver, lambda states: images_to_tensor(seen(states[0].numpy())), car, first, limits.ticks, goals
     )

@@ -17,8 +17,9 @@ from pydantic import Field
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.contract import PolicyContract
-from advnerf_core.policies.load import load_adapted, load_any_policy, source_sha256
+from advnerf_core.policies.load import is_address, load_adapted, load_any_policy, source_sha256
 from advnerf_core.policies.policy_file import LoadedPolicy, policy_sha256
+from advnerf_core.policies.view import PolicyView
 from advnerf_core.strict import StrictModel
 from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.plan.victims import RETRAINED, GivenVictim
@@ -63,7 +64,7 @@ def given_in(config: ExperimentConfig) -> dict[str, str]:
     return {name: each.policy for name, each in config.attacked.items() if isinstance(each, GivenVictim)}
 
 
-def look_at_given(experiment: RunFolder[ExperimentConfig]) -> None:
+def look_at_given(experiment: Experiment) -> None:
     """Load the policies that exist and keep what they say about themselves; those that have not changed since are not loaded.
 
     Raises:
@@ -73,7 +74,7 @@ def look_at_given(experiment: RunFolder[ExperimentConfig]) -> None:
     wanted, known = given_in(experiment.config), _read(experiment.folder)
     if not wanted:
         return
-    found = {name: _look_at(spec, known.get(name)) for name, spec in wanted.items()}
+    found = {name: _look_at(experiment, spec, known.get(name)) for name, spec in wanted.items()}
     views = {name: each.declared.view for name, each in found.items()}
     first, view = next(iter(views.items()))
     if others := [name for name, each in views.items() if each != view]:
@@ -86,18 +87,41 @@ def look_at_given(experiment: RunFolder[ExperimentConfig]) -> None:
         write_atomically(experiment.folder / KEPT, json.dumps(data, indent=1) + "\n")
 
 
-def _look_at(spec: str, known: GivenPolicy | None) -> GivenPolicy:
+def _look_at(experiment: Experiment, spec: str, known: GivenPolicy | None) -> GivenPolicy:
     source = source_sha256(spec)
     if known is not None and (known.policy, known.source_sha256) == (spec, source) and not known.not_fixed:
         return known
-    loaded, (adapted, _) = load_any_policy(spec), load_adapted(spec)
+    if is_address(spec):
+        loaded = _driver_at(experiment, spec)
+        contract = loaded.policy.contract
+    else:
+        loaded, contract = load_any_policy(spec), load_adapted(spec)[0].contract
     return GivenPolicy(
         policy=spec,
         source_sha256=source,
         sha256=loaded.sha256,
-        contract=adapted.contract.to_dict(),
+        contract=contract.to_dict(),
         not_fixed=str(loaded.metadata.get("not_fixed", "")),
     )
+
+
+def _driver_at(experiment: Experiment, address: str, expected_sha256: str | None = None) -> LoadedPolicy:
+    """A driver behind a socket; it sees the whole picture of the driving camera.
+
+    Raises:
+        ConfigError: Live nodes are to drive, or the world must be asked for its camera and was not yet.
+    """
+    from advnerf_core.policies.egodriver import DrivenRig, load_driver_at
+
+    if experiment.config.deploy.live:
+        raise ConfigError(
+            f"{experiment.file}: victims: expected policies that the policy node loads with deploy.through nodes, got the driver {address}; set "
+            "deploy.through world"
+        )
+    camera, car = experiment.camera, experiment.car
+    view = PolicyView(camera, 0, camera.height, camera.width, camera.height)
+    rig = DrivenRig(camera, experiment.mount, car.speed_mps, experiment.config.dt_s, car.wheelbase_m)
+    return load_driver_at(address, view, rig, expected_sha256)
 
 
 def _read(folder: Path) -> dict[str, GivenPolicy]:
@@ -145,7 +169,7 @@ def victim_sha256(experiment: RunFolder[ExperimentConfig], victim: str) -> str:
     return policy_sha256(victim_spec(experiment, victim))
 
 
-def load_victim(experiment: RunFolder[ExperimentConfig], victim: str) -> LoadedPolicy:
+def load_victim(experiment: Experiment, victim: str) -> LoadedPolicy:
     """A victim, ready for a drive or an attack.
 
     Raises:
@@ -154,7 +178,10 @@ def load_victim(experiment: RunFolder[ExperimentConfig], victim: str) -> LoadedP
     spec = victim_spec(experiment, victim)
     if victim not in given_in(experiment.config):
         return _loaded(spec, Path(spec).stat().st_mtime_ns)
-    return _loaded(spec, 0, given(experiment)[victim].sha256)
+    expected_sha256 = given(experiment)[victim].sha256
+    if is_address(spec):
+        return _driver_at(experiment, spec, expected_sha256)
+    return _loaded(spec, 0, expected_sha256)
 
 
 def told(experiment: Experiment, policy: Any, scenario: str) -> tuple[float, ...]:

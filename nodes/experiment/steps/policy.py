@@ -18,6 +18,7 @@ from advnerf_core.data.image_files import write_image
 from advnerf_core.data.transforms import load_transforms
 from advnerf_core.data.view_loading import load_image
 from advnerf_core.driving.path import Array
+from advnerf_core.driving.rollout import Remembering
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import planar_pose
@@ -265,10 +266,9 @@ def agreement(experiment: Experiment, policy: Policy | None = None) -> list[dict
     for frame in views.frames:
         real = experiment.view.image(load_image(frame)[0])
         with torch.no_grad():
-            on_real = float(policy(images_to_tensor(real), goals)[0])
-            on_surrogate = float(
-                policy(surrogate.render(frame.T_world_from_camera[None], None).images, goals)[0]
-            )
+            on_real = float(Remembering.afresh(policy, 1)(images_to_tensor(real), goals)[0])
+            rendered = surrogate.render(frame.T_world_from_camera[None], None).images
+            on_surrogate = float(Remembering.afresh(policy, 1)(rendered, goals)[0])
         rows.append({"real": on_real, "surrogate": on_surrogate})
     return rows
 

@@ -171,3 +171,31 @@ def test_victims_that_there_cannot_be(folder: Path, change: str, message: str) -
 def test_a_policy_says_itself_what_it_sees(folder: Path, change: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(AdvnerfError, match=message):
         run_experiment(load_experiment(folder / "mine.experiment.yaml", "tiny", (change,), tmp_path / "run"))
+
+
+@pytest.mark.slow
+def test_a_driver_behind_a_socket_is_attacked(folder: Path, tmp_path: Path) -> None:
+    """It is asked over gRPC, as alpasim and CARLA users do, in the learned scene and where it is deployed."""
+    pytest.importorskip("carla_driver_interface")
+    from carla_driver_interface.policies.constant_speed import ConstantSpeedPolicy
+    from carla_driver_interface.server import serving
+
+    with serving(ConstantSpeedPolicy(), port=0, host="127.0.0.1") as port:
+        victims = f"victims={{theirs: {{policy: 'grpc://127.0.0.1:{port}'}}}}"
+        experiment = load_experiment(folder / "mine.experiment.yaml", "tiny", (victims,), tmp_path / "run")
+        run_experiment(experiment, overrides=(victims,))
+        with pytest.raises(AdvnerfError, match=r"need no gradient against victim theirs"):
+            run_experiment(
+                load_experiment(
+                    folder / "mine.experiment.yaml",
+                    "tiny",
+                    (victims, "attack.methods=[gradient]"),
+                    tmp_path / "run",
+                )
+            )
+    # It plans straight ahead whatever it sees.
+    kept = read_json(driven_folder(experiment, Cell("track", "theirs", "none", 0)) / DRIVES)
+    assert kept["commands"] == [[0.0] * TICKS]
+    found = read_json(experiment.cell_result(Cell("track", "theirs", "random", 0)))
+    assert "constant_speed" in read_json(experiment.folder / "victims.json")["theirs"]["not_fixed"]
+    assert found["deployed"]["total_cte_m"] == found["deployed"]["none_total_cte_m"]

@@ -29,7 +29,7 @@ FILE: dict[str, Any] = {
         "kind": "photographs", "images": "my_photos", "closed": True, "off_track_m": 0.25,
         "car": {"speed_mps": 0.8, "wheelbase_m": 0.325, "max_steering_rad": 0.35}, "camera": {"x_m": 0.3, "z_m": 0.2},
     },
-    "victims": {"mine": {"policy": "my_driver:factory"}},
+    "victims": {"mine": {"policy": "hall_driver:factory"}},
     "objects": [{"name": "board", "kind": "panel", "x_m": 6.43, "y_m": -2.86, "yaw_rad": 3.64, "scale": 0.3}],
     "space": {"kind": "colours"}, "deploy": {"through": "nothing"}, "capture": {"held_out": 4}, "measure": {"starts": 1},
     "scene": {"steps": 12, "log2_entries": 10, "levels": 3, "finest": 16, "occupancy": 16},
@@ -52,7 +52,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
             lambda index: lab.observe_at(*states[index], depth=False)[0],
             "png",
         )
-    (found / "my_driver.py").write_text(MODULE)
+    (found / "hall_driver.py").write_text(MODULE)
     (found / "hall.experiment.yaml").write_text(yaml.safe_dump(FILE))
     return found
 
@@ -89,7 +89,7 @@ def test_it_is_attacked_in_what_is_learned_and_held_out_views_are_not_learned_fr
 
 
 def test_the_same_photographs_elsewhere_are_the_same_place(folder: Path, tmp_path: Path) -> None:
-    for name in ("my_photos", "hall.experiment.yaml", "my_driver.py"):
+    for name in ("my_photos", "hall.experiment.yaml", "hall_driver.py"):
         source = folder / name
         (shutil.copytree if source.is_dir() else shutil.copy)(source, tmp_path / name)
     assert loaded(tmp_path).world_settings == loaded(folder).world_settings

@@ -1,0 +1,298 @@
+"""A driver behind a socket as a policy: the egodriver protocol of alpasim, which users of CARLA speak too (PyPI ``carla-driver-interface``).
+
+The driver is sent a camera's pictures and where the car is, and answers with a plan: poses ahead. A car of constant speed follows it by pure
+pursuit (Coulter 1992): the wheel angle of the arc through the point of the plan that it reaches after the lookahead time. The car's own
+poses are those that its steering leads to from where the drive began, as an odometer has them. No route is sent: a policy of this project sees
+pictures.
+
+A drive is a session. The memory of the policy holds, per car: the session, the tick, x [m], y [m], yaw [rad].
+"""
+
+from __future__ import annotations
+
+import hashlib
+import ipaddress
+import re
+import uuid
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from advnerf_core.data.image_files import encoded
+from advnerf_core.geometry import Array, Pinhole
+from advnerf_core.policies.adapter import AdaptedPolicy, adapt
+from advnerf_core.policies.contract import PolicyContract, PolicyContractError
+from advnerf_core.policies.policy_file import LoadedPolicy
+from advnerf_core.policies.view import PolicyView
+
+_ADDRESS = re.compile(r"(grpcs?)://(\[[0-9a-f:]+\]|[^:/\s]+):(\d{1,5})")
+_CAMERA, _US_PER_S = "camera_front", 1_000_000
+_LOOKAHEAD_S, _ANSWER_S = 0.5, 60.0
+
+
+@dataclass(frozen=True, eq=False)
+class DrivenRig:
+    """What a driver is told about the car.
+
+    Attributes:
+        pinhole: Intrinsics of the pictures that it is sent.
+        T_car_from_camera: Where the camera sits on the car ``[4, 4]``.
+        speed_mps: The car's speed [m/s].
+        dt_s: Time between two pictures [s].
+        wheelbase_m: Between the axles [m]; None for a car whose control is a turn rate.
+    """
+
+    pinhole: Pinhole
+    T_car_from_camera: Array
+    speed_mps: float
+    dt_s: float
+    wheelbase_m: float | None
+
+    def control(self, curvature_1pm: float) -> float:
+        """Wheel angle [rad], or turn rate [rad/s], of a curvature [1/m]."""
+        if self.wheelbase_m is None:
+            return curvature_1pm * self.speed_mps
+        return float(np.arctan(curvature_1pm * self.wheelbase_m))
+
+    def turn_rate_radps(self, control: float) -> float:
+        """How fast the car turns under a control."""
+        return (
+            control
+            if self.wheelbase_m is None
+            else self.speed_mps * float(np.tan(control)) / self.wheelbase_m
+        )
+
+
+class EgoDriver:
+    """A network, as `advnerf_core.policies.adapter.adapt` takes it, that asks a driver.
+
+    Args:
+        address: ``grpc://HOST:PORT`` on this computer, or ``grpcs://HOST:PORT`` by TLS.
+        rig: The car that it drives.
+
+    Raises:
+        PolicyContractError: The address is none, its package is not installed, or nobody answers.
+    """
+
+    training = False
+
+    def __init__(self, address: str, rig: DrivenRig) -> None:
+        self.address, self.rig = address, rig
+        self._channel = _channel(address)
+        self._sessions: list[str] = []
+        self._revision = 0
+        self.identity = self._version()
+
+    @cached_property
+    def _stub(self) -> Any:
+        from carla_driver_interface.protocol import EgodriverServiceStub
+
+        return EgodriverServiceStub(self._channel)
+
+    def _version(self) -> str:
+        from carla_driver_interface.contract import ContractError, negotiate
+        from grpc import RpcError
+
+        try:
+            version, self._revision = negotiate(self._stub, timeout=_ANSWER_S)
+        except RpcError as error:
+            raise PolicyContractError(
+                f"expected a driver at {self.address}, got {error.code().name}: {error.details()}; start it first"
+            ) from None
+        except ContractError as error:
+            raise PolicyContractError(f"{self.address}: {error}") from None
+        return f"{version.version_id} {version.git_hash}".strip()
+
+    def initial_memory(self, batch: int) -> Tensor:
+        """Begin a session for each car, and end those before."""
+        from carla_driver_interface.protocol import DriveSessionCloseRequest
+
+        for session in self._sessions:
+            self._ask("close_session", DriveSessionCloseRequest(session_uuid=session))
+        self._sessions = [self._begin() for _ in range(batch)]
+        memory = torch.zeros(batch, 5, dtype=torch.float64)
+        memory[:, 0] = torch.arange(batch)
+        return memory
+
+    def _begin(self) -> str:
+        from carla_driver_interface.contract import CONTRACT_REVISION, camera_to_revision, contract_metadata
+        from carla_driver_interface.protocol import DriveSessionRequest
+
+        session = str(uuid.uuid4())
+        request = DriveSessionRequest(session_uuid=session, random_seed=0)
+        request.debug_info.scene_id = "advnerf"
+        camera = camera_to_revision(_camera(self.rig), CONTRACT_REVISION, self._revision)
+        request.rollout_spec.vehicle.available_cameras.append(camera)
+        self._ask("start_session", request, metadata=contract_metadata(self._revision))
+        return session
+
+    def __call__(self, images: Tensor, goals: Tensor | None, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Controls ``[B]`` of pictures ``[B, 3, H, W]``, and the memory ``[B, 5]`` after them."""
+        del goals
+        pictures = (images.detach() * 255.0).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
+        following, controls = memory.clone(), []
+        for index, (number, tick, *pose) in enumerate(memory.tolist()):
+            control = self._control(self._sessions[int(number)], int(tick), pose, pictures[index])
+            controls.append(control)
+            following[index, 1:] = torch.tensor([tick + 1, *self._moved(pose, control)])
+        return images.new_tensor(controls), following
+
+    def _control(self, session: str, tick: int, pose: list[float], picture: Array) -> float:
+        """What the plan of one car leads to."""
+        from carla_driver_interface.geometry import Pose, Trajectory
+        from carla_driver_interface.protocol import (
+            DriveRequest,
+            DynamicState,
+            RolloutCameraImage,
+            RolloutEgoTrajectory,
+            Vec3,
+        )
+
+        now_us = round(tick * self.rig.dt_s * _US_PER_S)
+        rig = Pose.from_xyz_yaw(pose[0], pose[1], 0.0, pose[2])
+        moved = RolloutEgoTrajectory(session_uuid=session)
+        moved.trajectory.CopyFrom(Trajectory([now_us], [rig]).to_proto())
+        moved.dynamic_states.append(DynamicState(linear_velocity=Vec3(x=self.rig.speed_mps)))
+        self._ask("submit_egomotion_observation", moved)
+        image = RolloutCameraImage(session_uuid=session)
+        image.camera_image.logical_id = _CAMERA
+        image.camera_image.frame_start_us = image.camera_image.frame_end_us = now_us
+        image.camera_image.image_bytes = encoded(np.ascontiguousarray(picture), ".png")
+        self._ask("submit_image_observation", image)
+        query_us = now_us + round(self.rig.dt_s * _US_PER_S)
+        request = DriveRequest(session_uuid=session, time_now_us=now_us, time_query_us=query_us)
+        plan = Trajectory.from_proto(self._ask("drive", request).trajectory)
+        if not len(plan):
+            return 0.0  # a driver without a plan holds its course
+        ahead = rig.inverse().transform_points(plan.positions)[:, :2]
+        return self.rig.control(pursued_curvature_1pm(ahead, self.rig.speed_mps * _LOOKAHEAD_S))
+
+    def _moved(self, pose: list[float], control: float) -> list[float]:
+        """The car's pose a tick later: along an arc."""
+        turn_rad = self.rig.turn_rate_radps(control) * self.rig.dt_s
+        way_m, yaw_rad = self.rig.speed_mps * self.rig.dt_s, pose[2] + 0.5 * turn_rad
+        chord_m = way_m * float(np.sinc(0.5 * turn_rad / np.pi))
+        return [
+            pose[0] + chord_m * float(np.cos(yaw_rad)),
+            pose[1] + chord_m * float(np.sin(yaw_rad)),
+            pose[2] + turn_rad,
+        ]
+
+    def _ask(self, name: str, request: Any, **more: Any) -> Any:
+        from grpc import RpcError
+
+        try:
+            return getattr(self._stub, name)(request, timeout=_ANSWER_S, **more)
+        except RpcError as error:
+            raise PolicyContractError(
+                f"expected an answer of the driver at {self.address} to {name}, got {error.code().name}: {error.details()}"
+            ) from None
+
+
+def pursued_curvature_1pm(ahead: Array, lookahead_m: float) -> float:
+    """Curvature [1/m], left positive, of the arc from the car to the point of a plan at the lookahead distance.
+
+    Args:
+        ahead: Points of the plan ``[N, 2]`` in the car's frame: x [m] forward, y [m] left.
+        lookahead_m: Distance from the car at which the plan is met; of a shorter plan its end is taken.
+    """
+    points = np.concatenate([[[0.0, 0.0]], ahead])
+    far = np.flatnonzero(np.linalg.norm(points, axis=1) >= lookahead_m)
+    if not far.size:
+        x, y = points[-1]
+    else:
+        start, end = points[far[0] - 1], points[far[0]]
+        step = end - start
+        # Where the piece leaves the circle of the lookahead: |start + share step| = lookahead.
+        a, b, c = step @ step, start @ step, start @ start - lookahead_m**2
+        x, y = start + (-b + np.sqrt(b * b - a * c)) / a * step
+    distance_m2 = x * x + y * y
+    return float(2.0 * y / distance_m2) if distance_m2 > 0.0 else 0.0
+
+
+def load_driver_at(
+    address: str, view: PolicyView, rig: DrivenRig, expected_sha256: str | None = None
+) -> LoadedPolicy:
+    """A driver as a policy without a gradient; its hash names its version and its answers to fixed pictures.
+
+    Raises:
+        PolicyContractError: Nobody answers, or another than was expected.
+    """
+    policy = driver_at(address, view, rig)
+    digest = hashlib.sha256(
+        f"{policy.identity}\0{policy.contract.to_json()}\0{policy.answers_mrad()}".encode()
+    )
+    sha256 = digest.hexdigest()
+    if expected_sha256 not in (None, sha256):
+        raise PolicyContractError(
+            f"expected the driver {expected_sha256} at {address}, got {sha256}: it answers otherwise; run the experiment again"
+        )
+    return LoadedPolicy(policy, view, {"origin": address, "not_fixed": policy.identity}, sha256)
+
+
+def driver_at(address: str, view: PolicyView, rig: DrivenRig) -> AdaptedPolicy:
+    """A driver behind the contract of policies: pictures of a view in, controls out."""
+    contract = PolicyContract(view, stateless=False, differentiable=False)
+    return adapt(EgoDriver(address, rig), contract)
+
+
+def _camera(rig: DrivenRig) -> Any:
+    from carla_driver_interface.geometry import Pose
+    from carla_driver_interface.protocol import (
+        AvailableCamera,
+        CameraSpec,
+        OpenCVPinholeCameraParam,
+        ShutterType,
+    )
+    from scipy.spatial.transform import Rotation
+
+    T, pinhole = rig.T_car_from_camera, rig.pinhole
+    spec = CameraSpec(
+        opencv_pinhole_param=OpenCVPinholeCameraParam(
+            principal_point_x=pinhole.cx,
+            principal_point_y=pinhole.cy,
+            focal_length_x=pinhole.fx,
+            focal_length_y=pinhole.fy,
+        ),
+        logical_id=_CAMERA,
+        resolution_w=pinhole.width,
+        resolution_h=pinhole.height,
+        shutter_type=ShutterType.GLOBAL,
+    )
+    pose = Pose.from_rotation(T[:3, 3], Rotation.from_matrix(T[:3, :3]))
+    return AvailableCamera(intrinsics=spec, rig_to_camera=pose.to_proto(), logical_id=_CAMERA)
+
+
+def _channel(address: str) -> Any:
+    found = _ADDRESS.fullmatch(address)
+    if found is None:
+        raise PolicyContractError(f"expected grpc://HOST:PORT or grpcs://HOST:PORT, got {address}")
+    scheme, host, port = found.groups()
+    try:
+        import grpc
+        from carla_driver_interface.protocol import channel_options
+    except ModuleNotFoundError:
+        raise PolicyContractError(
+            f"{address}: drivers behind a socket need a package: pip install 'advnerf[egodriver]'"
+        ) from None
+    if scheme == "grpcs":
+        return grpc.secure_channel(
+            f"{host}:{port}", grpc.ssl_channel_credentials(), options=channel_options()
+        )
+    if not _on_this_computer(host):
+        raise PolicyContractError(
+            f"expected a driver on this computer, or grpcs:// (TLS), got {address}: anyone on the way could steer; forward a port to this computer "
+            "(ssh -L), or use TLS"
+        )
+    return grpc.insecure_channel(f"{host}:{port}", options=channel_options())
+
+
+def _on_this_computer(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return host == "localhost"
