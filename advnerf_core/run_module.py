@@ -46,8 +46,13 @@ def search_working_folder_last() -> None:
         here = os.getcwd()
     except FileNotFoundError:  # it was removed since
         return
-    if here not in _LastOfAll.folders:
-        _LastOfAll.folders.append(here)
+    search_folder_last(here)
+
+
+def search_folder_last(folder: str) -> None:
+    """Let this process find modules in a folder too, but none that has the name of one that it finds already."""
+    if folder not in _LastOfAll.folders:
+        _LastOfAll.folders.append(folder)
     if _LastOfAll not in sys.meta_path:
         sys.meta_path.append(_LastOfAll)
 

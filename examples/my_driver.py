@@ -1,5 +1,7 @@
 """A driver behind a socket, in the egodriver protocol that users of alpasim and CARLA speak: serves until it is stopped.
 
+    .venv/bin/python examples/my_driver.py 50051
+
 Needs ``pip install 'advnerf[egodriver]'``. In an experiment: ``victims: {mine: {policy: grpc://127.0.0.1:50051}}``.
 """
 
@@ -17,7 +19,9 @@ class TowardsTheTape(BaseDriver):
 
     def drive(self, ctx: DriveContext) -> DriveResult:
         """Two seconds of plan in the car's frame: x forward, y left."""
-        picture = ctx.session.latest_frame("camera_front").as_array().astype(float)
+        frame = ctx.session.latest_frame("camera_front")
+        assert frame is not None, "a picture comes before each question"
+        picture = frame.as_array().astype(float)
         lower = picture[len(picture) // 2 :]
         green = (lower[..., 1] - 0.6 * (lower[..., 0] + lower[..., 2])).clip(0.0).sum(axis=0)
         left, right = green[: len(green) // 2].sum(), green[len(green) // 2 :].sum()

@@ -1,4 +1,6 @@
-"""A policy of your own as the victim of an experiment, `my_policy.experiment.yaml`: a network with its declaration, found by its name.
+"""A policy of your own as the victim of an experiment, `my_policy.experiment.yaml`: nothing is trained.
+
+    .venv/bin/advnerf experiment examples/my_policy.experiment.yaml --setting quick --run-folder runs/my_policy
 
 This one follows the green tape of the simulated room by its place in the picture; put your network and its weights in its place.
 """
