@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from advnerf_core.attack.adjoint import AttackProblem, adjoint_gradient, evaluate
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_json
 from advnerf_core.memory import RETURNS_WHAT_IS_FREED, peak_mib, restart_peak
 from benchmarks.attack_toy import toy_problem
 from benchmarks.results import REPOSITORY, record_row
@@ -257,7 +257,7 @@ def main() -> None:
         compare(arguments.repeats, arguments.trial, (16, 24, 48) if arguments.trial else (60, 200, 600))
         return
     rows = measure(arguments.horizons, arguments.repeats)
-    write_atomically(arguments.output, json.dumps(rows, indent=1) + "\n")
+    write_json(arguments.output, rows)
     by_horizon = {row["horizon_steps"]: row for row in rows}
     if not arguments.no_record and {50, 400} <= set(by_horizon):
         short, long = by_horizon[50], by_horizon[400]

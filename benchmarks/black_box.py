@@ -37,7 +37,7 @@ from advnerf_core.attack.search.query_count import CountedPolicy, calls_per_eval
 from advnerf_core.attack.search.search import Evaluation, OnEvaluation, draw_start_states
 from advnerf_core.documents import read_json
 from advnerf_core.fields.voxel_grid import cube_face_object
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_atomically, write_json
 from advnerf_core.policies.contract import PolicyContract
 from advnerf_core.policies.load import load_any_policy
 from advnerf_core.policies.onnx_policy import export_onnx
@@ -288,7 +288,7 @@ def _piece(options: argparse.Namespace) -> tuple[bool, dict[str, Any]]:
     table = shares(searches, white_calls, none_m, white_m)
     draw(searches, white_calls, none_m, white_m, options.out / "black_box.png")
     numbers = {"none_m": none_m, "white_m": white_m, "white_calls": white_calls, "shares": table}
-    write_atomically(options.out / "black_box.json", json.dumps(numbers, indent=1) + "\n")
+    write_json(options.out / "black_box.json", numbers)
     return finished, numbers
 
 

@@ -10,7 +10,6 @@ cannot be told because the differences depend on their step. A horizon that was 
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from functools import partial
 from pathlib import Path
@@ -22,7 +21,7 @@ from advnerf_core.attack.adjoint import adjoint_gradient
 from advnerf_core.attack.closed_loop import closed_loop_cosine
 from advnerf_core.attack.health import closed_loss
 from advnerf_core.documents import read_json
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_json
 from benchmarks.results import REPOSITORY, record_row
 from nodes.experiment.node.check import in_double
 from nodes.experiment.node.prepare import Prepared, prepare
@@ -62,7 +61,7 @@ def kept_or_measured(prepared: Prepared, directions: int, folder: Path) -> dict[
     """The same, once for each scene, policy, request and number of directions."""
     file = folder / f"{prepared.settings_hash[:16]}_{directions}.json"
     if not file.exists():
-        write_atomically(file, json.dumps(measured(prepared, directions), indent=1) + "\n")
+        write_json(file, measured(prepared, directions))
     found: dict[str, Any] = read_json(file)
     return found
 

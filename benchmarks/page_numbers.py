@@ -8,7 +8,6 @@ not published any more.
 
 from __future__ import annotations
 
-import json
 import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -17,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.documents import read_json
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_json
 
 MARK = "measured once, not kept"
 _SETTING = "settings"
@@ -94,7 +93,7 @@ def list_numbers(docs: Path, rows: Iterable[Mapping[str, Any]]) -> dict[str, dic
 
 def write_list(docs: Path, rows: Iterable[Mapping[str, Any]]) -> None:
     """Write the list of numbers beside the pages."""
-    write_atomically(docs / LIST, json.dumps(list_numbers(docs, rows), indent=1) + "\n")
+    write_json(docs / LIST, list_numbers(docs, rows))
 
 
 def _problems(

@@ -8,7 +8,6 @@ equally often; medians count. ``--record`` writes what is measured now.
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -23,7 +22,7 @@ from advnerf_core.driving.dynamics import Dubins
 from advnerf_core.driving.path import Line
 from advnerf_core.driving.path import Path as ReferencePath
 from advnerf_core.fields.hash_grid import HashGrid, HashGridConfig
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_json
 from advnerf_core.geometry import Pinhole, camera_mount, make_transform, planar_poses
 from advnerf_core.policies.pilotnet import PilotNet
 from advnerf_core.scene.bake import bake
@@ -126,7 +125,7 @@ def main() -> int:
             "machine": machine_description(),
             "rates": {name: round(rate, 4) for name, rate in found.items()},
         }
-        write_atomically(RECORDED, json.dumps(kept, indent=1) + "\n")
+        write_json(RECORDED, kept)
         print(f"wrote the rates of {kind} to {RECORDED.name}")
         return 0
     recorded = kept[kind]["rates"]

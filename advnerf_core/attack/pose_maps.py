@@ -23,7 +23,7 @@ from advnerf_core.attack.spaces.placement import PoseSpace, placed
 from advnerf_core.documents import read_json
 from advnerf_core.driving.cross_track import cross_track
 from advnerf_core.errors import AdvnerfError
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_json
 from advnerf_core.geometry import Array
 
 _FORMAT = "advnerf-pose-map-1"
@@ -216,7 +216,7 @@ def _cells(
             done[index] = evaluate_cell(index)
             if file is not None:
                 content = {"format": _FORMAT, "fingerprint": fingerprint, "cells": done}
-                write_atomically(file, json.dumps(content, indent=1) + "\n")
+                write_json(file, content)
         if on_cell is not None:
             on_cell(index + 1, count)
     return [done[index] for index in range(count)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from advnerf_core.data.lens import Lens
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_json
 from advnerf_core.geometry import OPENGL_FROM_OPENCV, Pinhole
 
 T = TypeVar("T")
@@ -61,7 +60,7 @@ def write_transforms(
             frame["camera_id"] = ids[index]
         frame["transform_matrix"] = (poses[index] @ OPENGL_FROM_OPENCV).tolist()
         frames.append({**frame, **({} if shared else intrinsics[index])})
-    write_atomically(path, json.dumps({**content, "frames": frames}, indent=1) + "\n")
+    write_json(path, {**content, "frames": frames})
 
 
 def _each(value: Any, kind: type[T], count: int) -> list[T]:

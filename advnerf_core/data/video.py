@@ -16,7 +16,7 @@ from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.image_files import Rgb, write_image
 from advnerf_core.data.keyframes import Candidate, KeyframeConfig, KeyframeSelector
 from advnerf_core.documents import read_json
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_json
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
 _RECORD = "keyframes.json"
@@ -99,7 +99,7 @@ def keep_keyframes(
     for row in kept:
         if row not in rows:
             (folder / row["file"]).unlink()
-    write_atomically(folder / _RECORD, json.dumps({"key": key, "frames": rows}, indent=1) + "\n")
+    write_json(folder / _RECORD, {"key": key, "frames": rows})
     return [folder / row["file"] for row in rows]
 
 

@@ -197,7 +197,7 @@ def _print_summary(results: list[dict[str, Any]]) -> None:
 
 
 def _write_summary(folder: Path, results: list[dict[str, Any]]) -> None:
-    from advnerf_core.files import write_atomically
+    from advnerf_core.files import write_json
     from nodes.lab.trials.series import summarise
 
-    write_atomically(folder / "summary.json", json.dumps(summarise(results), indent=1) + "\n")
+    write_json(folder / "summary.json", summarise(results))

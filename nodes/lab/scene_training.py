@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +16,7 @@ from advnerf_core.data.image_files import OPAQUE
 from advnerf_core.data.transforms import load_transforms
 from advnerf_core.data.views import ImageSet, PosedImages
 from advnerf_core.fields.hash_grid import HashGridConfig
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_atomically, write_json
 from advnerf_core.geometry import Array
 from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.field import SceneFieldConfig, save_scene
@@ -78,9 +77,9 @@ def train(request: TrainingRequest, report: Report) -> dict[str, Any]:
         rows = [
             {"image": name, "gain": gain.tolist()} for name, gain in zip(names, trained.gains, strict=True)
         ]
-        write_atomically(request.output / EXPOSURE, json.dumps(rows, indent=1) + "\n")
+        write_json(request.output / EXPOSURE, rows)
     figures = evaluate(FieldRenderer.from_file(request.output / SCENE), held_out, request.size)
-    write_atomically(request.output / FIGURES, json.dumps(figures, indent=1) + "\n")
+    write_json(request.output / FIGURES, figures)
     return figures
 
 

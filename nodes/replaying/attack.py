@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_json
 from nodes.bags.reader import read_info, read_messages
 from nodes.replaying.nodes import Choice
 from nodes.replaying.replay import Replay
@@ -123,7 +123,7 @@ class RetroAttack:
 
     def write_json(self, path: Path) -> None:
         """Write summary and rows."""
-        write_atomically(path, json.dumps({**self.numbers(), "images": list(self.rows())}, indent=1) + "\n")
+        write_json(path, {**self.numbers(), "images": list(self.rows())})
 
 
 def retro_attack(bag: Path, attack: Path, choice: Choice) -> RetroAttack:

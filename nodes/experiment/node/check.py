@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -30,7 +29,7 @@ from advnerf_core.attack.health import (
 from advnerf_core.attack.health_plot import draw_health
 from advnerf_core.attack.methods import alternatives, black_box_methods
 from advnerf_core.driving.clean_drive import CleanDrive
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_atomically, write_json
 from nodes.experiment.node.memory import measured_mib
 from nodes.experiment.node.prepare import Prepared, prepare, sensor_of
 from nodes.experiment.node.request import AttackRequest
@@ -234,7 +233,7 @@ def write_check(found: Check, folder: Path) -> tuple[Path, Path]:
     }
     data["gradient_pass_ms_per_frame"] = 1e3 * found.split.gradient_pass_s / found.split.frames
     table, picture = folder / "check.json", folder / "check.png"
-    write_atomically(table, json.dumps(data, indent=1) + "\n")
+    write_json(table, data)
     image = draw_health(found.adjoint, found.frozen, found.closed, found.ticks, found.memory_mib, found.split)
     write_atomically(picture, image)
     return table, picture

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +18,7 @@ from advnerf_core.attack.search.search import SearchResult
 from advnerf_core.attack.spaces.placed_sensor import PlacedSensor
 from advnerf_core.attack.spaces.placement import KeepOut, PoseBounds, PoseSpace, placed
 from advnerf_core.fields.voxel_grid import VoxelGridObject
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_atomically, write_json
 from advnerf_core.render.soft_pose import placement_of
 from nodes.experiment.engine.artefact import hash_of
 from nodes.experiment.engine.telling import telling
@@ -237,5 +236,5 @@ def _keep(ready: PreparedPoses, result: SearchResult, file: Path) -> None:
         "searched_total_cte_m": [e.predicted_total_cte_m for e in result.history],
         "seconds": [e.seconds for e in result.history],
     }
-    write_atomically(file.with_name(f"seed_{ready.prepared.seed}.json"), json.dumps(curve, indent=1) + "\n")
+    write_json(file.with_name(f"seed_{ready.prepared.seed}.json"), curve)
     save_attack(file, attack)  # last: a file that is there is a finished seed

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from advnerf_core.attack.objectives import load_objective
 from advnerf_core.attack.on_device import all_on_chosen_device, on_chosen_device
 from advnerf_core.attack.search.search import Evaluation, OnEvaluation, SearchResult
 from advnerf_core.attack.search.together import gradient_attacks
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_atomically, write_json
 from advnerf_core.places import require_utf8
 from advnerf_core.plugins import name_in_results
 from nodes.experiment.engine.telling import telling
@@ -233,7 +232,7 @@ def _keep(prepared: Prepared, result: SearchResult, folder: Path) -> None:
         "seconds": [e.seconds for e in result.history],
         "clean_drive": prepared.clean_drive.to_dict(),
     }
-    write_atomically(folder / f"seed_{prepared.seed}.json", json.dumps(curve, indent=1) + "\n")
+    write_json(folder / f"seed_{prepared.seed}.json", curve)
 
 
 def _both(first: OnEvaluation, second: OnEvaluation | None) -> OnEvaluation:

@@ -173,7 +173,7 @@ def run_here(job: Job, store: Store, experiment: Experiment, bench: Bench, displ
         try:
             _run(job, store, work, experiment, report, bench)
         except Exception as error:
-            text = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            text = _in_one_line(error)
             store.keep_error(job.name, job.settings_hash, text)
             (work / LOG).write_text(traceback.format_exc(), encoding="utf-8")
             return Ended(job.name, "failed", text, time.monotonic() - began)
@@ -210,10 +210,12 @@ def _run_job() -> None:
                 _run(job, store, work, experiment, _log_progress())
             except Exception as error:
                 traceback.print_exc(file=log)
-                store.keep_error(
-                    job.name, job.settings_hash, f"{type(error).__name__}: {' '.join(str(error).split())}"
-                )
+                store.keep_error(job.name, job.settings_hash, _in_one_line(error))
                 raise SystemExit(_FAILED) from None
+
+
+def _in_one_line(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
 def take_cell(store: Store, name: str) -> TextIO:
@@ -239,9 +241,7 @@ def _checked(job: Job, store: Store) -> Experiment:
                 f"{job.name}: its settings or inputs changed after the campaign was started; run the campaign again"
             )
     except Exception as error:
-        store.keep_error(
-            job.name, job.settings_hash, f"{type(error).__name__}: {' '.join(str(error).split())}"
-        )
+        store.keep_error(job.name, job.settings_hash, _in_one_line(error))
         raise SystemExit(_FAILED) from None
     return experiment
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from advnerf_core.data.image_files import write_image
 from advnerf_core.data.transforms import load_transforms
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_json
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.baked import BakedScene
 from advnerf_core.scene.field import load_scene
@@ -81,4 +80,4 @@ def compare_views(experiment: RunFolder[Any], view: PolicyView, begin: float, re
             row[f"{name}_image"] = str(path.relative_to(experiment.folder))
         rows.append(row)
     means = {key: float(np.mean([row[key] for row in rows])) for key in ("psnr_full_db", "psnr_policy_db")}
-    write_atomically(folder / FIDELITY, json.dumps({"mean": means, "views": rows}, indent=1) + "\n")
+    write_json(folder / FIDELITY, {"mean": means, "views": rows})

@@ -6,7 +6,6 @@ states of a run folder execute no code of it.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import Field
 
 from advnerf_core.documents import read_json
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_json
 from advnerf_core.policies.contract import PolicyContract
 from advnerf_core.policies.load import is_address, load_adapted, load_any_policy, source_sha256
 from advnerf_core.policies.policy_file import LoadedPolicy, policy_sha256
@@ -84,7 +83,7 @@ def look_at_given(experiment: Experiment) -> None:
         )
     if known | found != known:
         data = {name: each.model_dump(mode="json") for name, each in (known | found).items()}
-        write_atomically(experiment.folder / KEPT, json.dumps(data, indent=1) + "\n")
+        write_json(experiment.folder / KEPT, data)
 
 
 def _look_at(experiment: Experiment, spec: str, known: GivenPolicy | None) -> GivenPolicy:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 
 from advnerf_core.data.transforms import load_transforms
 from advnerf_core.documents import read_json
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_json
 from advnerf_core.geometry import Array, planar_poses
 from advnerf_core.scene.bake import NotBakedError, bake
 from advnerf_core.scene.baked import BakedScene
@@ -35,7 +34,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     try:
         baked = bake(load_field(experiment), views_of(experiment), experiment.view.pinhole)
     except NotBakedError as error:
-        write_atomically(folder / COMPARED, json.dumps({"used": False, "why": str(error)}, indent=1) + "\n")
+        write_json(folder / COMPARED, {"used": False, "why": str(error)})
         return
     report(0.8, "comparing")
     fidelity = read_json(experiment.stage_folder("scene") / FIDELITY)
@@ -50,7 +49,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         "most_lost_db": _MOST_LOST_DB,
         "mib": baked.voxels.nbytes / 2**20,
     }
-    write_atomically(folder / COMPARED, json.dumps(found, indent=1) + "\n")
+    write_json(folder / COMPARED, found)
 
 
 def views_of(experiment: Experiment) -> Array:

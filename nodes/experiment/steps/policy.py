@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from advnerf_core.data.view_loading import load_image
 from advnerf_core.driving.path import Array
 from advnerf_core.driving.rollout import Remembering
 from advnerf_core.fields.voxel_grid import VoxelGridObject
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_json
 from advnerf_core.geometry import planar_pose
 from advnerf_core.learning.imitation import ImitationProgress, Learned, train_policy
 from advnerf_core.learning.recipe import ImitationConfig, SourcePlan
@@ -99,7 +98,7 @@ def run(experiment: Experiment, folder: Path, report: MeasuringReport) -> None:
         "control_unit": experiment.car.control_unit,
         "on_held_out_views": agreement(experiment),
     }
-    write_atomically(folder / "policy.json", json.dumps(summary, indent=1) + "\n")
+    write_json(folder / "policy.json", summary)
 
 
 def _telling(experiment: Experiment, report: MeasuringReport) -> ImitationProgress:
@@ -275,7 +274,7 @@ def agreement(experiment: Experiment, policy: Policy | None = None) -> list[dict
 
 def write_placement(experiment: Experiment, folder: Path) -> None:
     """The objects' places, and each drive's first view without and with them, plain."""
-    write_atomically(folder / "objects.json", json.dumps(describe(experiment), indent=1) + "\n")
+    write_json(folder / "objects.json", describe(experiment))
     background = load_background(experiment)
     bare = surrogate_of(experiment, [], background)
     attacked = [face_object(experiment)] if has_face(experiment) else placed_objects(experiment)

@@ -7,7 +7,6 @@ against an adversary that answers it. Every search, collection, training and dri
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import os
 from collections.abc import Callable, Sequence
@@ -26,7 +25,7 @@ from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.spaces.space import ColourSpace
 from advnerf_core.documents import read_json
 from advnerf_core.driving.path import Array
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_json
 from advnerf_core.learning.frames import Frames, FrameStore
 from advnerf_core.learning.recipe import SourcePlan, recovery_states
 from advnerf_core.learning.retrain import FineTuneConfig, fine_tune
@@ -98,7 +97,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
                 "settings_hash": hash_of(wanted.model_dump(mode="json")),
             }
             # After every round: a loop takes hours, and may be stopped.
-            write_atomically(folder / "retrain.json", json.dumps(summary, indent=1) + "\n")
+            write_json(folder / "retrain.json", summary)
             retrain_plot.draw(folder / "curve.png", rounds, wanted.pays_ratio)
             if number == wanted.rounds or not _pays(found, wanted.pays_ratio):
                 break
@@ -230,7 +229,7 @@ def _judged(
             learned[0] / learned[1],
             driven[0] / driven[1],
         )
-    write_atomically(kept, json.dumps({"of": key, "ratios": ratios}, indent=1) + "\n")
+    write_json(kept, {"of": key, "ratios": ratios})
     return Found(thetas, ratios)
 
 

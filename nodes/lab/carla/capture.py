@@ -12,7 +12,7 @@ import numpy as np
 
 from advnerf_core.data.posed_images import write_posed_images
 from advnerf_core.documents import read_json
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_json
 from advnerf_core.geometry import planar_pose
 from hardware.worlds.carla.config import CarlaConfig
 from hardware.worlds.carla.photos import held_out_states, photo_poses
@@ -62,7 +62,7 @@ def capture(
         rng = np.random.default_rng(request.seed)
         poses = photo_poses(scene.drives, config, request.photos, rng)
         states = held_out_states(scene.drives, request.held_out, rng)
-        write_atomically(folder / DRIVES, json.dumps(drives, indent=1) + "\n")
+        write_json(folder / DRIVES, drives)
         total = len(poses) + len(states)
 
         taken = write_posed_images(
@@ -99,4 +99,4 @@ def _claim(folder: Path, config: CarlaConfig, request: CaptureRequest, drives: d
         return
     if folder.exists() and any(folder.iterdir()):
         raise ConfigError(f"{folder} is not empty and holds no capture: name another folder")
-    write_atomically(file, json.dumps({"sha256": digest, **json.loads(text)}, indent=1) + "\n")
+    write_json(file, {"sha256": digest, **json.loads(text)})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from advnerf_core.data.lens import Lens
 from advnerf_core.data.similarity import Similarity, extent
 from advnerf_core.data.transforms_write import write_transforms
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_json
 from advnerf_core.geometry import Array, Pinhole, make_transform
 from calibration.phone_and_car import Placed, place_in_mocap
 from calibration.photo_model import Model, PhotoSource, SfmConfig
@@ -285,5 +284,5 @@ def _box(corners: Array, margin: float) -> dict[str, Any]:
 
 
 def _finish(output: Path, transforms: tuple[Path, ...], facts: dict[str, Any]) -> Imported:
-    write_atomically(output / REPORT_FILE, json.dumps(facts, indent=1) + "\n")
+    write_json(output / REPORT_FILE, facts)
     return Imported(transforms, facts)

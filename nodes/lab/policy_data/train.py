@@ -14,7 +14,7 @@ import torch
 
 from advnerf_core.documents import read_json
 from advnerf_core.driving.expert import Expert
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_atomically, write_json
 from advnerf_core.learning.fit import FitConfig, fit, mean_absolute_error
 from advnerf_core.learning.frames import FrameSet, FrameStore
 from advnerf_core.learning.imitation import ImitationProgress, train_policy
@@ -114,7 +114,7 @@ def train_from_recordings(
     unchecked = {part.name: part.unchecked for part in parts if part.unchecked}
     result = Training(out / POLICY, sha256, mae, {**named, **frames}, left_out, unchecked)
     summary = {**asdict(result), "path": POLICY, "settings": claim}
-    write_atomically(out / "policy.json", json.dumps(summary, indent=1) + "\n")
+    write_json(out / "policy.json", summary)
     for old in (out / "work").iterdir():
         if old != work:
             shutil.rmtree(old, ignore_errors=True)

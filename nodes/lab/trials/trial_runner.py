@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_json
 from nodes.lab.trials.drive_health import read_health, spoiled_by
 from nodes.lab.trials.trial import SpoiledError, TrialError, TrialNode, TrialOutcome, TrialPlan
 from nodes.launching.launch import Launch
@@ -61,7 +60,7 @@ def run_trial(
     )
     if spoiled := spoiled_by(health):
         raise SpoiledError(spoiled)
-    write_atomically(run_dir / "trial.json", json.dumps(outcome.to_dict(), indent=1) + "\n")
+    write_json(run_dir / "trial.json", outcome.to_dict())
     return outcome
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.documents import read_json
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_atomically, write_json
 from nodes.lab.trials.trial import SpoiledError, TrialError
 
 MOST_TRIES = 3
@@ -56,7 +56,7 @@ def drive_with_tries(
             result = {**drive(), "spoiled": _all(rounds)}
         except SpoiledError as error:
             rounds[-1].append(" ".join(str(error).split()))
-            write_atomically(kept, json.dumps(rounds, indent=1) + "\n")
+            write_json(kept, rounds)
             tell(f"{file.stem} does not count: {rounds[-1][-1]} (try {len(rounds[-1])} of {MOST_TRIES})")
             continue
         write_atomically(file, json.dumps(result) + "\n")
@@ -70,7 +70,7 @@ def allow_more_tries(folder: Path) -> None:
     for kept in folder.glob(f"*{_TRIES}"):
         rounds = _read(kept)
         if len(rounds[-1]) >= MOST_TRIES:
-            write_atomically(kept, json.dumps([*rounds, []], indent=1) + "\n")
+            write_json(kept, [*rounds, []])
 
 
 def _read(kept: Path) -> list[list[str]]:

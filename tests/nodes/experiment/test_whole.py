@@ -127,7 +127,7 @@ def test_a_face_is_also_deployed_without_nodes_and_meets_the_same_searches(tmp_p
     os.environ.setdefault("MUJOCO_GL", "egl")
     asked = [*SMALL, "deploy.through=world", "deploy.starts=null"]
     experiment = load_experiment(LAUNCH / f"{file}.experiment.yaml", "demo", asked, tmp_path)
-    run_experiment(experiment)
+    run_experiment(experiment, overrides=asked)
     cell = Cell("track", "hardened", "random", 0)
     drives, clean = (
         json.loads((driven_folder(experiment, each) / "drives.json").read_text())
