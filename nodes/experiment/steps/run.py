@@ -15,6 +15,7 @@ from advnerf_core.attack.objectives import name_objective
 from advnerf_core.documents import Document
 from advnerf_core.places import require_utf8
 from advnerf_core.plugins import name_in_results, unknown
+from advnerf_core.run_module import search_folder_last
 from advnerf_core.strict import validate
 from hardware.worlds.world import Photographed
 from nodes.experiment.engine.artefact import REFERENCE, Artefact
@@ -75,6 +76,10 @@ def load_experiment(
     experiment = Experiment(config, file.resolve(), folder.resolve(), setting, executes=executes)
     if executes or not is_users(config.world):
         _check_world(experiment, document)
+    if given_in(config):
+        search_folder_last(
+            str(experiment.file.parent)
+        )  # package.module:factory may lie beside the experiment file
     try:
         stages = stages_of(experiment)
     except (VictimUnknownError, WorldUnknownError):

@@ -1,6 +1,9 @@
 """Policies that a user brings are attacked by an experiment: a file without a gradient and a module with one, none of them trained here."""
 
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +121,29 @@ def test_a_module_has_a_gradient_and_finished_cells_are_not_run_again(folder: Pa
     assert [end.name for end in ended] == ["track_module_gradient_0"]
     found = statuses(campaign_of(loaded(folder), (), cells(loaded(folder))), cells(loaded(folder)))
     assert {each.state for each in found} == {"done"}
+
+
+def test_a_factory_is_found_beside_the_experiment_file(folder: Path, tmp_path: Path) -> None:
+    """In a process of its own: this one has imported the module."""
+    command = [
+        sys.executable,
+        "-m",
+        "nodes.cli",
+        "status",
+        str(folder / "mine.experiment.yaml"),
+        "--setting",
+        "tiny",
+    ]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    done = subprocess.run(
+        [*command, "--run-folder", str(folder / "run")],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert "4 done of 4 cells" in done.stdout, done.stderr
 
 
 def test_a_black_box_has_no_gradient(folder: Path) -> None:
