@@ -21,7 +21,7 @@ from advnerf_core.report.cells import read_cell
 from benchmarks.results import record_row
 from nodes.experiment.plan.victims import HARDENED
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.victims import victim_spec
+from nodes.experiment.show.given import victim_spec
 from nodes.experiment.steps.policy import agreement
 
 _LEAST_DB, _MOST_SHARE, _MOST_MIN = 25.0, 0.02, 60.0

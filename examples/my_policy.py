@@ -6,6 +6,7 @@ This one steers to where the picture is green, as the tape of the simulated room
 """
 
 import torch
+
 from advnerf_core import PolicyContract, PolicyView, adapt
 from calibration.schema import CameraCalibration, load_calibration
 from nodes.runtime.paths import shipped

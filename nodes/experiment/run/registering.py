@@ -34,7 +34,7 @@ from nodes.experiment.run.config import Campaign
 from nodes.experiment.run.plan import read_experiment, registered_cell, statuses
 from nodes.experiment.run.store import FINISHED
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.victims import given
+from nodes.experiment.show.given import given
 from nodes.experiment.steps.attack import planned_evaluations
 from nodes.experiment.steps.keys import registered_settings
 from nodes.experiment.steps.verdicts import TRAINED_ON, VALIDATED_ON, unseen

@@ -37,8 +37,8 @@ from nodes.experiment.engine.run_folder import CELLS, RunFolder
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.plan.placed import PlacedObject, in_a_lane
+from nodes.experiment.show.given import given, given_in
 from nodes.experiment.show.kept_worlds import KeptWorld, is_users, kept_world
-from nodes.experiment.show.victims import given, given_in
 from nodes.lab.worlds.expert_drive import as_path
 from nodes.lab.worlds.named import NamedWorld, read_world, without
 from nodes.runtime.config import load_config

@@ -10,9 +10,9 @@ from nodes.experiment.engine.artefact import hash_of
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.faces import has_face, panel_of
+from nodes.experiment.show.given import victim_sha256
 from nodes.experiment.show.learned_scene import scene_sha256
 from nodes.experiment.show.spaces import geometry_sha256
-from nodes.experiment.show.victims import victim_sha256
 from nodes.experiment.steps.search_files import FROZEN
 from nodes.experiment.steps.verdicts import passing_digest
 from nodes.runtime.errors import RuntimeFault

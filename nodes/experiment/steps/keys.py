@@ -17,7 +17,7 @@ from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.space_config import FaceConfig
 from nodes.experiment.plan.victims import RETRAINED
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.victims import given, given_in, victim_sha256, victim_spec
+from nodes.experiment.show.given import given, given_in, victim_sha256, victim_spec
 from nodes.experiment.steps import bake
 from nodes.runtime.errors import RuntimeFault
 

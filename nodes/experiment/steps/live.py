@@ -21,7 +21,7 @@ from nodes.control.stop_causes import is_stall
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import DeployedDrive
 from nodes.experiment.show.faces import on_screen, panel_of, wanted_face
-from nodes.experiment.show.victims import victim_sha256, victim_spec
+from nodes.experiment.show.given import victim_sha256, victim_spec
 from nodes.lab.trials.evaluation import attack_ids, counterfactual, score, timing, trajectory
 from nodes.lab.trials.trial import TrialPlan
 from nodes.lab.trials.trial_runner import run_trial

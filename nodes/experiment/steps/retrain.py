@@ -37,10 +37,11 @@ from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import Dressed
 from nodes.experiment.show.drives import deployed_drives
+from nodes.experiment.show.given import victim_spec
 from nodes.experiment.show.native import stand_in
 from nodes.experiment.show.objects import placed_objects
 from nodes.experiment.show.spaces import colour_space, random_placements
-from nodes.experiment.show.victims import load_victim, victim_spec
+from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps import retrain_plot
 from nodes.experiment.steps.attack import attack_problem, load_shown, surrogate_part
 from nodes.experiment.steps.frozen import freeze

@@ -28,8 +28,9 @@ from nodes.experiment.plan.space_config import FaceConfig
 from nodes.experiment.plan.victims import RETRAINED
 from nodes.experiment.show import objects
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.given import VictimUnknownError, given_in, victim_spec
 from nodes.experiment.show.kept_worlds import WorldUnknownError, is_users, keep_worlds
-from nodes.experiment.show.victims import VictimUnknownError, given_in, look_at_given, victim_spec
+from nodes.experiment.show.victims import look_at_given
 from nodes.experiment.steps import bake, capture, live, policy, retrain, scene
 from nodes.experiment.steps.live import lab_of
 from nodes.lab.worlds.named import read_world

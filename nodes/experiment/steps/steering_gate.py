@@ -11,7 +11,8 @@ import numpy as np
 
 from advnerf_core.documents import read_json
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.victims import given_in, load_victim
+from nodes.experiment.show.given import given_in
+from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.policy import agreement
 from nodes.runtime.errors import RuntimeFault
 

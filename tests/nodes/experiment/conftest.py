@@ -21,9 +21,9 @@ from hardware.worlds.junction.scene import Intersection
 from hardware.worlds.world import World, WorldDescription
 from nodes.experiment.plan.victims import HARDENED, NAIVE
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.given import victim_spec
 from nodes.experiment.show.learned_scene import scene_file
 from nodes.experiment.show.objects import build, object_file
-from nodes.experiment.show.victims import victim_spec
 from nodes.experiment.steps.run import load_experiment
 from tests.support.stage_versions import measured
 

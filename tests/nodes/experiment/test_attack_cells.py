@@ -27,9 +27,10 @@ from nodes.experiment.plan.robustness_config import RobustnessConfig
 from nodes.experiment.plan.victims import NAIVE
 from nodes.experiment.run.cells import run_cell, search_cell
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.given import victim_spec
 from nodes.experiment.show.learned_scene import load_field
 from nodes.experiment.show.spaces import colour_space
-from nodes.experiment.show.victims import load_victim, victim_spec
+from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps import attack, frozen, run
 from nodes.experiment.steps.attack import cells, load_shown, surrogate_part
 from nodes.experiment.steps.deploy import DRIVES, ThroughWorld, cell_data

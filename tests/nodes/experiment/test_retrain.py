@@ -15,7 +15,8 @@ from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.config import RetrainConfig
 from nodes.experiment.plan.victims import HARDENED, RETRAINED
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.victims import load_victim, victim_spec
+from nodes.experiment.show.given import victim_spec
+from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps import attack, retrain
 
 SMALL = RetrainConfig(rounds=1, pays_ratio=1e-6, stills=2, drives=1, drive_steps=2, placements=1, steps=2)

@@ -7,7 +7,7 @@ import pytest
 
 from advnerf_core.data.posed_images import write_posed_images
 from advnerf_core.documents import Document
-from advnerf_core.errors import AdvnerfError
+from advnerf_core.errors import AdvnerfError, ConfigError
 from advnerf_core.geometry import (
     Array,
     Pinhole,
@@ -141,8 +141,8 @@ def test_an_open_path_from_a_file(tmp_path: Path) -> None:
         < 0.01
     )
     assert path.length_m == pytest.approx(3.0, abs=0.02)
-    file.write_text("0,0\n1;2\n")
-    with pytest.raises(WorldError, match=r"way\.csv:2: expected two numbers"):
+    file.write_text("x_m,y_m\n0,0\n1;2\n")
+    with pytest.raises(ConfigError, match=r"way\.csv:3: expected 2 fields as in the header"):
         points_of(file)
     with pytest.raises(WorldError, match="one smooth way"):
         path_along(np.zeros((4, 2)), 0.25, False)

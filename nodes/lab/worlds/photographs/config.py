@@ -75,7 +75,7 @@ class PhotographsConfig(StrictModel):
     Attributes:
         images: ``transforms.json`` of posed images, or its folder, in metres with z up; ``advnerf scene from-...`` makes one.
         path: ``driven``: the photographs were taken while driving, in the order in which they are listed; or the ``.json`` file of those
-            that were, as ``transforms_car.json``; or a CSV file of x [m], y [m] in driving order, in the frame of the photographs.
+            that were, as ``transforms_car.json``; or a CSV file with columns x_m, y_m in driving order, in the frame of the photographs.
         closed: Whether the path goes round.
         off_track_m: Half the width of the lane [m].
         ground_z_m: Height of the ground in the frame of the photographs [m]; None: below the driven ones, by the camera's height.

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import numpy as np
 
+from advnerf_core.documents import read_csv
 from advnerf_core.geometry import Array
 from hardware.worlds.fitting import path_through
 from hardware.worlds.paths import ReferencePath
@@ -42,29 +42,18 @@ def driven_track(cars: Array) -> Array:
     if len(best) < 3:
         raise WorldError(
             f"expected at least three photographs one after the other along a drive, got {len(points)} of which {len(best)} are; give the path "
-            "as a CSV file of x [m], y [m]"
+            "as a CSV file with columns x_m, y_m"
         )
     return points[best]
 
 
 def points_of(file: Path) -> Array:
-    """x [m], y [m] ``[N, 2]`` of a CSV file; a first line of words is a header.
+    """x [m], y [m] ``[N, 2]`` of a CSV file with the columns ``x_m`` and ``y_m``.
 
     Raises:
-        WorldError: It holds something else.
+        ConfigError: It holds something else.
     """
-    rows: list[tuple[float, float]] = []
-    with file.open(newline="", encoding="utf-8-sig") as stream:
-        for number, row in enumerate(csv.reader(stream), start=1):
-            try:
-                x_m, y_m = map(float, row)
-            except ValueError:
-                if number == 1:
-                    continue
-                raise WorldError(
-                    f"{file}:{number}: expected two numbers, x [m] and y [m], got {', '.join(row)!r:.80}"
-                ) from None
-            rows.append((x_m, y_m))
+    rows = [(row.number("x_m"), row.number("y_m")) for row in read_csv(file, ("x_m", "y_m"))]
     return np.array(rows, dtype=np.float64).reshape(-1, 2)
 
 
