@@ -14,7 +14,8 @@ from advnerf_core.scene.gate_limits import GateLimits
 from advnerf_core.strict import StrictModel
 from nodes.experiment.plan.deploy_config import DeployConfig
 from nodes.experiment.plan.method_names import ArchitectureReference, MethodReference, ObjectiveReference
-from nodes.experiment.plan.placed import PANEL, PlacedObject, WantedObject
+from nodes.experiment.plan.object_kinds import OBJECT_SUFFIX, PANEL, name_of
+from nodes.experiment.plan.placed import PlacedObject, WantedObject
 from nodes.experiment.plan.robustness_config import RobustnessConfig
 from nodes.experiment.plan.space_config import (
     ColoursConfig,
@@ -223,6 +224,9 @@ class ObjectConfig(StrictModel):
     hydrant_resolution: Annotated[int, Field(ge=8, le=128)] = Field(
         default=48, description="The same of a hydrant."
     )
+    mesh_resolution: Annotated[int, Field(ge=8, le=128)] = Field(
+        default=48, exclude_if=lambda cells: cells == 48, description="The same of a mesh of your own."
+    )
     fit_steps: Count = Field(default=300, description="Steps that refine the voxels on pictures of the mesh.")
     # Left out where they are these, so that results without panels do not depend on them.
     panel_resolution: Annotated[int, Field(ge=2, le=128)] = Field(
@@ -348,6 +352,11 @@ class ExperimentConfig(StrictModel):
         ):
             if len(set(names)) != len(names):
                 raise ValueError(f"expected different {what}, got {', '.join(names)}")
+        kinds = {each.kind for each in self.objects}
+        if len({name_of(kind).partition(".")[0] for kind in kinds}) != len(kinds):
+            raise ValueError(
+                f"expected files of different names as kinds of objects, got {', '.join(sorted(kinds))}"
+            )
         return self
 
     @model_validator(mode="after")
@@ -417,6 +426,12 @@ class ExperimentConfig(StrictModel):
             )
         if isinstance(self.space, (MeshTextureConfig, MeshShapeConfig)) and len(others) < len(self.objects):
             raise ValueError(f"expected objects with a mesh with space.kind {self.space.kind}, got a panel")
+        if isinstance(self.space, (MeshTextureConfig, MeshShapeConfig)) and any(
+            each.kind.endswith(OBJECT_SUFFIX) for each in self.objects
+        ):
+            raise ValueError(
+                f"expected objects with a mesh with space.kind {self.space.kind}, got voxels (*{OBJECT_SUFFIX}); name the mesh itself (.glb)"
+            )
         return self
 
     @model_validator(mode="after")

@@ -14,15 +14,8 @@ from advnerf_core.geometry import Array, make_transform, rotation_z
 from advnerf_core.strict import StrictModel
 from hardware.worlds.paths import ReferencePath
 from hardware.worlds.world import WorldDescription
+from nodes.experiment.plan.object_kinds import ObjectKind, footprint_m
 
-ObjectKind = Literal["small_car", "hydrant", "panel"]
-PANEL: ObjectKind = "panel"
-# Length and width [m] at scale 1: of the objects that ``advnerf object build --generate`` makes, and of a square panel that stands upright.
-OBJECT_SIZES_M: dict[ObjectKind, tuple[float, float]] = {
-    "small_car": (3.64, 1.7),
-    "hydrant": (0.48, 0.48),
-    "panel": (0.1, 2.0),
-}
 _SPACING_M = 0.05  # of the points that stand for a lane's middle
 
 
@@ -31,7 +24,7 @@ class PlacedObject(StrictModel):
 
     Attributes:
         name: Unique name.
-        kind: What it is.
+        kind: What it is: small_car, hydrant, panel, or a file of a user's, see `object_kinds`.
         x_m: Middle of its foot [m].
         y_m: Middle of its foot [m].
         z_m: Height it stands on [m]: the kerb's on a pavement.
@@ -50,7 +43,7 @@ class PlacedObject(StrictModel):
     @property
     def side_m(self) -> float:
         """Width [m]; of a panel also its height."""
-        return self.scale * OBJECT_SIZES_M[self.kind][1]
+        return self.scale * footprint_m(self.kind)[1]
 
     @property
     def T_world_from_face(self) -> Array:
@@ -65,7 +58,7 @@ class PlacedObject(StrictModel):
 
     def corners_m(self) -> list[tuple[float, float]]:
         """The four corners [m] of the ground it covers."""
-        length, width = (0.5 * self.scale * size for size in OBJECT_SIZES_M[self.kind])
+        length, width = (0.5 * self.scale * size for size in footprint_m(self.kind))
         c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         signs = ((1, 1), (-1, 1), (-1, -1), (1, -1))
         ends = [(a * length, b * width) for a, b in signs]
@@ -138,7 +131,7 @@ def in_a_lane(objects: Sequence[PlacedObject], world: WorldDescription) -> tuple
     for index, thing in enumerate(objects):
         turned, half = (
             rotation_z(thing.yaw_rad)[:2, :2],
-            0.5 * thing.scale * np.array(OBJECT_SIZES_M[thing.kind]),
+            0.5 * thing.scale * np.array(footprint_m(thing.kind)),
         )
         seen_from_it = (middles - [thing.x_m, thing.y_m]) @ turned
         nearest = np.clip(seen_from_it, -half, half)  # of the ground that it covers

@@ -28,7 +28,7 @@ from advnerf_core.report.evidence.registration import (
 from nodes.experiment.engine.artefact import hash_of
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.config import ExperimentConfig
-from nodes.experiment.plan.placed import PANEL
+from nodes.experiment.plan.object_kinds import PANEL
 from nodes.experiment.plan.space_config import ColoursConfig, FaceConfig
 from nodes.experiment.run.config import Campaign
 from nodes.experiment.run.plan import read_experiment, registered_cell, statuses

@@ -67,7 +67,8 @@ class Experiment(RunFolder[ExperimentConfig]):
     def resolved_in(cls, folder: FilePath) -> Experiment:
         """The experiment that a run folder is of, as its manifest resolved it."""
         manifest = read_json(folder / "manifest.json")
-        config = ExperimentConfig.model_validate(manifest["config"])
+        context = {"folder": FilePath(manifest["file"]).parent}
+        config = ExperimentConfig.model_validate(manifest["config"], context=context)
         return cls(config, FilePath(manifest["file"]), folder, manifest["setting"])
 
     @cached_property

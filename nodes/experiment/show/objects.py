@@ -16,14 +16,14 @@ from advnerf_core.objects.voxel.generators import GENERATORS
 from advnerf_core.objects.voxel.mesh import stand
 from advnerf_core.objects.voxel.model import ObjectModel, load_object, save_object
 from advnerf_core.scene.surrogate import BackgroundRenderer, Surrogate
-from nodes.experiment.plan.placed import PANEL, ObjectKind
+from nodes.experiment.plan.object_kinds import MADE_HERE_M, PANEL, is_mesh, load_mesh_of, name_of
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.learned_scene import load_background
 from nodes.runtime.progress import Report
 
 # As of a stage (`run.VERSIONS`), of what is made of a mesh; the stage's own is that of panels, which it only describes.
 MESH_VERSION = 2
-GENERATOR_OF: dict[ObjectKind, str] = {"small_car": "car", "hydrant": "hydrant"}
+GENERATOR_OF: dict[str, str] = {"small_car": "car", "hydrant": "hydrant"}
 
 
 def version_of(kinds: Sequence[str]) -> dict[str, int]:
@@ -37,15 +37,26 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     for index, kind in enumerate(kinds):
 
         def progress(fraction: float, text: str, index: int = index, kind: str = kind) -> None:
-            report((index + fraction) / len(kinds), f"{kind}: {text}")
+            report((index + fraction) / len(kinds), f"{name_of(kind)}: {text}")
 
         if not object_file(experiment, kind).exists():
             save_object(object_file(experiment, kind), build(experiment, kind, progress))
 
 
-def build(experiment: Experiment, kind: ObjectKind, progress: Any = None) -> ObjectModel:
-    """One kind of object from its generator."""
-    wanted, generator = experiment.config.object, GENERATOR_OF[kind]
+def build(experiment: Experiment, kind: str, progress: Any = None) -> ObjectModel:
+    """One kind of object: from its generator, from a user's mesh, or as a user has built it.
+
+    Raises:
+        MeshError, ObjectFileError: The user's file cannot be read.
+    """
+    wanted = experiment.config.object
+    if is_mesh(kind):
+        own, name = load_mesh_of(kind), name_of(kind)
+        source = {"mesh": name, "sha256": own.sha256}
+        return build_from_mesh(own, name, wanted.mesh_resolution, wanted.fit_steps, source, progress)
+    if kind not in MADE_HERE_M:
+        return load_object(Path(kind))
+    generator = GENERATOR_OF[kind]
     resolution = wanted.car_resolution if kind == "small_car" else wanted.hydrant_resolution
     mesh = stand(GENERATORS[generator]())
     return build_from_mesh(mesh, kind, resolution, wanted.fit_steps, {"generator": generator}, progress)
@@ -53,7 +64,7 @@ def build(experiment: Experiment, kind: ObjectKind, progress: Any = None) -> Obj
 
 def object_file(experiment: Experiment, kind: str) -> Path:
     """Where a kind of object is."""
-    return experiment.stage_folder("object") / f"{kind}.object.safetensors"
+    return experiment.stage_folder("object") / f"{name_of(kind).partition('.')[0]}.object.safetensors"
 
 
 def placed_objects(experiment: Experiment) -> list[VoxelGridObject]:

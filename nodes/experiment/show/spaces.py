@@ -25,7 +25,8 @@ from advnerf_core.objects.voxel.mesh import stand
 from advnerf_core.scene.remembered import frame_bytes
 from advnerf_core.scene.surrogate import Surrogate
 from hardware.worlds.world import World
-from nodes.experiment.plan.placed import OBJECT_SIZES_M, PANEL, PlacedObject
+from nodes.experiment.plan.object_kinds import MADE_HERE_M, PANEL, is_mesh, load_mesh_of
+from nodes.experiment.plan.placed import PlacedObject
 from nodes.experiment.plan.space_config import (
     ColoursConfig,
     FaceConfig,
@@ -110,7 +111,11 @@ def mesh_objects(experiment: Experiment, wanted: MeshTextureConfig | MeshShapeCo
     found = []
     for thing in experiment.objects:
         if wanted.ball_m is None:
-            mesh = stand(GENERATORS[GENERATOR_OF[thing.kind]]())
+            mesh = (
+                load_mesh_of(thing.kind)
+                if is_mesh(thing.kind)
+                else stand(GENERATORS[GENERATOR_OF[thing.kind]]())
+            )
         else:
             mesh = sphere(wanted.ball_m, wanted.ball_rgb)
         found.append(MeshField(unwrapped(mesh, wanted.texels), thing.T_world_from_object, thing.scale))
@@ -154,7 +159,7 @@ def random_placements(experiment: Experiment, count: int, seed: int) -> list[tup
 def geometry_sha256(experiment: Experiment, kind: str) -> str:
     """Hash of the object file of a kind; of a panel, that of the panel at scale 1."""
     if kind == PANEL:
-        return panel_object(experiment, OBJECT_SIZES_M[PANEL][1]).sha256
+        return panel_object(experiment, MADE_HERE_M[PANEL][1]).sha256
     path = object_file(experiment, kind)
     return _file_sha256(path, path.stat().st_mtime_ns)
 

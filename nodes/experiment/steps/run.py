@@ -22,6 +22,7 @@ from nodes.experiment.engine.artefact import REFERENCE, Artefact
 from nodes.experiment.engine.run_folder import require_own_folder, run_to_end
 from nodes.experiment.engine.stages import Stage, begun_with, stage_digests
 from nodes.experiment.plan.config import ExperimentConfig
+from nodes.experiment.plan.object_kinds import files_of, name_of
 from nodes.experiment.plan.placed import PlacedObject, in_a_lane
 from nodes.experiment.plan.setting_file import read_setting
 from nodes.experiment.plan.space_config import FaceConfig
@@ -228,7 +229,8 @@ def stages_of(experiment: Experiment) -> list[Stage]:
         "held_cap_m": config.held_cap_m,
         "scenarios": config.scenarios,
     }
-    kinds = sorted({thing.kind for thing in config.objects})
+    kinds = sorted({thing.kind for thing in config.objects}, key=name_of)
+    files = files_of(kinds)
     placed = [thing.model_dump(mode="json") for thing in config.objects]
 
     def stage(
@@ -286,7 +288,17 @@ def stages_of(experiment: Experiment) -> list[Stage]:
             {"view": view, "driven": {**measured, "world": world}},
             ("capture", "scene"),
         ),
-        stage("object", objects, {"object": part("object"), "kinds": kinds, **objects.version_of(kinds)}, ()),
+        stage(
+            "object",
+            objects,
+            {
+                "object": part("object"),
+                "kinds": list(map(name_of, kinds)),
+                **({"files": files} if files else {}),
+                **objects.version_of(kinds),
+            },
+            (),
+        ),
     ]
     if config.trains:
         learned_from = {

@@ -12,7 +12,8 @@ from advnerf_core.objects.voxel.generators import GENERATORS, hydrant, small_car
 from advnerf_core.objects.voxel.rasterise import draw_mesh
 from hardware.worlds.junction.config import IntersectionConfig
 from hardware.worlds.junction.scene import Intersection
-from nodes.experiment.plan.placed import OBJECT_SIZES_M, PlacedObject, in_a_lane
+from nodes.experiment.plan.object_kinds import MADE_HERE_M
+from nodes.experiment.plan.placed import PlacedObject, in_a_lane
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.overview import from_above
 from nodes.experiment.steps.run import load_experiment
@@ -34,7 +35,7 @@ def test_object_sizes_are_those_of_the_generated_meshes() -> None:
     for kind, mesh in (("hydrant", hydrant()), ("small_car", small_car())):
         low, high = mesh.box
         covered = 2.0 * np.maximum(np.abs(low[:2]), np.abs(high[:2]))
-        size = np.array(OBJECT_SIZES_M[kind])  # type: ignore[index]
+        size = np.array(MADE_HERE_M[kind])
         assert (covered <= size + 1e-6).all()
         assert (covered >= 0.8 * size).all()
         assert low[2] == pytest.approx(0.0, abs=0.01)

@@ -1,0 +1,107 @@
+"""Kinds of objects that an experiment places: those that this project makes, and object and mesh files of a user's."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+from pydantic import AfterValidator, PlainSerializer, ValidationInfo
+from pydantic_core import PydanticCustomError
+
+from advnerf_core.files import sha256_of
+from advnerf_core.places import expanded
+from advnerf_core.plugins import unknown
+from advnerf_core.strict import COMPLETE
+
+if TYPE_CHECKING:
+    from advnerf_core.objects.voxel.mesh import SurfaceMesh
+
+PANEL = "panel"
+# Length and width [m] at scale 1: of the objects that ``advnerf object build --generate`` makes, and of a square panel that stands upright.
+MADE_HERE_M: dict[str, tuple[float, float]] = {
+    "small_car": (3.64, 1.7),
+    "hydrant": (0.48, 0.48),
+    PANEL: (0.1, 2.0),
+}
+# What ``advnerf object build`` writes; and meshes whose format says which unit they are in.
+OBJECT_SUFFIX, MESH_SUFFIXES = ".object.safetensors", (".glb", ".gltf")
+
+
+def _located(kind: str, info: ValidationInfo) -> str:
+    if kind in MADE_HERE_M:
+        return kind
+    if not kind.endswith((OBJECT_SUFFIX, *MESH_SUFFIXES)):
+        raise PydanticCustomError(
+            COMPLETE,
+            "{text}",
+            {
+                "text": f"{unknown(kind, 'kind of object', MADE_HERE_M)}; one of your own is a file of 'advnerf object build' "
+                f"(*{OBJECT_SUFFIX}) or a mesh ({', '.join(MESH_SUFFIXES)}, in metres), relative to this file"
+            },
+        )
+    file = ((info.context or {}).get("folder") or Path.cwd()) / expanded(kind)
+    if not file.is_file():
+        text = f"expected an object or mesh file relative to this file, got {kind}, which is not there"
+        raise PydanticCustomError(COMPLETE, "{text}", {"text": text})
+    return str(file.resolve())
+
+
+def name_of(kind: str) -> str:
+    """What a kind is called in results: of a file its name, wherever it lies."""
+    return kind if kind in MADE_HERE_M else Path(kind).name
+
+
+ObjectKind = Annotated[str, AfterValidator(_located), PlainSerializer(name_of)]
+"""A kind of object; a file becomes absolute, and is written by its name alone: its content counts, see `files_of`."""
+
+
+def is_mesh(kind: str) -> bool:
+    """Whether a kind is a user's mesh."""
+    return kind.endswith(MESH_SUFFIXES)
+
+
+def files_of(kinds: list[str]) -> dict[str, str]:
+    """Hash of each kind that is a file, by its name in results."""
+    return {name_of(kind): _content(kind) for kind in kinds if kind not in MADE_HERE_M}
+
+
+def footprint_m(kind: str) -> tuple[float, float]:
+    """Length and width [m] of the ground that an object of a kind covers at scale 1.
+
+    Raises:
+        MeshError, ObjectFileError: Its file cannot be read.
+    """
+    if kind in MADE_HERE_M:
+        return MADE_HERE_M[kind]
+    return _footprint_m(kind, Path(kind).stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=16)
+def _footprint_m(kind: str, changed_ns: int) -> tuple[float, float]:
+    del changed_ns  # a changed file is another entry
+    if is_mesh(kind):
+        low, high = load_mesh_of(kind).box
+    else:
+        from advnerf_core.objects.voxel.model import load_object
+
+        low, high = load_object(Path(kind)).solid_box
+    # It turns about its axis, which need not be in its middle.
+    length, width = 2.0 * np.maximum(np.abs(low), np.abs(high))[:2]
+    return float(length), float(width)
+
+
+def load_mesh_of(kind: str) -> SurfaceMesh:
+    """A user's mesh: upright, its base on the ground.
+
+    Raises:
+        MeshError: It cannot be read.
+    """
+    from advnerf_core.objects.voxel.mesh_files import load_mesh
+
+    return load_mesh(Path(kind))
+
+
+def _content(kind: str) -> str:
+    return load_mesh_of(kind).sha256 if is_mesh(kind) else sha256_of(Path(kind))
