@@ -50,6 +50,7 @@ class Journal:
     def __init__(self, bag_file: Path, position: int) -> None:
         self.path = journal_of(bag_file)
         self._descriptor = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+        self._closed = False
         self._position = -1
         self.restart(position)
 
@@ -72,8 +73,10 @@ class Journal:
             _write_all(self._descriptor, _HEAD.pack(_MARK, position))
 
     def close(self) -> None:
-        """Close the file without removing it."""
-        os.close(self._descriptor)
+        """Close the file without removing it. May be called repeatedly: by then its number may be another file's."""
+        if not self._closed:
+            self._closed = True
+            os.close(self._descriptor)
 
 
 def read_journal(bag_file: Path) -> tuple[int, list[JournalEntry]]:

@@ -72,6 +72,7 @@ class Diary:
         """Close the file. Close the writer before it."""
         if self._descriptor is not None:
             os.close(self._descriptor)
+        self._descriptor = None
 
     def _write(self, line: bytes) -> None:
         """Append a line. After a failure, the next call continues with the rest of the same line."""
