@@ -17,7 +17,7 @@ from markupsafe import Markup
 
 from advnerf_core.report.cells import CellResult
 from advnerf_core.report.conditions import NONE, style_of
-from advnerf_core.report.evidence.words import DOMAIN_TITLES, collisions, excess_cells
+from advnerf_core.report.evidence.words import DOMAIN_TITLES, NOT_DRIVEN, collisions, excess_cells
 from advnerf_core.report.palette import look_css
 from advnerf_core.report.result_table import ResultTable, TableRow
 from advnerf_core.report.targets import Target, target_table, verdict
@@ -38,6 +38,7 @@ _EXPLAINED = {
     STRAYED: f"Total CTE at least {STRAYED_FROM:g} times that of the same drive without attack, on the track.",
     HELD: "None of these; drives without attack belong here.",
 }
+_FIRST_NUMBER, _SAYS_NOTHING = 4, ("", NOT_DRIVEN)
 LEGEND = (
     "Total CTE: mean over all drives, and past the plain object from the same starts. Excess: mean |CTE| per tick minus that of a control from "
     "the same start, past the plain object or with no object; the row of the plain object has its mean |CTE|. Intervals are nominal 95 % over "
@@ -109,8 +110,16 @@ def text_table(table: ResultTable) -> Table:
         cells.append((where if new_scenario else "", row.victim if new_victim else "", name, *_numbers(row)))
         classes.append(row.method if row.seeds else "unmeasured")
         last = row
-    right = (False, False, False, False, *[True] * 9)
-    return Table("Results", columns, tuple(cells), right, tuple(groups), tuple(classes))
+    # A column that says nothing in any line, as of a control that nobody drove, goes.
+    kept = [index for index in range(len(columns)) if any(row[index] not in _SAYS_NOTHING for row in cells)]
+    return Table(
+        "Results",
+        tuple(columns[index] for index in kept),
+        tuple(tuple(row[index] for index in kept) for row in cells),
+        tuple(index >= _FIRST_NUMBER for index in kept),
+        tuple(groups),
+        tuple(classes),
+    )
 
 
 def not_driven(table: ResultTable) -> str:

@@ -86,6 +86,7 @@ def test_it_is_attacked_in_what_is_learned_and_held_out_views_are_not_learned_fr
     page = (experiment.folder / "report" / "report.html").read_text()
     assert "nothing was driven in the place itself" in page
     assert ">deployed<" not in page, "no rows of drives that there cannot be"
+    assert ">over no object<" not in page, "no column of a control that nobody drove"
 
 
 def test_the_same_photographs_elsewhere_are_the_same_place(folder: Path, tmp_path: Path) -> None:
