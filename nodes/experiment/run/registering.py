@@ -35,6 +35,7 @@ from nodes.experiment.run.plan import read_experiment, registered_cell, statuses
 from nodes.experiment.run.store import FINISHED
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.given import given
+from nodes.experiment.show.victims import look_at_given
 from nodes.experiment.steps.attack import planned_evaluations
 from nodes.experiment.steps.keys import registered_settings
 from nodes.experiment.steps.verdicts import TRAINED_ON, VALIDATED_ON, unseen
@@ -89,6 +90,7 @@ def _scenarios(campaign: Campaign) -> dict[str, RegisteredScenario]:
 
 def _experiment(campaign: Campaign, cell: Cell) -> Experiment:
     experiment = read_experiment(campaign, cell)
+    look_at_given(experiment)  # they are fixed by their hashes before anything is run
     experiment.ask_world()
     return experiment
 

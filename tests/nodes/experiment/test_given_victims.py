@@ -22,6 +22,7 @@ from hardware.worlds.lab.lab import Lab
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.config import campaign_of
 from nodes.experiment.run.plan import statuses
+from nodes.experiment.run.registering import register
 from nodes.experiment.run.whole import run_experiment
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps.attack import cells
@@ -144,6 +145,19 @@ def test_a_factory_is_found_beside_the_experiment_file(folder: Path, tmp_path: P
         timeout=600,
     )
     assert "4 done of 4 cells" in done.stdout, done.stderr
+
+
+def test_a_registration_fixes_them_by_hash_before_anything_is_run(folder: Path, tmp_path: Path) -> None:
+    experiment = load_experiment(folder / "mine.experiment.yaml", "tiny", (), tmp_path / "run")
+    campaign = campaign_of(experiment, (), cells(experiment))
+    registered = register(campaign, "tiny", (), tmp_path / "published")
+    assert registered.scenarios["track"].victims == {
+        "policies": {
+            "mine": load_any_policy("my.onnx").sha256,
+            "module": load_any_policy("my_driver:factory").sha256,
+        }
+    }
+    assert not experiment.stage_folder("capture").exists()
 
 
 def test_a_black_box_has_no_gradient(folder: Path) -> None:
