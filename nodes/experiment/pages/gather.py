@@ -23,6 +23,7 @@ from nodes.experiment.engine.artefact import read_artefact
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.space_config import FaceConfig
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.given import victim_without_gradient
 from nodes.experiment.show.learned_scene import FIDELITY
 from nodes.experiment.steps.attack import cells
 from nodes.experiment.steps.deploy import DRIVES
@@ -165,6 +166,8 @@ def _not_measured(
         )
     if not measured:
         found["latency"] = "no live drive counts"
+    if victim_without_gradient(experiment):
+        found["memory"] = "the victim has no gradient"
     return found
 
 

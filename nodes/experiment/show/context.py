@@ -24,6 +24,7 @@ from advnerf_core.geometry import Array, Pinhole
 from advnerf_core.plugins import unknown
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.report.reference import Reference
+from advnerf_core.run_module import search_folder_last
 from hardware.worlds.paths import ReferencePath
 from hardware.worlds.world import (
     CarDescription,
@@ -68,6 +69,7 @@ class Experiment(RunFolder[ExperimentConfig]):
         """The experiment that a run folder is of, as its manifest resolved it."""
         manifest = read_json(folder / "manifest.json")
         context = {"folder": FilePath(manifest["file"]).parent}
+        search_folder_last(str(context["folder"]))  # where package.module:factory may lie
         config = ExperimentConfig.model_validate(manifest["config"], context=context)
         return cls(config, FilePath(manifest["file"]), folder, manifest["setting"])
 

@@ -97,3 +97,9 @@ def victim_sha256(experiment: RunFolder[ExperimentConfig], victim: str) -> str:
     if victim in given_in(experiment.config):
         return given(experiment)[victim].sha256
     return policy_sha256(victim_spec(experiment, victim))
+
+
+def victim_without_gradient(experiment: RunFolder[ExperimentConfig]) -> bool:
+    """Whether the main victim declares that it has no gradient."""
+    kept = given(experiment).get(experiment.config.main_victim)
+    return kept is not None and not kept.declared.differentiable

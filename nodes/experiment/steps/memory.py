@@ -22,6 +22,7 @@ from advnerf_core.report.data import MemoryRow
 from advnerf_core.run_module import module_command
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.faces import face_space
+from nodes.experiment.show.given import victim_without_gradient
 from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.attack import attack_problem
 from nodes.runtime.progress import Report
@@ -30,7 +31,9 @@ HORIZONS = (50, 200, 400)
 
 
 def measure(experiment: Experiment, folder: Path, report: Report) -> tuple[MemoryRow, ...]:
-    """Measure the horizons that are not measured yet; kept in ``memory.json`` so that a stopped report goes on."""
+    """Measure the horizons that are not measured yet; kept in ``memory.json`` so that a stopped report goes on. None of a victim without a gradient."""
+    if victim_without_gradient(experiment):
+        return ()
     kept = folder / "memory.json"
     rows: dict[str, float] = read_json(kept) if kept.exists() else {}
     for index, ticks in enumerate(HORIZONS):

@@ -239,3 +239,20 @@ def test_a_driver_behind_a_socket_is_attacked(folder: Path, tmp_path: Path) -> N
     found = read_json(experiment.cell_result(Cell("track", "theirs", "random", 0)))
     assert "constant_speed" in read_json(experiment.folder / "victims.json")["theirs"]["not_fixed"]
     assert found["deployed"]["total_cte_m"] == found["deployed"]["none_total_cte_m"]
+
+
+@pytest.mark.slow
+def test_live_nodes_drive_a_users_file(folder: Path, tmp_path: Path) -> None:
+    """The policy node loads it by the name that the experiment gives; what needs a gradient is not measured, and the page says why."""
+    launch = Path(__file__).parents[3] / "launch" / "green_screen.launch.yaml"
+    changes = (
+        "victims={mine: {policy: my.onnx}}",
+        "horizon=20",
+        "deploy={through: nodes, starts: 1, launch_file: " + str(launch) + "}",
+    )
+    experiment = load_experiment(folder / "mine.experiment.yaml", "tiny", changes, tmp_path / "run")
+    run_experiment(experiment, overrides=changes)
+    found = read_json(experiment.cell_result(Cell("track", "mine", "random", 0)))
+    assert len(found["deployed"]["total_cte_m"]) == 1, found["not_driven_live"]
+    page = (experiment.folder / "report" / "report.html").read_text()
+    assert "the victim has no gradient" in page
