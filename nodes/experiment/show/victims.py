@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.files import write_json
-from advnerf_core.policies.load import is_address, load_adapted, load_any_policy, source_sha256
+from advnerf_core.policies.adapter import adapted
+from advnerf_core.policies.contract import PolicyContract
+from advnerf_core.policies.load import is_address, load_any_policy, source_sha256
 from advnerf_core.policies.policy_file import LoadedPolicy
 from advnerf_core.policies.view import PolicyView
 from nodes.experiment.show.context import Experiment
@@ -42,11 +44,10 @@ def _look_at(experiment: Experiment, spec: str, known: GivenPolicy | None) -> Gi
     source = source_sha256(spec)
     if known is not None and (known.policy, known.source_sha256) == (spec, source) and not known.not_fixed:
         return known
-    if is_address(spec):
-        loaded = _driver_at(experiment, spec)
-        contract = loaded.policy.contract
-    else:
-        loaded, contract = load_any_policy(spec), load_adapted(spec)[0].contract
+    loaded = _driver_at(experiment, spec) if is_address(spec) else load_any_policy(spec)
+    # A network that was trained here declares nothing else.
+    plain = PolicyContract(loaded.view, goal_size=loaded.policy.goal_size)
+    contract = adapted(loaded.policy, plain).contract
     return GivenPolicy(
         policy=spec,
         source_sha256=source,
