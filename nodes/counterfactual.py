@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
-from advnerf_core.policies.load import Driver, load_driver
+from advnerf_core.policies.driver import Driver
+from advnerf_core.policies.load import load_driver
 from advnerf_core.strict import StrictModel
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError, MessageError

@@ -8,7 +8,8 @@ from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.transforms import load_transforms
 from advnerf_core.documents import parse_yaml
 from advnerf_core.errors import ConfigError
-from advnerf_core.policies.contract import PolicyContractError, declaration_beside
+from advnerf_core.policies.contract import PolicyContractError
+from advnerf_core.policies.declaration import declaration_beside
 from advnerf_core.strict import validate
 from calibration.schema import CalibrationError, RoomCalibration, VehicleCalibration, load_calibration
 from nodes.experiment.node.request import parse_request

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from advnerf_core.policies.answer import answer, memory_before
 from advnerf_core.policies.contract import PolicyContract, PolicyContractError
 
 
@@ -17,11 +18,11 @@ class AdaptedPolicy(nn.Module):
     Its mode is that of the network when it was wrapped: nothing is put into eval mode silently.
 
     Args:
-        network: Called as ``network(images)``, with goals as ``network(images, goals)``, and if it is not stateless as
-            ``network(images, goals, memory) -> (output, memory)``; then it also has ``initial_memory(batch)``. A network that asks another
-            program has an attribute ``identity``, a text that names that program.
+        network: Called as `advnerf_core.policies.answer` says; one that is not stateless also has ``initial_memory(batch)``. A network that
+            asks another program has an attribute ``identity``, a text that names that program.
 
     Attributes:
+        stateless: Whether the steering depends on the present image and goal only.
         identity: The program that is asked; empty for a network that runs here. Such a policy is not fixed: the program may change.
     """
 
@@ -32,13 +33,14 @@ class AdaptedPolicy(nn.Module):
                 "expected a network that is not stateless to have initial_memory(batch), got one without; add it, or declare "
                 "stateless = True if the output depends on the present image only"
             )
-        if (contract.input_name or contract.output_name) and not hasattr(network, "tensors"):
+        if (contract.input_name or contract.states) and not hasattr(network, "tensors"):
             raise PolicyContractError(
-                "expected input_name and output_name for an .onnx or .pt2 file only; remove them, and return what steers"
+                "expected input_name and states for an .onnx or .pt2 file only; remove them, and hand the memory through "
+                "forward(images, goals, memory)"
             )
         self.network = network
         self.contract = contract
-        self.stateless = contract.stateless
+        self.stateless = not contract.has_memory
         self.differentiable = contract.differentiable
         self.goal_size = contract.goal_size
         self.identity = str(getattr(network, "identity", ""))
@@ -46,18 +48,15 @@ class AdaptedPolicy(nn.Module):
 
     def initial_memory(self, batch: int) -> Tensor:
         """Memory ``[B, ...]`` before the first image, of a policy that is not stateless."""
-        memory: Tensor = self.network.initial_memory(batch)  # type: ignore[attr-defined]
+        memory: Tensor = memory_before(self.contract, self.network, batch, torch.empty(0))
         return memory
 
     def forward(self, images: Tensor, goals: Tensor | None = None, memory: Tensor | None = None) -> Any:
         """Steering ``[B]`` [rad], left positive, of images ``[B, 3, H, W]`` RGB 0..1; with memory also the next memory."""
-        given = self.contract.to_network(images)
         self._check_goals(goals, len(images))
-        if not self.stateless:
-            raw, memory = self.network(given, goals, memory)
-            return self.contract.to_steering_rad(raw, len(images)), memory
-        raw = self.network(given) if self.goal_size == 0 else self.network(given, goals)
-        return self.contract.to_steering_rad(raw, len(images))
+        raw, memory = answer(self.contract, self.network, images, goals, memory)
+        steering = self.contract.to_steering_rad(raw, len(images))
+        return steering if self.stateless else (steering, memory)
 
     def answers_mrad(self) -> list[int]:
         """Steering for three fixed pictures [mrad, whole]: by which a program that is asked is told from another."""
@@ -81,14 +80,12 @@ class AdaptedPolicy(nn.Module):
                 ("output", each) for each in tensors.outputs
             ]
             return [(what, f"{each}: {tensors.use_of(each, column)}") for what, each in rows]
-        channels, size = (contract.channels,), contract.size
-        image = (*channels, *size) if contract.layout == "NCHW" else (*size, *channels)
         goals = [("input", f"goals [B, {self.goal_size}]")] if self.goal_size else []
         columns = (
             "[B] or [B, 1]" if contract.output_column is None else f"[B, N], column {contract.output_column}"
         )
         return [
-            ("input", f"images [B, {', '.join(map(str, image))}]"),
+            ("input", f"images [B, {', '.join(map(str, contract.input_shape))}]"),
             *goals,
             ("output", f"steering {columns}"),
         ]

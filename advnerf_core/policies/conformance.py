@@ -139,7 +139,7 @@ def _runs(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
 def _remedy(examined: _Examined, batch: Tensor) -> str:
     """Which other shape the network would take."""
     contract = examined.policy.contract
-    given = contract.to_network(batch)
+    given = contract.first_input(batch)
     # As NCHW it would be given the other layout's axes; then height and width swapped; then the commonest other sizes.
     other = given.permute(0, 2, 3, 1) if contract.layout == "NCHW" else given.permute(0, 3, 1, 2)
     attempts: list[tuple[str, Tensor]] = [

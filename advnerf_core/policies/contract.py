@@ -11,16 +11,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from math import pi
 from numbers import Real
-from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
 
-from advnerf_core.documents import parse_json, read_yaml
+from advnerf_core.documents import Document
 from advnerf_core.errors import AdvnerfError, ConfigError
+from advnerf_core.policies.arrays import array_module, like
+from advnerf_core.policies.bins import SteeringBins
+from advnerf_core.policies.colours import ColourSpace, in_colour_space, of_channels
+from advnerf_core.policies.frames import FrameStack
+from advnerf_core.policies.memory import NetworkState
+from advnerf_core.policies.tracker import TrackedTrajectory, pursued_curvature_1pm
 from advnerf_core.policies.view import PolicyView
+from advnerf_core.strict import parse_value
 
-ColourSpace = Literal["RGB", "BGR", "YUV", "GRAY"]
 Unit = Literal["rad", "deg", "normalised", "1/m"]
 Side = Literal["left", "right"]
 Layout = Literal["NCHW", "NHWC"]
@@ -28,22 +33,12 @@ _CHOICES: dict[str, tuple[str, ...]] = {
     "colour_space": get_args(ColourSpace), "output_unit": get_args(Unit), "positive": get_args(Side),
     "layout": get_args(Layout),
 }  # fmt: skip
-# Keys for files with more than one reading. Without them, declarations have the text, and policies the hash, that they always had.
-_NAMED = ("input_name", "output_name", "output_column")
+# Keys that came later. Without them, declarations have the text, and policies the hash, that they always had.
+_SECTIONS: dict[str, Any] = {
+    "frames": FrameStack, "trajectory": TrackedTrajectory, "bins": SteeringBins, "states": tuple[NetworkState, ...],
+}  # fmt: skip
+_LATER = ("input_name", "output_name", "output_index", "output_column", *_SECTIONS)
 RAD_PER_DEG = pi / 180.0
-# Full-range YUV of BT.601 with U and V about one half, and grey, both as OpenCV's COLOR_RGB2YUV and COLOR_RGB2GRAY.
-_LUMA = (0.299, 0.587, 0.114)
-_RGB_IN_YUV = (
-    (0.299, -0.492 * 0.299, 0.877 * 0.701),
-    (0.587, -0.492 * 0.587, -0.877 * 0.587),
-    (0.114, 0.492 * 0.886, -0.877 * 0.114),
-)
-
-
-# Where an ONNX file carries its declaration.
-ONNX_METADATA_KEY = "advnerf_policy"
-# What a declaration beside a file adds to the file's name.
-DECLARATION_SUFFIX = ".policy.yaml"
 
 
 class PolicyContractError(AdvnerfError, ValueError):
@@ -70,10 +65,16 @@ class PolicyContract:
         wheelbase_m: Wheelbase that turns an inverse radius into an angle, ``atan(wheelbase / radius)`` [m]; with ``1/m`` only.
         steering_ratio: Turn of the steering wheel over that of the front wheels, for an output that is the steering wheel's.
         input_name: The file's input that takes the images; None where its shapes allow one reading only.
-        output_name: The file's output that steers; None where it has one output.
+        output_name: The output that steers, of a file or of a network that returns a dict; None where there is one output.
+        output_index: The same by its number from 0, of a file or of a network that returns a tuple.
         output_column: The column of an output ``[B, N]`` that steers; None for ``[B]`` and ``[B, 1]``.
+        frames: Which past images it sees as well; None for the present image alone.
+        trajectory: The output is waypoints, and this is how they are followed; None for an output that steers.
+        bins: The output is a score for each of these steering values; None for an output that steers.
+        states: Inputs and outputs of a file that carry its memory from image to image; they make it not stateless.
         positive: To which side a positive output steers.
-        stateless: Whether the output depends on the present image and goal only.
+        stateless: Whether the network's output depends on its present input only. With ``frames`` it may, and the policy still has a
+            memory: `has_memory`.
         differentiable: Whether gradients reach the image; a black box declares False.
         goal_size: Length of the goal vector; 0 for none.
     """
@@ -95,8 +96,15 @@ class PolicyContract:
     input_name: str | None = None
     output_name: str | None = None
     output_column: int | None = None
+    output_index: int | None = None
+    frames: FrameStack | None = None
+    trajectory: TrackedTrajectory | None = None
+    bins: SteeringBins | None = None
+    states: tuple[NetworkState, ...] = ()
 
     def __post_init__(self) -> None:
+        if self.states:
+            object.__setattr__(self, "stateless", False)
         for name, choices in _CHOICES.items():
             if getattr(self, name) not in choices:
                 raise PolicyContractError(
@@ -136,9 +144,13 @@ class PolicyContract:
         for name in ("input_name", "output_name"):
             if not isinstance(given := getattr(self, name), str | None):
                 raise PolicyContractError(f"{name}: expected text, got {given!r}; put it in quotes")
-        column = self.output_column
-        if column is not None and (type(column) is not int or column < 0):
-            raise PolicyContractError(f"output_column: expected a whole number >= 0, got {column!r}")
+        for name in ("output_column", "output_index"):
+            number = getattr(self, name)
+            if number is not None and (type(number) is not int or number < 0):
+                raise PolicyContractError(f"{name}: expected a whole number >= 0, got {number!r}")
+        if self.output_name is not None and self.output_index is not None:
+            raise PolicyContractError("expected output_name or output_index, got both; remove one")
+        self._check_meaning()
         if not (np.isfinite(self.steering_ratio) and self.steering_ratio > 0.0):
             raise PolicyContractError(f"steering_ratio: expected a number > 0, got {self.steering_ratio}")
         for name, unit in (("full_steering_rad", "normalised"), ("wheelbase_m", "1/m")):
@@ -154,9 +166,24 @@ class PolicyContract:
                 f"steering_ratio: expected it with output_unit = 'rad' or 'deg' only, got {self.output_unit!r}"
             )
 
+    def _check_meaning(self) -> None:
+        """An output is an angle, waypoints, or scores of bins."""
+        given = [name for name in ("output_column", "trajectory", "bins") if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise PolicyContractError(
+                f"expected an output of one kind, got {' and '.join(given)}; keep the one that the network has"
+            )
+        if self.trajectory is not None and (self.output_unit, self.steering_ratio) != ("rad", 1.0):
+            raise PolicyContractError(
+                "output_unit, steering_ratio: expected neither with a trajectory, which is in metres; remove them"
+            )
+        if self.bins is not None and self.bins.choice == "largest" and self.differentiable:
+            # No gradient passes through the choice of the largest score.
+            object.__setattr__(self, "differentiable", False)
+
     @property
     def channels(self) -> int:
-        """Channels of the network's input."""
+        """Channels of one image in the network's input."""
         return 1 if self.colour_space == "GRAY" else 3
 
     @property
@@ -164,47 +191,82 @@ class PolicyContract:
         """Height and width of the images [px]."""
         return self.view.height, self.view.width
 
+    @property
+    def has_memory(self) -> bool:
+        """Whether the steering depends on images before the present one."""
+        return self.frames is not None or not self.stateless
+
+    @property
+    def input_shape(self) -> tuple[int, ...]:
+        """Shape of the network's image input without its batch."""
+        count = 1 if self.frames is None else self.frames.count
+        times = (count,) if self.frames is not None and self.frames.axis == "time" else ()
+        channels = self.channels if times else count * self.channels
+        return (*times, channels, *self.size) if self.layout == "NCHW" else (*times, *self.size, channels)
+
     def to_network(self, images: Any) -> Any:
-        """What the network is given for images ``[B, 3, H, W]`` RGB 0..1 (numpy or torch; differentiable)."""
-        if images.ndim != 4 or tuple(images.shape[1:]) != (3, *self.size):
-            expected = f"[B, 3, {self.size[0]}, {self.size[1]}]"
+        """What the network is given for images (numpy or torch; differentiable).
+
+        Args:
+            images: ``[B, 3, H, W]`` RGB 0..1; with ``frames`` the stack ``[B, count, 3, H, W]``.
+        """
+        stack = () if self.frames is None else (self.frames.count,)
+        if tuple(images.shape[1:]) != (*stack, 3, *self.size):
+            expected = ", ".join(map(str, ("B", *stack, 3, *self.size)))
             raise PolicyContractError(
-                f"expected images {expected}, got {list(images.shape)}; use the policy's own view"
+                f"expected images [{expected}], got {list(images.shape)}; use the policy's own view"
             )
-        images = self._in_colour_space(images)
+        batch, images = len(images), images.reshape(-1, 3, *self.size)
+        images = in_colour_space(images, self.colour_space)
         if self.value_max != 1.0:
             images = images * self.value_max
         if any(self.mean):
-            images = images - _channels(images, self.mean)
+            images = images - of_channels(images, self.mean)
         if any(value != 1.0 for value in self.std):
-            images = images / _channels(images, self.std)
-        if self.layout == "NHWC":
-            images = (
-                images.permute(0, 2, 3, 1) if hasattr(images, "permute") else images.transpose(0, 2, 3, 1)
-            )
-        return images
+            images = images / of_channels(images, self.std)
+        if self.frames is not None:
+            count = () if self.frames.axis == "channels" else (self.frames.count,)
+            images = images.reshape(batch, *count, -1, *self.size)
+        return images if self.layout == "NCHW" else array_module(images).moveaxis(images, -3, -1)
 
-    def _in_colour_space(self, images: Any) -> Any:
-        if self.colour_space == "RGB":
-            return images
-        if self.colour_space == "BGR":
-            return images[:, [2, 1, 0]]
-        if self.colour_space == "GRAY":
-            return _LUMA[0] * images[:, 0:1] + _LUMA[1] * images[:, 1:2] + _LUMA[2] * images[:, 2:3]
-        # One colour at a time, each copied into three channels: the same code for numpy and torch.
-        parts = [images[:, [k] * 3] * _channels(images, weights) for k, weights in enumerate(_RGB_IN_YUV)]
-        return (parts[0] + parts[1] + parts[2] + _channels(images, (0.0, 0.5, 0.5))).clip(0.0, 1.0)
+    def first_input(self, images: Any) -> Any:
+        """What the network is given for the first images ``[B, 3, H, W]`` of a drive."""
+        if self.frames is None:
+            return self.to_network(images)
+        past = like(images, self.frames.initial(len(images), self.size))
+        return self.to_network(self.frames.push(images, past)[0])
 
     def to_steering_rad(self, raw: Any, batch: int) -> Any:
-        """Steering ``[B]`` [rad], left positive, of the network's output ``[B]``, ``[B, 1]`` or ``[B, N]`` (numpy or torch)."""
+        """Steering ``[B]`` [rad], left positive, of the network's output (numpy or torch; differentiable).
+
+        Args:
+            raw: ``[B]``, ``[B, 1]``, or ``[B, N]`` with ``output_column`` or ``bins``; with ``trajectory`` as in `waypoints_m`.
+            batch: Number of images.
+        """
+        if self.trajectory is not None:
+            curvature_1pm = pursued_curvature_1pm(self.waypoints_m(raw, batch), self.trajectory.lookahead_m)
+            return array_module(curvature_1pm).arctan(self.trajectory.wheelbase_m * curvature_1pm)
+        if self.bins is not None:
+            raw = self.bins.value(self._checked(raw, (batch, len(self.bins.values)), "bins"))
         raw = self._steering_column(raw, batch)
         side = 1.0 if self.positive == "left" else -1.0
         if self.output_unit == "1/m":
-            bend = raw * (side * float(self.wheelbase_m or 0.0))
-            return bend.atan() if hasattr(bend, "atan") else np.arctan(bend)
+            return array_module(raw).arctan(raw * (side * float(self.wheelbase_m or 0.0)))
         unit = {"rad": 1.0, "deg": RAD_PER_DEG, "normalised": self.full_steering_rad or 0.0}[self.output_unit]
         scale = side * unit / self.steering_ratio
         return raw if scale == 1.0 else raw * scale
+
+    def waypoints_m(self, raw: Any, batch: int) -> Any:
+        """Waypoints ``[B, N, 2]`` [m], x forward and y left, of the network's output ``[B, N, 2 or more]`` or ``[B, 2 N]``."""
+        assert self.trajectory is not None
+        count = len(self.trajectory.times_s)
+        shape = tuple(getattr(raw, "shape", ()))
+        if len(shape) == 3 and shape[:2] == (batch, count) and shape[2] > 2:
+            raw = raw[:, :, :2]  # what follows x and y, such as a heading, is not used
+        elif shape == (batch, 2 * count):
+            raw = raw.reshape(batch, count, 2)
+        raw = self._checked(raw, (batch, count, 2), "trajectory.times_s")
+        return raw if self.positive == "left" else raw * like(raw, (1.0, -1.0))
 
     def _steering_column(self, raw: Any, batch: int) -> Any:
         shape, column = tuple(getattr(raw, "shape", ())), self.output_column
@@ -218,10 +280,22 @@ class PolicyContract:
             f"for B = {batch}; return the column that steers, or declare it as output_column"
         )
 
+    def _checked(self, raw: Any, shape: tuple[int, ...], key: str) -> Any:
+        if tuple(getattr(raw, "shape", ())) != shape:
+            raise PolicyContractError(
+                f"{key}: expected an output of {list(shape)}, got {list(getattr(raw, 'shape', ())) or type(raw).__name__}; correct the declaration"
+            )
+        return raw
+
     def to_dict(self) -> dict[str, Any]:
         """Plain data from which `from_dict` makes the same declaration; names that are not declared are left out."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
-        values = {name: value for name, value in values.items() if value is not None or name not in _NAMED}
+        values = {
+            name: value for name, value in values.items() if value not in (None, ()) or name not in _LATER
+        }
+        for name in _SECTIONS:
+            if name in values:
+                values[name] = _plain(values[name])
         return {**values, "view": self.view.to_dict(), "mean": list(self.mean), "std": list(self.std)}
 
     def to_json(self) -> str:
@@ -247,34 +321,16 @@ class PolicyContract:
                 if name in values:
                     given = values[name]
                     values[name] = tuple(given) if isinstance(given, list | tuple) else (given,)
+            for name, kind in _SECTIONS.items():
+                if values.get(name) is not None:
+                    values[name] = parse_value(kind, Document(values[name], name))
             return cls(**values)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, ConfigError) as error:
             raise PolicyContractError(f"{source}: {error}") from error
 
 
-def declaration_beside(path: Path, embedded: str | None, **implied: Any) -> PolicyContract:
-    """The declaration of a file: the YAML file ``<path>.policy.yaml`` if there is one, else what the file carries.
-
-    Args:
-        embedded: JSON that the file carries; None or empty if it carries none.
-        **implied: What the file itself says about keys that the declaration leaves out.
-    """
-    beside = path.with_name(path.name + DECLARATION_SUFFIX)
-    try:
-        if beside.is_file():
-            return PolicyContract.from_dict(read_yaml(beside).data, str(beside), **implied)
-        if embedded:
-            return PolicyContract.from_dict(parse_json(embedded, str(path)), str(path), **implied)
-    except PolicyContractError:
-        raise
-    except ConfigError as error:
-        raise PolicyContractError(f"cannot read the declaration of {path}: {error}") from error
-    raise PolicyContractError(
-        f"{path} says nothing about its colours, range and unit; write {beside.name} beside it (see docs/policies.md)"
-    )
-
-
-def _channels(images: Any, values: tuple[float, ...]) -> Any:
-    if hasattr(images, "new_tensor"):
-        return images.new_tensor(values).view(1, -1, 1, 1)
-    return np.asarray(values, dtype=images.dtype).reshape(1, -1, 1, 1)
+def _plain(value: Any) -> Any:
+    """Sections of a declaration as JSON holds them, without their defaults."""
+    if isinstance(value, tuple):
+        return [_plain(each) for each in value]
+    return value.model_dump(mode="json", exclude_defaults=True)

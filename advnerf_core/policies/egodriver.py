@@ -1,8 +1,7 @@
 """A driver behind a socket as a policy: the egodriver protocol of alpasim, which users of CARLA speak too (PyPI ``carla-driver-interface``).
 
-The driver is sent a camera's pictures and where the car is, and answers with a plan: poses ahead. A car of constant speed follows it by pure
-pursuit (Coulter 1992): the wheel angle of the arc through the point of the plan that it reaches after the lookahead time. The car's own
-poses are those that its steering leads to from where the drive began, as an odometer has them. No route is sent: a policy of this project sees
+The driver is sent a camera's pictures and where the car is, and answers with a plan: poses ahead. A car of constant speed follows it with the
+tracker of `advnerf_core.policies.tracker`, which looks as far ahead as the car drives in half a second. The car's own poses are those that its steering leads to from where the drive began, as an odometer has them. No route is sent: a policy of this project sees
 pictures.
 
 A drive is a session. The memory of the policy holds, per car: the session, the tick, x [m], y [m], yaw [rad].
@@ -27,6 +26,7 @@ from advnerf_core.geometry import Array, Pinhole
 from advnerf_core.policies.adapter import AdaptedPolicy, adapt
 from advnerf_core.policies.contract import PolicyContract, PolicyContractError
 from advnerf_core.policies.policy_file import LoadedPolicy
+from advnerf_core.policies.tracker import pursued_curvature_1pm
 from advnerf_core.policies.view import PolicyView
 
 _ADDRESS = re.compile(r"(grpcs?)://(\[[0-9a-f:]+\]|[^:/\s]+):(\d{1,5})")
@@ -168,8 +168,8 @@ class EgoDriver:
         plan = Trajectory.from_proto(self._ask("drive", request).trajectory)
         if not len(plan):
             return 0.0  # a driver without a plan holds its course
-        ahead = rig.inverse().transform_points(plan.positions)[:, :2]
-        return self.rig.control(pursued_curvature_1pm(ahead, self.rig.speed_mps * _LOOKAHEAD_S))
+        ahead = rig.inverse().transform_points(plan.positions)[None, :, :2]
+        return self.rig.control(float(pursued_curvature_1pm(ahead, self.rig.speed_mps * _LOOKAHEAD_S)[0]))
 
     def _moved(self, pose: list[float], control: float) -> list[float]:
         """The car's pose a tick later: along an arc."""
@@ -191,27 +191,6 @@ class EgoDriver:
             raise PolicyContractError(
                 f"expected an answer of the driver at {self.address} to {name}, got {error.code().name}: {error.details()}"
             ) from None
-
-
-def pursued_curvature_1pm(ahead: Array, lookahead_m: float) -> float:
-    """Curvature [1/m], left positive, of the arc from the car to the point of a plan at the lookahead distance.
-
-    Args:
-        ahead: Points of the plan ``[N, 2]`` in the car's frame: x [m] forward, y [m] left.
-        lookahead_m: Distance from the car at which the plan is met; of a shorter plan its end is taken.
-    """
-    points = np.concatenate([[[0.0, 0.0]], ahead])
-    far = np.flatnonzero(np.linalg.norm(points, axis=1) >= lookahead_m)
-    if not far.size:
-        x, y = points[-1]
-    else:
-        start, end = points[far[0] - 1], points[far[0]]
-        step = end - start
-        # Where the piece leaves the circle of the lookahead: |start + share step| = lookahead.
-        a, b, c = step @ step, start @ step, start @ start - lookahead_m**2
-        x, y = start + (-b + np.sqrt(b * b - a * c)) / a * step
-    distance_m2 = x * x + y * y
-    return float(2.0 * y / distance_m2) if distance_m2 > 0.0 else 0.0
 
 
 def load_driver_at(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import zipfile
+from collections.abc import Mapping
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
@@ -15,15 +16,17 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
 from advnerf_core.inputs import InputFiles
-from advnerf_core.policies.contract import PolicyContract, PolicyContractError, declaration_beside
-from advnerf_core.policies.onnx_policy import example_inputs
+from advnerf_core.policies.contract import PolicyContract, PolicyContractError
+from advnerf_core.policies.declaration import declaration_beside
+from advnerf_core.policies.file_network import FileNetwork
+from advnerf_core.policies.onnx_policy import example_inputs, require_states
 from advnerf_core.policies.tensors import UINT8, TensorInfo, Tensors, chosen_tensors
 
 METADATA_FILE = "advnerf_policy.json"
 _LARGEST_BATCH = 65536
 
 
-class ProgramNetwork:
+class ProgramNetwork(FileNetwork):
     """An exported program as a function of tensors.
 
     Args:
@@ -31,31 +34,25 @@ class ProgramNetwork:
         tensors: Its inputs and outputs, and what each is used for.
     """
 
-    training = False
-
     def __init__(self, program: Any, tensors: Tensors) -> None:
-        self.tensors = tensors
+        super().__init__(tensors)
         self._module = program.module()
         self._dtypes = {each.name: getattr(torch, each.kind) for each in tensors.inputs}
-        self._steering = tensors.outputs.index(tensors.steering)
+        self._outputs = [each.name for each in tensors.outputs]
         for parameter in self._module.parameters():
             parameter.requires_grad_(False)
 
-    def __call__(self, images: Tensor, goals: Tensor | None = None) -> Tensor:
-        """Raw output of the program, in the type of the images."""
-        given = {self.tensors.image.name: images}
-        if self.tensors.goal is not None and goals is not None:
-            given[self.tensors.goal.name] = goals
-        arguments = [_as_dtype(given[name], dtype) for name, dtype in self._dtypes.items()]
-        try:
-            output: Tensor = tree_leaves(self._module(*arguments))[self._steering]
-        except (RuntimeError, AssertionError) as error:  # the program's own checks of sizes
-            reason = " ".join(str(error).split())
-            raise PolicyContractError(
-                f"expected the program to take {[list(each.shape) for each in arguments]}, but it wants "
-                f"{', '.join(map(str, self.tensors.inputs))}; correct size and layout in the declaration ({reason:.120})"
-            ) from error
-        return output.to(images.dtype)
+    def initial_memory(self, batch: int) -> Tensor:
+        """Memory ``[B, K]`` before the first image, of a program with states."""
+        return torch.from_numpy(super().initial_memory(batch))
+
+    def run(self, feeds: Mapping[str, Tensor], outputs: list[str]) -> list[Tensor]:
+        """Outputs of the program, in the type of the images."""
+        found = tree_leaves(
+            self._module(*(_as_dtype(feeds[name], kind) for name, kind in self._dtypes.items()))
+        )
+        dtype = feeds[self.tensors.image.name].dtype
+        return [found[self._outputs.index(name)].to(dtype) for name in outputs]
 
 
 def load_program(path: Path) -> tuple[ProgramNetwork, PolicyContract, str]:
@@ -64,20 +61,10 @@ def load_program(path: Path) -> tuple[ProgramNetwork, PolicyContract, str]:
     Raises:
         PolicyContractError: It is missing, no exported program, carries pickled objects, has no declaration, or one that does not fit.
     """
-    files = _checked_file(path)
-    extra = {METADATA_FILE: ""}
-    try:
-        program = torch.export.load(BytesIO(files.content), extra_files=extra)
-        inputs, outputs = _tensors(program)
-    except Exception as error:  # a damaged archive ends in any of a dozen exceptions
-        reason = " ".join(str(error).split())
-        raise PolicyContractError(
-            f"expected an exported program in {path}, got {reason:.200}; export it again"
-        ) from error
-    implied = {"value_max": 255.0} if any(each.kind == UINT8 for each in inputs) else {}
-    contract = declaration_beside(path, _text(extra[METADATA_FILE]), **implied)
-    if not contract.stateless:
-        raise PolicyContractError(f"expected a stateless policy in {path}, got one declared otherwise")
+    program, files, embedded = opened_program(path)
+    inputs, outputs = program_tensors(program)
+    contract = declaration_beside(path, embedded, inputs)
+    require_states(contract, path)
     tensors = chosen_tensors(inputs, outputs, contract, path)
     if tensors.image.kind == UINT8:
         contract = replace(contract, differentiable=False)  # no gradient passes through whole numbers
@@ -85,11 +72,30 @@ def load_program(path: Path) -> tuple[ProgramNetwork, PolicyContract, str]:
     return network, contract, files.sha256(contract.to_json())
 
 
+def opened_program(path: Path) -> tuple[Any, InputFiles, str]:
+    """An exported program, the file that it was made of, and the declaration that it carries; empty if it carries none.
+
+    Raises:
+        PolicyContractError: It is missing, no exported program, or carries pickled objects.
+    """
+    files = _checked_file(path)
+    extra = {METADATA_FILE: ""}
+    try:
+        program = torch.export.load(BytesIO(files.content), extra_files=extra)
+        program_tensors(program)
+    except Exception as error:  # a damaged archive ends in any of a dozen exceptions
+        reason = " ".join(str(error).split())
+        raise PolicyContractError(
+            f"expected an exported program in {path}, got {reason:.200}; export it again"
+        ) from error
+    return program, files, _text(extra[METADATA_FILE])
+
+
 def _as_dtype(given: Tensor, dtype: torch.dtype) -> Tensor:
     return (given.round().clamp(0, 255) if dtype == torch.uint8 else given).to(dtype)
 
 
-def _tensors(program: Any) -> tuple[list[TensorInfo], list[TensorInfo]]:
+def program_tensors(program: Any) -> tuple[list[TensorInfo], list[TensorInfo]]:
     """Inputs and outputs of a program."""
     nodes, signature = {node.name: node for node in program.graph.nodes}, program.graph_signature
 

@@ -16,7 +16,8 @@ import torch
 from numpy.typing import NDArray
 
 from advnerf_core.policies.adapter import AdaptedPolicy
-from advnerf_core.policies.contract import ColourSpace, PolicyContract
+from advnerf_core.policies.colours import ColourSpace
+from advnerf_core.policies.contract import PolicyContract
 from advnerf_core.policies.network import images_to_tensor
 
 Array = NDArray[np.float64]
@@ -108,7 +109,7 @@ def steering_of(
     for first in range(0, len(images), _BATCH):
         batch = images_to_tensor(images[first : first + _BATCH])
         goals = None if goal is None else torch.tensor(goal, dtype=torch.float32).expand(len(batch), -1)
-        if contract.stateless:
+        if assumed.stateless:
             steering.append(assumed(batch, goals))
         else:
             steering.append(assumed(batch, goals, assumed.initial_memory(len(batch)))[0])

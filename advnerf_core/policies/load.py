@@ -13,16 +13,14 @@ import re
 import sys
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
-
-import numpy as np
-from numpy.typing import NDArray
 
 from advnerf_core.code_files import module_sha256
 from advnerf_core.inputs import InputFiles
-from advnerf_core.policies.contract import DECLARATION_SUFFIX, PolicyContract, PolicyContractError
-from advnerf_core.policies.view import PolicyView
+from advnerf_core.policies.contract import PolicyContract, PolicyContractError
+from advnerf_core.policies.declaration import DECLARATION_SUFFIX
+from advnerf_core.policies.driver import Driver
 from advnerf_core.run_module import search_working_folder_last
 
 if TYPE_CHECKING:
@@ -210,26 +208,13 @@ def policy_file_sha256(path: Path) -> str:
     return (read_onnx(path) if path.suffix == ".onnx" else InputFiles(path)).sha256(declared)
 
 
-class Driver(Protocol):
-    """A policy as the live node uses it: one image after the other."""
-
-    view: PolicyView
-    goal_size: int
-    sha256: str
-
-    def steer(self, image: NDArray[np.uint8], goal: tuple[float, ...]) -> float:
-        """Steering [rad], left positive, of one policy image ``[H, W, 3]`` uint8 RGB."""
-
-    def reset(self) -> None:
-        """Forget the images so far."""
-
-
 def load_driver(spec: str | os.PathLike[str], expected_sha256: str | None = None) -> Driver:
     """A policy for the live node, on one thread; an ONNX file needs no torch."""
     if not is_factory(spec) and Path(spec).suffix == ".onnx":
         from advnerf_core.policies.onnx_policy import OnnxNetwork
 
-        driver = OnnxDriver(OnnxNetwork(Path(spec)))
+        network = OnnxNetwork(Path(spec))
+        driver = Driver(network, network.contract, network.sha256)
         if expected_sha256 not in (None, driver.sha256):
             raise PolicyContractError(
                 f"expected the policy {expected_sha256}, got {driver.sha256} from {spec}"
@@ -241,22 +226,3 @@ def load_driver(spec: str | os.PathLike[str], expected_sha256: str | None = None
 
     torch.set_num_threads(1)
     return TorchDriver(load_any_policy(spec, expected_sha256))
-
-
-class OnnxDriver:
-    """Drives by an ONNX file."""
-
-    def __init__(self, network: Any) -> None:
-        self._network = network
-        self.view: PolicyView = network.contract.view
-        self.goal_size: int = network.contract.goal_size
-        self.sha256: str = network.sha256
-
-    def steer(self, image: NDArray[np.uint8], goal: tuple[float, ...]) -> float:
-        """Steering [rad] of one image."""
-        images = np.moveaxis(image, -1, 0)[None].astype(np.float32) / np.float32(255.0)
-        goals = np.array([goal], dtype=np.float32) if goal else None
-        return float(self._network.steering_rad(images, goals)[0])
-
-    def reset(self) -> None:
-        """There is no memory."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,80 +14,41 @@ from numpy.typing import NDArray
 
 from advnerf_core.files import write_atomically
 from advnerf_core.inputs import InputFileError, InputFiles
-from advnerf_core.policies.contract import (
-    ONNX_METADATA_KEY,
-    PolicyContract,
-    PolicyContractError,
-    declaration_beside,
-)
-from advnerf_core.policies.tensors import UINT8, TensorInfo, Tensors, chosen_tensors
+from advnerf_core.policies.answer import answer
+from advnerf_core.policies.contract import PolicyContract, PolicyContractError
+from advnerf_core.policies.declaration import ONNX_METADATA_KEY, declaration_beside
+from advnerf_core.policies.file_network import FileNetwork, as_float
+from advnerf_core.policies.tensors import UINT8, TensorInfo, chosen_tensors
 
 _KINDS = {"tensor(float)": "float32", "tensor(double)": "float64"}
 _OPSET = 17
 
 
-class OnnxNetwork:
+class OnnxNetwork(FileNetwork):
     """An ONNX file as a function of arrays.
 
     Attributes:
         contract: Its declaration, with ``differentiable`` False whatever it says.
         sha256: Hash of the file, of files that it keeps weights in, and of the declaration.
-        tensors: Its inputs and outputs, and what each is used for.
     """
 
-    training = False
-
     def __init__(self, path: Path, threads: int = 1) -> None:
-        import onnxruntime
-
-        files = read_onnx(path)
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = threads
-        options.log_severity_level = 3
-        try:
-            self._session = _session(files, options)
-        except Exception as error:  # its exceptions share no base of their own
-            reason = " ".join(str(error).split())
-            raise PolicyContractError(
-                f"expected an ONNX model in {path}, got {reason:.200}; export it again"
-            ) from error
-        inputs, outputs = (
-            [_info(each) for each in some]
-            for some in (self._session.get_inputs(), self._session.get_outputs())
-        )
-        embedded = self._session.get_modelmeta().custom_metadata_map.get(ONNX_METADATA_KEY)
-        # Elements of eight bits leave one range.
-        implied = {"value_max": 255.0} if any(each.kind == UINT8 for each in inputs) else {}
-        self.contract = _black_box(declaration_beside(path, embedded, **implied), path)
+        self._session, files = opened_onnx(path, threads)
+        inputs, outputs, embedded = read_tensors(self._session)
+        self.contract = _black_box(declaration_beside(path, embedded, inputs), path)
         self.sha256 = files.sha256(self.contract.to_json())
-        self.tensors: Tensors = chosen_tensors(inputs, outputs, self.contract, path)
-        self._one_by_one = (self.tensors.image.shape or ())[:1] == (1,)
+        super().__init__(chosen_tensors(inputs, outputs, self.contract, path))
+        self._kinds = {each.name: each.kind for each in inputs}
 
-    def __call__(self, images: NDArray[Any], goals: NDArray[Any] | None = None) -> NDArray[Any]:
-        """Raw output of the network for its own kind of images ``[B, ...]``."""
-        feeds = [images] if goals is None else [images, goals]
-        if self._one_by_one and len(images) != 1:
-            return np.concatenate(
-                [self._run([feed[k : k + 1] for feed in feeds]) for k in range(len(images))]
-            )
-        return self._run(feeds)
+    def run(self, feeds: Mapping[str, Any], outputs: list[str]) -> list[Any]:
+        """Outputs of ONNX Runtime; half precision becomes single."""
+        arrays = {name: _as_kind(feed, self._kinds[name]) for name, feed in feeds.items()}
+        return [as_float(np.asarray(each)) for each in self._session.run(outputs, arrays)]
 
     def steering_rad(self, images: NDArray[Any], goals: NDArray[Any] | None = None) -> NDArray[Any]:
-        """Steering ``[B]`` [rad] of images ``[B, 3, H, W]`` RGB 0..1: the whole contract, without torch."""
-        raw = self(self.contract.to_network(images), goals)
+        """Steering ``[B]`` [rad] of images ``[B, 3, H, W]`` RGB 0..1 of a policy without memory: the whole contract, without torch."""
+        raw, _ = answer(self.contract, self, images, goals)
         return np.asarray(self.contract.to_steering_rad(raw, len(images)))
-
-    def _run(self, feeds: list[NDArray[Any]]) -> NDArray[Any]:
-        wanted = [each for each in (self.tensors.image, self.tensors.goal) if each is not None]
-        arrays = {each.name: _as_kind(feed, each.kind) for each, feed in zip(wanted, feeds, strict=True)}
-        try:
-            return np.asarray(self._session.run([self.tensors.steering.name], arrays)[0])
-        except Exception as error:
-            reason = " ".join(str(error).split())
-            raise PolicyContractError(
-                f"expected the ONNX model to take {[list(array.shape) for array in arrays.values()]}, but it wants "
-                f"{', '.join(map(str, wanted))}; correct size and layout in the declaration ({reason:.120})"
-            ) from error
 
 
 class TensorNetwork:
@@ -99,16 +60,58 @@ class TensorNetwork:
         self._network = network
         self.tensors = network.tensors
 
-    def __call__(self, images: Any, goals: Any = None) -> Any:
-        """Raw output of the network for tensors."""
+    def initial_memory(self, batch: int) -> Any:
+        """Memory ``[B, K]`` before the first image, of a file with states."""
         import torch
 
-        raw = self._network(_array(images), None if goals is None else _array(goals))
-        return torch.from_numpy(np.ascontiguousarray(raw)).to(images)
+        return torch.from_numpy(self._network.initial_memory(batch))
+
+    def __call__(self, images: Any, *others: Any) -> Any:
+        """Raw output of the network for tensors, and the next memory of one that has any."""
+        given = [
+            None if each is None else np.asarray(each.detach().cpu().numpy()) for each in (images, *others)
+        ]
+        answers = self._network(*given)
+        if isinstance(answers, tuple):
+            return tuple(_tensor(each, images) for each in answers)
+        return _tensor(answers, images)
 
 
-def _array(tensor: Any) -> NDArray[Any]:
-    return np.asarray(tensor.detach().cpu().numpy())
+def _tensor(array: NDArray[Any], images: Any) -> Any:
+    import torch
+
+    return torch.from_numpy(np.ascontiguousarray(array)).to(images)
+
+
+def opened_onnx(path: Path, threads: int = 1) -> tuple[Any, InputFiles]:
+    """A session of ONNX Runtime, and the files that it was made of.
+
+    Raises:
+        PolicyContractError: They cannot be read, or are no ONNX model.
+    """
+    import onnxruntime
+
+    files = read_onnx(path)
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = threads
+    options.log_severity_level = 3
+    try:
+        return _session(files, options), files
+    except Exception as error:  # its exceptions share no base of their own
+        reason = " ".join(str(error).split())
+        raise PolicyContractError(
+            f"expected an ONNX model in {path}, got {reason:.200}; export it again"
+        ) from error
+
+
+def read_tensors(session: Any) -> tuple[list[TensorInfo], list[TensorInfo], str | None]:
+    """Inputs and outputs of a session, and the declaration that the file carries; None if it carries none."""
+    embedded = session.get_modelmeta().custom_metadata_map.get(ONNX_METADATA_KEY)
+    return (
+        [_info(each) for each in session.get_inputs()],
+        [_info(each) for each in session.get_outputs()],
+        embedded,
+    )
 
 
 def export_onnx(network: Any, contract: PolicyContract, path: Path) -> None:
@@ -123,7 +126,9 @@ def export_onnx(network: Any, contract: PolicyContract, path: Path) -> None:
     import torch
 
     if not contract.stateless:
-        raise PolicyContractError("expected a stateless policy, got one with memory: an ONNX policy has none")
+        raise PolicyContractError(
+            "expected a stateless network, got one with memory; write a factory for it instead"
+        )
     examples, names = example_inputs(contract)
     buffer: Any = BytesIO()  # the exporter's signature knows names of files only
     with warnings.catch_warnings(), torch.no_grad():
@@ -156,16 +161,25 @@ def example_inputs(contract: PolicyContract) -> tuple[tuple[Any, ...], list[str]
     """Inputs of the network behind a declaration, a batch of two, and their names."""
     import torch
 
-    images = contract.to_network(torch.rand(2, 3, *contract.size, generator=torch.Generator().manual_seed(0)))
+    images = contract.first_input(
+        torch.rand(2, 3, *contract.size, generator=torch.Generator().manual_seed(0))
+    )
     if contract.goal_size == 0:
         return (images,), ["images"]
     return (images, torch.zeros(2, contract.goal_size)), ["images", "goals"]
 
 
 def _black_box(contract: PolicyContract, path: Path) -> PolicyContract:
-    if not contract.stateless:
-        raise PolicyContractError(f"expected a stateless policy in {path}, got one declared otherwise")
+    require_states(contract, path)
     return PolicyContract(**{**vars(contract), "differentiable": False})
+
+
+def require_states(contract: PolicyContract, path: Path) -> None:
+    """Refuse a file that is declared to have a memory, but not which inputs and outputs carry it."""
+    if not contract.stateless and not contract.states:
+        raise PolicyContractError(
+            f"{path}: stateless: expected true, or states: the inputs and outputs that carry the memory; got false without states"
+        )
 
 
 def read_onnx(path: Path) -> InputFiles:

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from advnerf_core.policies.contract import PolicyContract, PolicyContractError
+from advnerf_core.policies.memory import CarriedState, NetworkState
 
 UINT8 = "uint8"
 FLOATS = ("float16", "float32", "float64")
-_IMAGE_RANK, _GOAL_RANK = 4, 2
+_GOAL_RANK = 2
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,8 @@ class Tensors:
         outputs: In the file's order.
         image: The input that takes the images.
         goal: The input that takes the goals; None for a policy without a goal.
+        steering: The output that steers.
+        states: What is carried from image to image.
     """
 
     inputs: tuple[TensorInfo, ...]
@@ -51,11 +54,20 @@ class Tensors:
     image: TensorInfo
     goal: TensorInfo | None
     steering: TensorInfo
+    states: tuple[CarriedState, ...] = ()
+
+    @property
+    def one_by_one(self) -> bool:
+        """Whether the file takes one image at a time."""
+        return (self.image.shape or ())[:1] == (1,)
 
     def use_of(self, tensor: TensorInfo, column: int | None) -> str:
         """What a tensor is used for, in words."""
         if tensor is self.steering:
             return "steering" if column is None else f"steering, column {column}"
+        for state in self.states:
+            if tensor.name in (state.declared.input, state.declared.output):
+                return f"memory, {state.declared.output} to {state.declared.input}"
         return "images" if tensor is self.image else "goals" if tensor is self.goal else "not used"
 
 
@@ -67,11 +79,38 @@ def chosen_tensors(
     Raises:
         PolicyContractError: The declaration does not fit the file, or leaves more than one reading.
     """
-    image, goal = _chosen_inputs(inputs, contract, path)
+    states = tuple(_carried(inputs, outputs, state, path) for state in contract.states)
+    taken = {state.input for state in contract.states}
+    image, goal = _chosen_inputs([each for each in inputs if each.name not in taken], contract, path)
     _check_image(image, contract, path)
     if goal is not None and goal.kind not in FLOATS:
         raise PolicyContractError(f"{path}: expected goals of {', '.join(FLOATS)}, got {goal}")
-    return Tensors(tuple(inputs), tuple(outputs), image, goal, _chosen_output(outputs, contract, path))
+    given = {state.output for state in contract.states}
+    steering = _chosen_output(outputs, given, contract, path)
+    return Tensors(tuple(inputs), tuple(outputs), image, goal, steering, states)
+
+
+def _carried(
+    inputs: Sequence[TensorInfo], outputs: Sequence[TensorInfo], state: NetworkState, path: Path
+) -> CarriedState:
+    """A state with the shape that the file says."""
+    given = _named(inputs, state.input, "states.input", path)
+    _named(outputs, state.output, "states.output", path)
+    shape = list(given.shape or ())
+    if state.batch_axis < len(shape):
+        del shape[state.batch_axis]
+    sizes = tuple(each for each in shape if isinstance(each, int))
+    if not given.shape or len(sizes) != len(given.shape) - 1 or given.kind not in FLOATS:
+        raise PolicyContractError(
+            f"{path}: states: expected {', '.join(FLOATS)} of fixed sizes but for the batch on axis {state.batch_axis}, got {given}; correct "
+            "batch_axis, or export it with fixed sizes"
+        )
+    carried = CarriedState(state, sizes)
+    if isinstance(state.initial, tuple) and len(state.initial) != carried.size:
+        raise PolicyContractError(
+            f"{path}: states.initial: expected one number or {carried.size} for {given}, got {len(state.initial)}"
+        )
+    return carried
 
 
 def _chosen_inputs(
@@ -80,7 +119,7 @@ def _chosen_inputs(
     wanted = "1 input (images)" if contract.goal_size == 0 else "2 inputs (images, goals)"
     if len(inputs) != 1 + (contract.goal_size > 0):
         raise PolicyContractError(
-            f"expected {wanted} in {path}, got {_listed(inputs)}; declare goal_size, or export a network without the other inputs"
+            f"expected {wanted} in {path}, got {_listed(inputs)}; declare goal_size or states, or export a network without the other inputs"
         )
     if contract.input_name is not None:
         image = _named(inputs, contract.input_name, "input_name", path)
@@ -88,7 +127,7 @@ def _chosen_inputs(
         fitting = [
             each
             for each in inputs
-            if each.may_have_rank(_IMAGE_RANK)
+            if each.may_have_rank(1 + len(contract.input_shape))
             and all(other is each or other.may_have_rank(_GOAL_RANK) for other in inputs)
         ]
         if len(fitting) != 1 and len(inputs) > 1:
@@ -113,38 +152,56 @@ def _check_image(image: TensorInfo, contract: PolicyContract, path: Path) -> Non
         )
     if image.shape is None:
         return
-    size = contract.size
-    expected = (contract.channels, *size) if contract.layout == "NCHW" else (*size, contract.channels)
-    fits = len(image.shape) == _IMAGE_RANK and all(
+    expected = contract.input_shape
+    fits = len(image.shape) == 1 + len(expected) and all(
         not isinstance(has, int) or has == wants for has, wants in zip(image.shape[1:], expected, strict=True)
     )
     if not fits:
         raise PolicyContractError(
             f"{path}: expected an input of [B, {', '.join(map(str, expected))}] ({contract.layout}, {contract.colour_space}), got {image}; "
-            "correct size, layout or colour_space in the declaration"
+            "correct size, layout, frames or colour_space in the declaration"
         )
 
 
-def _chosen_output(outputs: Sequence[TensorInfo], contract: PolicyContract, path: Path) -> TensorInfo:
+def _chosen_output(
+    outputs: Sequence[TensorInfo], states: set[str], contract: PolicyContract, path: Path
+) -> TensorInfo:
+    free = [each for each in outputs if each.name not in states]
     if contract.output_name is not None:
         steering = _named(outputs, contract.output_name, "output_name", path)
-    elif len(outputs) == 1:
-        steering = outputs[0]
+    elif contract.output_index is not None:
+        if contract.output_index >= len(outputs):
+            raise PolicyContractError(
+                f"{path}: output_index: expected 0 to {len(outputs) - 1} of {_listed(outputs)}, got {contract.output_index}"
+            )
+        steering = outputs[contract.output_index]
+    elif len(free) == 1:
+        steering = free[0]
     else:
         raise PolicyContractError(
-            f"{path} has the outputs {_listed(outputs)}; declare output_name: the one that steers"
+            f"{path} has the outputs {_listed(free)}; declare output_name: the one that steers"
         )
     columns = steering.shape[1] if steering.shape is not None and len(steering.shape) == 2 else None
-    if isinstance(columns, int):
-        if contract.output_column is None and columns > 1:
-            raise PolicyContractError(
-                f"{path}: the output {steering} has {columns} columns; declare output_column: the one that steers, 0 to {columns - 1}"
-            )
-        if contract.output_column is not None and contract.output_column >= columns:
-            raise PolicyContractError(
-                f"{path}: output_column: expected 0 to {columns - 1} for the output {steering}, got {contract.output_column}"
-            )
+    if isinstance(columns, int) and contract.trajectory is None:
+        _check_columns(steering, columns, contract, path)
     return steering
+
+
+def _check_columns(steering: TensorInfo, columns: int, contract: PolicyContract, path: Path) -> None:
+    if contract.bins is not None:
+        if columns != len(contract.bins.values):
+            raise PolicyContractError(
+                f"{path}: bins.values: expected {columns} for the output {steering}, got {len(contract.bins.values)}"
+            )
+    elif contract.output_column is None and columns > 1:
+        raise PolicyContractError(
+            f"{path}: the output {steering} has {columns} columns; declare output_column: the one that steers, 0 to {columns - 1}; or what all "
+            "of them are: trajectory or bins"
+        )
+    elif contract.output_column is not None and contract.output_column >= columns:
+        raise PolicyContractError(
+            f"{path}: output_column: expected 0 to {columns - 1} for the output {steering}, got {contract.output_column}"
+        )
 
 
 def _named(tensors: Sequence[TensorInfo], name: str, key: str, path: Path) -> TensorInfo:

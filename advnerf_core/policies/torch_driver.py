@@ -7,30 +7,24 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from advnerf_core.policies.adapter import adapted
+from advnerf_core.policies.contract import PolicyContract
+from advnerf_core.policies.driver import Driver
 from advnerf_core.policies.network import images_to_tensor
 from advnerf_core.policies.policy_file import LoadedPolicy
 
 
-class TorchDriver:
-    """Drives by a torch policy, and keeps the memory of one that has any from image to image."""
+class TorchDriver(Driver):
+    """Drives by a torch policy."""
 
     def __init__(self, loaded: LoadedPolicy) -> None:
-        self._policy = loaded.policy
-        self.view = loaded.view
-        self.goal_size = int(loaded.policy.goal_size)
-        self.sha256 = loaded.sha256
-        self._memory: Tensor | None = None
-        self.reset()
+        plain = PolicyContract(loaded.view, goal_size=int(loaded.policy.goal_size))
+        policy = adapted(loaded.policy, plain)
+        super().__init__(policy.network, policy.contract, loaded.sha256)
 
-    def steer(self, image: NDArray[np.uint8], goal: tuple[float, ...]) -> float:
-        """Steering [rad] of one policy image ``[H, W, 3]`` uint8 RGB."""
+    @torch.inference_mode()
+    def answer(self, image: NDArray[np.uint8], goal: tuple[float, ...]) -> Tensor:
+        """The network's raw output for one policy image, as the methods of the declaration take it."""
         goals = torch.tensor([goal], dtype=torch.float32) if goal else None
-        with torch.inference_mode():
-            if self._memory is None:
-                return float(self._policy(images_to_tensor(image), goals)[0])
-            steering, self._memory = self._policy(images_to_tensor(image), goals, self._memory)
-        return float(steering[0])
-
-    def reset(self) -> None:
-        """Forget the images so far."""
-        self._memory = None if self._policy.stateless else self._policy.initial_memory(1)
+        raw: Tensor = self._after(images_to_tensor(image), goals)
+        return raw

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 
 from advnerf_core.places import open_tensors
-from advnerf_core.policies.contract import ONNX_METADATA_KEY, PolicyContractError, declaration_beside
+from advnerf_core.policies.contract import PolicyContractError
+from advnerf_core.policies.declaration import ONNX_METADATA_KEY, declaration_beside
 from advnerf_core.policies.view import PolicyView
 
 CAMERA, ATTACKED, POLICY = 0, 1, 2

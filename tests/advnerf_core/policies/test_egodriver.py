@@ -10,7 +10,7 @@ import torch
 from advnerf_core.driving.rollout import Remembering
 from advnerf_core.geometry import Array, Pinhole, camera_mount
 from advnerf_core.policies.contract import PolicyContractError
-from advnerf_core.policies.egodriver import DrivenRig, driver_at, load_driver_at, pursued_curvature_1pm
+from advnerf_core.policies.egodriver import DrivenRig, driver_at, load_driver_at
 from advnerf_core.policies.load import is_address, is_code, load_any_policy
 from advnerf_core.policies.view import PolicyView
 
@@ -68,21 +68,6 @@ class OnACircle(BaseDriver):
 def served(driver: BaseDriver) -> Iterator[str]:
     with serving(driver, port=0, host="127.0.0.1") as port:
         yield f"grpc://127.0.0.1:{port}"
-
-
-def test_the_arc_through_a_plan_is_that_of_the_circle_it_lies_on() -> None:
-    along_m = np.linspace(0.01, 1.0, 200)
-    for radius_m in (0.7, 2.0, 50.0):
-        left = arc(radius_m, along_m)
-        assert pursued_curvature_1pm(left, 0.4) == pytest.approx(1.0 / radius_m, rel=1e-3)
-        assert pursued_curvature_1pm(left * [1.0, -1.0], 0.4) == pytest.approx(-1.0 / radius_m, rel=1e-3)
-    # A coarse plan is met between its points: where the line from (0.2, 0) to (0.6, 0.3) is 0.4 m away.
-    share = (-0.16 + np.sqrt(0.16**2 + 0.5**2 * 4 * 0.12)) / (2 * 0.25)  # 0.25 s^2 + 0.16 s - 0.12 = 0
-    x, y = 0.2 + 0.4 * share, 0.3 * share
-    assert np.hypot(x, y) == pytest.approx(0.4)
-    assert pursued_curvature_1pm(np.array([[0.2, 0.0], [0.6, 0.3]]), 0.4) == pytest.approx(2 * y / 0.16)
-    assert pursued_curvature_1pm(np.array([[0.1, 0.05]]), 0.4) == pytest.approx(2 * 0.05 / 0.0125), "its end"
-    assert pursued_curvature_1pm(np.array([[0.0, 0.0]]), 0.4) == 0.0
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ import yaml
 from onnx import TensorProto
 from torch import nn
 
+from advnerf_core.policies.adapter import adapt
 from advnerf_core.policies.contract import PolicyContract, PolicyContractError
 from advnerf_core.policies.load import load_any_policy, load_driver
 from advnerf_core.policies.onnx_policy import OnnxNetwork
@@ -227,11 +228,23 @@ def test_an_exported_program_is_asked_the_same_questions(tmp_path):
     torch.testing.assert_close(policy(torch.full((2, 3, 8, 12), 0.2)), torch.full((2,), float(expected)))
 
 
-def test_names_are_refused_where_there_is_no_file():
-    from advnerf_core.policies.adapter import adapt
+def test_a_network_of_several_outputs_is_asked_for_the_one_that_steers():
+    grey = torch.full((2, 3, 8, 12), 0.5)
+    steers = torch.full((2,), 0.35)
+    torch.testing.assert_close(adapt(TwoHeads(), PolicyContract(VIEW, output_name="throttle"))(grey), steers)
+    both = adapt(lambda images: tuple(TwoHeads()(images).values()), PolicyContract(VIEW, output_index=0))
+    torch.testing.assert_close(both(grey), steers)
+    for network, how in (
+        (TwoHeads(), r"declare output_name, one of \['throttle', 'both'\]"),
+        (both.network, r"output_index, one of \[0, 1\]"),
+    ):
+        with pytest.raises(PolicyContractError, match=how):
+            adapt(network, PolicyContract(VIEW))(grey)
 
+
+def test_names_of_inputs_are_refused_where_there_is_no_file():
     with pytest.raises(PolicyContractError, match=r"for an \.onnx or \.pt2 file only"):
-        adapt(TwoHeads(), PolicyContract(VIEW, output_name="throttle"))
+        adapt(TwoHeads(), PolicyContract(VIEW, input_name="images"))
 
 
 @pytest.mark.skipif(not CASES.is_dir(), reason="needs the shared cases")

@@ -1,0 +1,46 @@
+"""A policy as the live node uses it: one image after the other. No torch here: the car's computer needs none for an ONNX file."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.policies.answer import answer, memory_before
+from advnerf_core.policies.contract import PolicyContract
+
+
+class Driver:
+    """Drives by a network of numpy arrays. The memory of a policy that has one goes on from image to image, until `reset`.
+
+    Args:
+        network: As `advnerf_core.policies.answer` calls it.
+        contract: Its declaration.
+        sha256: Hash of the policy.
+    """
+
+    def __init__(self, network: Any, contract: PolicyContract, sha256: str) -> None:
+        self.contract, self.view, self.goal_size = contract, contract.view, contract.goal_size
+        self.sha256 = sha256
+        self._network = network
+        self._memory: Any = None
+
+    def steer(self, image: NDArray[np.uint8], goal: tuple[float, ...]) -> float:
+        """Steering [rad], left positive, of one policy image ``[H, W, 3]`` uint8 RGB."""
+        return float(self.contract.to_steering_rad(self.answer(image, goal), 1)[0])
+
+    def answer(self, image: NDArray[np.uint8], goal: tuple[float, ...]) -> Any:
+        """The network's raw output for one policy image, as the methods of the declaration take it."""
+        images = np.moveaxis(image, -1, 0)[None].astype(np.float32) / np.float32(255.0)
+        return self._after(images, np.array([goal], dtype=np.float32) if goal else None)
+
+    def reset(self) -> None:
+        """Forget the images so far."""
+        self._memory = None
+
+    def _after(self, images: Any, goals: Any) -> Any:
+        if self._memory is None and self.contract.has_memory:
+            self._memory = memory_before(self.contract, self._network, 1, images)
+        raw, self._memory = answer(self.contract, self._network, images, goals, self._memory)
+        return raw

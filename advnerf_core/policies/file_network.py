@@ -1,0 +1,72 @@
+"""A policy file as a network: images, goals and memory go to the inputs that its declaration names, for every kind of file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from advnerf_core.policies.arrays import array_module
+from advnerf_core.policies.contract import PolicyContractError
+from advnerf_core.policies.memory import initial_memory, joined, split
+from advnerf_core.policies.tensors import Tensors
+
+
+class FileNetwork:
+    """Base of the networks of policy files; a subclass runs the file.
+
+    Args:
+        tensors: Its inputs and outputs, and what each is used for.
+    """
+
+    training = False
+
+    def __init__(self, tensors: Tensors) -> None:
+        self.tensors = tensors
+
+    def run(self, feeds: Mapping[str, Any], outputs: list[str]) -> list[Any]:
+        """Outputs by name of inputs by name, which are floating-point arrays of any type.
+
+        Raises:
+            Exception: The inputs do not fit the file.
+        """
+        raise NotImplementedError
+
+    def initial_memory(self, batch: int) -> Any:
+        """Memory ``[B, K]`` before the first image, of a file with states."""
+        return initial_memory(self.tensors.states, batch)
+
+    def __call__(self, images: Any, goals: Any = None, memory: Any = None) -> Any:
+        """Raw output ``[B, ...]`` of images as the file takes them; of a file with states also the next memory."""
+        if self.tensors.one_by_one and len(images) != 1:
+            given = [images, goals, memory]
+            answers = [
+                self(*(None if each is None else each[row : row + 1] for each in given))
+                for row in range(len(images))
+            ]
+            join = array_module(images).concatenate
+            if not self.tensors.states:
+                return join(answers, 0)
+            return join([each[0] for each in answers], 0), join([each[1] for each in answers], 0)
+        feeds = {self.tensors.image.name: images}
+        if self.tensors.goal is not None:
+            feeds[self.tensors.goal.name] = goals
+        states = self.tensors.states
+        if states:
+            feeds |= split(states, memory)
+        names = [self.tensors.steering.name, *(each.declared.output for each in states)]
+        try:
+            raw, *following = self.run(feeds, names)
+        except Exception as error:  # what the runtimes raise has no base in common
+            reason = " ".join(str(error).split())
+            raise PolicyContractError(
+                f"expected the file to take {[list(each.shape) for each in feeds.values()]}, but it wants "
+                f"{', '.join(map(str, self.tensors.inputs))}; correct size and layout in the declaration ({reason:.120})"
+            ) from error
+        return (raw, joined(states, dict(zip(names[1:], following, strict=True)))) if states else raw
+
+
+def as_float(array: Any) -> Any:
+    """An output in a type that conversions are exact enough in: half precision becomes single."""
+    return array.astype(np.float32) if array.dtype == np.float16 else array

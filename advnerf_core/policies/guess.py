@@ -1,0 +1,246 @@
+"""What a policy file says about itself without a declaration, and what only its author knows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from advnerf_core.geometry import Pinhole
+from advnerf_core.policies.contract import PolicyContract, PolicyContractError
+from advnerf_core.policies.declaration import find_declaration
+from advnerf_core.policies.frames import FrameStack
+from advnerf_core.policies.memory import NetworkState
+from advnerf_core.policies.tensors import FLOATS, UINT8, TensorInfo
+from advnerf_core.policies.tracker import TrackedTrajectory
+from advnerf_core.policies.view import IMAGE_HEIGHT, IMAGE_WIDTH, PolicyView
+
+_STEERING_WORDS = ("steer", "angle", "curvature")
+_WAYPOINT_WORDS = ("waypoint", "traj", "plan")
+_COLOURS = (3, 1)
+# Inputs and outputs of the same shape are a memory if they are this long; shorter ones may be a goal and the steering.
+_LONG = 8
+# Cars that plan waypoints do so half a second apart, more often than otherwise.
+_WAYPOINTS_S = 0.5
+
+
+@dataclass(frozen=True)
+class Question:
+    """Something that a file does not say about itself.
+
+    Attributes:
+        key: Key of the declaration, with dots for a section's.
+        text: What is asked, in words.
+        choices: What may be answered; empty for a number or a section.
+    """
+
+    key: str
+    text: str
+    choices: tuple[str, ...] = ()
+
+
+def guess_contract(path: str | Path) -> tuple[PolicyContract, list[Question]]:
+    """The declaration of a policy file: its own, else what its inputs and outputs say, with the usual values for the rest.
+
+    Returns:
+        The declaration, and what cannot be read from the file; no questions where the file has a declaration.
+
+    Raises:
+        PolicyContractError: It is no policy file, or no input can be an image.
+    """
+    path = Path(path)
+    if path.suffix == ".safetensors":
+        from advnerf_core.policies.policy_file import described_file
+
+        settings, view, _ = described_file(path)
+        return PolicyContract(view, goal_size=settings["goal_size"]), []
+    inputs, outputs, embedded = tensors_of(path)
+    declared = find_declaration(path, embedded, inputs)
+    return (declared, []) if declared is not None else _guessed(path, inputs, outputs)
+
+
+def tensors_of(path: Path) -> tuple[list[TensorInfo], list[TensorInfo], str | None]:
+    """Inputs and outputs of an ``.onnx`` or ``.pt2`` file, and the declaration that it carries; empty if it carries none.
+
+    Raises:
+        PolicyContractError: It is another file, or cannot be read.
+    """
+    if path.suffix == ".onnx":
+        from advnerf_core.policies.onnx_policy import opened_onnx, read_tensors
+
+        return read_tensors(opened_onnx(path)[0])
+    if path.suffix == ".pt2":
+        from advnerf_core.policies.exported_policy import opened_program, program_tensors
+
+        program, _, embedded = opened_program(path)
+        return *program_tensors(program), embedded
+    raise PolicyContractError(f"expected a file of .safetensors, .onnx or .pt2, got {path}")
+
+
+def _guessed(
+    path: Path, inputs: list[TensorInfo], outputs: list[TensorInfo]
+) -> tuple[PolicyContract, list[Question]]:
+    image = _image(path, inputs)
+    found, questions = _of_image(image)
+    others = [each for each in inputs if each is not image]
+    states = _states(others, outputs)
+    carried = {name for state in states for name in (state.input, state.output)}
+    others = [each for each in others if each.name not in carried]
+    if len(others) > 1:
+        raise PolicyContractError(
+            f"{path}: expected images, at most one goal, and states with an output of the same shape, got the inputs "
+            f"{', '.join(map(str, inputs))}; write a factory for it (docs/policies.md)"
+        )
+    if states:
+        found["states"] = states
+        pairs = ", ".join(f"{each.output} to {each.input}" for each in states)
+        questions.append(
+            Question("states", f"Is this its memory, {pairs}, and is it 0 before the first image?")
+        )
+    if others:
+        found |= {"goal_size": _last(others[0]) or 1, "input_name": image.name}
+        questions.append(Question("goal_size", f"Is the input {others[0]} a goal, and how long is it?"))
+    free = [each for each in outputs if each.name not in carried]
+    meant, more = _of_output(free)
+    return PolicyContract(**found, **meant), questions + more
+
+
+def _image(path: Path, inputs: list[TensorInfo]) -> TensorInfo:
+    fitting = [
+        each
+        for each in inputs
+        if each.kind in (*FLOATS, UINT8) and (each.shape is None or len(each.shape) in (4, 5))
+    ]
+    # The largest of several, such as an image beside a state of a convolution.
+    sized = sorted(fitting, key=lambda each: -sum(s for s in each.shape or () if isinstance(s, int)))
+    if not sized:
+        raise PolicyContractError(
+            f"{path}: expected an input of images [B, 3, H, W] or [B, H, W, 3], got {', '.join(map(str, inputs)) or 'no inputs'}; export the "
+            "network from its image input"
+        )
+    return sized[0]
+
+
+def _of_image(image: TensorInfo) -> tuple[dict[str, Any], list[Question]]:
+    """Keys that the shape and type of the image input give, and what they leave open."""
+    shape, questions = list(image.shape or (None,) * 4)[1:], []
+    times = shape.pop(0) if len(shape) == 4 else None
+    layout, channels = _layout(shape)
+    rows, columns = shape[-2:] if layout == "NCHW" else shape[:2]
+    height = rows if isinstance(rows, int) else IMAGE_HEIGHT
+    width = columns if isinstance(columns, int) else IMAGE_WIDTH
+    # A guess of a lens that sees a right angle; the camera of the place replaces it.
+    camera = Pinhole(width, height, 0.5 * width, 0.5 * width, 0.5 * width, 0.5 * height)
+    view = PolicyView(camera, crop_top_px=0, crop_height_px=height, width=width, height=height)
+    found: dict[str, Any] = {"view": view, "layout": layout}
+    size = "" if (height, width) == (rows, columns) else f" and in which size (not fixed in {image})"
+    text = f"For which camera is it, and which part of its picture does it see{size}?"
+    questions.append(Question("view", text))
+    colours, count = _stack(channels, times)
+    if count is not None:
+        found["frames"] = FrameStack(count=count, axis="channels" if times is None else "time")
+        text = f"{image} takes {count} images: how many ticks apart, in which order, and what stands for those before the first?"
+        questions.append(Question("frames", text))
+    if colours == 1:
+        found["colour_space"] = "GRAY"
+    else:
+        questions.append(Question("colour_space", "In which order are the colours?", ("RGB", "BGR", "YUV")))
+    if image.kind == UINT8:
+        found["value_max"] = 255.0
+    else:
+        text = "Which values do black and white have? Give value_max 1 or 255, and mean and std if they are used."
+        questions.append(Question("value_max", text, ("1", "255")))
+    return found, questions
+
+
+def _layout(shape: list[Any]) -> tuple[Any, int]:
+    """Layout and number of channels of an image of three axes."""
+    for layout, number in (("NCHW", shape[0]), ("NHWC", shape[-1])):
+        if number in _COLOURS:
+            return layout, number
+    fixed = [each for each in (shape[0], shape[-1]) if isinstance(each, int)]
+    channels = min(fixed, default=3)
+    return ("NCHW" if shape[0] == channels or not fixed else "NHWC"), channels
+
+
+def _stack(channels: int, times: Any) -> tuple[int, int | None]:
+    """Colours of each image, and number of images in the input; None for one."""
+    if times is not None:
+        return channels, times if isinstance(times, int) else 2
+    if channels in _COLOURS:
+        return channels, None
+    return (3, channels // 3) if channels % 3 == 0 else (1, channels)
+
+
+def _states(inputs: list[TensorInfo], outputs: list[TensorInfo]) -> tuple[NetworkState, ...]:
+    """Inputs that an output has the name or, if they are long, the shape of, in the order of the file."""
+    states, left = [], [each for each in outputs if not _steers(each)]
+    for given in inputs:
+        fitting = [each for each in left if _alike(each, given) and given.kind in FLOATS]
+        namesakes = [each for each in fitting if given.name.removesuffix("_in") in each.name]
+        chosen = next(iter(namesakes or fitting), None)
+        if chosen is not None and (namesakes or (_last(given) or 0) >= _LONG):
+            left.remove(chosen)
+            states.append(NetworkState(input=given.name, output=chosen.name, batch_axis=_batch_axis(given)))
+    return tuple(states)
+
+
+def _alike(output: TensorInfo, given: TensorInfo) -> bool:
+    """Whether an output can be given to an input: dimensions that are not fixed fit any."""
+    if output.shape is None or given.shape is None or len(output.shape) != len(given.shape):
+        return False
+    pairs = zip(output.shape, given.shape, strict=True)
+    return all(has == wants or not (isinstance(has, int) and isinstance(wants, int)) for has, wants in pairs)
+
+
+def _batch_axis(tensor: TensorInfo) -> int:
+    """Axis of the batch: the one that is not fixed, else the first of two and the second of three axes, as PyTorch's states have it."""
+    shape = tensor.shape or ()
+    free = [axis for axis, size in enumerate(shape) if not isinstance(size, int)]
+    return free[0] if free else min(1, max(0, len(shape) - 2))
+
+
+def _of_output(outputs: list[TensorInfo]) -> tuple[dict[str, Any], list[Question]]:
+    """Keys that the outputs give, and what they leave open."""
+    named = [each for each in outputs if _steers(each)]
+    planned = [each for each in outputs if _waypoints(each)]
+    chosen = (named or planned or outputs)[0]
+    found: dict[str, Any] = {"output_name": chosen.name} if len(outputs) > 1 else {}
+    questions = []
+    if len(outputs) > 1 and len(named or planned) != 1:
+        names = tuple(each.name for each in outputs)
+        questions.append(Question("output_name", "Which output steers?", names))
+    side = Question("positive", "To which side does a positive output steer?", ("left", "right"))
+    if chosen in planned:
+        times = tuple(_WAYPOINTS_S * number for number in range(1, _waypoints(chosen) + 1))
+        found["trajectory"] = TrackedTrajectory(times_s=times, lookahead_m=1.0, wheelbase_m=1.0)
+        text = f"At which times are the waypoints {chosen}, and which lookahead distance and wheelbase has the tracker?"
+        return found, [*questions, Question("trajectory", text), side]
+    columns = _last(chosen) if chosen.shape is not None and len(chosen.shape) == 2 else None
+    if columns is not None and columns > 1:
+        found["output_column"] = 0
+        text = f"{chosen} has {columns} columns: which one steers? Or declare bins, if each is the score of a steering value."
+        questions.append(Question("output_column", text, tuple(map(str, range(columns)))))
+    text = "In which unit does it steer? normalised needs full_steering_rad, 1/m needs wheelbase_m."
+    return found, [*questions, Question("output_unit", text, ("rad", "deg", "normalised", "1/m")), side]
+
+
+def _steers(tensor: TensorInfo) -> bool:
+    """Whether an output is named as one that steers."""
+    return any(word in tensor.name.lower() for word in _STEERING_WORDS)
+
+
+def _waypoints(tensor: TensorInfo) -> int:
+    """Number of waypoints in an output; 0 if it has none."""
+    shape = tensor.shape or ()
+    if len(shape) == 3 and all(isinstance(each, int) for each in shape[1:]) and shape[2] in (2, 3):
+        return int(shape[1] or 0)
+    flat = _last(tensor) or 0
+    named = any(word in tensor.name.lower() for word in _WAYPOINT_WORDS)
+    return flat // 2 if len(shape) == 2 and named and flat >= 4 and flat % 2 == 0 else 0
+
+
+def _last(tensor: TensorInfo) -> int | None:
+    """Last dimension of a tensor; None if it is not fixed."""
+    size = (tensor.shape or (None,))[-1]
+    return size if isinstance(size, int) else None
