@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem, adjoint_gradient
-from advnerf_core.driving.rollout import Rollout
+from advnerf_core.driving.rollout import Remembering, Rollout
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.scene.surrogate import PoseBatch, Surrogate
 from benchmarks.attack_toy import toy_problem
@@ -33,14 +33,10 @@ def backpropagated_gradient(problem: AttackProblem, theta: Tensor, rollout: Roll
     """Loss and gradient by plain back-propagation through the whole unrolled loop, images as dense autograd expressions."""
     theta = theta.clone().requires_grad_()
     states = [problem.start_states]
-    memory = None if problem.policy.stateless else problem.policy.initial_memory(len(states[0]))
+    policy = Remembering.afresh(problem.policy, len(states[0]))
     for frames in frozen_frames(problem, rollout):
         images = _differentiable_images(frames, theta)
-        if memory is None:
-            controls = problem.policy(images, problem.goals)
-        else:
-            controls, memory = problem.policy(images, problem.goals, memory)
-        states.append(problem.dynamics.step(states[-1], controls))
+        states.append(problem.dynamics.step(states[-1], policy(images, problem.goals)))
     loss = problem.losses(torch.stack(states)).mean()
     (gradient,) = torch.autograd.grad(loss, theta)
     return float(loss.detach()), gradient
@@ -57,10 +53,11 @@ def _differentiable_images(frames: PoseBatch, theta: Tensor) -> Tensor:
 
 def frozen_loss(problem: AttackProblem, theta: Tensor, frames: list[PoseBatch]) -> float:
     """Loss of the rollout for ``theta`` with the images taken at the nominal poses."""
+    policy = Remembering.afresh(problem.policy, len(problem.start_states))
     with torch.no_grad():
         states = [problem.start_states]
         for nominal in frames:
-            controls = problem.policy(nominal.render(theta).images, problem.goals)
+            controls = policy(nominal.render(theta).images, problem.goals)
             states.append(problem.dynamics.step(states[-1], controls))
         return float(problem.losses(torch.stack(states)).mean())
 

@@ -33,6 +33,8 @@ from nodes.runtime.process import run_node_main
 COUNTERFACTUAL_TOPIC = "/policy/counterfactual"
 _ATTACKED, _LABEL = "/compositor/image", "/compositor/attack"
 _ACTIVE_S = 1.0
+# As in the policy node.
+_MEMORY_GAP_S = 1.0
 _WARM_UP_RUNS = 3
 # Largest number of incomplete pairs. The images of a pair arrive within the compositor's waiting time for poses.
 _OPEN = 12
@@ -142,6 +144,9 @@ class CounterfactualNode(Node):
             self._counts["dropped_bad"] += 1
             self._trouble = str(error)
             return []
+        if self._last_ns is not None and now.mono_ns - self._last_ns > _MEMORY_GAP_S * NS_PER_S:
+            for driver in (self._clean, self._attacked):
+                driver.reset()
         self._trouble, self._last_ns = "", now.mono_ns
         return self._compare(clean, attacked, entry[_LABEL], stamp)
 

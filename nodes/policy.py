@@ -28,6 +28,8 @@ from nodes.runtime.process import run_node_main
 _DRIVE = "/policy/drive"
 _WARM_UP_RUNS = 5
 _ACTIVE_S = 1.0
+# A policy with memory forgets it when no image came for so long: what it remembers is no longer where the car is.
+_MEMORY_GAP_S = 1.0
 # Largest accepted lead of the camera's clock over the local clock.
 _CLOCK_TOLERANCE_S = 0.02
 
@@ -128,6 +130,8 @@ class PolicyNode(Node):
                 f"expected images of {camera.width} x {camera.height}, got {got}; train for this camera",
             )
             return []
+        if self._last_drive_ns is not None and now.mono_ns - self._last_drive_ns > _MEMORY_GAP_S * NS_PER_S:
+            self._driver.reset()
         steering_rad = self._steer(rgb)
         if not np.isfinite(steering_rad):
             self._drop("dropped_bad", "the policy's output is not finite")

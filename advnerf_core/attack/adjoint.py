@@ -86,9 +86,9 @@ class RenderCache:
 
 
 def roll_out(
-    problem: AttackProblem, theta: Tensor, cache: RenderCache | None = None
+    problem: AttackProblem, theta: Tensor, cache: RenderCache | None = None, keep_memories: bool = True
 ) -> tuple[Rollout, list[Tensor]]:
-    """Drive the closed loop for ``theta``; also the memories ``[T + 1]`` of a policy that has one (else empty)."""
+    """Drive the closed loop for ``theta``; also the memories ``[T + 1]`` of a policy that has one (else empty), for a gradient."""
     step = 0
 
     def observe(states: Tensor) -> Tensor:
@@ -99,9 +99,9 @@ def roll_out(
         step += 1
         return rendered.images
 
-    policy = (
-        problem.policy if problem.policy.stateless else Remembering(problem.policy, len(problem.start_states))
-    )
+    policy = problem.policy
+    if not policy.stateless:
+        policy = Remembering(policy, len(problem.start_states), keep_memories)
     rollout = drive(policy, observe, problem.dynamics, problem.start_states, problem.steps, problem.goals)
     if not bool(torch.isfinite(rollout.states).all()):
         tick = int((~torch.isfinite(rollout.states)).flatten(1).any(1).nonzero()[0])
@@ -113,7 +113,7 @@ def roll_out(
 
 def evaluate(problem: AttackProblem, theta: Tensor) -> tuple[Rollout, Totals]:
     """One closed-loop drive with parameters ``theta`` (``theta_shape``), and what it is charged; no gradient."""
-    rollout, _ = roll_out(problem, theta)
+    rollout, _ = roll_out(problem, theta, keep_memories=False)
     return rollout, problem.totals(rollout.states)
 
 

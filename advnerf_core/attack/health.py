@@ -26,7 +26,7 @@ from advnerf_core.attack.adjoint import (
 )
 from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.attack.spaces.displayed import DisplayedSensor
-from advnerf_core.driving.rollout import Rollout
+from advnerf_core.driving.rollout import Remembering, Rollout
 from advnerf_core.geometry import Array
 from advnerf_core.scene.surrogate import PoseBatch, Rendered, Surrogate
 
@@ -78,15 +78,12 @@ def with_remembered_frames(problem: AttackProblem) -> AttackProblem:
 
 def frozen_loss(problem: AttackProblem, theta: Tensor, rollout: Rollout) -> float:
     """Loss of the rollout for ``theta`` with all images taken at the poses of ``rollout``, under the same draws."""
-    memory = None if problem.policy.stateless else problem.policy.initial_memory(len(problem.start_states))
+    policy = Remembering.afresh(problem.policy, len(problem.start_states))
     with torch.no_grad():
         states = [problem.start_states]
         for tick, nominal in enumerate(rollout.states[:-1]):
             images = problem.sense((tick,), nominal, theta).images
-            if memory is None:
-                controls = problem.policy(images, problem.goals)
-            else:
-                controls, memory = problem.policy(images, problem.goals, memory)
+            controls = policy(images, problem.goals)
             states.append(problem.dynamics.step(states[-1], controls.to(states[-1].dtype)))
         loss = float(problem.losses(torch.stack(states)).mean())
     return loss + (0.0 if problem.regulariser is None else problem.regulariser(theta)[0])

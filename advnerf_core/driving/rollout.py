@@ -65,27 +65,30 @@ def drive(
 
 
 class Remembering:
-    """A policy with memory as a drive sees it: every memory that it had is kept.
+    """A policy with memory as a drive sees it.
 
     Args:
         policy: Called as ``policy(images, goals, memory) -> (steering, memory)``; it has ``initial_memory(batch)``.
+        keep: Whether every memory that it had is kept in ``memories``, which a gradient needs, or the last one. Past images are large.
     """
 
     stateless = True
 
-    def __init__(self, policy: Any, batch: int) -> None:
-        self._policy = policy
+    def __init__(self, policy: Any, batch: int, keep: bool = True) -> None:
+        self._policy, self._keep = policy, keep
         self.memories: list[Tensor] = [policy.initial_memory(batch)]
 
     @staticmethod
     def afresh(policy: Any, batch: int) -> Policy:
         """A policy at the start of a drive: itself if it has no memory."""
-        return policy if getattr(policy, "stateless", True) else Remembering(policy, batch)
+        return policy if getattr(policy, "stateless", True) else Remembering(policy, batch, keep=False)
 
     def __call__(self, images: Tensor, goals: Tensor | None = None) -> Tensor:
         """Controls ``[B]`` of images ``[B, 3, H, W]``; the memory goes on."""
         steering: Tensor
         steering, memory = self._policy(images, goals, self.memories[-1])
+        if not self._keep:
+            self.memories.clear()
         self.memories.append(memory)
         return steering
 

@@ -7,7 +7,9 @@ import pytest
 import torch
 
 from advnerf_core.geometry import Pinhole
+from advnerf_core.policies.adapter import adapt
 from advnerf_core.policies.contract import PolicyContract
+from advnerf_core.policies.frames import FrameStack
 from advnerf_core.policies.network import images_to_tensor
 from advnerf_core.policies.onnx_policy import export_onnx
 from advnerf_core.policies.pilotnet import PilotNet
@@ -122,6 +124,28 @@ def test_goal_must_fit_the_policy() -> None:
         PolicyNode(TorchDriver(_loaded(goal_size=3)))
     node = PolicyNode(TorchDriver(_loaded(goal_size=3)), goal=(0.0, 1.0, 0.0))
     assert len(_send(node, image_message(_rgb(), T0, "camera"))) == 1
+
+
+def test_a_policy_of_several_images_forgets_them_after_a_gap() -> None:
+    contract = PolicyContract(VIEW, frames=FrameStack(count=2, axis="time"))
+    network = adapt(lambda stack: stack.mean((2, 3, 4)) @ torch.tensor([0.5, 1.0]), contract)
+    node = PolicyNode(TorchDriver(LoadedPolicy(network, VIEW, {}, "ab" * 32)))
+    greys = [np.full((188, 336, 3), value, np.uint8) for value in (51, 102, 204)]
+
+    def steered(grey: np.ndarray, at_ms: int) -> float:
+        raw = encode(image_message(grey, T0, "camera"))
+        clock = ManualClock(mono_ns=10**10 + at_ms * MS, real_ns=T0)
+        info = MessageInfo(clock.now().mono_ns, 10**10, raw=raw)
+        (out,) = node.handle(
+            "/compositor/image", decode(type_name(image_message(grey, T0, "camera")), raw), info, clock.now()
+        )
+        return float(out.message.drive.steering_angle)
+
+    assert steered(greys[0], 0) == pytest.approx(0.3), (
+        "the first image is also the one before; the warm-up is forgotten"
+    )
+    assert steered(greys[1], 1000) == pytest.approx(0.5 * 0.2 + 0.4)
+    assert steered(greys[2], 2001) == pytest.approx(1.5 * 0.8)
 
 
 def test_an_onnx_policy_steers_alike_in_a_process_without_torch(tmp_path: Path) -> None:

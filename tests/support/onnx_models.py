@@ -32,6 +32,20 @@ def mean_model(gains, kind=TensorProto.FLOAT, columns=False):
     return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
 
 
+def network_model(nodes, inputs, outputs, weights=None):
+    """A model of nodes ``(operation, inputs, outputs, attributes)``, with tensors ``name: (type, shape)`` and weights by name."""
+    tensors = [
+        [helper.make_tensor_value_info(name, kind, shape) for name, (kind, shape) in some.items()]
+        for some in (inputs, outputs)
+    ]
+    made = [helper.make_node(operation, takes, gives, **more) for operation, takes, gives, more in nodes]
+    constants = [numpy_helper.from_array(value, name) for name, value in (weights or {}).items()]
+    graph = helper.make_graph(made, "network", *tensors, constants)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    onnx.checker.check_model(model)
+    return model
+
+
 def save_beside(model, file, declared=None, weights=None):
     """Write a model with its declaration, and its weights into another file if one is named."""
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -40,7 +54,12 @@ def save_beside(model, file, declared=None, weights=None):
             model, location=weights, size_threshold=0, convert_attribute=False
         )
     onnx.save(model, file)
-    declaration = {"view": VIEW.to_dict(), **(declared or {})}
+    return declare_beside(file, declared or {})
+
+
+def declare_beside(file, declared):
+    """Write the declaration of a file; it has `VIEW` if it names no other."""
+    declaration = {"view": VIEW.to_dict(), **declared}
     file.with_name(file.name + ".policy.yaml").write_text(yaml.safe_dump(declaration))
     return file
 

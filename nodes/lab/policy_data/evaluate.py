@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from advnerf_core.driving.rollout import Remembering
 from advnerf_core.files import write_atomically
 from nodes.lab.policy_data.frames import RecordedFrames
 from nodes.runtime.clock import NS_PER_S
@@ -66,15 +67,19 @@ def compare(predicted_rad: NDArray[np.floating[Any]], true_rad: NDArray[np.float
 
 def predict(policy: Any, images: NDArray[np.uint8], goal: tuple[float, ...] = ()) -> NDArray[np.float64]:
     """Compute the steering ``[N]`` [rad] of a loaded policy for policy images ``[N, H, W, 3]`` uint8."""
-    parts = []
+    parts, batch = [], _BATCH
+    if not getattr(policy, "stateless", True):  # one after the other, as they were driven
+        policy, batch = Remembering.afresh(policy, 1), 1
     with torch.no_grad():
-        for start in range(0, len(images), _BATCH):
-            parts.append(_steer(policy, _tensor(images[start : start + _BATCH]), goal).double().numpy())
+        for start in range(0, len(images), batch):
+            parts.append(_steer(policy, _tensor(images[start : start + batch]), goal).double().numpy())
     return np.concatenate(parts)
 
 
 def saliency(policy: Any, images: NDArray[np.uint8], goal: tuple[float, ...] = ()) -> NDArray[np.float32]:
     """Compute the saliency ``[N, H, W]`` in 0..1: absolute gradient of the steering, summed over colours, smoothed.
+
+    A policy with memory sees each image as the first of a drive.
 
     Gradient saliency after Simonyan et al., "Deep Inside Convolutional Networks", 2014, with a blur of 1.5 px.
     """
@@ -166,5 +171,5 @@ def _tensor(images: NDArray[np.uint8]) -> torch.Tensor:
 
 def _steer(policy: Any, images: torch.Tensor, goal: tuple[float, ...]) -> torch.Tensor:
     goals = torch.tensor(goal).expand(len(images), -1) if goal else None
-    result: torch.Tensor = policy(images, goals)
+    result: torch.Tensor = Remembering.afresh(policy, len(images))(images, goals)
     return result

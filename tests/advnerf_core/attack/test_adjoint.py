@@ -8,7 +8,12 @@ from torch import Tensor, nn
 
 from advnerf_core.attack.adjoint import AttackProblem, RenderCache, adjoint_gradient, evaluate, roll_out
 from advnerf_core.driving.dynamics import AckermannServoLag, Dubins
+from advnerf_core.geometry import Pinhole
+from advnerf_core.policies.adapter import AdaptedPolicy, adapt
+from advnerf_core.policies.contract import PolicyContract
+from advnerf_core.policies.frames import FrameStack
 from advnerf_core.policies.pilotnet import PilotNet
+from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.surrogate import Rendered
 from benchmarks.adjoint_gradient import backpropagated_gradient, finite_difference, relative_error
 from benchmarks.attack_toy import painted_room, random_policy, toy_problem
@@ -126,12 +131,24 @@ class Recurrent(nn.Module):
         return 0.5 * memory[:, 0] + 0.1 * memory[:, 1], memory
 
 
-def test_a_policy_with_memory_falls_back_to_the_sequential_adjoint(problem):
-    recurrent = dataclasses.replace(problem, policy=Recurrent().eval(), steps=6)
+def stacked() -> AdaptedPolicy:
+    """PilotNet for a mean of three images that are two ticks apart; the first one is repeated."""
+    view = PolicyView(Pinhole(336, 188, 173.97, 173.97, 168.0, 94.0))
+    contract = PolicyContract(view, frames=FrameStack(count=3, spacing=2, axis="time"))
+    network, weights = random_policy(), torch.tensor([0.5, -0.7, 1.2], dtype=torch.float64)
+    return adapt(lambda images: network(torch.einsum("btchw,t->bchw", images, weights)), contract)
+
+
+@pytest.mark.parametrize("policy", [Recurrent().eval(), stacked()], ids=["recurrent", "stack"])
+def test_a_policy_with_memory_falls_back_to_the_sequential_adjoint(problem, policy):
+    recurrent = dataclasses.replace(problem, policy=policy, steps=6)
     theta = theta_for(problem)
     result = adjoint_gradient(recurrent, theta)
     _, gradient = backpropagated_gradient(recurrent, theta, result.rollout)
     assert relative_error(result.gradient, gradient) <= 1e-8
+    direction = torch.randn(theta.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    numeric = finite_difference(recurrent, theta, result.rollout, direction)
+    assert abs((result.gradient * direction).sum() - numeric) <= 1e-5 * abs(numeric)
     uncached = adjoint_gradient(dataclasses.replace(recurrent, cache_bytes=0), theta)
     assert relative_error(uncached.gradient, gradient) <= 1e-8
 

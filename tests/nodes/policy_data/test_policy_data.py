@@ -9,7 +9,7 @@ from advnerf_core.driving.expert import Expert
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.learning.recipe import ImitationConfig
 from advnerf_core.policies.policy_file import load_policy
-from nodes.lab.policy_data.evaluate import compare, saliency
+from nodes.lab.policy_data.evaluate import compare, predict, saliency
 from nodes.lab.policy_data.frames import frames_of_log, view_for_size
 from nodes.lab.policy_data.train import TrainingRecording, train_from_recordings
 from nodes.runtime.errors import ConfigError
@@ -102,6 +102,22 @@ def test_saliency_is_where_the_gradient_is():
     assert np.unravel_index(maps[1].argmax(), (66, 200)) == (20, 150)
     assert maps.max() == pytest.approx(1.0)
     assert maps[:, 40:].max() == 0.0
+
+
+def test_a_policy_of_several_images_is_compared_in_the_order_of_the_recording():
+    class Slower:
+        stateless = False
+
+        def initial_memory(self, batch):
+            return torch.zeros(batch, 1)
+
+        def __call__(self, images, goals, memory):
+            return images.mean((1, 2, 3)) - memory[:, 0], images.mean((1, 2, 3))[:, None]
+
+    greys = np.array([51, 102, 255, 204], np.uint8)
+    images = np.broadcast_to(greys[:, None, None, None], (4, 66, 200, 3))
+    assert predict(Slower(), images).tolist() == pytest.approx([0.2, 0.2, 0.6, -0.2], abs=1e-6)
+    assert saliency(Slower(), images).shape == (4, 66, 200)
 
 
 def test_training_learns_is_kept_and_begins_anew_for_other_recordings(tmp_path):
