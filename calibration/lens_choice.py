@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.lens import Lens, straightening
 from advnerf_core.geometry import Pinhole
+from calibration.colmap_lens import lens_of
 from calibration.photo_model import MIN_IMAGES, Report
 
 # Name, free parameters, and the fewest images of the camera with which the model is tried at all.
@@ -55,19 +56,13 @@ class LensChoice:
 
 
 def intrinsics(camera: Any) -> tuple[Pinhole, Lens]:
-    """Convert a COLMAP camera to intrinsics. Both have pixel centres at +0.5."""
-    fx, fy = float(camera.focal_length_x), float(camera.focal_length_y)
-    extra = [float(camera.params[index]) for index in camera.extra_params_idxs()]
-    k1, k2, p1, p2 = (*extra, *[0.0] * (4 - len(extra)))
-    pinhole = Pinhole(
-        int(camera.width),
-        int(camera.height),
-        fx,
-        fy,
-        float(camera.principal_point_x),
-        float(camera.principal_point_y),
-    )
-    return pinhole, Lens((k1, k2, p1, p2, 0.0))
+    """Intrinsics of a COLMAP camera with one of the models above."""
+    found = lens_of(camera)
+    if found is None:
+        raise ValueError(
+            f"expected a camera with the model of a pinhole or OpenCV lens, got {camera.model_name}"
+        )
+    return found
 
 
 def nonsense(pinhole: Pinhole, lens: Lens) -> str | None:

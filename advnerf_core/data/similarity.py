@@ -150,6 +150,53 @@ def align_poses(
     return Alignment(similarity, inliers, position, rotation, extent(target[inliers, :3, 3]))
 
 
+def fit_positions(source: ArrayLike, target: ArrayLike, source_up: ArrayLike) -> tuple[Similarity, bool]:
+    """Least-squares similarity between positions ``[N, 3]`` without rotations, into a world with z up (Umeyama 1991).
+
+    Args:
+        source_up: Up ``[3]`` in the source world. It settles the rotation about a line that all positions are on.
+
+    Returns:
+        The similarity, and whether the positions are on a line, so that ``source_up`` was used.
+
+    Raises:
+        SimilarityError: All positions are at one place, or on a vertical line.
+    """
+    p, q = np.asarray(source, np.float64), np.asarray(target, np.float64)
+    p0, q0 = p.mean(axis=0), q.mean(axis=0)
+    p, q = p - p0, q - q0
+    spread = np.linalg.svd(p, compute_uv=False), np.linalg.svd(q, compute_uv=False)
+    if min(each[0] for each in spread) < 1e-9:
+        raise SimilarityError(
+            "expected known positions at different places, got all at one; give more of them"
+        )
+    on_line = any(len(each) < 2 or each[1] < _LINE_RATIO * each[0] for each in spread)
+    places = q.T @ p
+    if on_line:
+        along_p, along_q = np.linalg.svd(p)[2][0], np.linalg.svd(q)[2][0]
+        along_p = along_p * np.sign((p @ along_p) @ (q @ along_q))
+        if abs(along_q[2]) > 1.0 - _LINE_RATIO:
+            raise SimilarityError(
+                "expected known positions that are not above each other; give some elsewhere"
+            )
+        # What up says about the turn around the line counts as much as the line itself.
+        up_p, up_q = (_across(up, along) for up, along in ((source_up, along_p), ([0.0, 0.0, 1.0], along_q)))
+        places = np.outer(along_q, along_p) + np.outer(up_q, up_p)
+    R = _nearest_rotation(places)
+    scale = float(np.sum(R * (q.T @ p)) / (p**2).sum())
+    if scale <= 0.0:
+        raise SimilarityError(
+            "expected known positions in the order of the images, got a mirrored or mixed order"
+        )
+    return Similarity(scale, make_transform(R, q0 - scale * R @ p0)), on_line
+
+
+def _across(direction: ArrayLike, line: Array) -> Array:
+    """Unit vector of the part of a direction ``[3]`` that is perpendicular to a line's unit vector."""
+    part = np.asarray(direction, np.float64) - (np.asarray(direction) @ line) * line
+    return np.asarray(part / max(float(np.linalg.norm(part)), 1e-12))
+
+
 def extent(positions: ArrayLike) -> float:
     """Largest distance between two of the positions ``[N, 3]``."""
     p = np.asarray(positions, np.float64)

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from advnerf_core.data.colmap_folder import from_colmap_advice
 from advnerf_core.data.errors import DatasetError, raise_all
 from advnerf_core.data.image_files import SUFFIXES, image_size
 from advnerf_core.data.lens import Lens
@@ -127,7 +128,8 @@ def _read_json(path: Path) -> _Values:
     try:
         content = read_json(path)
     except MissingFileError as error:
-        raise DatasetError(f"expected a transforms.json at {path}, found none; correct the path") from error
+        advice = from_colmap_advice(path.parent, "correct the path")
+        raise DatasetError(f"expected a transforms.json at {path}, found none; {advice}") from error
     except ConfigError as error:
         raise DatasetError(str(error)) from error
     if not isinstance(content, dict):

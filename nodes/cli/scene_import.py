@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import signal
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -71,6 +71,8 @@ StepDeg = Annotated[
         help="Rotation after which the next frame is used even without that distance [deg].",
     ),
 ]
+
+Up = Literal["auto", "ground", "cameras"]
 
 
 @app.command("from-video")
@@ -171,6 +173,55 @@ def from_phone_and_car(
     )
 
 
+@app.command("from-colmap")
+def from_colmap(
+    model: Annotated[
+        Path,
+        typer.Argument(
+            help="Folder of a COLMAP model, or of several (sparse).", exists=True, file_okay=False
+        ),
+    ],
+    images: Annotated[
+        Path, typer.Argument(help="Folder of the images that COLMAP used.", exists=True, file_okay=False)
+    ],
+    output: Output,
+    number: Annotated[
+        str | None, typer.Option("--model", help="Which of several models.", show_default="the largest")
+    ] = None,
+    length: Annotated[
+        tuple[str, str, float] | None,
+        typer.Option(
+            help="A known length [m]: between the cameras of two images, or between two of COLMAP's points.",
+            metavar="A B METRES",
+        ),
+    ] = None,
+    positions: Annotated[
+        Path | None,
+        typer.Option(
+            help="CSV file of known camera positions, in a world with z up: image, x_m, y_m, z_m.",
+            exists=True,
+            dir_okay=False,
+        ),
+    ] = None,
+    marker_m: Annotated[
+        float | None, typer.Option("--marker", min=0.001, help="Side of printed markers in the images [m].")
+    ] = None,
+    dictionary: Annotated[str, typer.Option(help="OpenCV's name of the markers.")] = "DICT_APRILTAG_36h11",
+    up: Annotated[
+        Up, typer.Option(help="What z is: the ground if it is found, or the cameras' up.")
+    ] = "auto",
+) -> None:
+    """Use the poses and lenses of a COLMAP model. No pose is estimated.
+
+    Without --length, --positions or --marker the data set is in COLMAP's unit instead of metres.
+    """
+    from nodes.lab.importing.colmap import ColmapConfig
+    from nodes.lab.importing.colmap import from_colmap as run
+
+    config = ColmapConfig(number, length, positions, marker_m, dictionary, up)
+    _run("from-colmap", output, lambda report: run(model, images, output, config, report))
+
+
 @app.command("match-colours")
 def match_colours(
     scene: Annotated[
@@ -244,6 +295,9 @@ def _print_report(imported: Imported) -> None:
             f"{facts['taken_frames']} of {facts['recorded_frames']} frames used, {facts['without_pose']} had no motion-capture pose"
             + (f"; unchecked: {facts['unchecked']}" if facts.get("unchecked") else "")
         )
+    if colmap := facts.get("colmap"):
+        sizes = ", ".join(f"{name} ({size} images)" for name, size in colmap["images_by_model"].items())
+        print(f"model {colmap['model']}" + (f" of {sizes}; --model uses another" if "," in sizes else ""))
     if model := facts.get("structure_from_motion"):
         _print_model(model)
     if placing := facts.get("placing"):
@@ -251,6 +305,8 @@ def _print_report(imported: Imported) -> None:
             f"placed in the motion-capture world by {placing['inliers']} of {placing['cameras']} frames of the car: scale {placing['scale']:.4f}, "
             f"rms {1000 * placing['rms_position_m']:.1f} mm and {math.degrees(placing['rms_rotation_rad']):.2f} degrees"
         )
+    if "up" in facts:
+        print(f"up: {facts['up']}")
     print(f"scale: {facts['scale']}")
     print("\n".join(str(path) for path in imported.transforms))
 

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from advnerf_core.data.lens import Lens
-from advnerf_core.data.similarity import Similarity, extent
 from advnerf_core.data.transforms_write import write_transforms
 from advnerf_core.files import write_json
-from advnerf_core.geometry import Array, Pinhole, make_transform
+from advnerf_core.geometry import Array, Pinhole
 from calibration.phone_and_car import Placed, place_in_mocap
 from calibration.photo_model import Model, PhotoSource, SfmConfig
 from calibration.structure_from_motion import reconstruct
+from calibration.world_axes import upright
 from nodes.lab.importing.driven_bag import CAR_CAMERA, BagConfig, DrivenFrames, take_frames
 from nodes.lab.importing.errors import ImportRecordingError
 from nodes.lab.importing.media import IMAGES, MediaConfig, gather
@@ -32,8 +32,6 @@ from nodes.runtime.progress import Report
 
 _MEDIA_SHARE = 0.3
 _BOX_PERCENT, _BOX_MARGIN = 0.5, 0.05
-# Weight against the spread of the x axes. It is small, so that the axes decide as soon as the cameras have turned a little.
-_LEVEL_WEIGHT = 0.005
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +81,7 @@ def from_media(
             "scale": "not metric: the extent was assumed",
             "extent_m": extent_m,
         }
-        return _write(folder, model, poses, points, facts)
+        return write_model_set(folder, model, poses, points, facts)
 
     return build_beside(output, media, build).moved_to(output)
 
@@ -172,29 +170,6 @@ def from_phone_and_car(
     return build_beside(output, media, build).moved_to(output)
 
 
-def upright(model: Model, extent_m: float) -> Similarity:
-    """Compute the similarity that makes z point up and moves the centre of the points to the origin.
-
-    Up is the mean up direction of the cameras, pulled towards the direction perpendicular to all their x axes, because people hold a
-    camera level more accurately than they point it straight ahead.
-    """
-    poses = model.poses
-    sideways, up = poses[:, :3, 0], -poses[:, :3, 1].mean(axis=0)
-    up = np.linalg.solve(sideways.T @ sideways / len(poses) + _LEVEL_WEIGHT * np.eye(3), up)
-    up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else np.array([0.0, 0.0, 1.0])
-    aside = np.cross([0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0], up)
-    x = aside / np.linalg.norm(aside)
-    R = np.stack([x, np.cross(up, x), up])
-    spread = extent(poses[:, :3, 3])
-    if spread <= 0.0:
-        raise ImportRecordingError(
-            "expected photographs from different places, got all from one; move the camera instead of only turning it"
-        )
-    scale = extent_m / spread
-    middle = np.median(model.points, axis=0) if len(model.points) else poses[:, :3, 3].mean(axis=0)
-    return Similarity(scale, make_transform(R, -scale * R @ middle))
-
-
 def _reconstruct(output: Path, sources: Sequence[PhotoSource], sfm: SfmConfig, report: Report) -> Model:
     return reconstruct(
         output,
@@ -205,7 +180,17 @@ def _reconstruct(output: Path, sources: Sequence[PhotoSource], sfm: SfmConfig, r
     )
 
 
-def _write(output: Path, model: Model, poses: Array, points: Array, facts: dict[str, Any]) -> Imported:
+def write_model_set(
+    output: Path, model: Model, poses: Array, points: Array, facts: dict[str, Any]
+) -> Imported:
+    """Write ``transforms.json`` for images that are in a folder, and the report.
+
+    Args:
+        output: Folder that the names of the images are relative to.
+        poses: ``T_world_from_camera [N, 4, 4]`` of the images.
+        points: Points of the scene ``[M, 3]``.
+        facts: What the report says.
+    """
     path = output / TRANSFORMS
     _write_model(path, output, model, poses, range(len(model.images)), _box_of(points, poses))
     return _finish(output, (path,), facts)

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from advnerf_core.data import image_bytes, image_files, video
+from advnerf_core.data.colmap_folder import from_colmap_advice
 from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.keyframes import KeyframeConfig
 from advnerf_core.files import write_atomically
@@ -92,8 +93,9 @@ def photographs_in(folder: Path) -> list[Path]:
         elif path.is_file() and not path.name.startswith("."):
             others[path.suffix.lower() or "(no suffix)"] += 1
     if not files:
+        advice = from_colmap_advice(folder, "give the folder that holds them")
         raise ImportRecordingError(
-            f"expected photographs ({', '.join(_SUFFIXES)}) in {folder}, got none; give the folder that holds them"
+            f"expected photographs ({', '.join(_SUFFIXES)}) in {folder}, got none; {advice}"
         )
     if others:
         kinds = ", ".join(f"{count} {suffix}" for suffix, count in sorted(others.items()))

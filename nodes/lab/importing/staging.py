@@ -82,16 +82,17 @@ def build_beside(
 
 def _require_ours(output: Path, work: Path, media: Sequence[Path]) -> None:
     """Check that the images in a folder are from an earlier import, because they are replaced. A user's photographs are never touched."""
-    for images in (output / IMAGES, work):
+    for images in (output / IMAGES, output / COLMAP, work):
         inside = [path for path in media if path.resolve().is_relative_to(images.resolve())]
         if inside:
             raise ImportRecordingError(
                 f"expected media outside {images}, where the data set stores its copies; got {inside[0]}. Give another --output"
             )
-    images = output / IMAGES
-    if images.exists() and any(images.iterdir()) and not (images / _CLAIM).exists():
+    # All of these are replaced.
+    there = [output / name for name in _ENTRIES if _holds_files(output / name)]
+    if there and not (output / IMAGES / _CLAIM).exists():
         raise ImportRecordingError(
-            f"expected a new folder or one of an earlier import, but {images} has other files; give another --output"
+            f"expected a new folder or one of an earlier import, but {output} has other files: {there[0].name}; give another --output"
         )
     if (
         work.exists()
@@ -101,6 +102,10 @@ def _require_ours(output: Path, work: Path, media: Sequence[Path]) -> None:
         raise ImportRecordingError(
             f"expected to build the data set in {work}, but that folder has other files; rename it, or give another --output"
         )
+
+
+def _holds_files(path: Path) -> bool:
+    return any(path.iterdir()) if path.is_dir() else path.exists()
 
 
 def _take_over(output: Path, work: Path) -> None:

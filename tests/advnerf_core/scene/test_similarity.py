@@ -2,7 +2,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from advnerf_core.data.similarity import Similarity, SimilarityError, align_poses, extent, rotation_angles
+from advnerf_core.data.similarity import (
+    Similarity,
+    SimilarityError,
+    align_poses,
+    extent,
+    fit_positions,
+    rotation_angles,
+)
 from advnerf_core.geometry import make_transform
 
 TOLERANCES = (0.05, np.deg2rad(2.0))
@@ -120,3 +127,34 @@ def test_extent_and_small_angles():
     angles = np.array([1e-9, 1e-4, 1.0, np.pi - 1e-6])
     R = Rotation.from_rotvec(angles[:, None] * np.array([0.6, 0.0, 0.8])).as_matrix()
     np.testing.assert_allclose(rotation_angles(R), angles, rtol=1e-6)
+
+
+UP = TRUE.T_target_from_source[:3, :3].T @ [0.0, 0.0, 1.0]
+
+
+def test_positions_alone_give_the_similarity():
+    source = np.random.default_rng(0).normal(size=(6, 3))
+    found, on_line = fit_positions(source, TRUE.points(source), [1.0, 0.0, 0.0])
+    assert not on_line
+    assert found.scale == pytest.approx(TRUE.scale)
+    np.testing.assert_allclose(found.T_target_from_source, TRUE.T_target_from_source, atol=1e-9)
+
+
+@pytest.mark.parametrize("direction", [[1.0, 0.0, 0.0], [0.3, -2.0, 0.4], [-1.0, 1.0, 0.2]])
+@pytest.mark.parametrize("count", [2, 5])
+def test_up_settles_the_turn_about_a_line(direction, count):
+    target = np.linspace(0.0, 3.0, count)[:, None] * np.array(direction)
+    back = (target - TRUE.T_target_from_source[:3, 3]) @ TRUE.T_target_from_source[:3, :3] / TRUE.scale
+    found, on_line = fit_positions(back, target, UP)
+    assert on_line
+    np.testing.assert_allclose(found.T_target_from_source, TRUE.T_target_from_source, atol=1e-9)
+    tilted = UP + 0.05 * np.cross(UP, TRUE.T_target_from_source[:3, :3].T @ direction)
+    np.testing.assert_allclose(fit_positions(back, target, tilted)[0].points(back), target, atol=1e-9)
+
+
+def test_positions_at_one_place_or_above_each_other_are_refused():
+    with pytest.raises(SimilarityError, match="at different places"):
+        fit_positions(np.zeros((3, 3)), np.ones((3, 3)), [0.0, 0.0, 1.0])
+    lift = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    with pytest.raises(SimilarityError, match="not above each other"):
+        fit_positions(lift, lift, [0.0, 1.0, 0.0])

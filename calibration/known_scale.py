@@ -1,0 +1,201 @@
+"""Gives a model of photographs its metres: from one known length, from printed markers, or from known camera positions."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.data.similarity import Similarity, fit_positions
+from advnerf_core.geometry import Array, Pinhole, invert_transform
+from calibration.colmap_reading import ColmapModel
+from calibration.photo_model import Model, ReconstructionError
+from calibration.world_axes import Ground, cameras_up
+
+# An undistorted image ``[H, W, 3]`` with its pinhole and ``T_world_from_camera``.
+View = tuple[NDArray[np.uint8], Pinhole, Array]
+# A marker's corner farther from its projections is dropped [px].
+_MAX_CORNER_ERROR_PX = 3.0
+# Rays of a corner that meet at a smaller angle do not fix its distance [rad].
+_MIN_RAY_ANGLE_RAD = np.radians(2.0)
+# Sides of markers that differ more are not all of one size.
+_MAX_SIDE_SPREAD = 0.1
+# Known positions that fit worse than this share of their extent belong to something else.
+_MAX_POSITION_SHARE = 0.1
+_SHOWN = 4
+
+
+def length_scale(found: ColmapModel, one: str, other: str, length_m: float) -> float:
+    """Metres per unit of a model, from one known length.
+
+    Args:
+        one: Name of an image, for the position of its camera, or the number of a point in COLMAP.
+        other: The other end.
+        length_m: Distance between both [m].
+
+    Raises:
+        ReconstructionError: An end is not in the model, or both are at one place.
+    """
+    distance = float(np.linalg.norm(_end(found, one) - _end(found, other)))
+    if not (length_m > 0.0 and distance > 0.0):
+        raise ReconstructionError(
+            f"expected a length above 0 m between two different places, got {length_m} m from {one} to {other}; correct --length"
+        )
+    return length_m / distance
+
+
+def _end(found: ColmapModel, name: str) -> Array:
+    images = [each for each in found.model.images if each.name == name or each.name.endswith(f"/{name}")]
+    if len(images) == 1:
+        return np.asarray(images[0].T_world_from_camera[:3, 3])
+    if name.isdigit() and int(name) in found.points_by_id:
+        return found.points_by_id[int(name)]
+    names = ", ".join(each.name for each in (images or found.model.images)[:_SHOWN])
+    raise ReconstructionError(
+        f"expected --length to name one image with a pose ({names}, ...) or the number of a point in COLMAP, got {name}"
+    )
+
+
+@dataclass(frozen=True)
+class PositionFit:
+    """A model placed by known positions of its cameras.
+
+    Attributes:
+        similarity: From the model to the world of the positions.
+        images: Number of images that it was fitted to.
+        rms_m: Root mean square distance of the cameras from their positions [m].
+        worst_m: Largest such distance [m].
+        worst: Its image.
+        on_line: Whether the positions are on one line, so that up comes from the cameras or the ground.
+    """
+
+    similarity: Similarity
+    images: int
+    rms_m: float
+    worst_m: float
+    worst: str
+    on_line: bool
+
+
+def fit_known_positions(model: Model, positions_m: Mapping[str, Array], ground: Ground | None) -> PositionFit:
+    """Place a model by the positions ``[3]`` of cameras by image name, in a world with z up.
+
+    Args:
+        ground: Of the model; up, if the positions are on one line.
+
+    Raises:
+        ReconstructionError: The positions do not fit the model.
+        SimilarityError: They do not fix scale and direction.
+    """
+    images = [each for each in model.images if each.name in positions_m]
+    if len(images) < 2:
+        raise ReconstructionError(
+            f"expected positions of at least 2 of the model's images, got {len(images)}; "
+            f"write the names as COLMAP does: {', '.join(each.name for each in model.images[:_SHOWN])}"
+        )
+    source = np.stack([each.T_world_from_camera[:3, 3] for each in images])
+    target = np.stack([np.asarray(positions_m[each.name], np.float64) for each in images])
+    up = cameras_up(model.poses) if ground is None else ground.up
+    similarity, on_line = fit_positions(source, target, up)
+    errors = np.linalg.norm(similarity.points(source) - target, axis=1)
+    rms, worst = float(np.sqrt(np.mean(errors**2))), int(np.argmax(errors))
+    spread = float(np.linalg.norm(np.ptp(target, axis=0)))
+    if rms > _MAX_POSITION_SHARE * spread:
+        raise ReconstructionError(
+            f"expected positions that fit the model, got distances of {rms:.3g} m (rms) over {spread:.3g} m, the largest "
+            f"{errors[worst]:.3g} m at {images[worst].name}; correct the file: metres, x, y and z up in a right-handed frame"
+        )
+    return PositionFit(similarity, len(images), rms, float(errors[worst]), images[worst].name, on_line)
+
+
+@dataclass(frozen=True)
+class MarkerFit:
+    """The scale that printed markers give.
+
+    Attributes:
+        scale: Metres per unit of the model.
+        markers: Number of markers that were measured.
+        spread: Standard deviation of the sides over their mean.
+    """
+
+    scale: float
+    markers: int
+    spread: float
+
+
+def marker_scale(views: Iterable[View], side_m: float, dictionary: str) -> MarkerFit:
+    """Metres per unit of a model, from square markers that its images show.
+
+    Args:
+        views: Undistorted images.
+        side_m: Side of a marker's black square [m].
+        dictionary: OpenCV's name of the markers, such as ``DICT_APRILTAG_36h11``.
+
+    Raises:
+        ReconstructionError: No such dictionary, no marker in two views, or markers of different sizes.
+    """
+    if not dictionary.startswith("DICT_") or not hasattr(cv2.aruco, dictionary):
+        raise ReconstructionError(
+            f"expected a marker dictionary such as DICT_4X4_50 or DICT_APRILTAG_36h11, got {dictionary!r}"
+        )
+    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary)))
+    detector.setDetectorParameters(_subpixel())
+    seen: defaultdict[int, list[tuple[Array, Pinhole, Array]]] = defaultdict(list)
+    for image, pinhole, T in views:
+        corners, numbers, _ = detector.detectMarkers(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+        found = [] if numbers is None else [int(number) for number in numbers.ravel()]
+        for pixels, number in zip(corners, found, strict=True):
+            if found.count(number) == 1:  # printed twice, nobody knows which is which
+                seen[number].append((pixels.reshape(4, 2).astype(np.float64) + 0.5, pinhole, T))
+    sides = [_sides(each) for each in seen.values()]
+    measured = np.array([side for side in sides if side is not None]).reshape(-1, 4)
+    if not len(measured):
+        raise ReconstructionError(
+            f"expected a marker of {dictionary} in two images from different places, got none; check --dictionary, or use --length"
+        )
+    spread = float(measured.std() / measured.mean())
+    if spread > _MAX_SIDE_SPREAD:
+        raise ReconstructionError(
+            f"expected markers of one size, got sides that differ by {100 * spread:.0f} %; cover the others, or use --length"
+        )
+    return MarkerFit(side_m / float(np.median(measured)), len(measured), spread)
+
+
+def _subpixel() -> Any:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    return parameters
+
+
+def _sides(views: list[tuple[Array, Pinhole, Array]]) -> Array | None:
+    """Sides ``[4]`` of one marker, in the model's unit; None if its corners cannot be located."""
+    corners = [_triangulated([(pixels[k], pinhole, T) for pixels, pinhole, T in views]) for k in range(4)]
+    if any(corner is None for corner in corners):
+        return None
+    square = np.array(corners)
+    return np.asarray(np.linalg.norm(square - np.roll(square, -1, axis=0), axis=1))
+
+
+def _triangulated(views: list[tuple[Array, Pinhole, Array]]) -> Array | None:
+    """Point ``[3]`` nearest to the rays through its pixels; None if they are nearly parallel or do not meet."""
+    origins = np.array([T[:3, 3] for _, _, T in views])
+    rays = np.array([T[:3, :3] @ _ray(pixel, pinhole) for pixel, pinhole, T in views])
+    if len(rays) < 2 or (rays @ rays.T).min() > np.cos(_MIN_RAY_ANGLE_RAD):
+        return None
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    point = np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, origins))
+    for pixel, pinhole, T in views:
+        local = invert_transform(T)[:3] @ np.append(point, 1.0)
+        if local[2] <= 0.0 or np.linalg.norm(pinhole.project(local) - pixel) > _MAX_CORNER_ERROR_PX:
+            return None
+    return np.asarray(point)
+
+
+def _ray(pixel: Array, pinhole: Pinhole) -> Array:
+    direction = np.array([(pixel[0] - pinhole.cx) / pinhole.fx, (pixel[1] - pinhole.cy) / pinhole.fy, 1.0])
+    return np.asarray(direction / np.linalg.norm(direction))
