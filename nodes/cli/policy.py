@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from nodes.cli import policy_train as cli_policy_train
 from nodes.runtime.paths import shipped
 from nodes.runtime.terminal import PolicyName, print_table, table
+from nodes.runtime.termination import ends_in_order
 
 if TYPE_CHECKING:
     from advnerf_core.policies.view import PolicyView
     from nodes.lab.policy_reference import ReferenceFrames
 
+Goal = Annotated[
+    list[float] | None, typer.Option(help="One number of the goal vector. Repeat for each number.")
+]
+ServiceMode = Literal["carla", "alpasim"]
 _TWIN_ROOM = shipped("calibration/twin/room.yaml")
 
 app = typer.Typer(
@@ -57,9 +63,7 @@ def policy_check(
             show_default="the simulated lab's",
         ),
     ] = _TWIN_ROOM,
-    goal: Annotated[
-        list[float] | None, typer.Option(help="One number of the goal vector. Repeat for each number.")
-    ] = None,
+    goal: Goal = None,
 ) -> None:
     """Check a policy's adapter and whether the policy drives. Without a source option, the simulated lab is used.
 
@@ -109,6 +113,48 @@ def _reference(
     if run_folder is not None:
         return from_run(run_folder, view)
     return from_bag(bag, room, view) if bag is not None else from_twin(view)
+
+
+@app.command("serve")
+def policy_serve(
+    policy: PolicyName,
+    listen: Annotated[
+        str,
+        typer.Option(
+            metavar="HOST:PORT",
+            help="Where to listen. An address that other computers reach is served by TLS with your certificate.",
+        ),
+    ] = "127.0.0.1:6789",
+    wheelbase_m: Annotated[
+        float | None,
+        typer.Option(min=0.0, help="Wheelbase that makes an arc of a wheel angle; not needed for waypoints."),
+    ] = None,
+    speed_mps: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0, help="Speed of the plans.", show_default="the car's own; not used with waypoints"
+        ),
+    ] = None,
+    goal: Goal = None,
+    runtime: Annotated[
+        ServiceMode, typer.Option(help="What asks: CARLA's and Autoware's tools, or alpasim itself.")
+    ] = "carla",
+) -> None:
+    """Offer a policy to others as a driver behind gRPC, in the egodriver protocol of alpasim, Autoware and CARLA users, until Ctrl-C."""
+    from advnerf_core.policies.load import load_driver
+    from nodes.lab.policy_server import ServedCar, ServedPolicy, serving
+    from nodes.operator_page.certificate import certificate
+
+    name = policy.rpartition("/")[2]
+    served = ServedPolicy(load_driver(policy), name, ServedCar(wheelbase_m, speed_mps, tuple(goal or ())))
+    with ends_in_order(), serving(served, listen, runtime) as address:
+        print(f"{served.name} serves on {address}; Ctrl-C ends it", flush=True)
+        if address.startswith("grpcs"):
+            print(
+                f"Others need its certificate, {certificate().file}; ours takes it as GRPC_DEFAULT_SSL_ROOTS_FILE_PATH",
+                flush=True,
+            )
+        threading.Event().wait()
 
 
 @app.command("export")
