@@ -87,12 +87,6 @@ def objective_key(reference: str) -> str | list[str]:
     return [name_in_results(reference), code] if code else reference
 
 
-def name_objective(section: dict[str, Any]) -> None:
-    """Put the key of a section's objective in the place of its reference, which may be a path; nothing happens where it has none."""
-    if "objective" in section:
-        section["objective"] = objective_key(section["objective"])
-
-
 def objective_entry(reference: str, objective: Objective, value: float) -> dict[str, Any]:
     """What an attack file says of its objective: name, unit and value. Nothing for ``cte``, whose value is the predicted total CTE."""
     if reference == CTE:

@@ -61,6 +61,7 @@ class CellResult(StrictModel):
         placement: Name of the placement; empty for the scenario's own.
         attack_id: Id of the attack file; None for none.
         settings_hash: Hash of everything that the result depends on.
+        settings: The same in full, those that are left at their defaults too; empty in cells from before they were kept.
         stages: Digests of what capture, scene, object and policy stages had written; empty in cells from before they were kept.
         seconds: Time it took [s].
         machine: Where.
@@ -84,6 +85,7 @@ class CellResult(StrictModel):
     placement: str = ""
     attack_id: str | None = None
     settings_hash: str
+    settings: dict[str, Any] = Field(default_factory=dict)
     stages: dict[str, str] = Field(default_factory=dict)
     seconds: Annotated[float, Field(ge=0.0)]
     machine: str

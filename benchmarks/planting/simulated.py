@@ -97,7 +97,7 @@ def _registration(
             for where in conditions
         ),
         contrasts=(Contrast(name="the world's own car", before=CONDITIONS[0], after=CONDITIONS[1]),),
-    )
+    ).as_filed()
 
 
 def _write_cells(folder: Path, made: Simulated) -> None:

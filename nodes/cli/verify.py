@@ -12,6 +12,7 @@ from typing import Annotated
 import typer
 
 from advnerf_core.documents import parse_json
+from advnerf_core.errors import ConfigError
 from advnerf_core.run_module import module_command
 from nodes.cli.cell_choice import CellChoice, File, Folder, Only, Setting, load_cells
 from nodes.runtime.terminal import Overrides, say_error
@@ -65,6 +66,7 @@ def verify(
     from advnerf_core.report.evidence.verify import SetError, sets_in, verify_beside, verify_set
     from advnerf_core.report.evidence.verifying.pictures import picture_problems
     from nodes.experiment.run.kept_attacks import with_attacks
+    from nodes.experiment.run.redrive import RedriveError
 
     known = sets_in(published)
     if name is not None and name not in known:
@@ -86,7 +88,10 @@ def verify(
             if not is_kept(published / each):
                 print(f"{each} {LOST}")
                 continue
-            wrong += _redrive(published / each, again, seed)
+            try:
+                wrong += _redrive(published / each, again, seed)
+            except RedriveError as error:
+                print(error)
     wrong += _say("page, pictures, films and reference build", verify_beside(published))
     wrong += _history(published)
     wrong += 0 if name else _ledger(published)
@@ -142,14 +147,17 @@ def _ledger(published: Path) -> int:
 def _redrive(folder: Path, count: int, seed: int) -> int:
     """Drive some cells of a set again; how many came out otherwise."""
     from advnerf_core.report.evidence.registration import read_registration
-    from nodes.experiment.run.redrive import TOLERANCE_M, redrive
+    from nodes.experiment.run.redrive import TOLERANCE_M, redrive, unreadable
 
     registration = read_registration(folder)
     assert registration is not None, "the set was verified"
     file = Path("launch") / registration.file
     with TemporaryDirectory() as run:
         choice = CellChoice(file, registration.setting, Path(run), overrides=list(registration.overrides))
-        campaign, _ = load_cells(choice)
+        try:
+            campaign, _ = load_cells(choice)
+        except ConfigError as error:  # the file, or a key that was set, has another name by now
+            raise unreadable(folder, str(error)) from None
         ended = redrive(campaign, folder, count, seed, print)
     for each in ended:
         verdict = "as published" if each.same else f"otherwise: more than {TOLERANCE_M} m"

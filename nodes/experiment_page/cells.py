@@ -29,7 +29,7 @@ def cell_part(
     result = result_of(folder, name)
     found = {**part, "kind": "cell", "searched": cell["searched"], **result}
     found["seconds"] = part["seconds"] or result.get("seconds", 0.0)
-    begun_s, since_s = _changed_s(work / "key"), began_s - _SLACK_S
+    begun_s, since_s = _changed_s(work / "key.json"), began_s - _SLACK_S
     if part["state"] in ("done", "reused", "failed") or max(begun_s, part["began_s"]) < since_s:
         return found
     error = _error(work / "error.json")

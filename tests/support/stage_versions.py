@@ -1,4 +1,4 @@
-"""Numbers that say whether stages and cells still make what they made: ``python -m tests.support.stage_versions`` records them.
+"""Numbers and defaults that say whether stages and cells still make what they made: ``python -m tests.support.stage_versions`` records them.
 
 A tiny experiment in the lab, of which every part is summed up in a few numbers. They are the same from run to run, and nearly the same
 from machine to machine.
@@ -10,11 +10,13 @@ import json
 import os
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
+from pydantic import BaseModel
+from pydantic_core import to_jsonable_python
 
 if TYPE_CHECKING:
     from nodes.experiment.show.context import Experiment
@@ -43,9 +45,7 @@ def measured(folder: Path) -> dict[str, dict[str, Any]]:
     from advnerf_core.objects.voxel.mesh import stand
     from nodes.experiment.plan.cell import Cell
     from nodes.experiment.run.cells import Bench, run_cell
-    from nodes.experiment.show import objects
-    from nodes.experiment.steps import keys
-    from nodes.experiment.steps.run import VERSIONS, make_ready
+    from nodes.experiment.steps.run import make_ready
 
     experiment = tiny_experiment(folder)
     make_ready(experiment)
@@ -74,8 +74,66 @@ def measured(folder: Path) -> dict[str, dict[str, Any]]:
         },
         "cells": totals,
     }
-    versions = {**VERSIONS, "object": objects.MESH_VERSION, "cells": keys.VERSION}
-    return {name: {"version": versions[name], "numbers": each} for name, each in numbers.items()}
+    return {
+        name: {"version": version, "numbers": numbers.get(name, {})} for name, version in versions().items()
+    }
+
+
+def versions() -> dict[str, int]:
+    """Version of every stage, of cells and of requests."""
+    from nodes.experiment.node import prepare
+    from nodes.experiment.steps import keys
+    from nodes.experiment.steps.pipeline import VERSIONS
+
+    return {**VERSIONS, "cells": keys.VERSION, "requests": prepare.VERSION}
+
+
+def defaults() -> dict[str, dict[str, Any]]:
+    """Defaults of all settings that every stage, cells and requests read, by their names with dots; what is in a union has its class in the name."""
+    from nodes.experiment.node import prepare
+    from nodes.experiment.node.request import AttackRequest
+    from nodes.experiment.plan.config import ExperimentConfig
+    from nodes.experiment.steps import keys
+    from nodes.experiment.steps.pipeline import READS
+
+    found = {name: dict(_defaults(ExperimentConfig, include)) for name, include in READS.items()}
+    found["cells"] = dict(_defaults(ExperimentConfig, True, keys.FREE))
+    found["requests"] = dict(_defaults(AttackRequest, True, prepare.FREE))
+    return found
+
+
+def _defaults(
+    model: type[BaseModel], include: Any, exclude: Any = None, at: str = ""
+) -> Iterator[tuple[str, Any]]:
+    for name, field in model.model_fields.items():
+        wanted, unwanted = _part(include, name), _part(exclude, name)
+        if not wanted or unwanted is True:
+            continue
+        inside = _models_in(field.annotation)
+        for each in inside:
+            between = f"{each.__name__}." if len(inside) > 1 else ""
+            yield from _defaults(each, wanted, unwanted, f"{at}{name}.{between}")
+        if not field.is_required():
+            default = field.get_default(call_default_factory=True)
+            short = (
+                default.model_dump(mode="json", exclude_defaults=True)
+                if isinstance(default, BaseModel)
+                else default
+            )
+            yield f"{at}{name}", to_jsonable_python(short)
+
+
+def _part(fields: Any, name: str) -> Any:
+    """What a text of `BaseModel.model_dump` says of a field: True for all of it, None for nothing."""
+    if isinstance(fields, Mapping):
+        return fields.get("__all__", fields.get(name))
+    return True if fields is True or (fields and name in fields) else None
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for each in get_args(annotation) for model in _models_in(each)]
 
 
 def tiny_experiment(folder: Path, changes: Sequence[str] = ()) -> Experiment:
@@ -94,6 +152,8 @@ def main() -> None:
     """Write what is made now."""
     with tempfile.TemporaryDirectory() as folder:
         found = measured(Path(folder) / "run")
+    for name, each in defaults().items():
+        found[name]["defaults"] = each
     RECORDED.write_text(json.dumps(found, indent=1) + "\n")
     print(f"wrote {RECORDED.relative_to(ROOT)}: {sys.version.split()[0]}")
 

@@ -44,7 +44,13 @@ def settings_hash(experiment, cell):
 
 
 def registered_settings(experiment):
-    return dict(experiment.data)
+    from nodes.experiment.engine.artefact import Settings
+
+    return Settings.of(**experiment.data)
+
+
+def cell_settings(experiment, cell):
+    return registered_settings(experiment)
 
 
 def needed_settings(experiment):

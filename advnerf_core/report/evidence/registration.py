@@ -35,6 +35,7 @@ class RegisteredScenario(StrictModel):
 
     Attributes:
         settings_sha256: Hash of the world and of all settings that a result depends on.
+        settings: The same in full, those that are left at their defaults too; empty in registrations from before it was kept.
         path: The reference path, as `Path.to_dict` writes it.
         ticks: Control ticks of a drive.
         dt_s: Length of a tick [s].
@@ -49,6 +50,7 @@ class RegisteredScenario(StrictModel):
     """
 
     settings_sha256: str
+    settings: dict[str, Any] = Field(default_factory=dict)
     path: dict[str, Any]
     ticks: Annotated[int, Field(ge=1)]
     dt_s: float
@@ -168,7 +170,7 @@ class Registration(StrictModel):
     scenarios: dict[str, RegisteredScenario]
     cells: tuple[RegisteredCell, ...]
     primary: tuple[PrimaryTest, ...] = ()
-    contrasts: tuple[Contrast, ...] = Field(default=(), exclude_if=lambda contrasts: not contrasts)
+    contrasts: tuple[Contrast, ...] = ()
     level: Share = 0.95
     alpha: Share = 0.05
 
@@ -176,10 +178,14 @@ class Registration(StrictModel):
         """A scenario; None if it is not registered."""
         return self.scenarios.get(scenario_key(name, placement))
 
+    def as_filed(self) -> Registration:
+        """The registration as `read_registration` reads it once it is written: its defaults are said."""
+        return Registration.model_validate(self.model_dump(mode="json"))
+
     @property
     def digest(self) -> str:
-        """SHA-256 of everything in it but its date."""
-        data = self.model_dump(mode="json", exclude={"date"})
+        """SHA-256 of everything that its file says but its date; what was added to the format later is not in older files."""
+        data = self.model_dump(mode="json", exclude={"date"}, exclude_unset=True)
         return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 

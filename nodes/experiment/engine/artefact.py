@@ -1,7 +1,7 @@
 """An artefact: files that are kept with the key under which they were made, and with their digest.
 
 A stage, a search, a cell, a verdict and a prediction are artefacts: one whose key is that of now is not made again. A key is a hash over
-settings, the version of what makes it, and the digests of its inputs.
+the settings that differ from their defaults, the version of what makes it, and the digests of its inputs. All settings are stored beside it.
 
 A reference build keeps finished stages with the code. With it a machine that has only the repository goes on where another stopped: it
 has the very scene, victims and objects that the published cells were run with.
@@ -17,9 +17,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel
+
 from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
-from advnerf_core.files import write_atomically, write_json
+from advnerf_core.files import write_json
 from advnerf_core.report.evidence import kept_build
 from nodes.runtime.paths import shipped
 
@@ -35,6 +37,55 @@ class ReferenceBuildError(AdvnerfError):
 
 
 @dataclass(frozen=True)
+class Settings:
+    """What an artefact is made with, as JSON data.
+
+    Attributes:
+        resolved: All settings and inputs; they are stored beside the key.
+        keyed: What the key is made of: settings that differ from their defaults, and all inputs. A new setting changes no key, and a changed
+            default needs a new version of what reads it. Tags of unions have no default, so that they stay.
+    """
+
+    resolved: Mapping[str, Any]
+    keyed: Mapping[str, Any]
+
+    @property
+    def key(self) -> str:
+        """The key of what these settings make."""
+        return hash_of(self.keyed)
+
+    @classmethod
+    def of(
+        cls, model: BaseModel | None = None, include: Any = None, exclude: Any = None, **inputs: Any
+    ) -> Settings:
+        """Settings of a model, or of a part of it, and inputs.
+
+        Args:
+            model: The configuration; None for inputs alone.
+            include: Its fields that count, as `BaseModel.model_dump` takes them; None for all.
+            exclude: Fields that do not count.
+            **inputs: Plain data that has no defaults, such as digests.
+        """
+
+        resolved, keyed = (
+            {}
+            if model is None
+            else model.model_dump(mode="json", include=include, exclude=exclude, exclude_defaults=short)
+            for short in (False, True)
+        )
+        # A section of which only other fields differ from their defaults.
+        for name in [name for name, each in keyed.items() if each == {} and _has_section(model, name)]:
+            del keyed[name]
+        # Through JSON, so that tuples and lists cannot change a key between processes.
+        return cls(*(json.loads(json.dumps({**each, **inputs})) for each in (resolved, keyed)))
+
+
+def _has_section(model: Any, name: str) -> bool:
+    """Whether a field is a section that is there without being asked for."""
+    return isinstance(type(model).model_fields[name].get_default(call_default_factory=True), BaseModel)
+
+
+@dataclass(frozen=True)
 class Artefact:
     """What is remembered of a folder of files.
 
@@ -42,7 +93,7 @@ class Artefact:
         key: Hash of all that it depends on.
         digest: Of its files, once it is finished.
         seconds: How long it took.
-        settings: A part of the key already; apart from it they say what a folder was made with.
+        settings: All that it was made with, those that are left at their defaults too.
         kept: Of a stage from a reference build, which has no bulk: digest of the files that it does have.
         files_in: Of a stage in a reference build: folder beside it that has the same files, which are kept once; empty where its own folder has them.
     """
@@ -106,15 +157,12 @@ def read_current(file: Path, **key: str) -> dict[str, Any] | None:
 
 def has_key(file: Path, key: str) -> bool:
     """Whether the files beside a file were made under this key."""
-    try:
-        return file.read_text(encoding="utf-8").strip() == key
-    except OSError:
-        return False
+    return read_current(file, key=key) is not None
 
 
-def write_key(file: Path, key: str) -> None:
-    """Note under which key the files beside a file are made."""
-    write_atomically(file, key + "\n")
+def write_key(file: Path, key: str, settings: Settings) -> None:
+    """Note under which key, and with which settings, the files beside a file are made."""
+    write_json(file, {"key": key, "settings": settings.resolved})
 
 
 @dataclass(frozen=True)
@@ -145,9 +193,19 @@ class ReferenceBuild:
         Raises:
             ReferenceBuildError: Its files are not those that were kept.
         """
-        source, found = self._source(name, key), self.find(name, key)
-        if found is None:
-            return None
+        found = self.find(name, key)
+        return None if found is None else self._take(self._source(name, key), found, folder)
+
+    def take_digest(self, name: str, digest: str, key: str, folder: Path) -> Artefact | None:
+        """The same of the stage with a digest, whatever it was keyed by when it was kept; its record gets another key."""
+        for build in filter(None, (self.folder, self.shipped)):
+            for file in sorted(build.glob(f"{name}_*/{RECORD}")):
+                found = read_artefact(file.parent)
+                if found is not None and found.digest == digest:
+                    return self._take(file.parent, replace(found, key=key), folder)
+        return None
+
+    def _take(self, source: Path, found: Artefact, folder: Path) -> Artefact:
         if found.files_in:
             source = source.with_name(found.files_in)
             found = replace(found, files_in="")

@@ -9,20 +9,19 @@ copied from there. What a stage *does* is not known here.
 
 from __future__ import annotations
 
-import json
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from advnerf_core.errors import AdvnerfError
 from nodes.experiment.engine.artefact import (
     RECORD,
     Artefact,
     ReferenceBuild,
+    Settings,
     digest_of,
     hash_of,
     read_artefact,
@@ -43,20 +42,20 @@ class Stage:
     Attributes:
         name: Name of the stage and of its folder.
         run: Does the work, writing only below the given folder.
-        settings: The part of the configuration that the result depends on (JSON types).
+        settings: The part of the configuration that the result depends on, and inputs that no stage makes.
         after: Stages whose outputs this one reads.
         version: Raised when the meaning of the stage's output changes.
-        goes_on_from: Other settings whose result is a part of this one, as fewer rounds are: their folder is gone on from, not wiped.
+        resumes_from: Other settings whose result is a part of this one, as fewer rounds are: their folder is resumed, not wiped.
         bulk: Patterns of files that only the making of other stages reads, or of this one: a reference build leaves them out.
         reads_bulk_of: Stages whose bulk this one reads.
     """
 
     name: str
     run: Callable[[Path, MeasuringReport], None]
-    settings: Mapping[str, Any]
+    settings: Settings
     after: Sequence[str] = ()
     version: int = 1
-    goes_on_from: Sequence[Mapping[str, Any]] = ()
+    resumes_from: Sequence[Settings] = ()
     bulk: Sequence[str] = ()
     reads_bulk_of: Sequence[str] = ()
 
@@ -65,7 +64,7 @@ def key_of(stage: Stage, records: Mapping[str, Artefact]) -> str:
     """Hash over a stage's settings and version, and the digests of what the stages before it wrote."""
     inputs = {name: records[name].digest for name in stage.after}
     return hash_of(
-        {"name": stage.name, "version": stage.version, "settings": stage.settings, "inputs": inputs}
+        {"name": stage.name, "version": stage.version, "settings": stage.settings.keyed, "inputs": inputs}
     )
 
 
@@ -151,14 +150,14 @@ def _current(
     return records
 
 
-def begun_with(stages: Sequence[Stage], folder: Path, name: str) -> Mapping[str, Any] | None:
+def begun_with(stages: Sequence[Stage], folder: Path, name: str) -> Settings | None:
     """The settings that a stage's folder was begun with, if running the stage now would go on from there; None if it would not."""
     records = _current(stages, folder)
     stage = next(each for each in stages if each.name == name)
     record = read_artefact(folder / name)
     if record is None or any(earlier not in records for earlier in stage.after):
         return None
-    known = (stage.settings, *stage.goes_on_from)
+    known = (stage.settings, *stage.resumes_from)
     return next(
         (each for each in known if record.key == key_of(replace(stage, settings=each), records)), None
     )
@@ -228,7 +227,7 @@ def _go_on_or_begin(
     stage: Stage, at: _Place, key: str, records: Mapping[str, Artefact], display: StageDisplay
 ) -> Artefact:
     folder, old = at.folder, read_artefact(at.folder)
-    parts = [key_of(replace(stage, settings=settings), records) for settings in stage.goes_on_from]
+    parts = [key_of(replace(stage, settings=settings), records) for settings in stage.resumes_from]
     resumed = old is not None and old.kept is None and old.key in (key, *parts)
     if at.reference is not None and not at.whole and at.reference.find(stage.name, key) is not None:
         _require_ours(folder)
@@ -252,7 +251,7 @@ def _require_ours(folder: Path) -> None:
 
 def _run(stage: Stage, folder: Path, key: str, earlier_s: float, display: StageDisplay) -> Artefact:
     folder.mkdir(parents=True, exist_ok=True)
-    settings = json.loads(json.dumps(stage.settings))
+    settings = stage.settings.resolved
     write_artefact(folder, Artefact(key, None, earlier_s, settings))
     report = display.start(stage.name)
     begin = time.monotonic()

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,7 +24,7 @@ from advnerf_core.attack.artifact import (
 )
 from advnerf_core.attack.clean import clean_drive
 from advnerf_core.attack.methods import method_digest
-from advnerf_core.attack.objectives import load_objective, name_objective, objective_entry
+from advnerf_core.attack.objectives import load_objective, objective_entry, objective_key
 from advnerf_core.attack.on_device import said_of_device
 from advnerf_core.attack.problem import Totals
 from advnerf_core.attack.search.search import SearchResult, draw_start_states
@@ -32,6 +32,7 @@ from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.driving.actuated import ActuatedAckermann
 from advnerf_core.driving.clean_drive import CleanDrive
 from advnerf_core.driving.dynamics import Ackermann, Dynamics
+from advnerf_core.files import sha256_of
 from advnerf_core.objects.mesh.glb import glb_bytes
 from advnerf_core.objects.mesh.shape import ShapeSensor
 from advnerf_core.objects.mesh.surface import TexturedMesh
@@ -42,12 +43,22 @@ from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.surrogate import Surrogate, split_theta
 from calibration.display_colour import DisplayCalibration
 from calibration.schema import CameraCalibration, RoomCalibration, VehicleCalibration, load_calibration
-from nodes.experiment.engine.artefact import hash_of
+from nodes.experiment.engine.artefact import Settings, hash_of
 from nodes.experiment.node.meshes import found_meshes, shape_sensor
 from nodes.experiment.node.objects import PlacedObject, place
 from nodes.experiment.node.request import AttackRequest
 from nodes.lab.policy_camera import require_camera
 from nodes.runtime.errors import ConfigError
+
+# Raised when what a search finds changes with the same request, or a default of requests does.
+VERSION = 1
+# What a search does not depend on: where files lie, its name, length and memory, and what is an input of `request_hash`.
+FREE: Mapping[str, Any] = {
+    **dict.fromkeys(("name", "scene", "policy", "calibration", "camera", "vehicle", "room"), True),
+    "search": {"evaluations", "cache_mib", "time_batch", "seeds", "together", "method", "objective"},
+    "poses": {"attack", "landscape", "robustness"},
+    "objects": {"__all__": {"file": True, "target": True, "display": True, "mesh": {"file"}}},
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,43 +219,19 @@ def prepare(request: AttackRequest, seed: int | None = None) -> Prepared:
 
 def request_hash(request: AttackRequest) -> str:
     """Hash of what a request asks for; not of where its files lie, nor of its name, length and memory."""
-    asked = request.model_dump(
-        mode="json", exclude={"name", "scene", "policy", "calibration", "camera", "vehicle", "room"}
-    )
-    for key in ("evaluations", "cache_mib", "time_batch", "seeds", "together"):
-        asked["search"].pop(key)
-    name_objective(asked["search"])
     search = request.search
-    if code := method_digest(search.method):
-        asked["search"]["method"] = [search.method_name, code]
-    if not search.options:
-        del asked["search"]["options"]
-    for key in ("probes", "warm_pairs"):
-        if asked["search"][key] is None:  # so that hashes of requests without them stay what they were
-            del asked["search"][key]
-    if asked["poses"] is None:
-        del asked["poses"]
-    else:
-        for key in ("attack", "landscape", "robustness"):
-            del asked["poses"][key]
-    if asked["shape"] is None:
-        del asked["shape"]
-    for wanted in asked["objects"]:
-        del wanted["file"], wanted["target"]
-        if wanted["mesh"] is None:
-            del wanted["mesh"]
-        else:
-            del wanted["mesh"]["file"]
-        if wanted.pop("display") is None:
-            del wanted["display_cos"]
-        if not wanted["levels"]:
-            del wanted["levels"]
-    digest = hashlib.sha256(hash_of(asked).encode())
-    for name in ("camera", "vehicle", "room"):
-        digest.update(request.calibration_file(name).read_bytes())
-    if request.objects[0].display is not None:
-        digest.update(request.objects[0].display.read_bytes())
-    return digest.hexdigest()
+    files = [request.calibration_file(name) for name in ("camera", "vehicle", "room")]
+    files += [wanted.display for wanted in request.objects if wanted.display is not None]
+    settings = Settings.of(
+        request,
+        None,
+        FREE,
+        version=VERSION,
+        method=[search.method_name, method_digest(search.method)],
+        objective=objective_key(search.objective),
+        files=[sha256_of(file) for file in files],
+    )
+    return settings.key
 
 
 def make_dynamics(request: AttackRequest) -> Dynamics:

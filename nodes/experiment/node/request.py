@@ -162,7 +162,6 @@ class SearchRequest(StrictModel):
     options: dict[str, Any] = Field(default_factory=dict, description="What the method alone knows.")
     objective: ObjectiveReference = Field(
         default=CTE,
-        exclude_if=lambda objective: objective == CTE,
         description="What is maximised: cte, peak, time_off_track, collision, or file.py:Class, relative to this file.",
     )
     evaluations: Count = Field(

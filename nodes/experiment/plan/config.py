@@ -39,6 +39,8 @@ from nodes.experiment.plan.victims import (
 Count = Annotated[int, Field(ge=0)]
 Positive = Annotated[int, Field(ge=1)]
 PositiveNumber = Annotated[float, Field(gt=0)]
+# Fields of the section policy that make the network; its description stands for them in keys.
+NETWORK = {"architecture", "configuration", "hidden"}
 Unit = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -52,6 +54,10 @@ class CaptureConfig(StrictModel):
     colour_pairs: Count = Field(
         default=0,
         description="Views of the driving camera that fit a colour map, where photographs have colours of their own.",
+    )
+    driven_m: PositiveNumber = Field(
+        default=36.0,
+        description="Views of the driving camera lie so far along each path that does not close [m].",
     )
     seed: int = 0
 
@@ -82,20 +88,16 @@ class SceneConfig(StrictModel):
         default=None,
         description="Sample intervals in pixels of the policy's view; none: the default of pixel_intervals.",
     )
-    # These are left out where they change nothing, so that keys of scenes without them do not depend on them.
     decay: Literal["exponential", "cosine"] = Field(
         default="exponential",
-        exclude_if=lambda decay: decay == "exponential",
         description="How the learning rate falls; cosine stays high for longer.",
     )
     learning_rate: PositiveNumber = Field(
         default=0.01,
-        exclude_if=lambda rate: rate == 0.01,
         description="Learning rate at the start; with decay cosine 0.02 makes sharper scenes.",
     )
     exposure: bool = Field(
         default=False,
-        exclude_if=lambda on: not on,
         description="Learn a gain per channel for each photograph; for worlds whose camera chooses its exposure.",
     )
     seed: int = 0
@@ -146,15 +148,12 @@ class PolicyConfig(StrictModel):
         default=False,
         description="Drives in the deployment scene are those of its own car, with its lag, one after another; else the surrogate's.",
     )
-    # Left out where it is this, so that results without panels do not depend on it.
     panels: Literal["composed", "native"] = Field(
         default="composed",
-        exclude_if=lambda way: way == "composed",
         description="How frames of the deployment scene show panels, as deploy.panels; all deployments share the victim.",
     )
     learns_in: tuple[tuple[str, ...], ...] = Field(
         default=(),
-        exclude_if=lambda places: not places,
         description="Places that the victim learns in instead of the attacked one and its learned scene: changes of the section world, as --set takes "
         "them, one list per place. deployed_stills and deployed_drives are then those of each place, and half of them show no object.",
     )
@@ -180,12 +179,10 @@ class PolicyConfig(StrictModel):
     )
     architecture: ArchitectureReference = Field(
         default=PILOTNET,
-        exclude_if=lambda name: name == PILOTNET,
         description="pilotnet, resnet, vit_tiny, an installed package's, or file.py:Class relative to the experiment file.",
     )
     configuration: dict[str, Any] = Field(
         default={},
-        exclude_if=lambda settings: not settings,
         description="Settings of the architecture; those of pilotnet are the key hidden.",
     )
     seed: int = 0
@@ -205,14 +202,10 @@ class PolicyConfig(StrictModel):
         own = {"hidden": self.hidden} if self.architecture == PILOTNET else self.configuration
         return Architecture(self.architecture, own)
 
-    def key(self) -> dict[str, Any]:
-        """What a trained policy depends on, as JSON data: of a user's architecture its code, not the place of its file."""
-        values = self.model_dump(mode="json")
-        if self.architecture == PILOTNET:
-            return values
-        for name in ("architecture", "configuration", "hidden"):
-            values.pop(name, None)
-        return values | self.network.described()
+    @property
+    def recipe(self) -> dict[str, Any]:
+        """How a policy is trained, as JSON data: of a user's architecture its code, not the place of its file."""
+        return self.model_dump(mode="json", exclude=NETWORK) | self.network.described()
 
 
 class ObjectConfig(StrictModel):
@@ -225,21 +218,18 @@ class ObjectConfig(StrictModel):
         default=48, description="The same of a hydrant."
     )
     mesh_resolution: Annotated[int, Field(ge=8, le=128)] = Field(
-        default=48, exclude_if=lambda cells: cells == 48, description="The same of a mesh of your own."
+        default=48, description="The same of a mesh of your own."
     )
     fit_steps: Count = Field(default=300, description="Steps that refine the voxels on pictures of the mesh.")
-    # Left out where they are these, so that results without panels do not depend on them.
     panel_resolution: Annotated[int, Field(ge=2, le=128)] = Field(
-        default=64, exclude_if=lambda cells: cells == 64, description="Colours along each edge of a panel."
+        default=64, description="Colours along each edge of a panel."
     )
     panel_rgb: tuple[Unit, Unit, Unit] = Field(
         default=(0.5, 0.5, 0.5),
-        exclude_if=lambda rgb: rgb == (0.5, 0.5, 0.5),
         description="Colour of a panel without an attack.",
     )
     panel_light: Literal["ideal", "measured"] = Field(
         default="ideal",
-        exclude_if=lambda light: light == "ideal",
         description="How the learned scene shows a panel: in its own colours, or as the driving camera saw plain colours on it while the world was photographed.",
     )
 
@@ -251,7 +241,6 @@ class MeasureConfig(StrictModel):
     seed: int = Field(default=10_000, description="Of the starts.")
     no_object: bool = Field(
         default=False,
-        exclude_if=lambda wanted: not wanted,
         description="A second control: the same drives with the objects taken away.",
     )
 
@@ -266,7 +255,6 @@ class AttackConfig(StrictModel):
     )
     objective: ObjectiveReference = Field(
         default=CTE,
-        exclude_if=lambda objective: objective == CTE,
         description="What is maximised: cte, peak, time_off_track, collision, or file.py:Class, relative to the experiment file.",
     )
     starts: Positive = Field(
@@ -289,10 +277,8 @@ class AttackConfig(StrictModel):
     seeds: tuple[int, ...] = Field(
         default=(0,), min_length=1, description="One search of each method per seed."
     )
-    # Left out where it changes nothing, so that results without it do not depend on it.
     robustness: RobustnessConfig = Field(
         default=RobustnessConfig(),
-        exclude_if=lambda wanted: wanted == RobustnessConfig(),
         description="What the attacks shall bear, in expectation.",
     )
     time_batch: Positive = Field(default=16, description="Frames per gradient batch.")
@@ -530,7 +516,6 @@ class ExperimentConfig(StrictModel):
     view: ViewConfig = ViewConfig()
     victims: dict[VictimName, VictimConfig] = Field(
         default={},
-        exclude_if=lambda victims: not victims,
         description="Which policies are attacked, the main one first: mine: {policy: FILE, package.module:factory or grpc://HOST:PORT}, or "
         "NAME: {train: {textures: random}}, which the section policy trains. None: hardened and, with policy.naive_steps, naive, trained "
         "with and without random textures.",
@@ -539,7 +524,9 @@ class ExperimentConfig(StrictModel):
     object: ObjectConfig = ObjectConfig()
     attack: AttackConfig = AttackConfig()
     measure: MeasureConfig = MeasureConfig()
-    space: SpaceConfig = Field(default=ColoursConfig(), description="What the attacks may change.")
+    space: SpaceConfig = Field(
+        default=ColoursConfig(kind="colours"), description="What the attacks may change."
+    )
     deploy: DeployConfig = DeployConfig()
     gate: Literal["steering"] | GateLimits | None = Field(
         default="steering",

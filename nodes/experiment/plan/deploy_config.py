@@ -26,23 +26,18 @@ class DeployConfig(StrictModel):
     )
     car: Literal["own", "ideal"] = Field(
         default="own",
-        exclude_if=lambda car: car == "own",
         description="What drives through the world: its own car; or the surrogate's, which does what it is told and meets no obstacle.",
     )
     world: dict[str, Any] | None = Field(
         default=None,
-        exclude_if=lambda world: world is None,
         description="Another world of the same paths, camera and car, where attacks are deployed: another renderer, or another car behind it. none: the experiment's own.",
     )
-    # Left out where it changes nothing, so that results of ideal cameras do not depend on it.
     camera: Effects = Field(
         default=PRESETS["ideal"],
-        exclude_if=lambda effects: effects.ideal,
         description="What the driving camera adds to an ideal picture: ideal, webcam, zed, or the effects themselves.",
     )
     panels: Literal["composed", "native"] = Field(
         default="composed",
-        exclude_if=lambda way: way == "composed",
         description="Panels are drawn into the pictures by depth, or put into the world's own scene, which lights and hides them.",
     )
     launch_file: str = Field(

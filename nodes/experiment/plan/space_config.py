@@ -17,12 +17,10 @@ Unit = Annotated[float, Field(ge=0, le=1)]
 class ColoursConfig(StrictModel):
     """The colours of the objects."""
 
-    kind: Literal["colours"] = "colours"
+    kind: Literal["colours"]
     searched: ClassVar[str] = "The colours of {} are searched together in the learned scene"
-    # Left out where it changes nothing, so that results without it do not depend on it.
     cells: Annotated[int, Field(ge=0)] = Field(
         default=0,
-        exclude_if=lambda cells: cells == 0,
         description="Cells along each edge of coarse random textures; 0: as many as the objects have colours.",
     )
 
@@ -30,7 +28,7 @@ class ColoursConfig(StrictModel):
 class PlacesConfig(StrictModel):
     """Where the objects stand, and their colours unless these are kept."""
 
-    kind: Literal["places"] = "places"
+    kind: Literal["places"]
     searched: ClassVar[str] = "The places of {} are searched together in the learned scene"
     move_m: NotNegative = Field(default=1.5, description="An object's x and y may change by this [m].")
     turn_rad: NotNegative = Field(
@@ -60,14 +58,14 @@ class _MeshConfig(StrictModel):
 class MeshTextureConfig(_MeshConfig):
     """The textures of the objects as meshes, searched over the world's own pictures."""
 
-    kind: Literal["mesh_texture"] = "mesh_texture"
+    kind: Literal["mesh_texture"]
     searched: ClassVar[str] = "The textures of {} as meshes are searched over the world's own pictures"
 
 
 class MeshShapeConfig(_MeshConfig):
     """The shapes of the objects as meshes, searched over the world's own pictures."""
 
-    kind: Literal["mesh_shape"] = "mesh_shape"
+    kind: Literal["mesh_shape"]
     searched: ClassVar[str] = "The shapes of {} as meshes are searched over the world's own pictures"
     bound_m: PositiveNumber = Field(default=0.4, description="No vertex moves farther [m].")
     smoothness: NotNegative = Field(
@@ -80,7 +78,7 @@ class MeshShapeConfig(_MeshConfig):
 class FaceConfig(StrictModel):
     """One flat texture that a panel of the world carries: projected onto a board, or shown on a screen."""
 
-    kind: Literal["face"] = "face"
+    kind: Literal["face"]
     searched: ClassVar[str] = "The texture of one face is searched in the learned scene"
     panel: str = Field(
         default="board", min_length=1, description="Which of the world's panels carries the face."

@@ -28,7 +28,7 @@ from nodes.experiment.steps.keys import (
     clean_folder,
     require_known,
 )
-from nodes.experiment.steps.run import stages_of
+from nodes.experiment.steps.pipeline import stages_of
 from nodes.experiment.steps.search_files import ATTACK
 from nodes.experiment.steps.shared_search import take_search
 from nodes.runtime.progress import Report

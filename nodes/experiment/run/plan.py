@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from advnerf_core.report.evidence.registration import RegisteredCell, Registration, read_registration
-from nodes.experiment.engine.artefact import PUBLISHED, hash_of
+from nodes.experiment.engine.artefact import PUBLISHED, Settings
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import runs_alone
 from nodes.experiment.run.config import Campaign
@@ -75,7 +74,7 @@ def plan_cells(
     return planned
 
 
-def registered_under(registration: Registration | None, cell: Cell, settings: dict[str, Any]) -> str:
+def registered_under(registration: Registration | None, cell: Cell, settings: Settings) -> str:
     """Digest of the registration that a cell is run under; empty if it, with these settings, is not registered.
 
     Args:
@@ -86,7 +85,7 @@ def registered_under(registration: Registration | None, cell: Cell, settings: di
     if registration is None or registered_cell(cell) not in registration.cells:
         return ""
     scenario = registration.scenario(cell.scenario, cell.placement)
-    same = scenario is not None and scenario.settings_sha256 == hash_of(settings)
+    same = scenario is not None and scenario.settings_sha256 == settings.key
     return registration.digest if same else ""
 
 

@@ -1,4 +1,8 @@
-"""Driving published cells again: drives in the surrogate past a published attack must come out as they were published."""
+"""Driving published cells again: drives in the surrogate past a published attack must come out as they were published.
+
+A set keeps the keys that it was published with. Its stages are found by their digests, which its cells name, so that it does not matter
+what this version would key them by; what it would drive otherwise than was registered is left to the version that published it.
+"""
 
 from __future__ import annotations
 
@@ -11,22 +15,31 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from advnerf_core.report.cells import read_cell
+from advnerf_core.report.cells import CellResult, read_cell
 from advnerf_core.report.conditions import NONE
 from advnerf_core.report.evidence.kept import KeptDrive, kept_drives
 from advnerf_core.report.evidence.kept_build import LOST, is_kept
+from advnerf_core.report.evidence.registration import read_registration
+from advnerf_core.report.evidence.verifying.git import last_commit
+from nodes.experiment.engine.artefact import BUILD, Artefact, ReferenceBuild
+from nodes.experiment.engine.stages import key_of
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import Bench
 from nodes.experiment.run.config import Campaign
 from nodes.experiment.run.kept_attacks import attack_file
 from nodes.experiment.run.plan import read_experiment
+from nodes.experiment.run.registering import registered_scenario
+from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps.attack import surrogate_drives, surrogate_part
+from nodes.experiment.steps.pipeline import stages_of
 from nodes.experiment.steps.run import prepare_victims
 from nodes.experiment.steps.search_files import ATTACK
 from nodes.runtime.errors import RuntimeFault
 
 # Of positions, between machines: sums are taken in another order, and a search takes many steps.
 TOLERANCE_M = 0.05
+# What a registration says of drives: this version must read the experiment file like this to drive them again.
+_DRIVEN = ("path", "ticks", "dt_s", "off_track_m", "held_cap_m", "starts")
 
 
 class RedriveError(RuntimeFault):
@@ -61,10 +74,11 @@ def redrive(
         tell: Told which cell is driven.
 
     Raises:
-        RedriveError: The set's scene and victim were not kept.
+        RedriveError: The set's scene and victim were not kept, or this version would drive otherwise.
     """
     if not is_kept(published):
         raise RedriveError(f"{published.name} {LOST}")
+    _require_same_drives(campaign, published)
     names = {file.stem for file in published.glob("*.json")}
     known = [cell for cell in campaign.cells if cell.name in names]
     chosen = random.Random(seed).sample(known, min(count, len(known)))
@@ -72,17 +86,56 @@ def redrive(
     for cell in chosen:
         tell(f"{cell.name}: driven again")
         said = read_cell(published / f"{cell.name}.json")
-        again = _again(campaign, cell, attack_file(published, said.attack_id or NONE))
+        experiment = read_experiment(campaign, cell)
+        _take_stages(experiment, said, ReferenceBuild(published.parent / BUILD))
+        again = _again(experiment, campaign.inside(cell), attack_file(published, said.attack_id or NONE))
         found.append(_compared(cell.name, said.kept["surrogate"], again))
     return found
 
 
-def _again(campaign: Campaign, cell: Cell, attack: Path) -> list[KeptDrive]:
+def unreadable(published: Path, why: str) -> RedriveError:
+    """The error for a set that this version reads otherwise than the one that published it.
+
+    Args:
+        published: Folder of the set.
+        why: What differs.
+    """
+    commit = last_commit(published)
+    which = f"git checkout {commit[:12]} has" if commit else "check out"
+    return RedriveError(
+        f"{published.name}: {why}; {which} the version that published it, which can drive it again"
+    )
+
+
+def _require_same_drives(campaign: Campaign, published: Path) -> None:
+    """Refuse to compare with drives that were registered otherwise than this version would drive them."""
+    registration = read_registration(published)
+    for cell in {cell.scenario + cell.placement: cell for cell in campaign.cells}.values():
+        then = registration.scenario(cell.scenario, cell.placement) if registration is not None else None
+        if then is None:
+            continue
+        now = registered_scenario(read_experiment(campaign, cell), campaign.inside(cell).scenario)
+        if differ := [name for name in _DRIVEN if getattr(then, name) != getattr(now, name)]:
+            raise unreadable(published, f"expected the {', '.join(differ)} that were registered, got others")
+
+
+def _take_stages(experiment: Experiment, said: CellResult, build: ReferenceBuild) -> None:
+    """Put the stages that a published cell was run with into the run folder, as if this version had made them."""
+    records: dict[str, Artefact] = {}
+    for stage in stages_of(experiment):
+        if stage.name in said.stages:
+            key, folder = key_of(stage, records), experiment.stage_folder(stage.name)
+            found = build.take_digest(stage.name, said.stages[stage.name], key, folder)
+            if found is None:
+                raise RedriveError(f"{said.name} {LOST}")
+            records[stage.name] = found
+
+
+def _again(experiment: Experiment, inside: Cell, attack: Path) -> list[KeptDrive]:
     """Drives in the surrogate past the published attack; of a set without attacks, past what its search finds again."""
-    experiment = read_experiment(campaign, cell)
     prepare_victims(experiment)
     with TemporaryDirectory() as work, Bench(experiment) as bench:
-        inside, folder = campaign.inside(cell), Path(work)
+        folder = Path(work)
         if attack.exists():
             shutil.copy(attack, folder / ATTACK)
             found = surrogate_drives(experiment, bench.space, inside, folder)

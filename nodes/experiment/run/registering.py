@@ -25,7 +25,6 @@ from advnerf_core.report.evidence.registration import (
     read_registration,
     scenario_key,
 )
-from nodes.experiment.engine.artefact import hash_of
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.plan.object_kinds import PANEL
@@ -64,7 +63,7 @@ def register(campaign: Campaign, setting: str, overrides: Sequence[str], publish
         cells=tuple(registered_cell(cell) for cell in campaign.cells),
         primary=tuple(primary_tests(campaign)),
         contrasts=campaign.contrasts,
-    )
+    ).as_filed()
     folder = published / campaign.name
     before = read_registration(folder)
     if before is not None and before.digest == found.digest:
@@ -84,7 +83,7 @@ def _scenarios(campaign: Campaign) -> dict[str, RegisteredScenario]:
     for cell in campaign.cells:
         key = scenario_key(cell.scenario, cell.placement)
         if key not in found:
-            found[key] = _scenario(_experiment(campaign, cell), campaign.inside(cell).scenario)
+            found[key] = registered_scenario(_experiment(campaign, cell), campaign.inside(cell).scenario)
     return found
 
 
@@ -95,12 +94,20 @@ def _experiment(campaign: Campaign, cell: Cell) -> Experiment:
     return experiment
 
 
-def _scenario(experiment: Experiment, name: str) -> RegisteredScenario:
+def registered_scenario(experiment: Experiment, name: str) -> RegisteredScenario:
+    """What a registration says of one path of an experiment.
+
+    Args:
+        experiment: Its world and victims must be known.
+        name: The path, as the experiment names it.
+    """
     config, limits, found = experiment.config, experiment.limits, given(experiment)
+    settings = registered_settings(experiment)
     starts = [(float(x), float(y), float(yaw)) for x, y, yaw in experiment.measured_starts(name).tolist()]
     deployed = 0 if config.deploy.through == "nothing" else len(starts[: config.deploy.starts])
     return RegisteredScenario(
-        settings_sha256=hash_of(registered_settings(experiment)),
+        settings_sha256=settings.key,
+        settings=dict(settings.resolved),
         path=experiment.paths[name].to_dict(),
         ticks=limits.ticks,
         dt_s=limits.dt_s,
@@ -111,7 +118,7 @@ def _scenario(experiment: Experiment, name: str) -> RegisteredScenario:
         evaluations=planned_evaluations(experiment),
         space=config.space.model_dump(mode="json"),
         victims={
-            **(config.policy.key() if config.trains else {}),
+            **(config.policy.recipe if config.trains else {}),
             **({"policies": {each: policy.sha256 for each, policy in found.items()}} if found else {}),
         },
         drives_well_mean_cte_m=mean_cte_limit_m(limits.off_track_m),

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from advnerf_core.files import write_json
 from advnerf_core.report.cells import CellError, CellResult, cell_from, read_cell
-from nodes.experiment.engine.artefact import has_key, read_current, write_key
+from nodes.experiment.engine.artefact import Settings, has_key, read_current, write_key
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.config import Campaign
 from nodes.runtime.locks import HeldError, hold
@@ -19,7 +19,7 @@ from nodes.runtime.locks import HeldError, hold
 State = Literal["done", "not driven live", "failed", "changed", "running", "begun", "missing", "unreadable"]
 NOT_DRIVEN: State = "not driven live"
 FINISHED = ("done", NOT_DRIVEN)
-_KEY, _ERROR = "key", "error.json"
+_KEY, _ERROR = "key.json", "error.json"
 LOG = "log.txt"
 
 
@@ -84,13 +84,13 @@ class Store:
         data = {"error": error, "settings_hash": settings_hash, "date": date}
         write_json(self.work(name) / _ERROR, data)
 
-    def begin(self, name: str, settings_hash: str) -> Path:
+    def begin(self, name: str, settings_hash: str, settings: Settings) -> Path:
         """The cell's folder, empty unless work on the same settings was begun there."""
         work = self.work(name)
         if not self.has_begun(name, settings_hash):
             shutil.rmtree(work, ignore_errors=True)
         (work / _ERROR).unlink(missing_ok=True)
-        write_key(work / _KEY, settings_hash)
+        write_key(work / _KEY, settings_hash, settings)
         return work
 
     def has_begun(self, name: str, settings_hash: str) -> bool:

@@ -6,12 +6,12 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 from rich.console import Console
 
 from advnerf_core.files import sha256_of
 from advnerf_core.plugins import name_in_results
+from nodes.experiment.engine.artefact import Settings
 from nodes.experiment.engine.progress_record import ProgressRecord
 from nodes.experiment.engine.run_folder import require_own_folder
 from nodes.experiment.engine.stages import Stage, check_until, run_stages
@@ -25,7 +25,8 @@ from nodes.experiment.run.worker import Ended
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.victims import look_at_given
 from nodes.experiment.steps.attack import cells
-from nodes.experiment.steps.run import make_ready, stages_of
+from nodes.experiment.steps.pipeline import stages_of
+from nodes.experiment.steps.run import make_ready
 from nodes.experiment.steps.steering_gate import require_same_steering
 from nodes.runtime.progress import ProgressDisplay
 
@@ -158,7 +159,5 @@ def _of_methods(experiment: Experiment, names: Sequence[str]) -> Experiment:
 
 def _report_stage(experiment: Experiment, digests: dict[str, str], notes: Sequence[str] = ()) -> Stage:
     held_to = experiment.held_to.model_dump(mode="json")
-    settings: dict[str, Any] = {"cells": digests, "setting": experiment.setting, "held_to": held_to}
-    if notes:
-        settings["notes"] = list(notes)
+    settings = Settings.of(cells=digests, setting=experiment.setting, held_to=held_to, notes=list(notes))
     return Stage(REPORT, lambda folder, told: report.run(experiment, folder, told, notes), settings)

@@ -27,7 +27,7 @@ from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import Bench, run_cell, runs_alone, search_cell
 from nodes.experiment.run.store import LOG, Store
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.steps.keys import NEEDED, settings_hash
+from nodes.experiment.steps.keys import NEEDED, cell_settings, settings_hash
 from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import RuntimeFault
 from nodes.runtime.locks import HeldError, hold
@@ -169,7 +169,7 @@ def run_here(job: Job, store: Store, experiment: Experiment, bench: Bench, displ
     except HeldError as held:
         return Ended(job.name, "elsewhere", f"{job.name} is being run by process {held.owner}", 0.0)
     with lock:
-        work, report = store.begin(job.name, job.settings_hash), display.start(job.name)
+        work, report = _begin(job, store, experiment), display.start(job.name)
         try:
             _run(job, store, work, experiment, report, bench)
         except Exception as error:
@@ -180,6 +180,10 @@ def run_here(job: Job, store: Store, experiment: Experiment, bench: Bench, displ
     seconds = time.monotonic() - began
     display.finish(job.name, seconds, cached=False)
     return Ended(job.name, "done", _not_driven(job, store), seconds)
+
+
+def _begin(job: Job, store: Store, experiment: Experiment) -> Path:
+    return store.begin(job.name, job.settings_hash, cell_settings(experiment, job.cell))
 
 
 def _not_driven(job: Job, store: Store) -> str:
@@ -203,7 +207,7 @@ def _run_job() -> None:
     store.lock_file(job.name).parent.mkdir(parents=True, exist_ok=True)
     with take_cell(store, job.name):
         experiment = _checked(job, store)
-        work = store.begin(job.name, job.settings_hash)
+        work = _begin(job, store, experiment)
         with open(work / LOG, "a", encoding="utf-8", buffering=1) as log:
             os.dup2(log.fileno(), 1)
             try:
@@ -263,6 +267,7 @@ def _run(
         "method": job.cell.method,
         "seed": job.seed,
         "settings_hash": job.settings_hash,
+        "settings": dict(cell_settings(experiment, job.cell).resolved),
         "registration": job.registration,
         "stages": digests_in(Path(job.run_folder), NEEDED),
         "machine": found.get("machine") or machine_name(),

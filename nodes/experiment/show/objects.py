@@ -21,14 +21,7 @@ from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.learned_scene import load_background
 from nodes.runtime.progress import Report
 
-# As of a stage (`run.VERSIONS`), of what is made of a mesh; the stage's own is that of panels, which it only describes.
-MESH_VERSION = 2
 GENERATOR_OF: dict[str, str] = {"small_car": "car", "hydrant": "hydrant"}
-
-
-def version_of(kinds: Sequence[str]) -> dict[str, int]:
-    """What an experiment's objects depend on besides their settings."""
-    return {"meshes": MESH_VERSION} if set(kinds) - {PANEL} else {}
 
 
 def run(experiment: Experiment, folder: Path, report: Report) -> None:

@@ -153,7 +153,9 @@ def random_placements(experiment: Experiment, count: int, seed: int) -> list[tup
     """The objects at random allowed places, ``count`` times."""
     if not count:
         return []
-    return randomly_placed(placed_objects(experiment), place_limits(experiment, PlacesConfig()), count, seed)
+    return randomly_placed(
+        placed_objects(experiment), place_limits(experiment, PlacesConfig(kind="places")), count, seed
+    )
 
 
 def geometry_sha256(experiment: Experiment, kind: str) -> str:

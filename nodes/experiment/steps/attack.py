@@ -23,7 +23,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.policy_file import LoadedPolicy
 from advnerf_core.report.conditions import CONTROLS, EMPTY, NONE
-from nodes.experiment.engine.artefact import hash_of
+from nodes.experiment.engine.artefact import Settings, hash_of
 from nodes.experiment.engine.telling import telling
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.method_names import keep_title
@@ -240,17 +240,20 @@ def _search(
     folder: Path,
     report: Callable[..., None],
 ) -> SearchResult:
-    wanted = experiment.config.space.model_dump(mode="json")
-    wanted_of = {**frozen_for(experiment, cell), "scenario": cell.scenario, "space": wanted}
-    if (objective := experiment.config.attack.objective) != CTE:
-        wanted_of["objective"] = objective_key(objective)
-    settings_hash = hash_of(wanted_of)
+    objective = objective_key(experiment.config.attack.objective)
+    settings = Settings.of(
+        experiment.config,
+        {"space": True},
+        **frozen_for(experiment, cell),
+        scenario=cell.scenario,
+        objective=objective,
+    )
     method = load_method(cell.code)
     keep_title(folder.parent, cell.method, method.title)
-    settings = search_settings(experiment, method)
-    told = telling(method.evaluations(problem, settings), report, objective=problem.objective)
-    run = SearchRun(cell.seed, folder / _STATE, told, settings_hash)
-    return space.search(cell.code, on_chosen_device(problem), settings, run)
+    budget = search_settings(experiment, method)
+    told = telling(method.evaluations(problem, budget), report, objective=problem.objective)
+    run = SearchRun(cell.seed, folder / _STATE, told, settings.key)
+    return space.search(cell.code, on_chosen_device(problem), budget, run)
 
 
 def _attack_file(

@@ -18,7 +18,7 @@ from nodes.experiment.show.learned_scene import FIDELITY, HELD_OUT, baked_file, 
 from nodes.experiment.steps.capture import states_about
 from nodes.runtime.progress import Report
 
-# As of a stage (`run.VERSIONS`). It is part of the keys of what is made through baked scenes; the digest of this stage is not, as what it
+# As of a stage (`pipeline.VERSIONS`). It is part of the keys of what is made through baked scenes; the digest of this stage is not, as what it
 # writes follows from the scene, and machines differ in the last bits.
 VERSION = 1
 COMPARED = "baked.json"
@@ -55,7 +55,9 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
 def views_of(experiment: Experiment) -> Array:
     """Poses ``[N, 4, 4]`` of the driving camera about all paths, equally many about each."""
     count = len(experiment.paths) * (_VIEWS // len(experiment.paths))
-    states = states_about(experiment, count, np.random.default_rng(_SEED), _LATERAL_M, _HEADING_RAD)
+    driven_m = experiment.config.horizon * experiment.config.dt_s * experiment.car.speed_mps
+    rng = np.random.default_rng(_SEED)
+    states = states_about(experiment, count, rng, driven_m, _LATERAL_M, _HEADING_RAD)
     return planar_poses(states) @ experiment.mount
 
 

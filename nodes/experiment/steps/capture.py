@@ -98,7 +98,10 @@ def _driving_views(
     report: Report,
 ) -> None:
     """A set of views of the driving camera about the paths."""
-    config, states = experiment.config.capture, states_about(experiment, count, rng)
+    config, states = (
+        experiment.config.capture,
+        states_about(experiment, count, rng, experiment.config.capture.driven_m),
+    )
 
     def observed(index: int) -> NDArray[np.uint8]:
         x, y, yaw = map(float, states[index])
@@ -132,15 +135,15 @@ def states_about(
     experiment: Experiment,
     count: int,
     rng: np.random.Generator,
+    driven_m: float,
     lateral_m: float = _LATERAL_M,
     heading_rad: float = _HEADING_RAD,
 ) -> Array:
-    """Car states ``[count, 3]`` about the stretch of all paths that is measured, so far from the path (of half a lane of 1.75 m) and so turned."""
+    """Car states ``[count, 3]`` about all paths, or their first ``driven_m`` [m], so far from the path (of half a lane of 1.75 m) and so turned."""
     names = list(experiment.paths)
-    driven_m = experiment.config.horizon * experiment.config.dt_s * experiment.car.speed_mps
     parts = []
     for index, name in enumerate(names):
         path, share = experiment.paths[name], len(range(index, count, len(names)))
-        reach_m = None if path.closed else driven_m
+        reach_m = None if path.closed else min(driven_m, path.length_m)
         parts.append(recovery_states(path, share, rng, experiment.across_m(lateral_m), heading_rad, reach_m))
     return np.concatenate(parts)

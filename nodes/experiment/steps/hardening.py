@@ -64,7 +64,7 @@ def judge(experiment: Experiment, victim: str, textures: int = 0) -> HardnessVer
     verdict = HardnessVerdict(
         victim=victim,
         policy_sha256=policy.sha256,
-        recipe=experiment.config.policy.model_dump(mode="json"),
+        recipe=experiment.config.policy.recipe,
         trained_on=TRAINED_ON,
         validated_on=VALIDATED_ON,
         textures=count,

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from advnerf_core.attack.methods import METHODS, black_box_methods, method_digest, require_method
-from advnerf_core.attack.objectives import name_objective
+from advnerf_core.attack.objectives import ON_THE_PATH, objective_key
 from advnerf_core.plugins import PluginError
-from advnerf_core.policies.policy_file import policy_sha256
 from advnerf_core.report.conditions import EMPTY, NONE
-from nodes.experiment.engine.artefact import digests_in, hash_of
+from nodes.experiment.engine.artefact import Settings, digests_in
 from nodes.experiment.plan.cell import Cell
+from nodes.experiment.plan.config import NETWORK
 from nodes.experiment.plan.space_config import FaceConfig
 from nodes.experiment.plan.victims import RETRAINED
 from nodes.experiment.show.context import Experiment
@@ -23,10 +22,10 @@ from nodes.runtime.errors import RuntimeFault
 
 # The stages that cells need of their experiment; what comes after is the cells themselves.
 NEEDED = ("capture", "scene", "policy", "object")
-# As of a stage (`run.VERSIONS`): raised when what a cell finds changes with the same settings.
+# As of a stage (`pipeline.VERSIONS`): raised when what a cell finds changes with the same settings.
 VERSION = 4  # 4: textures are rounded to half precision before they are driven past
-# What a cell does not depend on: which others there are, how much memory may be used, and what is told of the world elsewhere.
-_FREE: Mapping[str, bool | set[str]] = {
+# What a cell does not depend on: which others there are, how much memory may be used, and what is an input of its own below.
+FREE: Mapping[str, Any] = {
     "name": True,
     "scenarios": True,
     "retrain": True,
@@ -34,82 +33,94 @@ _FREE: Mapping[str, bool | set[str]] = {
     "victims": True,
     "reference": True,
     "world": True,
-    "attack": {"seeds", "methods", "cache_mib"},
+    "view": True,
+    "policy": NETWORK,
+    "attack": {"seeds", "methods", "objective", "cache_mib"},
     "measure": {"no_object"},
-    "deploy": {"laps", "empty_scene", "ready_timeout_s"},
+    "deploy": {"world", "laps", "empty_scene", "ready_timeout_s"},
 }
-
-
 # What a drive without attack does not depend on besides.
-_SEARCHED_WITH = (
-    "objective",
-    "evaluations",
-    "horizon",
-    "learning_rate",
-    "cem_population",
-    "time_batch",
-    "robustness",
-)
+_SEARCHED_WITH = {"evaluations", "horizon", "learning_rate", "cem_population", "time_batch", "robustness"}
 
 
 class CellError(RuntimeFault):
     """A cell was asked for that this experiment does not have."""
 
 
-def cell_inputs(experiment: Experiment, cell: Cell) -> dict[str, Any]:
+def cell_settings(experiment: Experiment, cell: Cell, deployed: bool = True) -> Settings:
     """What a cell depends on: the resolved world (of a server, not its address), settings, and what the stages before it wrote.
+
+    Args:
+        experiment: The experiment.
+        cell: Which.
+        deployed: Whether it is deployed too; else it is the search alone, which does not depend on the section ``deploy`` nor on what of
+            the world changes only how its own car moves (`Traits.unseen`).
 
     Raises:
         CellError: No such drive, victim or method.
     """
     require_known(experiment, cell)
-    inputs = registered_settings(experiment)
-    if not cell.searched:
-        for key in _SEARCHED_WITH:
-            inputs["config"]["attack"].pop(key, None)
-    stages = [name for name in NEEDED if name != "policy" or cell.victim not in given_in(experiment.config)]
-    kept = {name: digest for name, digest in experiment.kept.items() if name in stages}
-    inputs["stages"] = {**kept, **digests_in(experiment.folder, stages)}
-    if cell.victim in given_in(experiment.config):
-        inputs["config"].pop("policy")
-        return {**inputs, "victim": victim_sha256(experiment, cell.victim)}
-    if cell.victim != RETRAINED:
-        return inputs
-    file = Path(victim_spec(experiment, cell.victim))
-    return {**inputs, "victim": policy_sha256(file) if file.exists() else None}
-
-
-def registered_settings(experiment: Experiment) -> dict[str, Any]:
-    """Settings that all cells of an experiment depend on, known before any stage is run: what a registration fixes."""
-    config = experiment.config.model_dump(mode="json", exclude=_FREE)
-    config["policy"] = experiment.config.policy.key()
-    if given_in(experiment.config):
-        config["view"] = experiment.view_settings
-    name_objective(config["attack"])
-    return {
-        "version": VERSION,
-        "bake": bake.VERSION,
-        "config": config,
-        "world": experiment.world_settings,
-        **(
-            {} if experiment.config.deploy.world is None else {"deployed_world": experiment.deployed_settings}
-        ),
-    }
-
-
-def settings_hash(experiment: Experiment, cell: Cell) -> str:
-    """The key of a cell: a hash of everything that its result depends on; a change of it makes the cell run again."""
-    named = {
+    free, given_victims = dict(FREE), given_in(experiment.config)
+    inputs: dict[str, Any] = {
         "scenario": cell.scenario,
         "victim": cell.victim,
         "method": cell.method,
         "seed": cell.seed,
-        "inputs": cell_inputs(experiment, cell),
+        "code": method_digest(cell.code),
     }
-    if code := method_digest(cell.code):
-        named["code"] = code
-    # Through JSON, so that tuples and lists, or paths that were not turned into text, cannot change the hash between processes.
-    return hash_of(json.loads(json.dumps(named, default=str)))
+    stages = list(NEEDED)
+    if cell.searched:
+        inputs["objective"] = objective_key(experiment.config.attack.objective)
+    else:
+        free["attack"] = FREE["attack"] | _SEARCHED_WITH
+    if cell.victim in given_victims:
+        free["policy"] = True
+        stages.remove("policy")
+    else:
+        inputs["architecture"] = experiment.config.policy.network.described()
+    if cell.victim in (*given_victims, RETRAINED):
+        inputs["policy_sha256"] = _policy_sha256(experiment, cell.victim)
+    if not deployed:
+        free["deploy"] = True
+    kept = {name: digest for name, digest in experiment.kept.items() if name in stages}
+    inputs["stages"] = {**kept, **digests_in(experiment.folder, stages)}
+    return Settings.of(experiment.config, None, free, **inputs, **_places(experiment, deployed))
+
+
+def _policy_sha256(experiment: Experiment, victim: str) -> str | None:
+    """Content hash of a policy that the stage policy does not make; None of one that is not retrained yet."""
+    if victim == RETRAINED and not Path(victim_spec(experiment, victim)).exists():
+        return None
+    return victim_sha256(experiment, victim)
+
+
+def _places(experiment: Experiment, deployed: bool = True) -> dict[str, Any]:
+    """Inputs of all cells of an experiment: versions, worlds and view."""
+    config = experiment.config
+    # Objectives on the path judge states alone; others may judge by the car's body.
+    seen = not deployed and config.attack.objective in ON_THE_PATH
+    return {
+        "version": VERSION,
+        "bake": bake.VERSION,
+        "world": experiment.seen_settings if seen else experiment.world_settings,
+        "deployed_world": experiment.deployed_settings if deployed and config.deploy.world else None,
+        "view": experiment.view_settings,
+    }
+
+
+def registered_settings(experiment: Experiment) -> Settings:
+    """Settings that all cells of an experiment depend on, known before any stage is run: what a registration fixes."""
+    config = experiment.config
+    code = {
+        "objective": objective_key(config.attack.objective),
+        "architecture": config.policy.network.described(),
+    }
+    return Settings.of(config, None, FREE, **code, **_places(experiment))
+
+
+def settings_hash(experiment: Experiment, cell: Cell) -> str:
+    """The key of a cell: a hash of everything that its result depends on; a change of it makes the cell run again."""
+    return cell_settings(experiment, cell).key
 
 
 def require_known(experiment: Experiment, cell: Cell) -> None:
@@ -152,7 +163,7 @@ def _require_gradient(experiment: Experiment, cell: Cell) -> None:
 
 def clean_folder(experiment: Experiment, cell: Cell, folder: Path) -> Path:
     """Where the drives without attack of a cell go, which belong to all methods: beside the cells' folders, named by what they depend on."""
-    inputs = hash_of(cell_inputs(experiment, cell.clean))
+    inputs = cell_settings(experiment, cell.clean).key
     return folder.parent / "shared" / f"{experiment.config.name}_{cell.clean.name}_{inputs[:12]}"
 
 

@@ -2,42 +2,35 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
-from advnerf_core.attack.methods import method_digest
-from advnerf_core.attack.objectives import name_objective
 from advnerf_core.documents import Document
 from advnerf_core.places import require_utf8
-from advnerf_core.plugins import name_in_results, unknown
+from advnerf_core.plugins import unknown
 from advnerf_core.run_module import search_folder_last
 from advnerf_core.strict import validate
 from hardware.worlds.world import Photographed
 from nodes.experiment.engine.artefact import REFERENCE, Artefact
 from nodes.experiment.engine.run_folder import require_own_folder, run_to_end
-from nodes.experiment.engine.stages import Stage, begun_with, stage_digests
+from nodes.experiment.engine.stages import begun_with, stage_digests
 from nodes.experiment.plan.config import ExperimentConfig
-from nodes.experiment.plan.object_kinds import files_of, name_of
 from nodes.experiment.plan.placed import PlacedObject, in_a_lane
 from nodes.experiment.plan.setting_file import read_setting
 from nodes.experiment.plan.space_config import FaceConfig
 from nodes.experiment.plan.victims import RETRAINED
-from nodes.experiment.show import objects
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.given import VictimUnknownError, given_in, victim_spec
 from nodes.experiment.show.kept_worlds import WorldUnknownError, is_users, keep_worlds
 from nodes.experiment.show.victims import look_at_given
-from nodes.experiment.steps import bake, capture, live, policy, retrain, scene
 from nodes.experiment.steps.live import lab_of
+from nodes.experiment.steps.pipeline import stages_of
 from nodes.lab.worlds.named import read_world
-from nodes.launching.launch_file import load_launch
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.progress import MeasuringReport, StageDisplay
+from nodes.runtime.progress import StageDisplay
 
 _LIBRARIES = (
     "torch",
@@ -49,12 +42,7 @@ _LIBRARIES = (
     "rosbags",
     "mcap",
 )
-# Raised when what a stage makes changes with the same settings: then its old results, and all that build on them, are made again.
-# tests/nodes/experiment/test_versions.py fails where a result changed and its version did not.
-VERSIONS = {"capture": 1, "scene": 2, "bake": bake.VERSION, "object": 1, "policy": 2, "retrain": 1, "live": 1}
 _WHOLE_STEP_S = 1e-6
-# What policies are trained with, beside what comes of it.
-_TRAINING_FILES = ("frames", "*.checkpoint.safetensors", "*.shards.json", "settings.json")
 
 
 def load_experiment(
@@ -205,7 +193,7 @@ def prepare_victims(experiment: Experiment) -> None:
     if begun is not None and Path(victim_spec(experiment, RETRAINED)).exists():
         return
     # Its victim is that of the first round: the others are left to the experiment itself, which goes on from here.
-    rounds = 1 if begun is None else begun["retrain"]["rounds"]
+    rounds = 1 if begun is None else begun.resolved["retrain"]["rounds"]
     config = experiment.config.model_copy(update={"retrain": wanted.model_copy(update={"rounds": rounds})})
     make_ready(replace(experiment, config=config), until="retrain")
     if not Path(victim_spec(experiment, RETRAINED)).exists():
@@ -213,126 +201,3 @@ def prepare_victims(experiment: Experiment) -> None:
             f"expected a retrained policy in {experiment.stage_folder('retrain')}, got none: no attack reaches retrain.pays_ratio = "
             f"{wanted.pays_ratio:g} (see retrain.json there), so nothing was retrained; lower it, or leave the victim retrained out of the campaign"
         )
-
-
-def stages_of(experiment: Experiment) -> list[Stage]:
-    """The stages that cells need, with the part of the configuration that each depends on; moving an object keeps capture, scene and object files.
-
-    The world must not have been opened for them.
-
-    More rounds of retraining go on from those that are there.
-    """
-    config, world = experiment.config, experiment.world_settings
-    measured = {
-        "horizon": config.horizon,
-        "dt_s": config.dt_s,
-        "held_cap_m": config.held_cap_m,
-        "scenarios": config.scenarios,
-    }
-    kinds = sorted({thing.kind for thing in config.objects}, key=name_of)
-    files = files_of(kinds)
-    placed = [thing.model_dump(mode="json") for thing in config.objects]
-
-    def stage(
-        name: str,
-        module: Any,
-        settings: dict[str, Any],
-        after: Sequence[str],
-        parts: Sequence[dict[str, Any]] = (),
-        bulk: Sequence[str] = (),
-        reads_bulk_of: Sequence[str] = (),
-    ) -> Stage:
-        def work(folder: Path, told: MeasuringReport) -> None:
-            module.run(experiment, folder, told)
-
-        settings, *smaller = json.loads(json.dumps([settings, *parts]))
-        return Stage(name, work, settings, after, VERSIONS[name], smaller, bulk, reads_bulk_of)
-
-    def part(name: str) -> Any:
-        return getattr(config, name).model_dump(mode="json")
-
-    # Of users' methods the code counts, not where it is.
-    searched = {**part("attack"), "methods": config.attack.method_names}
-    name_objective(searched)
-    if codes := {
-        name_in_results(each): code for each in config.attack.methods if (code := method_digest(each))
-    }:
-        searched["code"] = codes
-    view, space = experiment.view_settings, part("space")
-    # What a screen shows while a scene is photographed, and what policies meet, is part of what is learned.
-    shown = ("panel", "resolution", "plain_rgb")
-    face = {"face": {name: space[name] for name in shown}} if isinstance(config.space, FaceConfig) else {}
-    driven = {"world": world, "objects": placed, "view": view, **measured}
-    # A rule looks at the world while it is photographed.
-    ruled = {"objects": placed, "view": view} if experiment.has_rules else {}
-    if config.object.panel_light == "measured":
-        ruled = {"objects": placed, "view": view, "panel_light": "measured"}
-    stages = [
-        stage(
-            "capture",
-            capture,
-            {"world": experiment.seen_settings, "capture": part("capture"), **face, **ruled, **measured},
-            (),
-            bulk=(capture.PHOTOS, capture.COLOUR_PAIRS),
-        ),
-        stage(
-            "scene",
-            scene,
-            {"scene": part("scene"), "view": view, "colour_pairs": config.capture.colour_pairs},
-            ("capture",),
-            reads_bulk_of=("capture",),
-        ),
-        stage(
-            "bake",
-            bake,
-            {"view": view, "driven": {**measured, "world": world}},
-            ("capture", "scene"),
-        ),
-        stage(
-            "object",
-            objects,
-            {
-                "object": part("object"),
-                "kinds": list(map(name_of, kinds)),
-                **({"files": files} if files else {}),
-                **objects.version_of(kinds),
-            },
-            (),
-        ),
-    ]
-    if config.trains:
-        learned_from = {
-            **driven,
-            **face,
-            "policy": config.policy.key(),
-            "sigma": config.attack.random_sigma,
-            "bake": bake.VERSION,
-        }
-        after = ("capture", "scene", "object")
-        stages.append(stage("policy", policy, learned_from, after, bulk=_TRAINING_FILES))
-    if config.retrain is not None:
-        settings = {
-            **driven,
-            "bake": bake.VERSION,
-            "retrain": part("retrain"),
-            "attack": searched,
-            "space": space,
-        }
-        fewer = [
-            {**settings, "retrain": {**settings["retrain"], "rounds": rounds}}
-            for rounds in range(1, config.retrain.rounds)
-        ]
-        after = ("scene", "object", "policy")
-        stages.append(stage("retrain", retrain, settings, after, fewer, reads_bulk_of=("policy",)))
-    if config.deploy.live and (config.deploy.laps or config.deploy.empty_scene):
-        # The same on every machine, wherever it is installed.
-        graph = load_launch(experiment.launch_file, twin_calibration="calibration/twin").resolved
-        stages.append(
-            stage(
-                "live",
-                live,
-                {**driven, **face, "deploy": part("deploy"), "graph": graph},
-                ("capture", "policy") if config.trains else ("capture",),
-            )
-        )
-    return stages

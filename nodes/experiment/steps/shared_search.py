@@ -4,30 +4,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from advnerf_core.attack.methods import method_digest
-from advnerf_core.attack.objectives import ON_THE_PATH
 from advnerf_core.files import write_atomically
-from nodes.experiment.engine.artefact import has_key, hash_of, write_key
+from nodes.experiment.engine.artefact import has_key, write_key
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.steps.keys import cell_inputs
+from nodes.experiment.steps.keys import cell_settings
 from nodes.experiment.steps.search_files import ATTACK, SEARCHED
 
-_KEY = "search_key"
+_KEY = "search_key.json"
 
 
 def search_key(experiment: Experiment, cell: Cell) -> str:
-    """Hash of what a search, and the drives in the surrogate past what it found, depend on.
-
-    The section ``deploy`` is left out, and what of the world changes only how its own car moves (`Traits.unseen`).
-    """
-    inputs = cell_inputs(experiment, cell)
-    inputs["config"].pop("deploy")
-    inputs.pop("deployed_world", None)
-    if experiment.config.attack.objective in ON_THE_PATH:  # others may judge by the car's body
-        inputs["world"] = experiment.seen_settings
-    which = [cell.scenario, cell.victim, cell.method, cell.seed]
-    return hash_of({"cell": which, "code": method_digest(cell.code), "inputs": inputs})
+    """Hash of what a search, and the drives in the surrogate past what it found, depend on."""
+    return cell_settings(experiment, cell, deployed=False).key
 
 
 def take_search(experiment: Experiment, cell: Cell, folder: Path) -> Path | None:
@@ -41,7 +30,8 @@ def take_search(experiment: Experiment, cell: Cell, folder: Path) -> Path | None
     Returns:
         The folder that it was copied from.
     """
-    key = search_key(experiment, cell)
+    settings = cell_settings(experiment, cell, deployed=False)
+    key = settings.key
     if has_key(folder / _KEY, key):
         return None
     if (found := _finished(folder, key)) is not None:
@@ -49,7 +39,7 @@ def take_search(experiment: Experiment, cell: Cell, folder: Path) -> Path | None
         for name in (ATTACK, SEARCHED):
             if (found / name).exists():
                 write_atomically(folder / name, (found / name).read_bytes())
-    write_key(folder / _KEY, key)
+    write_key(folder / _KEY, key, settings)
     return found
 
 

@@ -17,19 +17,19 @@ def policy(text: str, folder: Path = EXAMPLES) -> PolicyConfig:
 
 
 def test_the_default_is_not_in_the_key():
-    key = policy("hidden: [16, 8, 4]").key()
+    key = policy("hidden: [16, 8, 4]").recipe
     assert key["hidden"] == [16, 8, 4]
     assert not {"architecture", "configuration", "code"} & key.keys()
-    assert policy("{hidden: [16, 8, 4], architecture: pilotnet}").key() == key
+    assert policy("{hidden: [16, 8, 4], architecture: pilotnet}").recipe == key
     assert policy("{}").network.described() == {"hidden": [200, 100, 20]}
 
 
 def test_the_key_holds_what_the_network_reads_and_nothing_else():
-    key = policy("{architecture: resnet, configuration: {blocks: 2}}").key()
+    key = policy("{architecture: resnet, configuration: {blocks: 2}}").recipe
     assert key["configuration"] == {"widths": [24, 32, 48, 64], "blocks": 2, "hidden": 64}
-    assert policy("{architecture: resnet, configuration: {blocks: 2}, hidden: [9, 9, 9]}").key() == key
-    assert policy("{architecture: resnet, configuration: {blocks: 2, hidden: 64}}").key() == key
-    assert policy("architecture: resnet").key() != key
+    assert policy("{architecture: resnet, configuration: {blocks: 2}, hidden: [9, 9, 9]}").recipe == key
+    assert policy("{architecture: resnet, configuration: {blocks: 2, hidden: 64}}").recipe == key
+    assert policy("architecture: resnet").recipe != key
 
 
 def test_a_users_class_counts_by_its_code_and_not_by_its_place(tmp_path):
@@ -39,9 +39,9 @@ def test_a_users_class_counts_by_its_code_and_not_by_its_place(tmp_path):
         policy("architecture: my_architecture.py:Mixer", folder) for folder in (EXAMPLES, tmp_path)
     )
     assert here.architecture != there.architecture
-    assert here.key() == there.key()
+    assert here.recipe == there.recipe
     (tmp_path / "my_architecture.py").write_bytes(code + b"\n# changed\n")
-    assert here.key() != there.key()
+    assert here.recipe != there.recipe
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ from nodes.experiment.steps import attack, frozen, run
 from nodes.experiment.steps.attack import cells, load_shown, surrogate_part
 from nodes.experiment.steps.deploy import DRIVES, ThroughWorld, cell_data
 from nodes.experiment.steps.films import film_cell
-from nodes.experiment.steps.keys import CellError, cell_inputs, clean_folder, settings_hash
+from nodes.experiment.steps.keys import CellError, cell_settings, clean_folder, settings_hash
 from nodes.experiment.steps.shared_search import search_key, take_search
 from nodes.runtime.errors import ConfigError
 from tests.support.strangers import spiral_code, spiral_theta, write_spiral
@@ -235,9 +235,10 @@ def test_a_search_bears_what_it_is_asked_to_and_is_measured_undisturbed(fresh: E
     measured = attack.from_measured_starts(fresh, "right", attack.past_field(fresh, plain, space, shown))
     assert np.array_equal(found["states"], attack.learned_drives(fresh, measured, shown.colours)[0])
     # What no search belongs to does not depend on it, and a setting that changes nothing is not there.
-    assert cell_inputs(bearing, GRADIENT.clean) == cell_inputs(fresh, GRADIENT.clean)
-    assert cell_inputs(bearing, GRADIENT) != cell_inputs(fresh, GRADIENT)
-    assert "robustness" not in cell_inputs(fresh, GRADIENT)["config"]["attack"]
+    assert cell_settings(bearing, GRADIENT.clean) == cell_settings(fresh, GRADIENT.clean)
+    assert cell_settings(bearing, GRADIENT) != cell_settings(fresh, GRADIENT)
+    assert "robustness" not in cell_settings(fresh, GRADIENT).keyed["attack"]
+    assert cell_settings(fresh, GRADIENT).resolved["attack"]["robustness"]["draws"] == 1
     junction = Path(__file__).parents[3] / "launch" / "junction.experiment.yaml"
     wrong = ["attack.robustness.smoothness=1", "space={kind: places}"]
     with pytest.raises(ConfigError, match="smoothness only where colours are searched"):
@@ -299,9 +300,9 @@ def test_the_driving_camera_may_be_a_real_one(fresh: Experiment, wall: Any) -> N
     assert commands(gain_sigma=0.5) != ideal
     # Of a lost frame the policy sees the one before.
     assert len(set(commands(lost=0.999))) == 1
-    assert "camera" not in cell_inputs(fresh, GRADIENT)["config"]["deploy"]
+    assert "deploy" not in cell_settings(fresh, GRADIENT).keyed
     noisy = changed(fresh, "deploy", camera=CameraEffects(read_noise=0.01))
-    assert cell_inputs(noisy, GRADIENT)["config"]["deploy"]["camera"]["read_noise"] == 0.01
+    assert cell_settings(noisy, GRADIENT).keyed["deploy"]["camera"] == {"read_noise": 0.01}
 
 
 def changed(experiment: Experiment, section: str, **values: Any) -> Experiment:

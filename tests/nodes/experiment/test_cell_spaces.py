@@ -40,10 +40,10 @@ from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError
 
 PLACES = Cell("right", "hardened", "random", 0)
-ONE = PlacesConfig(samples=1, steps=1)
+ONE = PlacesConfig(kind="places", samples=1, steps=1)
 MESHES = [
-    MeshTextureConfig(texels=8, ball_m=0.5),
-    MeshShapeConfig(texels=8, ball_m=0.5, bound_m=0.3, samples=1),
+    MeshTextureConfig(kind="mesh_texture", texels=8, ball_m=0.5),
+    MeshShapeConfig(kind="mesh_shape", texels=8, ball_m=0.5, bound_m=0.3, samples=1),
 ]
 
 
@@ -114,7 +114,7 @@ def test_meshes_are_searched_over_the_pictures_of_the_world(
 
 @pytest.mark.usefixtures("mitsuba")
 def test_without_an_attack_meshes_are_their_own_base(trained: Experiment, wall: Any, tmp_path: Path) -> None:
-    experiment = searching(trained, MeshTextureConfig(texels=8))
+    experiment = searching(trained, MeshTextureConfig(kind="mesh_texture", texels=8))
     data = whole(experiment, wall, Cell("right", "naive", "none", 0), tmp_path)
     assert data["attack_id"] is None
     for domain in ("surrogate", "deployed"):
@@ -159,7 +159,7 @@ def test_places_alone_keep_the_plain_colours_and_are_filmed(
     films_write_clip = films.write_clip
     monkeypatch.setattr(films, "write_clip", write_clip)
     folder = shutil.copytree(trained.folder, tmp_path / "run")
-    alone = PlacesConfig(samples=1, steps=1, colours=False)
+    alone = PlacesConfig(kind="places", samples=1, steps=1, colours=False)
     experiment = replace(searching(trained, alone), folder=folder)
     cell = run_cell(experiment, PLACES, tmp_path / "moved", silent)
     plain = run_cell(experiment, Cell("right", "hardened", "none", 0), tmp_path / "plain", silent)
@@ -194,7 +194,7 @@ def test_a_cell_depends_on_its_space_and_on_its_victim(trained: Experiment) -> N
         settings_hash(experiment, Cell("right", "naive", "random", 0)),
         settings_hash(experiment, Cell("right", "hardened", "random", 1)),
         settings_hash(searching(trained, MESHES[0]), PLACES),
-        settings_hash(searching(trained, ColoursConfig()), PLACES),
+        settings_hash(searching(trained, ColoursConfig(kind="colours")), PLACES),
     ]
     assert len({same, *others}) == 7
     for wrong in (
@@ -231,11 +231,13 @@ def test_the_gate_judges_learned_scenes_and_predictions_need_objects_where_they_
     trained: Experiment,
 ) -> None:
     judged = {
-        space.kind: has_learned_scene(searching(trained, space)) for space in (ColoursConfig(), ONE, *MESHES)
+        space.kind: has_learned_scene(searching(trained, space))
+        for space in (ColoursConfig(kind="colours"), ONE, *MESHES)
     }
     assert judged == {"colours": True, "places": True, "mesh_texture": False, "mesh_shape": False}
     predicted = {
-        space.kind: is_predictable(searching(trained, space)) for space in (ColoursConfig(), ONE, *MESHES)
+        space.kind: is_predictable(searching(trained, space))
+        for space in (ColoursConfig(kind="colours"), ONE, *MESHES)
     }
     assert predicted == {"colours": True, "places": False, "mesh_texture": False, "mesh_shape": False}
 
@@ -313,7 +315,7 @@ def test_maps_are_of_what_the_cell_found(
 @pytest.mark.parametrize(
     ("space", "searched"),
     [
-        (ColoursConfig(), "The colours of "),
+        (ColoursConfig(kind="colours"), "The colours of "),
         (ONE, "The places of "),
         (MESHES[0], "The textures of "),
         (MESHES[1], "The shapes of "),

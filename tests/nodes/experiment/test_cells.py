@@ -7,7 +7,7 @@ from advnerf_core.plugins import name_in_results
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import runs_alone
 from nodes.experiment.steps.attack import search_settings
-from nodes.experiment.steps.keys import cell_inputs, clean_folder
+from nodes.experiment.steps.keys import cell_settings, clean_folder
 from nodes.experiment.steps.run import load_experiment
 from tests.support.strangers import write_spiral
 
@@ -37,12 +37,12 @@ def test_live_nodes_have_the_machine_for_themselves(tmp_path):
 
 def test_what_changes_no_result_is_no_part_of_what_a_cell_depends_on(tmp_path):
     def inputs(*overrides):
-        return cell_inputs(room(tmp_path, *overrides), Cell("track", "hardened", "gradient", 0))
+        return cell_settings(room(tmp_path, *overrides), Cell("track", "hardened", "gradient", 0))
 
     for free in ("attack.cache_mib=64", "attack.seeds=[4]", "deploy.laps=0", "deploy.ready_timeout_s=90"):
         assert inputs(free) == inputs(), free
     none = Cell("track", "hardened", "none", 0)
-    assert cell_inputs(room(tmp_path, "attack.evaluations=7"), none) == cell_inputs(room(tmp_path), none)
+    assert cell_settings(room(tmp_path, "attack.evaluations=7"), none) == cell_settings(room(tmp_path), none)
     assert inputs("attack.evaluations=7") != inputs()
     for counts in ("attack.starts=2", "deploy.through=world", "world.car.speed_mps=0.6"):
         assert inputs(counts) != inputs(), counts

@@ -116,7 +116,7 @@ def test_cells_that_other_processes_run_are_seen_by_their_files(served):
     record.finish(CLEAN, 0.0, cached=True)
     for name, percent in ((RANDOM, 40), (GRADIENT, 80)):
         (folder / "cells" / name).mkdir(parents=True)
-        (folder / "cells" / name / "key").write_text("a hash\n")
+        (folder / "cells" / name / "key.json").write_text("{}")
         (folder / "cells" / name / "log.txt").write_text(f"{percent} % 4/5, total CTE 2.0 m\n")
     parts = {part["name"]: part for part in state_of(port)["parts"]}
     assert parts[CLEAN]["state"] == "reused"

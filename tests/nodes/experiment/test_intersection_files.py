@@ -13,7 +13,8 @@ from nodes.cli.main import main
 from nodes.experiment.engine.stages import run_stages
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps import run
-from nodes.experiment.steps.run import load_experiment, stages_of
+from nodes.experiment.steps.pipeline import stages_of
+from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import Report
 
@@ -52,9 +53,12 @@ def test_starts_are_drawn_about_the_nominal_one(tmp_path: Path) -> None:
         ("scene.steps=3", {"scene"}),
         ("object.fit_steps=3", {"object"}),
         ("objects=[]", {"object", "policy"}),
-        ("world.car.turn_rate_lag_s=0.2", {"bake", "policy"}),
-        ("world.car.speed_mps=5", {"capture", "bake", "policy"}),
-        ("world.road.lane_width_m=3.4", {"capture", "bake", "policy"}),
+        ("world.car.turn_rate_lag_s=0.2", {"policy"}),
+        ("world.car.speed_mps=5", {"capture", "policy"}),
+        ("world.road.lane_width_m=3.4", {"capture", "policy"}),
+        ("horizon=50", {"bake"}),
+        ("held_cap_m=5", set()),
+        ("object.panel_rgb=[0.4, 0.5, 0.5]", {"policy"}),
         ("attack.evaluations=3", set()),
     ],
 )

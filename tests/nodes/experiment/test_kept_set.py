@@ -10,7 +10,7 @@ from advnerf_core.report.cells import read_cells
 from advnerf_core.report.evidence.hardness import PUBLISHED_FILE
 from advnerf_core.report.evidence.kept_build import LOST
 from advnerf_core.report.evidence.verify import verify_set, write_set
-from nodes.experiment.engine.artefact import BUILD, ReferenceBuild
+from nodes.experiment.engine.artefact import BUILD, RECORD, ReferenceBuild, read_artefact, write_artefact
 from nodes.experiment.run.cells import keep_build
 from nodes.experiment.run.config import campaign_of
 from nodes.experiment.run.kept_attacks import attack_problems, with_attacks
@@ -26,9 +26,10 @@ from tests.support.stage_versions import TINY, tiny_experiment
 CHANGES = ("attack.methods=[gradient]", "attack.seeds=[0,1]", "measure.starts=2", "deploy.starts=1")
 
 
-def campaign_in(folder):
-    made = tiny_experiment(folder, CHANGES)
-    return campaign_of(made, [*TINY, *CHANGES], cells(made))
+def campaign_in(folder, *more):
+    changes = [*CHANGES, *more]
+    made = tiny_experiment(folder, changes)
+    return campaign_of(made, [*TINY, *changes], cells(made))
 
 
 @pytest.fixture
@@ -50,6 +51,8 @@ def published(tiny_room, tmp_path, monkeypatch):
     write_set(results / campaign.name)
     shutil.rmtree(campaign.folder)
     shutil.rmtree(build.folder)
+    for file in (results / BUILD).glob(f"*/{RECORD}"):  # an earlier version had other keys
+        write_artefact(file.parent, replace(read_artefact(file.parent), key="0" * 64))
     monkeypatch.setattr(run, "REFERENCE", ReferenceBuild(results / BUILD))
     return results / campaign.name
 
@@ -70,6 +73,11 @@ def test_it_is_driven_again_from_the_published_files_alone(published, tmp_path):
     # What is kept is what drove, so that poses come out as they were written: to the last digit that is kept.
     assert max(each.off_m for each in again) < 2e-5
     assert not list((tmp_path / "again" / "policy").glob("data*"))  # no victim was trained for it
+
+    with pytest.raises(
+        RedriveError, match="expected the held_cap_m that were registered, got others; check out"
+    ):
+        redrive(campaign_in(tmp_path / "other", "held_cap_m=2"), published, 1, 0, lambda text: None)
 
     # With another texture it would not.
     first = sorted((published / "attacks").iterdir())[0]

@@ -9,7 +9,7 @@ from advnerf_core.attack.artifact import load_attack
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import run_cell
 from nodes.experiment.steps.attack import ATTACK
-from nodes.experiment.steps.keys import cell_inputs, registered_settings, settings_hash
+from nodes.experiment.steps.keys import cell_settings, registered_settings, settings_hash
 from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError
 from tests.support.stage_versions import ROOT, TINY
@@ -41,11 +41,11 @@ def test_keys_follow_the_objective_where_something_is_searched(tmp_path):
     plain = load_experiment(FILE, "demo", TINY, tmp_path / "run")
     for name, objective in {"cte": "cte", "peak": "peak", **own}.items():
         found = experiment_of(tmp_path / "run", objective)
-        keys[name] = registered_settings(found)["config"]["attack"].get("objective")
-        assert cell_inputs(found, NONE) == cell_inputs(plain, NONE)
+        keys[name] = registered_settings(found).keyed["objective"]
+        assert cell_settings(found, NONE) == cell_settings(plain, NONE)
         same = settings_hash(found, RANDOM) == settings_hash(plain, RANDOM)
         assert same == (name == "cte")
-    assert keys["cte"] is None
+    assert keys["cte"] == "cte"
     assert keys["peak"] == "peak"
     assert keys["a"] == keys["b"]
     assert keys["a"][0] == "Left"

@@ -14,7 +14,8 @@ from advnerf_core.objects.voxel.model import load_object, save_object
 from nodes.experiment.plan.object_kinds import footprint_m
 from nodes.experiment.show import objects
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.steps.run import load_experiment, stages_of
+from nodes.experiment.steps.pipeline import stages_of
+from nodes.experiment.steps.run import load_experiment
 from tests.nodes.experiment.conftest import write_file
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 0.6, 2.4, 1.5
@@ -37,7 +38,7 @@ def experiment_in(folder: Path, *kinds: str) -> Experiment:
 
 
 def settings(experiment: Experiment, name: str) -> dict[str, object]:
-    return dict(next(stage for stage in stages_of(experiment) if stage.name == name).settings)
+    return dict(next(stage for stage in stages_of(experiment) if stage.name == name).settings.keyed)
 
 
 def test_a_mesh_and_a_built_object_stand_where_they_are_put(tmp_path: Path) -> None:
@@ -79,10 +80,9 @@ def test_what_is_in_the_file_counts_and_not_where_it_lies(tmp_path: Path) -> Non
     assert settings(changed, "object") != settings(first, "object")
 
 
-def test_experiments_without_files_depend_on_what_they_always_did(tmp_path: Path) -> None:
+def test_experiments_without_files_depend_on_their_kinds_alone(tmp_path: Path) -> None:
     found = settings(experiment_in(tmp_path, "hydrant"), "object")
-    assert found["kinds"] == ["hydrant"]
-    assert "files" not in found
+    assert (found["kinds"], found["files"]) == (["hydrant"], {})
 
 
 @pytest.mark.parametrize(

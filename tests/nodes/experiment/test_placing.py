@@ -15,7 +15,8 @@ from nodes.experiment.show.context import PLACED, Experiment
 from nodes.experiment.show.deployed import DressedScene
 from nodes.experiment.show.objects import placed_objects
 from nodes.experiment.show.placing import as_text, place_by_rule
-from nodes.experiment.steps.run import load_experiment, stages_of
+from nodes.experiment.steps.pipeline import stages_of
+from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError
 
 ROOM = Path(__file__).parents[3] / "launch" / "room.experiment.yaml"
@@ -91,7 +92,7 @@ def test_the_rule_is_obeyed_or_refused(lab: Lab, tmp_path: Path) -> None:
 
 def test_what_is_captured_depends_on_the_rule_and_on_no_place_by_hand(tmp_path: Path) -> None:
     def settings(experiment: Experiment) -> str:
-        return json.dumps(stages_of(experiment)[0].settings, sort_keys=True)
+        return json.dumps(stages_of(experiment)[0].settings.keyed, sort_keys=True)
 
     assert settings(room(tmp_path)) != settings(room(tmp_path, "{side: left}"))
     by_hand = [

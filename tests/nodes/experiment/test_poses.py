@@ -18,7 +18,7 @@ def test_objects_move_about_their_places_and_off_the_lanes(trained: Experiment) 
     for objects in moved:
         for thing, there in zip(things, objects, strict=True):
             offset_m = there.T_world_from_object[:2, 3] - [thing.x_m, thing.y_m]
-            assert np.abs(offset_m).max() <= PlacesConfig().move_m + 1e-9
+            assert np.abs(offset_m).max() <= PlacesConfig(kind="places").move_m + 1e-9
             low, high = (there.scale * corner for corner in footprint(there))
             corners = np.array([[x, y] for x in (low[0], high[0]) for y in (low[1], high[1])])
             yaw_rad = yaw_of(there.T_world_from_object)
@@ -35,10 +35,12 @@ def test_objects_move_about_their_places_and_off_the_lanes(trained: Experiment) 
 
 
 def test_cars_turn_a_little_and_hydrants_all_the_way(trained: Experiment) -> None:
-    for thing, bound in zip(trained.objects, bounds_of(trained.objects, PlacesConfig()), strict=True):
+    for thing, bound in zip(
+        trained.objects, bounds_of(trained.objects, PlacesConfig(kind="places")), strict=True
+    ):
         assert bound.yaw_rad is not None
         width_rad = bound.yaw_rad[1] - bound.yaw_rad[0]
         assert width_rad == pytest.approx(
-            2 * np.pi if thing.kind == "hydrant" else 2 * PlacesConfig().turn_rad
+            2 * np.pi if thing.kind == "hydrant" else 2 * PlacesConfig(kind="places").turn_rad
         )
         assert bound.scale is None

@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 
 from advnerf_core.report.evidence.registration import FILE, RegistrationError, read_registration
+from nodes.experiment.engine.artefact import Settings, write_key
 from nodes.experiment.run.config import campaign_of
 from nodes.experiment.run.plan import plan_cells, registered_under
 from nodes.experiment.run.registering import primary_tests, register
@@ -89,7 +90,7 @@ def test_a_registration_after_the_fact_is_refused(campaign, tmp_path):
     planned = plan_cells(campaign, campaign.cells[:1])[0]
     work = campaign.folder / "cells" / planned.cell.name
     work.mkdir(parents=True)
-    (work / "key").write_text(planned.job.settings_hash + "\n")
+    write_key(work / "key.json", planned.job.settings_hash, Settings.of())
     with pytest.raises(RegistrationError, match="before anything is run"):
         register(campaign, "tiny", [], tmp_path)
     assert not (tmp_path / "junction" / FILE).exists()
@@ -105,6 +106,7 @@ def test_cells_of_the_registered_settings_are_run_under_it_and_no_others(campaig
     found = register(campaign, "tiny", [], tmp_path)
     assert under(cell, trained) == found.digest
     assert under(replace(cell, seed=7), trained) == ""
+    assert found.scenario("right").settings["capture"]["driven_m"] == 36.0  # its defaults are there
     config = trained.config.model_copy(update={"horizon": 2})
     assert under(cell, replace(trained, config=config)) == ""
 

@@ -7,7 +7,8 @@ from nodes.experiment.engine.stages import StageError
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.whole import run_experiment
 from nodes.experiment.steps.attack import cells
-from nodes.experiment.steps.run import load_experiment, stages_of
+from nodes.experiment.steps.pipeline import stages_of
+from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError
 
 ROOM = Path(__file__).parents[3] / "launch" / "room.experiment.yaml"
@@ -105,9 +106,11 @@ def test_a_stage_depends_on_its_own_settings_and_on_no_others(tmp_path):
     assert changed("scene.exposure=true") == changed("scene.decay=cosine") == {"scene"}
     assert changed("scene.learning_rate=0.02") == {"scene"}
     assert changed("scene.exposure=false") == changed("scene.decay=exponential") == set()
-    assert not {"exposure", "decay", "learning_rate"} & room(tmp_path).config.scene.model_dump().keys()
     # What the panel shows without an attack is photographed and learned from.
     assert changed("space.plain_rgb=[0.5, 0.5, 0.5]") == {"capture", "policy"}
+    assert changed("space.resolution=32") == {"policy"}
+    assert changed("held_cap_m=2") == set()
+    assert changed("horizon=50") == {"bake", "policy"}
 
 
 def test_laps_are_a_stage_where_they_are_asked_for(tmp_path):

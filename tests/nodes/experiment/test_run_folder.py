@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
+from nodes.experiment.engine.artefact import Settings
 from nodes.experiment.engine.run_folder import RunFolder, run_to_end
 from nodes.experiment.engine.stages import Stage
 from nodes.runtime.errors import ConfigError
@@ -13,7 +14,7 @@ from nodes.runtime.errors import ConfigError
 def run(folder, name, value=1):
     config = SimpleNamespace(name=name, model_dump=lambda mode: {"value": value})
     stage = Stage(
-        "capture", lambda here, told: (here / "photo").write_text(f"{name} {value}"), {"value": value}
+        "capture", lambda here, told: (here / "photo").write_text(f"{name} {value}"), Settings.of(value=value)
     )
     experiment = RunFolder(config, folder / f"{name}.experiment.yaml", folder, "demo")
     return run_to_end(experiment, [stage], ["numpy"], None, Console(file=io.StringIO()))

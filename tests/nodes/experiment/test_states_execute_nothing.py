@@ -13,7 +13,8 @@ from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import runs_alone
 from nodes.experiment.show.kept_worlds import keep_worlds
 from nodes.experiment.steps.keys import settings_hash
-from nodes.experiment.steps.run import load_experiment, stages_of
+from nodes.experiment.steps.pipeline import stages_of
+from nodes.experiment.steps.run import load_experiment
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 OWN = ("world_warehouse", "my_architecture", "left_objective", "spiral_method")

@@ -3,13 +3,15 @@
 import json
 
 import pytest
+from pydantic import TypeAdapter
 
-from nodes.experiment.engine.artefact import ReferenceBuild
+from nodes.experiment.engine.artefact import ReferenceBuild, Settings
 from nodes.experiment.plan.cell import Cell
+from nodes.experiment.plan.space_config import SpaceConfig
 from nodes.experiment.run.cells import Bench, keep_build, run_cell
 from nodes.experiment.steps import run
 from nodes.experiment.steps.keys import settings_hash
-from tests.support.stage_versions import RECORDED, tiny_experiment
+from tests.support.stage_versions import RECORDED, defaults, tiny_experiment, versions
 
 # Between processors sums are taken in another order; a change of what is computed is larger.
 _RELATIVE = 0.01
@@ -21,10 +23,33 @@ def test_what_stages_and_cells_make_is_of_their_versions(tiny_room):
     for name, each in found.items():
         how = (
             f"{name}: record it with python -m tests.support.stage_versions, if that was meant, and raise its version "
-            "(VERSIONS in nodes/experiment/steps/run.py, VERSION in keys.py)"
+            "(VERSIONS in nodes/experiment/steps/pipeline.py, VERSION in keys.py)"
         )
         assert each["version"] == recorded[name]["version"], how
         assert each["numbers"] == pytest.approx(recorded[name]["numbers"], rel=_RELATIVE), how
+
+
+def test_defaults_that_are_not_in_keys_are_of_their_versions():
+    recorded, found = json.loads(RECORDED.read_text()), defaults()
+    assert {name: recorded[name]["version"] for name in found} == versions()
+    for name, each in found.items():
+        changed = {
+            key
+            for key in each
+            if key in recorded[name]["defaults"] and each[key] != recorded[name]["defaults"][key]
+        }
+        assert not changed, (
+            f"{name}: raise its version, as keys do not hold defaults, and record them with python -m tests.support.stage_versions"
+        )
+        assert set(each) == set(recorded[name]["defaults"]), (
+            f"{name}: record its settings with python -m tests.support.stage_versions"
+        )
+
+
+def test_tags_of_unions_stay_in_keys():
+    kinds = [{"kind": kind} for kind in ("colours", "places", "mesh_texture", "mesh_shape", "face")]
+    keyed = [Settings.of(TypeAdapter(SpaceConfig).validate_python(kind)).keyed for kind in kinds]
+    assert keyed == kinds
 
 
 def test_a_machine_that_has_only_the_reference_build_runs_the_same_cells(tiny_room, tmp_path, monkeypatch):

@@ -3,7 +3,13 @@ import os
 import pytest
 
 from advnerf_core.files import write_atomically
-from nodes.experiment.engine.artefact import ReferenceBuild, ReferenceBuildError, digest_of, read_artefact
+from nodes.experiment.engine.artefact import (
+    ReferenceBuild,
+    ReferenceBuildError,
+    Settings,
+    digest_of,
+    read_artefact,
+)
 from nodes.experiment.engine.stages import (
     Stage,
     StageError,
@@ -39,9 +45,9 @@ def writing(text):
 
 def job(first_setting=1, second_setting=1, first_text="a"):
     return [
-        Stage("first", writing(first_text), {"x": first_setting}),
-        Stage("second", writing("b"), {"y": second_setting}, after=("first",)),
-        Stage("other", writing("c"), {}),
+        Stage("first", writing(first_text), Settings.of(x=first_setting)),
+        Stage("second", writing("b"), Settings.of(y=second_setting), after=("first",)),
+        Stage("other", writing("c"), Settings.of()),
     ]
 
 
@@ -76,7 +82,7 @@ def test_an_interrupted_stage_finds_its_own_partial_work(tmp_path):
         if len(seen) == 1:
             raise KeyboardInterrupt
 
-    stages = [Stage("long", work, {})]
+    stages = [Stage("long", work, Settings.of())]
     with pytest.raises(KeyboardInterrupt):
         run_and_note(tmp_path, stages)
     assert read_artefact(tmp_path / "long").digest is None
@@ -91,18 +97,18 @@ def test_more_of_the_same_goes_on_from_what_is_there(tmp_path):
                 if not (file := folder / f"round{number}").exists():
                     file.write_text(f"made when {rounds} were asked for")
 
-        of = [{"rounds": fewer, "seed": seed} for fewer in range(1, rounds)]
-        return [Stage("loop", work, {"rounds": rounds, "seed": seed}, goes_on_from=of)]
+        of = [Settings.of(rounds=fewer, seed=seed) for fewer in range(1, rounds)]
+        return [Stage("loop", work, Settings.of(rounds=rounds, seed=seed), resumes_from=of)]
 
     def rounds():
         return [file.read_text()[10:11] for file in sorted((tmp_path / "loop").glob("round*"))]
 
     assert begun_with(growing(3), tmp_path, "loop") is None
     run_and_note(tmp_path, growing(2))
-    assert begun_with(growing(3), tmp_path, "loop") == {"rounds": 2, "seed": 0}
+    assert begun_with(growing(3), tmp_path, "loop") == Settings.of(rounds=2, seed=0)
     assert begun_with(growing(3, seed=1), tmp_path, "loop") is None
     assert run_and_note(tmp_path, growing(3)) == ["loop"]
-    assert begun_with(growing(3), tmp_path, "loop") == {"rounds": 3, "seed": 0}
+    assert begun_with(growing(3), tmp_path, "loop") == Settings.of(rounds=3, seed=0)
     assert begun_with(growing(2), tmp_path, "loop") is None
     assert rounds() == ["2", "2", "3"]
     assert run_and_note(tmp_path, growing(3)) == []
@@ -120,8 +126,8 @@ def test_partial_work_of_other_settings_is_not_used(tmp_path):
         raise RuntimeError("stop")
 
     with pytest.raises(RuntimeError):
-        run_and_note(tmp_path, [Stage("s", fail, {"x": 1})])
-    run_and_note(tmp_path, [Stage("s", writing("whole"), {"x": 2})])
+        run_and_note(tmp_path, [Stage("s", fail, Settings.of(x=1))])
+    run_and_note(tmp_path, [Stage("s", writing("whole"), Settings.of(x=2))])
     assert not (tmp_path / "s" / "partial").exists()
 
 
@@ -136,7 +142,7 @@ def test_until_stops_after_the_named_stage_and_unknown_names_are_refused(tmp_pat
     with pytest.raises(StageError, match="first, second, other; got 'third'"):
         run_and_note(tmp_path, job(), until="third")
     with pytest.raises(StageError, match="'b' needs a"):
-        run_and_note(tmp_path, [Stage("b", writing(""), {}, after=("a",))])
+        run_and_note(tmp_path, [Stage("b", writing(""), Settings.of(), after=("a",))])
 
 
 def test_the_digest_sees_names_and_contents(tmp_path):
@@ -184,9 +190,9 @@ def photographed(second_setting=1, third_setting=1):
         write_atomically(folder / "scene", f"learned {second_setting}")
 
     return [
-        Stage("first", photograph, {}, bulk=("photos",)),
-        Stage("second", learn, {"y": second_setting}, after=("first",), reads_bulk_of=("first",)),
-        Stage("third", writing("c"), {"z": third_setting}, after=("first", "second")),
+        Stage("first", photograph, Settings.of(), bulk=("photos",)),
+        Stage("second", learn, Settings.of(y=second_setting), after=("first",), reads_bulk_of=("first",)),
+        Stage("third", writing("c"), Settings.of(z=third_setting), after=("first", "second")),
     ]
 
 

@@ -129,6 +129,15 @@ class History:
         return ended.stdout
 
 
+def last_commit(folder: Path) -> str:
+    """The commit that last changed a file of a folder; empty where git does not say."""
+    try:
+        newest = next(iter(History(folder, ["."]).changes.values()))
+    except NoHistory:
+        return ""
+    return newest[-1].commit
+
+
 def blob_of(file: Path, like: str) -> str:
     """The hash that git gives a file's content, of the kind of another hash."""
     data = file.read_bytes()

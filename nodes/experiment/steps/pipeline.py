@@ -1,0 +1,185 @@
+"""The stages of an experiment: what each one reads of the experiment file, its other inputs, and its version."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from advnerf_core.attack.objectives import objective_key
+from nodes.experiment.engine.artefact import Settings
+from nodes.experiment.engine.stages import Stage
+from nodes.experiment.plan.config import NETWORK
+from nodes.experiment.plan.object_kinds import files_of, name_of
+from nodes.experiment.plan.space_config import FaceConfig
+from nodes.experiment.show import objects
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.given import given_in, victim_sha256
+from nodes.experiment.steps import bake, capture, live, policy, retrain, scene
+from nodes.launching.launch_file import load_launch
+from nodes.runtime.progress import MeasuringReport
+
+# Raised when what a stage makes changes with the same settings, or a default that it reads does: then its old results, and all that build
+# on them, are made again. tests/nodes/experiment/test_versions.py fails where one of them changed and the version did not.
+VERSIONS = {"capture": 1, "scene": 2, "bake": bake.VERSION, "object": 2, "policy": 2, "retrain": 1, "live": 1}
+# What a stage may read of the experiment file, as `BaseModel.model_dump` includes it; its key has nothing else of the file. Worlds,
+# views, and code and files of a user's are inputs.
+_FACE: dict[str, Any] = {"space": {"kind", "panel", "plain_rgb", "resolution"}}
+_OBJECTS: dict[str, Any] = {"objects": True, "object": {"panel_resolution", "panel_rgb", "panel_light"}}
+_DRIVE: dict[str, Any] = {"scenarios": True, "horizon": True, "dt_s": True}
+READS: Mapping[str, dict[str, Any]] = {
+    "capture": {"capture": True, **_FACE, **_OBJECTS, **_DRIVE},
+    "scene": {"scene": True, "capture": {"colour_pairs"}},
+    "bake": _DRIVE,
+    "object": {"object": {"car_resolution", "hydrant_resolution", "mesh_resolution", "fit_steps"}},
+    "policy": {"policy": True, "attack": {"random_sigma"}, **_FACE, **_OBJECTS, **_DRIVE},
+    "retrain": {
+        **dict.fromkeys(("retrain", "policy", "space", "attack", "held_cap_m"), True),
+        "deploy": {"car", "camera"},
+        **_OBJECTS,
+        **_DRIVE,
+    },
+    "live": {"deploy": {"nodes", "camera", "laps", "empty_scene"}, "held_cap_m": True, **_FACE, **_DRIVE},
+}
+# What the defence does not read of the gradient of the first seed, which it answers; the objective is an input.
+_UNREAD_BY_RETRAIN = {
+    "policy": NETWORK,
+    "attack": {"methods", "objective", "seeds", "cem_population", "cache_mib"},
+}
+# Files that policies are trained with, beside what comes of it.
+_TRAINING_FILES = ("frames", "*.checkpoint.safetensors", "*.shards.json", "settings.json")
+
+
+class _Module(Protocol):
+    def run(self, experiment: Experiment, folder: Path, report: MeasuringReport, /) -> None: ...
+
+
+def stages_of(experiment: Experiment) -> list[Stage]:
+    """The stages that cells need; the world must not have been opened for them.
+
+    More rounds of retraining go on from those that are there.
+    """
+    config = experiment.config
+    found = [_capture(experiment), _scene(experiment), _bake(experiment), _object(experiment)]
+    if config.trains:
+        found.append(_policy(experiment))
+    if config.retrain is not None:
+        found.append(_retrain(experiment, config.retrain.rounds))
+    if config.deploy.live and (config.deploy.laps or config.deploy.empty_scene):
+        found.append(_live(experiment))
+    return found
+
+
+def _stage(
+    name: str,
+    module: _Module,
+    experiment: Experiment,
+    settings: Settings,
+    after: Sequence[str] = (),
+    **others: Any,
+) -> Stage:
+    def work(folder: Path, report: MeasuringReport) -> None:
+        module.run(experiment, folder, report)
+
+    return Stage(name, work, settings, after, VERSIONS[name], **others)
+
+
+def _capture(experiment: Experiment) -> Stage:
+    config = experiment.config
+    unread: dict[str, Any] = {"object": {"panel_resolution", "panel_rgb"}}
+    if isinstance(config.space, FaceConfig):
+        unread["space"] = {"resolution"}
+    else:
+        unread["space"] = True
+    inputs = {"world": experiment.seen_settings}
+    # A rule follows the drive that is measured; so does what looks for the light on a panel.
+    if experiment.has_rules or config.object.panel_light == "measured":
+        inputs["view"] = experiment.view_settings
+    else:
+        unread |= dict.fromkeys(("objects", "object", "horizon", "dt_s"), True)
+    settings = Settings.of(config, READS["capture"], unread, **inputs)
+    return _stage("capture", capture, experiment, settings, bulk=(capture.PHOTOS, capture.COLOUR_PAIRS))
+
+
+def _scene(experiment: Experiment) -> Stage:
+    settings = Settings.of(experiment.config, READS["scene"], view=experiment.view_settings)
+    return _stage("scene", scene, experiment, settings, ("capture",), reads_bulk_of=("capture",))
+
+
+def _bake(experiment: Experiment) -> Stage:
+    settings = Settings.of(experiment.config, READS["bake"], view=experiment.view_settings)
+    return _stage("bake", bake, experiment, settings, ("capture", "scene"))
+
+
+def _object(experiment: Experiment) -> Stage:
+    kinds = sorted({thing.kind for thing in experiment.config.objects}, key=name_of)
+    settings = Settings.of(
+        experiment.config, READS["object"], kinds=list(map(name_of, kinds)), files=files_of(kinds)
+    )
+    return _stage("object", objects, experiment, settings)
+
+
+def _learned_from(experiment: Experiment) -> dict[str, Any]:
+    """Inputs of what is learned from pictures of the world and of the learned scene."""
+    return {
+        "world": experiment.world_settings,
+        "view": experiment.view_settings,
+        # Not the digest of what was baked, as machines differ in the last bits of it.
+        "bake": VERSIONS["bake"],
+        "architecture": experiment.config.policy.network.described(),
+    }
+
+
+def _policy(experiment: Experiment) -> Stage:
+    config = experiment.config
+    is_face = isinstance(config.space, FaceConfig)
+    unread: dict[str, Any] = {"policy": NETWORK}
+    unread |= dict.fromkeys(("objects", "object") if is_face else ("space",), True)
+    # The angle at which a screen is seen follows the drive that is measured, and so do rules in other places.
+    if not (is_face or config.policy.learns_in):
+        unread["horizon"] = True
+    settings = Settings.of(config, READS["policy"], unread, **_learned_from(experiment))
+    return _stage(
+        "policy", policy, experiment, settings, ("capture", "scene", "object"), bulk=_TRAINING_FILES
+    )
+
+
+def _retrain(experiment: Experiment, rounds: int) -> Stage:
+    attack = experiment.config.attack
+
+    def settings(count: int) -> Settings:
+        assert experiment.config.retrain is not None
+        fewer = experiment.config.retrain.model_copy(update={"rounds": count})
+        return Settings.of(
+            experiment.config.model_copy(update={"retrain": fewer}),
+            READS["retrain"],
+            _UNREAD_BY_RETRAIN,
+            objective=objective_key(attack.objective),
+            attack_seed=attack.seeds[0],
+            **_learned_from(experiment),
+        )
+
+    return _stage(
+        "retrain",
+        retrain,
+        experiment,
+        settings(rounds),
+        ("scene", "object", "policy"),
+        resumes_from=[settings(fewer) for fewer in range(1, rounds)],
+        reads_bulk_of=("policy",),
+    )
+
+
+def _live(experiment: Experiment) -> Stage:
+    config, main = experiment.config, experiment.config.main_victim
+    # The same on every machine, wherever it is installed.
+    graph = load_launch(experiment.launch_file, twin_calibration="calibration/twin").resolved
+    is_given = main in given_in(config)
+    settings = Settings.of(
+        config,
+        READS["live"],
+        world=experiment.world_settings,
+        graph=graph,
+        victim=victim_sha256(experiment, main) if is_given else main,
+    )
+    return _stage("live", live, experiment, settings, ("capture",) if is_given else ("capture", "policy"))
