@@ -75,19 +75,16 @@ class AdaptedPolicy(nn.Module):
         """Each input and output in words, with its shape and what it is used for: those of the file, else those of the contract."""
         contract, tensors = self.contract, getattr(self.network, "tensors", None)
         if tensors is not None:
-            column = contract.output_column
             rows = [("input", each) for each in tensors.inputs] + [
                 ("output", each) for each in tensors.outputs
             ]
-            return [(what, f"{each}: {tensors.use_of(each, column)}") for what, each in rows]
+            return [(what, f"{each}: {tensors.use_of(each, contract.meaning)}") for what, each in rows]
         goals = [("input", f"goals [B, {self.goal_size}]")] if self.goal_size else []
-        columns = (
-            "[B] or [B, 1]" if contract.output_column is None else f"[B, N], column {contract.output_column}"
-        )
+        columns = "[B] or [B, 1]" if contract.output_column is None else "[B, N]"
         return [
             ("input", f"images [B, {', '.join(map(str, contract.input_shape))}]"),
             *goals,
-            ("output", f"steering {columns}"),
+            ("output", f"{columns}: {contract.meaning}"),
         ]
 
     def _check_goals(self, goals: Tensor | None, batch: int) -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from advnerf_core.policies.adapter import AdaptedPolicy
+from advnerf_core.policies.answer import answer
 from advnerf_core.policies.contract import PolicyContractError
 from advnerf_core.policies.hypotheses import USEFUL_ERROR, Array, judge, steering_of
 from advnerf_core.policies.network import images_to_tensor
@@ -27,6 +28,9 @@ LARGEST_STEERING_RAD = 1.2
 # Outputs that should be equal may differ by this share of their spread: batched kernels round differently.
 _EQUAL_SHARE = 1e-3
 _CONSTANT_RAD = 1e-6
+_SIZE_ADVICE = (
+    "set the view's width and height to the size it was trained with, and the output to [B] or [B, 1]"
+)
 _PROBES = 4
 _MODES = (nn.modules.dropout._DropoutNd, nn.modules.batchnorm._BatchNorm)
 
@@ -69,7 +73,7 @@ def check_policy(
     findings.append(runs)
     if runs.verdict == FAILURE:
         return findings
-    for look in (_finite, _repeatable, _independent, _gradient):
+    for look in (_finite, _answer, _repeatable, _independent, _gradient):
         finding = look(examined, images)
         findings.append(finding)
         if finding.verdict == FAILURE and look in (_finite, _repeatable):
@@ -95,10 +99,13 @@ class _Examined:
     def steering(self, images: NDArray[np.uint8]) -> Array:
         return steering_of(self.policy, self.policy.contract, images, self.goal)
 
-    def __call__(self, images: Tensor) -> Tensor:
-        goals = (
+    def goals(self, images: Tensor) -> Tensor | None:
+        return (
             None if self.goal is None else torch.tensor(self.goal, dtype=images.dtype).expand(len(images), -1)
         )
+
+    def __call__(self, images: Tensor) -> Tensor:
+        goals = self.goals(images)
         if self.policy.stateless:
             steering: Tensor = self.policy(images, goals)
         else:
@@ -140,6 +147,8 @@ def _remedy(examined: _Examined, batch: Tensor) -> str:
     """Which other shape the network would take."""
     contract = examined.policy.contract
     given = contract.first_input(batch)
+    if given.ndim != len(batch.shape):
+        return _SIZE_ADVICE
     # As NCHW it would be given the other layout's axes; then height and width swapped; then the commonest other sizes.
     other = given.permute(0, 2, 3, 1) if contract.layout == "NCHW" else given.permute(0, 3, 1, 2)
     attempts: list[tuple[str, Tensor]] = [
@@ -156,7 +165,7 @@ def _remedy(examined: _Examined, batch: Tensor) -> str:
     for advice, images in attempts:
         if _accepts(examined, images):
             return advice
-    return "set the view's width and height to the size it was trained with, and the output to [B] or [B, 1]"
+    return _SIZE_ADVICE
 
 
 def _resized(images: Tensor, height: int, width: int) -> Tensor:
@@ -164,10 +173,8 @@ def _resized(images: Tensor, height: int, width: int) -> Tensor:
 
 
 def _accepts(examined: _Examined, given: Tensor) -> bool:
-    policy, goal = examined.policy, examined.goal
-    extra: list[Any] = (
-        [] if goal is None else [torch.tensor(goal, dtype=torch.float32).expand(len(given), -1)]
-    )
+    policy = examined.policy
+    extra: list[Any] = [] if examined.goal is None else [examined.goals(given)]
     try:
         with torch.no_grad():
             raw = policy.network(given.contiguous(), *extra)
@@ -184,6 +191,26 @@ def _finite(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
             advice = "look for a division by a spread or a logarithm of zero, and for damaged weights"
             return Finding("finite", FAILURE, f"the output on {name} is NaN or infinite; {advice}")
     return Finding("finite", OK, "finite on every image, also on black and white")
+
+
+def _answer(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
+    """What it answers to the first image, in the words of its declaration."""
+    policy, contract, batch = examined.policy, examined.policy.contract, images_to_tensor(images[:1])
+    memory = None if policy.stateless else policy.initial_memory(1)
+    with torch.no_grad():
+        raw, _ = answer(contract, policy.network, batch, examined.goals(batch), memory)
+        steering_rad = float(contract.to_steering_rad(raw, 1)[0])
+    side = "left" if steering_rad > 0.0 else "right"
+    text = f"to the first image {steering_rad:+.3f} rad, {abs(np.rad2deg(steering_rad)):.1f} degrees to the {side}"
+    if contract.trajectory is not None:
+        waypoints = contract.waypoints_m(raw, 1)
+        x, y = waypoints[0, -1].tolist()
+        speed_mps = float(contract.trajectory.speed_mps(waypoints)[0])
+        text += (
+            f", for waypoints up to {x:.2f} m ahead and {y:+.2f} m to the left; their speed, {speed_mps:.2f} m/s, is not used: the cars here "
+            "drive at a constant speed"
+        )
+    return Finding("answer", OK, text)
 
 
 def _repeatable(examined: _Examined, images: NDArray[np.uint8]) -> Finding:

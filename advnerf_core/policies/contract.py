@@ -197,6 +197,15 @@ class PolicyContract:
         return self.frames is not None or not self.stateless
 
     @property
+    def meaning(self) -> str:
+        """What the output is, in words."""
+        if self.trajectory is not None:
+            return f"{len(self.trajectory.times_s)} waypoints"
+        if self.bins is not None:
+            return f"scores of {len(self.bins.values)} steering values"
+        return "steering" if self.output_column is None else f"steering, column {self.output_column}"
+
+    @property
     def input_shape(self) -> tuple[int, ...]:
         """Shape of the network's image input without its batch."""
         count = 1 if self.frames is None else self.frames.count

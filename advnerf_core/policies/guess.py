@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -244,3 +246,18 @@ def _last(tensor: TensorInfo) -> int | None:
     """Last dimension of a tensor; None if it is not fixed."""
     size = (tensor.shape or (None,))[-1]
     return size if isinstance(size, int) else None
+
+
+def declaration_text(contract: PolicyContract, questions: Sequence[Question]) -> str:
+    """A declaration as YAML to be put beside the file: what is not the default, and what was asked for, with the question above."""
+    plain, default = contract.to_dict(), PolicyContract(contract.view).to_dict()
+    asked = {each.key: each for each in questions}
+    lines = []
+    for name in dict.fromkeys(("view", *plain)):
+        if name not in asked and name != "view" and plain[name] == default.get(name):
+            continue
+        if question := asked.get(name):
+            choices = f" ({' or '.join(question.choices)})" if question.choices else ""
+            lines.append(f"# {question.text}{choices}")
+        lines.append(f"{name}: {json.dumps(plain[name])}")
+    return "\n".join([*lines, ""])

@@ -171,7 +171,8 @@ def _range_changes(contract: PolicyContract) -> Iterator[Hypothesis]:
 def _output_changes(contract: PolicyContract) -> Iterator[Hypothesis]:
     side = "right" if contract.positive == "left" else "left"
     of_side = (f"steers positive to the {side}, not to the {contract.positive}", f"set positive = {side!r}")
-    units = [unit for unit in ("deg", "rad") if unit != contract.output_unit]
+    # Waypoints are in metres.
+    units = [unit for unit in ("deg", "rad") if unit != contract.output_unit and contract.trajectory is None]
     bases: list[tuple[tuple[tuple[str, str], ...], PolicyContract]] = [((), contract)]
     for unit in units:
         words = f"steers in {_UNIT_WORDS[unit]} for {_UNIT_WORDS[contract.output_unit]}"

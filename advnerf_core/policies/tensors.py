@@ -61,10 +61,10 @@ class Tensors:
         """Whether the file takes one image at a time."""
         return (self.image.shape or ())[:1] == (1,)
 
-    def use_of(self, tensor: TensorInfo, column: int | None) -> str:
-        """What a tensor is used for, in words."""
+    def use_of(self, tensor: TensorInfo, meaning: str) -> str:
+        """What a tensor is used for, in words; the output that is used has the declaration's ``meaning``."""
         if tensor is self.steering:
-            return "steering" if column is None else f"steering, column {column}"
+            return meaning
         for state in self.states:
             if tensor.name in (state.declared.input, state.declared.output):
                 return f"memory, {state.declared.output} to {state.declared.input}"

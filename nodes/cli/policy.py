@@ -55,6 +55,12 @@ def policy_check(
     bag: Annotated[
         Path | None, typer.Option(exists=True, help="Bag of a drive: check on its frames and poses.")
     ] = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option(
+            exists=True, help="Picture of the policy's camera: check the adapter on it, without an expert."
+        ),
+    ] = None,
     room: Annotated[
         Path,
         typer.Option(
@@ -67,15 +73,18 @@ def policy_check(
 ) -> None:
     """Check a policy's adapter and whether the policy drives. Without a source option, the simulated lab is used.
 
-    Exit code 1 if the adapter is wrong, or if the policy does not drive in the given scene.
+    Of a file without a declaration it prints one to correct. Exit code 1 then, if the adapter is wrong, or if the policy does not drive in the
+    given scene.
     """
     from advnerf_core.attack.methods import black_box_methods
     from advnerf_core.policies.conformance import FAILURE, check_policy
-    from advnerf_core.policies.load import load_adapted
+    from advnerf_core.policies.load import is_factory, load_adapted
     from nodes.lab.policy_reference import judged_by_drives
 
+    if not is_factory(policy) and _lacks_declaration(Path(policy)):
+        raise typer.Exit(_FAILURE_EXIT)
     adapted, sha256 = load_adapted(policy)
-    reference = _reference(adapted.contract.view, run_folder, bag, room, scene, calibration)
+    reference = _reference(adapted.contract.view, run_folder, bag, room, scene, calibration, picture)
     print(f"{policy} ({sha256[:12]}) on {reference.source}")
     told = tuple(goal) if goal else None
     methods = black_box_methods(adapted.stateless)
@@ -93,6 +102,21 @@ def policy_check(
         raise typer.Exit(_FAILURE_EXIT)
 
 
+def _lacks_declaration(file: Path) -> bool:
+    """Whether a file does not say how it was trained; then print what it says, and a declaration to correct."""
+    from advnerf_core.policies.declaration import DECLARATION_SUFFIX
+    from advnerf_core.policies.guess import declaration_text, guess_contract, tensors_of
+
+    contract, questions = guess_contract(file)
+    if not questions:
+        return False
+    inputs, outputs, _ = tensors_of(file)
+    print(f"{file} takes {', '.join(map(str, inputs))} and gives {', '.join(map(str, outputs))}.")
+    print("It does not say how it was trained. Correct what the comments ask for, and save these lines as")
+    print(f"{file}{DECLARATION_SUFFIX}:\n\n{declaration_text(contract, questions)}")
+    return True
+
+
 def _reference(
     view: PolicyView,
     run_folder: Path | None,
@@ -100,12 +124,17 @@ def _reference(
     room: Path,
     scene: Path | None,
     calibration: Path | None,
+    picture: Path | None,
 ) -> ReferenceFrames:
-    from nodes.lab.policy_reference import from_bag, from_run, from_scene, from_twin
+    from nodes.lab.policy_reference import from_bag, from_picture, from_run, from_scene, from_twin
     from nodes.runtime.errors import ConfigError
 
-    if sum(each is not None for each in (run_folder, bag, scene)) > 1:
-        raise ConfigError("expected at most one of --run-folder, --bag and --scene, got several; keep one")
+    if sum(each is not None for each in (run_folder, bag, scene, picture)) > 1:
+        raise ConfigError(
+            "expected at most one of --run-folder, --bag, --scene and --picture, got several; keep one"
+        )
+    if picture is not None:
+        return from_picture(picture, view)
     if (scene is None) != (calibration is None):
         raise ConfigError("expected --scene and --calibration together, got one of them; add the other")
     if scene is not None and calibration is not None:

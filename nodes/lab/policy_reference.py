@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from advnerf_core.data.image_files import read_stored
 from advnerf_core.data.transforms import load_transforms
 from advnerf_core.data.view_loading import load_image
 from advnerf_core.driving.clean_drive import CleanDrive
@@ -47,14 +48,14 @@ class ReferenceFrames:
 
     Attributes:
         images: Policy images ``[N, H, W, 3]`` uint8 RGB.
-        steering_rad: The expert's steering ``[N]`` [rad], left positive.
+        steering_rad: The expert's steering ``[N]`` [rad], left positive; None if it is not known.
         source: Origin of the frames, as text.
         drives: Drives a policy without an attack in the place of the frames; None if it cannot be driven, as for a bag.
         asked: Whether the user named this place. If so, a policy that does not drive there fails.
     """
 
     images: NDArray[np.uint8]
-    steering_rad: NDArray[np.float64]
+    steering_rad: NDArray[np.float64] | None
     source: str
     drives: Drives | None = None
     asked: bool = False
@@ -116,6 +117,13 @@ def from_bag(bag: Path, room: Path, view: PolicyView, count: int = 96) -> Refere
     return ReferenceFrames(
         np.stack(images), np.array(steering), f"{len(images)} frames of {bag}{unchecked}", asked=True
     )
+
+
+def from_picture(file: Path, view: PolicyView) -> ReferenceFrames:
+    """A picture of the policy's camera, its mirror image, and both at half the brightness; what is right on them is not known."""
+    rgb, _ = read_stored(file)
+    both = np.stack([_seen(view, each, str(file)) for each in (rgb, np.ascontiguousarray(rgb[:, ::-1]))])
+    return ReferenceFrames(np.concatenate([both, both // 2]), None, f"{file}, mirrored and darker")
 
 
 def from_run(folder: Path, view: PolicyView) -> ReferenceFrames:
@@ -240,6 +248,6 @@ def _seen(view: PolicyView, rgb: NDArray[np.uint8], source: str) -> NDArray[np.u
     if rgb.shape[:2] != (camera.height, camera.width):
         raise ConfigError(
             f"expected images of {camera.width} x {camera.height}, as in the policy's view, got {rgb.shape[1]} x "
-            f"{rgb.shape[0]} from {source}; give frames of the policy's camera with --bag"
+            f"{rgb.shape[0]} from {source}; give frames of the policy's camera with --bag, or one with --picture"
         )
     return view.image(rgb)

@@ -5,8 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from onnx import TensorProto
 from typer.testing import CliRunner
 
+from advnerf_core.data.image_files import write_image
 from advnerf_core.data.posed_images import write_posed_images
 from advnerf_core.driving.expert import Expert
 from advnerf_core.driving.path import Arc
@@ -16,6 +18,7 @@ from advnerf_core.geometry import Pinhole, planar_pose
 from advnerf_core.policies.adapter import adapt
 from advnerf_core.policies.conformance import FAILURE, OK, WARNING, Finding
 from advnerf_core.policies.contract import PolicyContract
+from advnerf_core.policies.guess import guess_contract
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.field import SceneField, SceneFieldConfig, save_scene
 from calibration.schema import CameraCalibration, RoomCalibration, load_calibration, save_calibration
@@ -24,6 +27,7 @@ from nodes.cli.main import app
 from nodes.lab.policy_reference import from_bag, from_run, from_scene, from_twin, judged_by_drives
 from nodes.runtime.errors import BagError, ConfigError
 from nodes.runtime.messages import encode, image_message, pose_message
+from tests.support.onnx_models import mean_model, save_beside
 
 ROOT = Path(__file__).parents[2]
 TWIN = ROOT / "calibration" / "twin"
@@ -181,6 +185,36 @@ def test_the_command_fails_for_a_policy_that_does_not_drive_where_it_was_asked_t
         )
         assert done.exit_code == code, done.output
         assert ("NO DRIVE" in done.output) == (code == 1)
+
+
+def test_a_file_without_a_declaration_is_given_one_to_correct_and_then_checked_on_a_picture(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setenv("COLUMNS", "300")
+    file = save_beside(mean_model([0.5, 0.25], columns=True, kind=TensorProto.UINT8), tmp_path / "mine.onnx")
+    beside = tmp_path / "mine.onnx.policy.yaml"
+    beside.unlink()
+    asked = CliRunner().invoke(app, ["policy", "check", str(file)])
+    assert asked.exit_code == 1
+    before, _, declaration = asked.output.partition(":\n\n")
+    assert "takes images [B, 3, 8, 12] uint8 and gives steering [B, 2] float32" in before
+    for comment in (
+        "# steering [B, 2] float32 has 2 columns: which one steers?",
+        "# To which side",
+        "# In which unit",
+    ):
+        assert comment in declaration
+    assert "value_max: 255.0" in declaration, "eight bits leave one range"
+    assert "layout" not in declaration, "what the file says and is the default"
+    beside.write_text(declaration.replace("output_column: 0", "output_column: 1").replace('"rad"', '"deg"'))
+    assert guess_contract(file)[1] == []
+    picture = np.full((8, 12, 3), 100, np.uint8)
+    picture[:4] = 200
+    write_image(tmp_path / "seen.png", picture)
+    checked = CliRunner().invoke(app, ["policy", "check", str(file), "--picture", str(tmp_path / "seen.png")])
+    steering_rad = np.deg2rad(0.25 * 150)
+    assert f"to the first image {steering_rad:+.3f} rad, 37.5 degrees to the left" in checked.output
+    assert checked.exit_code == 0, checked.output
 
 
 def test_the_twin_gives_left_and_right(monkeypatch):

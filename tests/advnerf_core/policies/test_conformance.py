@@ -9,6 +9,8 @@ from advnerf_core.geometry import Pinhole
 from advnerf_core.policies.adapter import adapt
 from advnerf_core.policies.conformance import FAILURE, OK, check_policy
 from advnerf_core.policies.contract import PolicyContract
+from advnerf_core.policies.frames import FrameStack
+from advnerf_core.policies.tracker import TrackedTrajectory
 from advnerf_core.policies.view import PolicyView
 
 VIEW = PolicyView(Pinhole(336, 188, 173.97, 173.97, 168.0, 94.0), width=40, height=22)
@@ -250,3 +252,26 @@ def test_a_network_of_yuv_that_is_declared_rgb_is_recognised():
     found = findings(around(from_yuv))
     assert "takes YUV for RGB: set colour_space = 'YUV'" in found["expert"].text
     assert findings(around(from_yuv), replace(DECLARED, colour_space="YUV"))["expert"].verdict == OK
+
+
+class Sees(nn.Module):
+    """A network that a declaration of two images and waypoints fits: the seer on the newest, on a straight line."""
+
+    def forward(self, images):
+        side = Seer()(images[:, 1])
+        ahead = torch.tensor([0.4, 0.8], dtype=images.dtype)
+        return torch.stack([ahead + 0.0 * side[:, None], ahead * side[:, None]], dim=2)
+
+
+def test_waypoints_and_stacks_are_checked_too():
+    tracked = TrackedTrajectory(times_s=(0.5, 1.0), lookahead_m=0.4, wheelbase_m=0.2)
+    contract = replace(DECLARED, frames=FrameStack(count=2, axis="time"), trajectory=tracked)
+    found = findings(Sees().eval(), contract)
+    assert {each.verdict for each in found.values()} == {OK}
+    assert "waypoints up to 0.80 m ahead" in found["answer"].text
+    assert "is not used: the cars here drive at a constant speed" in found["answer"].text
+    assert (
+        "set positive = 'left'" in findings(Sees().eval(), replace(contract, positive="right"))["expert"].text
+    )
+    wrong = replace(contract, frames=FrameStack(count=3, axis="channels"))
+    assert findings(Sees().eval(), wrong)["input"].verdict == FAILURE
