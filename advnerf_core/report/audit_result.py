@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AwareDatetime, Field, model_validator
 
 from advnerf_core.documents import Document, read_json
 from advnerf_core.files import write_json
@@ -192,7 +192,7 @@ class AuditResult(StrictModel):
     versions: dict[str, str] = Field(
         description="Version of each program that a number depends on, by its name."
     )
-    date: Text = Field(description="When it ended, ISO 8601.")
+    date: AwareDatetime = Field(description="When it ended, ISO 8601 with time zone.")
 
     @model_validator(mode="after")
     def _is_consistent(self) -> AuditResult:

@@ -1,0 +1,1 @@
+"""An audit's result in the formats of other tools: OpenSCENARIO, SARIF and JUnit."""
