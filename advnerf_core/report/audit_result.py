@@ -33,13 +33,14 @@ FORMAT: Literal["advnerf-audit-1"] = "advnerf-audit-1"
 Outcome = Literal["nothing_found", "found", "cannot_judge", "worse"]
 EXIT_CODES: dict[Outcome, int] = {"nothing_found": 0, "found": 1, "cannot_judge": 2, "worse": 3}
 
+ControlKind = Literal["no_object", "plain_object", "natural_picture"]
 Count = Annotated[int, Field(ge=0)]
 
 
 class AuditControl(StrictModel):
     """Drives without an attack, or past an object that was not searched."""
 
-    kind: Literal["no_object", "plain_object", "natural_picture"]
+    kind: ControlKind
     name: Text = Field(description="For readers: no object, grey panel, photograph of leaves.")
     evidence: Evidence
     mean_off_path_m: NotNegative | None = Field(
@@ -133,7 +134,9 @@ class AuditBudget(StrictModel):
     minutes: Positive | None = Field(
         default=None, description="What the user gave; converted into evaluations once."
     )
-    seconds: NotNegative = Field(description="Time that the audit took [s].")
+    seconds: NotNegative | None = Field(
+        description="Time that the audit took [s]; null where the same audit is to give the same bytes."
+    )
     ended: Literal["schedule", "budget", "interrupted"]
 
 
@@ -192,7 +195,9 @@ class AuditResult(StrictModel):
     versions: dict[str, str] = Field(
         description="Version of each program that a number depends on, by its name."
     )
-    date: AwareDatetime = Field(description="When it ended, ISO 8601 with time zone.")
+    date: AwareDatetime | None = Field(
+        description="When it ended, ISO 8601 with time zone; null where the same audit is to give the same bytes."
+    )
 
     @model_validator(mode="after")
     def _is_consistent(self) -> AuditResult:

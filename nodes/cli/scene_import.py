@@ -72,6 +72,8 @@ StepDeg = Annotated[
     ),
 ]
 
+# More images that were left out are not listed in the terminal.
+_SHOWN = 50
 Up = Literal["auto", "ground", "cameras"]
 
 
@@ -325,5 +327,7 @@ def _print_model(model: dict[str, Any]) -> None:
     print(
         f"{model['registered']} of {total} images placed, {model['points']} points, reprojection error {model['reprojection_error_px']:.2f} px"
     )
-    for image in model["left_out"]:
+    for image in model["left_out"][:_SHOWN]:
         print(f"left out: {image['name']}: {image['why']}")
+    if (more := len(model["left_out"]) - _SHOWN) > 0:
+        print(f"left out: {more} more, which import.json names")

@@ -26,7 +26,8 @@ def write_junit(file: Path, result: AuditResult) -> None:
     from junitparser import TestSuite
 
     suite = TestSuite(SUITE)
-    suite.timestamp = result.date.replace(microsecond=0).isoformat()
+    if result.date is not None:
+        suite.timestamp = result.date.replace(microsecond=0).isoformat()
     for name, value in _properties(result):
         suite.add_property(name, value)
     for case in (*_needs(result), _verdict(result)):
@@ -58,7 +59,9 @@ def _needs(result: AuditResult) -> Iterator[TestCase]:
 def _verdict(result: AuditResult) -> TestCase:
     from junitparser import Error, Failure, TestCase
 
-    case = TestCase(HOLDS_PATH, time=round(result.budget.seconds, 3))
+    case = TestCase(HOLDS_PATH)
+    if result.budget.seconds is not None:
+        case.time = round(result.budget.seconds, 3)
     verdict = result.verdict
     if verdict.outcome == "cannot_judge":
         case.result = [Error("; ".join(verdict.reasons), verdict.outcome)]

@@ -9,6 +9,7 @@ OpenSCENARIO has the frames of advnerf (ISO 8855): x forward, y left, z up, a ve
 
 from __future__ import annotations
 
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,8 @@ from advnerf_core.report.audit_result import AuditResult
 
 EGO, OBJECT, REPLAY = "Ego", "Object", "replay"
 _MINOR_VERSION = 2
+# The format asks for a date; without one the library would write today's.
+_NO_DATE = datetime(1970, 1, 1, tzinfo=timezone.utc)
 _WAYPOINTS = 30
 # What the format asks of a vehicle and an audit need not know, in shares of the wheelbase; the file lists what was assumed.
 _LENGTH, _WIDTH, _HEIGHT, _WHEEL, _REAR_OVERHANG = 1.6, 0.65, 0.55, 0.24, 0.3
@@ -71,7 +74,7 @@ def _scenario(result: AuditResult) -> Any:
         xosc.RoadNetwork(roadfile=result.place.road_network),
         xosc.Catalog(),
         osc_minor_version=_MINOR_VERSION,
-        creation_date=result.date,
+        creation_date=result.date or _NO_DATE,
     )
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Set
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 import numpy as np
@@ -80,7 +80,9 @@ def from_colmap(model: Path, images: Path, output: Path, config: ColmapConfig, r
     def build(folder: Path) -> Imported:
         report(0.0, "reading the model")
         found = read_colmap(model, config.model)
-        kept = _copy_images(found, images, folder, lambda share, text="": report(_with_reading(share), text))
+        kept = _copy_images(
+            found, images, folder, output, lambda share, text="": report(_with_reading(share), text)
+        )
         similarity, facts = _place(found, lambda: _views(kept, folder), config)
         facts = {
             "structure_from_motion": kept.summary(),
@@ -99,8 +101,9 @@ def _with_reading(share: float) -> float:
     return _READING_SHARE + (1.0 - _READING_SHARE) * share
 
 
-def _copy_images(found: ColmapModel, images: Path, folder: Path, report: Report) -> Model:
+def _copy_images(found: ColmapModel, images: Path, folder: Path, output: Path, report: Report) -> Model:
     """The model of those images that are there, under the names that they have in the data set."""
+    made = {folder.resolve(), output.resolve()}
     model, kept, left_out = found.model, list[Registered](), list(found.model.left_out)
     files = {each.name: _file_of(images, each.name) for each in model.images}
     _require_some(files, images)
@@ -114,7 +117,7 @@ def _copy_images(found: ColmapModel, images: Path, folder: Path, report: Report)
             left_out.append(LeftOut(image.name, str(error)))
         report((index + 1) / len(model.images), f"{index + 1} of {len(model.images)} images copied")
     known = {*files, *(each.name for each in left_out)}
-    left_out += [LeftOut(name, "it has no pose in the model") for name in _others(images, known)]
+    left_out += [LeftOut(name, "it has no pose in the model") for name in _others(images, known, made)]
     if len(kept) < MIN_IMAGES:
         raise ImportRecordingError(
             f"expected at least {MIN_IMAGES} readable images in {images}, got {len(kept)}; {left_out[0].name}: {left_out[0].why}"
@@ -124,14 +127,13 @@ def _copy_images(found: ColmapModel, images: Path, folder: Path, report: Report)
 
 def _file_of(images: Path, name: str) -> Path | None:
     """The image in the folder; None if it is not there."""
-    for written in (name, name.replace("\\", "/")):
-        file = images / written
-        if not file.resolve().is_relative_to(images.resolve()):
+    for written in (PurePosixPath(name), PurePosixPath(name.replace("\\", "/"))):
+        if written.is_absolute() or ".." in written.parts:
             raise ImportRecordingError(
                 f"expected names of images inside {images}, the model has {name!r}; rename it in the model"
             )
-        if file.is_file():
-            return file
+        if (images / written).is_file():
+            return images / written
     return None
 
 
@@ -148,11 +150,12 @@ def _require_some(files: dict[str, Path | None], images: Path) -> None:
     )
 
 
-def _others(images: Path, known: set[str]) -> list[str]:
+def _others(images: Path, known: set[str], made: Set[Path]) -> list[str]:
+    """Images in the folder that the model does not know; not those of data sets that are made inside it."""
     names = (
         file.relative_to(images).as_posix()
         for file in images.rglob("*")
-        if file.suffix.lower() in SUFFIXES and file.is_file()
+        if file.suffix.lower() in SUFFIXES and file.is_file() and made.isdisjoint(file.resolve().parents)
     )
     return sorted(set(names) - {name.replace("\\", "/") for name in known})
 
@@ -206,8 +209,9 @@ def _place(
     if ground is not None:
         up = f"normal of the ground, a plane of {ground.points} points at z = 0"
     if config.positions is not None:
-        fit = fit_known_positions(model, _read_positions(config.positions), ground)
-        source = f"known positions of {fit.images} images, rms {fit.rms_m:.3g} m, worst {fit.worst_m:.3g} m ({fit.worst})"
+        positions = _read_positions(config.positions)
+        fit = fit_known_positions(model, positions, ground)
+        source = f"known positions of {fit.images} images ({len(positions)} in the file), rms {fit.rms_m:.3g} m, worst {fit.worst_m:.3g} m ({fit.worst})"
         return fit.similarity, _facts(
             "positions",
             source,

@@ -217,6 +217,16 @@ def test_exports_load_neither_torch_nor_scipy_before_they_are_asked():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+def test_without_a_date_and_a_time_the_same_audit_gives_the_same_bytes(tmp_path):
+    written = []
+    for folder in (tmp_path / "one", tmp_path / "other"):
+        result = audit_result(date=None, budget={**audit()["budget"], "seconds": None})
+        written.append([file.read_bytes() for file in write_exports(folder, result)])
+    assert written[0] == written[1]
+    assert asam_issues(tmp_path / "one" / "audit.xosc")[0] == []
+    assert b"2026" not in b"".join(written[0])
+
+
 @pytest.mark.slow
 def test_microsofts_multitool_finds_no_error_in_sarif(tmp_path):
     if shutil.which("npm") is None:

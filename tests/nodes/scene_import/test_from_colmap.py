@@ -166,6 +166,14 @@ def test_what_is_not_there_is_named_and_the_rest_is_used(tmp_path, ring):
     assert left_out["other.png"] == "it has no pose in the model"
 
 
+def test_a_data_set_inside_the_folder_of_images_is_not_one_of_them(tmp_path):
+    model = write(posed(RING, NAMES), tmp_path / "model")
+    write_images(tmp_path, NAMES)
+    for _ in range(2):
+        run(tmp_path, model, tmp_path)
+        assert loaded(tmp_path)[1]["structure_from_motion"]["left_out"] == []
+
+
 def test_reduced_images_keep_their_rays(tmp_path, ring):
     run(tmp_path, ring[0], write_images(tmp_path / "half", NAMES, (WIDTH // 2, HEIGHT // 2)))
     pinhole = next(iter(loaded(tmp_path)[0].values())).pinhole
@@ -191,8 +199,20 @@ def test_other_images_are_refused_with_one_line(tmp_path, images, message):
     assert not (tmp_path / "out.part").exists()
 
 
-def test_a_model_does_not_reach_out_of_the_folder(tmp_path):
-    names = ["../secret.png", *NAMES[1:]]
+def test_images_may_be_links(tmp_path, ring):
+    links = tmp_path / "links"
+    links.mkdir()
+    for folder in ("front", "rear"):
+        (links / folder).symlink_to(ring[1] / folder)
+    run(tmp_path, ring[0], links)
+    assert set(loaded(tmp_path)[0]) == set(NAMES)
+
+
+@pytest.mark.parametrize(
+    "name", ["../secret.png", "front/../../secret.png", "..\\secret.png", "/etc/secret.png"]
+)
+def test_a_model_does_not_reach_out_of_the_folder(tmp_path, name):
+    names = [name, *NAMES[1:]]
     model = write(posed(RING, names), tmp_path / "model")
     images = write_images(tmp_path / "pictures", NAMES)
     write_images(tmp_path, ["secret.png"])
