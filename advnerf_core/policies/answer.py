@@ -20,7 +20,8 @@ def memory_before(contract: PolicyContract, network: Any, batch: int, images: An
     own = None if contract.stateless else network.initial_memory(batch)
     if contract.frames is None:
         return own
-    past = like(images, contract.frames.initial(batch, contract.size).reshape(batch, -1))
+    past = contract.frames.initial(batch, contract.size).reshape(batch, -1)
+    past = like(images if own is None else own, past)
     return past if own is None else array_module(past).concatenate([past, own.reshape(batch, -1)], 1)
 
 

@@ -36,10 +36,12 @@ class CarriedState:
 
     Attributes:
         shape: Shape of the input without the batch's axis.
+        one_by_one: Whether its batch is fixed to one.
     """
 
     declared: NetworkState
     shape: tuple[int, ...]
+    one_by_one: bool
 
     @property
     def size(self) -> int:

@@ -59,7 +59,7 @@ class Tensors:
     @property
     def one_by_one(self) -> bool:
         """Whether the file takes one image at a time."""
-        return (self.image.shape or ())[:1] == (1,)
+        return (self.image.shape or ())[:1] == (1,) or any(each.one_by_one for each in self.states)
 
     def use_of(self, tensor: TensorInfo, meaning: str) -> str:
         """What a tensor is used for, in words; the output that is used has the declaration's ``meaning``."""
@@ -105,7 +105,7 @@ def _carried(
             f"{path}: states: expected {', '.join(FLOATS)} of fixed sizes but for the batch on axis {state.batch_axis}, got {given}; correct "
             "batch_axis, or export it with fixed sizes"
         )
-    carried = CarriedState(state, sizes)
+    carried = CarriedState(state, sizes, given.shape[state.batch_axis] == 1)
     if isinstance(state.initial, tuple) and len(state.initial) != carried.size:
         raise PolicyContractError(
             f"{path}: states.initial: expected one number or {carried.size} for {given}, got {len(state.initial)}"

@@ -103,7 +103,7 @@ def test_the_gradient_through_a_stack_reaches_all_images_that_it_holds():
 
 
 def leaky(path, shape, batch_axis, initial, batch="B"):
-    """``h' = 0.5 h + mean(images) w``, ``steering = sum(h')``, with a state of the given shape without its batch."""
+    """``h' = 0.5 h + mean(images) w``, ``steering = sum(h')``, with a state of the given shape without its batch, which may be fixed."""
     full = [*shape[:batch_axis], batch, *shape[batch_axis:]]
     axes = [axis for axis in range(len(full)) if axis != batch_axis]
     weight = np.arange(1, 1 + int(np.prod(shape)), dtype=np.float32).reshape(shape) * 0.01
@@ -120,7 +120,7 @@ def leaky(path, shape, batch_axis, initial, batch="B"):
         "weight": np.expand_dims(weight, batch_axis),
         "half": np.array(0.5, np.float32),
     }
-    inputs = {"h_in": (FLOAT, full), "images": (FLOAT, [batch, 3, 8, 12])}
+    inputs = {"h_in": (FLOAT, full), "images": (FLOAT, ["B", 3, 8, 12])}
     outputs = {"h_out": (FLOAT, full), "steering": (FLOAT, [batch])}
     state = {"input": "h_in", "output": "h_out", "batch_axis": batch_axis, "initial": initial}
     return save_beside(network_model(nodes, inputs, outputs, weights), path, {"states": [state]})

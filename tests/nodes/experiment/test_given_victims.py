@@ -10,13 +10,17 @@ from typing import Any
 import numpy as np
 import onnxruntime
 import pytest
+import torch
 import yaml
 
 from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Array
+from advnerf_core.policies.contract import PolicyContract
+from advnerf_core.policies.frames import FrameStack
 from advnerf_core.policies.load import load_adapted, load_any_policy
 from advnerf_core.policies.onnx_policy import export_onnx
+from advnerf_core.policies.tracker import TrackedTrajectory
 from hardware.worlds.lab.config import LabConfig
 from hardware.worlds.lab.lab import Lab
 from nodes.experiment.plan.cell import Cell
@@ -104,6 +108,48 @@ def test_the_file_drives_as_the_runtime_of_onnx_says(folder: Path) -> None:
         world.reset(*map(float, experiment.measured_starts("track")[0]))
         for tick in range(TICKS):
             steering = steering_rad(session, experiment.view.image(world.observe(depth=False)[0]))
+            assert kept["commands"][0][tick] == pytest.approx(steering, abs=1e-5)
+            world.step(steering, experiment.car.speed_mps, experiment.config.dt_s)
+
+
+class Plans(torch.nn.Module):
+    """Two waypoints 0.4 m and 0.8 m ahead; the side is what the present image has that the one before had not."""
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        change = (
+            images[:, 1].mean((1, 2, 3)) - images[:, 0].mean((1, 2, 3)) + 0.2 * images[:, 1].mean((1, 2, 3))
+        )
+        ahead = torch.tensor([0.4, 0.8])
+        return torch.stack([ahead + 0.0 * change[:, None], change[:, None] * ahead], dim=2)
+
+
+def test_a_policy_of_waypoints_and_two_images_is_attacked_and_drives_as_the_runtime_of_onnx_says(
+    folder: Path,
+) -> None:
+    """The waypoints lie on a line, so that the point 0.5 m away and the wheel angle have a closed form."""
+    tracked = TrackedTrajectory(times_s=(0.5, 1.0), lookahead_m=0.5, wheelbase_m=0.25)
+    view = load_adapted("my_driver:factory")[0].contract.view
+    contract = PolicyContract(view, frames=FrameStack(count=2, axis="time"), trajectory=tracked)
+    export_onnx(Plans().eval(), contract, folder / "plans.onnx")
+    change = "victims={plans: {policy: plans.onnx}}"
+    run_experiment(loaded(folder, change), overrides=(change,))
+    experiment, session = loaded(folder, change), onnxruntime.InferenceSession(folder / "plans.onnx")
+    assert "total_cte_m" in read_json(experiment.cell_result(Cell("track", "plans", "random", 0)))["deployed"]
+    kept = read_json(driven_folder(experiment, Cell("track", "plans", "none", 0)) / DRIVES)
+    with Lab(LabConfig()) as world:
+        world.reset(*map(float, experiment.measured_starts("track")[0]))
+        before = None
+        for tick in range(TICKS):
+            seen = (
+                np.moveaxis(experiment.view.image(world.observe(depth=False)[0]), -1, 0).astype(np.float32)
+                / 255
+            )
+            before = seen if before is None else before
+            (points,) = session.run(None, {session.get_inputs()[0].name: np.stack([before, seen])[None]})
+            before = seen
+            side = np.sin(np.arctan2(points[0, 1, 1], points[0, 1, 0]))
+            steering = float(np.arctan(0.25 * 2.0 * side / 0.5))
+            assert abs(steering) > 1e-2
             assert kept["commands"][0][tick] == pytest.approx(steering, abs=1e-5)
             world.step(steering, experiment.car.speed_mps, experiment.config.dt_s)
 
