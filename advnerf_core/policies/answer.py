@@ -41,20 +41,20 @@ def answer(
         images, past = contract.frames.push(images, past.reshape(len(memory), *shape))
     given = contract.to_network(images)
     if contract.stateless:
-        return _one_output(contract, network(given) if goals is None else network(given, goals)), _row(past)
+        return one_output(contract, network(given) if goals is None else network(given, goals)), _row(past)
     if past is not None:
         own = own.reshape(network.initial_memory(len(memory)).shape)
     raw, own = network(given, goals, own)
     if past is not None:
         own = array_module(past).concatenate([_row(past), _row(own)], 1)
-    return _one_output(contract, raw), own
+    return one_output(contract, raw), own
 
 
 def _row(memory: Any) -> Any:
     return None if memory is None else memory.reshape(len(memory), -1)
 
 
-def _one_output(contract: PolicyContract, raw: Any) -> Any:
+def one_output(contract: PolicyContract, raw: Any) -> Any:
     """The output that is declared, of a network that returns several."""
     key: Any = contract.output_name if contract.output_name is not None else contract.output_index
     if not isinstance(raw, Mapping | list | tuple):

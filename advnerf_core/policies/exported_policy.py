@@ -18,8 +18,9 @@ from torch.utils._pytree import tree_leaves
 from advnerf_core.inputs import InputFiles
 from advnerf_core.policies.contract import PolicyContract, PolicyContractError
 from advnerf_core.policies.declaration import declaration_beside
+from advnerf_core.policies.exportable import exportable
 from advnerf_core.policies.file_network import FileNetwork
-from advnerf_core.policies.onnx_policy import example_inputs, require_states
+from advnerf_core.policies.onnx_policy import require_states
 from advnerf_core.policies.tensors import UINT8, TensorInfo, Tensors, chosen_tensors
 
 METADATA_FILE = "advnerf_policy.json"
@@ -110,24 +111,25 @@ def program_tensors(program: Any) -> tuple[list[TensorInfo], list[TensorInfo]]:
 
 
 def export_program(network: Any, contract: PolicyContract, path: Path) -> None:
-    """Write a stateless network with its declaration as an exported program, whole or not at all."""
-    if not contract.stateless:
-        raise PolicyContractError(
-            "expected a stateless policy, got one with memory: write a factory for it instead"
-        )
-    examples, _ = example_inputs(contract)
+    """Write a network with its declaration as an exported program, whole or not at all."""
+    given = exportable(network, contract)
     batch = torch.export.Dim("batch", min=1, max=_LARGEST_BATCH)
     try:
-        program = torch.export.export(network, examples, dynamic_shapes=tuple({0: batch} for _ in examples))
+        shapes = tuple({0: batch} for _ in given.examples)
+        program = torch.export.export(given.network, given.examples, dynamic_shapes=shapes)
     except Exception as error:  # the exporter and the network raise what they like
         reason = " ".join(str(error).split())
         raise PolicyContractError(
             f"the network cannot be exported ({type(error).__name__}: {reason:.160}); name its factory instead of a file"
         ) from error
+    signature = program.graph_signature
+    declared = given.declared(
+        signature.user_inputs[-1], signature.user_outputs[-1], signature.user_outputs[0]
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.stem}.{os.getpid()}.tmp.pt2")
     try:
-        torch.export.save(program, partial, extra_files={METADATA_FILE: contract.to_json()})
+        torch.export.save(program, partial, extra_files={METADATA_FILE: declared.to_json()})
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)

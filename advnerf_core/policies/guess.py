@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +84,7 @@ def _guessed(
     path: Path, inputs: list[TensorInfo], outputs: list[TensorInfo]
 ) -> tuple[PolicyContract, list[Question]]:
     image = _image(path, inputs)
-    found, questions = _of_image(image)
+    found, questions = _of_image(image, _value_max(path, image))
     others = [each for each in inputs if each is not image]
     states = _states(others, outputs)
     carried = {name for state in states for name in (state.input, state.output)}
@@ -123,8 +124,19 @@ def _image(path: Path, inputs: list[TensorInfo]) -> TensorInfo:
     return sized[0]
 
 
-def _of_image(image: TensorInfo) -> tuple[dict[str, Any], list[Question]]:
-    """Keys that the shape and type of the image input give, and what they leave open."""
+def _value_max(path: Path, image: TensorInfo) -> float | None:
+    """White in the images, where the file says so; None otherwise."""
+    if image.kind == UINT8:
+        return 255.0
+    if path.suffix != ".onnx" or find_spec("onnx") is None:  # ONNX Runtime reads files without it
+        return None
+    from advnerf_core.policies.graph_range import value_max_of
+
+    return value_max_of(path, image.name)
+
+
+def _of_image(image: TensorInfo, value_max: float | None) -> tuple[dict[str, Any], list[Question]]:
+    """Keys that the shape, type and range of the image input give, and what they leave open."""
     shape, questions = list(image.shape or (None,) * 4)[1:], []
     times = shape.pop(0) if len(shape) == 4 else None
     layout, channels = _layout(shape)
@@ -147,8 +159,8 @@ def _of_image(image: TensorInfo) -> tuple[dict[str, Any], list[Question]]:
         found["colour_space"] = "GRAY"
     else:
         questions.append(Question("colour_space", "In which order are the colours?", ("RGB", "BGR", "YUV")))
-    if image.kind == UINT8:
-        found["value_max"] = 255.0
+    if value_max is not None:
+        found["value_max"] = value_max
     else:
         text = "Which values do black and white have? Give value_max 1 or 255, and mean and std if they are used."
         questions.append(Question("value_max", text, ("1", "255")))

@@ -115,7 +115,7 @@ def read_tensors(session: Any) -> tuple[list[TensorInfo], list[TensorInfo], str 
 
 
 def export_onnx(network: Any, contract: PolicyContract, path: Path) -> None:
-    """Write a stateless torch network with its declaration as an ONNX file, whole or not at all.
+    """Write a torch network with its declaration as an ONNX file, whole or not at all.
 
     Args:
         network: The network behind the declaration, in eval mode.
@@ -125,25 +125,24 @@ def export_onnx(network: Any, contract: PolicyContract, path: Path) -> None:
     import onnx
     import torch
 
-    if not contract.stateless:
-        raise PolicyContractError(
-            "expected a stateless network, got one with memory; write a factory for it instead"
-        )
-    examples, names = example_inputs(contract)
+    from advnerf_core.policies.exportable import exportable
+
+    given = exportable(network, contract)
+    names = [*given.inputs, *given.outputs]
     buffer: Any = BytesIO()  # the exporter's signature knows names of files only
     with warnings.catch_warnings(), torch.no_grad():
         # It announces its successor, which needs another package, and remarks on every check of a shape.
         warnings.simplefilter("ignore")
         try:
             torch.onnx.export(
-                network,
-                examples,
+                given.network,
+                given.examples,
                 buffer,
                 dynamo=False,
                 opset_version=_OPSET,
-                input_names=names,
-                output_names=["steering"],
-                dynamic_axes={name: {0: "B"} for name in [*names, "steering"]},
+                input_names=given.inputs,
+                output_names=given.outputs,
+                dynamic_axes={name: {0: "B"} for name in names},
             )
         except Exception as error:  # the exporter and the network raise what they like
             reason = " ".join(str(error).split())
@@ -152,21 +151,10 @@ def export_onnx(network: Any, contract: PolicyContract, path: Path) -> None:
                 "or replace the layer"
             ) from error
     model = onnx.load_from_string(buffer.getvalue())
-    model.metadata_props.add(key=ONNX_METADATA_KEY, value=_black_box(contract, path).to_json())
+    declared = given.declared("memory", "next_memory")
+    model.metadata_props.add(key=ONNX_METADATA_KEY, value=_black_box(declared, path).to_json())
     onnx.checker.check_model(model)
     write_atomically(path, model.SerializeToString())
-
-
-def example_inputs(contract: PolicyContract) -> tuple[tuple[Any, ...], list[str]]:
-    """Inputs of the network behind a declaration, a batch of two, and their names."""
-    import torch
-
-    images = contract.first_input(
-        torch.rand(2, 3, *contract.size, generator=torch.Generator().manual_seed(0))
-    )
-    if contract.goal_size == 0:
-        return (images,), ["images"]
-    return (images, torch.zeros(2, contract.goal_size)), ["images", "goals"]
 
 
 def _black_box(contract: PolicyContract, path: Path) -> PolicyContract:

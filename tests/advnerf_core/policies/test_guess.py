@@ -13,7 +13,7 @@ from advnerf_core.policies.guess import guess_contract
 from advnerf_core.policies.load import load_any_policy
 from advnerf_core.policies.pilotnet import PilotNet
 from advnerf_core.policies.policy_file import save_policy
-from tests.support.onnx_models import VIEW, mean_model, save_beside
+from tests.support.onnx_models import VIEW, mean_model, network_model, save_beside
 
 FLOAT, UINT8 = TensorProto.FLOAT, TensorProto.UINT8
 
@@ -110,6 +110,36 @@ def test_memory_and_goal_are_told_apart(tmp_path):
     ]
     assert (contract.goal_size, contract.input_name, contract.output_name) == (1, "image", "steering")
     assert {"states", "goal_size"} <= {each.key for each in questions}
+
+
+def scaled(folder, layers):
+    """A file whose images go through constants ``(operation, value)`` and then a mean."""
+    nodes, weights, name = [("Cast", ["images"], ["cast"], {"to": FLOAT})], {}, "cast"
+    for number, (operation, value) in enumerate(layers):
+        weights[f"value{number}"] = np.array(value, np.float32)
+        nodes.append((operation, [name, f"value{number}"], [f"out{number}"], {}))
+        name = f"out{number}"
+    nodes.append(("ReduceMean", [name], ["steering"], {"axes": [1, 2, 3], "keepdims": 0}))
+    shapes = {"images": (FLOAT, ["B", 3, 8, 12])}, {"steering": (FLOAT, ["B"])}
+    onnx.save(network_model(nodes, *shapes, weights), folder / "scaled.onnx")
+    return folder / "scaled.onnx"
+
+
+@pytest.mark.parametrize(
+    ("layers", "value_max"),
+    [
+        ([("Div", 255.0)], 255.0),
+        ([("Mul", 1 / 127.5), ("Add", -1.0)], 255.0),
+        ([("Sub", [[[104.0]], [[117.0]], [[124.0]]]), ("Div", 58.0)], 255.0),
+        ([("Sub", [[[0.485]], [[0.456]], [[0.406]]]), ("Div", 0.22)], 1.0),
+        ([("Mul", 2.0), ("Sub", 1.0)], 1.0),
+        ([], None),
+    ],
+)
+def test_a_network_that_scales_its_images_says_their_range(tmp_path, layers, value_max):
+    contract, questions = guess_contract(scaled(tmp_path, layers))
+    assert contract.value_max == (value_max or 1.0)
+    assert ("value_max" in {each.key for each in questions}) == (value_max is None)
 
 
 def test_a_guess_with_its_answers_is_a_declaration(tmp_path):

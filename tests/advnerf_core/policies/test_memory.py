@@ -10,8 +10,10 @@ from torch import nn
 from advnerf_core.driving.rollout import Remembering
 from advnerf_core.policies.adapter import adapt
 from advnerf_core.policies.contract import PolicyContract, PolicyContractError
+from advnerf_core.policies.exported_policy import export_program
 from advnerf_core.policies.frames import FrameStack
 from advnerf_core.policies.load import load_any_policy, load_driver
+from advnerf_core.policies.onnx_policy import export_onnx
 from tests.support.onnx_models import VIEW, declare_beside, network_model, save_beside
 
 FLOAT = TensorProto.FLOAT
@@ -237,3 +239,51 @@ def test_an_exported_program_carries_its_state_and_its_gradient(tmp_path):
 def test_a_wrong_stack_is_one_error(declared):
     with pytest.raises(PolicyContractError, match=next(reversed(declared))):
         PolicyContract.from_dict({"view": VIEW.to_dict(), "frames": declared})
+
+
+class Led(nn.Module):
+    """A network of two outputs that is told a goal and remembers."""
+
+    def initial_memory(self, batch):
+        return torch.tensor([[0.5, -0.5]]).expand(batch, 2).clone()
+
+    def forward(self, images, goals, memory):
+        memory = 0.5 * memory + images.mean((2, 3))[:, :2] * (1.0 if goals is None else goals)
+        return {"throttle": memory[:, 1], "angle": 0.3 * torch.tanh(memory.sum(1))}, memory
+
+
+@pytest.mark.parametrize("goals", [None, torch.tensor([[0.5, 2.0], [1.0, -1.0]])])
+def test_a_network_with_a_memory_is_exported_with_it(tmp_path, goals):
+    contract = PolicyContract(VIEW, stateless=False, goal_size=0 if goals is None else 2, output_name="angle")
+    policy, images = adapt(Led().eval(), contract), torch.from_numpy(DRIVE).permute(0, 3, 1, 2) / 255.0
+    export_onnx(policy.network, contract, tmp_path / "led.onnx")
+    export_program(policy.network, contract, tmp_path / "led.pt2")
+
+    def driven(policy):
+        drive = Remembering(policy, 2)
+        return torch.stack([drive(torch.stack([image, image.flip(1)]), goals) for image in images]).tolist()
+
+    expected = driven(policy)
+    for name in ("led.onnx", "led.pt2"):
+        assert np.allclose(driven(load_any_policy(tmp_path / name).policy), expected, atol=1e-5), name
+
+
+def test_a_stack_is_exported_as_the_network_takes_it(tmp_path):
+    stack = FrameStack(count=3, spacing=2, order="newest_first")
+    weights = torch.from_numpy(weights_of((9, 8, 12)))
+    policy = adapt(Weighted(weights), PolicyContract(VIEW, frames=stack))
+    export_onnx(policy.network, policy.contract, tmp_path / "stack.onnx")
+    driver, drive = load_driver(tmp_path / "stack.onnx"), Remembering(policy, 1)
+    for image in DRIVE:
+        expected = drive(torch.from_numpy(image).permute(2, 0, 1)[None] / 255.0)
+        assert driver.steer(image, ()) == pytest.approx(float(expected), abs=1e-6)
+
+
+class Weighted(nn.Module):
+    def __init__(self, weights):
+        super().__init__()
+        self.weights = weights
+        self.eval()
+
+    def forward(self, images):
+        return (images * self.weights).mean((1, 2, 3))

@@ -1,0 +1,66 @@
+"""Which values an ONNX network was made for, where its first layers say so: one that scales its own images, as Keras's ``Rescaling`` does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+# Layers that leave the values as they are.
+_PASSED = frozenset(
+    {"Cast", "Identity", "Transpose", "Reshape", "Squeeze", "Unsqueeze", "Pad", "Slice", "Crop"}
+)
+# Nothing of an image in 0..1 is divided by, or compared with, more than this.
+_LARGEST_OF_ONE = 8.0
+
+
+def value_max_of(path: Path, image: str) -> float | None:
+    """White in the images of an ONNX file, 1 or 255, as its normalisation says; None where it has none.
+
+    Args:
+        image: Name of the input.
+    """
+    import onnx
+
+    graph = onnx.load(path, load_external_data=False).graph
+    constants = {each.name: each for each in graph.initializer}
+    constants |= {
+        node.output[0]: attribute.t
+        for node in graph.node
+        if node.op_type == "Constant"
+        for attribute in node.attribute
+        if attribute.name == "value"
+    }
+    name = image
+    while (node := next((each for each in graph.node if name in each.input), None)) is not None:
+        if node.op_type not in _PASSED:
+            return _scale(node, constants)
+        name = node.output[0]
+    return None
+
+
+def _scale(node: Any, constants: dict[str, Any]) -> float | None:
+    """What the first layer that changes the values says about them."""
+    # The running mean of a batch normalisation is its fourth input.
+    names = node.input[3:4] if node.op_type == "BatchNormalization" else node.input
+    values = [_array(constants[name]) for name in names if name in constants]
+    if (
+        node.op_type not in ("BatchNormalization", "Sub", "Add", "Div", "Mul")
+        or not values
+        or values[0] is None
+    ):
+        return None
+    largest = float(np.abs(values[0]).max(initial=0.0))
+    if node.op_type == "Mul":
+        largest = 1.0 / largest if largest > 0.0 else 0.0
+    return 255.0 if largest > _LARGEST_OF_ONE else 1.0
+
+
+def _array(tensor: Any) -> Any:
+    """Values of a tensor; None of one that lies in another file."""
+    import onnx
+
+    if onnx.external_data_helper.uses_external_data(tensor):
+        return None
+    return onnx.numpy_helper.to_array(tensor)
