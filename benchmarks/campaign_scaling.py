@@ -1,4 +1,4 @@
-"""Question: how many attacks an hour does a campaign run here, with one worker and with two?
+"""Question: how many attacks an hour does an experiment run here, with one worker and with two?
 
 The cells are real: gradient attacks on the finished room of ``make experiment``, each in a process of its own, shortened to a few
 iterations so that what a cell costs besides (starting Python, loading scene and policy) shows rather than hides.
@@ -15,40 +15,40 @@ from pathlib import Path
 from statistics import median
 
 from benchmarks.results import record_row
-from nodes.experiment.run.config import load_campaign
-from nodes.experiment.run.run import Options, run_campaign
+from nodes.experiment.run.run import Options, run_cells
+from nodes.experiment.steps.run import load_experiment
 
 COMMAND = "python -m benchmarks.campaign_scaling runs/full"
 _FILE = """name: scaling
-seeds: [{seeds}]
-methods: [gradient]
-victims: [hardened]
-scenarios:
-  green_screen:
-    as_scenario: track
-    experiment: {experiment}
-    setting: full
-    run_folder: {folder}
-    set: [deploy.through=nothing, attack.starts=1, attack.evaluations={iterations}]
+base: {experiment}
+setting: full
+gate: {{}}
+attack: {{starts: 1, evaluations: {iterations}}}
+deploy: {{through: nothing}}
+over:
+  variant: {{green_screen: {{run_folder: {folder}}}}}
+  victim: [hardened]
+  method: [gradient]
+  seed: [{seeds}]
 """
 
 
 def measure(
     folder: Path, work: Path, jobs: int, threads: int, cells: int, iterations: int
 ) -> tuple[float, float]:
-    """Wall time and processor time of a campaign of its own [s]; the second is what it costs also where others share the cores."""
+    """Wall time and processor time of an experiment of its own [s]; the second is what it costs also where others share the cores."""
     # The gate's verdict stays: it is judged once, before anything is timed.
     shutil.rmtree(work / "cells", ignore_errors=True)
     work.mkdir(parents=True, exist_ok=True)
-    file = work / "scaling.campaign.yaml"
+    file = work / "scaling.experiment.yaml"
     experiment = Path("launch/room.experiment.yaml").resolve()
     seeds = ", ".join(str(100 + seed) for seed in range(cells))
     file.write_text(
         _FILE.format(seeds=seeds, experiment=experiment, folder=folder.resolve(), iterations=iterations)
     )
-    campaign = load_campaign(file, work)
+    loaded = load_experiment(file, None, [], work)
     began, before = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
-    ended = run_campaign(campaign, campaign.cells, Options(jobs, threads, gate=False), print)
+    ended = run_cells(loaded, loaded.cells, Options(jobs, threads, gate=False), print)
     seconds = time.monotonic() - began
     wrong = [end for end in ended if end.how != "done"]
     if wrong or len(ended) != cells:
@@ -64,7 +64,7 @@ def main() -> None:
     parser.add_argument("--cells", type=int, default=4)
     parser.add_argument("--iterations", type=int, default=6)
     parser.add_argument("--repeats", type=int, default=3, help="runs of each way, in turns; medians count")
-    parser.add_argument("--work", type=Path, default=Path("runs/campaigns/scaling"))
+    parser.add_argument("--work", type=Path, default=Path("runs/scaling"))
     parser.add_argument("--dry", action="store_true", help="print only")
     arguments = parser.parse_args()
     load_before = os.getloadavg()[0]

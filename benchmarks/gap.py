@@ -1,6 +1,6 @@
 """What is left of an attack where everything is the world's own? ``python -m benchmarks.gap SET...``.
 
-Reads published gap sets (`launch/gap_*.campaign.yaml`): the difference between the gradient and the random family that is strongest in the
+Reads published gap sets (`launch/gap_*.experiment.yaml`): the difference between the gradient and the random family that is strongest in the
 surrogate, past a panel that the world's own renderer shows, driven by the world's own car; and how much of the surrogate's excess is left,
 of the gradient's searches and of random ones that are strong in the surrogate.
 """

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import re
 
+from advnerf_core.report.evidence.registration import launch_file
+
 # Name of what computes the rows again, and the commands; groups are its arguments.
 KEPT_COMMANDS: dict[str, re.Pattern[str]] = {
-    "campaign": re.compile(r"advnerf (?:experiment|predict) (launch/(?:paper|meshes|poses)\.campaign\.yaml)"),
+    "table": re.compile(r"advnerf (?:experiment|predict) (launch/(?:paper|meshes|poses)\.experiment\.yaml)"),
     "retraining": re.compile(
         r"advnerf experiment (launch/junction\.experiment\.yaml) --setting (retrain) --run-folder (\S+)"
     ),
@@ -22,6 +24,6 @@ NOT_KEPT = "Measured once, not kept."
 def kept_by(command: str) -> tuple[str, tuple[str, ...]] | None:
     """What computes the rows of a command again, with its arguments; None where what they were measured from is not kept."""
     for name, pattern in KEPT_COMMANDS.items():
-        if found := pattern.fullmatch(command):
+        if found := pattern.fullmatch(launch_file(command)):
             return name, tuple(each or "" for each in found.groups())
     return None

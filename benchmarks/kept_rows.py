@@ -18,8 +18,8 @@ PUBLISHED = REPOSITORY / "docs" / "results"
 _COMPARED = ("value", "unit", "target", "met", "note")
 
 
-def campaign_rows(file: str) -> list[LedgerRow]:
-    """Rows of a campaign's table, targets, gate and predictions."""
+def table_rows(file: str) -> list[LedgerRow]:
+    """Rows of an experiment's table, targets, gate and predictions."""
     found = transfer_table.ledger_rows(REPOSITORY / file, PUBLISHED / Path(file).name.split(".")[0])
     return [row.with_command(row.command.replace(str(REPOSITORY / file), file)) for row in found]
 
@@ -37,7 +37,7 @@ def retraining_rows(file: str, setting: str, folder: str) -> list[LedgerRow]:
 
 
 _AGAIN: dict[str, Callable[..., list[LedgerRow]]] = {
-    "campaign": campaign_rows,
+    "table": table_rows,
     "retraining": retraining_rows,
     "gap": gap.ledger_rows,
     "predictions": predictions.ledger_rows,

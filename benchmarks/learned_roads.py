@@ -52,7 +52,7 @@ def _record_time(experiment: Experiment, minutes: float) -> None:
     road = world.get("road", {})
     changes = " ".join(f"--set world.road.{key}={road[key]}" for key in ("blocks", "seed") if key in road)
     command = f"make world NAME={world['kind']}" + (f' CHANGES="{changes}"' if changes else "")
-    note = f"{len(experiment.config.attack.methods)} searches, {measured.starts} starts"
+    note = f"{len(experiment.config.methods)} searches, {measured.starts} starts"
     record_row(
         f"{road_of(world)}: from its installation to its table, setting {experiment.setting}",
         minutes,

@@ -17,13 +17,15 @@ from typing import Any
 from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.scene.fidelity import reasons_against
+from advnerf_core.scene.gate_limits import GateLimits
 from benchmarks.first_build import PAGE as FIRST_BUILD
 from benchmarks.first_build import page_text
 from benchmarks.kept_rows import computed_again, counts, row_problems
 from benchmarks.page_numbers import count_numbers
 from benchmarks.results import PAGE, REPOSITORY, read_rows, write_pages
 from nodes.experiment.run.admission import gate_file, gate_key
-from nodes.experiment.run.config import Campaign, load_campaign
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.steps.run import load_experiment
 
 PUBLISHED = REPOSITORY / "docs" / "results"
 _TARGET = re.compile(r"(>=|<=|>|<) ?(\d[\d,]*(?:\.\d+)?)(?![\d^])")
@@ -77,20 +79,20 @@ def row_page_problems(rows: list[dict[str, Any]], page: Path) -> Iterator[str]:
 
 
 def gate_problems() -> Iterator[str]:
-    """Verdicts of the fidelity gate that do not follow from their numbers and the limits of the campaign."""
-    for file in sorted((REPOSITORY / "launch").glob("*.campaign.yaml")):
+    """Verdicts of the fidelity gate that do not follow from their numbers and the limits of the experiment."""
+    for file in sorted((REPOSITORY / "launch").glob("*.experiment.yaml")):
         folder = PUBLISHED / file.name.split(".")[0]
         if (folder / "gate").exists():
-            yield from _verdicts(load_campaign(file), folder)
+            yield from _verdicts(load_experiment(file, None, [], None), folder)
 
 
-def _verdicts(campaign: Campaign, folder: Path) -> Iterator[str]:
-    cells = {gate_key(cell): cell for cell in campaign.cells}
+def _verdicts(experiment: Experiment, folder: Path) -> Iterator[str]:
+    cells = {gate_key(cell): cell for cell in experiment.cells}
     for key, cell in sorted(cells.items()):
-        limits = campaign.scenario(cell).gate or campaign.gate
+        limits = experiment.config_of(cell).gate
         for drive, of in ((False, "held-out views"), (True, "drive without attack")):
             file = gate_file(folder, key, drive)
-            if limits is None or not file.exists():
+            if not isinstance(limits, GateLimits) or not file.exists():
                 continue
             said = read_json(file)
             reasons = list(reasons_against(said["numbers"], limits, of))

@@ -21,6 +21,7 @@ from typing import Any
 
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
+from advnerf_core.report.evidence.registration import launch_file
 from benchmarks.answers import Answer, answers, sets_table, table
 from benchmarks.kept_commands import NOT_KEPT, kept_by
 from benchmarks.questions import LOST, OTHER, QUESTIONS, Question, question_of
@@ -199,7 +200,7 @@ def _question_page(question: Question, rows: list[dict[str, Any]]) -> str:
     text += f"{question.answers} [All questions](../results.md).\n"
     for command in dict.fromkeys(row["command"] for row in rows):
         kept = "Computed again by `advnerf verify`." if kept_by(command) else NOT_KEPT
-        text += f"\n## `{command}`\n\n{kept}\n\n| measured | value | target | met | note | machine, date |\n|---|---|---|---|---|---|\n"
+        text += f"\n## `{launch_file(command)}`\n\n{kept}\n\n| measured | value | target | met | note | machine, date |\n|---|---|---|---|---|---|\n"
         text += "".join(_render_row(row) for row in rows if row["command"] == command)
     return text
 

@@ -1,4 +1,4 @@
-"""Question: what did the campaigns of the first build show? ``python -m benchmarks.transfer_table [CAMPAIGN_FILE]``.
+"""Question: what did the experiments of the first build show? ``python -m benchmarks.transfer_table [FILE]``.
 
 Their cells in ``docs/results`` kept totals and no drives, some not even the number of ticks, so their rows of the ledger are ratios of total
 CTE to that past the plain object, as they were recorded. Tables and pages of today are in metres.
@@ -22,13 +22,13 @@ from advnerf_core.report.targets import Target, evaluate
 from benchmarks.first_build_ratios import paper_ratio, seeds_interval, skill_text, transfer_ratio
 from benchmarks.results import LedgerRow
 from nodes.experiment.run.admission import gate_file, gate_key
-from nodes.experiment.run.config import load_campaign
 from nodes.experiment.run.plan import PUBLISHED
 from nodes.experiment.run.predictions import prediction_file
 from nodes.experiment.run.published import published_table
+from nodes.experiment.steps.run import load_experiment
 
 VICTIM = "hardened"
-CAMPAIGN = Path("launch/paper.campaign.yaml")
+FILE = Path("launch/paper.experiment.yaml")
 # Of targets that are missed: what was tried, and what it points to.
 _SMALL_BASE = "tried: the victim has learned from random textures; nothing was tuned after the first drive; points to the base: "
 _SHAPES = (
@@ -228,7 +228,7 @@ def gate_rows(
     return rows
 
 
-def skill_rows(folder: Path, cells: Sequence[CellResult], campaign: str) -> list[LedgerRow]:
+def skill_rows(folder: Path, cells: Sequence[CellResult], file: str) -> list[LedgerRow]:
     """How good the predictions of transfer were, and how alike pictures are along the deployed drives without attack."""
     if (found := skill_text(folder, cells)) is None:
         return []
@@ -238,21 +238,21 @@ def skill_rows(folder: Path, cells: Sequence[CellResult], campaign: str) -> list
         f"along the drives without attack PSNR {min(c['psnr_db'] for c in clean):.1f} to {max(c['psnr_db'] for c in clean):.1f} dB, "
         f"steering differs by at most {max(c['steering'] for c in clean):.4f} on average"
     )
-    line, command = "predicted against deployed ratio, median factor", f"advnerf predict {campaign}"
+    line, command = "predicted against deployed ratio, median factor", f"advnerf predict {file}"
     return [LedgerRow(line, factor, "x", "", None, command, f"{text} {views}", **measured_where(cells))]
 
 
 def ledger_rows(file: Path, folder: Path | None = None) -> list[LedgerRow]:
-    """Rows of the ledger for a campaign's published table, its other targets, its gate and its predictions.
+    """Rows of the ledger for an experiment's published table, its other targets, its gate and its predictions.
 
     Args:
-        file: Of the campaign, relative to the project: which lines and seeds there should be.
+        file: Of the experiment, relative to the project: which lines and seeds there should be.
         folder: Of the published cells; ``docs/results/NAME`` if it is not given.
     """
-    campaign = load_campaign(file)
-    folder = folder or PUBLISHED / campaign.name
-    table, run = published_table(folder, campaign), f"advnerf experiment {file}"
-    limits, found = campaign.reference.targets, []
+    experiment = load_experiment(file, None, [], None)
+    folder = folder or PUBLISHED / experiment.config.name
+    table, run = published_table(folder, experiment), f"advnerf experiment {file}"
+    limits, found = experiment.held_to.targets, []
     for row, said, target in rows_of(table, limits):
         cells = table.cells_of(row)
         note = note_of(row, cells) + why_missed(target, row, cells)
@@ -263,7 +263,7 @@ def ledger_rows(file: Path, folder: Path | None = None) -> list[LedgerRow]:
             LedgerRow(line, row.ratio or 0.0, "x no attack", limit, met, run, note, **measured_where(cells))
         )
     found += _other_targets(table, limits, run)
-    for key, told in gate_rows(folder, sorted({gate_key(cell) for cell in campaign.cells})):
+    for key, told in gate_rows(folder, sorted({gate_key(cell) for cell in experiment.cells})):
         where = measured_where([cell for cell in table.cells.values() if gate_key(cell) == key])
         line, psnr_db, unit, passes, passed, note = told
         found.append(LedgerRow(line, psnr_db, unit, passes, passed, run, note, **where))
@@ -291,12 +291,12 @@ def main() -> None:
     """Record the rows of the published table, and its other targets."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument(
-        "campaign", type=Path, nargs="?", default=CAMPAIGN, help="which lines and seeds there should be"
+        "file", type=Path, nargs="?", default=FILE, help="which lines and seeds there should be"
     )
     parser.add_argument("--folder", type=Path, help="of the published cells; docs/results/NAME if not given")
     parser.add_argument("--dry", action="store_true", help="print only")
     arguments = parser.parse_args()
-    for row in ledger_rows(arguments.campaign, arguments.folder):
+    for row in ledger_rows(arguments.file, arguments.folder):
         print(f"{row.line}: {row.value:.3g} {row.unit} (target {row.target or '-'}): {row.met}; {row.note}")
         if not arguments.dry:
             row.record()

@@ -1,6 +1,6 @@
 """Does a victim drive on roads that neither it nor anybody has seen? ``python -m benchmarks.unseen_roads RUN_FOLDER``.
 
-The run folder is one of ``launch/metadrive.experiment.yaml --setting unseen`` (or of a campaign of it): its victim learned on ten roads of
+The run folder is one of ``launch/metadrive.experiment.yaml --setting unseen`` (or of launch/gap_metadrive_unseen.experiment.yaml): its victim learned on ten roads of
 MetaDrive's generator. It drives five others with MetaDrive's own car, from the measured starts, without any panel and past a plain one that
 stands by the rule. On a road it drives well if it never leaves its lane and stays near its middle in the mean, by the limit that
 registrations fix.

@@ -1,4 +1,4 @@
-"""One cell of a campaign: a scenario, a victim, a method and a seed, with its drives in the surrogate and where it is deployed."""
+"""One cell of an experiment: a scenario, a victim, a method and a seed, with its drives in the surrogate and where it is deployed."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ def cell_from(data: Any, source: str) -> CellResult:
         first = error.errors(include_url=False)[0]
         where = ".".join(map(str, first["loc"])) or "the whole"
         raise CellError(
-            f"{source}: not a campaign's cell: {where}: {first['msg']}; remove it to run the cell again"
+            f"{source}: not a cell: {where}: {first['msg']}; remove it to run the cell again"
         ) from None
 
 

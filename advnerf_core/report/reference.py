@@ -1,4 +1,4 @@
-"""What a report is held to: limits, as data that an experiment or campaign file names."""
+"""What a report is held to: limits, as data that an experiment file names."""
 
 from __future__ import annotations
 

@@ -118,7 +118,7 @@ class ResultTable:
     Attributes:
         rows: The lines, in the order asked for.
         cells: The cells, by name.
-        name: Name of the experiment or campaign.
+        name: Name of the experiment.
     """
 
     rows: tuple[TableRow, ...]
@@ -143,7 +143,7 @@ def make_table(wanted: Sequence[Wanted], cells: Iterable[CellResult], name: str 
     Args:
         wanted: What the table should have; it says what is missing.
         cells: What is there; cells that were not asked for are left out.
-        name: Name of the experiment or campaign.
+        name: Name of the experiment.
     """
     seeds = {want.key: want.seeds for want in wanted}
     drives = CellDrives(cell for cell in cells if cell.seed in seeds.get(cell.key, ()))

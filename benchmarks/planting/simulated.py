@@ -82,7 +82,7 @@ def _registration(
     searched = [("none", 0), *((method, each) for method in _METHODS for each in range(searches))]
     return Registration(
         name=name,
-        file="simulated.campaign.yaml",
+        file="simulated.experiment.yaml",
         setting="",
         date="2026-01-01T00:00:00+00:00",
         software_version="0",

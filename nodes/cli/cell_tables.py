@@ -16,7 +16,7 @@ from nodes.runtime.terminal import print_table, say_error, table
 if TYPE_CHECKING:
     from advnerf_core.report.result_table import ResultTable
     from nodes.experiment.plan.cell import Cell
-    from nodes.experiment.run.config import Campaign
+    from nodes.experiment.show.context import Experiment
 
 _COLOURS = {
     "done": "green",
@@ -33,8 +33,8 @@ def status(choice: CellChoice) -> None:
     """Say which cells are done, running, failed (and why), made with other settings, or missing."""
     from nodes.experiment.run.plan import statuses
 
-    campaign, cells = load_cells(choice, executes=False)
-    found = statuses(campaign, cells)
+    experiment, cells = load_cells(choice, executes=False)
+    found = statuses(experiment, cells)
     rows = table("cell", "state", "")
     for each in found:
         colour = _COLOURS.get(each.state, "dim")
@@ -43,7 +43,7 @@ def status(choice: CellChoice) -> None:
     counts: Any = Counter(each.state for each in found)
     print(
         ", ".join(f"{count} {state}" for state, count in counts.most_common())
-        + f" of {len(found)} cells in {campaign.folder}"
+        + f" of {len(found)} cells in {experiment.folder}"
     )
 
 
@@ -59,8 +59,8 @@ def table_command(
     ] = None,
 ) -> None:
     """Print the table of all cells, and the targets."""
-    campaign, cells = load_cells(choice, executes=False)
-    _show(campaign, cells, None, source)
+    experiment, cells = load_cells(choice, executes=False)
+    _show(experiment, cells, None, source)
 
 
 def report(
@@ -83,47 +83,47 @@ def report(
         raise ConfigError(
             "expected --output with --only, as the page of some cells would replace that of all"
         )
-    campaign, cells = load_cells(choice, executes=False)
-    _show(campaign, cells, output or page_folder(campaign), source)
+    experiment, cells = load_cells(choice, executes=False)
+    _show(experiment, cells, output or page_folder(experiment), source)
 
 
-def _show(campaign: Campaign, cells: Sequence[Cell], output: Path | None, source: Path | None) -> None:
+def _show(experiment: Experiment, cells: Sequence[Cell], output: Path | None, source: Path | None) -> None:
     if source is None:
-        show_table(campaign, cells, output)
+        show_table(experiment, cells, output)
     else:
-        _show_published(campaign, cells, output, source / campaign.name)
+        _show_published(experiment, cells, output, source / experiment.config.name)
 
 
-def page_folder(campaign: Campaign) -> Path:
-    """Where the page of all cells of a campaign goes."""
-    return campaign.folder / "table"
+def page_folder(experiment: Experiment) -> Path:
+    """Where the page of all cells of an experiment goes."""
+    return experiment.folder / "table"
 
 
-def show_table(campaign: Campaign, cells: Sequence[Cell], output: Path | None) -> None:
+def show_table(experiment: Experiment, cells: Sequence[Cell], output: Path | None) -> None:
     """Print the table of cells of the settings of now; write its page into ``output`` if it is given."""
     from nodes.experiment.run.plan import statuses
-    from nodes.experiment.run.published import campaign_table
+    from nodes.experiment.run.published import table_of
 
-    know_methods(campaign)  # titles are kept since cells were run
-    found = statuses(campaign, cells)
-    full = campaign_table(campaign, found)
-    page = _write_and_print(campaign, full, campaign.folder, campaign.folder / "cells", output)
+    know_methods(experiment)  # titles are kept since cells were run
+    found = statuses(experiment, cells)
+    full = table_of(experiment, found)
+    page = _write_and_print(experiment, full, experiment.folder, experiment.folder / "cells", output)
     left_out = [each for each in found if each.state in ("changed", "unreadable")]
     for each in left_out:
         say_error(f"{each.cell.name} is left out: {each.text}")
     _say_where(full, cells, page)
 
 
-def _show_published(campaign: Campaign, cells: Sequence[Cell], output: Path | None, folder: Path) -> None:
+def _show_published(experiment: Experiment, cells: Sequence[Cell], output: Path | None, folder: Path) -> None:
     from nodes.experiment.run.published import published_table
 
-    full = published_table(folder, campaign, list(cells))
-    # Films are not published; those of the campaign's own cells may be of other drives.
-    _say_where(full, cells, _write_and_print(campaign, full, folder, folder, output))
+    full = published_table(folder, experiment, list(cells))
+    # Films are not published; those of the own cells may be of other drives.
+    _say_where(full, cells, _write_and_print(experiment, full, folder, folder, output))
 
 
 def _write_and_print(
-    campaign: Campaign, full: ResultTable, folder: Path, clips_folder: Path, output: Path | None
+    experiment: Experiment, full: ResultTable, folder: Path, clips_folder: Path, output: Path | None
 ) -> Path | None:
     """Table, targets and the predictions in ``folder`` to the terminal, and the page into ``output`` if it is asked for."""
     from rich.console import Console
@@ -136,7 +136,7 @@ def _write_and_print(
     from nodes.experiment.run.predictions import predicted
 
     pairs = predicted(folder, list(full.cells.values()))
-    targets = evaluate(campaign.reference.targets, full)
+    targets = evaluate(experiment.held_to.targets, full)
     page = None
     if output is not None:
         sections = [("Predicted and measured transfer", prediction_section(pairs))] if pairs else []

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
@@ -13,38 +13,30 @@ import typer
 from nodes.cli.cell_choice import CellChoice, load_cells
 from nodes.cli.cell_tables import page_folder, report, show_table, status, table_command
 from nodes.cli.publish import publish
+from nodes.runtime.errors import ConfigError
 from nodes.runtime.options import with_groups
 from nodes.runtime.terminal import Device, say_error
 from nodes.runtime.termination import ends_in_order
 
 if TYPE_CHECKING:
     from nodes.experiment.engine.progress_record import ProgressRecord
+    from nodes.experiment.plan.cell import Cell
     from nodes.experiment.run.run import Options
     from nodes.experiment.run.worker import Ended
+    from nodes.experiment.show.context import Experiment
 
 _FAILURE_EXIT = 1
+_MANY = 1000
 
 
 def _say_code(choice: CellChoice) -> None:
     """Print the code that a run of a file will execute; nothing is executed for it."""
-    from nodes.experiment.plan.setting_file import read_setting
-    from nodes.experiment.run.config import is_campaign, load_campaign
+    from nodes.experiment.plan.experiment_file import read_experiment_file
     from nodes.lab.plugin_tables import say_code
-    from nodes.runtime.named_code import with_absolute_code
 
-    file, overrides = choice.file, choice.overrides or []
-    if not is_campaign(file):
-        say_code(read_setting(file, choice.setting, overrides).data, file.resolve().parent)
-        return
-    campaign = load_campaign(file, choice.folder, tuple(overrides))
-    named: list[Any] = [{"methods": [cell.code for cell in campaign.cells]}]
-    for scenario in campaign.scenarios.values():
-        inner = (file.parent / scenario.experiment).resolve()
-        # Of the methods only those of the campaign are run.
-        data = read_setting(inner, scenario.setting, scenario.set).data
-        worlds = {key: data[key] for key in ("world", "deploy") if key in data}
-        named.append(with_absolute_code(worlds, inner.parent))
-    say_code(named, file.resolve().parent)
+    read = read_experiment_file(choice.file, choice.setting, choice.overrides or [])
+    documents = [*read.variants.values()] or [read.document]
+    say_code([each.data for each in documents], choice.file.resolve().parent)
 
 
 def experiment(
@@ -105,64 +97,75 @@ def experiment(
     page_port: Annotated[
         int, typer.Option(min=0, max=65535, help="Port of the page; 0 selects a free one.")
     ] = 8091,
+    many: Annotated[
+        bool, typer.Option("--many", help=f"Run more than {_MANY} cells without being asked.")
+    ] = False,
 ) -> None:
     """Run an experiment, from the photographs to the report: every stage and every cell that is not there yet. It may be stopped at any time."""
     os.environ.setdefault("MUJOCO_GL", "egl")
     from advnerf_core.attack.device import use_device
-    from nodes.experiment.run.config import is_campaign
     from nodes.experiment.run.run import Options
-    from nodes.runtime.errors import ConfigError
 
     use_device(device)
-    many = is_campaign(choice.file)
     _say_code(choice)
     address = "" if cluster in (None, "auto") else str(cluster)
     backend: Literal["local", "ray"] = "local" if cluster is None else "ray"
-    here = not many and jobs is None and cluster is None
-    options = Options(
-        jobs or 0, threads or 0, backend, address, retry, gate, search_only, here, ready=not many
-    )
-    if not many:
-        _run_one(choice, until, options, anew, page_port if page else None)
-        return
-    if until is not None or anew or page:
-        what = "--until" if until is not None else "--anew" if anew else "--page"
-        raise ConfigError(f"expected {what} with an experiment file, got it with the campaign {choice.file}")
-    _run_many(choice, options)
-
-
-def _run_one(choice: CellChoice, until: str | None, options: Options, anew: bool, port: int | None) -> None:
-    from nodes.experiment.run.whole import run_experiment
-    from nodes.experiment.steps.run import load_experiment
-
-    overrides, folder = choice.overrides or [], choice.folder or Path("runs") / choice.setting
+    loaded, cells = load_cells(choice)
+    if until is None:
+        _allow(len(cells), many)
+    options = Options(jobs or 0, threads or 0, backend, address, retry, gate, search_only)
     with ends_in_order():
-        loaded = load_experiment(choice.file, choice.setting, overrides, folder)
-        if options.here and len(loaded.config.attack.seeds) > 1:
+        if not loaded.variants:
             # Searches with one core each are faster than one after another on all: `python -m benchmarks.seeds_together`.
-            options = replace(options, here=False)
-
-        def run(record: ProgressRecord | None) -> list[Ended]:
-            return run_experiment(loaded, until, options, choice.only, overrides, anew=anew, record=record)
-
-        if port is None:
-            ended = run(None)
+            here = jobs is None and cluster is None and len(loaded.config.seeds) == 1
+            ended = _run_one(
+                loaded,
+                choice.only,
+                until,
+                replace(options, here=here, ready=True),
+                anew,
+                page_port if page else None,
+            )
         else:
-            from nodes.experiment_page.page import run_with_page
-
-            ended = run_with_page(loaded, port, run, lambda text: print(text, flush=True))
+            if until is not None or anew or page:
+                loaded.require_one()
+            ended = _run_variants(loaded, cells, options)
     _say_wrong(ended)
 
 
-def _run_many(choice: CellChoice, options: Options) -> None:
-    from nodes.experiment.run.run import run_campaign
+def _allow(count: int, many: bool) -> None:
+    """Ask before more cells are run than a person may have meant."""
+    if count <= _MANY or many:
+        return
+    if not sys.stdin.isatty():
+        raise ConfigError(
+            f"expected at most {_MANY} cells without --many, got {count}; add it, or run some with --only"
+        )
+    typer.confirm(f"Run {count} cells?", abort=True)
 
-    campaign, cells = load_cells(choice)
-    with ends_in_order():
-        ended = run_campaign(campaign, cells, options, lambda text: print(text, flush=True))
+
+def _run_one(
+    loaded: Experiment, only: str, until: str | None, options: Options, anew: bool, port: int | None
+) -> list[Ended]:
+    from nodes.experiment.run.whole import run_experiment
+
+    def run(record: ProgressRecord | None) -> list[Ended]:
+        return run_experiment(loaded, until, options, only, anew=anew, record=record)
+
+    if port is None:
+        return run(None)
+    from nodes.experiment_page.page import run_with_page
+
+    return run_with_page(loaded, port, run, lambda text: print(text, flush=True))
+
+
+def _run_variants(loaded: Experiment, cells: Sequence[Cell], options: Options) -> list[Ended]:
+    from nodes.experiment.run.run import run_cells
+
+    ended = run_cells(loaded, cells, options, lambda text: print(text, flush=True))
     if not options.search_only:
-        show_table(campaign, campaign.cells, page_folder(campaign))
-    _say_wrong(ended)
+        show_table(loaded, loaded.cells, page_folder(loaded))
+    return ended
 
 
 def _say_wrong(ended: Sequence[Any]) -> None:
@@ -179,11 +182,11 @@ def predict(
 ) -> None:
     """Predict how the attacks transfer from pictures without a deployed drive with them; the table then says how good that was."""
     os.environ.setdefault("MUJOCO_GL", "egl")
-    from nodes.experiment.run.predictions import predict_campaign
+    from nodes.experiment.run.predictions import predict_cells
 
-    campaign, cells = load_cells(choice)
+    experiment, cells = load_cells(choice)
     with ends_in_order():
-        made = predict_campaign(campaign, cells, lambda text: print(text, flush=True), draws)
+        made = predict_cells(experiment, cells, lambda text: print(text, flush=True), draws)
     print(f"{made} predictions made")
 
 
@@ -195,8 +198,8 @@ def maps(
     os.environ.setdefault("MUJOCO_GL", "egl")
     from nodes.experiment.run.maps import map_cells
 
-    campaign, cells = load_cells(choice)
-    for picture in map_cells(campaign, cells, number):
+    experiment, cells = load_cells(choice)
+    for picture in map_cells(experiment, cells, number):
         print(picture)
 
 

@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 
 def publish(
     choice: CellChoice,
-    to: Annotated[Path, typer.Option(help="Gets a folder with the campaign's name.")] = Path("docs/results"),
+    to: Annotated[Path, typer.Option(help="Gets a folder with the experiment's name.")] = Path(
+        "docs/results"
+    ),
     prune: Annotated[
         bool, typer.Option("--prune", help="Remove cells there that other settings have made.")
     ] = False,
@@ -54,33 +56,35 @@ def publish(
     from nodes.experiment.run.store import NOT_DRIVEN
     from nodes.runtime.errors import ConfigError
 
-    campaign, cells = load_cells(choice)
-    registered = (to / campaign.name / registration.FILE).exists()
+    experiment, cells = load_cells(choice)
+    registered = (to / experiment.config.name / registration.FILE).exists()
     if registered and not build:
         raise ConfigError(
-            f"expected to publish the registered set {campaign.name} with its scene and victim, got --no-build; leave it out: without them nobody "
+            f"expected to publish the registered set {experiment.config.name} with its scene and victim, got --no-build; leave it out: without them nobody "
             "can drive the set again"
         )
-    found_here = statuses(campaign, cells)
+    found_here = statuses(experiment, cells)
     for each in found_here:
         if each.state == NOT_DRIVEN:
             say_error(
                 f"{each.cell.name} is no evidence and is not published: it was not driven live: {each.text}"
             )
-    found = copy_cells(campaign, found_here, to, prune)
+    found = copy_cells(experiment, found_here, to, prune)
     for name in found.written:
-        print(f"{to / campaign.name / name}.json")
+        print(f"{to / experiment.config.name / name}.json")
     if withdraw:
-        registration.withdraw(to / campaign.name, dict(_scenario_and_reason(each) for each in withdraw))
+        registration.withdraw(
+            to / experiment.config.name, dict(_scenario_and_reason(each) for each in withdraw)
+        )
     if declare:
-        victims.declare(to / campaign.name, dict(_scenario_and_reason(each) for each in declare))
+        victims.declare(to / experiment.config.name, dict(_scenario_and_reason(each) for each in declare))
     if build:  # before the page, which says whether the set can be driven again
-        _say_build(publish_build(campaign, cells, to, prune))
+        _say_build(publish_build(experiment, cells, to, prune))
     if registered:
-        print(write_numbers(to / campaign.name))
-        if (film := write_film(campaign, to / campaign.name)) is not None:
+        print(write_numbers(to / experiment.config.name))
+        if (film := write_film(experiment, to / experiment.config.name)) is not None:
             print(film)
-            print(write_above_of(to / campaign.name))  # with frames of the film
+            print(write_above_of(to / experiment.config.name))  # with frames of the film
         print(write_page(to))
     else:
         write_beside(to)

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from nodes.cli.cell_choice import File
+from nodes.cli.cell_choice import File, Folder, Setting
 from nodes.runtime.terminal import Overrides, print_table, table
 
 _REFUSED_EXIT = 1
@@ -22,9 +22,9 @@ def add_to(app: typer.Typer) -> None:
 
 def gate(
     file: File,
-    setting: Annotated[str, typer.Option(help="Setting of the experiment file.")] = "full",
-    run_folder: Annotated[Path | None, typer.Option(show_default="runs/<setting>")] = None,
-    scenario: Annotated[str, typer.Option(help="Which path; the views that are compared are of all.")] = "",
+    setting: Setting = None,
+    run_folder: Folder = None,
+    path: Annotated[str, typer.Option(help="Which path; the views that are compared are of all.")] = "",
     victim: Annotated[str, typer.Option(help="Victim: hardened or naive.")] = "hardened",
     bag: Annotated[
         Path | None, typer.Option(help="Bag of a drive without an attack, to compare as well.", exists=True)
@@ -50,10 +50,11 @@ def gate(
     from nodes.experiment.run.gate import judge_scene
     from nodes.experiment.steps.run import load_experiment
 
-    experiment = load_experiment(file, setting, overrides or [], run_folder or Path("runs") / setting)
+    experiment = load_experiment(file, setting, overrides or [], run_folder)
+    experiment.require_one()
     wanted = {"psnr_db": psnr_db, "ssim": ssim, "steering": steering}
     limits = GateLimits.model_validate({name: value for name, value in wanted.items() if value is not None})
-    verdicts = judge_scene(experiment, Cell(scenario, victim, NONE, 0), limits, bag)
+    verdicts = judge_scene(experiment, Cell(path, victim, NONE, 0), limits, bag)
     if as_json:
         print(json.dumps({of: verdict.record() for of, verdict in verdicts}))
     else:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated
@@ -25,7 +24,7 @@ _FAILURE_EXIT = 1
 
 def register(
     file: File,
-    setting: Setting = "evidence",
+    setting: Setting = None,
     folder: Folder = None,
     only: Only = "",
     published: Published = Path("docs/results"),
@@ -33,12 +32,10 @@ def register(
 ) -> None:
     """Write down what an experiment will run, and which tests will be claimed, before anything is run."""
     from advnerf_core.report.evidence.registration import FILE
-    from nodes.experiment.run.config import is_campaign
     from nodes.experiment.run.registering import register as write_registration
 
-    campaign, cells = load_cells(CellChoice(file, setting, folder, only, overrides))
-    shown = "" if is_campaign(file) else setting
-    found = write_registration(replace(campaign, cells=tuple(cells)), shown, overrides or [], published)
+    experiment, cells = load_cells(CellChoice(file, setting, folder, only, overrides))
+    found = write_registration(experiment, cells, published)
     print(f"{published / found.name / FILE}: {found.digest[:12]}")
     print(
         f"{len(found.cells)} cells, {len(found.scenarios)} scenarios, {len(found.primary)} primary tests; commit it, then run the experiment"
@@ -146,19 +143,19 @@ def _ledger(published: Path) -> int:
 
 def _redrive(folder: Path, count: int, seed: int) -> int:
     """Drive some cells of a set again; how many came out otherwise."""
-    from advnerf_core.report.evidence.registration import read_registration
+    from advnerf_core.report.evidence.registration import launch_file, read_registration
     from nodes.experiment.run.redrive import TOLERANCE_M, redrive, unreadable
 
     registration = read_registration(folder)
     assert registration is not None, "the set was verified"
-    file = Path("launch") / registration.file
+    file = Path("launch") / launch_file(registration.file)
     with TemporaryDirectory() as run:
         choice = CellChoice(file, registration.setting, Path(run), overrides=list(registration.overrides))
         try:
-            campaign, _ = load_cells(choice)
+            experiment, _ = load_cells(choice)
         except ConfigError as error:  # the file, or a key that was set, has another name by now
             raise unreadable(folder, str(error)) from None
-        ended = redrive(campaign, folder, count, seed, print)
+        ended = redrive(experiment, folder, count, seed, print)
     for each in ended:
         verdict = "as published" if each.same else f"otherwise: more than {TOLERANCE_M} m"
         print(f"{each.name}: at most {each.off_m:.4f} m from the published poses, {verdict}")

@@ -1,1 +1,1 @@
-"""Experiments: stages, searches, deployed drives, campaigns of cells, and their reports."""
+"""Experiments: stages, searches, deployed drives, cells, and their reports."""

@@ -37,8 +37,8 @@ def launch_argument(text: str | Path) -> Path:
 
 
 def experiment_argument(text: str | Path) -> Path:
-    """Experiment or campaign file of an argument."""
-    return named_file(text, "experiment", "campaign")
+    """Experiment file of an argument."""
+    return named_file(text, "experiment")
 
 
 def policy_argument(text: str) -> str:

@@ -1,38 +1,42 @@
 """Cells that cost nothing, in place of those of experiments: the processes, queues and files around them are the real ones.
 
 A test puts the functions below over those of `nodes.experiment` (`put_over`). A process of its own, which must not import what searches need,
-gets this module in place of theirs (`install`). Files in the campaign's folder say what goes wrong: ``fail``, ``hang``, ``late``.
+gets this module in place of theirs (`install`). Files in the run folder say what goes wrong: ``fail``, ``hang``, ``late``.
 """
 
 import os
 import sys
 import time
 from contextlib import nullcontext
-from pathlib import Path
-from types import SimpleNamespace
 
-from advnerf_core.documents import read_yaml
 from advnerf_core.run_module import module_command
+from nodes.experiment.show.variants import Variants, resolve
 
 MODULE = "tests.support.toy_cells"
-REPLACED = ("run.cells", "steps.run", "steps.keys", "show.context")
+REPLACED = ("run.cells", "steps.run", "steps.keys", "steps.steering_gate", "show.context")
 NEEDED = ("capture", "policy")
 FACTORS = {"none": 1.0, "random": 1.1, "cem": 2.0, "gradient": 3.0}
-Experiment = SimpleNamespace
 Bench = nullcontext
 
 
+class Experiment(Variants):
+    """An experiment whose section world says what its cells find."""
+
+    @property
+    def data(self):
+        return self.config.world
+
+
 def load_experiment(file, setting, overrides, folder, executes=True):
-    data = read_yaml(file).data
-    del data["settings"]
-    for text in overrides:
-        key, value = text.split("=")
-        data[key] = float(value)
-    return SimpleNamespace(folder=Path(folder), data=data)
+    return resolve(Experiment, file, setting, overrides, folder, executes, lambda made, document: made)
 
 
 def prepare_victims(experiment):
     experiment.folder.mkdir(parents=True, exist_ok=True)
+
+
+def require_same_steering(experiment, may_go_on=False, say=print):
+    pass
 
 
 def settings_hash(experiment, cell):
@@ -83,11 +87,11 @@ def search_cell(experiment, cell, folder, report, bench=None):
 
 def run_cell(experiment, cell, folder, report, bench=None):
     _note(folder, f"begin {cell.name} {cell.code} {os.environ.get('OMP_NUM_THREADS')}")
-    campaign = folder.parent.parent
-    if (campaign / "fail").exists() and cell.method == "cem":
+    run = folder.parent.parent
+    if (run / "fail").exists() and cell.method == "cem":
         raise RuntimeError("the search came to nothing")
     try:
-        while (campaign / "hang").exists() and cell.method == "gradient":
+        while (run / "hang").exists() and cell.method == "gradient":
             (folder / "pid").write_text(str(os.getpid()))
             time.sleep(0.02)
     except BaseException:
@@ -103,7 +107,7 @@ def run_cell(experiment, cell, folder, report, bench=None):
         "none_total_cte_m": [none],
     }
     found = {"attack_id": None, "surrogate": drives, "extra": {"horizon": 20}}
-    if (campaign / "late").exists() and cell.method == "gradient":
+    if (run / "late").exists() and cell.method == "gradient":
         return {**found, "not_driven_live": "live0 was spoiled 3 times, at last: late"}
     return {**found, "deployed": drives}
 

@@ -8,6 +8,7 @@ from typing import Any
 from advnerf_core.report.conditions import style_of
 from advnerf_core.report.evidence.intervals import MEASURED_COVERAGE
 from advnerf_core.report.evidence.luck import luck_sentences
+from advnerf_core.report.evidence.registration import launch_file
 from advnerf_core.report.evidence.words import (
     DOMAIN_TITLES,
     claim,
@@ -301,7 +302,7 @@ def _markdown(columns: tuple[str, ...], rows: tuple[tuple[str, ...], ...]) -> st
 def _commands(name: str, registration: Mapping[str, Any]) -> str:
     setting = f" --setting {registration['setting']}" if registration["setting"] else ""
     changes = "".join(f" --set {text}" for text in registration["overrides"])
-    what = f"launch/{registration['file']}{setting}{changes}"
+    what = f"launch/{launch_file(registration['file'])}{setting}{changes}"
     return "\n".join(
         [
             f"    advnerf experiment {what}",

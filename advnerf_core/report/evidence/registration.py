@@ -147,7 +147,7 @@ class Registration(StrictModel):
     Attributes:
         format: Of the file.
         name: Name of the set of results.
-        file: The experiment or campaign file.
+        file: The experiment file; `launch_file` says what it is called now.
         setting: Its setting.
         overrides: Changes of it on the command line.
         date: When it was registered, ISO.
@@ -187,6 +187,11 @@ class Registration(StrictModel):
         """SHA-256 of everything that its file says but its date; what was added to the format later is not in older files."""
         data = self.model_dump(mode="json", exclude={"date"}, exclude_unset=True)
         return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
+
+
+def launch_file(text: str) -> str:
+    """A registered file, or a recorded command, with the name that the file has now: registrations and rows keep the old one."""
+    return text.replace(".campaign.yaml", ".experiment.yaml")
 
 
 def scenario_key(name: str, placement: str) -> str:

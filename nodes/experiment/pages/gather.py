@@ -25,7 +25,6 @@ from nodes.experiment.plan.space_config import FaceConfig
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.given import victim_without_gradient
 from nodes.experiment.show.learned_scene import FIDELITY
-from nodes.experiment.steps.attack import cells
 from nodes.experiment.steps.deploy import DRIVES
 from nodes.experiment.steps.frozen import frozen_hashes
 from nodes.experiment.steps.keys import driven_folder
@@ -58,8 +57,7 @@ def gather(
     live = experiment.config.deploy.live
     return rd.ReportData(
         drives=tuple(
-            _drives(experiment, name, films.get(name), seen.get(name, {}))
-            for name in experiment.config.scenarios
+            _drives(experiment, name, films.get(name), seen.get(name, {})) for name in experiment.config.paths
         ),
         manifest=_manifest(experiment),
         overview=overview,
@@ -74,15 +72,15 @@ def gather(
 def _drives(
     experiment: Experiment, scenario: str, film: Path | None, seen: Mapping[str, NDArray[np.uint8]]
 ) -> rd.Drives:
-    plan = [cell for cell in cells(experiment) if cell.scenario == scenario]
+    plan = [cell for cell in experiment.cells if cell.scenario == scenario]
     runs = [run for domain in DOMAINS for cell in plan for run in _runs(experiment, cell, domain)]
-    if scenario == experiment.config.scenarios[0] and (empty := _extra(experiment, EMPTY)) is not None:
+    if scenario == experiment.config.paths[0] and (empty := _extra(experiment, EMPTY)) is not None:
         runs.append(
             rd.Run(
                 "deployed",
                 EMPTY,
                 empty["victim"],
-                experiment.config.attack.seeds[0],
+                experiment.config.seeds[0],
                 0,
                 np.array(empty["states"])[:, :3],
                 np.array(empty["cte_m"]),
@@ -134,7 +132,7 @@ def _live_parts(experiment: Experiment) -> dict[str, Any]:
     driven = {name: extra for name in ("laps", EMPTY) if (extra := _extra(experiment, name)) is not None}
     measured = [
         *driven.values(),
-        *(each for cell in cells(experiment) for each in _live_results(experiment, cell)),
+        *(each for cell in experiment.cells for each in _live_results(experiment, cell)),
     ]
     found: dict[str, Any] = {
         "latency": _latency(experiment, measured),
@@ -173,7 +171,7 @@ def _not_measured(
 
 def _settings(experiment: Experiment) -> dict[str, str]:
     config, attack = experiment.config, experiment.config.attack
-    starts = {name: experiment.measured_starts(name).tolist() for name in config.scenarios}
+    starts = {name: experiment.measured_starts(name).tolist() for name in config.paths}
     poses = {
         f"measured starts, {name} (x, y, yaw)": "; ".join(
             f"({x:.2f} m, {y:.2f} m, {np.degrees(yaw):.1f}°)" for x, y, yaw in found
@@ -186,7 +184,7 @@ def _settings(experiment: Experiment) -> dict[str, str]:
         "searches": f"{attack.evaluations} evaluations each, learning rate {attack.learning_rate:g}, time batch {attack.time_batch}",
         "space": ", ".join(f"{name} {value}" for name, value in config.space.model_dump().items()),
         **poses,
-        "seeds": ", ".join(str(seed) for seed in attack.seeds),
+        "seeds": ", ".join(str(seed) for seed in config.seeds),
         "speed": f"{experiment.car.speed_mps:g} m/s",
         "off-track": f"|CTE| > {experiment.limits.off_track_m:g} m",
     }
@@ -228,7 +226,7 @@ def _live_results(experiment: Experiment, cell: Cell) -> list[dict[str, Any]]:
 
 
 def _textures(experiment: Experiment) -> Iterator[rd.Texture]:
-    for cell in filter(lambda each: each.searched, cells(experiment)):
+    for cell in filter(lambda each: each.searched, experiment.cells):
         attack = load_attack(experiment.cell_folder(cell) / ATTACK)
         whose = "" if cell.victim == experiment.config.main_victim else f", {cell.victim} victim"
         yield rd.Texture(
@@ -281,7 +279,7 @@ def _latency(experiment: Experiment, results: list[dict[str, Any]]) -> rd.Latenc
 def _timings(experiment: Experiment) -> dict[str, float]:
     names = ("capture", "scene", "bake", "policy", "object", "live")
     records = {name: read_artefact(experiment.stage_folder(name)) for name in names}
-    results = [experiment.cell_result(cell) for cell in cells(experiment)]
+    results = [experiment.cell_result(cell) for cell in experiment.cells]
     seconds = {name: record.seconds for name, record in records.items() if record is not None}
     return {**seconds, "cells": sum(read_json(file)["seconds"] for file in results)}
 

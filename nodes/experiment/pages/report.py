@@ -32,7 +32,7 @@ from nodes.experiment.show.images import as_uint8
 from nodes.experiment.show.overview import from_above
 from nodes.experiment.show.spaces import dress, make_space, shown_there
 from nodes.experiment.steps import films, memory
-from nodes.experiment.steps.attack import cells, load_found, load_shown
+from nodes.experiment.steps.attack import load_found, load_shown
 from nodes.experiment.steps.keys import driven_folder
 from nodes.runtime.progress import Report
 
@@ -55,7 +55,7 @@ def run(experiment: Experiment, folder: Path, report: Report, notes: Sequence[st
     """
     from advnerf_core.report.sections import page_sections, what_it_did  # matplotlib
 
-    know_methods_of(experiment.folder / CELLS, experiment.config.attack.method_names)
+    know_methods_of(experiment.folder / CELLS, experiment.config.method_names)
     data, table = _measure(experiment, folder, report), table_of(experiment)
     report(0.95, "writing the page")
     lead = (*notes, opening(experiment), *what_it_did(data, table, experiment.config.main_victim))
@@ -66,7 +66,7 @@ def run(experiment: Experiment, folder: Path, report: Report, notes: Sequence[st
 
 def _measure(experiment: Experiment, folder: Path, report: Report) -> ReportData:
     """Cut films, and see the objects where the deployed world can be opened; of live drives measure memory."""
-    names = experiment.config.scenarios
+    names = experiment.config.paths
     if experiment.config.deploy.live:
         rows = memory.measure(experiment, folder, lambda part, text="": report(0.6 * part, text))
         report(0.6, "cutting films")
@@ -90,12 +90,12 @@ def _measure(experiment: Experiment, folder: Path, report: Report) -> ReportData
 def opening(experiment: Experiment) -> str:
     """What was done, in one paragraph."""
     config, attack = experiment.config, experiment.config.attack
-    methods = ", ".join(style_of(name).title for name in attack.method_names)
+    methods = ", ".join(style_of(name).title for name in config.method_names)
     kinds = Counter(thing.kind.replace("_", " ") for thing in experiment.objects)
     named = " and ".join(count(number, kind) for kind, number in kinds.items())
     return (
-        f"Policies ({', '.join(config.attacked)}) drive {', '.join(config.scenarios)}. {config.space.searched.format(named)} ({methods}; {attack.evaluations} evaluations "
-        f"each, {count(len(attack.seeds), 'seed')}, {count(attack.starts, 'start')}, T = {config.horizon} ticks of {config.dt_s:g} s){_then(experiment)}."
+        f"Policies ({', '.join(config.attacked)}) drive {', '.join(config.paths)}. {config.space.searched.format(named)} ({methods}; {attack.evaluations} evaluations "
+        f"each, {count(len(config.seeds), 'seed')}, {count(attack.starts, 'start')}, T = {config.horizon} ticks of {config.dt_s:g} s){_then(experiment)}."
     )
 
 
@@ -123,11 +123,11 @@ def print_summary(experiment: Experiment, console: Console) -> None:
 
 def table_of(experiment: Experiment) -> ResultTable:
     """The table of all cells that this experiment itself has run."""
-    plan = cells(experiment)
+    plan = experiment.cells
     files = [experiment.cell_result(cell) for cell in plan]
     found = [read_cell(file) for file in files if file.exists()]
     return make_table(
-        wanted_rows(plan, experiment.config.scenarios, experiment.config.deploy.through != "nothing"),
+        wanted_rows(plan, experiment.config.deploy.through != "nothing"),
         found,
         experiment.config.name,
     )
@@ -137,11 +137,11 @@ def textures_seen(
     experiment: Experiment, scene: World, space: Space, scenario: str
 ) -> dict[str, NDArray[np.uint8]]:
     """The same views of the driving camera past the plain, random and attacked objects of the first seed, one row each."""
-    seed = experiment.config.attack.seeds[0]
+    seed = experiment.config.seeds[0]
     reference = experiment.references[scenario]
     states = [np.array(reference.pose_at(experiment.along_m(at))) for at in _SEEN_AT_M]
     seen = {}
-    for method in (NONE, *experiment.config.attack.method_names):
+    for method in (NONE, *experiment.config.method_names):
         cell = Cell(scenario, experiment.config.main_victim, method, seed)
         folder = driven_folder(experiment, cell)
         shown = load_shown(space, folder, cell)
@@ -155,7 +155,7 @@ def textures_seen(
 
 def seen_where_learned(experiment: Experiment, space: Space, scenario: str) -> dict[str, NDArray[np.uint8]]:
     """What the policy sees in the learned scene past the plain, random and attacked objects of the first seed, where most of them is in view."""
-    victim, seed = experiment.config.main_victim, experiment.config.attack.seeds[0]
+    victim, seed = experiment.config.main_victim, experiment.config.seeds[0]
     driven = films.drives_of(experiment, "surrogate", Cell(scenario, victim, NONE, 0))[0]
     states = driven[np.linspace(0, len(driven) - 1, min(_LOOKED_AT, len(driven))).astype(int)]
     poses = planar_poses(states) @ experiment.mount
@@ -166,7 +166,7 @@ def seen_where_learned(experiment: Experiment, space: Space, scenario: str) -> d
     changed = (rendered(space.plain) - rendered(Shown((), torch.zeros(0, 3)))).abs().sum(dim=(1, 2, 3))
     best = changed.argsort(descending=True, stable=True)[:_SHOWN].sort().values
     seen = {}
-    for method in (NONE, *experiment.config.attack.method_names):
+    for method in (NONE, *experiment.config.method_names):
         cell = Cell(scenario, victim, method, 0 if method == NONE else seed)
         pictures = rendered(load_shown(space, driven_folder(experiment, cell), cell))[best]
         seen[method] = np.concatenate([as_uint8(each) for each in pictures], axis=1)

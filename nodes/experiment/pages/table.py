@@ -16,16 +16,17 @@ from advnerf_core.report.targets import Target
 from nodes.experiment.plan.cell import Cell
 
 
-def wanted_rows(cells: Sequence[Cell], scenarios: Sequence[str], deployed: bool = True) -> list[Wanted]:
-    """The lines that cells fill, in the order of their scenarios; in the learned scene alone where nothing is deployed."""
+def wanted_rows(cells: Sequence[Cell], deployed: bool = True) -> list[Wanted]:
+    """The lines that cells fill, in the order in which their paths and variants appear; in the learned scene alone where nothing is deployed."""
     seeds: dict[tuple[str, str, str, str], list[int]] = {}
     for cell in cells:
-        seeds.setdefault((cell.scenario, cell.placement, cell.victim, cell.method), []).append(cell.seed)
+        seeds.setdefault((cell.scenario, "", cell.victim, cell.method), []).append(cell.seed)
+    scenarios = list(dict.fromkeys(scenario for scenario, _, _, _ in seeds))
     # By victim before method: the reader compares the methods on one victim.
     victims = list(dict.fromkeys(victim for _, _, victim, _ in seeds))
     order = sorted(
         seeds,
-        key=lambda key: (scenarios.index(key[0]), key[1], victims.index(key[2]), order_of(key[3])),
+        key=lambda key: (scenarios.index(key[0]), victims.index(key[2]), order_of(key[3])),
     )
     return [Wanted(*key, tuple(seeds[key]), deployed) for key in order]
 

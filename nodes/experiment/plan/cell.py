@@ -1,4 +1,4 @@
-"""One point of the grid that experiments are made of: which path, which victim meets what, which seed, where the objects stand."""
+"""One point of the grid that experiments are made of: which variant and path, which victim meets what, which seed."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from dataclasses import dataclass, field, replace
 from advnerf_core.plugins import name_in_results
 from advnerf_core.report.cells import cell_name
 from advnerf_core.report.conditions import CONTROLS, NONE
+from nodes.experiment.plan.config import ExperimentConfig
+from nodes.experiment.plan.victims import TRAINED_PLAIN
 from nodes.runtime.errors import ConfigError
 
 # What --only may name.
-KEYS = ("scenario", "placement", "victim", "method", "seed")
+KEYS = ("variant", "path", "victim", "method", "seed")
 
 
 @dataclass(frozen=True)
@@ -19,11 +21,12 @@ class Cell:
     """One cell.
 
     Attributes:
-        scenario: Name of the path, or in a campaign of the scenario.
+        scenario: What tables and file names call its variant and path: the path; of a variant its name, or PATH_VARIANT if it has several paths.
         victim: Which policy.
         method: Name of the method that found what it meets; ``none``: no attack, ``empty``: no object.
         seed: Of the search and its starts; 0 without attack.
-        placement: Name of the placement of the objects; empty for the experiment's own.
+        variant: Which variant of the experiment; empty for an experiment without variants.
+        within: The path of a variant's cell; empty where ``scenario`` is the path.
         reference: Where the method's code is, as `advnerf_core.attack.methods.load_method` takes it, if its name does not say.
     """
 
@@ -31,19 +34,30 @@ class Cell:
     victim: str
     method: str
     seed: int
-    placement: str = ""
+    variant: str = ""
+    within: str = ""
     reference: str = field(default="", compare=False)
 
     @classmethod
-    def of(cls, scenario: str, victim: str, method: str, seed: int, placement: str = "") -> Cell:
+    def of(cls, path: str, victim: str, method: str, seed: int) -> Cell:
         """The cell of a method as `load_method` takes it, or of a control."""
         name = name_in_results(method)
-        return cls(scenario, victim, name, seed, placement, "" if method == name else method)
+        return cls(path, victim, name, seed, reference="" if method == name else method)
+
+    @property
+    def path(self) -> str:
+        """The path that is driven."""
+        return self.within or self.scenario
+
+    @property
+    def inside(self) -> Cell:
+        """The cell as its variant names it."""
+        return replace(self, scenario=self.path, variant="", within="")
 
     @property
     def name(self) -> str:
         """Name of its files."""
-        return cell_name(self.scenario, self.victim, self.method, self.seed, self.placement)
+        return cell_name(self.scenario, self.victim, self.method, self.seed)
 
     @property
     def searched(self) -> bool:
@@ -61,8 +75,38 @@ class Cell:
         return self.reference or self.method
 
 
+def cells_of(config: ExperimentConfig, variant: str = "") -> list[Cell]:
+    """All cells of a resolved experiment, or of one of its variants: every seed against each victim, quick ones first.
+
+    Unless ``over`` names victims, one that was trained plain beside the main one meets the first seed alone.
+    """
+    paths = config.paths
+
+    def seeds_of(victim: str) -> tuple[int, ...]:
+        beside = victim != config.main_victim and config.attacked.get(victim) == TRAINED_PLAIN
+        return config.seeds[:1] if beside and config.over.victim is None else config.seeds
+
+    def cell(path: str, victim: str, method: str, seed: int) -> Cell:
+        # All seeds are measured from the same starts, so that a control is one cell for all of them.
+        found = Cell.of(path, victim, method, 0 if method in CONTROLS else seed)
+        if not variant:
+            return found
+        return replace(
+            found, scenario=variant if len(paths) == 1 else f"{path}_{variant}", variant=variant, within=path
+        )
+
+    found = (
+        cell(path, victim, method, seed)
+        for victim in config.over.victim or config.attacked
+        for seed in seeds_of(victim)
+        for method in config.conditions
+        for path in paths
+    )
+    return list(dict.fromkeys(found))
+
+
 def select(cells: Sequence[Cell], only: str) -> list[Cell]:
-    """The cells that fit a text such as ``scenario=straight,method=gradient+none,seed=0``; an empty text takes all.
+    """The cells that fit a text such as ``path=straight,method=gradient+none,seed=0``; an empty text takes all.
 
     Raises:
         ConfigError: The text is no such text, or no cell fits.

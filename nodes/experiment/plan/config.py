@@ -10,11 +10,14 @@ from pydantic import Field, model_validator
 from advnerf_core.attack.objectives import CTE
 from advnerf_core.plugins import name_in_results
 from advnerf_core.policies.architecture import PILOTNET, Architecture, require_architecture
+from advnerf_core.report.conditions import CONTROLS, NONE
+from advnerf_core.report.evidence.registration import Contrast
 from advnerf_core.scene.gate_limits import GateLimits
 from advnerf_core.strict import StrictModel
 from nodes.experiment.plan.deploy_config import DeployConfig
 from nodes.experiment.plan.method_names import ArchitectureReference, MethodReference, ObjectiveReference
 from nodes.experiment.plan.object_kinds import OBJECT_SUFFIX, PANEL, name_of
+from nodes.experiment.plan.over import OverConfig
 from nodes.experiment.plan.placed import PlacedObject, WantedObject
 from nodes.experiment.plan.robustness_config import RobustnessConfig
 from nodes.experiment.plan.space_config import (
@@ -286,15 +289,10 @@ class AttackConfig(StrictModel):
         default=512.0, description="Budget of the frame cache [MiB]."
     )
 
-    @property
-    def method_names(self) -> tuple[str, ...]:
-        """What the methods are called in tables and file names."""
-        return tuple(map(name_in_results, self.methods))
-
     @model_validator(mode="after")
     def _told_apart(self) -> AttackConfig:
-        if len(set(self.method_names)) != len(self.methods):
-            raise ValueError(f"expected methods of different names, got {', '.join(self.method_names)}")
+        if len(set(map(name_in_results, self.methods))) != len(self.methods):
+            raise ValueError(f"expected methods of different names, got {', '.join(self.methods)}")
         return self
 
 
@@ -346,6 +344,15 @@ class ExperimentConfig(StrictModel):
         return self
 
     @model_validator(mode="after")
+    def _goes_over_keys(self) -> ExperimentConfig:
+        known, axes = type(self).model_fields, self.over.model_extra or {}
+        if unknown := [key for key in axes if key.partition(".")[0] not in known]:
+            raise ValueError(
+                f"over: expected {', '.join(OverConfig.model_fields)}, or keys of the experiment such as attack.evaluations, got {unknown[0]}"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _victims_there_can_be(self) -> ExperimentConfig:
         if RETRAINED in self.victims:
             raise ValueError(
@@ -368,9 +375,9 @@ class ExperimentConfig(StrictModel):
 
     @model_validator(mode="after")
     def _retraining_needs_the_gradient(self) -> ExperimentConfig:
-        if self.retrain is not None and "gradient" not in self.attack.methods:
+        if self.retrain is not None and "gradient" not in self.methods:
             raise ValueError(
-                f"expected gradient among attack.methods, as retrain learns from what it finds, got {', '.join(self.attack.methods)}"
+                f"expected gradient among attack.methods, as retrain learns from what it finds, got {', '.join(self.methods)}"
             )
         return self
 
@@ -462,7 +469,7 @@ class ExperimentConfig(StrictModel):
 
     @model_validator(mode="after")
     def _measures_from_starts_of_its_own(self) -> ExperimentConfig:
-        if self.measure.seed in self.attack.seeds:
+        if self.measure.seed in self.seeds:
             raise ValueError(
                 f"expected measure.seed to be none of attack.seeds, as no search may have the starts that are measured, got {self.measure.seed}"
             )
@@ -536,6 +543,19 @@ class ExperimentConfig(StrictModel):
     reference: Path | None = Field(
         default=None, description="File of what the report is held to, relative to this file; none: nothing."
     )
+    over: OverConfig = Field(
+        default=OverConfig(),
+        description="What the cells are made of: variants, paths, victims, methods and seeds.",
+    )
+    contrasts: tuple[Contrast, ...] = Field(
+        default=(),
+        description="What the same attacks in two variants tell apart; they must be searched alike.",
+    )
+    run_folder: Path | None = Field(
+        default=None,
+        description="Where results go, relative to the working folder; none: runs/SETTING, or runs/NAME for a file without settings. A "
+        "variant with another one has stages of its own there.",
+    )
     retrain: RetrainConfig | None = Field(
         default=None, description="Retrain the hardened victim on what was found; none: not."
     )
@@ -549,6 +569,32 @@ class ExperimentConfig(StrictModel):
         if self.policy.naive_steps:
             trained[NAIVE] = TRAINED_PLAIN
         return trained
+
+    @property
+    def paths(self) -> tuple[str, ...]:
+        """The paths that cells drive."""
+        return self.over.path or self.scenarios
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Seeds of the searches."""
+        return self.over.seed or self.attack.seeds
+
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        """Controls and methods of attack that a victim meets."""
+        controls = CONTROLS if self.measure.no_object else (NONE,)
+        return self.over.method or (*controls, *self.attack.methods)
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """Methods of attack, as `advnerf_core.attack.methods.load_method` takes them."""
+        return tuple(each for each in self.conditions if each not in CONTROLS)
+
+    @property
+    def method_names(self) -> tuple[str, ...]:
+        """What the methods are called in tables and file names."""
+        return tuple(map(name_in_results, self.methods))
 
     @property
     def main_victim(self) -> str:

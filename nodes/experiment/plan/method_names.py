@@ -1,4 +1,4 @@
-"""Names of methods, objectives and architectures in experiment, campaign and request files: checked where they stand, and absolute for other processes.
+"""Names of methods, objectives and architectures in experiment and request files: checked where they stand, and absolute for other processes.
 
 The title that a user's method brings is kept beside the cells that it searched: pages show it without executing the method.
 """

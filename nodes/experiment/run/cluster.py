@@ -1,4 +1,4 @@
-"""Cells over machines, with Ray. Every machine needs this package and the folders of the campaign, under the same paths."""
+"""Cells over machines, with Ray. Every machine needs this package and the folders of the experiment, under the same paths."""
 
 from __future__ import annotations
 
@@ -96,6 +96,6 @@ def run_on_ray(jobs: Sequence[Job], at_a_time: int) -> Iterator[tuple[Job, Ended
             end = None
         except RayError as error:
             raise ConfigError(
-                f"expected every machine of the cluster to have this package and the campaign's folders, got {' '.join(str(error).split())[-500:]}"
+                f"expected every machine of the cluster to have this package and the experiment's folders, got {' '.join(str(error).split())[-500:]}"
             ) from None
         yield job, end

@@ -9,8 +9,8 @@ from pathlib import Path
 from advnerf_core.attack.artifact import AttackFileError, load_attack, save_attack
 from advnerf_core.report.cells import CellResult, read_cell
 from advnerf_core.report.evidence.verify import Verified
-from nodes.experiment.run.config import Campaign
-from nodes.experiment.run.store import CellStatus, store_of
+from nodes.experiment.run.store import CellStatus, Store
+from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps.search_files import ATTACK, is_published_with_its_attack
 
 FOLDER = "attacks"
@@ -26,11 +26,11 @@ def attack_file(folder: Path, attack_id: str) -> Path:
     return folder / FOLDER / f"{attack_id}.safetensors"
 
 
-def publish_attacks(campaign: Campaign, found: Sequence[CellStatus], folder: Path) -> list[Path]:
+def publish_attacks(experiment: Experiment, found: Sequence[CellStatus], folder: Path) -> list[Path]:
     """Copy the attacks of done cells, as far as this machine has them.
 
     Args:
-        campaign: The campaign.
+        experiment: The experiment.
         found: Where its cells are.
         folder: Of the published set.
 
@@ -43,7 +43,7 @@ def publish_attacks(campaign: Campaign, found: Sequence[CellStatus], folder: Pat
             continue
         attack_id = str(each.result.attack_id)
         target = attack_file(folder, attack_id)
-        source = next((file for file in _sources(campaign, each) if _id_of(file) == attack_id), None)
+        source = next((file for file in _sources(experiment, each) if _id_of(file) == attack_id), None)
         if source is not None and not target.exists():
             save_attack(target, load_attack(source), small=True)
             written.append(target)
@@ -84,12 +84,12 @@ def _problems_of(cell: CellResult, file: Path) -> Iterator[str]:
         yield f"{cell.name}: expected attack, victim, method and seed {wanted} in {file}, got {got}"
 
 
-def _sources(campaign: Campaign, found: CellStatus) -> list[Path]:
-    """Files where a cell's attack may be: beside the cell's result, or in the run folder of its experiment."""
-    own = [store_of(campaign).work(found.cell.name)]
+def _sources(experiment: Experiment, found: CellStatus) -> list[Path]:
+    """Files where a cell's attack may be: beside the cell's result, or in the run folder of its variant."""
+    own = [Store(experiment.folder).work(found.cell.name)]
     if found.file is not None:
         own.append(found.file.with_suffix(""))
-    own.append(campaign.run_folder(found.cell) / "cells" / campaign.inside(found.cell).name)
+    own.append(Store(experiment.folder_of(found.cell)).work(found.cell.inside.name))
     return [folder / ATTACK for folder in own]
 
 

@@ -8,14 +8,13 @@ from pathlib import Path
 
 from advnerf_core.report.evidence.registration import RegisteredCell, Registration, read_registration
 from nodes.experiment.engine.artefact import PUBLISHED, Settings
+from nodes.experiment.engine.run_folder import CELLS
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import runs_alone
-from nodes.experiment.run.config import Campaign
-from nodes.experiment.run.store import CellStatus, store_of
+from nodes.experiment.run.store import CellStatus, Store
 from nodes.experiment.run.worker import Job
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps.keys import registered_settings, settings_hash
-from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError, RuntimeFault
 
 
@@ -34,43 +33,28 @@ class Planned:
     live: bool
 
 
-def plan_cells(
-    campaign: Campaign, cells: Sequence[Cell], experiments: dict[tuple[str, str], Experiment] | None = None
-) -> list[Planned]:
-    """Settings of every cell as they are; reads experiments and digests of their stages, prepares nothing.
+def plan_cells(experiment: Experiment, cells: Sequence[Cell]) -> list[Planned]:
+    """Settings of every cell as they are; reads variants and digests of their stages, prepares nothing.
 
     Args:
-        campaign: The campaign.
+        experiment: The experiment.
         cells: Which of its cells.
-        experiments: Those that were read already, by scenario and placement; it gets what is read.
     """
-    experiments = {} if experiments is None else experiments
-    registration = read_registration(PUBLISHED / campaign.name)
+    registration = read_registration(PUBLISHED / experiment.config.name)
     planned = []
     for cell in cells:
-        key = (cell.scenario, cell.placement)
-        if key not in experiments:
-            experiments[key] = read_experiment(campaign, cell)
-        inside = campaign.inside(cell)
-        digest = settings_hash(experiments[key], inside)
+        of = experiment.of(cell)
         job = Job(
-            str(campaign.folder),
-            cell.name,
-            str(campaign.experiment_file(cell)),
-            campaign.scenario(cell).setting,
-            tuple(campaign.overrides(cell)),
-            str(campaign.run_folder(cell)),
-            inside.scenario,
-            cell.scenario,
-            cell.placement,
-            cell.victim,
-            cell.code,
-            cell.seed,
-            digest,
+            str(experiment.folder),
+            str(experiment.file),
+            experiment.setting,
+            experiment.overrides,
+            cell,
+            settings_hash(of, cell.inside),
             threads=1,
-            registration=registered_under(registration, cell, registered_settings(experiments[key])),
+            registration=registered_under(registration, cell, registered_settings(of)),
         )
-        planned.append(Planned(cell, job, runs_alone(experiments[key])))
+        planned.append(Planned(cell, job, runs_alone(of)))
     return planned
 
 
@@ -78,74 +62,44 @@ def registered_under(registration: Registration | None, cell: Cell, settings: Se
     """Digest of the registration that a cell is run under; empty if it, with these settings, is not registered.
 
     Args:
-        registration: Of the campaign or experiment; None if there is none.
-        cell: Which, as the campaign names it.
-        settings: What `registered_settings` says of its experiment.
+        registration: Of the experiment; None if there is none.
+        cell: Which.
+        settings: What `registered_settings` says of its variant.
     """
     if registration is None or registered_cell(cell) not in registration.cells:
         return ""
-    scenario = registration.scenario(cell.scenario, cell.placement)
+    scenario = registration.scenario(cell.scenario)
     same = scenario is not None and scenario.settings_sha256 == settings.key
     return registration.digest if same else ""
 
 
 def registered_cell(cell: Cell) -> RegisteredCell:
     """The cell as a registration names it."""
-    return RegisteredCell(
-        scenario=cell.scenario,
-        placement=cell.placement,
-        victim=cell.victim,
-        method=cell.method,
-        seed=cell.seed,
-    )
+    return RegisteredCell(scenario=cell.scenario, victim=cell.victim, method=cell.method, seed=cell.seed)
 
 
-def statuses(campaign: Campaign, cells: Sequence[Cell]) -> list[CellStatus]:
-    """Where every cell is; one whose experiment cannot be read, as it is not made yet, is missing."""
-    store = store_of(campaign)
-    experiments: dict[tuple[str, str], Experiment] = {}
-    return [
-        store.status(cell, hash_as_it_is(campaign, cell, experiments), elsewhere(campaign, cell))
-        for cell in cells
-    ]
+def statuses(experiment: Experiment, cells: Sequence[Cell]) -> list[CellStatus]:
+    """Where every cell is; one whose variant cannot be read, as it is not made yet, is missing."""
+    store = Store(experiment.folder)
+    return [store.status(cell, current_key(experiment, cell), elsewhere(experiment, cell)) for cell in cells]
 
 
-def elsewhere(campaign: Campaign, cell: Cell) -> list[Path]:
-    """Files where a cell may be besides the campaign's own folder: in the run folder of its experiment, and where cells are kept with the code."""
-    run = campaign.run_folder(cell)
-    return [
-        *([run / "cells" / f"{campaign.inside(cell).name}.json"] if run != campaign.folder else []),
-        PUBLISHED / campaign.name / f"{cell.name}.json",
-    ]
+def elsewhere(experiment: Experiment, cell: Cell) -> list[Path]:
+    """Files where a cell may be besides the experiment's own folder: where its variant's run folder has it, and where cells are kept with the code."""
+    own = experiment.folder_of(cell) / CELLS / f"{cell.inside.name}.json"
+    kept = PUBLISHED / experiment.config.name / f"{cell.name}.json"
+    return [kept] if own == Store(experiment.folder).result_file(cell.name) else [own, kept]
 
 
-def hash_as_it_is(
-    campaign: Campaign, cell: Cell, experiments: dict[tuple[str, str], Experiment]
-) -> str | None:
+def current_key(experiment: Experiment, cell: Cell) -> str | None:
     """Hash of everything that a cell depends on; None if it cannot be known yet, as what the cell needs is not made.
 
-    Args:
-        campaign: The campaign.
-        cell: Which of its cells.
-        experiments: As of `plan_cells`.
-
     Raises:
-        ConfigError: Its experiment is wrong.
+        ConfigError: Its variant is wrong.
     """
     try:
-        return plan_cells(campaign, [cell], experiments)[0].job.settings_hash
+        return plan_cells(experiment, [cell])[0].job.settings_hash
     except ConfigError:
         raise
     except (RuntimeFault, OSError):
         return None
-
-
-def read_experiment(campaign: Campaign, cell: Cell) -> Experiment:
-    """Read the experiment of a cell, with the campaign's settings."""
-    return load_experiment(
-        campaign.experiment_file(cell),
-        campaign.scenario(cell).setting,
-        campaign.overrides(cell),
-        campaign.run_folder(cell),
-        campaign.executes,
-    )

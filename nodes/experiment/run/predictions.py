@@ -14,9 +14,8 @@ from advnerf_core.report.predictions import Predicted
 from nodes.experiment.engine.artefact import read_current
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import is_predictable
-from nodes.experiment.run.config import Campaign
 from nodes.experiment.run.plan import plan_cells
-from nodes.experiment.run.store import store_of
+from nodes.experiment.run.store import Store
 from nodes.experiment.show.context import Experiment
 
 if TYPE_CHECKING:
@@ -25,8 +24,8 @@ if TYPE_CHECKING:
 _KEYS = {"excess_m", "excess_low_m", "excess_high_m", "retained", "clean_drive"}
 
 
-def predict_campaign(
-    campaign: Campaign, cells: Sequence[Cell], say: Callable[[str], None], draws: int | None = None
+def predict_cells(
+    experiment: Experiment, cells: Sequence[Cell], say: Callable[[str], None], draws: int | None = None
 ) -> int:
     """Predict every attacked cell that has been searched and is not predicted yet; returns how many were.
 
@@ -34,7 +33,7 @@ def predict_campaign(
     no drive with the attack, so it is the same before and after that drive.
 
     Args:
-        campaign: The campaign.
+        experiment: The experiment.
         cells: Of it.
         say: Told what was predicted, and what was not and why.
         draws: Drives per prediction, `DEFAULT_DRAWS` unless told.
@@ -42,18 +41,16 @@ def predict_campaign(
     from nodes.experiment.run.gate import DEFAULT_DRAWS, lacks, predict_cell  # loads torch
 
     draws = DEFAULT_DRAWS if draws is None else draws
-    store, made = store_of(campaign), 0
-    experiments: dict[tuple[str, str], Experiment] = {}
-    clean: dict[tuple[str, str, str, int], CleanDrive] = {}
+    store, made = Store(experiment.folder), 0
+    clean: dict[tuple[str, str, int], CleanDrive] = {}
     for cell in cells:
         if not cell.searched:
             continue
-        planned = plan_cells(campaign, [cell], experiments)[0]
+        planned = plan_cells(experiment, [cell])[0]
         # Work of other settings may hold a search too, of another attack.
-        experiment = experiments[cell.scenario, cell.placement]
-        if not is_predictable(experiment):
+        if not is_predictable(experiment.of(cell)):
             continue
-        file = prediction_file(campaign.folder, cell.name)
+        file = prediction_file(experiment.folder, cell.name)
         kept = kept_prediction(file, planned.job.settings_hash)
         if kept is not None and kept.get("draws") == draws:
             continue
@@ -61,11 +58,11 @@ def predict_campaign(
             if kept is not None or store.result(cell.name) is not None:
                 say(f"{cell.name}: not predicted, as its search is not in {store.work(cell.name)}")
             continue
-        which = (experiment, campaign.inside(cell), store.work(cell.name))
+        which = (experiment.of(cell), cell.inside, store.work(cell.name))
         if lacking := lacks(*which):
             say(f"{cell.name}: not predicted, as it lacks {lacking}")
             continue
-        drive = (cell.scenario, cell.placement, cell.victim, cell.seed)
+        drive = (cell.scenario, cell.victim, cell.seed)
         found, clean[drive] = predict_cell(*which, draws, clean.get(drive))
         summary = clean[drive].agreement.summary()
         record = {"settings_hash": planned.job.settings_hash, **found.record(), "clean_drive": summary}
@@ -81,7 +78,7 @@ def predicted(folder: Path, results: Sequence[CellResult]) -> list[Predicted]:
     """Predictions of finished cells, each with what was measured.
 
     Args:
-        folder: Of the campaign, or of what was published of it.
+        folder: Of the experiment, or of what was published of it.
         results: Its finished cells.
     """
     pairs, drives = [], CellDrives(results)
@@ -107,7 +104,7 @@ def predicted(folder: Path, results: Sequence[CellResult]) -> list[Predicted]:
 
 
 def prediction_file(folder: Path, name: str) -> Path:
-    """Where the prediction of a cell is kept, in the folder of a campaign or of what was published of it."""
+    """Where the prediction of a cell is kept, in the folder of an experiment or of what was published of it."""
     return folder / "predictions" / f"{name}.json"
 
 

@@ -19,11 +19,10 @@ from nodes.experiment.pages.table import wanted_rows
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.admission import gate_file, gate_key
 from nodes.experiment.run.cells import keep_build
-from nodes.experiment.run.config import Campaign
 from nodes.experiment.run.kept_attacks import publish_attacks
-from nodes.experiment.run.plan import read_experiment
 from nodes.experiment.run.predictions import kept_prediction, prediction_file
 from nodes.experiment.run.store import FINISHED, CellStatus
+from nodes.experiment.show.context import Experiment
 from nodes.runtime.errors import ConfigError
 
 
@@ -34,7 +33,7 @@ class Published:
     Attributes:
         written: New or changed there.
         same: There already.
-        stale: There, but of other settings than those of now, as is what the campaign's own folder has.
+        stale: There, but of other settings than those of now, as is what the run folder has.
     """
 
     written: tuple[str, ...]
@@ -42,25 +41,27 @@ class Published:
     stale: tuple[str, ...]
 
 
-def publish(campaign: Campaign, found: Sequence[CellStatus], folder: Path, prune: bool = False) -> Published:
+def publish(
+    experiment: Experiment, found: Sequence[CellStatus], folder: Path, prune: bool = False
+) -> Published:
     """Copy finished cells to where they are kept with the code, with the fidelity gate's verdicts and the predictions of these cells.
 
     What lies there of cells that are not finished here stays: they may have been run elsewhere.
 
     Args:
-        campaign: The campaign.
+        experiment: The experiment.
         found: Where its cells are.
-        folder: Gets one folder per campaign.
+        folder: Gets one folder per experiment.
         prune: Remove what lies there of cells whose results here are of other settings too.
     """
     written, same, stale = [], [], []
     for each in found:
-        target = folder / campaign.name / f"{each.cell.name}.json"
+        target = folder / experiment.config.name / f"{each.cell.name}.json"
         if each.state == "changed" and _is_of(target, each.result):
             stale.append(each.cell.name)
             if prune:
                 target.unlink()
-                prediction_file(folder / campaign.name, each.cell.name).unlink(missing_ok=True)
+                prediction_file(folder / experiment.config.name, each.cell.name).unlink(missing_ok=True)
         if each.state != "done":
             continue
         text = _as_published(each)
@@ -69,20 +70,22 @@ def publish(campaign: Campaign, found: Sequence[CellStatus], folder: Path, prune
             continue
         write_atomically(target, text)
         written.append(each.cell.name)
-    _publish_beside(campaign, [each for each in found if each.state == "done"], folder / campaign.name)
-    publish_attacks(campaign, found, folder / campaign.name)
-    _publish_hardness(campaign, folder / campaign.name)
+    _publish_beside(
+        experiment, [each for each in found if each.state == "done"], folder / experiment.config.name
+    )
+    publish_attacks(experiment, found, folder / experiment.config.name)
+    _publish_hardness(experiment, folder / experiment.config.name)
     return Published(tuple(written), tuple(same), tuple(stale))
 
 
 def _as_published(found: CellStatus) -> str:
-    """A done cell's file, under the cell's names in this campaign: an experiment that ran it itself may have others."""
+    """A done cell's file, under the name that it has here: the variant's own run folder has it under the name of its path."""
     assert found.file is not None, "a done cell is somewhere"
     cell, text = found.cell, found.file.read_text(encoding="utf-8")
     data = json.loads(text)
-    if (data["scenario"], data.get("placement", "")) == (cell.scenario, cell.placement):
+    if data["scenario"] == cell.scenario:
         return text
-    return json.dumps({**data, "scenario": cell.scenario, "placement": cell.placement}, indent=1) + "\n"
+    return json.dumps({**data, "scenario": cell.scenario}, indent=1) + "\n"
 
 
 @dataclass(frozen=True)
@@ -103,23 +106,19 @@ class PublishedBuild:
 
 
 def publish_build(
-    campaign: Campaign, cells: Sequence[Cell], folder: Path, prune: bool = False
+    experiment: Experiment, cells: Sequence[Cell], folder: Path, prune: bool = False
 ) -> PublishedBuild:
-    """Copy the scenes, victims and objects of a campaign into the reference build.
+    """Copy the scenes, victims and objects of an experiment into the reference build.
 
     Args:
-        campaign: The campaign.
+        experiment: The experiment.
         cells: Whose.
         folder: Of what is published.
         prune: Remove stages there that no cell published in ``folder`` was run with.
     """
     reference = ReferenceBuild(folder / BUILD)
-    experiments = {(each.scenario, each.placement): each for each in cells}
-    written = [
-        path
-        for cell in experiments.values()
-        for path in keep_build(read_experiment(campaign, cell), reference)
-    ]
+    variants = {each.variant: experiment.of(each) for each in cells}
+    written = [path for variant in variants.values() for path in keep_build(variant, reference)]
     removed = _prune_build(reference, folder) if prune else []
     size = sum(path.stat().st_size for path in reference.folder.rglob("*") if path.is_file())
     return PublishedBuild(reference.folder, tuple(written), tuple(removed), size)
@@ -150,21 +149,21 @@ def _is_of(published: Path, result: CellResult | None) -> bool:
     )
 
 
-def _publish_beside(campaign: Campaign, done: Sequence[CellStatus], folder: Path) -> None:
+def _publish_beside(experiment: Experiment, done: Sequence[CellStatus], folder: Path) -> None:
     for each in done:
         assert each.result is not None, "a finished cell has a result"
-        kept = kept_prediction(prediction_file(campaign.folder, each.cell.name), each.result.settings_hash)
+        kept = kept_prediction(prediction_file(experiment.folder, each.cell.name), each.result.settings_hash)
         if kept is not None:
             write_json(prediction_file(folder, each.cell.name), kept)
     for key in sorted({gate_key(each.cell) for each in done}):
         for drive in (False, True):
-            if (verdict := gate_file(campaign.folder, key, drive)).exists():
+            if (verdict := gate_file(experiment.folder, key, drive)).exists():
                 write_atomically(gate_file(folder, key, drive), verdict.read_text(encoding="utf-8"))
 
 
-def _publish_hardness(campaign: Campaign, folder: Path) -> None:
+def _publish_hardness(experiment: Experiment, folder: Path) -> None:
     """Publish every verdict of the victims, also of recipes that did not pass."""
-    runs = dict.fromkeys(campaign.run_folder(cell) for cell in campaign.cells)
+    runs = dict.fromkeys(experiment.folder_of(cell) for cell in experiment.cells)
     record = merged(
         [read_hardness(folder / PUBLISHED_FILE), *(read_hardness(run / HARDNESS) for run in runs)]
     )
@@ -172,13 +171,13 @@ def _publish_hardness(campaign: Campaign, folder: Path) -> None:
         write_hardness(folder / PUBLISHED_FILE, record)
 
 
-def published_table(folder: Path, campaign: Campaign, cells: Sequence[Cell] | None = None) -> ResultTable:
+def published_table(folder: Path, experiment: Experiment, cells: Sequence[Cell] | None = None) -> ResultTable:
     """The table of published cells, with all lines and seeds that are asked for.
 
     Args:
         folder: Of the published cells.
-        campaign: Whose they are.
-        cells: Which of them the table is of; None for all of the campaign.
+        experiment: Whose they are.
+        cells: Which of them the table is of; None for all.
 
     Raises:
         ConfigError: There are none.
@@ -187,22 +186,18 @@ def published_table(folder: Path, campaign: Campaign, cells: Sequence[Cell] | No
     if not found:
         raise ConfigError(f"expected published cells in {folder}, got none; run advnerf publish")
     return make_table(
-        wanted_rows(campaign.cells if cells is None else cells, list(campaign.scenarios)),
+        wanted_rows(experiment.cells if cells is None else cells),
         found,
-        campaign.name,
+        experiment.config.name,
     )
 
 
-def campaign_table(campaign: Campaign, found: Sequence[CellStatus]) -> ResultTable:
+def table_of(experiment: Experiment, found: Sequence[CellStatus]) -> ResultTable:
     """The table of the cells that are there.
 
     Args:
-        campaign: The campaign.
+        experiment: The experiment.
         found: Where the cells are that the table is of; only results of the settings as they are now are taken.
     """
     cells = [each.result for each in found if each.result is not None and each.state in FINISHED]
-    return make_table(
-        wanted_rows([each.cell for each in found], list(campaign.scenarios)),
-        cells,
-        campaign.name,
-    )
+    return make_table(wanted_rows([each.cell for each in found]), cells, experiment.config.name)

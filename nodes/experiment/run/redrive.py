@@ -25,9 +25,7 @@ from nodes.experiment.engine.artefact import BUILD, Artefact, ReferenceBuild
 from nodes.experiment.engine.stages import key_of
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import Bench
-from nodes.experiment.run.config import Campaign
 from nodes.experiment.run.kept_attacks import attack_file
-from nodes.experiment.run.plan import read_experiment
 from nodes.experiment.run.registering import registered_scenario
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps.attack import surrogate_drives, surrogate_part
@@ -62,12 +60,12 @@ class Redriven:
 
 
 def redrive(
-    campaign: Campaign, published: Path, count: int, seed: int, tell: Callable[[str], None]
+    experiment: Experiment, published: Path, count: int, seed: int, tell: Callable[[str], None]
 ) -> list[Redriven]:
     """Drive some cells of a set again, in the surrogate, with the scene, the victim and the attacks that are kept.
 
     Args:
-        campaign: The registered cells, with a run folder that may be empty.
+        experiment: The registered one, with a run folder that may be empty.
         published: Folder of the set.
         count: How many cells, drawn at random.
         seed: Of the draw.
@@ -78,17 +76,17 @@ def redrive(
     """
     if not is_kept(published):
         raise RedriveError(f"{published.name} {LOST}")
-    _require_same_drives(campaign, published)
+    _require_same_drives(experiment, published)
     names = {file.stem for file in published.glob("*.json")}
-    known = [cell for cell in campaign.cells if cell.name in names]
+    known = [cell for cell in experiment.cells if cell.name in names]
     chosen = random.Random(seed).sample(known, min(count, len(known)))
     found = []
     for cell in chosen:
         tell(f"{cell.name}: driven again")
         said = read_cell(published / f"{cell.name}.json")
-        experiment = read_experiment(campaign, cell)
-        _take_stages(experiment, said, ReferenceBuild(published.parent / BUILD))
-        again = _again(experiment, campaign.inside(cell), attack_file(published, said.attack_id or NONE))
+        variant = experiment.of(cell)
+        _take_stages(variant, said, ReferenceBuild(published.parent / BUILD))
+        again = _again(variant, cell.inside, attack_file(published, said.attack_id or NONE))
         found.append(_compared(cell.name, said.kept["surrogate"], again))
     return found
 
@@ -107,14 +105,14 @@ def unreadable(published: Path, why: str) -> RedriveError:
     )
 
 
-def _require_same_drives(campaign: Campaign, published: Path) -> None:
+def _require_same_drives(experiment: Experiment, published: Path) -> None:
     """Refuse to compare with drives that were registered otherwise than this version would drive them."""
     registration = read_registration(published)
-    for cell in {cell.scenario + cell.placement: cell for cell in campaign.cells}.values():
-        then = registration.scenario(cell.scenario, cell.placement) if registration is not None else None
+    for cell in {cell.scenario: cell for cell in experiment.cells}.values():
+        then = registration.scenario(cell.scenario) if registration is not None else None
         if then is None:
             continue
-        now = registered_scenario(read_experiment(campaign, cell), campaign.inside(cell).scenario)
+        now = registered_scenario(experiment.of(cell), cell.path)
         if differ := [name for name in _DRIVEN if getattr(then, name) != getattr(now, name)]:
             raise unreadable(published, f"expected the {', '.join(differ)} that were registered, got others")
 
@@ -131,16 +129,16 @@ def _take_stages(experiment: Experiment, said: CellResult, build: ReferenceBuild
             records[stage.name] = found
 
 
-def _again(experiment: Experiment, inside: Cell, attack: Path) -> list[KeptDrive]:
+def _again(experiment: Experiment, cell: Cell, attack: Path) -> list[KeptDrive]:
     """Drives in the surrogate past the published attack; of a set without attacks, past what its search finds again."""
     prepare_victims(experiment)
     with TemporaryDirectory() as work, Bench(experiment) as bench:
         folder = Path(work)
         if attack.exists():
             shutil.copy(attack, folder / ATTACK)
-            found = surrogate_drives(experiment, bench.space, inside, folder)
+            found = surrogate_drives(experiment, bench.space, cell, folder)
         else:
-            found = surrogate_part(experiment, bench.space, inside, folder, lambda fraction, text="": None)
+            found = surrogate_part(experiment, bench.space, cell, folder, lambda fraction, text="": None)
     return [KeptDrive.model_validate(each) for each in kept_drives(found)]
 
 

@@ -1,4 +1,4 @@
-"""Registering an experiment or a campaign: what will be run is written down before it is run."""
+"""Registering an experiment: what will be run is written down before it is run."""
 
 from __future__ import annotations
 
@@ -23,14 +23,12 @@ from advnerf_core.report.evidence.registration import (
     Registration,
     RegistrationError,
     read_registration,
-    scenario_key,
 )
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.plan.object_kinds import PANEL
 from nodes.experiment.plan.space_config import ColoursConfig, FaceConfig
-from nodes.experiment.run.config import Campaign
-from nodes.experiment.run.plan import read_experiment, registered_cell, statuses
+from nodes.experiment.run.plan import registered_cell, statuses
 from nodes.experiment.run.store import FINISHED
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.given import given
@@ -40,31 +38,30 @@ from nodes.experiment.steps.keys import registered_settings
 from nodes.experiment.steps.verdicts import TRAINED_ON, VALIDATED_ON, unseen
 
 
-def register(campaign: Campaign, setting: str, overrides: Sequence[str], published: Path) -> Registration:
-    """Write down what a campaign, or one experiment, will run.
+def register(experiment: Experiment, cells: Sequence[Cell], published: Path) -> Registration:
+    """Write down what an experiment will run.
 
     Args:
-        campaign: The cells.
-        setting: Of the experiment file; empty for a campaign.
-        overrides: Changes on the command line.
-        published: Folder of all published sets; the file goes into a folder of the campaign's name.
+        experiment: The experiment.
+        cells: Which of its cells.
+        published: Folder of all published sets; the file goes into a folder of the experiment's name.
 
     Raises:
         RegistrationError: Other things are registered under this name, cells of these settings were run already, or a test lacks baselines.
     """
     found = Registration(
-        name=campaign.name,
-        file=campaign.file.name,
-        setting=setting,
-        overrides=tuple(overrides),
+        name=experiment.config.name,
+        file=experiment.file.name,
+        setting=experiment.setting,
+        overrides=experiment.overrides,
         date=datetime.now(timezone.utc).isoformat(timespec="seconds"),
         software_version=version("advnerf"),
-        scenarios=_scenarios(campaign),
-        cells=tuple(registered_cell(cell) for cell in campaign.cells),
-        primary=tuple(primary_tests(campaign)),
-        contrasts=campaign.contrasts,
+        scenarios=_scenarios(experiment, cells),
+        cells=tuple(registered_cell(cell) for cell in cells),
+        primary=tuple(primary_tests(experiment, cells)),
+        contrasts=experiment.config.contrasts,
     ).as_filed()
-    folder = published / campaign.name
+    folder = published / experiment.config.name
     before = read_registration(folder)
     if before is not None and before.digest == found.digest:
         return before
@@ -73,25 +70,20 @@ def register(campaign: Campaign, setting: str, overrides: Sequence[str], publish
             f"{folder / FILE}: expected the same experiment as was registered on {before.date}, got another; remove the file, and the cells "
             "published beside it, to register anew"
         )
-    _refuse_late(campaign)
+    _refuse_late(experiment, cells)
     write_json(folder / FILE, found.model_dump(mode="json"))
     return found
 
 
-def _scenarios(campaign: Campaign) -> dict[str, RegisteredScenario]:
+def _scenarios(experiment: Experiment, cells: Sequence[Cell]) -> dict[str, RegisteredScenario]:
     found: dict[str, RegisteredScenario] = {}
-    for cell in campaign.cells:
-        key = scenario_key(cell.scenario, cell.placement)
-        if key not in found:
-            found[key] = registered_scenario(_experiment(campaign, cell), campaign.inside(cell).scenario)
+    for cell in cells:
+        if cell.scenario not in found:
+            variant = experiment.of(cell)
+            look_at_given(variant)  # they are fixed by their hashes before anything is run
+            variant.ask_world()
+            found[cell.scenario] = registered_scenario(variant, cell.path)
     return found
-
-
-def _experiment(campaign: Campaign, cell: Cell) -> Experiment:
-    experiment = read_experiment(campaign, cell)
-    look_at_given(experiment)  # they are fixed by their hashes before anything is run
-    experiment.ask_world()
-    return experiment
 
 
 def registered_scenario(experiment: Experiment, name: str) -> RegisteredScenario:
@@ -125,18 +117,18 @@ def registered_scenario(experiment: Experiment, name: str) -> RegisteredScenario
     )
 
 
-def primary_tests(campaign: Campaign) -> list[PrimaryTest]:
-    """The tests on the main victim, per scenario: the gradient against all baselines, and that in coarse cells against coarse ones.
+def primary_tests(experiment: Experiment, cells: Sequence[Cell]) -> list[PrimaryTest]:
+    """The tests on the main victim, per variant and path: the gradient against all baselines, and that in coarse cells against coarse ones.
 
-    Baselines are the methods whose textures neither trained nor judged the victim. A scenario without any has no test.
+    Baselines are the methods whose textures neither trained nor judged the victim. A place without any has no test.
 
     Raises:
-        RegistrationError: A scenario with a baseline lacks some of those that a test needs.
+        RegistrationError: A place with a baseline lacks some of those that a test needs.
     """
     tests = []
-    for scenario, placement in dict.fromkeys((cell.scenario, cell.placement) for cell in campaign.cells):
-        found = [each for each in campaign.cells if (each.scenario, each.placement) == (scenario, placement)]
-        config = read_experiment(campaign, found[0]).config
+    for scenario in dict.fromkeys(cell.scenario for cell in cells):
+        found = [each for each in cells if each.scenario == scenario]
+        config = experiment.of(found[0]).config
         victim = config.main_victim
         methods = unseen(cell.method for cell in found if cell.victim == victim and cell.searched)
         against = [name for name in methods if name not in (GRADIENT, COARSE_GRADIENT)]
@@ -145,15 +137,13 @@ def primary_tests(campaign: Campaign) -> list[PrimaryTest]:
         lacking = _lacking(methods, config)
         if lacking:
             raise RegistrationError(
-                f"{scenario_key(scenario, placement)}: expected the baselines that a test of the gradient needs, got {', '.join(against)} "
+                f"{scenario}: expected the baselines that a test of the gradient needs, got {', '.join(against)} "
                 f"(textures of {', '.join(TRAINED_ON)} train the victim, those of {', '.join(VALIDATED_ON)} judge it); add {'; '.join(lacking)} to "
                 "the methods"
             )
         coarse = [name for name in against if name in COARSE_BASELINES] if COARSE_GRADIENT in methods else []
         tests += [
-            PrimaryTest(
-                scenario=scenario, placement=placement, victim=victim, method=method, against=tuple(names)
-            )
+            PrimaryTest(scenario=scenario, victim=victim, method=method, against=tuple(names))
             for method, names in ((GRADIENT, against), (COARSE_GRADIENT, coarse))
             if names
         ]
@@ -173,10 +163,10 @@ def _coarse_cells_differ(config: ExperimentConfig) -> bool:
     return isinstance(space, ColoursConfig) and panel and 0 < space.cells < config.object.panel_resolution
 
 
-def _refuse_late(campaign: Campaign) -> None:
+def _refuse_late(experiment: Experiment, cells: Sequence[Cell]) -> None:
     done = [
         each.cell.name
-        for each in statuses(campaign, campaign.cells)
+        for each in statuses(experiment, cells)
         if each.state in (*FINISHED, "begun", "running")
     ]
     if done:

@@ -1,9 +1,9 @@
-"""Runs a campaign: prepares its experiments, then its cells, over cores or over a cluster; what is there and fits is not run again."""
+"""Runs cells: prepares what they need, then runs them, over cores or over a cluster; what is there and fits is not run again."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from multiprocessing.pool import ThreadPool
@@ -15,12 +15,12 @@ from rich.console import Console
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.admission import past_the_gate
 from nodes.experiment.run.cells import Bench, needed_settings
-from nodes.experiment.run.config import Campaign
-from nodes.experiment.run.plan import Planned, elsewhere, plan_cells, read_experiment
-from nodes.experiment.run.store import NOT_DRIVEN, Store, store_of
+from nodes.experiment.run.plan import Planned, elsewhere, plan_cells
+from nodes.experiment.run.store import NOT_DRIVEN, Store
 from nodes.experiment.run.worker import Ended, Job, run_here, run_in_process
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps.run import prepare_victims
+from nodes.experiment.steps.steering_gate import require_same_steering
 from nodes.lab.trials.tries import allow_more_tries
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay, StageDisplay
@@ -33,7 +33,7 @@ _ROUNDS = 3
 
 @dataclass(frozen=True)
 class Options:
-    """How a campaign is run.
+    """How cells are run.
 
     Attributes:
         jobs: Cells at a time; 0 takes one per core, or the cores of the cluster.
@@ -41,7 +41,7 @@ class Options:
         backend: ``local`` or ``ray``.
         address: Of a running Ray cluster; empty takes the one in RAY_ADDRESS, or starts one here.
         retry: Also run cells that failed before.
-        gate: Whether scenarios whose surrogate the fidelity gate refuses are left out; else it is only told.
+        gate: Whether cells whose surrogate the fidelity gate refuses are left out; else it is only told.
         search_only: Search, and deploy nothing: for predictions before the drives, or to choose what is worth one.
         here: One cell after another in this process, which starts none and shares what cells of one experiment have in common.
         ready: What cells need is there already.
@@ -58,23 +58,21 @@ class Options:
     ready: bool = False
 
 
-def run_campaign(
-    campaign: Campaign,
+def run_cells(
+    experiment: Experiment,
     cells: Sequence[Cell],
     options: Options,
     say: Say,
-    experiments: dict[tuple[str, str], Experiment] | None = None,
     console: Console | None = None,
     watcher: StageDisplay | None = None,
 ) -> list[Ended]:
     """Run the cells that are not there yet.
 
     Args:
-        campaign: The campaign.
+        experiment: The experiment.
         cells: Those of its cells that are wanted.
         options: Over what, and how many at a time.
         say: Told of every start and end.
-        experiments: As of `plan_cells`.
         console: Where the progress of cells in this process is shown.
         watcher: Receives the progress of cells in this process too.
 
@@ -82,22 +80,22 @@ def run_campaign(
         How every cell that was run ended, in the order of their ends.
 
     Raises:
-        ConfigError: An experiment is wrong; nothing was run.
+        ConfigError: A variant is wrong; nothing was run.
     """
-    store, experiments = store_of(campaign), {} if experiments is None else experiments
+    store = Store(experiment.folder)
     if not options.ready:
-        _prepare(campaign, cells, say)
+        _prepare(experiment, cells, options, say)
     # Before the gate, so that a cell that there cannot be is told first.
-    plan = plan_cells(campaign, cells, experiments)
-    judged = past_the_gate(campaign, cells, options.gate, say)
+    plan = plan_cells(experiment, cells)
+    judged = past_the_gate(experiment, cells, options.gate, say)
     wanted = [
         each
         for each in plan
-        if each.cell in judged and _is_wanted(store, each, elsewhere(campaign, each.cell), options, say)
+        if each.cell in judged and _is_wanted(store, each, elsewhere(experiment, each.cell), options, say)
     ]
     if not wanted:
         there = sum(
-            store.status(each.cell, each.job.settings_hash, elsewhere(campaign, each.cell)).state == "done"
+            store.status(each.cell, each.job.settings_hash, elsewhere(experiment, each.cell)).state == "done"
             for each in plan
         )
         say(
@@ -106,7 +104,7 @@ def run_campaign(
         return []
     _require_positive(options)
     if options.here:
-        return _run_here(store, wanted, experiments, options, say, ProgressDisplay(console, watcher))
+        return _run_here(store, wanted, experiment, options, say, ProgressDisplay(console, watcher))
     jobs, threads = _shares(options)
     if options.search_only:
         say(f"{len(wanted)} cells to search, {_at_a_time(jobs, threads)}")
@@ -125,26 +123,27 @@ def run_campaign(
         if each.live and each.cell.name not in lost:
             ended.append(_tell(run_in_process(replace(each.job, threads=_cores())), say))
     # Their drives without attack are there now.
-    past_the_gate(campaign, [each.cell for each in wanted if each.live], options.gate, say)
+    past_the_gate(experiment, [each.cell for each in wanted if each.live], options.gate, say)
     return ended
 
 
 def _run_here(
     store: Store,
     wanted: Sequence[Planned],
-    experiments: Mapping[tuple[str, str], Experiment],
+    experiment: Experiment,
     options: Options,
     say: Say,
     display: ProgressDisplay,
 ) -> list[Ended]:
-    """One cell after another in this process; those of one experiment share what it opens."""
+    """One cell after another in this process; those of one variant share what it opens."""
     ended = []
-    for key, group in groupby(wanted, lambda each: (each.cell.scenario, each.cell.placement)):
-        experiment = experiments[key]
-        with display, Bench(experiment) as bench:
-            for each in group:
+    for _, group in groupby(wanted, lambda each: each.cell.variant):
+        cells = list(group)
+        variant = experiment.of(cells[0].cell)
+        with display, Bench(variant) as bench:
+            for each in cells:
                 job = replace(each.job, threads=_cores(), phase="search" if options.search_only else "whole")
-                ended.append(run_here(job, store, experiment, bench, display))
+                ended.append(run_here(job, store, variant, bench, display))
     for end in ended:
         if end.how != "done" or end.text:
             say(f"{end.name}: {end.how}: {end.text}")
@@ -155,33 +154,29 @@ def _at_a_time(jobs: int, threads: int) -> str:
     return f"{jobs or 'all the cluster has cores for'} at a time, {threads} threads each"
 
 
-def _prepare(campaign: Campaign, cells: Sequence[Cell], say: Say) -> None:
-    done: set[Path] = set()
-    # All files are read before anything is made, so that a mistake in the last does not cost the hours of the first.
-    experiments = {(cell.scenario, cell.placement): (cell, read_experiment(campaign, cell)) for cell in cells}
-    _refuse_two_in_one_folder(campaign, cells)
-    for cell, experiment in experiments.values():
-        folder = campaign.run_folder(cell)
-        if folder in done:
-            continue
-        done.add(folder)
-        say(f"{cell.scenario}{'.' * bool(cell.placement)}{cell.placement}: {folder}")
-        prepare_victims(experiment)
+def _prepare(experiment: Experiment, cells: Sequence[Cell], options: Options, say: Say) -> None:
+    # All variants are read before anything is made, so that a mistake in the last does not cost the hours of the first.
+    wanted = {cell.variant: experiment.of(cell) for cell in cells}
+    _refuse_two_in_one_folder(experiment, cells)
+    for name, variant in {each.folder: (name, each) for name, each in reversed(wanted.items())}.values():
+        say(f"{name or variant.config.name}: {variant.folder}")
+        prepare_victims(variant)
+        require_same_steering(variant, not options.gate, say)
 
 
-def _refuse_two_in_one_folder(campaign: Campaign, cells: Sequence[Cell]) -> None:
-    """Scenarios of one run folder must need the same scene and policies, or each would run on, or remake, those of the other."""
-    folders = {campaign.run_folder(cell) for cell in cells}
+def _refuse_two_in_one_folder(experiment: Experiment, cells: Sequence[Cell]) -> None:
+    """Variants of one run folder must need the same scene and policies, or each would run on, or remake, those of the other."""
+    folders = {experiment.folder_of(cell) for cell in cells}
     first: dict[Path, tuple[str, dict[str, Any]]] = {}
-    for cell in {(each.scenario, each.placement): each for each in campaign.cells}.values():
-        if (folder := campaign.run_folder(cell)) not in folders:
+    for cell in {each.variant: each for each in experiment.cells}.values():
+        if (folder := experiment.folder_of(cell)) not in folders:
             continue
-        needed = needed_settings(read_experiment(campaign, cell))
-        name, others = first.setdefault(folder, (cell.scenario, needed))
+        needed = needed_settings(experiment.of(cell))
+        name, others = first.setdefault(folder, (cell.variant, needed))
         if wrong := [stage for stage in needed.keys() & others.keys() if needed[stage] != others[stage]]:
             raise ConfigError(
-                f"{campaign.file}: expected scenarios {name} and {cell.scenario} to have the same settings of stage {', '.join(sorted(wrong))}, as "
-                f"both are in {folder}, got different ones; give one of them a run_folder of its own"
+                f"{experiment.file}: expected variants {name} and {cell.variant} to have the same settings of stage {', '.join(sorted(wrong))}, "
+                f"as both are in {folder}, got different ones; give one of them a run_folder of its own"
             )
 
 
@@ -214,7 +209,7 @@ def _run_beside(jobs: list[Job], at_a_time: int, options: Options, say: Say) -> 
         return []
     if options.backend == "ray":
         return _run_on_ray(jobs, at_a_time, options, say)
-    # Its threads are daemons: they do not keep a campaign that is stopped from ending, and their cells end with it.
+    # Its threads are daemons: they do not keep a stopped run from ending, and their cells end with it.
     with ThreadPool(at_a_time) as pool:
         return [_tell(end, say) for end in pool.imap_unordered(run_in_process, jobs)]
 
@@ -240,13 +235,13 @@ def _run_on_ray(jobs: list[Job], at_a_time: int, options: Options, say: Say) -> 
                 return ended
             say(f"a machine of the cluster was lost: {len(lost)} cells are handed out again")
             left = lost
-        text = "its machine was lost again and again; it goes on when the campaign is run again"
+        text = "its machine was lost again and again; it goes on when the experiment is run again"
         return ended + [_tell(Ended(job.name, "lost", text, 0.0), say) for job in left]
 
 
 def _is_finished(job: Job) -> bool:
     """Whether a result of these settings is there, whoever was to tell of it; a search has none of its own and goes on from its state."""
-    result = Store(Path(job.campaign_folder)).result(job.name)
+    result = Store(Path(job.folder)).result(job.name)
     return result is not None and result.settings_hash == job.settings_hash
 
 

@@ -19,17 +19,17 @@ from advnerf_core.report.evidence.page import film_of
 from advnerf_core.report.evidence.registration import read_registration
 from advnerf_core.report.evidence.results import Evidence
 from advnerf_core.report.evidence.verifying.layout import SET
-from nodes.experiment.run.config import Campaign
+from nodes.experiment.show.context import Experiment
 
 MOST_BYTES = 250_000
 _WIDTH_PX, _FRAME_MS, _QUALITIES = 760, 200, (70, 50, 35, 20, 10)
 _EVERY = 2  # of ten frames a second
 
 
-def write_film(campaign: Campaign, published: Path) -> Path | None:
+def write_film(experiment: Experiment, published: Path) -> Path | None:
     """Write the film of the first primary test beside the page; None if there is none, or a clip is not on this machine."""
     primary = read_json(published / SET)["primary"]
-    clips = _clips(campaign, published, primary[0]) if primary else []
+    clips = _clips(experiment, published, primary[0]) if primary else []
     if not clips or not all(clip.exists() for clip in clips):
         return None
     frames = _side_by_side([read_clip(clip)[::_EVERY] for clip in clips])
@@ -42,7 +42,7 @@ def write_film(campaign: Campaign, published: Path) -> Path | None:
     return target
 
 
-def _clips(campaign: Campaign, published: Path, test: dict[str, Any]) -> list[Path]:
+def _clips(experiment: Experiment, published: Path, test: dict[str, Any]) -> list[Path]:
     which, registration = test["test"], read_registration(published)
     assert registration is not None, "a set was registered"
     evidence = Evidence(registration, read_cells(published))
@@ -50,7 +50,7 @@ def _clips(campaign: Campaign, published: Path, test: dict[str, Any]) -> list[Pa
         evidence.searches((which["scenario"], which["placement"], which["victim"], method))[0]
         for method in (NONE, test["baseline"], which["method"])
     ]
-    return [campaign.folder / "cells" / str(cell.extra.get("clip", "")) for cell in searched]
+    return [experiment.folder / "cells" / str(cell.extra.get("clip", "")) for cell in searched]
 
 
 def _side_by_side(clips: Sequence[NDArray[np.uint8]]) -> list[Image.Image]:

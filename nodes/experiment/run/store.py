@@ -1,4 +1,4 @@
-"""A campaign's folder: one JSON per finished cell, one folder of work per cell, locks, and errors of what failed."""
+"""The cells in a run folder: one JSON per finished cell, one folder of work per cell, locks, and errors of what failed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from advnerf_core.files import write_json
 from advnerf_core.report.cells import CellError, CellResult, cell_from, read_cell
 from nodes.experiment.engine.artefact import Settings, has_key, read_current, write_key
 from nodes.experiment.plan.cell import Cell
-from nodes.experiment.run.config import Campaign
 from nodes.runtime.locks import HeldError, hold
 
 State = Literal["done", "not driven live", "failed", "changed", "running", "begun", "missing", "unreadable"]
@@ -45,7 +44,7 @@ class CellStatus:
 
 @dataclass(frozen=True)
 class Store:
-    """The folder of a campaign."""
+    """The run folder of an experiment."""
 
     folder: Path
 
@@ -159,10 +158,5 @@ def _first_of(files: Sequence[Path], settings_hash: str) -> tuple[Path, CellResu
 
 
 def _named(result: CellResult, cell: Cell) -> CellResult:
-    """A result under the name that it has here: a campaign may call a path otherwise than its experiment."""
-    return result.model_copy(update={"scenario": cell.scenario, "placement": cell.placement})
-
-
-def store_of(campaign: Campaign) -> Store:
-    """The folder of a campaign."""
-    return Store(campaign.folder)
+    """A result under the name that it has here: the variant's own run folder has it under the name of its path."""
+    return result.model_copy(update={"scenario": cell.scenario})

@@ -11,20 +11,19 @@ from rich.console import Console
 
 from advnerf_core.files import sha256_of
 from advnerf_core.plugins import name_in_results
+from advnerf_core.report.conditions import CONTROLS
 from nodes.experiment.engine.artefact import Settings
 from nodes.experiment.engine.progress_record import ProgressRecord
 from nodes.experiment.engine.run_folder import require_own_folder
 from nodes.experiment.engine.stages import Stage, check_until, run_stages
 from nodes.experiment.pages import report
 from nodes.experiment.plan.cell import Cell, select
-from nodes.experiment.run.config import Campaign, campaign_of
 from nodes.experiment.run.plan import statuses
-from nodes.experiment.run.run import Options, run_campaign
+from nodes.experiment.run.run import Options, run_cells
 from nodes.experiment.run.store import FINISHED, NOT_DRIVEN
 from nodes.experiment.run.worker import Ended
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.victims import look_at_given
-from nodes.experiment.steps.attack import cells
 from nodes.experiment.steps.pipeline import stages_of
 from nodes.experiment.steps.run import make_ready
 from nodes.experiment.steps.steering_gate import require_same_steering
@@ -38,7 +37,6 @@ def run_experiment(
     until: str | None = None,
     options: Options | None = None,
     only: str = "",
-    overrides: Sequence[str] = (),
     console: Console | None = None,
     anew: bool = False,
     record: ProgressRecord | None = None,
@@ -50,7 +48,6 @@ def run_experiment(
         until: Last stage to run; None for all, and the cells.
         options: How cells are run; None runs one after another in this process.
         only: Which cells; see `select`.
-        overrides: ``key=value`` texts with which the experiment was read, for other processes.
         console: Where to print.
         anew: Whether stages are made here that are kept with the code.
         record: Keeps the progress for the experiment page.
@@ -67,8 +64,7 @@ def run_experiment(
     look_at_given(experiment)
     stages = [*stages_of(experiment), _report_stage(experiment, {})]
     check_until(stages, until)
-    plan = cells(experiment)
-    chosen = select(plan, only)
+    chosen = select(experiment.cells, only)
     if record is not None:
         names = [stage.name for stage in stages]
         until_there = names if until is None else names[: names.index(until) + 1]
@@ -76,11 +72,10 @@ def run_experiment(
     make_ready(experiment, None if until == REPORT else until, console, anew, record)
     ended: list[Ended] = []
     if until in (None, REPORT):
-        campaign = campaign_of(experiment, overrides, plan)
         options = options or Options(here=True, ready=True)
         require_same_steering(experiment, not options.gate, partial(_say, console, record))
-        ended = _run_cells(experiment, campaign, chosen, options, console, record)
-        _write_report(experiment, campaign, console, record)
+        ended = _run_cells(experiment, chosen, options, console, record)
+        _write_report(experiment, console, record)
     console.print(
         f"{experiment.config.name} ({experiment.setting}): {time.monotonic() - began:.0f} s", highlight=False
     )
@@ -89,17 +84,14 @@ def run_experiment(
 
 def _run_cells(
     experiment: Experiment,
-    campaign: Campaign,
     chosen: Sequence[Cell],
     options: Options,
     console: Console,
     record: ProgressRecord | None,
 ) -> list[Ended]:
-    known = {(name, ""): experiment for name in campaign.scenarios}
     if record is not None:
-        _record_cells_there(campaign, chosen, options, record)
-
-    return run_campaign(campaign, chosen, options, partial(_say, console, record), known, console, record)
+        _record_cells_there(experiment, chosen, options, record)
+    return run_cells(experiment, chosen, options, partial(_say, console, record), console, record)
 
 
 def _say(console: Console, record: ProgressRecord | None, text: str) -> None:
@@ -109,37 +101,35 @@ def _say(console: Console, record: ProgressRecord | None, text: str) -> None:
 
 
 def _record_cells_there(
-    campaign: Campaign, chosen: Sequence[Cell], options: Options, record: ProgressRecord
+    experiment: Experiment, chosen: Sequence[Cell], options: Options, record: ProgressRecord
 ) -> None:
     """Cells that will not be run again: done, or failed before."""
-    for each in statuses(campaign, chosen):
+    for each in statuses(experiment, chosen):
         if each.state in FINISHED and not (each.state == NOT_DRIVEN and options.retry):
             record.finish(each.cell.name, 0.0, cached=True)
         elif each.state == "failed" and not options.retry:
             record.fail(each.cell.name, each.text)
 
 
-def _write_report(
-    experiment: Experiment, campaign: Campaign, console: Console, record: ProgressRecord | None
-) -> None:
+def _write_report(experiment: Experiment, console: Console, record: ProgressRecord | None) -> None:
     """The report of the methods whose cells are all here and deployed, once no cell is left to run.
 
     A method of which a cell failed is left out and named. What the report was made of is part of its key.
     """
-    found = statuses(campaign, campaign.cells)
+    found = statuses(experiment, experiment.cells)
     failed = {each.cell.method: f"{each.cell.name}: {each.text}" for each in found if each.state == "failed"}
     reported = _of_methods(
-        experiment, [name for name in experiment.config.attack.method_names if name not in failed]
+        experiment, [name for name in experiment.config.method_names if name not in failed]
     )
     done = {each.cell.name for each in found if each.state in FINISHED}
-    files = {cell.name: experiment.cell_result(cell) for cell in cells(reported)}
+    files = {cell.name: experiment.cell_result(cell) for cell in reported.cells}
     missing = [name for name, file in files.items() if name not in done or not file.exists()]
     notes = [f"not in the report, as a cell failed: {name} ({text})" for name, text in failed.items()]
-    if missing or not reported.config.attack.methods:
+    if missing or not reported.config.methods:
         notes = [f"no report yet: {len(found) - len(done)} of {len(found)} cells are missing"]
     for text in notes:
         _say(console, record, text)
-    if missing or not reported.config.attack.methods:
+    if missing or not reported.config.methods:
         return
     digests = {name: sha256_of(file) for name, file in files.items()}
     with ProgressDisplay(console, record) as display:
@@ -149,12 +139,12 @@ def _write_report(
 
 def _of_methods(experiment: Experiment, names: Sequence[str]) -> Experiment:
     """The same experiment with some of its methods."""
-    attack = experiment.config.attack
-    kept = tuple(each for each in attack.methods if name_in_results(each) in names)
-    if kept == attack.methods:
+    config = experiment.config
+    kept = tuple(each for each in config.conditions if each in CONTROLS or name_in_results(each) in names)
+    if kept == config.conditions:
         return experiment
-    fewer = attack.model_copy(update={"methods": kept})
-    return replace(experiment, config=experiment.config.model_copy(update={"attack": fewer}))
+    over = config.over.model_copy(update={"method": kept})
+    return replace(experiment, config=config.model_copy(update={"over": over}))
 
 
 def _report_stage(experiment: Experiment, digests: dict[str, str], notes: Sequence[str] = ()) -> Stage:

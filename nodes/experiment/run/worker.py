@@ -1,7 +1,7 @@
 """The process of one cell: whatever happens to it, other cells do not notice. ``python -m nodes.experiment.run.worker`` reads its job from stdin.
 
-The result, or the error, is left in the campaign's folder; the exit code says which. A killed worker leaves neither, and its folder as it
-was: the next run of the campaign goes on there.
+The result, or the error, is left in the run folder; the exit code says which. A killed worker leaves neither, and its folder as it
+was: the next run of the experiment goes on there.
 """
 
 from __future__ import annotations
@@ -54,45 +54,37 @@ class Job:
     """One cell to run; plain data, so that it can go to another machine.
 
     Attributes:
-        campaign_folder: Where results go; the same folder on every machine.
-        name: Name of the cell.
-        experiment: Experiment file.
+        folder: The run folder, where results go; the same folder on every machine.
+        file: Experiment file.
         setting: Which of its settings.
         overrides: Changes of it.
-        run_folder: Run folder of the experiment.
-        scenario: What the experiment calls the scenario.
-        shown_scenario: What the campaign calls it.
-        placement: Name of the placement.
-        victim: Which policy.
-        method: Which search: a name, or ``file.py:Name`` with an absolute path.
-        seed: Of starts and search.
+        cell: Which of its cells.
         settings_hash: Of what the result depends on, when it was planned.
         threads: Threads that it may use.
         phase: ``search``: only what may run beside others; ``whole``: all of it.
         registration: Digest of the registration that it is run under; empty if there is none.
     """
 
-    campaign_folder: str
-    name: str
-    experiment: str
+    folder: str
+    file: str
     setting: str
     overrides: tuple[str, ...]
-    run_folder: str
-    scenario: str
-    shown_scenario: str
-    placement: str
-    victim: str
-    method: str
-    seed: int
+    cell: Cell
     settings_hash: str
     threads: int
     phase: Phase = "whole"
     registration: str = ""
 
     @property
-    def cell(self) -> Cell:
-        """The cell as its experiment names it."""
-        return Cell.of(self.scenario, self.victim, self.method, self.seed)
+    def name(self) -> str:
+        """Name of the cell."""
+        return self.cell.name
+
+    @classmethod
+    def from_json(cls, text: str) -> Job:
+        """The job of `json.dumps` of its values."""
+        data = json.loads(text)
+        return cls(**{**data, "overrides": tuple(data["overrides"]), "cell": Cell(**data["cell"])})
 
 
 @dataclass(frozen=True)
@@ -115,7 +107,7 @@ class Ended:
 def run_in_process(job: Job) -> Ended:
     """Run a cell in a process of its own and wait for it; called in a thread here, or in a worker of a cluster."""
     began = time.monotonic()
-    store = Store(Path(job.campaign_folder))
+    store = Store(Path(job.folder))
     environment = {
         **os.environ,
         "PYTHONUNBUFFERED": "1",
@@ -150,7 +142,7 @@ def run_in_process(job: Job) -> Ended:
     if code < 0 or code == _ASKED_TO_END:
         by = signal.Signals(-code) if code < 0 else signal.SIGTERM
         return Ended(
-            job.name, "lost", f"killed by {by.name}; it goes on when the campaign is run again", seconds
+            job.name, "lost", f"killed by {by.name}; it goes on when the experiment is run again", seconds
         )
     error = store.error(job.name, job.settings_hash)
     if error:
@@ -202,8 +194,8 @@ def main() -> None:
 
 
 def _run_job() -> None:
-    job = Job(**{**(data := json.loads(sys.stdin.read())), "overrides": tuple(data["overrides"])})
-    store = Store(Path(job.campaign_folder))
+    job = Job.from_json(sys.stdin.read())
+    store = Store(Path(job.folder))
     store.lock_file(job.name).parent.mkdir(parents=True, exist_ok=True)
     with take_cell(store, job.name):
         experiment = _checked(job, store)
@@ -239,10 +231,11 @@ def _checked(job: Job, store: Store) -> Experiment:
     """The experiment as it is now, before anything of the cell is touched."""
     try:
         _use_threads(job.threads)
-        experiment = load_experiment(Path(job.experiment), job.setting, job.overrides, Path(job.run_folder))
-        if settings_hash(experiment, job.cell) != job.settings_hash:
+        whole = load_experiment(Path(job.file), job.setting, job.overrides, Path(job.folder))
+        experiment = whole.of(job.cell)
+        if settings_hash(experiment, job.cell.inside) != job.settings_hash:
             raise ChangedError(
-                f"{job.name}: its settings or inputs changed after the campaign was started; run the campaign again"
+                f"{job.name}: its settings or inputs changed after the experiment was started; run it again"
             )
     except Exception as error:
         store.keep_error(job.name, job.settings_hash, _in_one_line(error))
@@ -255,21 +248,20 @@ def _run(
 ) -> None:
     began = time.monotonic()
     if job.phase == "search":
-        search_cell(experiment, job.cell, work, report, bench)
+        search_cell(experiment, job.cell.inside, work, report, bench)
         _add_seconds(work, time.monotonic() - began)
         return
     with _wait_for_live() if runs_alone(experiment) else nullcontext():
-        found = run_cell(experiment, job.cell, work, report, bench)
+        found = run_cell(experiment, job.cell.inside, work, report, bench)
     ours = {
-        "scenario": job.shown_scenario,
-        "placement": job.placement,
-        "victim": job.victim,
+        "scenario": job.cell.scenario,
+        "victim": job.cell.victim,
         "method": job.cell.method,
-        "seed": job.seed,
+        "seed": job.cell.seed,
         "settings_hash": job.settings_hash,
         "settings": dict(cell_settings(experiment, job.cell).resolved),
         "registration": job.registration,
-        "stages": digests_in(Path(job.run_folder), NEEDED),
+        "stages": digests_in(experiment.folder, NEEDED),
         "machine": found.get("machine") or machine_name(),
         "date": found.get("date") or datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }
@@ -279,7 +271,7 @@ def _run(
 
 
 def _wait_for_live() -> TextIO:
-    """A live graph measures time: of all campaigns on this machine only one cell at a time drives one."""
+    """A live graph measures time: of all experiments on this machine only one cell at a time drives one."""
     path = Path(tempfile.gettempdir()) / _LIVE_LOCK
     while True:
         try:

@@ -23,7 +23,6 @@ from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, Pinhole
 from advnerf_core.plugins import unknown
 from advnerf_core.policies.view import PolicyView
-from advnerf_core.report.reference import Reference
 from advnerf_core.run_module import search_folder_last
 from hardware.worlds.paths import ReferencePath
 from hardware.worlds.world import (
@@ -34,15 +33,15 @@ from hardware.worlds.world import (
     World,
     WorldDescription,
 )
-from nodes.experiment.engine.run_folder import CELLS, RunFolder
+from nodes.experiment.engine.run_folder import CELLS
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.plan.placed import PlacedObject, in_a_lane
 from nodes.experiment.show.given import given, given_in
 from nodes.experiment.show.kept_worlds import KeptWorld, is_users, kept_world
+from nodes.experiment.show.variants import Variants
 from nodes.lab.worlds.expert_drive import as_path
 from nodes.lab.worlds.named import NamedWorld, read_world, without
-from nodes.runtime.config import load_config
 from nodes.runtime.errors import ConfigError
 
 WORLD, PLACED, CALIBRATION = "world.json", "objects.json", "calibration"
@@ -53,16 +52,14 @@ _HALF_LANE_M, _SPEED_MPS = 1.75, 6.0
 
 
 @dataclass(frozen=True)
-class Experiment(RunFolder[ExperimentConfig]):
-    """One resolved experiment.
+class Experiment(Variants):
+    """One resolved experiment in a world, or one of its variants.
 
     Attributes:
         kept: Digests of what its stages wrote that are kept with the code, and those of the run folder before them, when it was read.
-        executes: Whether worlds of a user's code may be executed; else what the run folder keeps of them is read.
     """
 
     kept: Mapping[str, str] = field(default_factory=dict)
-    executes: bool = True
 
     @classmethod
     def resolved_in(cls, folder: FilePath) -> Experiment:
@@ -370,16 +367,6 @@ class Experiment(RunFolder[ExperimentConfig]):
     def searched_ticks(self) -> int:
         """Over how many ticks attacks are optimised."""
         return self.config.attack.horizon or self.config.horizon
-
-    @cached_property
-    def held_to(self) -> Reference:
-        """What the report is held to.
-
-        Raises:
-            ConfigError: The file is not there, or is none of limits.
-        """
-        file = self.config.reference
-        return Reference() if file is None else load_config(Reference, self.file.parent / file)
 
     @property
     def launch_file(self) -> FilePath:

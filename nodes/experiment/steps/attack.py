@@ -22,7 +22,7 @@ from advnerf_core.attack.spaces.space import Shown, Space, half_precision
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.policy_file import LoadedPolicy
-from advnerf_core.report.conditions import CONTROLS, EMPTY, NONE
+from advnerf_core.report.conditions import EMPTY
 from nodes.experiment.engine.artefact import Settings, hash_of
 from nodes.experiment.engine.telling import telling
 from nodes.experiment.plan.cell import Cell
@@ -34,7 +34,6 @@ from nodes.experiment.plan.space_config import (
     MeshTextureConfig,
     PlacesConfig,
 )
-from nodes.experiment.plan.victims import TRAINED_PLAIN
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.drives import learned_drives, totals
 from nodes.experiment.show.learned_scene import baked_file, load_field, scene_sha256
@@ -44,29 +43,6 @@ from nodes.experiment.steps.frozen import frozen_for, hardness_before
 from nodes.experiment.steps.search_files import ATTACK, SEARCHED
 
 _STATE = "state.safetensors"
-
-
-def cells(experiment: Experiment) -> list[Cell]:
-    """All cells in order: controls, then every seed against each victim, the first alone against one that was trained plain; quick ones first."""
-    config, seeds, methods = (
-        experiment.config,
-        experiment.config.attack.seeds,
-        experiment.config.attack.methods,
-    )
-    rows = [
-        (victim, seed)
-        for victim, wanted in config.attacked.items()
-        for seed in (seeds[:1] if wanted == TRAINED_PLAIN and victim != config.main_victim else seeds)
-    ]
-    controls = CONTROLS if experiment.config.measure.no_object else (NONE,)
-    # All seeds are measured from the same starts, so that a control is one cell for all of them.
-    found = [
-        Cell.of(scenario, victim, condition, 0 if condition in CONTROLS else seed)
-        for victim, seed in rows
-        for condition in (*controls, *methods)
-        for scenario in experiment.config.scenarios
-    ]
-    return list(dict.fromkeys(found))
 
 
 def surrogate_part(

@@ -1,4 +1,4 @@
-"""Films of drives from the driver's seat: one per drive of an experiment's report, and one per cell of a campaign."""
+"""Films of drives from the driver's seat: one per drive of an experiment's report, and one per cell."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _FRAME_S = 0.1  # of films: finer ticks are not all filmed
 
 def strongest(experiment: Experiment) -> str:
     """The method that films show: the gradient if it was searched."""
-    methods = experiment.config.attack.method_names
+    methods = experiment.config.method_names
     return "gradient" if "gradient" in methods else methods[-1]
 
 
@@ -49,7 +49,7 @@ def film_scenario(
         folder: Gets the film.
     """
     attacked = Cell(
-        scenario, experiment.config.main_victim, strongest(experiment), experiment.config.attack.seeds[0]
+        scenario, experiment.config.main_victim, strongest(experiment), experiment.config.seeds[0]
     )
     shown = load_shown(space, driven_folder(experiment, attacked), attacked)
     whole = Surrogate(load_background(experiment), experiment.camera, experiment.mount, shown.objects)

@@ -28,7 +28,7 @@ def frozen_hashes(experiment: Experiment) -> dict[str, str]:
     starts = {
         f"{scenario} {seed}": experiment.start_states(scenario, seed).tolist()
         for scenario in experiment.config.scenarios
-        for seed in experiment.config.attack.seeds
+        for seed in experiment.config.seeds
     }
     starts |= {name: experiment.measured_starts(name).tolist() for name in experiment.config.scenarios}
     return {

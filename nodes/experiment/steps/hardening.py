@@ -24,7 +24,6 @@ from nodes.experiment.show.spaces import make_space
 from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.attack import (
     attack_problem,
-    cells,
     from_measured_starts,
     past,
     planned_evaluations,
@@ -110,7 +109,7 @@ def _totals_m(
 
 def _refuse_late(experiment: Experiment, victim: str) -> None:
     """A verdict that comes after a gradient search says nothing about the choice of the victim."""
-    for cell in cells(experiment):
+    for cell in experiment.cells:
         folder = experiment.cell_folder(cell)
         if cell.victim == victim and cell.method.startswith("gradient") and folder.exists():
             raise HardnessError(

@@ -51,7 +51,7 @@ def peak_above_idle_mib(experiment: Experiment, ticks: int) -> float:
     """Peak above idle of one gradient over so many ticks [MiB]; the process must be fresh."""
     space = face_space(experiment, ideal=True)
     policy, scenario = load_victim(experiment, experiment.config.main_victim), experiment.config.scenarios[0]
-    problem = attack_problem(experiment, space, policy, scenario, experiment.config.attack.seeds[0])
+    problem = attack_problem(experiment, space, policy, scenario, experiment.config.seeds[0])
     goals = None if problem.goals is None else problem.goals[:1]
     one = problem.start_states[:1]
     problem = dataclasses.replace(problem, start_states=one, goals=goals, steps=ticks, cache_bytes=0)

@@ -155,7 +155,7 @@ def _retrain(experiment: Experiment, rounds: int) -> Stage:
             READS["retrain"],
             _UNREAD_BY_RETRAIN,
             objective=objective_key(attack.objective),
-            attack_seed=attack.seeds[0],
+            attack_seed=experiment.config.seeds[0],
             **_learned_from(experiment),
         )
 

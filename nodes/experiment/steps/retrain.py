@@ -155,7 +155,7 @@ def _first_attacks(
     """What the gradient's cells of the first seed find; they are searched here if they are not yet."""
     thetas: dict[str, torch.Tensor] = {}
     for index, name in enumerate(experiment.config.scenarios):
-        cell = Cell(name, experiment.config.main_victim, "gradient", experiment.config.attack.seeds[0])
+        cell = Cell(name, experiment.config.main_victim, "gradient", experiment.config.seeds[0])
         at = experiment.cell_folder(cell)
         freeze(experiment, cell, at)
 
@@ -180,7 +180,7 @@ def _attack_again(
     attack = experiment.config.attack
     thetas: dict[str, torch.Tensor] = {}
     for index, scenario in enumerate(experiment.config.scenarios):
-        problem = attack_problem(experiment, space, victim, scenario, attack.seeds[0])
+        problem = attack_problem(experiment, space, victim, scenario, experiment.config.seeds[0])
 
         def told(evaluation: Any, index: int = index, scenario: str = scenario) -> None:
             done = (index + (evaluation.iteration + 1) / attack.evaluations) / len(
@@ -195,7 +195,7 @@ def _attack_again(
             attack.evaluations,
             attack.learning_rate,
             SearchRun(
-                attack.seeds[0],
+                experiment.config.seeds[0],
                 folder / f"{scenario}.state.safetensors",
                 told,
                 hash_of({"victim": victim.sha256, "scenario": scenario}),
@@ -214,7 +214,7 @@ def _judged(
     folder: Path,
 ) -> Found:
     """Ratios to no attack of the same victim in both domains, from the attack's starts; kept in the folder of the round."""
-    seed, kept = experiment.config.attack.seeds[0], folder / "ratios.json"
+    seed, kept = experiment.config.seeds[0], folder / "ratios.json"
     key = [policy.sha256, *(hashlib.sha256(theta.numpy().tobytes()).hexdigest() for theta in thetas.values())]
     if kept.exists() and (known := read_json(kept))["of"] == key:
         return Found(thetas, known["ratios"])

@@ -9,22 +9,19 @@ from pathlib import Path
 from rich.console import Console
 
 from advnerf_core.documents import Document
-from advnerf_core.places import require_utf8
 from advnerf_core.plugins import unknown
 from advnerf_core.run_module import search_folder_last
-from advnerf_core.strict import validate
 from hardware.worlds.world import Photographed
 from nodes.experiment.engine.artefact import REFERENCE, Artefact
 from nodes.experiment.engine.run_folder import require_own_folder, run_to_end
 from nodes.experiment.engine.stages import begun_with, stage_digests
-from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.plan.placed import PlacedObject, in_a_lane
-from nodes.experiment.plan.setting_file import read_setting
 from nodes.experiment.plan.space_config import FaceConfig
 from nodes.experiment.plan.victims import RETRAINED
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.given import VictimUnknownError, given_in, victim_spec
 from nodes.experiment.show.kept_worlds import WorldUnknownError, is_users, keep_worlds
+from nodes.experiment.show.variants import resolve
 from nodes.experiment.show.victims import look_at_given
 from nodes.experiment.steps.live import lab_of
 from nodes.experiment.steps.pipeline import stages_of
@@ -46,27 +43,28 @@ _WHOLE_STEP_S = 1e-6
 
 
 def load_experiment(
-    file: Path, setting: str, overrides: Sequence[str], folder: Path, executes: bool = True
+    file: Path, setting: str | None, overrides: Sequence[str], folder: Path | None, executes: bool = True
 ) -> Experiment:
-    """Resolve an experiment file.
+    """Resolve an experiment file and its variants.
 
     Args:
         file: A ``*.experiment.yaml`` file.
-        setting: Which of its settings to lay over its values.
+        setting: Which of its settings to lay over its values; None takes demo where it has settings.
         overrides: ``section.key=value`` texts, applied last.
-        folder: The run folder.
+        folder: The run folder; None takes the file's ``run_folder``, or else one under ``runs``.
         executes: Whether a world of a user's code may be executed; else the file's values are not checked against that world.
 
     Raises:
         ConfigError: With file, line and the valid keys.
     """
-    require_utf8(folder.absolute())
-    document = read_setting(file, setting, overrides)
-    config = validate(ExperimentConfig, document, file.parent)
-    experiment = Experiment(config, file.resolve(), folder.resolve(), setting, executes=executes)
-    if executes or not is_users(config.world):
+    return resolve(Experiment, file, setting, overrides, folder, executes, _load)
+
+
+def _load(experiment: Experiment, document: Document) -> Experiment:
+    """An experiment without variants, whose values fit its world, with what of its stages is kept with the code."""
+    if experiment.executes or not is_users(experiment.config.world):
         _check_world(experiment, document)
-    if given_in(config):
+    if given_in(experiment.config):
         search_folder_last(
             str(experiment.file.parent)
         )  # package.module:factory may lie beside the experiment file
@@ -199,5 +197,5 @@ def prepare_victims(experiment: Experiment) -> None:
     if not Path(victim_spec(experiment, RETRAINED)).exists():
         raise ConfigError(
             f"expected a retrained policy in {experiment.stage_folder('retrain')}, got none: no attack reaches retrain.pays_ratio = "
-            f"{wanted.pays_ratio:g} (see retrain.json there), so nothing was retrained; lower it, or leave the victim retrained out of the campaign"
+            f"{wanted.pays_ratio:g} (see retrain.json there), so nothing was retrained; lower it, or leave the victim retrained out"
         )

@@ -29,7 +29,7 @@ TICKS = 10
 
 
 def targets_of(table):
-    """What the shipped campaigns are held to."""
+    """What the shipped experiments are held to."""
     return evaluate(PAPER.targets, table)
 
 

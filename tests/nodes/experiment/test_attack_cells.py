@@ -32,7 +32,7 @@ from nodes.experiment.show.learned_scene import load_field
 from nodes.experiment.show.spaces import colour_space
 from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps import attack, frozen, run
-from nodes.experiment.steps.attack import cells, load_shown, surrogate_part
+from nodes.experiment.steps.attack import load_shown, surrogate_part
 from nodes.experiment.steps.deploy import DRIVES, ThroughWorld, cell_data
 from nodes.experiment.steps.films import film_cell
 from nodes.experiment.steps.keys import CellError, cell_settings, clean_folder, settings_hash
@@ -70,7 +70,7 @@ def finished(experiment: Experiment, scene: Any, cell: Cell) -> dict[str, Any]:
 
 
 def test_cells_are_all_methods_of_all_drives(trained: Experiment) -> None:
-    names = [cell.name for cell in cells(trained)]
+    names = [cell.name for cell in trained.cells]
     assert len(set(names)) == len(names) == 2 * 3 * 4  # victims, drives, none and three methods
     assert names[:3] == ["straight_hardened_none_0", "right_hardened_none_0", "left_hardened_none_0"]
     more = replace(
@@ -79,9 +79,9 @@ def test_cells_are_all_methods_of_all_drives(trained: Experiment) -> None:
             update={"attack": trained.config.attack.model_copy(update={"seeds": (0, 1, 2)})}
         ),
     )
-    assert sum(cell.victim == NAIVE for cell in cells(more)) == 3 * 4
+    assert sum(cell.victim == NAIVE for cell in more.cells) == 3 * 4
     assert (
-        len(cells(more)) == (3 * 3 + 1) * 3 + 3 * 4
+        len(more.cells) == (3 * 3 + 1) * 3 + 3 * 4
     )  # none once, as all seeds are measured from the same starts
 
 
@@ -122,11 +122,11 @@ def test_a_method_of_a_file_runs_a_cell_and_appears_in_the_tables(
     changes = ["attack.methods=[spiral.py:Spiral, gradient]", "scenarios=[right]", "policy.naive_steps=0"]
     experiment = run.load_experiment(file, "tiny", changes, fresh.folder)
     names = [f"right_hardened_{method}_0" for method in ("none", "Spiral", "gradient")]
-    assert [cell.name for cell in cells(experiment)] == names
+    assert [cell.name for cell in experiment.cells] == names
     space = colour_space(experiment)
-    for cell in cells(experiment):
+    for cell in experiment.cells:
         finished(experiment, wall, cell)
-    spiral = cells(experiment)[1]
+    spiral = experiment.cells[1]
     out = experiment.cell_folder(spiral)
     shown = load_shown(space, out, spiral)
     found = shown.colours
@@ -246,7 +246,7 @@ def test_a_search_bears_what_it_is_asked_to_and_is_measured_undisturbed(fresh: E
 
 
 def test_cells_that_differ_in_their_deployment_alone_share_one_search(fresh: Experiment) -> None:
-    folder = fresh.folder / "campaign"
+    folder = fresh.folder / "together"
     first = search_cell(fresh, GRADIENT, folder / "ideal", silent)
     noisy = changed(fresh, "deploy", camera=CameraEffects(read_noise=0.01))
     drawn = []
@@ -270,7 +270,7 @@ def test_cells_that_differ_in_their_deployment_alone_share_one_search(fresh: Exp
 
 def test_an_attack_may_be_deployed_in_another_world_of_the_same_paths(fresh: Experiment) -> None:
     slow = {**fresh.config.world, "car": {**fresh.config.world.get("car", {}), "turn_rate_lag_s": 0.5}}
-    there, folder = changed(fresh, "deploy", world=slow), fresh.folder / "campaign"
+    there, folder = changed(fresh, "deploy", world=slow), fresh.folder / "together"
     here = run_cell(fresh, GRADIENT, folder / "here", silent)
     found = run_cell(there, GRADIENT, folder / "there", silent)
     assert found["attack_id"] == here["attack_id"]
@@ -313,7 +313,7 @@ def changed(experiment: Experiment, section: str, **values: Any) -> Experiment:
 
 def test_the_control_without_objects_is_asked_for(trained: Experiment, tmp_path: Path) -> None:
     more = changed(trained, "measure", no_object=True)
-    assert {cell.name for cell in cells(more)} - {cell.name for cell in cells(trained)} == {
+    assert {cell.name for cell in more.cells} - {cell.name for cell in trained.cells} == {
         f"{drive}_{victim}_empty_0"
         for drive in ("straight", "right", "left")
         for victim in ("hardened", "naive")
@@ -349,7 +349,7 @@ def test_another_policy_after_the_attack_is_refused(fresh: Experiment) -> None:
 
 
 def test_table_is_over_the_clean_drive_of_the_same_domain(fresh: Experiment) -> None:
-    for cell in cells(fresh):
+    for cell in fresh.cells:
         factor = {"none": 1.0, "random": 1.1, "cem": 1.5, "gradient": 3.0}[cell.method]
         parts = {
             domain: {

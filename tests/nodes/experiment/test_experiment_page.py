@@ -21,7 +21,7 @@ from nodes.experiment_page.page import ExperimentPage, run_with_page
 from nodes.experiment_page.time_left import all_left_s
 from nodes.runtime.errors import BusError
 from tests.support.experiment_page import CELLS, record_of, search_so_far, state_of
-from tests.support.stage_versions import TINY, tiny_experiment
+from tests.support.stage_versions import tiny_experiment
 
 OTHER_PATHS = [
     "/../secret.png",
@@ -277,7 +277,7 @@ def test_a_page_changes_no_key_and_no_attack(tiny_room, tmp_path, monkeypatch):
 
         def run(record, experiment=experiment):
             only = "victim=hardened,method=none+random"
-            return whole.run_experiment(experiment, only=only, overrides=TINY, record=record)
+            return whole.run_experiment(experiment, only=only, record=record)
 
         ended = run(None) if name == "alone" else run_with_page(experiment, 0, run, lambda text: None)
         assert [end.how for end in ended] == ["done", "done"]

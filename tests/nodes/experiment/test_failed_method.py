@@ -27,7 +27,7 @@ def run(folder, method):
     changes = [*TINY, f"attack.methods=[random, '{method}:Broken']"]
     experiment = load_experiment(ROOT / "launch" / "room.experiment.yaml", "demo", changes, folder)
     console = Console(width=400, record=True, quiet=False)
-    ended = whole.run_experiment(experiment, overrides=changes, console=console)
+    ended = whole.run_experiment(experiment, console=console)
     return console.export_text(), {end.name: end.how for end in ended}
 
 

@@ -24,12 +24,10 @@ from advnerf_core.policies.tracker import TrackedTrajectory
 from hardware.worlds.lab.config import LabConfig
 from hardware.worlds.lab.lab import Lab
 from nodes.experiment.plan.cell import Cell
-from nodes.experiment.run.config import campaign_of
 from nodes.experiment.run.plan import statuses
 from nodes.experiment.run.registering import register
 from nodes.experiment.run.whole import run_experiment
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.steps.attack import cells
 from nodes.experiment.steps.deploy import DRIVES
 from nodes.experiment.steps.keys import driven_folder
 from nodes.experiment.steps.run import load_experiment
@@ -84,7 +82,7 @@ def loaded(folder: Path, *overrides: str, run: str = "run") -> Experiment:
 
 def test_both_are_attacked_and_nothing_was_trained(folder: Path) -> None:
     experiment = loaded(folder)
-    assert [cell.name for cell in cells(experiment)] == [
+    assert [cell.name for cell in experiment.cells] == [
         "track_mine_none_0", "track_mine_random_0", "track_module_none_0", "track_module_random_0",
     ]  # fmt: skip
     assert not experiment.stage_folder("policy").exists()
@@ -164,9 +162,9 @@ def steering_rad(session: onnxruntime.InferenceSession, rgb: Array) -> float:
 
 def test_a_module_has_a_gradient_and_finished_cells_are_not_run_again(folder: Path) -> None:
     experiment = loaded(folder, *ONLY_THE_MODULE)
-    ended = run_experiment(experiment, overrides=ONLY_THE_MODULE)
+    ended = run_experiment(experiment)
     assert [end.name for end in ended] == ["track_module_gradient_0"]
-    found = statuses(campaign_of(loaded(folder), (), cells(loaded(folder))), cells(loaded(folder)))
+    found = statuses(loaded(folder), loaded(folder).cells)
     assert {each.state for each in found} == {"done"}
 
 
@@ -195,8 +193,7 @@ def test_a_factory_is_found_beside_the_experiment_file(folder: Path, tmp_path: P
 
 def test_a_registration_fixes_them_by_hash_before_anything_is_run(folder: Path, tmp_path: Path) -> None:
     experiment = load_experiment(folder / "mine.experiment.yaml", "tiny", (), tmp_path / "run")
-    campaign = campaign_of(experiment, (), cells(experiment))
-    registered = register(campaign, "tiny", (), tmp_path / "published")
+    registered = register(experiment, experiment.cells, tmp_path / "published")
     assert registered.scenarios["track"].victims == {
         "policies": {
             "mine": load_any_policy("my.onnx").sha256,
@@ -218,10 +215,7 @@ def test_another_policy_under_the_same_name_is_another_cell(folder: Path, tmp_pa
     try:
         (folder / "my_driver.py").write_text(text.replace("manual_seed(0)", "manual_seed(1)"))
         changed = load_experiment(folder / "mine.experiment.yaml", "tiny", (), tmp_path / "run")
-        states = {
-            each.cell.victim: each.state
-            for each in statuses(campaign_of(changed, (), cells(changed)), cells(changed))
-        }
+        states = {each.cell.victim: each.state for each in statuses(changed, changed.cells)}
     finally:
         (folder / "my_driver.py").write_text(text)
     assert states["module"] == "changed"
@@ -269,7 +263,7 @@ def test_a_driver_behind_a_socket_is_attacked(folder: Path, tmp_path: Path) -> N
     with serving(ConstantSpeedPolicy(), port=0, host="127.0.0.1") as port:
         victims = f"victims={{theirs: {{policy: 'grpc://127.0.0.1:{port}'}}}}"
         experiment = load_experiment(folder / "mine.experiment.yaml", "tiny", (victims,), tmp_path / "run")
-        run_experiment(experiment, overrides=(victims,))
+        run_experiment(experiment)
         with pytest.raises(AdvnerfError, match=r"need no gradient against victim theirs"):
             run_experiment(
                 load_experiment(
@@ -297,7 +291,7 @@ def test_live_nodes_drive_a_users_file(folder: Path, tmp_path: Path) -> None:
         "deploy={through: nodes, starts: 1, launch_file: " + str(launch) + "}",
     )
     experiment = load_experiment(folder / "mine.experiment.yaml", "tiny", changes, tmp_path / "run")
-    run_experiment(experiment, overrides=changes)
+    run_experiment(experiment)
     found = read_json(experiment.cell_result(Cell("track", "mine", "random", 0)))
     assert len(found["deployed"]["total_cte_m"]) == 1, found["not_driven_live"]
     page = (experiment.folder / "report" / "report.html").read_text()

@@ -12,24 +12,20 @@ from advnerf_core.report.evidence.kept_build import LOST
 from advnerf_core.report.evidence.verify import verify_set, write_set
 from nodes.experiment.engine.artefact import BUILD, RECORD, ReferenceBuild, read_artefact, write_artefact
 from nodes.experiment.run.cells import keep_build
-from nodes.experiment.run.config import campaign_of
 from nodes.experiment.run.kept_attacks import attack_problems, with_attacks
 from nodes.experiment.run.plan import statuses
 from nodes.experiment.run.published import publish, publish_build
 from nodes.experiment.run.redrive import RedriveError, redrive
 from nodes.experiment.run.registering import register
-from nodes.experiment.run.run import Options, run_campaign
+from nodes.experiment.run.run import Options, run_cells
 from nodes.experiment.steps import run
-from nodes.experiment.steps.attack import cells
-from tests.support.stage_versions import TINY, tiny_experiment
+from tests.support.stage_versions import tiny_experiment
 
 CHANGES = ("attack.methods=[gradient]", "attack.seeds=[0,1]", "measure.starts=2", "deploy.starts=1")
 
 
-def campaign_in(folder, *more):
-    changes = [*CHANGES, *more]
-    made = tiny_experiment(folder, changes)
-    return campaign_of(made, [*TINY, *changes], cells(made))
+def experiment_in(folder, *more):
+    return tiny_experiment(folder, [*CHANGES, *more])
 
 
 @pytest.fixture
@@ -39,22 +35,22 @@ def published(tiny_room, tmp_path, monkeypatch):
     assert keep_build(tiny_experiment(tiny_room[0]), build)
     monkeypatch.setattr(run, "REFERENCE", build)
     monkeypatch.chdir(tmp_path)
-    campaign = campaign_in(tmp_path / "run")
-    register(campaign, "demo", CHANGES, results)
-    run.make_ready(run.load_experiment(campaign.file, "demo", [*TINY, *CHANGES], campaign.folder), "policy")
-    ended = run_campaign(
-        campaign, campaign.cells, Options(here=True, ready=True, gate=False), lambda text: None
+    experiment = experiment_in(tmp_path / "run")
+    register(experiment, experiment.cells, results)
+    run.make_ready(experiment, "policy")
+    ended = run_cells(
+        experiment, experiment.cells, Options(here=True, ready=True, gate=False), lambda text: None
     )
     assert {end.how for end in ended} == {"done"}
-    publish(campaign, statuses(campaign, campaign.cells), results)
-    assert len(publish_build(campaign, campaign.cells, results).written) == 4
-    write_set(results / campaign.name)
-    shutil.rmtree(campaign.folder)
+    publish(experiment, statuses(experiment, experiment.cells), results)
+    assert len(publish_build(experiment, experiment.cells, results).written) == 4
+    write_set(results / experiment.config.name)
+    shutil.rmtree(experiment.folder)
     shutil.rmtree(build.folder)
     for file in (results / BUILD).glob(f"*/{RECORD}"):  # an earlier version had other keys
         write_artefact(file.parent, replace(read_artefact(file.parent), key="0" * 64))
     monkeypatch.setattr(run, "REFERENCE", ReferenceBuild(results / BUILD))
-    return results / campaign.name
+    return results / experiment.config.name
 
 
 def test_it_is_driven_again_from_the_published_files_alone(published, tmp_path):
@@ -68,7 +64,7 @@ def test_it_is_driven_again_from_the_published_files_alone(published, tmp_path):
     assert "hardened" not in page
     assert LOST not in page
 
-    again = redrive(campaign_in(tmp_path / "again"), published, 3, 0, lambda text: None)
+    again = redrive(experiment_in(tmp_path / "again"), published, 3, 0, lambda text: None)
     assert len(again) == 3
     # What is kept is what drove, so that poses come out as they were written: to the last digit that is kept.
     assert max(each.off_m for each in again) < 2e-5
@@ -77,7 +73,7 @@ def test_it_is_driven_again_from_the_published_files_alone(published, tmp_path):
     with pytest.raises(
         RedriveError, match="expected the held_cap_m that were registered, got others; check out"
     ):
-        redrive(campaign_in(tmp_path / "other", "held_cap_m=2"), published, 1, 0, lambda text: None)
+        redrive(experiment_in(tmp_path / "other", "held_cap_m=2"), published, 1, 0, lambda text: None)
 
     # With another texture it would not.
     first = sorted((published / "attacks").iterdir())[0]
@@ -91,4 +87,4 @@ def test_it_is_driven_again_from_the_published_files_alone(published, tmp_path):
 
     shutil.rmtree(published.parent / BUILD)
     with pytest.raises(RedriveError, match=f"room {LOST}"):
-        redrive(campaign_in(tmp_path / "again"), published, 1, 0, lambda text: None)
+        redrive(experiment_in(tmp_path / "again"), published, 1, 0, lambda text: None)

@@ -17,7 +17,6 @@ from hardware.worlds.lab.config import LabConfig
 from hardware.worlds.lab.lab import Lab
 from nodes.experiment.run.whole import run_experiment
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.steps.attack import cells
 from nodes.experiment.steps.run import load_experiment
 from tests.nodes.experiment.test_given_victims import MODULE
 
@@ -76,7 +75,7 @@ def test_it_is_attacked_in_what_is_learned_and_held_out_views_are_not_learned_fr
     assert (len(learned.frames), len(held_out.frames)) == (PHOTOGRAPHS - 4, 4)
     ours = {tuple(np.round(each.T_world_from_camera[:3, 3], 6)) for each in learned.frames}
     assert ours.isdisjoint(tuple(np.round(each.T_world_from_camera[:3, 3], 6)) for each in held_out.frames)
-    results = {cell.method: read_json(experiment.cell_result(cell)) for cell in cells(experiment)}
+    results = {cell.method: read_json(experiment.cell_result(cell)) for cell in experiment.cells}
     assert list(results) == ["none", "random", "gradient"]
     for method, result in results.items():
         assert "deployed" not in result

@@ -7,12 +7,10 @@ import pytest
 
 from advnerf_core.report.evidence.registration import FILE, RegistrationError, read_registration
 from nodes.experiment.engine.artefact import Settings, write_key
-from nodes.experiment.run.config import campaign_of
 from nodes.experiment.run.plan import plan_cells, registered_under
 from nodes.experiment.run.registering import primary_tests, register
-from nodes.experiment.steps.attack import cells
 from nodes.experiment.steps.keys import registered_settings
-from tests.support.stage_versions import TINY, tiny_experiment
+from tests.support.stage_versions import tiny_experiment
 
 GRADIENT = "right_hardened_gradient_0"
 FAMILIES = ("random_coarse", "random_levels", "random_pink")
@@ -20,22 +18,22 @@ METHODS = ("random", *FAMILIES, "cem", "gradient")
 
 
 @pytest.fixture
-def campaign(trained, tmp_path):
+def experiment(trained, tmp_path):
     return made_of(trained, tmp_path, METHODS)
 
 
 def made_of(trained, tmp_path, methods, **changes):
-    """A campaign of the experiment with other methods, and with other sections of its configuration."""
+    """The experiment with other methods, and with other sections of its configuration."""
     attack = trained.config.attack.model_copy(update={"methods": methods})
     config = trained.config.model_copy(update={"attack": attack, **changes})
     ours = replace(trained, config=config)
-    return campaign_of(replace(ours, folder=tmp_path / "run"), ["measure.seed=10000"], cells(ours))
+    return replace(ours, folder=tmp_path / "run", overrides=("measure.seed=10000",))
 
 
-def test_a_registration_says_what_will_be_run(campaign, trained, tmp_path):
-    found = register(campaign, "tiny", [], tmp_path)
+def test_a_registration_says_what_will_be_run(experiment, trained, tmp_path):
+    found = register(experiment, experiment.cells, tmp_path)
     assert read_registration(tmp_path / "junction") == found
-    assert len(found.cells) == len(campaign.cells)
+    assert len(found.cells) == len(experiment.cells)
     scenario = found.scenario("right")
     assert scenario.reference_path().to_dict() == trained.paths["right"].to_dict()
     assert [list(start) for start in scenario.starts] == trained.measured_starts("right").tolist()
@@ -45,10 +43,9 @@ def test_a_registration_says_what_will_be_run(campaign, trained, tmp_path):
     # White noise has trained the victim: it is run, and is no baseline of the test.
     assert (test.method, test.against) == ("gradient", (*FAMILIES, "cem"))
     # Once more it is the same; of another experiment it is refused.
-    assert register(campaign, "tiny", [], tmp_path) == found
-    fewer = replace(campaign, cells=campaign.cells[:5])
+    assert register(experiment, experiment.cells, tmp_path) == found
     with pytest.raises(RegistrationError, match="remove the file"):
-        register(fewer, "tiny", [], tmp_path)
+        register(experiment, experiment.cells[:5], tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -63,11 +60,13 @@ def test_a_registration_says_what_will_be_run(campaign, trained, tmp_path):
 )  # fmt: skip
 def test_a_test_needs_three_unseen_families_and_a_coarse_search(trained, tmp_path, methods, lacks):
     if not lacks:
-        tests = primary_tests(made_of(trained, tmp_path, methods))
+        made = made_of(trained, tmp_path, methods)
+        tests = primary_tests(made, made.cells)
         assert {test.against for test in tests} == ({methods[:-1]} if methods[:-1] else set())
         return
+    made = made_of(trained, tmp_path, methods)
     with pytest.raises(RegistrationError, match="baselines that a test of the gradient needs") as refused:
-        primary_tests(made_of(trained, tmp_path, methods))
+        primary_tests(made, made.cells)
     assert f"add {lacks} to the methods" in str(refused.value)
 
 
@@ -75,7 +74,7 @@ def test_where_coarse_textures_have_other_cells_the_gradient_is_run_in_both(tmp_
     def on_a_face(edge, methods):
         changes = [f"space.cells={edge}", f"attack.methods=[{','.join(methods)}]"]
         made = tiny_experiment(tmp_path / "run", changes)
-        return primary_tests(campaign_of(made, [*TINY, *changes], cells(made)))
+        return primary_tests(made, made.cells)
 
     methods = (*FAMILIES, "cem", "gradient")
     assert [test.method for test in on_a_face(0, methods)] == ["gradient"]
@@ -86,24 +85,24 @@ def test_where_coarse_textures_have_other_cells_the_gradient_is_run_in_both(tmp_
     assert (coarse.method, coarse.against) == ("gradient_coarse", ("random_coarse", "cem"))
 
 
-def test_a_registration_after_the_fact_is_refused(campaign, tmp_path):
-    planned = plan_cells(campaign, campaign.cells[:1])[0]
-    work = campaign.folder / "cells" / planned.cell.name
+def test_a_registration_after_the_fact_is_refused(experiment, tmp_path):
+    planned = plan_cells(experiment, experiment.cells[:1])[0]
+    work = experiment.folder / "cells" / planned.cell.name
     work.mkdir(parents=True)
     write_key(work / "key.json", planned.job.settings_hash, Settings.of())
     with pytest.raises(RegistrationError, match="before anything is run"):
-        register(campaign, "tiny", [], tmp_path)
+        register(experiment, experiment.cells, tmp_path)
     assert not (tmp_path / "junction" / FILE).exists()
 
 
-def test_cells_of_the_registered_settings_are_run_under_it_and_no_others(campaign, trained, tmp_path):
-    def under(cell, experiment):
+def test_cells_of_the_registered_settings_are_run_under_it_and_no_others(experiment, trained, tmp_path):
+    def under(cell, of):
         registration = read_registration(tmp_path / "junction")
-        return registered_under(registration, cell, registered_settings(experiment))
+        return registered_under(registration, cell, registered_settings(of))
 
-    cell = next(each for each in campaign.cells if each.name == GRADIENT)
+    cell = next(each for each in experiment.cells if each.name == GRADIENT)
     assert under(cell, trained) == ""
-    found = register(campaign, "tiny", [], tmp_path)
+    found = register(experiment, experiment.cells, tmp_path)
     assert under(cell, trained) == found.digest
     assert under(replace(cell, seed=7), trained) == ""
     assert found.scenario("right").settings["capture"]["driven_m"] == 36.0  # its defaults are there
@@ -115,7 +114,7 @@ def test_a_cell_keeps_its_drives(trained, tmp_path):
     from advnerf_core.report.cells import cell_from
     from nodes.experiment.run.cells import run_cell
 
-    cell = next(each for each in cells(trained) if each.name == "right_hardened_random_0")
+    cell = next(each for each in trained.cells if each.name == "right_hardened_random_0")
     data = run_cell(trained, cell, tmp_path / cell.name, lambda fraction, text="": None)
     result = cell_from(
         json.loads(json.dumps({**data, "settings_hash": "", "machine": "", "date": ""})), "a cell"

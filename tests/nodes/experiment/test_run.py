@@ -6,7 +6,6 @@ import pytest
 from nodes.experiment.engine.stages import StageError
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.whole import run_experiment
-from nodes.experiment.steps.attack import cells
 from nodes.experiment.steps.pipeline import stages_of
 from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError
@@ -120,7 +119,7 @@ def test_laps_are_a_stage_where_they_are_asked_for(tmp_path):
 
 
 def test_every_seed_meets_every_condition_and_the_naive_victim_the_first(tmp_path):
-    full = cells(room(tmp_path, "full"))
+    full = room(tmp_path, "full").cells
     assert Cell("track", "hardened", "gradient", 2) in full
     assert {cell.seed for cell in full if cell.victim == "naive"} == {0}
     assert len(full) == len({cell.name for cell in full}) == 3 * 2 + 1 + 3

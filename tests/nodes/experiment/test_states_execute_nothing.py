@@ -111,15 +111,16 @@ def test_a_finished_cell_is_done_without_its_code_until_the_code_changes(yard):
     file.parent.mkdir(parents=True)
     file.write_text(json.dumps(data))
     yard.executed()
-    campaign = yard.file.with_name("mine.campaign.yaml")
-    campaign.write_text(
-        f"name: mine\nfolder: {yard.run.parent / 'mine'}\nseeds: [0]\nmethods: [none]\nvictims: [hardened]\n"
-        f"scenarios: {{loop: {{experiment: {yard.file.name}, setting: tiny, run_folder: {yard.run}, set: {json.dumps(CHANGES)}}}}}\n"
+    variants = yard.file.with_name("mine.experiment.yaml")
+    changes = "".join(f"      {change.replace('=', ': ', 1)}\n" for change in CHANGES)
+    variants.write_text(
+        f"base: {yard.file.name}\nsetting: tiny\nname: mine\nrun_folder: {yard.run.parent / 'mine'}\n"
+        f"over:\n  victim: [hardened]\n  method: [none]\n  variant:\n    loop:\n      over.path: [loop]\n      run_folder: {yard.run}\n{changes}"
     )
     for state in ("done", "changed"):
         shown = yard.command("status", "--only", "method=none,victim=hardened")
         assert state in shown.split()
-        found = CliRunner().invoke(app, ["status", str(campaign)])
+        found = CliRunner().invoke(app, ["status", str(variants)])
         assert ("done" in found.output.split()) == (state == "done")
         assert yard.executed() == ""
         yard.write("world_warehouse", (EXAMPLES / "world_warehouse.py").read_text() + "\n# another\n")

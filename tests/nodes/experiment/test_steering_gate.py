@@ -1,14 +1,12 @@
 """A learned scene that lacks what the policy steers by is not attacked, unless the user says so."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 from rich.console import Console
 
 from nodes.experiment.run import whole
-from nodes.experiment.run.config import campaign_of
 from nodes.experiment.run.run import Options
 from nodes.experiment.steps.run import load_experiment
 from nodes.experiment.steps.steering_gate import other_steering
@@ -58,15 +56,8 @@ def test_a_refused_scene_ends_the_experiment_with_one_line_and_the_key(tiny_room
     kept = json.loads(views.read_text())
     assert other_steering(kept["on_held_out_views"], "rad") != "", "twelve steps learn nothing"
     with pytest.raises(RuntimeFault, match=r"lacks what the policy steers by.*--no-gate, or gate: null"):
-        whole.run_experiment(experiment, overrides=changes)
-    monkeypatch.setattr(whole, "run_campaign", lambda *_: [])
+        whole.run_experiment(experiment)
+    monkeypatch.setattr(whole, "run_cells", lambda *_: [])
     console = Console(record=True, width=400)
-    whole.run_experiment(experiment, None, Options(here=True, gate=False), overrides=changes, console=console)
+    whole.run_experiment(experiment, None, Options(here=True, gate=False), console=console)
     assert "fidelity gate: victim hardened: the learned scene lacks" in console.export_text()
-
-
-def test_limits_of_ones_own_are_judged_by_the_campaign(tmp_path: Path):
-    for text, limits in (("{steering: 0.02}", 0.02), ("null", None), ("steering", None)):
-        experiment = load_experiment(FILE, "demo", [f"gate={text}"], tmp_path)
-        gate = campaign_of(experiment, [], []).gate
-        assert (None if gate is None else gate.steering) == limits

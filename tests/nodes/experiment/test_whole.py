@@ -35,7 +35,7 @@ SMALL = [
 def test_from_photographs_to_report_and_nothing_twice(tmp_path, file):
     os.environ.setdefault("MUJOCO_GL", "egl")
     experiment = LAUNCH / f"{file}.experiment.yaml"
-    first = run_experiment(load_experiment(experiment, "demo", SMALL, tmp_path), overrides=SMALL)
+    first = run_experiment(load_experiment(experiment, "demo", SMALL, tmp_path))
     assert {end.how for end in first} == {"done"}
     page = (tmp_path / "report" / "report.html").read_text()
     assert "<html" in page
@@ -72,7 +72,7 @@ def test_an_experiment_that_load_keeps_from_driving_live_ends_well_and_says_so(t
     monkeypatch.setattr(live, "drive_live", spoiled)
     monkeypatch.setattr(films, "_deployed_track", lambda *given: planted_track(*given))
     experiment = load_experiment(LAUNCH / "room.experiment.yaml", "demo", SMALL, tmp_path)
-    ended = run_experiment(experiment, overrides=SMALL)
+    ended = run_experiment(experiment)
     assert {end.how for end in ended} == {"done"}
     page = (tmp_path / "report" / "report.html").read_text()
     assert "NOT DRIVEN LIVE: gradient (hardened, seed 0)" in page
@@ -87,10 +87,10 @@ def test_an_experiment_that_load_keeps_from_driving_live_ends_well_and_says_so(t
     } == {"none": (True, 1), "random": (True, 1), "gradient": (False, 3)}
     count = len(tried)
     again = load_experiment(LAUNCH / "room.experiment.yaml", "demo", SMALL, tmp_path)
-    assert run_experiment(again, overrides=SMALL) == []
+    assert run_experiment(again) == []
     assert len(tried) == count
     options = Options(here=True, ready=True, retry=True)
-    (end,) = run_experiment(again, options=options, overrides=SMALL)
+    (end,) = run_experiment(again, options=options)
     assert "spoiled 6 times" in end.text
     assert len(tried) == count + 3
 
@@ -127,7 +127,7 @@ def test_a_face_is_also_deployed_without_nodes_and_meets_the_same_searches(tmp_p
     os.environ.setdefault("MUJOCO_GL", "egl")
     asked = [*SMALL, "deploy.through=world", "deploy.starts=null"]
     experiment = load_experiment(LAUNCH / f"{file}.experiment.yaml", "demo", asked, tmp_path)
-    run_experiment(experiment, overrides=asked)
+    run_experiment(experiment)
     cell = Cell("track", "hardened", "random", 0)
     drives, clean = (
         json.loads((driven_folder(experiment, each) / "drives.json").read_text())

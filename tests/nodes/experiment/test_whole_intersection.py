@@ -14,7 +14,6 @@ from advnerf_core.report.clips import read_clip
 from nodes.experiment.pages import report
 from nodes.experiment.run.cells import Bench, run_cell
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.steps.attack import cells
 
 
 def silent(fraction: float, text: str = "") -> None:
@@ -41,14 +40,14 @@ def test_all_cells_and_the_report(trained: Experiment, tmp_path: Path) -> None:
     )
 
     with Bench(experiment) as bench:
-        for cell in cells(experiment):
+        for cell in experiment.cells:
             data = run_cell(experiment, cell, experiment.cell_folder(cell), silent, bench)
             kept = {**data, "settings_hash": "h", "machine": "m", "date": "d"}
             experiment.cell_result(cell).write_text(json.dumps(kept))
     report.run(experiment, folder / "report", silent)
 
     found = json.loads((folder / "report" / "table.json").read_text())["cells"].values()
-    assert len(found) == len(cells(experiment)) == 24
+    assert len(found) == len(experiment.cells) == 24
     for cell in found:
         assert len(cell["deployed"]["total_cte_m"]) == 1
         if cell["method"] == "none":

@@ -1,4 +1,4 @@
-"""A method that a user brings, in the worker processes of a campaign: named, found, run again when its code changes, alone when it fails."""
+"""A method that a user brings, in the worker processes of an experiment: named, found, run again when its code changes, alone when it fails."""
 
 import json
 
@@ -8,10 +8,9 @@ import torch
 from advnerf_core.report.result_page import text_table
 from benchmarks.attack_toy import toy_problem
 from nodes.experiment.plan.cell import select
-from nodes.experiment.run.config import load_campaign
 from nodes.experiment.run.plan import statuses
-from nodes.experiment.run.published import campaign_table
-from nodes.experiment.run.run import Options, run_campaign
+from nodes.experiment.run.published import table_of
+from nodes.experiment.run.run import Options, run_cells
 from nodes.runtime.errors import ConfigError
 from tests.support.strangers import install_method, spiral_code, spiral_theta, write_spiral
 
@@ -19,31 +18,31 @@ from tests.support.strangers import install_method, spiral_code, spiral_theta, w
 @pytest.fixture
 def searching(here):
     write_spiral(here.folder)
-    here.write("seeds: [1]\nmethods: [spiral.py:Spiral, spiral, none]\nvictims: [hardened]\n")
+    here.write(seed=[1], method=["none", "spiral.py:Spiral", "spiral"])
     return here
 
 
 def run(bench, **options):
-    campaign, said = load_campaign(bench.file), []
-    return run_campaign(campaign, campaign.cells, Options(**options), said.append), said
+    loaded, said = bench.load(), []
+    return run_cells(loaded, loaded.cells, Options(**options), said.append), said
 
 
 def states(bench):
-    campaign = load_campaign(bench.file)
-    return {each.cell.name: each.state for each in statuses(campaign, campaign.cells)}
+    loaded = bench.load()
+    return {each.cell.name: each.state for each in statuses(loaded, loaded.cells)}
 
 
 def test_methods_of_a_file_and_of_a_package_run_in_worker_processes_and_appear_in_the_table(
     searching, monkeypatch, tmp_path
 ):
     install_method(searching.folder, monkeypatch, spiral_code())
-    campaign = load_campaign(searching.file)
+    loaded = searching.load()
     names = [f"straight_hardened_{method}" for method in ("none_0", "Spiral_1", "spiral_1")]
-    assert [cell.name for cell in campaign.cells] == names
-    assert [cell.name for cell in select(campaign.cells, "method=Spiral")] == [names[1]]
+    assert [cell.name for cell in loaded.cells] == names
+    assert [cell.name for cell in select(loaded.cells, "method=Spiral")] == [names[1]]
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
-    monkeypatch.chdir(elsewhere)  # references are relative to the campaign file
+    monkeypatch.chdir(elsewhere)  # references are relative to the experiment file
     ended, _ = run(searching, jobs=2)
     assert {end.how for end in ended} == {"done"}
     (begun,) = [line for line in searching.calls if line.startswith("begin straight_hardened_Spiral_1 ")]
@@ -54,12 +53,12 @@ def test_methods_of_a_file_and_of_a_package_run_in_worker_processes_and_appear_i
     thetas = [spiral_theta(shape, number, seed=1).flatten() for number in range(3)]
     found = torch.tensor(result["extra"]["theta"])
     assert min(float((found - theta).abs().max()) for theta in thetas) < 1e-5
-    table = text_table(campaign_table(campaign, statuses(campaign, campaign.cells)))
+    table = text_table(table_of(loaded, statuses(loaded, loaded.cells)))
     assert [row[2] for row in table.rows if row[2]] == ["plain object", "Spiral", "spiral"]
 
 
 def test_its_cells_run_again_when_its_code_changes_and_no_others(searching):
-    searching.write("seeds: [1]\nmethods: [spiral.py:Spiral, none]\nvictims: [hardened]\n")
+    searching.write(seed=[1], method=["none", "spiral.py:Spiral"])
     run(searching, here=True)
     (searching.folder / "spiral.py").write_text(
         spiral_code().replace("growth: float = 0.2", "growth: float = 0.4")
@@ -72,7 +71,7 @@ def test_its_cells_run_again_when_its_code_changes_and_no_others(searching):
 
 
 def test_a_broken_method_fails_alone_and_in_one_line(searching):
-    searching.write("seeds: [1]\nmethods: [spiral.py:Spiral, none]\nvictims: [hardened]\n")
+    searching.write(seed=[1], method=["none", "spiral.py:Spiral"])
     (searching.folder / "spiral.py").write_text("turns = 1 / 0\n")
     ended, _ = run(searching, here=True)
     how = {end.name: (end.how, end.text) for end in ended}
@@ -87,19 +86,19 @@ def test_a_broken_method_fails_alone_and_in_one_line(searching):
     ("methods", "says"),
     [
         (
-            "[none, spirel.py:Spiral]",
-            r"toy.campaign.yaml:4: methods.1: attack method spirel.py:Spiral: expected a Python file at",
+            ["none", "spirel.py:Spiral"],
+            r"toy.experiment.yaml:\d+: over.method.1: attack method spirel.py:Spiral: expected a Python file at",
         ),
         (
-            "[none, spiral]",
-            r":4: methods.1: expected an attack method of random, .*; got 'spiral'; one of your own is file.py:Name",
+            ["none", "spiral"],
+            r": over.method.1: expected an attack method of random, .*; got 'spiral'; one of your own is file.py:Name",
         ),
-        ("[spiral.py:Spiral, other.py:Spiral]", "every one of methods once"),
-        ("[spiral.py:cem]", "expected a name that no other condition has, got cem"),
+        (["spiral.py:Spiral", "other.py:Spiral"], "every one of over.method once"),
+        (["spiral.py:cem"], "expected a name that no other condition has, got cem"),
     ],
 )
 def test_what_cannot_be_is_told_with_its_line(searching, methods, says):
     (searching.folder / "other.py").write_text(spiral_code())
-    searching.write(f"seeds: [0]\nmethods: {methods}\nvictims: [hardened]\n")
+    searching.write(seed=[0], method=methods)
     with pytest.raises(ConfigError, match=says):
-        load_campaign(searching.file)
+        searching.load()

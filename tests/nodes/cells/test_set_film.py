@@ -17,13 +17,13 @@ PUBLISHED = Path(__file__).parents[3] / "docs" / "results" / "gap_duckietown_rob
 def test_the_film_shows_the_first_seed_of_each_method_or_is_not_made(tmp_path):
     published, run = tmp_path / "results" / PUBLISHED.name, tmp_path / "run"
     shutil.copytree(PUBLISHED, published)
-    campaign = SimpleNamespace(folder=run)
-    assert write_film(campaign, published) is None  # another machine drove
+    experiment = SimpleNamespace(folder=run)
+    assert write_film(experiment, published) is None  # another machine drove
     for name, grey in (("none_0", 40), ("random_coarse_6", 120), ("gradient_6", 200)):
         frames = np.full((12, 66, 200, 3), grey, np.uint8)
         track = ClipTrack(name, name.rpartition("_")[0], frames, np.zeros(12))
         write_clip(run / "cells" / f"more_hardened_{name}" / "clip.mp4", [track])
-    film = write_film(campaign, published)
+    film = write_film(experiment, published)
     assert film is not None
     assert film.stat().st_size <= MOST_BYTES
     shown = np.asarray(Image.open(film).convert("RGB"))

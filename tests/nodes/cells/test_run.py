@@ -9,9 +9,8 @@ import time
 
 import pytest
 
-from nodes.experiment.run.config import load_campaign
 from nodes.experiment.run.plan import statuses
-from nodes.experiment.run.run import Options, _shares, run_campaign
+from nodes.experiment.run.run import Options, _shares, run_cells
 from nodes.experiment.run.store import Store
 from nodes.experiment.run.worker import take_cell
 from nodes.runtime.locks import hold
@@ -19,17 +18,17 @@ from tests.support.waiting import wait_for
 
 
 def run(bench, jobs=2, **options):
-    campaign = load_campaign(bench.file)
+    loaded = bench.load()
     said = []
-    return run_campaign(campaign, campaign.cells, Options(jobs=jobs, **options), said.append), said
+    return run_cells(loaded, loaded.cells, Options(jobs=jobs, **options), said.append), said
 
 
 def states(bench):
-    campaign = load_campaign(bench.file)
-    return {each.cell.name: each.state for each in statuses(campaign, campaign.cells)}
+    loaded = bench.load()
+    return {each.cell.name: each.state for each in statuses(loaded, loaded.cells)}
 
 
-def test_a_campaign_runs_once_and_only_what_changed_again(here):
+def test_cells_run_once_and_only_what_changed_again(here):
     ended, _ = run(here)
     assert {end.how for end in ended} == {"done"}
     assert len(ended) == 3
@@ -42,7 +41,7 @@ def test_a_campaign_runs_once_and_only_what_changed_again(here):
     assert ended == []
     assert "nothing to do" in said[-1]
 
-    here.write("seeds: [0, 1, 2]\nmethods: [none, gradient]\nvictims: [hardened]\n")
+    here.write(seed=[0, 1, 2], method=["none", "gradient"])
     ended, _ = run(here)
     assert [end.name for end in ended] == ["straight_hardened_gradient_2"]
     assert all(here.cells.joinpath(name).stat().st_mtime_ns == stamp for name, stamp in before.items())
@@ -97,7 +96,7 @@ def test_a_killed_worker_loses_its_cell_and_no_other(here):
 
 
 @pytest.mark.slow
-def test_a_killed_campaign_takes_its_workers_along_and_goes_on(here):
+def test_a_killed_run_takes_its_workers_along_and_goes_on(here):
     process, worker = start_hanging(here)
     process.kill()
     process.communicate()
@@ -111,7 +110,7 @@ def test_a_killed_campaign_takes_its_workers_along_and_goes_on(here):
 
 @pytest.mark.slow
 def test_failed_cells_say_why_and_are_retried_when_asked(here):
-    here.write("seeds: [0, 1]\nmethods: [none, cem]\nvictims: [hardened]\n")
+    here.write(seed=[0, 1], method=["none", "cem"])
     (here.folder / "fail").touch()
     code, out, err = here.call("experiment", str(here.file), "--jobs", "2")
     assert code == 1
@@ -132,8 +131,9 @@ def test_failed_cells_say_why_and_are_retried_when_asked(here):
 @pytest.mark.slow
 def test_live_cells_run_alone_after_all_others(here):
     here.write(
-        "seeds: [0, 1]\nmethods: [none, cem]\nvictims: [hardened]\n",
-        f"  live: {{experiment: toy.experiment.yaml, run_folder: {here.folder / 'run'}, set: [alone=1]}}\n",
+        seed=[0, 1],
+        method=["none", "cem"],
+        variants={"live": {"run_folder": str(here.folder / "run"), "world.alone": 1}},
     )
     ended, _ = run(here)
     assert {end.how for end in ended} == {"done"}
@@ -204,7 +204,7 @@ def test_no_cluster_is_one_clear_error(here):
 
 
 def start_hanging(bench, jobs=1):
-    """The campaign's process, and the pid of the worker that hangs in the gradient cell of seed 0."""
+    """The process of the command, and the pid of the worker that hangs in the gradient cell of seed 0."""
     (bench.folder / "hang").touch()
     process = bench.start("experiment", str(bench.file), "--jobs", str(jobs))
     return process, pid_of(bench, "straight_hardened_gradient_0")
@@ -225,8 +225,8 @@ def is_alive(pid):
 
 
 def test_a_worker_that_is_asked_to_end_has_not_failed(here):
-    """As by a daemon that frees memory: it goes on when the campaign is run again, without being asked to try again."""
-    here.write("seeds: [0]\nmethods: [gradient]\nvictims: [hardened]\n")
+    """As by a daemon that frees memory: it goes on when the experiment is run again, without being asked to try again."""
+    here.write(seed=[0], method=["gradient"])
     process, worker = start_hanging(here)
     os.kill(worker, signal.SIGTERM)
     out, err = process.communicate(timeout=600)
@@ -237,7 +237,7 @@ def test_a_worker_that_is_asked_to_end_has_not_failed(here):
 
 
 def test_a_cell_that_fails_anew_is_failed_whatever_it_found_before(here):
-    here.write("seeds: [0]\nmethods: [cem]\nvictims: [hardened]\n")
+    here.write(seed=[0], method=["cem"])
     assert [end.how for end in run(here)[0]] == ["done"]
     here.describe(none_m=5.0)
     (here.folder / "fail").touch()
@@ -259,7 +259,7 @@ def test_a_cluster_is_filled_unless_it_is_said_how_many():
 
 def test_a_worker_that_is_asked_to_end_closes_what_is_open(here):
     """As a CARLA world must be put back: the cell's ``finally`` is run."""
-    here.write("seeds: [0]\nmethods: [gradient]\nvictims: [hardened]\n")
+    here.write(seed=[0], method=["gradient"])
     process, worker = start_hanging(here)
     process.terminate()  # its worker is told by the kernel
     process.communicate(timeout=600)

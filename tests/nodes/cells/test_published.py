@@ -12,17 +12,16 @@ from nodes.cli.main import app
 from nodes.experiment.engine.artefact import BUILD
 from nodes.experiment.pages.table import write_table
 from nodes.experiment.plan.cell import select
-from nodes.experiment.run.config import load_campaign
 from nodes.experiment.run.plan import elsewhere, plan_cells, statuses
 from nodes.experiment.run.published import (
     Published,
-    campaign_table,
     publish,
     publish_build,
     published_table,
+    table_of,
 )
 from nodes.experiment.run.registering import _refuse_late
-from nodes.experiment.run.run import Options, run_campaign
+from nodes.experiment.run.run import Options, run_cells
 from nodes.runtime.errors import ConfigError
 
 
@@ -55,19 +54,19 @@ def command(*arguments):
 
 
 def test_a_cell_that_was_not_driven_live_is_shown_and_never_published(here, tmp_path):
-    campaign = load_campaign(here.file)
-    plan = plan_cells(campaign, campaign.cells)
+    loaded = here.load()
+    plan = plan_cells(loaded, loaded.cells)
     for each in plan:
         late = {"deployed": None, "not_driven_live": "live0 was spoiled 3 times"}
         put(each, here.cells, **(late if each.cell.method == "gradient" else {}))
-    found = statuses(campaign, campaign.cells)
-    table = campaign_table(campaign, found)
+    found = statuses(loaded, loaded.cells)
+    table = table_of(loaded, found)
     deployed, learned = (
         table.find("straight", "hardened", "gradient", domain) for domain in ("deployed", "surrogate")
     )
     assert (deployed.drives, deployed.total_m, deployed.missing) == (0, None, (0, 1))
     assert learned.drives == 2
-    written = publish(campaign, found, tmp_path / "kept").written
+    written = publish(loaded, found, tmp_path / "kept").written
     assert set(written) == {each.cell.name for each in plan if each.cell.method == "none"}
     output = command("publish", here.file, "--to", tmp_path / "kept", "--no-build")
     assert (
@@ -75,21 +74,21 @@ def test_a_cell_that_was_not_driven_live_is_shown_and_never_published(here, tmp_
     )
     assert "2 are not finished" in output
     with pytest.raises(RegistrationError, match="register before anything is run"):
-        _refuse_late(campaign)
+        _refuse_late(loaded, loaded.cells)
 
 
 def test_a_table_and_published_cells_from_finished_cells(here, tmp_path):
     """Without running: results are put where workers put them; one of other settings is not taken."""
     bench = here
-    campaign = load_campaign(bench.file)
-    found = statuses(campaign, campaign.cells)
+    loaded = bench.load()
+    found = statuses(loaded, loaded.cells)
     assert {each.state for each in found} == {"missing"}
-    plan = plan_cells(campaign, campaign.cells)
+    plan = plan_cells(loaded, loaded.cells)
     put(plan[0], bench.cells)
     put(plan[1], bench.cells, "of before")
-    found = statuses(campaign, campaign.cells)
+    found = statuses(loaded, loaded.cells)
     assert sorted(each.state for each in found) == ["changed", "done", "missing"]
-    table = campaign_table(campaign, found)
+    table = table_of(loaded, found)
     assert list(table.cells) == [plan[0].cell.name]
     page = write_table(table, bench.cells, tmp_path / "page")
     assert {path.name for path in page.parent.iterdir()} == {
@@ -98,36 +97,36 @@ def test_a_table_and_published_cells_from_finished_cells(here, tmp_path):
         "table.json",
         "table.md",
     }
-    assert publish(campaign, found, tmp_path / "kept") == Published((plan[0].cell.name,), (), ())
-    assert publish(campaign, found, tmp_path / "kept") == Published((), (plan[0].cell.name,), ())
+    assert publish(loaded, found, tmp_path / "kept") == Published((plan[0].cell.name,), (), ())
+    assert publish(loaded, found, tmp_path / "kept") == Published((), (plan[0].cell.name,), ())
     kept = tmp_path / "kept" / "toy" / f"{plan[0].cell.name}.json"
     whole = bench.cells / kept.name
     assert kept.read_text() == whole.read_text()
     whole.write_text(json.dumps({**json.loads(whole.read_text()), "extra": {"changed": 1}}))
-    found = statuses(campaign, campaign.cells)
-    assert publish(campaign, found, tmp_path / "kept") == Published((plan[0].cell.name,), (), ())
+    found = statuses(loaded, loaded.cells)
+    assert publish(loaded, found, tmp_path / "kept") == Published((plan[0].cell.name,), (), ())
     assert json.loads(kept.read_text())["extra"] == {"changed": 1}
-    assert publish(campaign, found, tmp_path / "kept") == Published((), (plan[0].cell.name,), ())
-    shown = published_table(tmp_path / "kept" / "toy", campaign)
+    assert publish(loaded, found, tmp_path / "kept") == Published((), (plan[0].cell.name,), ())
+    shown = published_table(tmp_path / "kept" / "toy", loaded)
     assert shown.find("straight", "hardened", "none", "deployed").ratio == 3.0
     assert shown.find("straight", "hardened", "gradient", "deployed").missing == (0, 1)
     with pytest.raises(ConfigError, match="advnerf publish"):
-        published_table(tmp_path / "nowhere", campaign)
+        published_table(tmp_path / "nowhere", loaded)
     # A cell that other settings have made goes when it is asked for, unless it is not the one that is here; one that was never begun here stays.
     changed, missing = next(each for each in found if each.state == "changed").cell.name, found[-1].cell.name
     there = tmp_path / "kept" / "toy" / f"{changed}.json"
     shutil.copy(bench.cells / f"{changed}.json", there)
     shutil.copy(bench.cells / f"{plan[0].cell.name}.json", there.with_name(f"{missing}.json"))
-    assert publish(campaign, found, tmp_path / "kept").stale == (changed,)
+    assert publish(loaded, found, tmp_path / "kept").stale == (changed,)
     assert there.exists()
-    assert publish(campaign, found, tmp_path / "kept", prune=True).stale == (changed,)
+    assert publish(loaded, found, tmp_path / "kept", prune=True).stale == (changed,)
     assert not there.exists()
     put(plan[1], there.parent, "of elsewhere")
-    assert publish(campaign, found, tmp_path / "kept", prune=True).stale == ()
+    assert publish(loaded, found, tmp_path / "kept", prune=True).stale == ()
     assert there.exists()
     assert there.with_name(f"{missing}.json").exists()
     (bench.cells / f"{plan[0].cell.name}.json").write_text("{")
-    assert sorted(each.state for each in statuses(campaign, campaign.cells)) == [
+    assert sorted(each.state for each in statuses(loaded, loaded.cells)) == [
         "changed",
         "missing",
         "unreadable",
@@ -143,9 +142,9 @@ def test_a_published_cell_whose_key_matches_is_done_on_any_machine(here, tmp_pat
         folder.mkdir(parents=True)
         record = {"key": "k", "digest": digest, "seconds": 1.0, "settings": {}}
         (folder / "stage.json").write_text(json.dumps(record))
-    campaign = load_campaign(here.file)
-    cells = select(campaign.cells, "seed=0")
-    assert [end.how for end in run_campaign(campaign, cells, Options(here=True), lambda text: None)] == [
+    loaded = here.load()
+    cells = select(loaded.cells, "seed=0")
+    assert [end.how for end in run_cells(loaded, cells, Options(here=True), lambda text: None)] == [
         "done",
         "done",
     ]
@@ -161,26 +160,26 @@ def test_a_published_cell_whose_key_matches_is_done_on_any_machine(here, tmp_pat
     (attacked,) = [row for row in rows if (row["method"], row["domain"]) == ("gradient", "deployed")]
     assert float(attacked["total_m"]) == 3.0 * float(attacked["plain_total_m"])
     assert not (here.folder / "table").exists()  # the page of all cells of this file
-    assert run_campaign(campaign, cells, Options(here=True), lambda text: None) == []
-    assert {each.text for each in statuses(campaign, cells)} == {
+    assert run_cells(loaded, cells, Options(here=True), lambda text: None) == []
+    assert {each.text for each in statuses(loaded, cells)} == {
         f"from {file.relative_to(tmp_path)}"
         for file in (kept / "toy" / first.name, kept / "toy" / second.name)
     }
     # Nor is one of other settings taken, or one that cannot be read.
     (kept / "toy" / second.name).write_text("{")
     here.describe(none_m=2.0, other=1)
-    assert [each.state for each in statuses(campaign, cells)] == ["missing", "missing"]
+    assert [each.state for each in statuses(here.load(), cells)] == ["missing", "missing"]
     here.describe(none_m=2.0)
-    ended = run_campaign(campaign, cells, Options(here=True), lambda text: None)
+    ended = run_cells(loaded, cells, Options(here=True), lambda text: None)
     assert [end.name for end in ended] == [second.stem]
 
 
-def test_a_cell_that_its_experiment_has_run_is_done_for_a_campaign_too(here):
-    campaign = load_campaign(here.file)
-    plan = plan_cells(campaign, campaign.cells)
+def test_a_cell_that_its_experiment_has_run_is_done_for_a_variant_too(here):
+    loaded = here.load()
+    plan = plan_cells(loaded, loaded.cells)
     put(plan[0], here.folder / "run" / "cells")
     put(plan[1], here.folder / "run" / "cells", "of before")
-    assert [each.state for each in statuses(campaign, campaign.cells)] == [
+    assert [each.state for each in statuses(loaded, loaded.cells)] == [
         "done",
         "missing",
         "missing",
@@ -188,7 +187,7 @@ def test_a_cell_that_its_experiment_has_run_is_done_for_a_campaign_too(here):
 
 
 def test_a_published_build_stays_as_long_as_a_published_cell_was_run_with_it(here, tmp_path):
-    build, campaign = tmp_path / BUILD, load_campaign(here.file)
+    build, loaded = tmp_path / BUILD, here.load()
     for name, digest in (("scene_of_a_cell", "s1"), ("scene_of_none", "s2")):
         (build / name).mkdir(parents=True)
         record = {"key": "k", "digest": digest, "seconds": 1.0, "settings": {}, "kept": "d"}
@@ -196,23 +195,23 @@ def test_a_published_build_stays_as_long_as_a_published_cell_was_run_with_it(her
     (tmp_path / "paper").mkdir()
     (tmp_path / "paper" / "cell.json").write_text(json.dumps({"stages": {"scene": "s1"}}))
     (tmp_path / "paper" / "gate.json").write_text(json.dumps({"passed": True}))
-    found = publish_build(campaign, campaign.cells, tmp_path)
+    found = publish_build(loaded, loaded.cells, tmp_path)
     assert (found.written, found.removed) == ((), ())
-    found = publish_build(campaign, campaign.cells, tmp_path, prune=True)
+    found = publish_build(loaded, loaded.cells, tmp_path, prune=True)
     assert [each.name for each in found.removed] == ["scene_of_none"]
     assert [each.name for each in build.iterdir()] == ["scene_of_a_cell"]
     assert found.size_bytes == (build / "scene_of_a_cell" / "stage.json").stat().st_size
 
 
 def test_a_cell_that_its_experiment_ran_itself_is_published_too(here, tmp_path):
-    campaign = load_campaign(here.file)
-    plan = plan_cells(campaign, campaign.cells)[0]
-    own = elsewhere(campaign, plan.cell)[0]
+    loaded = here.load()
+    plan = plan_cells(loaded, loaded.cells)[0]
+    own = elsewhere(loaded, plan.cell)[0]
     assert own.parent != here.cells
     put(plan, own.parent)
     (own.parent / f"{plan.cell.name}.json").rename(own)
-    found = publish(campaign, statuses(campaign, campaign.cells), tmp_path / "kept")
+    found = publish(loaded, statuses(loaded, loaded.cells), tmp_path / "kept")
     assert found.written == (plan.cell.name,)
-    kept = json.loads((tmp_path / "kept" / campaign.name / f"{plan.cell.name}.json").read_text())
+    kept = json.loads((tmp_path / "kept" / loaded.config.name / f"{plan.cell.name}.json").read_text())
     assert kept["settings_hash"] == plan.job.settings_hash
-    assert publish(campaign, statuses(campaign, campaign.cells), tmp_path / "kept").same == (plan.cell.name,)
+    assert publish(loaded, statuses(loaded, loaded.cells), tmp_path / "kept").same == (plan.cell.name,)

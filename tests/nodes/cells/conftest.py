@@ -1,9 +1,11 @@
-"""Campaigns over toy cells in real processes."""
+"""Experiments over toy cells in real processes."""
 
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
+from types import MappingProxyType
 
 import pytest
 
@@ -32,9 +34,10 @@ def gated(here, monkeypatch):
 
 @pytest.fixture
 def bench(tmp_path, monkeypatch):
-    """A folder with an experiment of toy cells and a campaign of one scenario, two seeds, two methods."""
+    """A folder with an experiment of toy cells: one path, two seeds, two methods."""
     toy_cells.put_over(monkeypatch, MODULES)
     monkeypatch.setattr(worker, "module_command", toy_cells.command)
+    monkeypatch.setattr("nodes.experiment.steps.run.load_experiment", toy_cells.load_experiment)
     return Bench(tmp_path)
 
 
@@ -49,20 +52,37 @@ class Bench:
     def __init__(self, folder):
         self.folder = folder
         self.cells = folder / "cells"
-        self.describe(none_m=2.0)
-        self.file = folder / "toy.campaign.yaml"
-        self.write("seeds: [0, 1]\nmethods: [gradient, none]\nvictims: [hardened]\n")
+        self.file = folder / "toy.experiment.yaml"
+        self.world, self.over = {"none_m": 2.0}, {}
+        self.write(seed=[0, 1], method=["none", "gradient"])
 
     def describe(self, **values):
-        """Write the experiment; ``none_m`` is its total CTE without attack."""
-        lines = [f"{name}: {value}\n" for name, value in values.items()]
-        (self.folder / "toy.experiment.yaml").write_text("settings: {full: {}}\n" + "".join(lines))
+        """Write the experiment with another world; ``none_m`` is its total CTE without attack."""
+        self.world = values
+        self.write()
 
-    def write(self, head, scenarios=""):
-        scenario = f"{{experiment: toy.experiment.yaml, setting: full, run_folder: {self.folder / 'run'}}}"
-        self.file.write_text(
-            f"name: toy\nfolder: {self.folder}\n{head}scenarios:\n  straight: {scenario}\n{scenarios}"
+    def write(self, variants=None, gate=MappingProxyType({}), **over):
+        """Write the experiment with other methods and seeds, with more variants beside ``straight``, and with limits of the gate."""
+        self.over |= over
+        straight = {"over.path": ["straight"], "run_folder": str(self.folder / "run")}
+        named = {"variant": {"straight": straight, **(variants or {})}, "victim": ["hardened"], **self.over}
+        self._write(
+            self.file, run_folder=str(self.folder), gate=None if gate is None else dict(gate), over=named
         )
+
+    def plain(self):
+        """An experiment file of the same world without variants."""
+        file = self.folder / "plain.experiment.yaml"
+        self._write(file)
+        return file
+
+    def _write(self, file, **keys):
+        world = {"kind": "toy", **self.world}
+        data = {"name": "toy", "world": world, "scenarios": ["straight"], **keys}
+        file.write_text(json.dumps(data, indent=1))
+
+    def load(self):
+        return toy_cells.load_experiment(self.file, None, [], None)
 
     @property
     def environment(self):

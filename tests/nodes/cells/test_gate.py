@@ -1,4 +1,4 @@
-"""The fidelity gate of campaigns, and predictions, on pictures whose steering is known: a policy that reads it off a pixel."""
+"""The fidelity gate of cells, and predictions, on pictures whose steering is known: a policy that reads it off a pixel."""
 
 import inspect
 import json
@@ -15,18 +15,16 @@ from advnerf_core.driving.path import Line, Path
 from advnerf_core.driving.rollout import drive
 from nodes.cli.experiment import predict
 from nodes.cli.main import app
-from nodes.experiment.run.config import load_campaign
 from nodes.experiment.run.plan import statuses
-from nodes.experiment.run.predictions import predict_campaign, predicted
-from nodes.experiment.run.run import Options, run_campaign
-from tests.support.toy_cells import load_experiment
+from nodes.experiment.run.predictions import predict_cells, predicted
+from nodes.experiment.run.run import Options, run_cells
 
-HEAD = "seeds: [0]\nmethods: [gradient, none]\nvictims: [hardened]\n"
+ONE = {"seed": [0], "method": ["none", "gradient"]}
 
 
 def run(bench, **options):
-    campaign, said = load_campaign(bench.file), []
-    return run_campaign(campaign, campaign.cells, Options(here=True, **options), said.append), said
+    loaded, said = bench.load(), []
+    return run_cells(loaded, loaded.cells, Options(here=True, **options), said.append), said
 
 
 def times_judged(bench):
@@ -35,7 +33,7 @@ def times_judged(bench):
 
 def test_a_surrogate_that_the_policy_reads_wrongly_has_its_cells_left_out(gated):
     gated.describe(none_m=2.0, wrong=0.2)
-    gated.write(HEAD)
+    gated.write(**ONE)
     ended, said = run(gated)
     assert ended == []
     assert gated.calls == []
@@ -49,6 +47,13 @@ def test_a_surrogate_that_the_policy_reads_wrongly_has_its_cells_left_out(gated)
     assert times_judged(gated) == 1  # kept
 
 
+def test_a_surrogate_without_limits_is_not_judged(gated):
+    gated.describe(none_m=2.0, wrong=0.2)
+    gated.write(gate=None, **ONE)
+    assert {end.how for end in run(gated)[0]} == {"done"}
+    assert not (gated.folder / "gate").exists()
+
+
 def test_a_verdict_is_made_again_only_for_other_limits(gated):
     assert {end.how for end in run(gated)[0]} == {"done"}
     verdict = json.loads((gated.folder / "gate" / "straight_hardened.json").read_text())
@@ -57,7 +62,7 @@ def test_a_verdict_is_made_again_only_for_other_limits(gated):
     assert verdict["numbers"]["steering"] == 0.0
     run(gated)
     assert times_judged(gated) == 1
-    gated.write("gate: {views: 17}\n" + HEAD)
+    gated.write(gate={"views": 17}, **ONE)
     _, said = run(gated)
     assert times_judged(gated) == 2
     assert any("16 pictures, at least 17 needed" in line for line in said)
@@ -67,7 +72,7 @@ def test_a_verdict_is_made_again_only_for_other_limits(gated):
 
 
 def test_a_drive_without_attack_is_judged_too_as_soon_as_there_is_one(gated):
-    gated.write(HEAD)
+    gated.write(**ONE)
     gated.describe(none_m=2.0, late=1.0, wrong_drive=0.2)
     ended, said = run(gated)
     assert {end.how for end in ended} == {"done"}
@@ -77,7 +82,7 @@ def test_a_drive_without_attack_is_judged_too_as_soon_as_there_is_one(gated):
     )
     verdict = gated.folder / "gate" / "straight_hardened.drive.json"
     assert not verdict.exists()
-    gated.write(HEAD.replace("[0]", "[0, 1]"))
+    gated.write(seed=[0, 1])
     ended, said = run(gated)
     assert ended == []
     assert any(
@@ -88,26 +93,26 @@ def test_a_drive_without_attack_is_judged_too_as_soon_as_there_is_one(gated):
 
 
 def test_transfer_is_predicted_from_the_search_before_any_drive(gated):
-    gated.write(HEAD)
-    campaign = load_campaign(gated.file)
+    gated.write(**ONE)
+    loaded = gated.load()
     said = []
-    assert predict_campaign(campaign, campaign.cells, said.append) == 0
+    assert predict_cells(loaded, loaded.cells, said.append) == 0
     ended, _ = run(gated, search_only=True)
     assert {end.how for end in ended} == {"done"}
     assert {line.split()[0] for line in gated.calls} == {"search"}
-    assert [each.state for each in statuses(campaign, campaign.cells)] == ["begun", "begun"]
-    assert predict_campaign(campaign, campaign.cells, said.append) == 1  # nothing is predicted of no attack
-    assert predict_campaign(campaign, campaign.cells, said.append) == 0
-    assert predict_campaign(campaign, campaign.cells, said.append, draws=9) == 1  # as many as are asked for
-    assert predict_campaign(campaign, campaign.cells, said.append) == 1
+    assert [each.state for each in statuses(loaded, loaded.cells)] == ["begun", "begun"]
+    assert predict_cells(loaded, loaded.cells, said.append) == 1  # nothing is predicted of no attack
+    assert predict_cells(loaded, loaded.cells, said.append) == 0
+    assert predict_cells(loaded, loaded.cells, said.append, draws=9) == 1  # as many as are asked for
+    assert predict_cells(loaded, loaded.cells, said.append) == 1
     kept = json.loads((gated.folder / "predictions" / "straight_hardened_gradient_0.json").read_text())
     assert kept["retained"] == pytest.approx(0.5, abs=0.02)
     assert kept["total_cte_m"] == pytest.approx(driven(0.1), rel=0.03)  # half of the attack's 0.2 rad/s
     assert kept["clean_drive"]["steering"] == 0.0
-    assert predicted(campaign.folder, []) == []
+    assert predicted(loaded.folder, []) == []
     run(gated)
-    found = [each.result for each in statuses(campaign, campaign.cells) if each.result is not None]
-    (pair,) = predicted(campaign.folder, found)
+    found = [each.result for each in statuses(loaded, loaded.cells) if each.result is not None]
+    (pair,) = predicted(loaded.folder, found)
     assert pair.name == "straight_hardened_gradient_0"
     assert pair.expected_m == pytest.approx(kept["excess_m"])
     result = next(each for each in found if each.name == pair.name)
@@ -116,14 +121,14 @@ def test_transfer_is_predicted_from_the_search_before_any_drive(gated):
 
 
 def test_a_search_of_other_settings_is_not_predicted_from(gated):
-    gated.write(HEAD)
+    gated.write(**ONE)
     run(gated)
     gated.describe(none_m=5.0)
-    campaign, said = load_campaign(gated.file), []
-    assert predict_campaign(campaign, campaign.cells, said.append) == 0
+    loaded, said = gated.load(), []
+    assert predict_cells(loaded, loaded.cells, said.append) == 0
     run(gated, search_only=True)  # its old result is still there
-    assert {each.state for each in statuses(campaign, campaign.cells)} == {"changed"}
-    assert predict_campaign(campaign, campaign.cells, said.append) == 1
+    assert {each.state for each in statuses(loaded, loaded.cells)} == {"changed"}
+    assert predict_cells(loaded, loaded.cells, said.append) == 1
 
 
 def driven(turn_radps):
@@ -146,12 +151,11 @@ def driven(turn_radps):
 
 
 @pytest.mark.parametrize(("wrong", "code"), [(0.0, 0), (0.2, 1)])
-def test_the_gate_is_a_command_of_its_own_with_an_exit_code(gated, wrong, code, monkeypatch):
-    monkeypatch.setattr("nodes.experiment.steps.run.load_experiment", load_experiment)
+def test_the_gate_is_a_command_of_its_own_with_an_exit_code(gated, wrong, code):
     gated.describe(none_m=2.0, wrong=wrong)
     (gated.folder / "run").mkdir()
     arguments = (
-        str(gated.folder / "toy.experiment.yaml"),
+        str(gated.plain()),
         "--run-folder",
         str(gated.folder / "run"),
     )

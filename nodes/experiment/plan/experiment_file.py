@@ -1,0 +1,185 @@
+"""Reads an experiment file with one of its settings, and its variants. Needs no torch."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from advnerf_core.documents import Document, Key, read_yaml
+from nodes.experiment.plan.over import (
+    COORDINATES,
+    OVER,
+    Change,
+    coordinates_in,
+    variants_in,
+    with_dotted_axes,
+)
+from nodes.runtime.config import apply_overrides
+from nodes.runtime.errors import ConfigError
+
+# Chosen where a file has settings and none is named.
+DEFAULT_SETTING = "demo"
+# Keys that are of the whole experiment, not of a variant.
+_OF_THE_WHOLE = ("name", "run_folder", "contrasts")
+
+
+@dataclass(frozen=True)
+class ExperimentFile:
+    """An experiment file with one of its settings laid over its values, and overrides over that.
+
+    Attributes:
+        setting: Which setting; empty for a file without settings.
+        document: The values.
+        variants: The values of each variant that the section ``over`` names.
+    """
+
+    setting: str
+    document: Document
+    variants: Mapping[str, Document]
+
+
+def read_experiment_file(file: Path, setting: str | None, overrides: Sequence[str]) -> ExperimentFile:
+    """Read an experiment file and its variants; see `load_experiment`."""
+    read = _with_setting(file, setting, ())
+    apply_overrides(read.document, overrides)
+    with_dotted_axes(read.document)
+    over = read.document.data.get(OVER)
+    try:
+        changes = variants_in(over)
+    except ValueError as error:
+        raise ConfigError(f"{read.document.place((OVER,))}: {error}") from None
+    variants = {name: _variant(file, read, each, overrides) for name, each in changes.items()}
+    return ExperimentFile(read.setting, read.document, variants)
+
+
+@dataclass(frozen=True)
+class _Read:
+    """A file as it was read.
+
+    Attributes:
+        setting: Which of its settings is laid over its values.
+        document: Its values.
+        of: Name of the experiment that it changes: of its base, or its own.
+    """
+
+    setting: str
+    document: Document
+    of: Any
+
+
+def _with_setting(file: Path, setting: str | None, above: Sequence[Path]) -> _Read:
+    document, base_name = _on_its_base(file, above)
+    settings = document.data.pop("settings", None) or {}
+    if setting is None:
+        setting = DEFAULT_SETTING if settings else ""
+    if setting or settings:
+        if setting not in settings:
+            raise ConfigError(
+                f"{file}: no setting called {setting!r}; known are {', '.join(settings) or 'none'}"
+            )
+        _lay_over(document, settings[setting] or {}, ("settings", setting), ())
+    return _Read(setting, document, base_name or document.data.get("name"))
+
+
+def _on_its_base(file: Path, above: Sequence[Path]) -> tuple[Document, Any]:
+    """An experiment file, laid over the file that its key ``base`` names, if it has one, and the name of that experiment."""
+    document = read_yaml(file)
+    if not isinstance(document.data, dict):
+        raise ConfigError(f"{file}: expected an experiment file with keys and values")
+    base, setting = document.data.pop("base", None), document.data.pop("setting", None)
+    if base is None:
+        if setting is not None:
+            raise ConfigError(
+                f"{document.place(('setting',))}: expected setting only with base, whose setting it names, got {setting}; name the settings of "
+                "this file under settings"
+            )
+        return document, None
+    at = file.parent / str(base)
+    if at.resolve() in [each.resolve() for each in (*above, file)]:
+        raise ConfigError(
+            f"{document.place(('base',))}: expected a base other than the file itself, got {base}"
+        )
+    if setting is None:
+        under, _ = _on_its_base(at, (*above, file))
+    else:
+        under = _with_setting(at, str(setting), (*above, file)).document
+    name = under.data.get("name")
+    _lay_over(under, document.data, (), (), document.places)
+    return Document(under.data, document.source, under.places), name
+
+
+def _variant(file: Path, read: _Read, changes: Sequence[Change], overrides: Sequence[str]) -> Document:
+    """The values of one variant: those of the experiment, or of the variant's own base, with its changes and the overrides."""
+    values = {change.key: change.value for change in changes}
+    base, setting = values.pop("base", None), values.pop("setting", None)
+    if base is None:
+        made = Document(copy.deepcopy(read.document.data), read.document.source, dict(read.document.places))
+        made.data["name"] = read.of
+    else:
+        made = _with_setting(file.parent / str(base), setting, (file,)).document
+    whole = read.document.data.get(OVER)
+    made.data[OVER] = copy.deepcopy(coordinates_in(made.data.get(OVER)) | coordinates_in(whole))
+    for key in _OF_THE_WHOLE[1:]:
+        made.data.pop(key, None)
+    for change in changes:
+        if change.key in values:
+            _change(made, change, read.document)
+    apply_overrides(made, [text for text in overrides if _is_of_variants(text)])
+    return made
+
+
+def _change(made: Document, change: Change, document: Document) -> None:
+    """Lay one change of a variant over its values."""
+    steps, value = tuple(change.key.split(".")), copy.deepcopy(change.value)
+    places = {
+        (*steps, *at[len(change.origin) :]): place
+        for at, place in document.places.items()
+        if at[: len(change.origin)] == change.origin
+    }
+    for step in reversed(steps):
+        value = {step: value}
+    _lay_over(made, value, (), (), {steps: document.place(change.origin)} | places)
+
+
+def _is_of_variants(override: str) -> bool:
+    """Whether an override changes every variant, and not which there are."""
+    first, _, rest = override.partition("=")[0].strip().partition(".")
+    return rest.partition(".")[0] in COORDINATES if first == OVER else first not in _OF_THE_WHOLE
+
+
+def _lay_over(
+    document: Document,
+    values: dict[str, Any],
+    origin: tuple[str, ...],
+    key: tuple[str, ...],
+    places: Mapping[Key, str] | None = None,
+) -> None:
+    """Merge values into the document, keeping for each the place where it stands: in ``places``, or in the document itself under ``origin``."""
+    source = document.places if places is None else places
+    target = document.data
+    for step in key:
+        if not isinstance(target.get(step), dict):
+            target[step] = {}
+        target = target[step]
+    for name, value in values.items():
+        here, there = (*key, name), (*origin, *key, name)
+        before = target.get(name)
+        if isinstance(value, dict) and isinstance(before, dict) and not _another_kind(before, value):
+            _lay_over(document, value, origin, here, places)
+            continue
+        target[name] = value
+        document.places[here] = next(
+            (source[there[:end]] for end in range(len(there), 0, -1) if there[:end] in source),
+            document.source,
+        )
+        document.places |= {
+            (*here, *at[len(there) :]): place for at, place in source.items() if at[: len(there)] == there
+        }
+
+
+def _another_kind(before: Mapping[str, Any], value: Mapping[str, Any]) -> bool:
+    """Whether a section is of another ``kind``, whose keys are others: it takes the place of the one before."""
+    return "kind" in value and value["kind"] != before.get("kind")

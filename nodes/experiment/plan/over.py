@@ -1,0 +1,159 @@
+"""The section ``over`` of an experiment: what its cells are made of, and the variants that are read of it."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from pydantic import ConfigDict, Field, StringConstraints, model_validator
+
+from advnerf_core.documents import Document, Key
+from advnerf_core.plugins import name_in_results
+from advnerf_core.strict import StrictModel
+from nodes.experiment.plan.method_names import ConditionReference
+from nodes.experiment.plan.victims import VictimName
+
+# Names become parts of file names, which are separated by "_" and "."; a variant may hold "_", victims may not.
+VariantName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_-]*$")]
+OVER, VARIANT = "over", "variant"
+
+
+class OverConfig(StrictModel):
+    """What an experiment goes over: its cells are the product. Any other key of the experiment may be an axis too, as a dotted path
+    with a list of values: ``attack.evaluations: [20, 60]``."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, Annotated[list[Any], Field(min_length=1)]] = Field(init=False)
+
+    variant: dict[VariantName, dict[str, Any]] = Field(
+        default={},
+        description="Named variants of the experiment: for each the keys that differ, as dotted paths. With base (and setting) a variant begins "
+        "from another experiment file instead of this one; with run_folder it has stages of its own.",
+    )
+    path: tuple[str, ...] | None = Field(
+        default=None, min_length=1, description="Paths; none: all of the experiment's."
+    )
+    victim: tuple[VictimName, ...] | None = Field(
+        default=None,
+        min_length=1,
+        description="Victims; none: all of the experiment's, the one that was trained without textures with the first seed alone.",
+    )
+    method: tuple[ConditionReference, ...] | None = Field(
+        default=None,
+        min_length=1,
+        description="The controls none and empty, and methods of attack; none: attack.methods and their controls.",
+    )
+    seed: tuple[int, ...] | None = Field(
+        default=None, min_length=1, description="Seeds of the searches; none: attack.seeds."
+    )
+
+    @model_validator(mode="after")
+    def _nothing_twice(self) -> OverConfig:
+        for name in ("path", "victim", "method", "seed"):
+            values = getattr(self, name) or ()
+            # Two files may have methods of one name.
+            names = [name_in_results(value) for value in values] if name == "method" else values
+            if len(set(names)) != len(names):
+                raise ValueError(f"expected every one of over.{name} once, got {list(values)}")
+        return self
+
+
+# What says which cells a variant has; everything else of the section makes variants.
+COORDINATES = tuple(name for name in OverConfig.model_fields if name != VARIANT)
+
+
+@dataclass(frozen=True)
+class Change:
+    """What a variant changes.
+
+    Attributes:
+        key: The key of the experiment, as a dotted path.
+        value: What it is in the variant.
+        origin: Where that stands in the experiment file.
+    """
+
+    key: str
+    value: Any
+    origin: Key
+
+
+def with_dotted_axes(document: Document) -> None:
+    """Make dotted paths, in place, of the sections that ``--set over.attack.evaluations=[20,60]`` makes in a section ``over``."""
+    over = document.data.get(OVER)
+    for name in list(over) if isinstance(over, dict) else ():
+        if name == VARIANT or not isinstance(over[name], dict):
+            continue
+        for key, value in _leaves(over.pop(name), (name,)):
+            over[".".join(key)] = value
+            document.places[(OVER, ".".join(key))] = document.place((OVER, *key))
+
+
+def _leaves(values: Mapping[str, Any], above: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, (*above, str(name)))
+        else:
+            yield (*above, str(name)), value
+
+
+def variants_in(over: Any) -> dict[str, list[Change]]:
+    """The variants of a section ``over`` by name, each with its changes: the product of its named variants and its axes.
+
+    Args:
+        over: The section as it was read; what is wrong in it is refused where it is validated.
+
+    Raises:
+        ValueError: Two have one name.
+    """
+    if not isinstance(over, dict):
+        return {}
+    named, factors = (
+        over.get(VARIANT),
+        [_values(key, each) for key, each in over.items() if _is_axis(key, each)],
+    )
+    if isinstance(named, dict) and named:
+        factors.insert(0, [(name, _changes(name, changes)) for name, changes in named.items()])
+    found: dict[str, list[Change]] = {}
+    for combined in itertools.product(*factors) if factors else ():
+        name = "_".join(str(each) for each, _ in combined)
+        if name in found:
+            raise ValueError(
+                f"expected values whose letters and digits differ, got two variants of the name {name}"
+            )
+        found[name] = [change for _, changes in combined for change in changes]
+    return found
+
+
+def coordinates_in(over: Any) -> dict[str, Any]:
+    """What of a section ``over`` says which cells a variant has."""
+    return {name: over[name] for name in COORDINATES if name in over} if isinstance(over, dict) else {}
+
+
+def _changes(name: str, changes: Any) -> list[Change]:
+    """What a named variant changes."""
+    items = changes.items() if isinstance(changes, dict) else ()
+    return [Change(str(key), value, (OVER, VARIANT, name, key)) for key, value in items]
+
+
+def _is_axis(key: str, values: Any) -> bool:
+    return isinstance(values, list) and key != VARIANT and key not in COORDINATES
+
+
+def _values(key: str, values: list[Any]) -> list[tuple[str, list[Change]]]:
+    """What the values of an axis are called in the names of variants, and what each changes."""
+    last = key.rpartition(".")[2]
+    return [
+        (f"{last}-{_slug(value, at)}", [Change(key, value, (OVER, key, at))])
+        for at, value in enumerate(values)
+    ]
+
+
+def _slug(value: Any, number: int) -> str:
+    """A value in the name of a variant; its number in the list where it is a section or a list itself."""
+    letters = (
+        "" if isinstance(value, dict | list) else re.sub(r"[^a-z0-9]+", "-", str(value).lower()).strip("-")
+    )
+    return letters or str(number)
