@@ -33,10 +33,10 @@ _CHOICES: dict[str, tuple[str, ...]] = {
     "colour_space": get_args(ColourSpace), "output_unit": get_args(Unit), "positive": get_args(Side),
     "layout": get_args(Layout),
 }  # fmt: skip
-# Keys that came later. Without them, declarations have the text, and policies the hash, that they always had.
 _SECTIONS: dict[str, Any] = {
     "frames": FrameStack, "trajectory": TrackedTrajectory, "bins": SteeringBins, "states": tuple[NetworkState, ...],
 }  # fmt: skip
+# Keys that came later. Without them, declarations have the text, and policies the hash, that they always had.
 _LATER = ("input_name", "output_name", "output_index", "output_column", *_SECTIONS)
 RAD_PER_DEG = pi / 180.0
 
@@ -68,13 +68,12 @@ class PolicyContract:
         output_name: The output that steers, of a file or of a network that returns a dict; None where there is one output.
         output_index: The same by its number from 0, of a file or of a network that returns a tuple.
         output_column: The column of an output ``[B, N]`` that steers; None for ``[B]`` and ``[B, 1]``.
-        frames: Which past images it sees as well; None for the present image alone.
+        frames: Which past images it sees as well. This and the next three are sections, which may be given as their keys and values.
         trajectory: The output is waypoints, and this is how they are followed; None for an output that steers.
         bins: The output is a score for each of these steering values; None for an output that steers.
         states: Inputs and outputs of a file that carry its memory from image to image; they make it not stateless.
         positive: To which side a positive output steers.
-        stateless: Whether the network's output depends on its present input only. With ``frames`` it may, and the policy still has a
-            memory: `has_memory`.
+        stateless: Whether the network's output depends on its present input only; a stack of ``frames`` is such an input.
         differentiable: Whether gradients reach the image; a black box declares False.
         goal_size: Length of the goal vector; 0 for none.
     """
@@ -103,8 +102,7 @@ class PolicyContract:
     states: tuple[NetworkState, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.states:
-            object.__setattr__(self, "stateless", False)
+        self._read_sections()
         for name, choices in _CHOICES.items():
             if getattr(self, name) not in choices:
                 raise PolicyContractError(
@@ -113,8 +111,19 @@ class PolicyContract:
         self._check_types()
         self._check_input()
         self._check_output()
-        if not isinstance(self.goal_size, int) or isinstance(self.goal_size, bool) or self.goal_size < 0:
+        if type(self.goal_size) is not int or self.goal_size < 0:
             raise PolicyContractError(f"expected a goal size >= 0, got {self.goal_size!r}")
+
+    def _read_sections(self) -> None:
+        """Make objects of sections that are given as their keys and values."""
+        try:
+            for name, kind in _SECTIONS.items():
+                if (given := getattr(self, name)) not in (None, ()):
+                    object.__setattr__(self, name, parse_value(kind, Document(given, name)))
+        except ConfigError as error:
+            raise PolicyContractError(str(error)) from error
+        if self.states:
+            object.__setattr__(self, "stateless", False)
 
     def _check_types(self) -> None:
         for name in ("value_max", "full_steering_rad", "wheelbase_m", "steering_ratio", "mean", "std"):
@@ -177,8 +186,7 @@ class PolicyContract:
             raise PolicyContractError(
                 "output_unit, steering_ratio: expected neither with a trajectory, which is in metres; remove them"
             )
-        if self.bins is not None and self.bins.choice == "largest" and self.differentiable:
-            # No gradient passes through the choice of the largest score.
+        if self.bins is not None and self.bins.choice == "largest":  # no gradient passes through the choice
             object.__setattr__(self, "differentiable", False)
 
     @property
@@ -300,11 +308,10 @@ class PolicyContract:
         """Plain data from which `from_dict` makes the same declaration; names that are not declared are left out."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         values = {
-            name: value for name, value in values.items() if value not in (None, ()) or name not in _LATER
+            name: _plain(value) if name in _SECTIONS else value
+            for name, value in values.items()
+            if value not in (None, ()) or name not in _LATER
         }
-        for name in _SECTIONS:
-            if name in values:
-                values[name] = _plain(values[name])
         return {**values, "view": self.view.to_dict(), "mean": list(self.mean), "std": list(self.std)}
 
     def to_json(self) -> str:
@@ -330,11 +337,8 @@ class PolicyContract:
                 if name in values:
                     given = values[name]
                     values[name] = tuple(given) if isinstance(given, list | tuple) else (given,)
-            for name, kind in _SECTIONS.items():
-                if values.get(name) is not None:
-                    values[name] = parse_value(kind, Document(values[name], name))
             return cls(**values)
-        except (TypeError, ValueError, ConfigError) as error:
+        except (TypeError, ValueError) as error:
             raise PolicyContractError(f"{source}: {error}") from error
 
 

@@ -237,8 +237,19 @@ def test_an_exported_program_carries_its_state_and_its_gradient(tmp_path):
     "declared", [{"count": 1}, {"count": 3, "spacing": 0}, {"count": 2, "first": "white"}, {"number": 3}]
 )
 def test_a_wrong_stack_is_one_error(declared):
-    with pytest.raises(PolicyContractError, match=next(reversed(declared))):
-        PolicyContract.from_dict({"view": VIEW.to_dict(), "frames": declared})
+    for make in (
+        lambda: PolicyContract.from_dict({"view": VIEW.to_dict(), "frames": declared}),
+        lambda: PolicyContract(VIEW, frames=declared),
+    ):
+        with pytest.raises(PolicyContractError, match=next(reversed(declared))):
+            make()
+
+
+def test_a_section_may_be_given_as_its_keys_and_values():
+    assert PolicyContract(VIEW, frames={"count": 3}) == PolicyContract(VIEW, frames=FrameStack(count=3))
+    contract = PolicyContract(VIEW, states=[{"input": "h", "output": "g"}])
+    assert (contract.states[0].initial, contract.stateless) == (0.0, False)
+    assert PolicyContract.from_dict(contract.to_dict()) == contract
 
 
 class Led(nn.Module):
