@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from advnerf_core.data.similarity import Similarity, fit_positions
 from advnerf_core.geometry import Array, Pinhole, invert_transform
-from calibration.colmap_reading import ColmapModel
 from calibration.photo_model import Model, ReconstructionError
 from calibration.world_axes import Ground, cameras_up
 
@@ -30,10 +29,13 @@ _MAX_POSITION_SHARE = 0.1
 _SHOWN = 4
 
 
-def length_scale(found: ColmapModel, one: str, other: str, length_m: float) -> float:
+def length_scale(
+    model: Model, points_by_id: Mapping[int, Array], one: str, other: str, length_m: float
+) -> float:
     """Metres per unit of a model, from one known length.
 
     Args:
+        points_by_id: Points ``[3]`` by the number that COLMAP shows.
         one: Name of an image, for the position of its camera, or the number of a point in COLMAP.
         other: The other end.
         length_m: Distance between both [m].
@@ -41,7 +43,7 @@ def length_scale(found: ColmapModel, one: str, other: str, length_m: float) -> f
     Raises:
         ReconstructionError: An end is not in the model, or both are at one place.
     """
-    distance = float(np.linalg.norm(_end(found, one) - _end(found, other)))
+    distance = float(np.linalg.norm(_end(model, points_by_id, one) - _end(model, points_by_id, other)))
     if not (length_m > 0.0 and distance > 0.0):
         raise ReconstructionError(
             f"expected a length above 0 m between two different places, got {length_m} m from {one} to {other}; correct --length"
@@ -49,13 +51,13 @@ def length_scale(found: ColmapModel, one: str, other: str, length_m: float) -> f
     return length_m / distance
 
 
-def _end(found: ColmapModel, name: str) -> Array:
-    images = [each for each in found.model.images if each.name == name or each.name.endswith(f"/{name}")]
+def _end(model: Model, points_by_id: Mapping[int, Array], name: str) -> Array:
+    images = [each for each in model.images if each.name == name or each.name.endswith(f"/{name}")]
     if len(images) == 1:
         return np.asarray(images[0].T_world_from_camera[:3, 3])
-    if name.isdigit() and int(name) in found.points_by_id:
-        return found.points_by_id[int(name)]
-    names = ", ".join(each.name for each in (images or found.model.images)[:_SHOWN])
+    if name.isdigit() and int(name) in points_by_id:
+        return points_by_id[int(name)]
+    names = ", ".join(each.name for each in (images or model.images)[:_SHOWN])
     raise ReconstructionError(
         f"expected --length to name one image with a pose ({names}, ...) or the number of a point in COLMAP, got {name}"
     )

@@ -95,18 +95,18 @@ def _is_under(plane: tuple[Array, float], positions: Array, points: Array, thick
     return bool(max(cameras, np.mean(points @ plane[0] - plane[1] < -2.0 * thickness)) <= _BELOW_SHARE)
 
 
-def upright(model: Model, extent_m: float) -> Similarity:
-    """Similarity that makes z the cameras' up, moves the centre of the points to the origin, and sets the extent.
+def extent_scale(model: Model, extent_m: float) -> float:
+    """Factor that makes the distance between the two cameras that are farthest apart ``extent_m`` [m].
 
-    Args:
-        extent_m: Distance between the two cameras that are farthest apart, afterwards [m].
+    Raises:
+        ReconstructionError: All cameras are at one place.
     """
     spread = extent(model.poses[:, :3, 3])
     if spread <= 0.0:
         raise ReconstructionError(
             "expected photographs from different places, got all from one; move the camera instead of only turning it"
         )
-    return _levelled(model, cameras_up(model.poses), None, extent_m / spread)
+    return extent_m / spread
 
 
 def on_ground(model: Model, ground: Ground | None, scale: float) -> Similarity:
@@ -115,14 +115,10 @@ def on_ground(model: Model, ground: Ground | None, scale: float) -> Similarity:
     With a ground, that is z = 0, and the origin lies below the middle of the points. Without it, the origin is that middle.
     """
     up = cameras_up(model.poses) if ground is None else ground.up
-    return _levelled(model, up, None if ground is None else ground.height, scale)
-
-
-def _levelled(model: Model, up: Array, height: float | None, scale: float) -> Similarity:
     aside = np.cross([0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0], up)
     x = aside / np.linalg.norm(aside)
     R = np.stack([x, np.cross(up, x), up])
     middle = np.median(model.points, axis=0) if len(model.points) else model.poses[:, :3, 3].mean(axis=0)
-    if height is not None:
-        middle = middle - (middle @ up - height) * up
+    if ground is not None:
+        middle = middle - (middle @ up - ground.height) * up
     return Similarity(scale, make_transform(R, -scale * R @ middle))

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 import signal
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from nodes.lab.importing.metric_options import MetricOptions
+from nodes.runtime.options import with_groups
 from nodes.runtime.terminal import print_table, table
 
 if TYPE_CHECKING:
@@ -48,7 +50,7 @@ ExtentM = Annotated[
     typer.Option(
         "--extent",
         min=0.001,
-        help="Distance between the two camera positions farthest apart [m]; sets the scale.",
+        help="Assumed distance between the two camera positions farthest apart [m], if nothing gives the scale.",
     ),
 ]
 Seed = Annotated[int, typer.Option("--seed", help="Random seed.")]
@@ -74,13 +76,14 @@ StepDeg = Annotated[
 
 # More images that were left out are not listed in the terminal.
 _SHOWN = 50
-Up = Literal["auto", "ground", "cameras"]
 
 
 @app.command("from-video")
+@with_groups
 def from_video(
     media: Media,
     output: Output,
+    metric: MetricOptions,
     movement: Movement = 0.06,
     most: Most = 300,
     one_camera: OneCamera = False,
@@ -88,13 +91,15 @@ def from_video(
     seed: Seed = 0,
 ) -> None:
     """Estimate poses and lenses of the sharpest frames of videos. Several videos and cameras go into one model."""
-    _from_media(media, output, movement, most, one_camera, extent_m, seed)
+    _from_media(media, output, movement, most, one_camera, extent_m, metric, seed)
 
 
 @app.command("from-images")
+@with_groups
 def from_images(
     media: Media,
     output: Output,
+    metric: MetricOptions,
     most: Most = 300,
     one_camera: OneCamera = False,
     extent_m: ExtentM = 4.0,
@@ -104,7 +109,7 @@ def from_images(
 
     The images of a folder share a camera unless their sizes or EXIF data differ.
     """
-    _from_media(media, output, 0.06, most, one_camera, extent_m, seed)
+    _from_media(media, output, 0.06, most, one_camera, extent_m, metric, seed)
 
 
 @app.command("from-bag")
@@ -176,6 +181,7 @@ def from_phone_and_car(
 
 
 @app.command("from-colmap")
+@with_groups
 def from_colmap(
     model: Annotated[
         Path,
@@ -187,41 +193,18 @@ def from_colmap(
         Path, typer.Argument(help="Folder of the images that COLMAP used.", exists=True, file_okay=False)
     ],
     output: Output,
+    metric: MetricOptions,
     number: Annotated[
         str | None, typer.Option("--model", help="Which of several models.", show_default="the largest")
     ] = None,
-    length: Annotated[
-        tuple[str, str, float] | None,
-        typer.Option(
-            help="A known length [m]: between the cameras of two images, or between two of COLMAP's points.",
-            metavar="A B METRES",
-        ),
-    ] = None,
-    positions: Annotated[
-        Path | None,
-        typer.Option(
-            help="CSV file of known camera positions, in a world with z up: image, x_m, y_m, z_m.",
-            exists=True,
-            dir_okay=False,
-        ),
-    ] = None,
-    marker_m: Annotated[
-        float | None, typer.Option("--marker", min=0.001, help="Side of printed markers in the images [m].")
-    ] = None,
-    dictionary: Annotated[str, typer.Option(help="OpenCV's name of the markers.")] = "DICT_APRILTAG_36h11",
-    up: Annotated[
-        Up, typer.Option(help="What z is: the ground if it is found, or the cameras' up.")
-    ] = "auto",
 ) -> None:
     """Use the poses and lenses of a COLMAP model. No pose is estimated.
 
     Without --length, --positions or --marker the data set is in COLMAP's unit instead of metres.
     """
-    from nodes.lab.importing.colmap import ColmapConfig
     from nodes.lab.importing.colmap import from_colmap as run
 
-    config = ColmapConfig(number, length, positions, marker_m, dictionary, up)
-    _run("from-colmap", output, lambda report: run(model, images, output, config, report))
+    _run("from-colmap", output, lambda report: run(model, images, output, number, metric, report))
 
 
 @app.command("match-colours")
@@ -253,7 +236,14 @@ def match_colours(
 
 
 def _from_media(
-    media: list[Path], output: Path, movement: float, most: int, one_camera: bool, extent_m: float, seed: int
+    media: list[Path],
+    output: Path,
+    movement: float,
+    most: int,
+    one_camera: bool,
+    extent_m: float,
+    metric: MetricOptions,
+    seed: int,
 ) -> None:
     from advnerf_core.data.keyframes import KeyframeConfig
     from calibration.photo_model import SfmConfig
@@ -264,7 +254,7 @@ def _from_media(
     _run(
         "from-media",
         output,
-        lambda report: run(media, output, config, SfmConfig(seed=seed), extent_m, report),
+        lambda report: run(media, output, config, SfmConfig(seed=seed), extent_m, metric, report),
     )
 
 

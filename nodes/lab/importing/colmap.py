@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Set
-from dataclasses import dataclass, replace
+from collections.abc import Set
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
-
-import numpy as np
+from typing import Any
 
 from advnerf_core.data.errors import DatasetError
-from advnerf_core.data.image_files import SUFFIXES, image_size, read_bytes, read_stored, write_image
-from advnerf_core.data.lens import straightening
-from advnerf_core.data.similarity import Similarity
-from advnerf_core.documents import read_csv
-from advnerf_core.errors import ConfigError
+from advnerf_core.data.image_files import SUFFIXES, image_size, read_bytes, write_image
 from advnerf_core.files import write_atomically
-from advnerf_core.geometry import Array, Pinhole
+from advnerf_core.geometry import Pinhole
 from calibration.colmap_reading import ColmapModel, read_colmap, undistorted_image
-from calibration.known_scale import View, fit_known_positions, length_scale, marker_scale
 from calibration.photo_model import MIN_IMAGES, LeftOut, Model, Registered
-from calibration.world_axes import find_ground, on_ground
 from nodes.lab.importing.data_set import Imported, write_model_set
 from nodes.lab.importing.errors import ImportRecordingError
 from nodes.lab.importing.media import IMAGES
+from nodes.lab.importing.metric import Unscaled, place, undistorted_views
+from nodes.lab.importing.metric_options import MetricOptions
 from nodes.lab.importing.staging import build_beside
 from nodes.runtime.progress import Report
 
@@ -32,58 +26,32 @@ _READING_SHARE = 0.1
 _ROUNDING_PX = 1.0
 
 
-@dataclass(frozen=True)
-class ColmapConfig:
-    """Settings of an import from COLMAP. At most one of ``length``, ``positions`` and ``marker_m`` gives the metre.
-
-    Attributes:
-        model: Name of the model's folder, if there are several; None for the one with the most images.
-        length: Two images, or numbers of points, and the distance between them [m].
-        positions: CSV file with known positions of cameras: ``image, x_m, y_m, z_m``, z up.
-        marker_m: Side of printed markers [m].
-        dictionary: OpenCV's name of the markers.
-        up: ``ground``, ``cameras``, or ``auto`` for the ground if it is found.
-    """
-
-    model: str | None = None
-    length: tuple[str, str, float] | None = None
-    positions: Path | None = None
-    marker_m: float | None = None
-    dictionary: str = "DICT_APRILTAG_36h11"
-    up: Literal["auto", "ground", "cameras"] = "auto"
-
-    def __post_init__(self) -> None:
-        given = [
-            option
-            for option, value in (
-                ("--length", self.length),
-                ("--positions", self.positions),
-                ("--marker", self.marker_m),
-            )
-            if value is not None
-        ]
-        if len(given) > 1:
-            raise ImportRecordingError(
-                f"expected one source of the scale, got {' and '.join(given)}; give one of them"
-            )
-
-
-def from_colmap(model: Path, images: Path, output: Path, config: ColmapConfig, report: Report) -> Imported:
+def from_colmap(
+    model: Path, images: Path, output: Path, number: str | None, metric: MetricOptions, report: Report
+) -> Imported:
     """Make an upright data set with the poses and lenses of a COLMAP model.
 
     Args:
         model: Folder of the model, or of several.
         images: Folder of the images that the model was made from.
         output: Folder of the data set, with copies of the images.
+        number: Name of the model's folder, if there are several; None for the one with the most images.
+        metric: What is known of the world.
     """
 
     def build(folder: Path) -> Imported:
         report(0.0, "reading the model")
-        found = read_colmap(model, config.model)
+        found = read_colmap(model, number)
         kept = _copy_images(
             found, images, folder, output, lambda share, text="": report(_with_reading(share), text)
         )
-        similarity, facts = _place(found, lambda: _views(kept, folder), config)
+        unknown = Unscaled(
+            1.0,
+            "unknown: lengths are in COLMAP's unit, not in metres; give --length, --positions or --marker",
+        )
+        similarity, facts = place(
+            found.model, found.points_by_id, lambda: undistorted_views(kept, folder), metric, unknown
+        )
         facts = {
             "structure_from_motion": kept.summary(),
             "colmap": {"model": str(found.folder), "images_by_model": found.sizes},
@@ -192,71 +160,3 @@ def _same_size(image: Registered, file: Path, pinhole: Pinhole, exactly: bool = 
             "give the images that the model was made from"
         )
     return pinhole.resized(width, height)
-
-
-def _place(
-    found: ColmapModel, views: Callable[[], Iterable[View]], config: ColmapConfig
-) -> tuple[Similarity, dict[str, Any]]:
-    """The similarity into the data set's world, and what the report says of it."""
-    model = found.model
-    ground = None if config.up == "cameras" else find_ground(model.poses, model.points)
-    if ground is None and config.up == "ground":
-        raise ImportRecordingError(
-            "expected a ground plane among the points below the cameras, found none; take photographs that show more of the ground, "
-            "or give --up cameras"
-        )
-    up = "the cameras' up"
-    if ground is not None:
-        up = f"normal of the ground, a plane of {ground.points} points at z = 0"
-    if config.positions is not None:
-        positions = _read_positions(config.positions)
-        fit = fit_known_positions(model, positions, ground)
-        source = f"known positions of {fit.images} images ({len(positions)} in the file), rms {fit.rms_m:.3g} m, worst {fit.worst_m:.3g} m ({fit.worst})"
-        return fit.similarity, _facts(
-            "positions",
-            source,
-            up.removesuffix(" at z = 0") if fit.on_line else "that of the known positions",
-            False,
-        )
-    scale, scale_from, source = 1.0, None, ""
-    if config.length is not None:
-        scale, scale_from = length_scale(found, *config.length), "length"
-        source = f"{config.length[2]:g} m from {config.length[0]} to {config.length[1]}"
-    elif config.marker_m is not None:
-        markers = marker_scale(views(), config.marker_m, config.dictionary)
-        scale, scale_from = markers.scale, "fiducials"
-        source = f"{markers.markers} markers of {config.marker_m:g} m, whose sides differ by {100 * markers.spread:.2g} %"
-    return on_ground(model, ground, scale), _facts(scale_from, source, up, ground is not None)
-
-
-def _facts(scale_from: str | None, source: str, up: str, ground_at_zero: bool) -> dict[str, Any]:
-    unknown = "unknown: lengths are in COLMAP's unit, not in metres; give --length, --positions or --marker"
-    return {
-        "scale": f"metric: {source}" if scale_from else unknown,
-        "scale_from": scale_from,
-        "up": up,
-        "ground_at_zero": ground_at_zero,
-    }
-
-
-def _read_positions(file: Path) -> dict[str, Array]:
-    positions: dict[str, Array] = {}
-    for row in read_csv(file, ("image", "x_m", "y_m", "z_m")):
-        name = row.values["image"].strip()
-        if name in positions:
-            raise ConfigError(
-                f"{row.place}: image: expected each image once, got {name} again; remove one row"
-            )
-        positions[name] = np.array([row.number(column) for column in ("x_m", "y_m", "z_m")])
-    return positions
-
-
-def _views(model: Model, folder: Path) -> Iterator[View]:
-    """Undistorted images with pinhole and pose."""
-    for image in model.images:
-        pixels = read_stored(folder / image.name)[0]
-        if image.lens.is_ideal:
-            yield pixels, image.pinhole, np.asarray(image.T_world_from_camera)
-        else:
-            straight = straightening(image.pinhole, image.lens)
-            yield straight.apply(pixels), straight.pinhole, np.asarray(image.T_world_from_camera)

@@ -16,10 +16,12 @@ from advnerf_core.geometry import Array, Pinhole
 from calibration.phone_and_car import Placed, place_in_mocap
 from calibration.photo_model import Model, PhotoSource, SfmConfig
 from calibration.structure_from_motion import reconstruct
-from calibration.world_axes import upright
+from calibration.world_axes import extent_scale
 from nodes.lab.importing.driven_bag import CAR_CAMERA, BagConfig, DrivenFrames, take_frames
 from nodes.lab.importing.errors import ImportRecordingError
 from nodes.lab.importing.media import IMAGES, MediaConfig, gather
+from nodes.lab.importing.metric import Unscaled, place, undistorted_views
+from nodes.lab.importing.metric_options import MetricOptions
 from nodes.lab.importing.staging import (
     COLMAP,
     REPORT_FILE,
@@ -57,16 +59,18 @@ def from_media(
     media_config: MediaConfig,
     sfm: SfmConfig,
     extent_m: float,
+    metric: MetricOptions,
     report: Report,
 ) -> Imported:
-    """Make an upright, centred data set from videos and photographs. Its scale is only as accurate as ``extent_m``.
+    """Make an upright data set from videos and photographs.
 
     Args:
         media: Videos and folders of photographs.
         output: Folder of the data set. A stopped run resumes there.
         media_config: Selection of frames.
         sfm: Settings of structure from motion.
-        extent_m: Largest distance between two camera positions [m].
+        extent_m: Assumed largest distance between two camera positions [m]; not used if ``metric`` gives the scale.
+        metric: What is known of the world.
     """
 
     def build(folder: Path) -> Imported:
@@ -74,13 +78,12 @@ def from_media(
             media, folder, media_config, lambda share, text="": report(_MEDIA_SHARE * share, text)
         )
         model = _reconstruct(folder, sources, sfm, report)
-        similarity = upright(model, extent_m)
+        assumed = Unscaled(
+            extent_scale(model, extent_m), f"not metric: an extent of {extent_m:g} m was assumed"
+        )
+        similarity, placing = place(model, {}, lambda: undistorted_views(model, folder), metric, assumed)
         poses, points = similarity.poses(model.poses), similarity.points(model.points)
-        facts = {
-            "structure_from_motion": model.summary(),
-            "scale": "not metric: the extent was assumed",
-            "extent_m": extent_m,
-        }
+        facts = {"structure_from_motion": model.summary(), **placing}
         return write_model_set(folder, model, poses, points, facts)
 
     return build_beside(output, media, build).moved_to(output)

@@ -11,12 +11,13 @@ from advnerf_core.data.transforms import load_transforms
 from advnerf_core.geometry import Pinhole, look_at, make_transform, rotation_x, rotation_z
 from benchmarks.lab_recordings import lab_with_phone, photograph, record_drive
 from calibration.photo_model import Model, Registered, SfmConfig
-from calibration.world_axes import upright
+from calibration.world_axes import extent_scale, on_ground
 from hardware.worlds.lab.lab import Lab
 from hardware.worlds.lab.phone import video_poses
 from nodes.lab.importing.data_set import from_media
 from nodes.lab.importing.errors import ImportRecordingError
 from nodes.lab.importing.media import MediaConfig
+from nodes.lab.importing.metric_options import MetricOptions
 
 
 def walk(count=40):
@@ -35,7 +36,7 @@ def model_of(poses):
 def test_a_walk_is_put_upright_centred_and_to_scale():
     tilted = Similarity(0.2, make_transform(rotation_x(1.0) @ rotation_z(0.4), [5.0, -3.0, 2.0]))
     model = model_of(tilted.poses(walk()))
-    found = upright(model, extent_m=5.0)
+    found = on_ground(model, None, extent_scale(model, 5.0))
     poses = found.poses(model.poses)
     assert extent(poses[:, :3, 3]) == pytest.approx(5.0)
     assert np.ptp(poses[:, 2, 3]) < 2e-3, "all at one height again"
@@ -64,7 +65,13 @@ def test_pictures_of_a_person_are_never_touched(tmp_path):
         media.mkdir(exist_ok=True)
         with pytest.raises(ImportRecordingError, match=message):
             from_media(
-                [media], tmp_path / "holiday", MediaConfig(), SfmConfig(), 4.0, lambda share, text="": None
+                [media],
+                tmp_path / "holiday",
+                MediaConfig(),
+                SfmConfig(),
+                4.0,
+                MetricOptions(),
+                lambda share, text="": None,
             )
     assert mine.read_bytes() == b"precious"
 
@@ -94,6 +101,16 @@ def test_photographs_of_the_lab_become_a_data_set(tmp_path):
     np.testing.assert_allclose(
         np.stack([f.T_world_from_camera for f in load_transforms(tmp_path / "set").frames]), found
     )
+    length_m = float(np.linalg.norm(poses[0][:3, 3] - poses[-1][:3, 3]))
+    known = (files[0].name, files[-1].name, str(length_m))
+    assert run("from-images", tmp_path / "phone", "-o", tmp_path / "set", "--length", *known).returncode == 0
+    found = np.stack([f.T_world_from_camera for f in load_transforms(tmp_path / "set").frames])
+    aligned = align_poses(found, np.stack(poses), 0.3, 0.1, 1.0)
+    assert aligned.similarity.scale == pytest.approx(1.0, abs=0.02)
+    report = json.loads((tmp_path / "set" / "import.json").read_text())
+    assert report["scale_from"] == "length"
+    assert report["ground_at_zero"], "the floor of the lab"
+    np.testing.assert_allclose(found[:, 2, 3], np.stack(poses)[:, 2, 3], atol=0.05)
 
 
 @pytest.mark.slow

@@ -16,9 +16,10 @@ from advnerf_core.data.transforms import load_transforms
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Pinhole, look_at, make_transform, rotation_x, rotation_z
 from benchmarks.painted_corner import poses_of, write_photographs
-from nodes.lab.importing.colmap import ColmapConfig, from_colmap
+from nodes.lab.importing.colmap import from_colmap
 from nodes.lab.importing.errors import ImportRecordingError
 from nodes.lab.importing.media import photographs_in
+from nodes.lab.importing.metric_options import MetricOptions
 from tests.support.colmap_models import (
     HEIGHT,
     OTHER_CAMERAS,
@@ -54,11 +55,11 @@ def floor(count=400):
     return [in_colmap(np.append(point, 1.0)[:, None])[:3, 0] for point in points]
 
 
-def run(tmp_path, folder, images, **config):
+def run(tmp_path, folder, images, model=None, **known):
     def report(share, text=""):
         assert 0.0 <= share <= 1.0
 
-    return from_colmap(folder, images, tmp_path / "out", ColmapConfig(**config), report)
+    return from_colmap(folder, images, tmp_path / "out", model, MetricOptions(**known), report)
 
 
 @pytest.fixture

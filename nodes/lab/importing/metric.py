@@ -1,0 +1,120 @@
+"""Puts a model of photographs into an upright, metric world, by what the user knows of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from advnerf_core.data.image_files import read_stored
+from advnerf_core.data.lens import straightening
+from advnerf_core.data.similarity import Similarity
+from advnerf_core.documents import read_csv
+from advnerf_core.errors import ConfigError
+from advnerf_core.geometry import Array
+from calibration.known_scale import View, fit_known_positions, length_scale, marker_scale
+from calibration.photo_model import Model
+from calibration.world_axes import Ground, find_ground, on_ground
+from nodes.lab.importing.errors import ImportRecordingError
+from nodes.lab.importing.metric_options import MetricOptions
+
+
+@dataclass(frozen=True)
+class Unscaled:
+    """What a model has without a known length.
+
+    Attributes:
+        scale: Factor of its lengths.
+        why: What the report says of them.
+    """
+
+    scale: float
+    why: str
+
+
+def place(
+    model: Model,
+    points_by_id: Mapping[int, Array],
+    views: Callable[[], Iterable[View]],
+    options: MetricOptions,
+    otherwise: Unscaled,
+) -> tuple[Similarity, dict[str, Any]]:
+    """Similarity from a model into an upright world, and what the report says of it.
+
+    Args:
+        points_by_id: Points ``[3]`` of the model by the number that COLMAP shows.
+        views: Gives the undistorted images, for markers.
+        otherwise: The scale if no option gives it.
+    """
+    ground = _ground(model, options)
+    if options.positions is not None:
+        return _at_positions(model, options.positions, ground)
+    up = "the cameras' up"
+    if ground is not None:
+        up = f"normal of the ground, a plane of {ground.points} points at z = 0"
+    scale, scale_from, said = otherwise.scale, None, otherwise.why
+    if options.length is not None:
+        one, other, length_m = options.length
+        scale, scale_from = length_scale(model, points_by_id, one, other, length_m), "length"
+        said = f"metric: {length_m:g} m from {one} to {other}"
+    elif options.marker_m is not None:
+        found = marker_scale(views(), options.marker_m, options.dictionary)
+        scale, scale_from = found.scale, "fiducials"
+        said = f"metric: {found.markers} markers of {options.marker_m:g} m, whose sides differ by {100 * found.spread:.2g} %"
+    return on_ground(model, ground, scale), _facts(said, scale_from, up, ground is not None)
+
+
+def _ground(model: Model, options: MetricOptions) -> Ground | None:
+    ground = None if options.up == "cameras" else find_ground(model.poses, model.points)
+    if ground is None and options.up == "ground":
+        raise ImportRecordingError(
+            "expected a ground plane among the points below the cameras, found none; take photographs that show more of the ground, "
+            "or give --up cameras"
+        )
+    return ground
+
+
+def _at_positions(model: Model, file: Path, ground: Ground | None) -> tuple[Similarity, dict[str, Any]]:
+    positions = _read_positions(file)
+    fit = fit_known_positions(model, positions, ground)
+    said = (
+        f"metric: known positions of {fit.images} images ({len(positions)} in the file), rms {fit.rms_m:.3g} m, "
+        f"worst {fit.worst_m:.3g} m ({fit.worst})"
+    )
+    up = "that of the known positions"
+    if fit.on_line:
+        up = (
+            "the cameras' up"
+            if ground is None
+            else f"normal of the ground, a plane of {ground.points} points"
+        )
+    return fit.similarity, _facts(said, "positions", up, ground_at_zero=False)
+
+
+def _facts(scale: str, scale_from: str | None, up: str, ground_at_zero: bool) -> dict[str, Any]:
+    return {"scale": scale, "scale_from": scale_from, "up": up, "ground_at_zero": ground_at_zero}
+
+
+def _read_positions(file: Path) -> dict[str, Array]:
+    positions: dict[str, Array] = {}
+    for row in read_csv(file, ("image", "x_m", "y_m", "z_m")):
+        name = row.values["image"].strip()
+        if name in positions:
+            raise ConfigError(
+                f"{row.place}: image: expected each image once, got {name} again; remove one row"
+            )
+        positions[name] = np.array([row.number(column) for column in ("x_m", "y_m", "z_m")])
+    return positions
+
+
+def undistorted_views(model: Model, folder: Path) -> Iterator[View]:
+    """Undistorted images of a model, whose names are relative to a folder, with pinhole and pose."""
+    for image in model.images:
+        pixels, pinhole = read_stored(folder / image.name)[0], image.pinhole
+        if not image.lens.is_ideal:
+            straight = straightening(image.pinhole, image.lens)
+            pixels, pinhole = straight.apply(pixels), straight.pinhole
+        yield pixels, pinhole, np.asarray(image.T_world_from_camera)
