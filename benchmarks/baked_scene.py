@@ -71,7 +71,7 @@ def fidelity(experiment: Experiment, backgrounds: Backgrounds) -> None:
     lost_db = found["psnr_field_db"] - found["psnr_baked_db"]
     note = f"{found['psnr_baked_db']:.2f} dB of {found['psnr_field_db']:.2f} dB through the field; {found['mib']:.0f} MiB of voxels"
     record("baked scene: PSNR that held-out views lose", lost_db, "dB", "<= 0.3 dB", lost_db <= 0.3, note)
-    path = experiment.paths[experiment.config.scenarios[0]]
+    path = experiment.paths[experiment.config.paths[0]]
     states = recovery_states(path, _VIEWS, np.random.default_rng(77), experiment.world.off_track_m, 0.3, None)
     poses, policy = (
         planar_poses(states) @ experiment.mount,
@@ -188,7 +188,7 @@ def _copy_as_of_before(run: Path, target: Path) -> None:
 def _problem(experiment: Experiment, background: BackgroundRenderer, victim: str, seed: int) -> AttackProblem:
     policy = load_victim(experiment, victim)
     return attack_problem(
-        experiment, face_space(experiment, background), policy, experiment.config.scenarios[0], seed
+        experiment, face_space(experiment, background), policy, experiment.config.paths[0], seed
     )
 
 
@@ -257,7 +257,7 @@ def pairs(experiment: Experiment, backgrounds: Backgrounds) -> None:
     # Seeds of one start would repeat one drive.
     attack = experiment.config.attack.model_copy(update={"nominal_start": False})
     experiment = replace(experiment, config=experiment.config.model_copy(update={"attack": attack}))
-    scenario, rows = experiment.config.scenarios[0], []
+    scenario, rows = experiment.config.paths[0], []
     settings = search_settings(experiment, load_method("gradient"))
     with experiment.open_world() as scene:
         dressed = PaintedScene(experiment, scene)

@@ -20,7 +20,7 @@ from benchmarks.results import REPOSITORY
 EXPERIMENT = REPOSITORY / "launch" / "room.experiment.yaml"
 # The demo with a third method, and without what the pictures do not show.
 _SETTINGS = [
-    "attack.methods=[random,cem,gradient]",
+    "over.method=[none,random,cem,gradient]",
     "policy.naive_steps=0",
     "deploy.through=world",
     "deploy.starts=null",

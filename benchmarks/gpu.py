@@ -55,7 +55,7 @@ def main() -> None:
         return
     use_device("cuda")
     experiment = Experiment.resolved_in(arguments.run_folder.resolve())
-    policy, scenario = load_victim(experiment, HARDENED), experiment.config.scenarios[0]
+    policy, scenario = load_victim(experiment, HARDENED), experiment.config.paths[0]
     background = load_background(experiment)
     surrogate = Surrogate(background, experiment.view.pinhole, experiment.mount, hydrants(1))
     space = face_space(experiment, background)

@@ -95,7 +95,7 @@ def _timed(folder: Path, seeds: list[int], batch: bool) -> float:
     """Seconds of the iterations of these seeds in this process."""
     experiment = Experiment.resolved_in(folder.resolve())
     space, policy = face_space(experiment), load_victim(experiment, HARDENED)
-    (scenario,) = experiment.config.scenarios
+    (scenario,) = experiment.config.paths
 
     def problem(seed: int) -> AttackProblem:
         return attack_problem(experiment, space, policy, scenario, seed)

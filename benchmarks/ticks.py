@@ -61,7 +61,7 @@ def measured(folder: Path, repeats: int = 5) -> dict[str, float]:
 
 def _ticks(experiment: Experiment, repeats: int) -> dict[str, float]:
     """Of a tick of a rollout with one object and with five (scene, objects, policy, car, 200 x 66)."""
-    scenario, background = experiment.config.scenarios[0], load_background(experiment)
+    scenario, background = experiment.config.paths[0], load_background(experiment)
     path, loaded = experiment.paths[scenario], load_victim(experiment, HARDENED)
     states = np.array([path.pose_at(float(s)) for s in np.linspace(0.0, 3.0, 30)])
     poses, found = planar_poses(states) @ experiment.mount, {}
@@ -83,7 +83,7 @@ def _ticks(experiment: Experiment, repeats: int) -> dict[str, float]:
 
 def _iteration(experiment: Experiment, repeats: int) -> float:
     """Of a rollout and its gradient."""
-    scenario, space = experiment.config.scenarios[0], make_space(experiment, None)
+    scenario, space = experiment.config.paths[0], make_space(experiment, None)
     loaded = load_victim(experiment, HARDENED)
     problem = replace(attack_problem(experiment, space, loaded, scenario, 0), steps=STEPS)
     theta = space.surrogate.initial_theta(torch.Generator().manual_seed(0))

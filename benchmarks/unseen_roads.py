@@ -68,7 +68,7 @@ def main() -> None:
 
 def _drive(there: Experiment, dressed: Dressed, policy: Policy) -> tuple[float, int]:
     """Mean |CTE| over all drives [m], and how many left the lane."""
-    (scenario,) = there.config.scenarios
+    (scenario,) = there.config.paths
     starts = there.measured_starts(scenario)
     found = deployed_drives(there, dressed, policy, scenario, starts, dressed.plain_theta())
     return float(np.mean([drive.metrics.mean_cte_m for drive in found])), sum(

@@ -91,7 +91,7 @@ def _policies() -> Mapping[str, str]:
 
 TABLES: Mapping[str, PluginTable] = MappingProxyType(
     {
-        "methods": PluginTable(_methods, "advnerf.methods", ("method", "methods")),
+        "methods": PluginTable(_methods, "advnerf.methods", ("method",)),
         "policies": PluginTable(_policies),
         "architectures": PluginTable(_architectures, "advnerf.architectures", ("architecture", "student")),
         "objectives": PluginTable(_objectives, "advnerf.objectives", ("objective",)),

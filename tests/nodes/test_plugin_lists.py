@@ -67,7 +67,7 @@ def test_named_code_is_found_wherever_it_stands(tmp_path: Path, monkeypatch: pyt
     (tmp_path / "my_policy.py").write_text("def make(): raise SystemError\n")
     install_method(tmp_path, monkeypatch, "raise SystemError\n", "whirl")
     data = {
-        "attack": {"methods": ["random", "spiral.py:Spiral", "whirl"]},
+        "over": {"method": ["random", "spiral.py:Spiral", "whirl"]},
         "world": {"kind": "missing.py:World"},
         "policy": "my_policy:make",
         "nodes": {"camera": {"module": "nodes.camera"}, "mine": {"module": "my_policy"}},
@@ -92,7 +92,7 @@ def trap(tmp_path: Path) -> tuple[Path, Path]:
 @pytest.mark.parametrize("word", ["status", "table", "report"])
 def test_reading_commands_execute_no_method(trap: tuple[Path, Path], tmp_path: Path, word: str) -> None:
     file, trace = trap
-    methods = f"attack.methods=['{file}:Spiral']"
+    methods = f"over.method=[none,'{file}:Spiral']"
     code, printed = command(word, "junction", "--run-folder", tmp_path / "run", "--set", methods)
     assert "Spiral" in printed or code == 0
     assert not trace.exists()

@@ -57,7 +57,8 @@ def gather(
     live = experiment.config.deploy.live
     return rd.ReportData(
         drives=tuple(
-            _drives(experiment, name, films.get(name), seen.get(name, {})) for name in experiment.config.paths
+            _drives(experiment, name, films.get(name), seen.get(name, {}))
+            for name in experiment.config.cell_paths
         ),
         manifest=_manifest(experiment),
         overview=overview,
@@ -74,7 +75,7 @@ def _drives(
 ) -> rd.Drives:
     plan = [cell for cell in experiment.cells if cell.scenario == scenario]
     runs = [run for domain in DOMAINS for cell in plan for run in _runs(experiment, cell, domain)]
-    if scenario == experiment.config.paths[0] and (empty := _extra(experiment, EMPTY)) is not None:
+    if scenario == experiment.config.cell_paths[0] and (empty := _extra(experiment, EMPTY)) is not None:
         runs.append(
             rd.Run(
                 "deployed",
@@ -171,7 +172,7 @@ def _not_measured(
 
 def _settings(experiment: Experiment) -> dict[str, str]:
     config, attack = experiment.config, experiment.config.attack
-    starts = {name: experiment.measured_starts(name).tolist() for name in config.paths}
+    starts = {name: experiment.measured_starts(name).tolist() for name in config.cell_paths}
     poses = {
         f"measured starts, {name} (x, y, yaw)": "; ".join(
             f"({x:.2f} m, {y:.2f} m, {np.degrees(yaw):.1f}°)" for x, y, yaw in found

@@ -66,7 +66,7 @@ def run(experiment: Experiment, folder: Path, report: Report, notes: Sequence[st
 
 def _measure(experiment: Experiment, folder: Path, report: Report) -> ReportData:
     """Cut films, and see the objects where the deployed world can be opened; of live drives measure memory."""
-    names = experiment.config.paths
+    names = experiment.config.cell_paths
     if experiment.config.deploy.live:
         rows = memory.measure(experiment, folder, lambda part, text="": report(0.6 * part, text))
         report(0.6, "cutting films")
@@ -94,7 +94,7 @@ def opening(experiment: Experiment) -> str:
     kinds = Counter(thing.kind.replace("_", " ") for thing in experiment.objects)
     named = " and ".join(count(number, kind) for kind, number in kinds.items())
     return (
-        f"Policies ({', '.join(config.attacked)}) drive {', '.join(config.paths)}. {config.space.searched.format(named)} ({methods}; {attack.evaluations} evaluations "
+        f"Policies ({', '.join(config.attacked)}) drive {', '.join(config.cell_paths)}. {config.space.searched.format(named)} ({methods}; {attack.evaluations} evaluations "
         f"each, {count(len(config.seeds), 'seed')}, {count(attack.starts, 'start')}, T = {config.horizon} ticks of {config.dt_s:g} s){_then(experiment)}."
     )
 

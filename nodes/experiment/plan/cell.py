@@ -80,7 +80,7 @@ def cells_of(config: ExperimentConfig, variant: str = "") -> list[Cell]:
 
     Unless ``over`` names victims, one that was trained plain beside the main one meets the first seed alone.
     """
-    paths = config.paths
+    paths = config.cell_paths
 
     def seeds_of(victim: str) -> tuple[int, ...]:
         beside = victim != config.main_victim and config.attacked.get(victim) == TRAINED_PLAIN

@@ -10,12 +10,12 @@ from pydantic import Field, model_validator
 from advnerf_core.attack.objectives import CTE
 from advnerf_core.plugins import name_in_results
 from advnerf_core.policies.architecture import PILOTNET, Architecture, require_architecture
-from advnerf_core.report.conditions import CONTROLS, NONE
+from advnerf_core.report.conditions import CONTROLS, EMPTY
 from advnerf_core.report.evidence.registration import Contrast
 from advnerf_core.scene.gate_limits import GateLimits
 from advnerf_core.strict import StrictModel
 from nodes.experiment.plan.deploy_config import DeployConfig
-from nodes.experiment.plan.method_names import ArchitectureReference, MethodReference, ObjectiveReference
+from nodes.experiment.plan.method_names import ArchitectureReference, ObjectiveReference
 from nodes.experiment.plan.object_kinds import OBJECT_SUFFIX, PANEL, name_of
 from nodes.experiment.plan.over import OverConfig
 from nodes.experiment.plan.placed import PlacedObject, WantedObject
@@ -242,20 +242,11 @@ class MeasureConfig(StrictModel):
 
     starts: Positive = Field(default=5, description="Starts, none of which a search had.")
     seed: int = Field(default=10_000, description="Of the starts.")
-    no_object: bool = Field(
-        default=False,
-        description="A second control: the same drives with the objects taken away.",
-    )
 
 
 class AttackConfig(StrictModel):
     """The adversary, and what it may spend: all methods evaluate equally often."""
 
-    methods: tuple[MethodReference, ...] = Field(
-        default=("random", "cem", "gradient"),
-        min_length=1,
-        description="Methods of attack; also file.py:Name, relative to the experiment file.",
-    )
     objective: ObjectiveReference = Field(
         default=CTE,
         description="What is maximised: cte, peak, time_off_track, collision, or file.py:Class, relative to the experiment file.",
@@ -277,9 +268,6 @@ class AttackConfig(StrictModel):
     learning_rate: PositiveNumber = 0.1
     random_sigma: PositiveNumber = Field(default=5.0, description="Spread of the random textures' theta.")
     cem_population: Annotated[int, Field(ge=4)] = Field(default=10, description="Candidates of a generation.")
-    seeds: tuple[int, ...] = Field(
-        default=(0,), min_length=1, description="One search of each method per seed."
-    )
     robustness: RobustnessConfig = Field(
         default=RobustnessConfig(),
         description="What the attacks shall bear, in expectation.",
@@ -288,12 +276,6 @@ class AttackConfig(StrictModel):
     cache_mib: Annotated[float, Field(ge=0)] = Field(
         default=512.0, description="Budget of the frame cache [MiB]."
     )
-
-    @model_validator(mode="after")
-    def _told_apart(self) -> AttackConfig:
-        if len(set(map(name_in_results, self.methods))) != len(self.methods):
-            raise ValueError(f"expected methods of different names, got {', '.join(self.methods)}")
-        return self
 
 
 class RetrainConfig(StrictModel):
@@ -331,7 +313,7 @@ class ExperimentConfig(StrictModel):
     @model_validator(mode="after")
     def _different_names(self) -> ExperimentConfig:
         for what, names in (
-            ("scenarios", self.scenarios),
+            ("paths", self.paths),
             ("names of objects", [each.name for each in self.objects]),
         ):
             if len(set(names)) != len(names):
@@ -377,7 +359,7 @@ class ExperimentConfig(StrictModel):
     def _retraining_needs_the_gradient(self) -> ExperimentConfig:
         if self.retrain is not None and "gradient" not in self.methods:
             raise ValueError(
-                f"expected gradient among attack.methods, as retrain learns from what it finds, got {', '.join(self.methods)}"
+                f"expected gradient among over.method, as retrain learns from what it finds, got {', '.join(self.methods)}"
             )
         return self
 
@@ -392,9 +374,9 @@ class ExperimentConfig(StrictModel):
                 raise ValueError(
                     "expected retrain only where objects are attacked, got it with space.kind face"
                 )
-            if self.measure.no_object:
+            if EMPTY in self.conditions:
                 raise ValueError(
-                    "expected measure.no_object only where objects are attacked, got it with space.kind face, whose panel was "
+                    "expected the control empty in over.method only where objects are attacked, got it with space.kind face, whose panel was "
                     "photographed with its scene; set deploy.empty_scene instead"
                 )
         elif self.deploy.live:
@@ -471,7 +453,7 @@ class ExperimentConfig(StrictModel):
     def _measures_from_starts_of_its_own(self) -> ExperimentConfig:
         if self.measure.seed in self.seeds:
             raise ValueError(
-                f"expected measure.seed to be none of attack.seeds, as no search may have the starts that are measured, got {self.measure.seed}"
+                f"expected measure.seed to be none of over.seed, as no search may have the starts that are measured, got {self.measure.seed}"
             )
         return self
 
@@ -505,7 +487,7 @@ class ExperimentConfig(StrictModel):
     world: dict[str, Any] = Field(
         description="kind: junction, carla, an installed package's, or file.py:Class relative to this file; and changes of that world's Config."
     )
-    scenarios: tuple[str, ...] = Field(min_length=1, description="Which of the world's paths are driven.")
+    paths: tuple[str, ...] = Field(min_length=1, description="Which of the world's paths are driven.")
     objects: tuple[WantedObject, ...] = Field(
         default=(),
         description="Where the objects of the attack stand, or by which rule (stands); not part of the world.",
@@ -571,20 +553,19 @@ class ExperimentConfig(StrictModel):
         return trained
 
     @property
-    def paths(self) -> tuple[str, ...]:
-        """The paths that cells drive."""
-        return self.over.path or self.scenarios
+    def cell_paths(self) -> tuple[str, ...]:
+        """The paths that cells drive; all are photographed and learned."""
+        return self.over.path or self.paths
 
     @property
     def seeds(self) -> tuple[int, ...]:
         """Seeds of the searches."""
-        return self.over.seed or self.attack.seeds
+        return self.over.seed
 
     @property
     def conditions(self) -> tuple[str, ...]:
         """Controls and methods of attack that a victim meets."""
-        controls = CONTROLS if self.measure.no_object else (NONE,)
-        return self.over.method or (*controls, *self.attack.methods)
+        return self.over.method
 
     @property
     def methods(self) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ from pydantic import ConfigDict, Field, StringConstraints, model_validator
 
 from advnerf_core.documents import Document, Key
 from advnerf_core.plugins import name_in_results
+from advnerf_core.report.conditions import NONE
 from advnerf_core.strict import StrictModel
 from nodes.experiment.plan.method_names import ConditionReference
 from nodes.experiment.plan.victims import VictimName
@@ -41,13 +42,14 @@ class OverConfig(StrictModel):
         min_length=1,
         description="Victims; none: all of the experiment's, the one that was trained without textures with the first seed alone.",
     )
-    method: tuple[ConditionReference, ...] | None = Field(
-        default=None,
+    method: tuple[ConditionReference, ...] = Field(
+        default=(NONE, "random", "cem", "gradient"),
         min_length=1,
-        description="The controls none and empty, and methods of attack; none: attack.methods and their controls.",
+        description="What victims meet: the controls none (the plain object) and empty (no object), and methods of attack; also file.py:Name, relative "
+        "to the experiment file.",
     )
-    seed: tuple[int, ...] | None = Field(
-        default=None, min_length=1, description="Seeds of the searches; none: attack.seeds."
+    seed: tuple[int, ...] = Field(
+        default=(0,), min_length=1, description="Seeds of the searches: one search of each method per seed."
     )
 
     @model_validator(mode="after")

@@ -69,13 +69,13 @@ class FirstSeen(StrictModel):
     """A rule for where an object stands: the first spot beside a path where it fits and is seen; see `nodes.experiment.show.placing`.
 
     Attributes:
-        scenario: The path; None for the experiment's first.
+        path: The path; None for the experiment's first.
         side: On which side of it.
         seen_s: For so long a drive along the path sees nearly all of it, unhidden and from the front [s].
         least_px: So high it is then in the policy's picture [px].
     """
 
-    scenario: str | None = None
+    path: str | None = None
     side: Literal["right", "left", "either"] = "either"
     seen_s: float = Field(default=2.0, gt=0.0)
     least_px: float = Field(default=8.0, gt=0.0)

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from advnerf_core.files import sha256_of
 from advnerf_core.plugins import name_in_results
-from advnerf_core.report.conditions import CONTROLS
+from advnerf_core.report.conditions import CONTROLS, NONE
 from nodes.experiment.engine.artefact import Settings
 from nodes.experiment.engine.progress_record import ProgressRecord
 from nodes.experiment.engine.run_folder import require_own_folder
@@ -125,11 +125,14 @@ def _write_report(experiment: Experiment, console: Console, record: ProgressReco
     files = {cell.name: experiment.cell_result(cell) for cell in reported.cells}
     missing = [name for name, file in files.items() if name not in done or not file.exists()]
     notes = [f"not in the report, as a cell failed: {name} ({text})" for name, text in failed.items()]
-    if missing or not reported.config.methods:
-        notes = [f"no report yet: {len(found) - len(done)} of {len(found)} cells are missing"]
-    for text in notes:
+    lacking = ""
+    if NONE not in reported.config.conditions:
+        lacking = "no report: it compares with drives without attack, and over.method has no none; add it"
+    elif missing or not reported.config.methods:
+        lacking = f"no report yet: {len(found) - len(done)} of {len(found)} cells are missing"
+    for text in [lacking] if lacking else notes:
         _say(console, record, text)
-    if missing or not reported.config.methods:
+    if lacking:
         return
     digests = {name: sha256_of(file) for name, file in files.items()}
     with ProgressDisplay(console, record) as display:

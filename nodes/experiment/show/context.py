@@ -242,10 +242,10 @@ class Experiment(Variants):
             ConfigError: The world has no such path.
         """
         known = self.world.paths
-        for name in self.config.scenarios:
+        for name in self.config.paths:
             if name not in known:
-                raise ConfigError(f"{self.file}: scenarios: {unknown(name, 'scenario', known)}")
-        return {name: known[name] for name in self.config.scenarios}
+                raise ConfigError(f"{self.file}: paths: {unknown(name, 'path', known)}")
+        return {name: known[name] for name in self.config.paths}
 
     @cached_property
     def paths(self) -> dict[str, Path]:
@@ -411,7 +411,7 @@ class Experiment(Variants):
         return self._starts(scenario, self._start_noise(scenario, wanted.seed, wanted.starts))
 
     def _start_noise(self, scenario: str, seed: int, count: int) -> Array:
-        generator = np.random.default_rng([seed, self.config.scenarios.index(scenario)])
+        generator = np.random.default_rng([seed, self.config.paths.index(scenario)])
         return generator.standard_normal((count, 3))
 
     def _starts(self, scenario: str, noise: Array) -> torch.Tensor:

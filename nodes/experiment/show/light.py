@@ -85,7 +85,7 @@ def _poses(experiment: Experiment, world: World, thing: PlacedObject) -> list[Po
     ]
     if not found:
         raise ConfigError(
-            f"{experiment.file}: expected the panel {thing.name} to be seen on the way along {experiment.config.scenarios[0]}, with {_LEAST_PX} pixels "
+            f"{experiment.file}: expected the panel {thing.name} to be seen on the way along {experiment.config.paths[0]}, with {_LEAST_PX} pixels "
             "inside its edge; it is hidden, turned away or too small: move it, or set object.panel_light=ideal"
         )
     return [

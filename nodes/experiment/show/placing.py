@@ -54,7 +54,7 @@ def place_by_rule(experiment: Experiment, world: World) -> list[PlacedObject]:
         if isinstance(wanted, PlacedObject):
             found.append(wanted)
             continue
-        name = wanted.stands.scenario or experiment.config.scenarios[0]
+        name = wanted.stands.path or experiment.config.paths[0]
         seen = views.setdefault(name, list(_views(experiment, world, name)))
         spot = next(
             (
@@ -137,7 +137,7 @@ def _fits(
 
 def seen_from(experiment: Experiment, world: World, panel: PlacedObject, least_px: float) -> list[Pose]:
     """Poses of the drive without an error along the first path from which nearly all of a panel is seen."""
-    name = experiment.config.scenarios[0]
+    name = experiment.config.paths[0]
     poses = [(float(x), float(y), float(yaw)) for x, y, yaw in clean_poses(experiment, name)]
     views = _views(experiment, world, name)
     return [

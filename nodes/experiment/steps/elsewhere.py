@@ -91,7 +91,7 @@ def _plans(there: Experiment, world: World, place: str) -> list[SourcePlan]:
     assert plain is not None, "an experiment that places objects by a rule has some"
     shape, sigma = tuple(plain.shape), there.config.attack.random_sigma
     found = []
-    for name in there.config.scenarios:
+    for name in there.config.paths:
         sources = (
             RenderedSource(f"{place}-{name}-bare", seen_in(bare), there.dynamics),
             RenderedSource(

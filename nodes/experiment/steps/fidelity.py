@@ -55,7 +55,7 @@ _CAR, _IMAGE, _SAFETY = "/vicon/car", "/compositor/image", "/safety/state"
 def policy_of(experiment: Experiment, cell: Cell) -> tuple[Any, tuple[float, ...]]:
     """The victim and what it is told on its path, of the first where none is named."""
     policy = load_victim(experiment, cell.victim).policy
-    return policy, told(experiment, policy, cell.scenario or experiment.config.scenarios[0])
+    return policy, told(experiment, policy, cell.scenario or experiment.config.paths[0])
 
 
 def held_out(experiment: Experiment) -> PicturePairs:

@@ -27,10 +27,10 @@ def frozen_hashes(experiment: Experiment) -> dict[str, str]:
     policies = {f"policy_{name}": victim_sha256(experiment, name) for name in experiment.config.attacked}
     starts = {
         f"{scenario} {seed}": experiment.start_states(scenario, seed).tolist()
-        for scenario in experiment.config.scenarios
+        for scenario in experiment.config.paths
         for seed in experiment.config.seeds
     }
-    starts |= {name: experiment.measured_starts(name).tolist() for name in experiment.config.scenarios}
+    starts |= {name: experiment.measured_starts(name).tolist() for name in experiment.config.paths}
     return {
         **_frozen_place(experiment),
         **policies,

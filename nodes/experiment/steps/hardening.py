@@ -89,7 +89,7 @@ def family_hardness(
     """
     space = make_space(experiment, None)
     policy = load_victim(experiment, victim)
-    for scenario in experiment.config.scenarios:
+    for scenario in experiment.config.paths:
         problem = attack_problem(experiment, space, policy, scenario, _SEED)
         problem = from_measured_starts(experiment, scenario, problem)
         none_m = np.array(clean_drive(past(problem, space, space.plain), space.plain.colours).total_cte_m)

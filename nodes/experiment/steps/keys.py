@@ -27,7 +27,7 @@ VERSION = 4  # 4: textures are rounded to half precision before they are driven 
 # What a cell does not depend on: which others there are, how much memory may be used, and what is an input of its own below.
 FREE: Mapping[str, Any] = {
     "name": True,
-    "scenarios": True,
+    "paths": True,
     "retrain": True,
     "gate": True,
     "victims": True,
@@ -38,8 +38,7 @@ FREE: Mapping[str, Any] = {
     "world": True,
     "view": True,
     "policy": NETWORK,
-    "attack": {"seeds", "methods", "objective", "cache_mib"},
-    "measure": {"no_object"},
+    "attack": {"objective", "cache_mib"},
     "deploy": {"world", "laps", "empty_scene", "ready_timeout_s"},
 }
 # What a drive without attack does not depend on besides.
@@ -134,7 +133,7 @@ def require_known(experiment: Experiment, cell: Cell) -> None:
     """
     retrained = [] if experiment.config.retrain is None else [RETRAINED]
     known: tuple[tuple[str, str, Sequence[str]], ...] = (
-        ("scenario", cell.scenario, experiment.config.scenarios),
+        ("path", cell.scenario, experiment.config.paths),
         ("victim", cell.victim, [*experiment.config.attacked, *retrained]),
     )
     for what, value, choices in known:
@@ -160,7 +159,7 @@ def _require_gradient(experiment: Experiment, cell: Cell) -> None:
     if not given(experiment)[cell.victim].declared.differentiable:
         raise CellError(
             f"expected methods that need no gradient against victim {cell.victim}, which declares that it has none, got {cell.method}; set "
-            f"attack.methods to some of {', '.join(black_box_methods())}"
+            f"over.method to some of {', '.join(black_box_methods())}"
         )
 
 

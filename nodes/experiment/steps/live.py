@@ -146,7 +146,7 @@ def blocked_tick(driven: dict[str, Any]) -> int | None:
 
 def extra_runs(experiment: Experiment) -> dict[str, LiveRun]:
     """Runs of the main victim beside the cells: laps without attack, and a drive with the panel taken away, where they are asked for."""
-    wanted, scenario = experiment.config.deploy, experiment.config.scenarios[0]
+    wanted, scenario = experiment.config.deploy, experiment.config.paths[0]
     start = experiment.references[scenario].drive_start
     runs, main = {}, experiment.config.main_victim
     if wanted.laps:

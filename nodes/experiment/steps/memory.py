@@ -50,7 +50,7 @@ def measure(experiment: Experiment, folder: Path, report: Report) -> tuple[Memor
 def peak_above_idle_mib(experiment: Experiment, ticks: int) -> float:
     """Peak above idle of one gradient over so many ticks [MiB]; the process must be fresh."""
     space = face_space(experiment, ideal=True)
-    policy, scenario = load_victim(experiment, experiment.config.main_victim), experiment.config.scenarios[0]
+    policy, scenario = load_victim(experiment, experiment.config.main_victim), experiment.config.paths[0]
     problem = attack_problem(experiment, space, policy, scenario, experiment.config.seeds[0])
     goals = None if problem.goals is None else problem.goals[:1]
     one = problem.start_states[:1]

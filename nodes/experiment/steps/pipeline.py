@@ -26,7 +26,7 @@ VERSIONS = {"capture": 1, "scene": 2, "bake": bake.VERSION, "object": 2, "policy
 # views, and code and files of a user's are inputs.
 _FACE: dict[str, Any] = {"space": {"kind", "panel", "plain_rgb", "resolution"}}
 _OBJECTS: dict[str, Any] = {"objects": True, "object": {"panel_resolution", "panel_rgb", "panel_light"}}
-_DRIVE: dict[str, Any] = {"scenarios": True, "horizon": True, "dt_s": True}
+_DRIVE: dict[str, Any] = {"paths": True, "horizon": True, "dt_s": True}
 READS: Mapping[str, dict[str, Any]] = {
     "capture": {"capture": True, **_FACE, **_OBJECTS, **_DRIVE},
     "scene": {"scene": True, "capture": {"colour_pairs"}},
@@ -44,7 +44,7 @@ READS: Mapping[str, dict[str, Any]] = {
 # What the defence does not read of the gradient of the first seed, which it answers; the objective is an input.
 _UNREAD_BY_RETRAIN = {
     "policy": NETWORK,
-    "attack": {"methods", "objective", "seeds", "cem_population", "cache_mib"},
+    "attack": {"objective", "cem_population", "cache_mib"},
 }
 # Files that policies are trained with, beside what comes of it.
 _TRAINING_FILES = ("frames", "*.checkpoint.safetensors", "*.shards.json", "settings.json")

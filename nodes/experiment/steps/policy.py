@@ -83,7 +83,7 @@ def run(experiment: Experiment, folder: Path, report: MeasuringReport) -> None:
         trained = train_policy(
             settings,
             learned_from,
-            experiment.expert(experiment.config.scenarios[0]),
+            experiment.expert(experiment.config.paths[0]),
             experiment.view,
             folder,
             _telling(experiment, report),
@@ -152,7 +152,7 @@ def plans(
         return RenderedSource(called, seen_in(dressed), experiment.dynamics, drawn)
 
     found = []
-    for name in experiment.config.scenarios:
+    for name in experiment.config.paths:
         common: dict[str, Any] = {
             "drive_steps": config.drive_steps,
             "goal": experiment.goal(name),
@@ -259,7 +259,7 @@ def agreement(experiment: Experiment, policy: Policy | None = None) -> list[dict
     views = load_transforms(experiment.stage_folder("capture") / capture.HELD_OUT / "transforms.json")
     policy = policy or load_policy(experiment.stage_folder("policy") / "policy.safetensors").policy
     surrogate = surrogate_of(experiment, [])
-    goal = told(experiment, policy, experiment.config.scenarios[0])
+    goal = told(experiment, policy, experiment.config.paths[0])
     goals = torch.tensor([goal], dtype=torch.float32) if goal else None
     rows = []
     for frame in views.frames:

@@ -154,13 +154,13 @@ def _first_attacks(
 ) -> Found:
     """What the gradient's cells of the first seed find; they are searched here if they are not yet."""
     thetas: dict[str, torch.Tensor] = {}
-    for index, name in enumerate(experiment.config.scenarios):
+    for index, name in enumerate(experiment.config.paths):
         cell = Cell(name, experiment.config.main_victim, "gradient", experiment.config.seeds[0])
         at = experiment.cell_folder(cell)
         freeze(experiment, cell, at)
 
         def told(part: float, text: str = "", index: int = index, name: str = name) -> None:
-            done = (index + part) / len(experiment.config.scenarios)
+            done = (index + part) / len(experiment.config.paths)
             report(0.4 * done, f"attacking, {name}: {text}")
 
         surrogate_part(experiment, space, cell, at, told)
@@ -179,13 +179,11 @@ def _attack_again(
     """The gradient attack of the first seed on a retrained victim, as long as the attack on the first one."""
     attack = experiment.config.attack
     thetas: dict[str, torch.Tensor] = {}
-    for index, scenario in enumerate(experiment.config.scenarios):
+    for index, scenario in enumerate(experiment.config.paths):
         problem = attack_problem(experiment, space, victim, scenario, experiment.config.seeds[0])
 
         def told(evaluation: Any, index: int = index, scenario: str = scenario) -> None:
-            done = (index + (evaluation.iteration + 1) / attack.evaluations) / len(
-                experiment.config.scenarios
-            )
+            done = (index + (evaluation.iteration + 1) / attack.evaluations) / len(experiment.config.paths)
             report(
                 0.4 * done, f"attacking again, {scenario}: total CTE {evaluation.predicted_total_cte_m:.1f} m"
             )

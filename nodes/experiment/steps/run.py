@@ -106,11 +106,11 @@ def _check_objective(experiment: Experiment, document: Document) -> None:
 
 
 def _check_places(experiment: Experiment, document: Document) -> None:
-    """Scenarios must be the world's, and objects must stand beside its lanes; said with the line of the file."""
-    for index, name in enumerate(experiment.config.scenarios):
+    """Paths must be the world's, and objects must stand beside its lanes; said with the line of the file."""
+    for index, name in enumerate(experiment.config.paths):
         if name not in experiment.world.paths:
-            message = unknown(name, "scenario", experiment.world.paths)
-            raise ConfigError(f"{document.place(('scenarios', index))}: scenarios: {message}")
+            message = unknown(name, "path", experiment.world.paths)
+            raise ConfigError(f"{document.place(('paths', index))}: paths: {message}")
     if isinstance(experiment.named_world.make(), Photographed):
         _check_photographed(experiment, document)
     by_hand = [

@@ -24,7 +24,7 @@ TINY = {
         "deployed_stills": 2, "surrogate_stills": 2, "deployed_drives": 1, "surrogate_drives": 1, "drive_steps": 2, "dagger_rounds": 1,
         "first_steps": 2, "round_steps": 2, "naive_steps": 0, "hidden": [16, 8, 4],
     },
-    "attack": {"evaluations": 1, "seeds": [0], "methods": ["gradient"], "time_batch": 2},
+    "attack": {"evaluations": 1, "time_batch": 2}, "over": {"method": ["none", "gradient"]},
 }  # fmt: skip
 OBJECTS = [
     {"name": "car", "kind": "small_car", "x_m": -4.5, "y_m": 5.0},
@@ -37,7 +37,7 @@ def file(tmp_path, settings):
     """An experiment file with one drive of three ticks."""
     camera = {**settings["camera"], "width": 336, "height": 188}  # the policy's view is cut from it
     world = {"kind": "carla", **settings, "camera": camera}
-    data = {"name": "tiny", "horizon": 3, "scenarios": ["right"], "world": world, "objects": OBJECTS}
+    data = {"name": "tiny", "horizon": 3, "paths": ["right"], "world": world, "objects": OBJECTS}
     file = tmp_path / "tiny.experiment.yaml"
     file.write_text(yaml.safe_dump({**data, "settings": {"tiny": TINY}}))
     return file
@@ -103,7 +103,7 @@ def test_the_servers_address_changes_no_cell_and_its_junction_does(as_carla, fil
         experiment = load_experiment(file, "tiny", list(changes), tmp_path / "run")
         return settings_hash(experiment, Cell("right", "hardened", "gradient", 0))
 
-    assert of() == of("world.server.port=3000") == of("attack.seeds=[0,7]")
+    assert of() == of("world.server.port=3000") == of("over.seed=[0,7]")
     assert of() != of("world.junction.beyond_m=31")
 
 

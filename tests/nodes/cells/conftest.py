@@ -78,7 +78,7 @@ class Bench:
 
     def _write(self, file, **keys):
         world = {"kind": "toy", **self.world}
-        data = {"name": "toy", "world": world, "scenarios": ["straight"], **keys}
+        data = {"name": "toy", "world": world, "paths": ["straight"], **keys}
         file.write_text(json.dumps(data, indent=1))
 
     def load(self):

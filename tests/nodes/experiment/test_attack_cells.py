@@ -73,12 +73,7 @@ def test_cells_are_all_methods_of_all_drives(trained: Experiment) -> None:
     names = [cell.name for cell in trained.cells]
     assert len(set(names)) == len(names) == 2 * 3 * 4  # victims, drives, none and three methods
     assert names[:3] == ["straight_hardened_none_0", "right_hardened_none_0", "left_hardened_none_0"]
-    more = replace(
-        trained,
-        config=trained.config.model_copy(
-            update={"attack": trained.config.attack.model_copy(update={"seeds": (0, 1, 2)})}
-        ),
-    )
+    more = changed(trained, "over", seed=(0, 1, 2))
     assert sum(cell.victim == NAIVE for cell in more.cells) == 3 * 4
     assert (
         len(more.cells) == (3 * 3 + 1) * 3 + 3 * 4
@@ -119,7 +114,7 @@ def test_a_method_of_a_file_runs_a_cell_and_appears_in_the_tables(
     fresh: Experiment, wall: Any, tmp_path: Path
 ) -> None:
     spiral_file, file = write_spiral(tmp_path), Path(shutil.copy(fresh.file, tmp_path))
-    changes = ["attack.methods=[spiral.py:Spiral, gradient]", "scenarios=[right]", "policy.naive_steps=0"]
+    changes = ["over.method=[none,spiral.py:Spiral, gradient]", "paths=[right]", "policy.naive_steps=0"]
     experiment = run.load_experiment(file, "tiny", changes, fresh.folder)
     names = [f"right_hardened_{method}_0" for method in ("none", "Spiral", "gradient")]
     assert [cell.name for cell in experiment.cells] == names
@@ -312,15 +307,17 @@ def changed(experiment: Experiment, section: str, **values: Any) -> Experiment:
 
 
 def test_the_control_without_objects_is_asked_for(trained: Experiment, tmp_path: Path) -> None:
-    more = changed(trained, "measure", no_object=True)
+    more = changed(trained, "over", method=("none", "empty", "random", "cem", "gradient"))
     assert {cell.name for cell in more.cells} - {cell.name for cell in trained.cells} == {
         f"{drive}_{victim}_empty_0"
         for drive in ("straight", "right", "left")
         for victim in ("hardened", "naive")
     }
     room = Path(__file__).parents[3] / "launch" / "room.experiment.yaml"
-    with pytest.raises(ConfigError, match=r"measure\.no_object only where objects are attacked.*empty_scene"):
-        run.load_experiment(room, "full", ["measure.no_object=true"], tmp_path)
+    with pytest.raises(
+        ConfigError, match=r"control empty in over\.method only where objects are attacked.*empty_scene"
+    ):
+        run.load_experiment(room, "full", ["over.method=[none,empty,gradient]"], tmp_path)
 
 
 def test_a_cell_is_filmed_frame_by_frame(fresh: Experiment, wall: Any) -> None:
@@ -334,7 +331,7 @@ def test_a_cell_is_filmed_frame_by_frame(fresh: Experiment, wall: Any) -> None:
 
 def test_unknown_cells_are_refused(trained: Experiment, tmp_path: Path) -> None:
     for wrong in (("back", "hardened", "none"), ("left", "nobody", "none"), ("left", "hardened", "luck")):
-        with pytest.raises(CellError, match=r"expected an? (scenario|victim|attack method) of"):
+        with pytest.raises(CellError, match=r"expected an? (path|victim|attack method) of"):
             run_cell(trained, Cell(*wrong, 0), tmp_path, silent)
     assert not list(tmp_path.iterdir())
 

@@ -215,8 +215,8 @@ def test_a_cell_of_colours_depends_on_the_world_and_not_on_what_else_is_searched
     same = digest()
     for free in (
         "name=mine",
-        "attack.methods=[random]",
-        "attack.seeds=[0,1,2]",
+        "over.method=[none,random]",
+        "over.seed=[0,1,2]",
         "attack.cache_mib=64",
         "retrain={}",
     ):

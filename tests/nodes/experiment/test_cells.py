@@ -39,7 +39,7 @@ def test_what_changes_no_result_is_no_part_of_what_a_cell_depends_on(tmp_path):
     def inputs(*overrides):
         return cell_settings(room(tmp_path, *overrides), Cell("track", "hardened", "gradient", 0))
 
-    for free in ("attack.cache_mib=64", "attack.seeds=[4]", "deploy.laps=0", "deploy.ready_timeout_s=90"):
+    for free in ("attack.cache_mib=64", "over.seed=[4]", "deploy.laps=0", "deploy.ready_timeout_s=90"):
         assert inputs(free) == inputs(), free
     none = Cell("track", "hardened", "none", 0)
     assert cell_settings(room(tmp_path, "attack.evaluations=7"), none) == cell_settings(room(tmp_path), none)

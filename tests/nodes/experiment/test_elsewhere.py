@@ -27,7 +27,7 @@ def experiment_in(folder: Path, *changes: str) -> Experiment:
     data = {
         "name": "flat",
         "world": {"kind": f"{WORLD}:FlatWorld", "seed": 1},
-        "scenarios": ["round"],
+        "paths": ["round"],
         "horizon": 26,
         "objects": [
             {"name": "board", "kind": "panel", "scale": 0.3, "stands": {"least_px": 8, "seen_s": 0.5}}

@@ -46,13 +46,13 @@ def factory():
     return adapt(torch.nn.Sequential(*layers).eval(), PolicyContract(view, colour_space="BGR", **normal, output_unit="deg", positive="right"))
 """
 FILE: dict[str, Any] = {
-    "name": "mine", "world": {"kind": "lab"}, "scenarios": ["track"], "held_cap_m": 1.5, "horizon": TICKS, "gate": None,
+    "name": "mine", "world": {"kind": "lab"}, "paths": ["track"], "held_cap_m": 1.5, "horizon": TICKS, "gate": None,
     "victims": {"mine": {"policy": "my.onnx"}, "module": {"policy": "my_driver:factory"}},
     "space": {"kind": "face", "panel": "board", "resolution": 8}, "measure": {"starts": 1},
-    "capture": {"photos": 9, "held_out": 3, "colour_pairs": 3}, "attack": {"methods": ["random"], "evaluations": 2},
+    "capture": {"photos": 9, "held_out": 3, "colour_pairs": 3}, "attack": {"evaluations": 2}, "over": {"method": ["none", "random"]},
     "scene": {"steps": 20, "log2_entries": 10, "finest": 32, "occupancy": 32}, "settings": {"tiny": {}},
 }  # fmt: skip
-ONLY_THE_MODULE = ("victims={module: {policy: 'my_driver:factory'}}", "attack.methods=[random,gradient]")
+ONLY_THE_MODULE = ("victims={module: {policy: 'my_driver:factory'}}", "over.method=[none,random,gradient]")
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +130,7 @@ def test_a_policy_of_waypoints_and_two_images_is_attacked_and_drives_as_the_runt
     contract = PolicyContract(view, frames=FrameStack(count=2, axis="time"), trajectory=tracked)
     export_onnx(Plans().eval(), contract, folder / "plans.onnx")
     change = "victims={plans: {policy: plans.onnx}}"
-    run_experiment(loaded(folder, change), overrides=(change,))
+    run_experiment(loaded(folder, change))
     experiment, session = loaded(folder, change), onnxruntime.InferenceSession(folder / "plans.onnx")
     assert "total_cte_m" in read_json(experiment.cell_result(Cell("track", "plans", "random", 0)))["deployed"]
     kept = read_json(driven_folder(experiment, Cell("track", "plans", "none", 0)) / DRIVES)
@@ -204,8 +204,8 @@ def test_a_registration_fixes_them_by_hash_before_anything_is_run(folder: Path, 
 
 
 def test_a_black_box_has_no_gradient(folder: Path) -> None:
-    with pytest.raises(AdvnerfError, match=r"need no gradient against victim mine.*attack\.methods.*cem"):
-        run_experiment(loaded(folder, "attack.methods=[random,gradient]"))
+    with pytest.raises(AdvnerfError, match=r"need no gradient against victim mine.*over\.method.*cem"):
+        run_experiment(loaded(folder, "over.method=[none,random,gradient]"))
 
 
 def test_another_policy_under_the_same_name_is_another_cell(folder: Path, tmp_path: Path) -> None:
@@ -269,7 +269,7 @@ def test_a_driver_behind_a_socket_is_attacked(folder: Path, tmp_path: Path) -> N
                 load_experiment(
                     folder / "mine.experiment.yaml",
                     "tiny",
-                    (victims, "attack.methods=[gradient]"),
+                    (victims, "over.method=[none,gradient]"),
                     tmp_path / "run",
                 )
             )

@@ -30,7 +30,7 @@ def ours(trained, tmp_path):
     for stage in ("scene", "object", "policy"):
         shutil.copytree(trained.stage_folder(stage), folder / stage)
     measure = trained.config.measure.model_copy(update={"starts": STARTS})
-    config = trained.config.model_copy(update={"measure": measure, "scenarios": ("right",)})
+    config = trained.config.model_copy(update={"measure": measure, "paths": ("right",)})
     return replace(trained, folder=folder, config=config)
 
 

@@ -94,10 +94,10 @@ def test_every_shipped_experiment_names_its_world(tmp_path: Path) -> None:
         ),
         ({"world": {"road": {}}}, "expected kind: NAME"),
         (
-            {"scenarios": ["backwards"]},
-            "scenarios: expected a scenario of straight, right, left; got 'backwards'",
+            {"paths": ["backwards"]},
+            "paths: expected a path of straight, right, left; got 'backwards'",
         ),
-        ({"scenarios": ["left", "left"]}, "expected different scenarios, got left, left"),
+        ({"paths": ["left", "left"]}, "expected different paths, got left, left"),
         (
             {"world": {"kind": "junction", "road": {"lane_width_m": 9.0}}},
             "road.lane_width_m: input should be less",
@@ -140,8 +140,8 @@ def test_unknown_setting_names_the_known_ones(tmp_path: Path) -> None:
 
 
 def test_retraining_without_the_gradient_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"gradient among attack\.methods"):
-        load(tmp_path, "retrain.rounds=1", "attack.methods=[random]")
+    with pytest.raises(ConfigError, match=r"gradient among over\.method"):
+        load(tmp_path, "retrain.rounds=1", "over.method=[none,random]")
 
 
 def test_training_drives_that_end_before_the_junction_are_refused(tmp_path: Path) -> None:

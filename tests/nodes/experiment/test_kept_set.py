@@ -21,7 +21,7 @@ from nodes.experiment.run.run import Options, run_cells
 from nodes.experiment.steps import run
 from tests.support.stage_versions import tiny_experiment
 
-CHANGES = ("attack.methods=[gradient]", "attack.seeds=[0,1]", "measure.starts=2", "deploy.starts=1")
+CHANGES = ("over.method=[none,gradient]", "over.seed=[0,1]", "measure.starts=2", "deploy.starts=1")
 
 
 def experiment_in(folder, *more):

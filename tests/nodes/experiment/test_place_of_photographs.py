@@ -23,7 +23,7 @@ from tests.nodes.experiment.test_given_victims import MODULE
 PHOTOGRAPHS, TICKS = 24, 3
 T_IMAGES_FROM_LAB = make_transform(rotation_z(0.5), [3.0, -2.0, 1.2])
 FILE: dict[str, Any] = {
-    "name": "hall", "scenarios": ["track"], "held_cap_m": 1.5, "horizon": TICKS, "gate": None,
+    "name": "hall", "paths": ["track"], "held_cap_m": 1.5, "horizon": TICKS, "gate": None,
     "world": {
         "kind": "photographs", "images": "my_photos", "closed": True, "off_track_m": 0.25,
         "car": {"speed_mps": 0.8, "wheelbase_m": 0.325, "max_steering_rad": 0.35}, "camera": {"x_m": 0.3, "z_m": 0.2},
@@ -32,7 +32,7 @@ FILE: dict[str, Any] = {
     "objects": [{"name": "board", "kind": "panel", "x_m": 6.43, "y_m": -2.86, "yaw_rad": 3.64, "scale": 0.3}],
     "space": {"kind": "colours"}, "deploy": {"through": "nothing"}, "capture": {"held_out": 4}, "measure": {"starts": 1},
     "scene": {"steps": 12, "log2_entries": 10, "levels": 3, "finest": 16, "occupancy": 16},
-    "attack": {"methods": ["random", "gradient"], "evaluations": 2}, "object": {"panel_resolution": 4},
+    "attack": {"evaluations": 2}, "over": {"method": ["none", "random", "gradient"]}, "object": {"panel_resolution": 4},
     "settings": {"tiny": {}},
 }  # fmt: skip
 

@@ -24,8 +24,8 @@ def experiment(trained, tmp_path):
 
 def made_of(trained, tmp_path, methods, **changes):
     """The experiment with other methods, and with other sections of its configuration."""
-    attack = trained.config.attack.model_copy(update={"methods": methods})
-    config = trained.config.model_copy(update={"attack": attack, **changes})
+    over = trained.config.over.model_copy(update={"method": ("none", *methods)})
+    config = trained.config.model_copy(update={"over": over, **changes})
     ours = replace(trained, config=config)
     return replace(ours, folder=tmp_path / "run", overrides=("measure.seed=10000",))
 
@@ -72,7 +72,7 @@ def test_a_test_needs_three_unseen_families_and_a_coarse_search(trained, tmp_pat
 
 def test_where_coarse_textures_have_other_cells_the_gradient_is_run_in_both(tmp_path):
     def on_a_face(edge, methods):
-        changes = [f"space.cells={edge}", f"attack.methods=[{','.join(methods)}]"]
+        changes = [f"space.cells={edge}", f"over.method=[none,{','.join(methods)}]"]
         made = tiny_experiment(tmp_path / "run", changes)
         return primary_tests(made, made.cells)
 

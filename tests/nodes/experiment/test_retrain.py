@@ -62,7 +62,7 @@ def test_a_round_of_retraining_and_the_attack_on_it(attacked: Experiment) -> Non
     assert found["rounds"][1]["victim"] == retrained.sha256
     assert found["final_policy"] == "retrain/round0/policy.safetensors"  # in the run folder, wherever that is
     assert retrained.metadata["fine_tuned_from"] == found["rounds"][0]["victim"]
-    for name in attacked.config.scenarios:
+    for name in attacked.config.paths:
         row = found["old_attacks"][name]
         assert row["ratio"] == pytest.approx(row["retrained_attacked_m"] / row["original_undisturbed_m"])
         assert found["rounds"][0]["surrogate"][name] > 0.0
@@ -71,7 +71,7 @@ def test_a_round_of_retraining_and_the_attack_on_it(attacked: Experiment) -> Non
     assert sorted(store.names()) == sorted(
         f"{domain}-{name}{moved}"
         for domain in ("deployed", "surrogate")
-        for name in attacked.config.scenarios
+        for name in attacked.config.paths
         for moved in ("", "-moved0")
     )
     picture = cv2.imread(str(folder / "curve.png"))
@@ -105,6 +105,6 @@ def test_an_attack_that_does_not_pay_ends_it(attacked: Experiment) -> None:
     assert len(found["rounds"]) == 1
     assert found["old_attacks"] == {}
     assert not Path(victim_spec(attacked, RETRAINED)).exists()
-    seed = attacked.config.attack.seeds[0]
+    seed = attacked.config.seeds[0]
     file = attacked.cell_folder(Cell("left", HARDENED, "gradient", seed)) / attack.ATTACK
     assert load_attack(file).objects

@@ -19,7 +19,7 @@ def room(tmp_path, setting="demo", *overrides):
 
 def test_settings_lie_over_the_file_and_the_command_line_over_both(tmp_path):
     assert room(tmp_path).config.attack.horizon == 40
-    assert room(tmp_path, "full").config.attack.seeds == (0, 1, 2)
+    assert room(tmp_path, "full").config.seeds == (0, 1, 2)
     changed = room(tmp_path, "full", "attack.horizon=30", "world.car.speed_mps=0.6")
     assert (changed.searched_ticks, changed.car.speed_mps) == (30, 0.6)
     assert room(tmp_path, "full").searched_ticks == room(tmp_path, "full").config.horizon
@@ -56,7 +56,7 @@ def test_an_unknown_setting_names_those_there_are(tmp_path):
 def test_an_error_names_the_line_of_the_file(tmp_path):
     file = tmp_path / "bad.experiment.yaml"
     file.write_text(
-        "name: room\nworld: {kind: lab}\nscenarios: [track]\nsettings:\n  demo:\n    attack:\n      horizen: 3\n"
+        "name: room\nworld: {kind: lab}\npaths: [track]\nsettings:\n  demo:\n    attack:\n      horizen: 3\n"
     )
     with pytest.raises(ConfigError, match=r"bad\.experiment\.yaml:7: unknown key attack\.horizen"):
         load_experiment(file, "demo", [], tmp_path)
@@ -66,7 +66,7 @@ def test_a_file_says_only_what_is_other_than_its_base(tmp_path):
     (tmp_path / "base.experiment.yaml").write_text(ROOM.read_text())
     file = tmp_path / "mine.experiment.yaml"
     file.write_text(
-        "base: base.experiment.yaml\nname: mine\nspace: {panel: monitor}\nattack: {seeds: [4, 5]}\n"
+        "base: base.experiment.yaml\nname: mine\nspace: {panel: monitor}\nover: {seed: [4, 5]}\n"
         "settings:\n  demo: {attack: {evaluations: 3}}\n  quick: {scene: {steps: 5}}\n"
     )
     mine, base = load_experiment(file, "demo", [], tmp_path), room(tmp_path)
@@ -75,9 +75,9 @@ def test_a_file_says_only_what_is_other_than_its_base(tmp_path):
         "monitor",
         3,
     )
-    assert mine.config.attack.seeds == (0,)  # the setting's of the base, which lies over the values of both
+    assert mine.config.seeds == (0,)  # the setting's of the base, which lies over the values of both
     assert (mine.config.space.resolution, mine.config.policy) == (64, base.config.policy)
-    assert load_experiment(file, "quick", [], tmp_path).config.attack.seeds == (4, 5)
+    assert load_experiment(file, "quick", [], tmp_path).config.seeds == (4, 5)
     file.write_text(file.read_text() + "view:\n  crop_topp: 3\n")
     with pytest.raises(ConfigError, match=r"mine\.experiment\.yaml:9: unknown key view\.crop_topp"):
         load_experiment(file, "demo", [], tmp_path)

@@ -21,7 +21,7 @@ OWN = ("world_warehouse", "my_architecture", "left_objective", "spiral_method")
 CHANGES = [
     "policy.architecture=my_architecture.py:Mixer",
     "attack.objective=left_objective.py:LeftOffset",
-    "attack.methods=[spiral_method.py:Spiral]",
+    "over.method=[none,spiral_method.py:Spiral]",
     "deploy.world={kind: 'world_warehouse.py:Warehouse'}",
 ]
 CELL = Cell("loop", "hardened", "none", 0)

@@ -55,7 +55,7 @@ def test_all_cells_and_the_report(trained: Experiment, tmp_path: Path) -> None:
     rows = list(csv.DictReader((folder / "report" / "table.csv").open()))
     assert len(rows) == 48
     assert all(float(row["total_m"]) > 0.0 for row in rows)
-    for name in experiment.config.scenarios:
+    for name in experiment.config.paths:
         assert len(read_clip(folder / "report" / f"{name}.mp4")) == 4  # three ticks and the start
     page = (folder / "report" / "report.html").read_text()
     assert "&lt;it&gt;" in page  # what it quotes is escaped

@@ -21,7 +21,7 @@ def test_a_cell_whose_process_dies_has_no_result_and_the_others_go_on(
     tiny |= {
         "name": "flat",
         "world": {"kind": f"{HERE / 'flat_world.py'}:FlatWorld", "faulty": str(faulty)},
-        "scenarios": ["round"],
+        "paths": ["round"],
         "objects": [{"name": "hydrant", "kind": "hydrant", "x_m": 7.0, "y_m": 2.0}],
     }
     file.write_text(yaml.safe_dump(tiny))

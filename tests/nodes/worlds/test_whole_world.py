@@ -70,8 +70,8 @@ def test_a_mistake_in_the_file_is_one_line(
     file = tmp_path / "mine.experiment.yaml"
     for wrong, told in (
         (
-            text.replace("scenarios: [loop, dock]", "scenarios: [lopo]"),
-            "mine.experiment.yaml:6: scenarios: expected a scenario of loop, dock; got 'lopo' (did you mean loop?)",
+            text.replace("paths: [loop, dock]", "paths: [lopo]"),
+            "mine.experiment.yaml:6: paths: expected a path of loop, dock; got 'lopo' (did you mean loop?)",
         ),
         (
             text.replace("x_m: 1.5, y_m: -1.95", "x_m: 1.5, y_m: -2.5"),
