@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -101,8 +102,11 @@ def _converted(found: Any, folder: Path, sizes: dict[str, int], parts: int) -> C
         parts,
         cameras,
     )
+    # Copies: a camera of pycolmap belongs to its model, which ends here.
     undistorted = {
-        each.name: each.camera for each in images if lens_of(found.cameras[each.camera_id]) is None
+        each.name: copy.deepcopy(found.cameras[each.camera_id])
+        for each in images
+        if lens_of(found.cameras[each.camera_id]) is None
     }
     return ColmapModel(model, folder, sizes, undistorted, points)
 
@@ -135,7 +139,7 @@ def _intrinsics(camera: Any, folder: Path) -> tuple[Pinhole, Lens]:
     except (ValueError, RuntimeError, DatasetError) as error:
         reason = (str(error).splitlines() or [""])[0]
         advice = "undistort the images with COLMAP's image_undistorter and give the model that it writes"
-        if camera.is_spherical():
+        if camera.model_name == "EQUIRECTANGULAR":
             advice = "render perspective images from the panoramas and find the poses of those"
         raise ReconstructionError(
             f"{folder}: camera {camera.camera_id} ({camera.model_name}): expected a lens whose distortion can be undone, got: {reason}; {advice}"

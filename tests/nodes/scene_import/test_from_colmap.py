@@ -148,6 +148,19 @@ def test_known_positions_give_metres_and_the_world(tmp_path, ring):
     assert not report["ground_at_zero"]
 
 
+@pytest.mark.parametrize("with_floor", [True, False])
+def test_positions_on_a_straight_drive_take_up_from_the_ground_or_the_cameras(tmp_path, with_floor):
+    drive = [look_at([0.5 * k, 0.2, 1.2], [0.5 * k + 3.0, 0.2, 1.2]) for k in range(8)]
+    model = posed([in_colmap(T) for T in drive], NAMES, floor() if with_floor else ())
+    images = write_images(tmp_path / "pictures", NAMES)
+    known = write_positions(tmp_path / "gps.csv", drive)
+    run(tmp_path, write(model, tmp_path / "model"), images, positions=known)
+    frames, report = loaded(tmp_path)
+    for name, T in zip(NAMES, drive, strict=True):
+        np.testing.assert_allclose(frames[name].T_world_from_camera, T, atol=0.005)
+    assert report["up"].startswith("normal of the ground" if with_floor else "the cameras' up")
+
+
 def test_positions_of_something_else_are_refused(tmp_path, ring):
     wrong = write_positions(tmp_path / "gps.csv", RING[::-1][:4] + RING[:4])
     with pytest.raises(AdvnerfError, match="expected positions that fit the model"):
