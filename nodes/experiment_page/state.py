@@ -119,9 +119,8 @@ def _cell_searches(cells_folder: Path, record: Mapping[str, Any], begun: set[str
 
 def _title(cell: Mapping[str, Any]) -> str:
     """A cell as its readers call it."""
-    where = ", ".join(filter(None, (cell["scenario"], cell["placement"], cell["victim"])))
     seed = f", seed {cell['seed']}" if cell["searched"] else ""
-    return f"{where}, {style_of(cell['method']).title}{seed}"
+    return f"{cell['scenario']}, {cell['victim']}, {style_of(cell['method']).title}{seed}"
 
 
 def _other_searches(folder: Path) -> list[dict[str, Any]]:
