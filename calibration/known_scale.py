@@ -152,7 +152,7 @@ def marker_scale(views: Iterable[View], side_m: float, dictionary: str) -> Marke
         corners, numbers, _ = detector.detectMarkers(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
         found = [] if numbers is None else [int(number) for number in numbers.ravel()]
         for pixels, number in zip(corners, found, strict=True):
-            if found.count(number) == 1:  # printed twice, nobody knows which is which
+            if found.count(number) == 1:  # two markers of one number cannot be told apart
                 seen[number].append((pixels.reshape(4, 2).astype(np.float64) + 0.5, pinhole, T))
     sides = [_sides(each) for each in seen.values()]
     measured = np.array([side for side in sides if side is not None]).reshape(-1, 4)
