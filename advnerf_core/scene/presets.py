@@ -44,8 +44,7 @@ class ScenePreset:
 
 # Bands of spherical harmonics: photographs show gloss.
 PHOTOGRAPH_BANDS = 3
-# Found by `python -m benchmarks.learning_rates` on photographs, a room, a road and a town. Experiments keep the defaults of
-# `TrainConfig`, on which their published results rest.
+# Found by `python -m benchmarks.learning_rates` on photographs, a room, a road and a town. Experiments train like this too.
 FAST = TrainConfig(learning_rate=0.02, decay="cosine")
 # Ends by time: no training takes so many steps in minutes.
 _NO_LIMIT_STEPS = 1_000_000

@@ -25,6 +25,7 @@ ROOT = Path(__file__).parents[2]
 RECORDED = ROOT / "tests" / "nodes" / "experiment" / "versions.json"
 TINY = (
     "capture.photos=12", "capture.colour_pairs=2", "capture.held_out=3", "scene.steps=12", "scene.log2_entries=12", "scene.occupancy=32",
+    "scene.decay=exponential", "scene.learning_rate=0.01",  # twelve steps at more learn nothing that could be baked
     "policy.deployed_stills=12", "policy.surrogate_stills=8", "policy.deployed_drives=1", "policy.surrogate_drives=2",
     "policy.drive_steps=3", "policy.first_steps=6", "policy.round_steps=3", "policy.naive_steps=0",
     "attack.horizon=6", "attack.evaluations=2", "space.resolution=8", "horizon=8", "deploy.through=world",
@@ -97,7 +98,9 @@ def defaults() -> dict[str, dict[str, Any]]:
     from nodes.experiment.steps.pipeline import READS
 
     found = {name: dict(_defaults(ExperimentConfig, include)) for name, include in READS.items()}
-    found["cells"] = dict(_defaults(ExperimentConfig, True, keys.FREE))
+    # Of what stages alone read cells have the digests.
+    by_digest = dict.fromkeys(("capture", "scene", "policy"), True)
+    found["cells"] = dict(_defaults(ExperimentConfig, True, {**keys.FREE, **by_digest}))
     found["requests"] = dict(_defaults(AttackRequest, True, prepare.FREE))
     return found
 
@@ -152,8 +155,15 @@ def main() -> None:
     """Write what is made now."""
     with tempfile.TemporaryDirectory() as folder:
         found = measured(Path(folder) / "run")
+    before = json.loads(RECORDED.read_text())
     for name, each in defaults().items():
         found[name]["defaults"] = each
+        known = before.get(name, {}).get("defaults", {})
+        changed = [key for key in each.keys() & known.keys() if each[key] != known[key]]
+        if changed and found[name]["version"] == before[name]["version"]:
+            raise SystemExit(
+                f"{name}: expected another version with other {', '.join(changed)}; raise it first"
+            )
     RECORDED.write_text(json.dumps(found, indent=1) + "\n")
     print(f"wrote {RECORDED.relative_to(ROOT)}: {sys.version.split()[0]}")
 

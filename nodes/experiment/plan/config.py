@@ -92,12 +92,12 @@ class SceneConfig(StrictModel):
         description="Sample intervals in pixels of the policy's view; none: the default of pixel_intervals.",
     )
     decay: Literal["exponential", "cosine"] = Field(
-        default="exponential",
+        default="cosine",
         description="How the learning rate falls; cosine stays high for longer.",
     )
     learning_rate: PositiveNumber = Field(
-        default=0.01,
-        description="Learning rate at the start; with decay cosine 0.02 makes sharper scenes.",
+        default=0.02,
+        description="Learning rate at the start.",
     )
     exposure: bool = Field(
         default=False,

@@ -21,7 +21,7 @@ from nodes.runtime.progress import MeasuringReport
 
 # Raised when what a stage makes changes with the same settings, or a default that it reads does: then its old results, and all that build
 # on them, are made again. tests/nodes/experiment/test_versions.py fails where one of them changed and the version did not.
-VERSIONS = {"capture": 1, "scene": 2, "bake": bake.VERSION, "object": 2, "policy": 2, "retrain": 1, "live": 1}
+VERSIONS = {"capture": 1, "scene": 3, "bake": bake.VERSION, "object": 2, "policy": 2, "retrain": 1, "live": 1}
 # What a stage may read of the experiment file, as `BaseModel.model_dump` includes it; its key has nothing else of the file. Worlds,
 # views, and code and files of a user's are inputs.
 _FACE: dict[str, Any] = {"space": {"kind", "panel", "plain_rgb", "resolution"}}

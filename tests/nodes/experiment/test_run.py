@@ -3,6 +3,7 @@ from pathlib import Path
 
 import pytest
 
+from advnerf_core.scene.presets import FAST
 from nodes.experiment.engine.stages import StageError
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.whole import run_experiment
@@ -102,9 +103,11 @@ def test_a_stage_depends_on_its_own_settings_and_on_no_others(tmp_path):
 
     assert changed("attack.evaluations=7") == changed("space.cells=4") == changed("deploy.starts=2") == set()
     assert changed("attack.random_sigma=4") == {"policy"}
-    assert changed("scene.exposure=true") == changed("scene.decay=cosine") == {"scene"}
-    assert changed("scene.learning_rate=0.02") == {"scene"}
-    assert changed("scene.exposure=false") == changed("scene.decay=exponential") == set()
+    assert changed("scene.exposure=true") == changed("scene.decay=exponential") == {"scene"}
+    assert changed("scene.learning_rate=0.01") == {"scene"}
+    assert changed("scene.exposure=false") == changed("scene.decay=cosine") == set()
+    scene = room(tmp_path).config.scene
+    assert (scene.decay, scene.learning_rate) == (FAST.decay, FAST.learning_rate)  # as advnerf scene train
     # What the panel shows without an attack is photographed and learned from.
     assert changed("space.plain_rgb=[0.5, 0.5, 0.5]") == {"capture", "policy"}
     assert changed("space.resolution=32") == {"policy"}
