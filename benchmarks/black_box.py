@@ -62,7 +62,7 @@ class OutOfTimeError(Exception):
 def make_problem(folder: Path, steps: int) -> AttackProblem:
     """The experiment's own attack: its face where its attack files have it, its starts of seed 0, over fewer ticks."""
     attack = load_attack(folder / "cells" / "track_hardened_gradient_0" / "attack.safetensors")
-    plain = read_json(folder / "manifest.json")["config"]["space"]["plain_rgb"]
+    plain = read_json(folder / "manifest.json")["config"]["carrier"]["plain_rgb"]
     shown, carrier = attack.required_face(), attack.face_object
     face = cube_face_object(
         shown.size_m[0], carrier.theta.shape[0], tuple(plain), carrier.T_world_from_object

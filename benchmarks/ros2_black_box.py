@@ -41,7 +41,7 @@ def drive_starts(
     """Total CTE [m] of each start, without and with the attack."""
     calibration = folder / "capture" / "calibration"
     room = load_calibration(RoomCalibration, calibration / "room.yaml")
-    plain_rgb = tuple(read_json(folder / "manifest.json")["config"]["space"]["plain_rgb"])
+    plain_rgb = tuple(read_json(folder / "manifest.json")["config"]["carrier"]["plain_rgb"])
     carrier, size_m = attack.face_object, attack.required_face().size_m[0]
     face = cube_face_object(size_m, carrier.theta.shape[0], plain_rgb, carrier.T_world_from_object)
     x_m, y_m, yaw_rad = room.start_pose

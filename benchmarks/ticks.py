@@ -27,9 +27,9 @@ from advnerf_core.objects.voxel.mesh import stand
 from advnerf_core.scene.surrogate import Surrogate
 from benchmarks.timing import seconds_in_turns
 from nodes.experiment.plan.config import ExperimentConfig
-from nodes.experiment.plan.space_config import FaceConfig
 from nodes.experiment.plan.victims import HARDENED
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.faces import has_face
 from nodes.experiment.show.learned_scene import load_background
 from nodes.experiment.show.spaces import make_space
 from nodes.experiment.show.victims import load_victim
@@ -55,7 +55,7 @@ def hydrants(count: int) -> list[VoxelGridObject]:
 def measured(folder: Path, repeats: int = 5) -> dict[str, float]:
     """Milliseconds of ticks before the room's scene, and of an iteration on whatever the experiment attacks."""
     experiment = _run_of(folder)
-    in_room = isinstance(experiment.config.space, FaceConfig)
+    in_room = has_face(experiment)
     return {**(_ticks(experiment, repeats) if in_room else {}), "iteration": _iteration(experiment, repeats)}
 
 

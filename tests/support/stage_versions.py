@@ -28,7 +28,7 @@ TINY = (
     "scene.decay=exponential", "scene.learning_rate=0.01",  # twelve steps at more learn nothing that could be baked
     "policy.deployed_stills=12", "policy.surrogate_stills=8", "policy.deployed_drives=1", "policy.surrogate_drives=2",
     "policy.drive_steps=3", "policy.first_steps=6", "policy.round_steps=3", "policy.naive_steps=0",
-    "attack.horizon=6", "attack.evaluations=2", "space.resolution=8", "horizon=8", "deploy.through=world",
+    "attack.horizon=6", "attack.evaluations=2", "carrier.resolution=8", "horizon=8", "deploy.through=world",
     "gate=null",
 )  # fmt: skip
 

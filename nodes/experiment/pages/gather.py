@@ -21,8 +21,8 @@ from advnerf_core.report.conditions import EMPTY
 from advnerf_core.report.reference import DOMAINS, Domain
 from nodes.experiment.engine.artefact import read_artefact
 from nodes.experiment.plan.cell import Cell
-from nodes.experiment.plan.space_config import FaceConfig
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.faces import has_face
 from nodes.experiment.show.given import victim_without_gradient
 from nodes.experiment.show.learned_scene import FIDELITY
 from nodes.experiment.steps.deploy import DRIVES
@@ -62,7 +62,7 @@ def gather(
         ),
         manifest=_manifest(experiment),
         overview=overview,
-        textures=tuple(_textures(experiment)) if isinstance(experiment.config.space, FaceConfig) else (),
+        textures=tuple(_textures(experiment)) if has_face(experiment) else (),
         fidelity=_fidelity(experiment),
         live=live,
         memory=memory,
@@ -184,6 +184,7 @@ def _settings(experiment: Experiment) -> dict[str, str]:
         "horizon": f"T = {config.horizon} control ticks of {config.dt_s:g} s, {experiment.searched_ticks} of them optimised",
         "searches": f"{attack.evaluations} evaluations each, learning rate {attack.learning_rate:g}, time batch {attack.time_batch}",
         "space": ", ".join(f"{name} {value}" for name, value in config.space.model_dump().items()),
+        "carrier": ", ".join(f"{name} {value}" for name, value in config.carrier.model_dump().items()),
         **poses,
         "seeds": ", ".join(str(seed) for seed in config.seeds),
         "speed": f"{experiment.car.speed_mps:g} m/s",

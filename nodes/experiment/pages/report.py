@@ -25,6 +25,7 @@ from hardware.worlds.world import World
 from nodes.experiment.engine.run_folder import CELLS
 from nodes.experiment.pages.gather import gather
 from nodes.experiment.pages.table import wanted_rows, write_table
+from nodes.experiment.plan.carriers import FaceCarrier
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.method_names import know_methods_of
 from nodes.experiment.show.context import Experiment
@@ -93,8 +94,9 @@ def opening(experiment: Experiment) -> str:
     methods = ", ".join(style_of(name).title for name in config.method_names)
     kinds = Counter(thing.kind.replace("_", " ") for thing in experiment.objects)
     named = " and ".join(count(number, kind) for kind, number in kinds.items())
+    searched = (config.carrier if isinstance(config.carrier, FaceCarrier) else config.space).searched
     return (
-        f"Policies ({', '.join(config.attacked)}) drive {', '.join(config.cell_paths)}. {config.space.searched.format(named)} ({methods}; {attack.evaluations} evaluations "
+        f"Policies ({', '.join(config.attacked)}) drive {', '.join(config.cell_paths)}. {searched.format(named)} ({methods}; {attack.evaluations} evaluations "
         f"each, {count(len(config.seeds), 'seed')}, {count(attack.starts, 'start')}, T = {config.horizon} ticks of {config.dt_s:g} s){_then(experiment)}."
     )
 

@@ -14,7 +14,7 @@ Positive = Annotated[int, Field(ge=1)]
 
 
 class DeployConfig(StrictModel):
-    """What drives past a found attack, and how often. All but ``through``, ``starts``, ``car``, ``world``, ``camera`` and ``panels`` concerns live nodes only."""
+    """What drives past a found attack, and how often. All but ``through``, ``starts``, ``car``, ``world`` and ``camera`` concerns live nodes only."""
 
     through: Literal["world", "nodes", "nothing"] = Field(
         default="world",
@@ -35,10 +35,6 @@ class DeployConfig(StrictModel):
     camera: Effects = Field(
         default=PRESETS["ideal"],
         description="What the driving camera adds to an ideal picture: ideal, webcam, zed, or the effects themselves.",
-    )
-    panels: Literal["composed", "native"] = Field(
-        default="composed",
-        description="Panels are drawn into the pictures by depth, or put into the world's own scene, which lights and hides them.",
     )
     launch_file: str = Field(
         default="green_screen.launch.yaml", description="Node graph, beside the experiment file."

@@ -75,31 +75,7 @@ class MeshShapeConfig(_MeshConfig):
     boundary_samples: Positive = Field(default=1, description="Points a pixel for that of the silhouettes.")
 
 
-class FaceConfig(StrictModel):
-    """One flat texture that a panel of the world carries: projected onto a board, or shown on a screen."""
-
-    kind: Literal["face"]
-    searched: ClassVar[str] = "The texture of one face is searched in the learned scene"
-    panel: str = Field(
-        default="board", min_length=1, description="Which of the world's panels carries the face."
-    )
-    resolution: Annotated[int, Field(ge=2, le=128)] = Field(
-        default=64, description="Grid cells along each side of the face."
-    )
-    cells: Annotated[int, Field(ge=0, le=128)] = Field(
-        default=8,
-        description="Cells a side of the coarse texture that methods without a gradient search; 0: every cell.",
-    )
-    plain_rgb: tuple[Unit, Unit, Unit] = Field(
-        default=(0.20, 0.62, 0.28), description="What a screen shows without an attack."
-    )
-    display_model: bool = Field(
-        default=True,
-        description="On a screen: search with its measured colours in the loop; false takes it for ideal.",
-    )
-
-
 SpaceConfig = Annotated[
-    ColoursConfig | PlacesConfig | MeshTextureConfig | MeshShapeConfig | FaceConfig,
+    ColoursConfig | PlacesConfig | MeshTextureConfig | MeshShapeConfig,
     Field(discriminator="kind"),
 ]

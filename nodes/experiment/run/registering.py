@@ -24,10 +24,11 @@ from advnerf_core.report.evidence.registration import (
     RegistrationError,
     read_registration,
 )
+from nodes.experiment.plan.carriers import FaceCarrier
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.plan.object_kinds import PANEL
-from nodes.experiment.plan.space_config import ColoursConfig, FaceConfig
+from nodes.experiment.plan.space_config import ColoursConfig
 from nodes.experiment.run.plan import registered_cell, statuses
 from nodes.experiment.run.store import FINISHED
 from nodes.experiment.show.context import Experiment
@@ -156,11 +157,13 @@ def _lacking(methods: Sequence[str], config: ExperimentConfig) -> list[str]:
 
 def _coarse_cells_differ(config: ExperimentConfig) -> bool:
     """Whether coarse textures have other cells than the gradient's, where the gradient can have theirs: on a face, or on one panel."""
-    space = config.space
-    if isinstance(space, FaceConfig):
-        return 0 < space.cells < space.resolution
+    space, carrier = config.space, config.carrier
+    if not isinstance(space, ColoursConfig):
+        return False
+    if isinstance(carrier, FaceCarrier):
+        return 0 < space.cells < carrier.resolution
     panel = len(config.objects) == 1 and config.objects[0].kind == PANEL
-    return isinstance(space, ColoursConfig) and panel and 0 < space.cells < config.object.panel_resolution
+    return panel and 0 < space.cells < config.object.panel_resolution
 
 
 def _refuse_late(experiment: Experiment, cells: Sequence[Cell]) -> None:

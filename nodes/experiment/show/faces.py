@@ -19,7 +19,7 @@ from advnerf_core.scene.surrogate import BackgroundRenderer, Surrogate
 from calibration.display_colour import DisplayCalibration
 from calibration.schema import load_calibration
 from hardware.worlds.world import Panel, Rgb, World
-from nodes.experiment.plan.space_config import FaceConfig
+from nodes.experiment.plan.carriers import FaceCarrier, ScreenConfig
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.learned_scene import load_background
 from nodes.experiment.show.screen import cos_angle, face_picture, plain_picture, screens_of
@@ -32,13 +32,13 @@ DISPLAY = "display.yaml"
 
 def has_face(experiment: Experiment) -> bool:
     """Whether the attack is a face on a panel."""
-    return isinstance(experiment.config.space, FaceConfig)
+    return isinstance(experiment.config.carrier, FaceCarrier)
 
 
-def wanted_face(experiment: Experiment) -> FaceConfig:
-    """The section ``space`` of an experiment that attacks a face."""
-    assert isinstance(experiment.config.space, FaceConfig), "only asked where the space is a face"
-    return experiment.config.space
+def wanted_face(experiment: Experiment) -> FaceCarrier:
+    """The section ``carrier`` of an experiment that attacks a face."""
+    assert isinstance(experiment.config.carrier, FaceCarrier), "only asked where a face is attacked"
+    return experiment.config.carrier
 
 
 def panel_of(experiment: Experiment) -> Panel:
@@ -49,13 +49,13 @@ def panel_of(experiment: Experiment) -> Panel:
     """
     name, panels = wanted_face(experiment).panel, experiment.world.panels
     if name not in panels:
-        raise ConfigError(f"{experiment.file}: space.panel: {unknown(name, 'panel', panels)}")
+        raise ConfigError(f"{experiment.file}: carrier.panel: {unknown(name, 'panel', panels)}")
     return panels[name]
 
 
 def on_screen(experiment: Experiment) -> bool:
     """Whether a screen shows the face; else it is projected onto a board."""
-    return has_face(experiment) and panel_of(experiment).screen_px is not None
+    return isinstance(experiment.config.carrier, ScreenConfig)
 
 
 def face_object(experiment: Experiment) -> VoxelGridObject:
@@ -93,8 +93,7 @@ def face_space(
     )
     mount = FaceMount(wanted.panel, (panel.square_m, panel.square_m), corners_on(panel))
     named = NamedObject("face", field.sha256)
-    ideal = not wanted.display_model if ideal is None else ideal
-    if ideal or not on_screen(experiment):
+    if not isinstance(wanted, ScreenConfig) or (not wanted.display_model if ideal is None else ideal):
         return FaceSpace(surrogate, named, mount)
     return FaceSpace(surrogate, named, mount, display_of(experiment), mean_cos_angle(experiment))
 

@@ -21,6 +21,7 @@ from calibration.display_colour import (
 from calibration.schema import load_calibration
 from hardware.worlds.paths import Pose
 from hardware.worlds.world import NativePanels, Panel, World
+from nodes.experiment.plan.carriers import ComposedConfig, NativeConfig
 from nodes.experiment.plan.placed import PlacedObject
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.placing import seen_from
@@ -34,9 +35,15 @@ _NAME = "light"
 _LEAST_FREE = 0.4
 
 
+def measures_light(experiment: Experiment) -> bool:
+    """Whether the light on the panel is measured while the world is photographed."""
+    carrier = experiment.config.carrier
+    return isinstance(carrier, ComposedConfig | NativeConfig) and carrier.response == "measured"
+
+
 def light_on_panels(experiment: Experiment) -> DisplayModel | None:
     """The light on the panel, as the capture stage measured it; None where colours are taken to be seen as they are painted."""
-    if experiment.config.object.panel_light == "ideal":
+    if not measures_light(experiment):
         return None
     return load_calibration(DisplayCalibration, experiment.calibration_folder / LIGHT).display
 
@@ -55,7 +62,7 @@ def measure_light(experiment: Experiment, world: World) -> DisplayFit:
     """
     if not isinstance(world, NativePanels):
         raise ConfigError(
-            f"expected a world that takes panels (add_panel) with object.panel_light measured, got {type(world).__name__}"
+            f"expected a world that takes panels (add_panel) with carrier.response measured, got {type(world).__name__}"
         )
     (thing,) = experiment.objects
     poses = _poses(experiment, world, thing)
@@ -86,7 +93,7 @@ def _poses(experiment: Experiment, world: World, thing: PlacedObject) -> list[Po
     if not found:
         raise ConfigError(
             f"{experiment.file}: expected the panel {thing.name} to be seen on the way along {experiment.config.paths[0]}, with {_LEAST_PX} pixels "
-            "inside its edge; it is hidden, turned away or too small: move it, or set object.panel_light=ideal"
+            "inside its edge; it is hidden, turned away or too small: move it, or set carrier.response=identity"
         )
     return [
         found[index] for index in np.linspace(0, len(found) - 1, min(_POSES, len(found))).round().astype(int)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -17,6 +17,8 @@ from advnerf_core.geometry import Array
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.surrogate import split_theta
 from hardware.worlds.world import NativePanels, Panel, Rgb, World
+from nodes.experiment.plan.carriers import ComposedConfig, NativeConfig, Way
+from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import Dressed, DressedScene
 from nodes.runtime.errors import ConfigError
 
@@ -26,15 +28,21 @@ _Shown = tuple[tuple[str, bytes, bytes], ...]
 _STANDING: WeakKeyDictionary[Any, _Shown] = WeakKeyDictionary()
 
 
-def stand_in(
-    view: PolicyView, scene: World, objects: Sequence[ColouredObject], panels: Literal["composed", "native"]
-) -> Dressed:
+def object_carrier(experiment: Experiment) -> ComposedConfig | NativeConfig:
+    """The section ``carrier`` of an experiment that attacks objects."""
+    assert isinstance(experiment.config.carrier, ComposedConfig | NativeConfig), (
+        "only asked where objects are attacked"
+    )
+    return experiment.config.carrier
+
+
+def stand_in(view: PolicyView, scene: World, objects: Sequence[ColouredObject], way: Way) -> Dressed:
     """An open deployment scene with objects in it: composed by depth, or as panels of the world's own scene.
 
     Raises:
         ConfigError: The world takes no panels.
     """
-    return DressedScene(scene, view, objects) if panels == "composed" else NativeScene(scene, view, objects)
+    return DressedScene(scene, view, objects) if way == "composed" else NativeScene(scene, view, objects)
 
 
 class NativeScene:
@@ -52,8 +60,8 @@ class NativeScene:
     def __init__(self, scene: World, view: PolicyView, panels: Sequence[ColouredObject]) -> None:
         if not isinstance(scene, NativePanels):
             raise ConfigError(
-                f"expected a world that takes panels (add_panel) with deploy.panels native, got {type(scene).__name__}; "
-                "set deploy.panels=composed"
+                f"expected a world that takes panels (add_panel) with carrier.kind native, got {type(scene).__name__}; "
+                "set carrier.kind=composed"
             )
         self.scene: World = scene
         self.view, self._native = view, scene
@@ -114,6 +122,6 @@ class NativeScene:
 def _panel_of(field: ColouredObject) -> Panel:
     if not isinstance(field, VoxelGridObject) or field.face_size_m is None:
         raise ConfigError(
-            "expected panels with deploy.panels native, got a solid object; set deploy.panels=composed"
+            "expected panels with carrier.kind native, got a solid object; set carrier.kind=composed"
         )
     return Panel(np.array(field.T_world_from_object), *field.face_size_m)

@@ -29,7 +29,6 @@ from nodes.experiment.plan.object_kinds import MADE_HERE_M, PANEL, is_mesh, load
 from nodes.experiment.plan.placed import PlacedObject
 from nodes.experiment.plan.space_config import (
     ColoursConfig,
-    FaceConfig,
     MeshShapeConfig,
     MeshTextureConfig,
     PlacesConfig,
@@ -39,7 +38,7 @@ from nodes.experiment.show.deployed import Dressed
 from nodes.experiment.show.faces import PaintedScene, face_space, has_face
 from nodes.experiment.show.frames import DeployedFrames
 from nodes.experiment.show.light import light_on_panels
-from nodes.experiment.show.native import stand_in
+from nodes.experiment.show.native import object_carrier, stand_in
 from nodes.experiment.show.objects import (
     GENERATOR_OF,
     object_file,
@@ -64,10 +63,10 @@ def make_space(experiment: Experiment, scene: World | None) -> Space:
         scene: The open deployment scene; needed where `over_the_world`.
     """
     wanted = experiment.config.space
+    if has_face(experiment):
+        return face_space(experiment)
     if isinstance(wanted, ColoursConfig):
         return colour_space(experiment)
-    if isinstance(wanted, FaceConfig):
-        return face_space(experiment)
     if isinstance(wanted, PlacesConfig):
         return _place_space(experiment, wanted)
     assert scene is not None, "meshes are searched over the pictures of an open scene"
@@ -87,7 +86,7 @@ def dress(experiment: Experiment, scene: World, shown: Shown) -> Dressed:
     """An open deployment scene that shows what a search found; see `shown_there` for its colours."""
     if has_face(experiment):
         return PaintedScene(experiment, scene)
-    return stand_in(experiment.view, scene, shown.objects, experiment.config.deploy.panels)
+    return stand_in(experiment.view, scene, shown.objects, object_carrier(experiment).kind)
 
 
 def shown_there(experiment: Experiment, shown: Shown, attack: AttackFile | None) -> Tensor | None:
@@ -96,7 +95,7 @@ def shown_there(experiment: Experiment, shown: Shown, attack: AttackFile | None)
     A composed object has the colours that are seen; what the world's own light falls on has those that are painted.
     """
     if attack is None or attack.face is None:
-        native = experiment.config.deploy.panels == "native" and shown.painted is not None
+        native = experiment.config.carrier.kind == "native" and shown.painted is not None
         return (shown.painted if native else shown.colours) if shown.objects else None
     return torch.from_numpy(np.array(attack.face_object.theta))
 

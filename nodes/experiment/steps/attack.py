@@ -29,7 +29,6 @@ from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.method_names import keep_title
 from nodes.experiment.plan.space_config import (
     ColoursConfig,
-    FaceConfig,
     MeshShapeConfig,
     MeshTextureConfig,
     PlacesConfig,
@@ -184,7 +183,7 @@ def load_found(folder: Path, cell: Cell) -> AttackFile | None:
 def search_settings(experiment: Experiment, method: Method) -> SearchSettings:
     """What a search may spend."""
     attack, space = experiment.config.attack, experiment.config.space
-    cells = space.cells if isinstance(space, (ColoursConfig, FaceConfig)) else 0
+    cells = space.cells if isinstance(space, ColoursConfig) else 0
     return SearchSettings(
         evaluations=planned_evaluations(experiment),
         learning_rate=space.learning_rate

@@ -12,10 +12,10 @@ from advnerf_core.plugins import PluginError
 from advnerf_core.report.conditions import EMPTY, NONE
 from nodes.experiment.engine.artefact import Settings, digests_in
 from nodes.experiment.plan.cell import Cell
-from nodes.experiment.plan.config import NETWORK
-from nodes.experiment.plan.space_config import FaceConfig
+from nodes.experiment.plan.sections import NETWORK
 from nodes.experiment.plan.victims import RETRAINED
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.faces import has_face
 from nodes.experiment.show.given import given, given_in, victim_sha256, victim_spec
 from nodes.experiment.steps import bake
 from nodes.runtime.errors import RuntimeFault
@@ -83,7 +83,10 @@ def cell_settings(experiment: Experiment, cell: Cell, deployed: bool = True) -> 
     if cell.victim in (*given_victims, RETRAINED):
         inputs["policy_sha256"] = _policy_sha256(experiment, cell.victim)
     if not deployed:
-        free["deploy"] = True
+        # Objects are searched alike, however they are shown to the car.
+        free |= (
+            {"deploy": True} if has_face(experiment) else {"deploy": True, "carrier": {"kind", "training"}}
+        )
     kept = {name: digest for name, digest in experiment.kept.items() if name in stages}
     inputs["stages"] = {**kept, **digests_in(experiment.folder, stages)}
     return Settings.of(experiment.config, None, free, **inputs, **_places(experiment, deployed))
@@ -139,7 +142,7 @@ def require_known(experiment: Experiment, cell: Cell) -> None:
     for what, value, choices in known:
         if value not in choices:
             raise CellError(f"expected a {what} of {', '.join(choices)}, got {value!r}")
-    if cell.method == EMPTY and isinstance(experiment.config.space, FaceConfig):
+    if cell.method == EMPTY and has_face(experiment):
         raise CellError(
             "expected the control empty only where objects are attacked; a panel of the room was photographed with its scene"
         )

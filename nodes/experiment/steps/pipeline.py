@@ -9,12 +9,15 @@ from typing import Any, Protocol
 from advnerf_core.attack.objectives import objective_key
 from nodes.experiment.engine.artefact import Settings
 from nodes.experiment.engine.stages import Stage
-from nodes.experiment.plan.config import NETWORK
+from nodes.experiment.plan.carriers import ScreenConfig
 from nodes.experiment.plan.object_kinds import files_of, name_of
-from nodes.experiment.plan.space_config import FaceConfig
+from nodes.experiment.plan.sections import NETWORK
 from nodes.experiment.show import objects
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.faces import has_face
 from nodes.experiment.show.given import given_in, victim_sha256
+from nodes.experiment.show.light import measures_light
+from nodes.experiment.show.native import object_carrier
 from nodes.experiment.steps import bake, capture, live, policy, retrain, scene
 from nodes.launching.launch_file import load_launch
 from nodes.runtime.progress import MeasuringReport
@@ -24,25 +27,27 @@ from nodes.runtime.progress import MeasuringReport
 VERSIONS = {"capture": 1, "scene": 3, "bake": bake.VERSION, "object": 2, "policy": 2, "retrain": 1, "live": 1}
 # What a stage may read of the experiment file, as `BaseModel.model_dump` includes it; its key has nothing else of the file. Worlds,
 # views, and code and files of a user's are inputs.
-_FACE: dict[str, Any] = {"space": {"kind", "panel", "plain_rgb", "resolution"}}
-_OBJECTS: dict[str, Any] = {"objects": True, "object": {"panel_resolution", "panel_rgb", "panel_light"}}
+_CARRIER: dict[str, Any] = {"carrier": {"kind", "panel", "plain_rgb", "resolution", "response"}}
+_OBJECTS: dict[str, Any] = {"objects": True, "object": {"panel_resolution", "panel_rgb"}}
 _DRIVE: dict[str, Any] = {"paths": True, "horizon": True, "dt_s": True}
 READS: Mapping[str, dict[str, Any]] = {
-    "capture": {"capture": True, **_FACE, **_OBJECTS, **_DRIVE},
+    "capture": {"capture": True, **_CARRIER, **_OBJECTS, **_DRIVE},
     "scene": {"scene": True, "capture": {"colour_pairs"}},
     "bake": _DRIVE,
     "object": {"object": {"car_resolution", "hydrant_resolution", "mesh_resolution", "fit_steps"}},
-    "policy": {"policy": True, "attack": {"random_sigma"}, **_FACE, **_OBJECTS, **_DRIVE},
+    "policy": {"policy": True, "attack": {"random_sigma"}, **_CARRIER, **_OBJECTS, **_DRIVE},
     "retrain": {
         **dict.fromkeys(("retrain", "policy", "space", "attack", "held_cap_m"), True),
         "deploy": {"car", "camera"},
+        **_CARRIER,
         **_OBJECTS,
         **_DRIVE,
     },
-    "live": {"deploy": {"nodes", "camera", "laps", "empty_scene"}, "held_cap_m": True, **_FACE, **_DRIVE},
+    "live": {"deploy": {"nodes", "camera", "laps", "empty_scene"}, "held_cap_m": True, **_CARRIER, **_DRIVE},
 }
 # What the defence does not read of the gradient of the first seed, which it answers; the objective is an input.
-_UNREAD_BY_RETRAIN = {
+_UNREAD_BY_RETRAIN: dict[str, Any] = {
+    "carrier": {"kind"},
     "policy": NETWORK,
     "attack": {"objective", "cem_population", "cache_mib"},
 }
@@ -86,17 +91,16 @@ def _stage(
 
 def _capture(experiment: Experiment) -> Stage:
     config = experiment.config
-    unread: dict[str, Any] = {"object": {"panel_resolution", "panel_rgb"}}
-    if isinstance(config.space, FaceConfig):
-        unread["space"] = {"resolution"}
-    else:
-        unread["space"] = True
+    unread: dict[str, Any] = {"object": True, "carrier": {"resolution"}}
     inputs = {"world": experiment.seen_settings}
+    # What a screen shows is photographed; an overlay is drawn into pictures later.
+    if not isinstance(config.carrier, ScreenConfig):
+        unread["carrier"] = {"kind", "panel", "plain_rgb", "resolution"}
     # A rule follows the drive that is measured; so does what looks for the light on a panel.
-    if experiment.has_rules or config.object.panel_light == "measured":
+    if experiment.has_rules or measures_light(experiment):
         inputs["view"] = experiment.view_settings
     else:
-        unread |= dict.fromkeys(("objects", "object", "horizon", "dt_s"), True)
+        unread |= dict.fromkeys(("objects", "horizon", "dt_s"), True)
     settings = Settings.of(config, READS["capture"], unread, **inputs)
     return _stage("capture", capture, experiment, settings, bulk=(capture.PHOTOS, capture.COLOUR_PAIRS))
 
@@ -127,14 +131,15 @@ def _learned_from(experiment: Experiment) -> dict[str, Any]:
         # Not the digest of what was baked, as machines differ in the last bits of it.
         "bake": VERSIONS["bake"],
         "architecture": experiment.config.policy.network.described(),
+        # Its default is not the same for all carriers, and whether the deployed drive shows objects otherwise does not matter.
+        "training": None if has_face(experiment) else object_carrier(experiment).training,
     }
 
 
 def _policy(experiment: Experiment) -> Stage:
-    config = experiment.config
-    is_face = isinstance(config.space, FaceConfig)
+    config, is_face = experiment.config, has_face(experiment)
     unread: dict[str, Any] = {"policy": NETWORK}
-    unread |= dict.fromkeys(("objects", "object") if is_face else ("space",), True)
+    unread |= dict.fromkeys(("objects", "object"), True) if is_face else {"carrier": {"kind"}}
     # The angle at which a screen is seen follows the drive that is measured, and so do rules in other places.
     if not (is_face or config.policy.learns_in):
         unread["horizon"] = True

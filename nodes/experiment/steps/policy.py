@@ -34,7 +34,7 @@ from nodes.experiment.show.faces import PaintedScene, face_object, face_space, h
 from nodes.experiment.show.images import as_uint8
 from nodes.experiment.show.learned_scene import load_background
 from nodes.experiment.show.light import light_on_panels
-from nodes.experiment.show.native import stand_in
+from nodes.experiment.show.native import object_carrier, stand_in
 from nodes.experiment.show.objects import (
     describe,
     last_result_kept,
@@ -184,7 +184,7 @@ def _object_domains(
     """Objects stand in both scenes, plain or coloured."""
     objects = placed_objects(experiment) if objects is None else objects
     surrogate = surrogate_of(experiment, objects, load_background(experiment))
-    light = light_on_panels(experiment)
+    light, carrier = light_on_panels(experiment), object_carrier(experiment)
     lit = None if light is None else DisplayedSensor(surrogate, light)
 
     def seen(states: Array) -> Show:
@@ -197,7 +197,7 @@ def _object_domains(
         return show
 
     return _Domains(
-        stand_in(experiment.view, scene, objects, experiment.config.policy.panels),
+        stand_in(experiment.view, scene, objects, carrier.training),
         seen,
         surrogate.theta_shape,
     )
@@ -211,7 +211,7 @@ def surrogate_plan(experiment: Experiment) -> SourcePlan:
     """
     if not has_face(experiment):
         raise ConfigError(
-            f"expected an experiment whose attack is a face (space.kind face), got {experiment.config.space.kind}"
+            f"expected an experiment whose attack is a face (carrier.kind overlay or screen), got {experiment.config.carrier.kind}"
         )
     space, seen = _seen_face(experiment)
     shape, sigma = space.surrogate.theta_shape, experiment.config.attack.random_sigma

@@ -15,8 +15,8 @@ from hardware.worlds.world import Photographed
 from nodes.experiment.engine.artefact import REFERENCE, Artefact
 from nodes.experiment.engine.run_folder import require_own_folder, run_to_end
 from nodes.experiment.engine.stages import begun_with, stage_digests
+from nodes.experiment.plan.carriers import ComposedConfig, FaceCarrier, ScreenConfig
 from nodes.experiment.plan.placed import PlacedObject, in_a_lane
-from nodes.experiment.plan.space_config import FaceConfig
 from nodes.experiment.plan.victims import RETRAINED
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.given import VictimUnknownError, given_in, victim_spec
@@ -118,12 +118,8 @@ def _check_places(experiment: Experiment, document: Document) -> None:
     ]
     if (found := in_a_lane(experiment.placed_by_hand, experiment.world)) is not None:
         raise ConfigError(f"{document.place(('objects', by_hand[found[0]]))}: {found[1]}")
-    if (
-        isinstance(space := experiment.config.space, FaceConfig)
-        and space.panel not in experiment.world.panels
-    ):
-        message = unknown(space.panel, "panel", experiment.world.panels)
-        raise ConfigError(f"{document.place(('space', 'panel'))}: space.panel: {message}")
+    if isinstance(carrier := experiment.config.carrier, FaceCarrier):
+        _check_panel(carrier, experiment, document)
     if experiment.traits.own_photo_colours and not experiment.config.capture.colour_pairs:
         raise ConfigError(
             f"{document.place(('capture',))}: expected capture.colour_pairs of at least 1, as the photographs of the world "
@@ -131,6 +127,20 @@ def _check_places(experiment: Experiment, document: Document) -> None:
         )
     if not given_in(experiment.config):  # policies that exist are looked at when the experiment is run
         _ = experiment.view
+
+
+def _check_panel(carrier: FaceCarrier, experiment: Experiment, document: Document) -> None:
+    """The panel of a face must be the world's, and a screen exactly where a screen shows the face."""
+    panels = experiment.world.panels
+    if carrier.panel not in panels:
+        message = unknown(carrier.panel, "panel", panels)
+        raise ConfigError(f"{document.place(('carrier', 'panel'))}: carrier.panel: {message}")
+    has_screen = panels[carrier.panel].screen_px is not None
+    if has_screen != isinstance(carrier, ScreenConfig):
+        raise ConfigError(
+            f"{document.place(('carrier', 'kind'))}: expected carrier.kind {'screen' if has_screen else 'overlay'} with the panel "
+            f"{carrier.panel}, which is {'a' if has_screen else 'no'} screen, got {carrier.kind}"
+        )
 
 
 def _check_photographed(experiment: Experiment, document: Document) -> None:
@@ -146,7 +156,7 @@ def _check_photographed(experiment: Experiment, document: Document) -> None:
         ),
         (("space", "kind"), config.space.kind not in ("colours", "places"), "space.kind colours or places"),
         (("capture", "colour_pairs"), config.capture.colour_pairs > 0, "capture.colour_pairs 0"),
-        (("object", "panel_light"), config.object.panel_light != "ideal", "object.panel_light ideal"),
+        (("carrier",), config.carrier != ComposedConfig(kind="composed"), "carrier {kind: composed}"),
     )
     for key, wrong, wanted in refused:
         if wrong:

@@ -6,7 +6,7 @@ import pytest
 
 from advnerf_core.documents import parse_yaml
 from advnerf_core.strict import validate
-from nodes.experiment.plan.config import PolicyConfig
+from nodes.experiment.plan.sections import PolicyConfig
 from nodes.runtime.errors import ConfigError
 
 EXAMPLES = Path(__file__).parents[3] / "examples"

@@ -19,7 +19,7 @@ from advnerf_core.report.cells import cell_from
 from advnerf_core.report.clips import ClipTrack, read_clip
 from nodes.experiment.pages.report import opening
 from nodes.experiment.plan.cell import Cell
-from nodes.experiment.plan.config import RetrainConfig
+from nodes.experiment.plan.sections import RetrainConfig
 from nodes.experiment.plan.space_config import (
     ColoursConfig,
     MeshShapeConfig,

@@ -33,9 +33,8 @@ def experiment_in(folder: Path, *changes: str) -> Experiment:
             {"name": "board", "kind": "panel", "scale": 0.3, "stands": {"least_px": 8, "seen_s": 0.5}}
         ],
         "space": {"kind": "colours", "cells": 4},
-        "deploy": {"panels": "native"},
+        "carrier": {"kind": "native"},
         "policy": {
-            "panels": "native",
             "learns_in": [["seed=2"], ["seed=3"]],
             "deployed_stills": 5,
             "deployed_drives": 3,

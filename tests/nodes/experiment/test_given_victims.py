@@ -48,7 +48,7 @@ def factory():
 FILE: dict[str, Any] = {
     "name": "mine", "world": {"kind": "lab"}, "paths": ["track"], "held_cap_m": 1.5, "horizon": TICKS, "gate": None,
     "victims": {"mine": {"policy": "my.onnx"}, "module": {"policy": "my_driver:factory"}},
-    "space": {"kind": "face", "panel": "board", "resolution": 8}, "measure": {"starts": 1},
+    "carrier": {"kind": "overlay", "resolution": 8}, "space": {"kind": "colours", "cells": 8}, "measure": {"starts": 1},
     "capture": {"photos": 9, "held_out": 3, "colour_pairs": 3}, "attack": {"evaluations": 2}, "over": {"method": ["none", "random"]},
     "scene": {"steps": 20, "log2_entries": 10, "finest": 32, "occupancy": 32}, "settings": {"tiny": {}},
 }  # fmt: skip

@@ -24,12 +24,11 @@ from nodes.runtime.errors import ConfigError
 LAUNCH = Path(__file__).parents[3] / "launch"
 BOARD = "{name: board, kind: panel, x_m: 2.0, y_m: -2.8, yaw_rad: 2.8, scale: 0.3}"
 CHANGES = [
-    "space={kind: colours}",
     "deploy.through=world",
+    "space.cells=0",
     "object.panel_resolution=8",
-    "object.panel_light=measured",
     "policy.naive_steps=0",
-    "policy.panels=native",
+    "carrier={kind: composed, training: native, response: measured}",
 ]
 
 
@@ -89,8 +88,8 @@ def test_light_needs_a_panel_and_a_world_that_takes_it(tmp_path: Path) -> None:
     def load(name: str, *changes: str):
         return load_experiment(LAUNCH / f"{name}.experiment.yaml", "demo", list(changes), tmp_path / name)
 
-    with pytest.raises(ConfigError, match=r"one panel, policy\.panels native"):
-        load("room", *CHANGES[:-1], f"objects=[{BOARD}]")
+    with pytest.raises(ConfigError, match=r"training native with carrier\.response measured"):
+        load("room", *CHANGES[:-1], "carrier={kind: composed, response: measured}", f"objects=[{BOARD}]")
     junction = load(
         "junction", *CHANGES[2:], "objects=[{name: board, kind: panel, x_m: 12.0, y_m: 5.0, yaw_rad: -2.0}]"
     )
@@ -98,7 +97,7 @@ def test_light_needs_a_panel_and_a_world_that_takes_it(tmp_path: Path) -> None:
         measure_light(junction, world)
     with Lab() as world, pytest.raises(ConfigError, match="hidden, turned away or too small"):
         measure_light(load("room", *CHANGES, f"objects=[{BOARD.replace('2.8, scale', '0.3, scale')}]"), world)
-    plain = load("room", *CHANGES[:3], *CHANGES[4:], f"objects=[{BOARD}]")
+    plain = load("room", *CHANGES[:-1], "carrier={kind: composed, training: native}", f"objects=[{BOARD}]")
     measured = load("room", *CHANGES, f"objects=[{BOARD}]")
     assert stages_of(plain)[0].settings != stages_of(measured)[0].settings
 

@@ -93,7 +93,11 @@ def test_laps_and_the_empty_scene_are_driven_where_they_are_asked_for(tmp_path):
 
 def test_live_nodes_simulate_the_lab_alone(tmp_path):
     junction = LAUNCH / "junction.experiment.yaml"
-    with pytest.raises(ConfigError, match=r"expected space\.kind face.*with deploy\.through nodes"):
+    with pytest.raises(
+        ConfigError, match=r"expected carrier\.kind overlay or screen.*with deploy\.through nodes"
+    ):
         load_experiment(junction, "demo", ["deploy.through=nodes"], tmp_path)
     with pytest.raises(ConfigError, match=r"expected world\.kind lab with deploy\.through nodes"):
-        load_experiment(junction, "demo", ["deploy.through=nodes", "space.kind=face", "objects=[]"], tmp_path)
+        load_experiment(
+            junction, "demo", ["deploy.through=nodes", "carrier.kind=overlay", "objects=[]"], tmp_path
+        )

@@ -116,13 +116,14 @@ def test_a_panel_is_an_object_of_an_experiment(tmp_path: Path) -> None:
     surrogate = Surrogate(lambda poses, pinhole: None, experiment.view.pinhole, np.eye(4), [field])
     (attacked,) = ColourSpace(surrogate, [NamedObject("board", "")]).attacked(torch.zeros(16, 16, 3))
     assert (attacked.size_m, attacked.scale) == ((3.0, 3.0), 1.0)
-    plain = load_experiment(LAUNCH / "junction.experiment.yaml", "demo", [], tmp_path / "other")
-    dumped = plain.config.model_dump(mode="json")
-    assert not {"panel_resolution", "panel_rgb"} & set(dumped["object"])
-    assert "panels" not in dumped["deploy"]
     with pytest.raises(ConfigError, match="objects of kind panel alone"):
-        load_experiment(LAUNCH / "junction.experiment.yaml", "demo", ["deploy.panels=native"], tmp_path)
-    naive = [*changes, "policy.panels=native", "policy.own_car=true", "policy.naive_steps=10"]
+        load_experiment(LAUNCH / "junction.experiment.yaml", "demo", ["carrier.kind=native"], tmp_path)
+    naive = [
+        *changes,
+        "carrier={kind: composed, training: native}",
+        "policy.own_car=true",
+        "policy.naive_steps=10",
+    ]
     with pytest.raises(ConfigError, match="would learn from random textures"):
         load_experiment(LAUNCH / "junction.experiment.yaml", "demo", naive, tmp_path)
     mesh = [*changes, "space={kind: mesh_texture}"]

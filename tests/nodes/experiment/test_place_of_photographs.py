@@ -103,6 +103,7 @@ def test_the_same_photographs_elsewhere_are_the_same_place(folder: Path, tmp_pat
         ("objects=[{name: a, kind: panel, stands: {}}]", "expected objects whose places are given"),
         ("objects=[]", "expected objects whose places are given"),
         ("space={kind: mesh_shape}", "an object with a mesh|objects with a mesh|expected space.kind colours"),
+        ("carrier={kind: native}", "expected carrier"),
         ("world.images=nowhere", r"world\.images|images: expected a file or folder"),
         ("world.camera.height_m=0.3", r"unknown key .*camera\.height_m"),
     ],

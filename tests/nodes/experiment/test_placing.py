@@ -24,7 +24,7 @@ ROOM = Path(__file__).parents[3] / "launch" / "room.experiment.yaml"
 
 def room(folder: Path, rule: str = "{}", scale: float = 0.25) -> Experiment:
     changes = [
-        "space={kind: colours}",
+        "carrier={kind: composed}",
         "deploy.through=world",
         "object.panel_resolution=8",
         f"objects=[{{name: board, kind: panel, scale: {scale}, stands: {rule}}}]",
@@ -96,7 +96,7 @@ def test_what_is_captured_depends_on_the_rule_and_on_no_place_by_hand(tmp_path: 
 
     assert settings(room(tmp_path)) != settings(room(tmp_path, "{side: left}"))
     by_hand = [
-        "space={kind: colours}",
+        "carrier={kind: composed}",
         "deploy.through=world",
         "objects=[{name: board, kind: panel, x_m: 2.0, y_m: -2.8, scale: 0.2}]",
     ]

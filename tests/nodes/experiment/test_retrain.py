@@ -12,7 +12,7 @@ import pytest
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.learning.frames import Frames, FrameStore
 from nodes.experiment.plan.cell import Cell
-from nodes.experiment.plan.config import RetrainConfig
+from nodes.experiment.plan.sections import RetrainConfig
 from nodes.experiment.plan.victims import HARDENED, RETRAINED
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.given import victim_spec

@@ -24,7 +24,7 @@ def test_settings_lie_over_the_file_and_the_command_line_over_both(tmp_path):
     changed = room(tmp_path, "full", "attack.horizon=30", "world.car.speed_mps=0.6")
     assert (changed.searched_ticks, changed.car.speed_mps) == (30, 0.6)
     assert room(tmp_path, "full").searched_ticks == room(tmp_path, "full").config.horizon
-    assert changed.config.space.resolution == 64
+    assert changed.config.carrier.resolution == 64
 
 
 @pytest.mark.parametrize(
@@ -36,8 +36,16 @@ def test_settings_lie_over_the_file_and_the_command_line_over_both(tmp_path):
             ["attack.horizon=61"],
             r"attack\.horizon to be at most horizon = 60 ticks, which are measured, got 61",
         ),
-        (["space.display_model=sometimes"], r"display_model.*valid boolean"),
-        (["space.panel=door"], r"space\.panel: .*board, monitor.*door"),
+        (["carrier={kind: screen, display_model: sometimes}"], r"display_model.*valid boolean"),
+        (["carrier.display_model=false"], r"unknown key .*display_model"),
+        (
+            ["carrier={kind: overlay, panel: monitor}"],
+            r"expected carrier\.kind screen with the panel monitor",
+        ),
+        (["carrier={kind: screen, panel: board}"], r"expected carrier\.kind overlay with the panel board"),
+        (["space={kind: places}"], r"space\.kind colours with carrier\.kind overlay"),
+        (["measure.no_object=true"], r"set deploy\.empty_scene instead"),
+        (["carrier.panel=door"], r"carrier\.panel: .*board, monitor.*door"),
         (["world.camera.widht=3"], r"unknown key camera\.widht"),
         (["capture.colour_pairs=0"], r"colour_pairs of at least 1.*world lab have colours of their own"),
         (["deploy.through=air"], r"deploy\.through"),
@@ -67,24 +75,24 @@ def test_a_file_says_only_what_is_other_than_its_base(tmp_path):
     (tmp_path / "base.experiment.yaml").write_text(ROOM.read_text())
     file = tmp_path / "mine.experiment.yaml"
     file.write_text(
-        "base: base.experiment.yaml\nname: mine\nspace: {panel: monitor}\nover: {seed: [4, 5]}\n"
+        "base: base.experiment.yaml\nname: mine\ncarrier: {kind: screen, resolution: 32}\nover: {seed: [4, 5]}\n"
         "settings:\n  demo: {attack: {evaluations: 3}}\n  quick: {scene: {steps: 5}}\n"
     )
     mine, base = load_experiment(file, "demo", [], tmp_path), room(tmp_path)
-    assert (mine.config.name, mine.config.space.panel, mine.config.attack.evaluations) == (
+    assert (mine.config.name, mine.config.carrier.panel, mine.config.attack.evaluations) == (
         "mine",
         "monitor",
         3,
     )
     assert mine.config.seeds == (0,)  # the setting's of the base, which lies over the values of both
-    assert (mine.config.space.resolution, mine.config.policy) == (64, base.config.policy)
+    assert (mine.config.carrier.resolution, mine.config.policy) == (32, base.config.policy)
     assert load_experiment(file, "quick", [], tmp_path).config.seeds == (4, 5)
     file.write_text(file.read_text() + "view:\n  crop_topp: 3\n")
     with pytest.raises(ConfigError, match=r"mine\.experiment\.yaml:9: unknown key view\.crop_topp"):
         load_experiment(file, "demo", [], tmp_path)
     # A section of another kind has other keys.
-    file.write_text("base: base.experiment.yaml\nspace: {kind: colours}\ndeploy: {through: world}\n")
-    assert load_experiment(file, "demo", [], tmp_path).config.space.kind == "colours"
+    file.write_text("base: base.experiment.yaml\ncarrier: {kind: composed}\ndeploy: {through: world}\n")
+    assert load_experiment(file, "demo", [], tmp_path).config.carrier.training == "composed"
     for wrong, says in (
         ("mine.experiment.yaml", "a base other than the file itself"),
         ("no.yaml", "expected a file"),
@@ -108,9 +116,9 @@ def test_a_stage_depends_on_its_own_settings_and_on_no_others(tmp_path):
     assert changed("scene.exposure=false") == changed("scene.decay=cosine") == set()
     scene = room(tmp_path).config.scene
     assert (scene.decay, scene.learning_rate) == (FAST.decay, FAST.learning_rate)  # as advnerf scene train
-    # What the panel shows without an attack is photographed and learned from.
-    assert changed("space.plain_rgb=[0.5, 0.5, 0.5]") == {"capture", "policy"}
-    assert changed("space.resolution=32") == {"policy"}
+    # What a screen shows without an attack is photographed; an overlay is drawn later.
+    assert changed("carrier.plain_rgb=[0.5, 0.5, 0.5]") == {"policy"}
+    assert changed("carrier.resolution=32") == {"policy"}
     assert changed("held_cap_m=2") == set()
     assert changed("horizon=50") == {"bake", "policy"}
 

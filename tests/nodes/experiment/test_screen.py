@@ -91,8 +91,8 @@ def seen_on_the_face(sensor, experiment):
 def test_an_attack_looks_through_the_display_model_where_a_monitor_shows_it_and_it_is_on(
     tmp_path, file, display_model, seen
 ):
-    override = f"space.display_model={str(display_model).lower()}"
-    asked = load_experiment(LAUNCH / f"{file}.experiment.yaml", "demo", [override], tmp_path)
+    changes = [f"carrier.display_model={str(display_model).lower()}"] if file == "monitor" else []
+    asked = load_experiment(LAUNCH / f"{file}.experiment.yaml", "demo", changes, tmp_path)
     asked.calibration_folder.mkdir(parents=True)
     save_calibration(
         DisplayCalibration(date=LAB_DATE, method=METHOD, model=SEEN_AS.to_dict()),

@@ -6,6 +6,7 @@ import pytest
 from pydantic import TypeAdapter
 
 from nodes.experiment.engine.artefact import ReferenceBuild, Settings
+from nodes.experiment.plan.carriers import CarrierConfig
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.space_config import SpaceConfig
 from nodes.experiment.run.cells import Bench, keep_build, run_cell
@@ -47,9 +48,11 @@ def test_defaults_that_are_not_in_keys_are_of_their_versions():
 
 
 def test_tags_of_unions_stay_in_keys():
-    kinds = [{"kind": kind} for kind in ("colours", "places", "mesh_texture", "mesh_shape", "face")]
-    keyed = [Settings.of(TypeAdapter(SpaceConfig).validate_python(kind)).keyed for kind in kinds]
-    assert keyed == kinds
+    kinds = [{"kind": kind} for kind in ("colours", "places", "mesh_texture", "mesh_shape")]
+    carriers = [{"kind": kind} for kind in ("overlay", "screen", "composed", "native")]
+    for union, members in ((SpaceConfig, kinds), (CarrierConfig, carriers)):
+        read = [TypeAdapter(union).validate_python(member) for member in members]
+        assert [Settings.of(each).keyed for each in read] == members
 
 
 def test_a_machine_that_has_only_the_reference_build_runs_the_same_cells(tiny_room, tmp_path, monkeypatch):

@@ -1,0 +1,272 @@
+"""Sections of the experiment file: what is captured, learned, attacked, measured and retrained, in settings."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from advnerf_core.attack.objectives import CTE
+from advnerf_core.policies.architecture import PILOTNET, Architecture, require_architecture
+from advnerf_core.strict import StrictModel
+from nodes.experiment.plan.method_names import ArchitectureReference, ObjectiveReference
+from nodes.experiment.plan.robustness_config import RobustnessConfig
+
+Count = Annotated[int, Field(ge=0)]
+Positive = Annotated[int, Field(ge=1)]
+PositiveNumber = Annotated[float, Field(gt=0)]
+# Fields of the section policy that make the network; its description stands for them in keys.
+NETWORK = {"architecture", "configuration", "hidden"}
+Unit = Annotated[float, Field(ge=0, le=1)]
+
+
+class CaptureConfig(StrictModel):
+    """How the world is photographed."""
+
+    photos: Positive = Field(default=450, description="Posed photographs that the scene is learned from.")
+    held_out: Annotated[int, Field(ge=3)] = Field(
+        default=36, description="Views of the driving camera along the paths that nothing learns from."
+    )
+    colour_pairs: Count = Field(
+        default=0,
+        description="Views of the driving camera that fit a colour map, where photographs have colours of their own.",
+    )
+    driven_m: PositiveNumber = Field(
+        default=36.0,
+        description="Views of the driving camera lie so far along each path that does not close [m].",
+    )
+    seed: int = 0
+
+
+class SceneConfig(StrictModel):
+    """How the radiance field is trained; the length is in steps, so that the result does not depend on the machine."""
+
+    steps: Positive = Field(default=1500, description="Training iterations.")
+    levels: Annotated[int, Field(ge=1, le=20)] = Field(default=8, description="Levels of the hash grid.")
+    finest: Positive = Field(
+        default=2048, description="Cells of its finest level along the box's longest side."
+    )
+    log2_entries: Annotated[int, Field(ge=10, le=24)] = Field(
+        default=18, description="Entries of a level of the hash grid, as a power of two."
+    )
+    occupancy: Positive = Field(
+        default=128, description="Cells of the occupancy grid along the box's longest side."
+    )
+    refine_depth: PositiveNumber = Field(
+        default=0.005, description="Optical depth from which rendering looks into a cell; see TrainConfig."
+    )
+    margin_m: Annotated[float, Field(ge=0)] = Field(
+        default=0.5,
+        description="The learned box reaches so far beyond the world's, if that is not contracted [m].",
+    )
+    near_m: PositiveNumber = Field(default=0.3, description="Nothing stands nearer to the cameras [m].")
+    interval_px: PositiveNumber | None = Field(
+        default=None,
+        description="Sample intervals in pixels of the policy's view; none: the default of pixel_intervals.",
+    )
+    decay: Literal["exponential", "cosine"] = Field(
+        default="cosine",
+        description="How the learning rate falls; cosine stays high for longer.",
+    )
+    learning_rate: PositiveNumber = Field(
+        default=0.02,
+        description="Learning rate at the start.",
+    )
+    exposure: bool = Field(
+        default=False,
+        description="Learn a gain per channel for each photograph; for worlds whose camera chooses its exposure.",
+    )
+    seed: int = 0
+
+
+class ViewConfig(StrictModel):
+    """What the policy sees of the driving camera: a window of its image, resized to 200 x 66; the default fits 336 x 188."""
+
+    crop_top_px: Count = Field(default=24, description="First row that is kept.")
+    crop_height_px: Positive = Field(default=111, description="Number of rows that are kept.")
+    crop_left_px: Count = Field(default=0, description="First column that is kept.")
+    crop_width_px: Positive | None = Field(
+        default=None, description="Number of columns that are kept; none: all to the right edge."
+    )
+
+
+class PolicyConfig(StrictModel):
+    """How the goal-conditioned policy is trained: frames per path and domain, rounds, optimiser steps."""
+
+    stiffness_1pm: PositiveNumber = Field(
+        default=0.2, description="How firmly the expert returns to the path [1/m]; see ExpertConfig."
+    )
+    feed_forward: Annotated[float, Field(ge=0, le=1)] = Field(
+        default=1.0, description="Share of the path's curvature that the expert steers ahead."
+    )
+    delay_s: Annotated[float, Field(ge=0)] = Field(
+        default=0.1,
+        description="What the expert looks ahead by: half a tick and part of the deployed car's lag [s].",
+    )
+    smoothing_m: PositiveNumber | None = Field(
+        default=None,
+        description="The expert averages the path's curvature over this [m]; none: the way of one tick.",
+    )
+    driven_m: PositiveNumber | None = Field(
+        default=44.0, description="Frames are taken so far along each path [m]; none: all along."
+    )
+    drives_from_m: PositiveNumber | None = Field(
+        default=12.0,
+        description="DAgger drives start so far along each path at most, so that they pass the junction [m]; none: anywhere.",
+    )
+    stills_heading_rad: PositiveNumber = Field(
+        default=0.3, description="Stills are turned up to this much from the path [rad]."
+    )
+    drives_heading_rad: PositiveNumber = Field(
+        default=0.12, description="DAgger drives start turned up to this much [rad]."
+    )
+    own_car: bool = Field(
+        default=False,
+        description="Drives in the deployment scene are those of its own car, with its lag, one after another; else the surrogate's.",
+    )
+    learns_in: tuple[tuple[str, ...], ...] = Field(
+        default=(),
+        description="Places that the victim learns in instead of the attacked one and its learned scene: changes of the section world, as --set takes "
+        "them, one list per place. deployed_stills and deployed_drives are then those of each place, and half of them show no object.",
+    )
+    deployed_stills: Count = Field(default=320, description="Poses about each path in the deployment scene.")
+    surrogate_stills: Count = Field(default=240, description="The same in the surrogate.")
+    deployed_drives: Count = Field(
+        default=3, description="Drives on each path in the deployment scene, per DAgger round."
+    )
+    surrogate_drives: Count = Field(default=3, description="The same in the surrogate.")
+    drive_steps: Positive = Field(
+        default=60, description="Control ticks of such a drive; finer ticks need more."
+    )
+    dagger_rounds: Count = Field(default=2, description="Rounds of DAgger.")
+    first_steps: Positive = Field(default=800, description="Optimiser steps of behaviour cloning.")
+    round_steps: Positive = Field(default=300, description="Optimiser steps after each round.")
+    naive_steps: Count = Field(
+        default=1400,
+        description="Optimiser steps of the victim that never sees a random texture, as many as the hardened one's in all; 0: none.",
+    )
+    hidden: tuple[int, int, int] = Field(
+        default=(200, 100, 20),
+        description="Widths of PilotNet's linear layers; other architectures do not read them.",
+    )
+    architecture: ArchitectureReference = Field(
+        default=PILOTNET,
+        description="pilotnet, resnet, vit_tiny, an installed package's, or file.py:Class relative to the experiment file.",
+    )
+    configuration: dict[str, Any] = Field(
+        default={},
+        description="Settings of the architecture; those of pilotnet are the key hidden.",
+    )
+    seed: int = 0
+
+    @model_validator(mode="after")
+    def _fits_the_architecture(self) -> PolicyConfig:
+        if self.architecture == PILOTNET and self.configuration:
+            raise ValueError(
+                f"expected no policy.configuration with the architecture pilotnet, got {', '.join(self.configuration)}; set policy.hidden"
+            )
+        require_architecture(self.architecture, None, self.configuration)
+        return self
+
+    @property
+    def network(self) -> Architecture:
+        """The architecture with its settings."""
+        own = {"hidden": self.hidden} if self.architecture == PILOTNET else self.configuration
+        return Architecture(self.architecture, own)
+
+    @property
+    def recipe(self) -> dict[str, Any]:
+        """How a policy is trained, as JSON data: of a user's architecture its code, not the place of its file."""
+        return self.model_dump(mode="json", exclude=NETWORK) | self.network.described()
+
+
+class ObjectConfig(StrictModel):
+    """How the objects are made; where they stand is the section objects."""
+
+    car_resolution: Annotated[int, Field(ge=8, le=128)] = Field(
+        default=64, description="Voxels along a car's longest side."
+    )
+    hydrant_resolution: Annotated[int, Field(ge=8, le=128)] = Field(
+        default=48, description="The same of a hydrant."
+    )
+    mesh_resolution: Annotated[int, Field(ge=8, le=128)] = Field(
+        default=48, description="The same of a mesh of your own."
+    )
+    fit_steps: Count = Field(default=300, description="Steps that refine the voxels on pictures of the mesh.")
+    panel_resolution: Annotated[int, Field(ge=2, le=128)] = Field(
+        default=64, description="Colours along each edge of a panel."
+    )
+    panel_rgb: tuple[Unit, Unit, Unit] = Field(
+        default=(0.5, 0.5, 0.5),
+        description="Colour of a panel without an attack.",
+    )
+
+
+class MeasureConfig(StrictModel):
+    """From where finished attacks are measured, in both domains: the same starts for all methods and seeds."""
+
+    starts: Positive = Field(default=5, description="Starts, none of which a search had.")
+    seed: int = Field(default=10_000, description="Of the starts.")
+
+
+class AttackConfig(StrictModel):
+    """The adversary, and what it may spend: all methods evaluate equally often."""
+
+    objective: ObjectiveReference = Field(
+        default=CTE,
+        description="What is maximised: cte, peak, time_off_track, collision, or file.py:Class, relative to the experiment file.",
+    )
+    starts: Positive = Field(
+        default=1, description="Start poses optimised together; the first of seed 0 is the nominal one."
+    )
+    nominal_start: bool = Field(
+        default=False, description="The first start of every seed is the nominal one, not of seed 0 alone."
+    )
+    start_sigma: Annotated[float, Field(ge=0)] = Field(
+        default=0.1, description="Spread of starts [m and rad]; headings a quarter of it."
+    )
+    evaluations: Positive = Field(default=50, description="Closed-loop evaluations of each search.")
+    horizon: Positive | None = Field(
+        default=None,
+        description="Control ticks of the drives that are optimised; none: all that are measured.",
+    )
+    learning_rate: PositiveNumber = 0.1
+    random_sigma: PositiveNumber = Field(default=5.0, description="Spread of the random textures' theta.")
+    cem_population: Annotated[int, Field(ge=4)] = Field(default=10, description="Candidates of a generation.")
+    robustness: RobustnessConfig = Field(
+        default=RobustnessConfig(),
+        description="What the attacks shall bear, in expectation.",
+    )
+    time_batch: Positive = Field(default=16, description="Frames per gradient batch.")
+    cache_mib: Annotated[float, Field(ge=0)] = Field(
+        default=512.0, description="Budget of the frame cache [MiB]."
+    )
+
+
+class RetrainConfig(StrictModel):
+    """The defence: how often the victim answers the attack, and what it learns from."""
+
+    rounds: Positive = Field(default=1, description="Rounds of attack and retraining, at most.")
+    pays_ratio: PositiveNumber = Field(
+        default=1.5,
+        description="The loop ends when no attack's total CTE in the surrogate is this many times that of none.",
+    )
+    stills: Positive = Field(
+        default=120, description="Poses about each path, per domain, seen plain and with a found texture."
+    )
+    drives: Positive = Field(
+        default=2,
+        description="Pairs of the victim's drives on each path, per domain: past plain objects and past a found texture.",
+    )
+    drive_steps: Positive = Field(
+        default=60, description="Control ticks of such a drive; finer ticks need more."
+    )
+    placements: Count = Field(
+        default=0,
+        description="Random places of all objects in random colours that the victim also learns from; see poses.py.",
+    )
+    steps: Positive = Field(default=500, description="Optimiser steps of the fine-tuning.")
+    new_share: Annotated[float, Field(gt=0, lt=1)] = Field(
+        default=0.4, description="Share of new frames in the training."
+    )
+    seed: int = 0
