@@ -90,17 +90,17 @@ def check_carrier(
         ValueError: It does not.
     """
     if isinstance(carrier, FaceCarrier):
-        unwanted = {
-            "space.kind colours": not isinstance(space, ColoursConfig),
-            "no objects": bool(objects),
-            "no retrain": retrains,
-            "measure.no_object off (set deploy.empty_scene instead)": no_object,
-            "no deploy.world": deploy.world is not None,
+        there = {
+            "space.kind colours": "" if isinstance(space, ColoursConfig) else space.kind,
+            "no objects": ", ".join(each.name for each in objects),
+            "no retrain": "it" * retrains,
+            "no control empty in over.method (set deploy.empty_scene instead)": "it" * no_object,
+            "no deploy.world": "" if deploy.world is None else str(deploy.world.get("kind")),
         }
-        for wanted, wrong in unwanted.items():
-            if wrong:
+        for wanted, found in there.items():
+            if found:
                 raise ValueError(
-                    f"expected {wanted} with carrier.kind {carrier.kind}, as one face on a panel of the world is all that is attacked, got another"
+                    f"expected {wanted} with carrier.kind {carrier.kind}, which attacks one face on a panel of the captured world, got {found}"
                 )
         return
     if deploy.live:

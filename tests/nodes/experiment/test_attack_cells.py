@@ -315,7 +315,8 @@ def test_the_control_without_objects_is_asked_for(trained: Experiment, tmp_path:
     }
     room = Path(__file__).parents[3] / "launch" / "room.experiment.yaml"
     with pytest.raises(
-        ConfigError, match=r"control empty in over\.method only where objects are attacked.*empty_scene"
+        ConfigError,
+        match=r"no control empty in over\.method \(set deploy\.empty_scene instead\) with carrier\.kind overlay",
     ):
         run.load_experiment(room, "full", ["over.method=[none,empty,gradient]"], tmp_path)
 
