@@ -44,7 +44,7 @@ def test_settings_lie_over_the_file_and_the_command_line_over_both(tmp_path):
         ),
         (["carrier={kind: screen, panel: board}"], r"expected carrier\.kind overlay with the panel board"),
         (["space={kind: places}"], r"space\.kind colours with carrier\.kind overlay"),
-        (["measure.no_object=true"], r"set deploy\.empty_scene instead"),
+        (["over.method=[none,empty,gradient]"], r"set deploy\.empty_scene instead"),
         (["carrier.panel=door"], r"carrier\.panel: .*board, monitor.*door"),
         (["world.camera.widht=3"], r"unknown key camera\.widht"),
         (["capture.colour_pairs=0"], r"colour_pairs of at least 1.*world lab have colours of their own"),
