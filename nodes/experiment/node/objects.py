@@ -33,7 +33,7 @@ class Face:
 
 
 @dataclass(frozen=True, eq=False)
-class PlacedObject:
+class LoadedObject:
     """An object of a request in the scene.
 
     Attributes:
@@ -49,7 +49,7 @@ class PlacedObject:
     sha256: str
 
 
-def place(wanted: ObjectRequest) -> PlacedObject:
+def place(wanted: ObjectRequest) -> LoadedObject:
     """Make the object of a request.
 
     Raises:
@@ -61,7 +61,7 @@ def place(wanted: ObjectRequest) -> PlacedObject:
         return _from_file(wanted)
     if wanted.mesh is not None:
         mesh, sha256 = mesh_field(wanted.mesh, wanted.pose, wanted.scale)
-        return PlacedObject(mesh_name(wanted.mesh), mesh, None, sha256)
+        return LoadedObject(mesh_name(wanted.mesh), mesh, None, sha256)
     field = cube_face_object(
         wanted.size_m,
         wanted.resolution,
@@ -71,10 +71,10 @@ def place(wanted: ObjectRequest) -> PlacedObject:
         depth_m=wanted.size_m if wanted.kind == "cube" else 0.01,
     )
     field = _scaled(field, wanted.scale)
-    return PlacedObject(wanted.kind, field, _face(wanted), field.sha256)
+    return LoadedObject(wanted.kind, field, _face(wanted), field.sha256)
 
 
-def _from_file(wanted: ObjectRequest) -> PlacedObject:
+def _from_file(wanted: ObjectRequest) -> LoadedObject:
     assert wanted.file is not None
     if wanted.free == "face" or wanted.target is not None:
         raise ConfigError(
@@ -83,7 +83,7 @@ def _from_file(wanted: ObjectRequest) -> PlacedObject:
     field = load_object(wanted.file).placed(wanted.pose, wanted.scale)
     if wanted.levels:
         field = with_summed_levels(field, wanted.levels, finest=max(field.slots.shape))
-    return PlacedObject(wanted.file.name.partition(".")[0], field, None, field.sha256)
+    return LoadedObject(wanted.file.name.partition(".")[0], field, None, field.sha256)
 
 
 def _scaled(field: VoxelGridObject, scale: float) -> VoxelGridObject:

@@ -45,13 +45,13 @@ from calibration.display_colour import DisplayCalibration
 from calibration.schema import CameraCalibration, RoomCalibration, VehicleCalibration, load_calibration
 from nodes.experiment.engine.artefact import Settings, hash_of
 from nodes.experiment.node.meshes import found_meshes, shape_sensor
-from nodes.experiment.node.objects import PlacedObject, place
+from nodes.experiment.node.objects import LoadedObject, place
 from nodes.experiment.node.request import AttackRequest
 from nodes.lab.policy_camera import require_camera
 from nodes.runtime.errors import ConfigError
 
 # Raised when what a search finds changes with the same request, or a default of requests does.
-VERSION = 1
+VERSION = 2  # 2: starts are drawn as those of experiments
 # What a search does not depend on: where files lie, its name, length and memory, and what is an input of `request_hash`.
 FREE: Mapping[str, Any] = {
     **dict.fromkeys(("name", "scene", "policy", "calibration", "camera", "vehicle", "room"), True),
@@ -79,7 +79,7 @@ class Prepared:
     problem: AttackProblem
     surrogate: Surrogate
     policy: LoadedPolicy
-    objects: tuple[PlacedObject, ...]
+    objects: tuple[LoadedObject, ...]
     hashes: dict[str, str]
     seed: int
 
@@ -258,7 +258,8 @@ def start_states(request: AttackRequest, room: RoomCalibration, dynamics: Dynami
     if starts.poses:
         poses = torch.tensor(starts.poses, dtype=torch.float64)
     else:
-        poses = draw_start_states(starts.nominal or room.start_pose, starts.count, starts.sigma, seed)
+        nominal, first = starts.nominal or room.start_pose, seed == 0 or starts.nominal_start
+        poses = draw_start_states(nominal, starts.count, starts.sigma, seed, nominal_first=first)
     # Drives of one start pose differ by what is drawn in them.
     poses = poses.repeat_interleave(request.robustness.repeats, dim=0)
     return torch.nn.functional.pad(poses, (0, dynamics.state_size - 3))

@@ -136,8 +136,13 @@ class StartsRequest(StrictModel):
     nominal: tuple[float, float, float] | None = Field(
         default=None, description="x [m], y [m], yaw [rad]; the room's own start if it is not given."
     )
-    count: Count = Field(default=1, description="How many are drawn; the first is the nominal one.")
-    sigma: NotNegative = Field(default=0.1, description="Spread of the others [m and rad].")
+    count: Count = Field(default=1, description="How many are drawn; the first of seed 0 is the nominal one.")
+    nominal_start: bool = Field(
+        default=False, description="The first start of every seed is the nominal one, not of seed 0 alone."
+    )
+    sigma: NotNegative = Field(
+        default=0.1, description="Spread of starts [m and rad]; headings a quarter of it."
+    )
 
 
 class DynamicsRequest(StrictModel):

@@ -10,9 +10,9 @@ from functools import cached_property
 from pathlib import Path as FilePath
 from typing import Any
 
-import numpy as np
 import torch
 
+from advnerf_core.attack.search.search import draw_start_states
 from advnerf_core.documents import Document, read_json
 from advnerf_core.driving.dynamics import Ackermann, Dubins
 from advnerf_core.driving.expert import Expert, ExpertConfig
@@ -400,24 +400,17 @@ class Experiment(Variants):
         Searches get others from `measured_starts`.
         """
         wanted = self.config.attack
-        noise = self._start_noise(scenario, seed, wanted.starts)
-        if seed == 0 or wanted.nominal_start:
-            noise[0] = 0.0
-        return self._starts(scenario, noise)
+        first = seed == 0 or wanted.nominal_start
+        return self._starts(scenario, wanted.starts, seed, nominal_first=first)
 
     def measured_starts(self, scenario: str) -> torch.Tensor:
         """Start poses ``[M, 3]`` float64 from which all methods and seeds are measured, about the nominal one; no search has them."""
         wanted = self.config.measure
-        return self._starts(scenario, self._start_noise(scenario, wanted.seed, wanted.starts))
+        return self._starts(scenario, wanted.starts, wanted.seed, nominal_first=False)
 
-    def _start_noise(self, scenario: str, seed: int, count: int) -> Array:
-        generator = np.random.default_rng([seed, self.config.paths.index(scenario)])
-        return generator.standard_normal((count, 3))
-
-    def _starts(self, scenario: str, noise: Array) -> torch.Tensor:
-        # A tenth of a radian at the start would be 2.4 m of error at the junction.
-        spread = self.config.attack.start_sigma * np.array([1.0, 1.0, 0.25])
-        return torch.from_numpy(np.array(self.references[scenario].drive_start) + spread * noise)
+    def _starts(self, path: str, count: int, seed: int, nominal_first: bool) -> torch.Tensor:
+        number, sigma = self.config.paths.index(path), self.config.attack.start_sigma
+        return draw_start_states(self.references[path].drive_start, count, sigma, seed, number, nominal_first)
 
 
 def as_json(description: WorldDescription) -> dict[str, Any]:
