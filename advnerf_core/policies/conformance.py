@@ -308,7 +308,10 @@ def _range(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
         text = f"steers {steering[0]:.4f} rad whatever it sees; check the range of values (value_max) and that the weights are loaded"
         return Finding("range", FAILURE, text)
     if largest > LARGEST_STEERING_RAD:
-        text = f"steers up to {largest:.3g} rad, more than any car can; set output_unit = 'deg' if the network was trained on degrees"
+        advice = "set output_unit = 'deg' if the network was trained on degrees"
+        if examined.policy.contract.trajectory is not None:
+            advice = "check that the waypoints are in metres in the car's frame, x forward first, and wheelbase_m and lookahead_m"
+        text = f"steers up to {largest:.3g} rad, more than any car can; {advice}"
         return Finding("range", FAILURE, text)
     return Finding("range", OK, f"steers {steering.min():+.3f} to {steering.max():+.3f} rad, left positive")
 

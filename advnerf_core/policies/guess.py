@@ -17,6 +17,7 @@ from advnerf_core.policies.memory import NetworkState
 from advnerf_core.policies.tensors import FLOATS, UINT8, TensorInfo
 from advnerf_core.policies.tracker import TrackedTrajectory
 from advnerf_core.policies.view import IMAGE_HEIGHT, IMAGE_WIDTH, PolicyView
+from advnerf_core.strict import StrictModel
 
 _STEERING_WORDS = ("steer", "angle", "curvature")
 _WAYPOINT_WORDS = ("waypoint", "traj", "plan")
@@ -148,7 +149,7 @@ def _of_image(image: TensorInfo, value_max: float | None) -> tuple[dict[str, Any
     view = PolicyView(camera, crop_top_px=0, crop_height_px=height, width=width, height=height)
     found: dict[str, Any] = {"view": view, "layout": layout}
     size = "" if (height, width) == (rows, columns) else f" and in which size (not fixed in {image})"
-    text = f"For which camera is it, and which part of its picture does it see{size}?"
+    text = f"For which camera is it (the lens is a guess), and which part of its picture does it see{size}?"
     questions.append(Question("view", text))
     colours, count = _stack(channels, times)
     if count is not None:
@@ -228,7 +229,7 @@ def _of_output(outputs: list[TensorInfo]) -> tuple[dict[str, Any], list[Question
     if chosen in planned:
         times = tuple(_WAYPOINTS_S * number for number in range(1, _waypoints(chosen) + 1))
         found["trajectory"] = TrackedTrajectory(times_s=times, lookahead_m=1.0, wheelbase_m=1.0)
-        text = f"At which times are the waypoints {chosen}, and which lookahead distance and wheelbase has the tracker?"
+        text = f"At which times are the waypoints of {chosen}, and which lookahead distance and wheelbase has the tracker?"
         return found, [*questions, Question("trajectory", text), side]
     columns = _last(chosen) if chosen.shape is not None and len(chosen.shape) == 2 else None
     if columns is not None and columns > 1:
@@ -266,10 +267,17 @@ def declaration_text(contract: PolicyContract, questions: Sequence[Question]) ->
     asked = {each.key: each for each in questions}
     lines = []
     for name in dict.fromkeys(("view", *plain)):
-        if name not in asked and name != "view" and plain[name] == default.get(name):
-            continue
+        if name not in asked and (name == "stateless" or plain[name] == default.get(name)):
+            continue  # what states say, or what it is without the key
         if question := asked.get(name):
             choices = f" ({' or '.join(question.choices)})" if question.choices else ""
             lines.append(f"# {question.text}{choices}")
-        lines.append(f"{name}: {json.dumps(plain[name])}")
+        lines.append(f"{name}: {json.dumps(_whole(getattr(contract, name), plain[name]))}")
     return "\n".join([*lines, ""])
+
+
+def _whole(value: Any, plain: Any) -> Any:
+    """A section with its defaults, which can then be seen and changed."""
+    if isinstance(value, tuple) and value and isinstance(value[0], StrictModel):
+        return [each.model_dump(mode="json") for each in value]
+    return value.model_dump(mode="json") if isinstance(value, StrictModel) else plain

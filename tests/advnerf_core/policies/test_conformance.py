@@ -273,5 +273,10 @@ def test_waypoints_and_stacks_are_checked_too():
     assert (
         "set positive = 'left'" in findings(Sees().eval(), replace(contract, positive="right"))["expert"].text
     )
+    short = replace(contract, trajectory=tracked.model_copy(update={"wheelbase_m": 50.0}))
+    assert (
+        "check that the waypoints are in metres"
+        in check_policy(adapt(Sees().eval(), short), reference()[0])[-1].text
+    )
     wrong = replace(contract, frames=FrameStack(count=3, axis="channels"))
     assert findings(Sees().eval(), wrong)["input"].verdict == FAILURE

@@ -9,7 +9,7 @@ from onnx import TensorProto, helper
 from torch import nn
 
 from advnerf_core.policies.contract import PolicyContract, PolicyContractError
-from advnerf_core.policies.guess import guess_contract
+from advnerf_core.policies.guess import declaration_text, guess_contract
 from advnerf_core.policies.load import load_any_policy
 from advnerf_core.policies.pilotnet import PilotNet
 from advnerf_core.policies.policy_file import save_policy
@@ -110,6 +110,9 @@ def test_memory_and_goal_are_told_apart(tmp_path):
     ]
     assert (contract.goal_size, contract.input_name, contract.output_name) == (1, "image", "steering")
     assert {"states", "goal_size"} <= {each.key for each in questions}
+    text = declaration_text(contract, questions)
+    assert "initial" in text, "what can be changed is seen"
+    assert PolicyContract.from_dict(yaml.safe_load(text)) == contract
 
 
 def scaled(folder, layers):
