@@ -90,9 +90,9 @@ def _guessed(
     states = _states(others, outputs)
     carried = {name for state in states for name in (state.input, state.output)}
     others = [each for each in others if each.name not in carried]
-    if len(others) > 1:
+    if len(others) > 1 or not all(each.may_have_rank(2) for each in others):
         raise PolicyContractError(
-            f"{path}: expected images, at most one goal, and states with an output of the same shape, got the inputs "
+            f"{path}: expected images, at most one goal [B, N], and states with an output of the same shape, got the inputs "
             f"{', '.join(map(str, inputs))}; write a factory for it (docs/policies.md)"
         )
     if states:
@@ -189,12 +189,18 @@ def _stack(channels: int, times: Any) -> tuple[int, int | None]:
 
 def _states(inputs: list[TensorInfo], outputs: list[TensorInfo]) -> tuple[NetworkState, ...]:
     """Inputs that an output has the name or, if they are long, the shape of, in the order of the file."""
-    states, left = [], [each for each in outputs if not _steers(each)]
+    states: list[NetworkState] = []
+    left = [each for each in outputs if not _steers(each)]
     for given in inputs:
         fitting = [each for each in left if _alike(each, given) and given.kind in FLOATS]
         namesakes = [each for each in fitting if given.name.removesuffix("_in") in each.name]
         chosen = next(iter(namesakes or fitting), None)
-        if chosen is not None and (namesakes or (_last(given) or 0) >= _LONG):
+        # One output is left, which steers.
+        if (
+            chosen is not None
+            and len(outputs) - len(states) > 1
+            and (namesakes or (_last(given) or 0) >= _LONG)
+        ):
             left.remove(chosen)
             states.append(NetworkState(input=given.name, output=chosen.name, batch_axis=_batch_axis(given)))
     return tuple(states)

@@ -115,6 +115,16 @@ def test_memory_and_goal_are_told_apart(tmp_path):
     assert PolicyContract.from_dict(yaml.safe_load(text)) == contract
 
 
+def test_an_output_is_left_to_steer_and_what_is_no_goal_is_refused(tmp_path):
+    image, long = ("image", FLOAT, ["B", 3, 66, 200]), ["B", 64]
+    contract, _ = guess_contract(
+        model(tmp_path, [image, ("command", FLOAT, long)], [("scores", FLOAT, long)])
+    )
+    assert (contract.states, contract.goal_size) == ((), 64)
+    with pytest.raises(PolicyContractError, match=r"at most one goal \[B, N\].*depth .*write a factory"):
+        guess_contract(model(tmp_path, [image, ("depth", FLOAT, ["B", 1, 33, 100])], [STEERING]))
+
+
 def scaled(folder, layers):
     """A file whose images go through constants ``(operation, value)`` and then a mean."""
     nodes, weights, name = [("Cast", ["images"], ["cast"], {"to": FLOAT})], {}, "cast"
