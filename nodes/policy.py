@@ -42,6 +42,7 @@ class PolicyNodeConfig(StrictModel):
         sha256: Expected hash of the policy; empty accepts any.
         image_topic: Topic of the images, raw or compressed.
         speed_mps: Speed of the commands [m/s].
+        planned_speed: Drive at the speed that the policy's waypoints imply, at most ``speed_mps``. Predictions assume a constant speed.
         max_age_s: Largest age of an image since capture and since publication [s].
         goal: Goal vector of a goal-conditioned policy.
     """
@@ -50,6 +51,7 @@ class PolicyNodeConfig(StrictModel):
     sha256: str = ""
     image_topic: str = "/compositor/image"
     speed_mps: float = Field(default=0.8, ge=0.0, le=2.0)
+    planned_speed: bool = False
     max_age_s: float = Field(default=0.15, gt=0.0, le=0.5)
     goal: tuple[float, ...] = ()
 
@@ -63,6 +65,7 @@ class PolicyNode(Node):
         speed_mps: Speed of the commands [m/s].
         max_age_s: Largest age of an image [s].
         goal: Goal vector, of the length that the policy expects.
+        planned_speed: Whether the waypoints of the policy say the speed, up to ``speed_mps``.
     """
 
     publications = (_DRIVE,)
@@ -75,15 +78,20 @@ class PolicyNode(Node):
         speed_mps: float = 0.8,
         max_age_s: float = 0.15,
         goal: tuple[float, ...] = (),
+        planned_speed: bool = False,
     ) -> None:
         if len(goal) != driver.goal_size:
             raise ConfigError(
                 f"expected a goal of {driver.goal_size} numbers for this policy, got {len(goal)}; set 'goal'"
             )
+        if planned_speed and driver.contract.trajectory is None:
+            raise ConfigError(
+                "expected a policy that answers with waypoints for planned_speed, got one that steers; leave planned_speed out"
+            )
         self.subscriptions = (image_topic,)
         self._driver = driver
         self._goal = goal
-        self._speed_mps = speed_mps
+        self._speed_mps, self._planned_speed = speed_mps, planned_speed
         self._max_age_ns = round(max_age_s * NS_PER_S)
         self._counts = {"images": 0, "dropped_stale": 0, "dropped_bad": 0}
         self._inference_ms = 0.0
@@ -100,7 +108,9 @@ class PolicyNode(Node):
         # One thread: with one image at a time, more would take cores from the other nodes and add wake-up delays.
         cv2.setNumThreads(1)
         driver = load_driver(config.policy, config.sha256 or None)
-        return cls(driver, config.image_topic, config.speed_mps, config.max_age_s, config.goal)
+        return cls(
+            driver, config.image_topic, config.speed_mps, config.max_age_s, config.goal, config.planned_speed
+        )
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Compute a command from an image, unless the image is too old or does not fit the policy."""
@@ -132,13 +142,13 @@ class PolicyNode(Node):
             return []
         if self._last_drive_ns is not None and now.mono_ns - self._last_drive_ns > _MEMORY_GAP_S * NS_PER_S:
             self._driver.reset()
-        steering_rad = self._steer(rgb)
-        if not np.isfinite(steering_rad):
+        steering_rad, speed_mps = self._command(rgb)
+        if not np.isfinite([steering_rad, speed_mps]).all():
             self._drop("dropped_bad", "the policy's output is not finite")
             return []
         self._trouble, self._fault = "", False
         self._last_drive_ns = now.mono_ns
-        return [Out(_DRIVE, drive_message(self._speed_mps, steering_rad, capture_ns))]
+        return [Out(_DRIVE, drive_message(speed_mps, steering_rad, capture_ns))]
 
     def tick(self, now: Now) -> list[Out]:
         """Note the time, so that the status shows when images stop."""
@@ -157,17 +167,20 @@ class PolicyNode(Node):
         """Report used and dropped images, and the duration of the last inference [ms]."""
         return {**self._counts, "inference_ms": self._inference_ms}
 
-    def _steer(self, rgb: NDArray[np.uint8]) -> float:
+    def _command(self, rgb: NDArray[np.uint8]) -> tuple[float, float]:
+        """Steering [rad] and speed [m/s]."""
         # This clock only measures the reported duration. No decision depends on it, so replays stay deterministic.
         start = time.perf_counter()
-        steering_rad = self._driver.steer(self._driver.view.image(rgb), self._goal)
+        steering_rad, planned_mps = self._driver.command(self._driver.view.image(rgb), self._goal)
         self._inference_ms = 1e3 * (time.perf_counter() - start)
-        return steering_rad
+        if planned_mps is None or not self._planned_speed:
+            return steering_rad, self._speed_mps
+        return steering_rad, float(np.minimum(planned_mps, self._speed_mps))  # NaN stays
 
     def _warm_up(self) -> None:
         camera = self._driver.view.camera
         for _ in range(_WARM_UP_RUNS):
-            self._steer(np.zeros((camera.height, camera.width, 3), np.uint8))
+            self._command(np.zeros((camera.height, camera.width, 3), np.uint8))
         self._driver.reset()
 
     def _drop(self, counter: str, trouble: str) -> None:

@@ -207,8 +207,8 @@ def _answer(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
         x, y = waypoints[0, -1].tolist()
         speed_mps = float(contract.trajectory.speed_mps(waypoints)[0])
         text += (
-            f", for waypoints up to {x:.2f} m ahead and {y:+.2f} m to the left; their speed, {speed_mps:.2f} m/s, is not used: the cars here "
-            "drive at a constant speed"
+            f", for waypoints up to {x:.2f} m ahead and {y:+.2f} m to the left; their speed, {speed_mps:.2f} m/s, is not used by searches "
+            "and experiments, whose cars have a constant one"
         )
     return Finding("answer", OK, text)
 

@@ -28,7 +28,15 @@ class Driver:
 
     def steer(self, image: NDArray[np.uint8], goal: tuple[float, ...]) -> float:
         """Steering [rad], left positive, of one policy image ``[H, W, 3]`` uint8 RGB."""
-        return float(self.contract.to_steering_rad(self.answer(image, goal), 1)[0])
+        return self.command(image, goal)[0]
+
+    def command(self, image: NDArray[np.uint8], goal: tuple[float, ...]) -> tuple[float, float | None]:
+        """The same, and the speed that the waypoints imply [m/s]; None for a policy without waypoints."""
+        raw, trajectory = self.answer(image, goal), self.contract.trajectory
+        steering_rad = float(self.contract.to_steering_rad(raw, 1)[0])
+        if trajectory is None:
+            return steering_rad, None
+        return steering_rad, float(trajectory.speed_mps(self.contract.waypoints_m(raw, 1))[0])
 
     def answer(self, image: NDArray[np.uint8], goal: tuple[float, ...]) -> Any:
         """The network's raw output for one policy image, as the methods of the declaration take it."""

@@ -148,6 +148,24 @@ def test_a_policy_of_several_images_forgets_them_after_a_gap() -> None:
     assert steered(greys[2], 2001) == pytest.approx(1.5 * 0.8)
 
 
+def test_the_speed_of_waypoints_is_used_where_it_is_asked_for() -> None:
+    tracked = {"times_s": [0.5, 1.0], "lookahead_m": 0.3, "wheelbase_m": 0.25}
+    contract = PolicyContract(VIEW, trajectory=tracked)
+    line = torch.tensor([[0.3, 0.0], [0.6, 0.0]])
+    network = adapt(lambda images: images.mean() * line.expand(len(images), 2, 2), contract)
+    loaded, image = LoadedPolicy(network, VIEW, {}, "ab" * 32), np.full((188, 336, 3), 255, np.uint8)
+
+    def speed(**settings: object) -> float:
+        (out,) = _send(PolicyNode(TorchDriver(loaded), **settings), image_message(image, T0, "camera"))
+        return float(out.message.drive.speed)
+
+    assert speed(speed_mps=0.8) == pytest.approx(0.8)
+    assert speed(speed_mps=0.8, planned_speed=True) == pytest.approx(0.6)
+    assert speed(speed_mps=0.4, planned_speed=True) == pytest.approx(0.4), "the node's own is the limit"
+    with pytest.raises(ConfigError, match="answers with waypoints for planned_speed"):
+        PolicyNode(TorchDriver(_loaded()), planned_speed=True)
+
+
 def test_an_onnx_policy_steers_alike_in_a_process_without_torch(tmp_path: Path) -> None:
     pytest.importorskip("onnxruntime")
     file = tmp_path / "policy.onnx"
