@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from advnerf_core.policies.arrays import array_module
 from advnerf_core.policies.contract import PolicyContractError
 from advnerf_core.policies.memory import initial_memory, joined, split
@@ -65,8 +63,3 @@ class FileNetwork:
                 f"{', '.join(map(str, self.tensors.inputs))}; correct size and layout in the declaration ({reason:.120})"
             ) from error
         return (raw, joined(states, dict(zip(names[1:], following, strict=True)))) if states else raw
-
-
-def as_float(array: Any) -> Any:
-    """An output in a type that conversions are exact enough in: half precision becomes single."""
-    return array.astype(np.float32) if array.dtype == np.float16 else array

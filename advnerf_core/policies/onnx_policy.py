@@ -17,7 +17,7 @@ from advnerf_core.inputs import InputFileError, InputFiles
 from advnerf_core.policies.answer import answer
 from advnerf_core.policies.contract import PolicyContract, PolicyContractError
 from advnerf_core.policies.declaration import ONNX_METADATA_KEY, declaration_beside
-from advnerf_core.policies.file_network import FileNetwork, as_float
+from advnerf_core.policies.file_network import FileNetwork
 from advnerf_core.policies.tensors import UINT8, TensorInfo, chosen_tensors
 
 _KINDS = {"tensor(float)": "float32", "tensor(double)": "float64"}
@@ -43,7 +43,8 @@ class OnnxNetwork(FileNetwork):
     def run(self, feeds: Mapping[str, Any], outputs: list[str]) -> list[Any]:
         """Outputs of ONNX Runtime; half precision becomes single."""
         arrays = {name: _as_kind(feed, self._kinds[name]) for name, feed in feeds.items()}
-        return [as_float(np.asarray(each)) for each in self._session.run(outputs, arrays)]
+        found = [np.asarray(each) for each in self._session.run(outputs, arrays)]
+        return [each.astype(np.float32) if each.dtype == np.float16 else each for each in found]
 
     def steering_rad(self, images: NDArray[Any], goals: NDArray[Any] | None = None) -> NDArray[Any]:
         """Steering ``[B]`` [rad] of images ``[B, 3, H, W]`` RGB 0..1 of a policy without memory: the whole contract, without torch."""
