@@ -20,6 +20,7 @@ from pydantic_core import to_jsonable_python
 
 if TYPE_CHECKING:
     from nodes.experiment.show.context import Experiment
+    from nodes.runtime.progress import StageDisplay
 
 ROOT = Path(__file__).parents[2]
 RECORDED = ROOT / "tests" / "nodes" / "experiment" / "versions.json"
@@ -33,11 +34,12 @@ TINY = (
 )  # fmt: skip
 
 
-def measured(folder: Path) -> dict[str, dict[str, Any]]:
+def measured(folder: Path, watcher: StageDisplay | None = None) -> dict[str, dict[str, Any]]:
     """Version and numbers of every stage and of cells.
 
     Args:
         folder: Gets the run folder.
+        watcher: Receives the starts and ends of the stages.
     """
     os.environ.setdefault("MUJOCO_GL", "egl")
     from advnerf_core.data.transforms import load_transforms
@@ -49,7 +51,7 @@ def measured(folder: Path) -> dict[str, dict[str, Any]]:
     from nodes.experiment.steps.run import make_ready
 
     experiment = tiny_experiment(folder)
-    make_ready(experiment)
+    make_ready(experiment, watcher=watcher)
     views = load_transforms(experiment.stage_folder("capture") / "held_out", require_all=True).load()
     fidelity = json.loads((experiment.stage_folder("scene") / "fidelity.json").read_text())["mean"]
     baked = json.loads((experiment.stage_folder("bake") / "baked.json").read_text())
@@ -112,7 +114,7 @@ def _defaults(
         wanted, unwanted = _part(include, name), _part(exclude, name)
         if not wanted or unwanted is True:
             continue
-        inside = _models_in(field.annotation)
+        inside = models_in(field.annotation)
         for each in inside:
             between = f"{each.__name__}." if len(inside) > 1 else ""
             yield from _defaults(each, wanted, unwanted, f"{at}{name}.{between}")
@@ -133,10 +135,11 @@ def _part(fields: Any, name: str) -> Any:
     return True if fields is True or (fields and name in fields) else None
 
 
-def _models_in(annotation: Any) -> list[type[BaseModel]]:
+def models_in(annotation: Any) -> list[type[BaseModel]]:
+    """Models that an annotation names, also in unions and containers."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
-    return [model for each in get_args(annotation) for model in _models_in(each)]
+    return [model for each in get_args(annotation) for model in models_in(each)]
 
 
 def tiny_experiment(folder: Path, changes: Sequence[str] = ()) -> Experiment:

@@ -16,6 +16,8 @@ class _FaceCarrier(StrictModel):
     """One flat texture on a panel of the world. The space ``colours`` searches it, and nothing else is attacked."""
 
     searched: ClassVar[str] = "The texture of one face is searched in the learned scene"
+    training: ClassVar[None] = None
+    response: ClassVar[Literal["identity"]] = "identity"
 
     panel: str = Field(min_length=1, description="Which of the world's panels carries the face.")
     resolution: Annotated[int, Field(ge=2, le=128)] = Field(

@@ -13,7 +13,7 @@ from advnerf_core.report.evidence.registration import Contrast
 from advnerf_core.scene.gate_limits import GateLimits
 from advnerf_core.strict import StrictModel
 from nodes.experiment.plan import rules
-from nodes.experiment.plan.carriers import CarrierConfig, ComposedConfig
+from nodes.experiment.plan.carriers import CarrierConfig, ComposedConfig, FaceCarrier
 from nodes.experiment.plan.deploy_config import DeployConfig
 from nodes.experiment.plan.over import OverConfig
 from nodes.experiment.plan.placed import WantedObject
@@ -164,19 +164,20 @@ class ExperimentConfig(StrictModel):
 
     @model_validator(mode="after")
     def _follows_the_rules(self) -> ExperimentConfig:
-        retrain = self.retrain
-        rules.check_names(self.paths, self.objects)
+        carrier, objects, retrain = self.carrier, self.objects, self.retrain
+        rules.check_names(self.paths, objects)
         rules.check_victims(self.attacked, self.policy, retrain)
-        rules.check_carrier(
-            self.carrier,
-            self.space,
-            self.objects,
-            self.deploy,
-            no_object=EMPTY in self.conditions,
-            retrains=retrain is not None,
-        )
-        rules.check_training(self.carrier, self.policy, self.objects)
-        rules.check_space(self.space, self.objects, self.attack, self.deploy)
-        rules.check_searches(self.methods, self.seeds, self.measure.seed, retrain)
+        if isinstance(carrier, FaceCarrier):
+            empty = "no control empty in over.method (set deploy.empty_scene instead)"
+            unwanted = {
+                "no retrain": "it" if retrain else "",
+                empty: "it" if EMPTY in self.conditions else "",
+            }
+            rules.check_face(carrier, self.space, objects, self.deploy, unwanted)
+        else:
+            rules.check_objects(carrier, objects, self.deploy, retrain is not None)
+        rules.check_training(carrier, self.policy, objects)
+        rules.check_space(self.space, objects, self.attack, self.deploy)
+        rules.check_searches(self.methods, self.seeds, self.measure.seed, retrain is not None)
         rules.check_drives(self.attack, self.policy, retrain, self.horizon, self.dt_s)
         return self

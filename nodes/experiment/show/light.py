@@ -21,7 +21,6 @@ from calibration.display_colour import (
 from calibration.schema import load_calibration
 from hardware.worlds.paths import Pose
 from hardware.worlds.world import NativePanels, Panel, World
-from nodes.experiment.plan.carriers import ComposedConfig, NativeConfig
 from nodes.experiment.plan.placed import PlacedObject
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.placing import seen_from
@@ -35,15 +34,9 @@ _NAME = "light"
 _LEAST_FREE = 0.4
 
 
-def measures_light(experiment: Experiment) -> bool:
-    """Whether the light on the panel is measured while the world is photographed."""
-    carrier = experiment.config.carrier
-    return isinstance(carrier, ComposedConfig | NativeConfig) and carrier.response == "measured"
-
-
 def light_on_panels(experiment: Experiment) -> DisplayModel | None:
     """The light on the panel, as the capture stage measured it; None where colours are taken to be seen as they are painted."""
-    if not measures_light(experiment):
+    if experiment.config.carrier.response == "identity":
         return None
     return load_calibration(DisplayCalibration, experiment.calibration_folder / LIGHT).display
 

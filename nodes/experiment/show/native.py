@@ -17,8 +17,6 @@ from advnerf_core.geometry import Array
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.surrogate import split_theta
 from hardware.worlds.world import NativePanels, Panel, Rgb, World
-from nodes.experiment.plan.carriers import ComposedConfig, NativeConfig, Way
-from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import Dressed, DressedScene
 from nodes.runtime.errors import ConfigError
 
@@ -28,21 +26,13 @@ _Shown = tuple[tuple[str, bytes, bytes], ...]
 _STANDING: WeakKeyDictionary[Any, _Shown] = WeakKeyDictionary()
 
 
-def object_carrier(experiment: Experiment) -> ComposedConfig | NativeConfig:
-    """The section ``carrier`` of an experiment that attacks objects."""
-    assert isinstance(experiment.config.carrier, ComposedConfig | NativeConfig), (
-        "only asked where objects are attacked"
-    )
-    return experiment.config.carrier
-
-
-def stand_in(view: PolicyView, scene: World, objects: Sequence[ColouredObject], way: Way) -> Dressed:
+def stand_in(view: PolicyView, scene: World, objects: Sequence[ColouredObject], native: bool) -> Dressed:
     """An open deployment scene with objects in it: composed by depth, or as panels of the world's own scene.
 
     Raises:
         ConfigError: The world takes no panels.
     """
-    return DressedScene(scene, view, objects) if way == "composed" else NativeScene(scene, view, objects)
+    return (NativeScene if native else DressedScene)(scene, view, objects)
 
 
 class NativeScene:

@@ -38,7 +38,7 @@ from nodes.experiment.show.deployed import Dressed
 from nodes.experiment.show.faces import PaintedScene, face_space, has_face
 from nodes.experiment.show.frames import DeployedFrames
 from nodes.experiment.show.light import light_on_panels
-from nodes.experiment.show.native import object_carrier, stand_in
+from nodes.experiment.show.native import stand_in
 from nodes.experiment.show.objects import (
     GENERATOR_OF,
     object_file,
@@ -86,7 +86,7 @@ def dress(experiment: Experiment, scene: World, shown: Shown) -> Dressed:
     """An open deployment scene that shows what a search found; see `shown_there` for its colours."""
     if has_face(experiment):
         return PaintedScene(experiment, scene)
-    return stand_in(experiment.view, scene, shown.objects, object_carrier(experiment).kind)
+    return stand_in(experiment.view, scene, shown.objects, experiment.config.carrier.kind == "native")
 
 
 def shown_there(experiment: Experiment, shown: Shown, attack: AttackFile | None) -> Tensor | None:

@@ -19,7 +19,7 @@ from hardware.worlds.world import Photograph, Photographed, World
 from nodes.experiment.show.context import CALIBRATION, PLACED, Experiment
 from nodes.experiment.show.faces import DISPLAY, on_screen, panel_of, plain_screen, wanted_face
 from nodes.experiment.show.learned_scene import HELD_OUT
-from nodes.experiment.show.light import LIGHT, measure_light, measures_light
+from nodes.experiment.show.light import LIGHT, measure_light
 from nodes.experiment.show.placing import as_text, place_by_rule
 from nodes.experiment.show.screen import measure_display, screens_of
 from nodes.runtime.progress import Report, counted
@@ -41,7 +41,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         if experiment.has_rules:
             report(0.0, "placing objects")
             write_atomically(folder / PLACED, as_text(place_by_rule(experiment, scene)))
-        if measures_light(experiment):
+        if experiment.config.carrier.response == "measured":
             report(0.0, "measuring the light on the panel")
             save_calibration(measure_light(experiment, scene).calibration(), folder / CALIBRATION / LIGHT)
         _calibrate(experiment, scene, folder / CALIBRATION, report)

@@ -20,7 +20,7 @@ from advnerf_core.learning.sources import RenderedSource
 from hardware.worlds.world import World
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import seen_in
-from nodes.experiment.show.native import object_carrier, stand_in
+from nodes.experiment.show.native import stand_in
 from nodes.experiment.show.objects import placed_objects, random_theta
 from nodes.experiment.show.placing import place_by_rule
 from nodes.runtime.config import apply_overrides
@@ -84,9 +84,9 @@ def _equal(one: Any, other: Any) -> bool:
 
 def _plans(there: Experiment, world: World, place: str) -> list[SourcePlan]:
     """Sources of one place."""
-    wanted, training = there.config.policy, object_carrier(there).training
-    bare = stand_in(there.view, world, [], training)
-    dressed = stand_in(there.view, world, placed_objects(there), training)
+    wanted, native = there.config.policy, there.config.carrier.training == "native"
+    bare = stand_in(there.view, world, [], native)
+    dressed = stand_in(there.view, world, placed_objects(there), native)
     plain = dressed.plain_theta()
     assert plain is not None, "an experiment that places objects by a rule has some"
     shape, sigma = tuple(plain.shape), there.config.attack.random_sigma

@@ -16,8 +16,6 @@ from nodes.experiment.show import objects
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.faces import has_face
 from nodes.experiment.show.given import given_in, victim_sha256
-from nodes.experiment.show.light import measures_light
-from nodes.experiment.show.native import object_carrier
 from nodes.experiment.steps import bake, capture, live, policy, retrain, scene
 from nodes.launching.launch_file import load_launch
 from nodes.runtime.progress import MeasuringReport
@@ -97,7 +95,7 @@ def _capture(experiment: Experiment) -> Stage:
     if not isinstance(config.carrier, ScreenConfig):
         unread["carrier"] = {"kind", "panel", "plain_rgb", "resolution"}
     # A rule follows the drive that is measured; so does what looks for the light on a panel.
-    if experiment.has_rules or measures_light(experiment):
+    if experiment.has_rules or config.carrier.response == "measured":
         inputs["view"] = experiment.view_settings
     else:
         unread |= dict.fromkeys(("objects", "horizon", "dt_s"), True)
@@ -132,7 +130,7 @@ def _learned_from(experiment: Experiment) -> dict[str, Any]:
         "bake": VERSIONS["bake"],
         "architecture": experiment.config.policy.network.described(),
         # Its default is not the same for all carriers, and whether the deployed drive shows objects otherwise does not matter.
-        "training": None if has_face(experiment) else object_carrier(experiment).training,
+        "training": experiment.config.carrier.training,
     }
 
 

@@ -34,7 +34,7 @@ from nodes.experiment.show.faces import PaintedScene, face_object, face_space, h
 from nodes.experiment.show.images import as_uint8
 from nodes.experiment.show.learned_scene import load_background
 from nodes.experiment.show.light import light_on_panels
-from nodes.experiment.show.native import object_carrier, stand_in
+from nodes.experiment.show.native import stand_in
 from nodes.experiment.show.objects import (
     describe,
     last_result_kept,
@@ -184,7 +184,7 @@ def _object_domains(
     """Objects stand in both scenes, plain or coloured."""
     objects = placed_objects(experiment) if objects is None else objects
     surrogate = surrogate_of(experiment, objects, load_background(experiment))
-    light, carrier = light_on_panels(experiment), object_carrier(experiment)
+    light = light_on_panels(experiment)
     lit = None if light is None else DisplayedSensor(surrogate, light)
 
     def seen(states: Array) -> Show:
@@ -197,7 +197,7 @@ def _object_domains(
         return show
 
     return _Domains(
-        stand_in(experiment.view, scene, objects, carrier.training),
+        stand_in(experiment.view, scene, objects, native=experiment.config.carrier.training == "native"),
         seen,
         surrogate.theta_shape,
     )

@@ -38,7 +38,7 @@ from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import Dressed
 from nodes.experiment.show.drives import deployed_drives
 from nodes.experiment.show.given import victim_spec
-from nodes.experiment.show.native import object_carrier, stand_in
+from nodes.experiment.show.native import stand_in
 from nodes.experiment.show.objects import placed_objects
 from nodes.experiment.show.spaces import colour_space, random_placements
 from nodes.experiment.show.victims import load_victim
@@ -78,7 +78,10 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     thetas: list[torch.Tensor] = []
     with experiment.open_world() as scene:
         dressed = stand_in(
-            experiment.view, scene, placed_objects(experiment), object_carrier(experiment).training
+            experiment.view,
+            scene,
+            placed_objects(experiment),
+            native=experiment.config.carrier.training == "native",
         )
         told = _part(report, 0.0, 1.0 / (wanted.rounds + 1), "round 0")
         first = _first_attacks(experiment, space, dressed, victim, folder / "round0", told)

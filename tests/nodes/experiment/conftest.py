@@ -25,6 +25,7 @@ from nodes.experiment.show.given import victim_spec
 from nodes.experiment.show.learned_scene import scene_file
 from nodes.experiment.show.objects import build, object_file
 from nodes.experiment.steps.run import load_experiment
+from tests.support.setting_reads import recording
 from tests.support.stage_versions import measured
 
 LAUNCH = Path(__file__).parents[3] / "launch" / "junction.experiment.yaml"
@@ -73,10 +74,12 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
 
 
 @pytest.fixture(scope="session")
-def tiny_room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, dict[str, Any]]]:
-    """The run folder of a tiny experiment in the lab, run whole, and the numbers that sum it up."""
+def tiny_room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any], dict[str, set[str]]]:
+    """The run folder of a tiny experiment in the lab, run whole, the numbers that sum it up, and the settings that its stages read."""
     folder = tmp_path_factory.mktemp("room") / "run"
-    return folder, measured(folder)
+    with recording() as reads:
+        found = measured(folder, reads)
+    return folder, found, reads.of
 
 
 @dataclass

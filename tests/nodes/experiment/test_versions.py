@@ -12,6 +12,7 @@ from nodes.experiment.plan.space_config import SpaceConfig
 from nodes.experiment.run.cells import Bench, keep_build, run_cell
 from nodes.experiment.steps import run
 from nodes.experiment.steps.keys import settings_hash
+from nodes.experiment.steps.pipeline import stages_of
 from tests.support.stage_versions import RECORDED, defaults, tiny_experiment, versions
 
 # Between processors sums are taken in another order; a change of what is computed is larger.
@@ -28,6 +29,31 @@ def test_what_stages_and_cells_make_is_of_their_versions(tiny_room):
         )
         assert each["version"] == recorded[name]["version"], how
         assert each["numbers"] == pytest.approx(recorded[name]["numbers"], rel=_RELATIVE), how
+
+
+# What stages ask to know what there is to do: which victims and objects there are. The network is an input of its own.
+_ASKED = {
+    "victims",
+    "policy.naive_steps",
+    "objects",
+    "policy.architecture",
+    "policy.hidden",
+    "policy.configuration",
+}
+
+
+def test_stages_read_no_settings_that_their_keys_lack(tiny_room):
+    keys = {stage.name: stage.settings.resolved for stage in stages_of(tiny_experiment(tiny_room[0]))}
+    assert set(tiny_room[2]) == set(keys)
+    for name, read in tiny_room[2].items():
+        known = {
+            f"{section}.{key}"
+            for section, each in keys[name].items()
+            if isinstance(each, dict)
+            for key in each
+        }
+        assert read - known - set(keys[name]) <= _ASKED, name
+    assert tiny_room[2]["bake"] == {"horizon", "dt_s"}
 
 
 def test_defaults_that_are_not_in_keys_are_of_their_versions():
