@@ -22,7 +22,7 @@ from advnerf_core.policies.bins import SteeringBins
 from advnerf_core.policies.colours import ColourSpace, in_colour_space, of_channels
 from advnerf_core.policies.frames import FrameStack
 from advnerf_core.policies.memory import NetworkState
-from advnerf_core.policies.tracker import TrackedTrajectory, pursued_curvature_1pm
+from advnerf_core.policies.tracker import TrackedTrajectory
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.strict import parse_value
 
@@ -261,8 +261,7 @@ class PolicyContract:
             batch: Number of images.
         """
         if self.trajectory is not None:
-            curvature_1pm = pursued_curvature_1pm(self.waypoints_m(raw, batch), self.trajectory.lookahead_m)
-            return array_module(curvature_1pm).arctan(self.trajectory.wheelbase_m * curvature_1pm)
+            return self.trajectory.control(self.waypoints_m(raw, batch))
         if self.bins is not None:
             raw = self.bins.value(self._checked(raw, (batch, len(self.bins.values)), "bins"))
         raw = self._steering_column(raw, batch)

@@ -235,7 +235,7 @@ def _of_output(outputs: list[TensorInfo]) -> tuple[dict[str, Any], list[Question
     if chosen in planned:
         times = tuple(_WAYPOINTS_S * number for number in range(1, _waypoints(chosen) + 1))
         found["trajectory"] = TrackedTrajectory(times_s=times, lookahead_m=1.0, wheelbase_m=1.0)
-        text = f"At which times are the waypoints of {chosen}, and which lookahead distance and wheelbase has the tracker?"
+        text = f"At which times are the waypoints of {chosen}, and which lookahead distance, and wheelbase or car_speed_mps, has the tracker?"
         return found, [*questions, Question("trajectory", text), side]
     columns = _last(chosen) if chosen.shape is not None and len(chosen.shape) == 2 else None
     if columns is not None and columns > 1:

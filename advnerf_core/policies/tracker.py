@@ -23,18 +23,35 @@ class TrackedTrajectory(StrictModel):
     Attributes:
         times_s: Time of each waypoint after the image [s], increasing.
         lookahead_m: Distance from the car at which the tracker meets the waypoints [m]; of shorter ones the last is taken.
-        wheelbase_m: Distance between the axles [m].
+        wheelbase_m: Distance between the axles of a car whose control is a wheel angle [m].
+        car_speed_mps: Instead of it, the speed of a car whose control is a turn rate [m/s].
     """
 
     times_s: tuple[_Positive, ...] = Field(min_length=1)
     lookahead_m: _Positive
-    wheelbase_m: _Positive
+    wheelbase_m: _Positive | None = None
+    car_speed_mps: _Positive | None = None
 
     @model_validator(mode="after")
     def _times_increase(self) -> TrackedTrajectory:
         if any(second <= first for first, second in zip(self.times_s, self.times_s[1:], strict=False)):
             raise ValueError(f"times_s must increase; got {list(self.times_s)}")
         return self
+
+    @model_validator(mode="after")
+    def _one_kind_of_car(self) -> TrackedTrajectory:
+        if (self.wheelbase_m is None) == (self.car_speed_mps is None):
+            raise ValueError(
+                "expected wheelbase_m of a car that is told a wheel angle, or car_speed_mps of one that is told a turn rate; give one of them"
+            )
+        return self
+
+    def control(self, waypoints: Any) -> Any:
+        """Wheel angle ``[B]`` [rad], or turn rate [rad/s], that leads to the waypoints ``[B, N, 2]`` (numpy or torch; differentiable)."""
+        curvature_1pm = pursued_curvature_1pm(waypoints, self.lookahead_m)
+        if self.wheelbase_m is None:
+            return self.car_speed_mps * curvature_1pm
+        return array_module(curvature_1pm).arctan(self.wheelbase_m * curvature_1pm)
 
     def speed_mps(self, waypoints: Any) -> Any:
         """Mean speed ``[B]`` [m/s] from the car to the last of the waypoints ``[B, N, 2]`` (numpy or torch)."""

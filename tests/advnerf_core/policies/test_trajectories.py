@@ -84,6 +84,13 @@ def test_a_policy_of_waypoints_steers_to_them(reshaped):
     assert float(slopes.sum()) == pytest.approx((steered(0.6 + 1e-5) - steered(0.6 - 1e-5)) / 2e-5, rel=1e-5)
 
 
+def test_a_car_that_is_told_a_turn_rate_is_turned_along_the_same_arc():
+    tracked = {"times_s": [0.5, 1.0, 1.5], "lookahead_m": LOOKAHEAD_M, "car_speed_mps": 7.0}
+    policy = adapt(Plans(), PolicyContract(VIEW, trajectory=tracked))
+    curvature_1pm = np.tan(steered(0.6)) / WHEELBASE_M
+    assert float(policy(pictures(0.6))[0]) == pytest.approx(7.0 * curvature_1pm, rel=1e-6)
+
+
 def test_the_live_node_follows_the_waypoints_of_a_file_without_torch(tmp_path):
     file = tmp_path / "plans.onnx"
     contract = PolicyContract(VIEW, trajectory=TRACKED, positive="right")
@@ -104,6 +111,8 @@ def test_the_live_node_follows_the_waypoints_of_a_file_without_torch(tmp_path):
         ({"times_s": [1.0, 0.5]}, "times_s must increase"),
         ({"times_s": []}, "times_s"),
         ({"lookahead_m": 0.0}, "lookahead_m.*greater than 0"),
+        ({"car_speed_mps": 7.0}, "give one of them"),
+        ({"wheelbase_m": None}, "give one of them"),
         ({"lookahead": 1.0}, "unknown key lookahead|lookahead: extra"),
     ],
 )
