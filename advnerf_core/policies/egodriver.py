@@ -26,7 +26,7 @@ from advnerf_core.geometry import Array, Pinhole
 from advnerf_core.policies.adapter import AdaptedPolicy, adapt
 from advnerf_core.policies.contract import PolicyContract, PolicyContractError
 from advnerf_core.policies.policy_file import LoadedPolicy
-from advnerf_core.policies.tracker import pursued_curvature_1pm
+from advnerf_core.policies.tracker import TrackedTrajectory
 from advnerf_core.policies.view import PolicyView
 
 _ADDRESS = re.compile(r"(grpcs?)://(\[[0-9a-f:]+\]|[^:/\s]+):(\d{1,5})")
@@ -52,11 +52,16 @@ class DrivenRig:
     dt_s: float
     wheelbase_m: float | None
 
-    def control(self, curvature_1pm: float) -> float:
-        """Wheel angle [rad], or turn rate [rad/s], of a curvature [1/m]."""
-        if self.wheelbase_m is None:
-            return curvature_1pm * self.speed_mps
-        return float(np.arctan(curvature_1pm * self.wheelbase_m))
+    @cached_property
+    def tracker(self) -> TrackedTrajectory:
+        """What follows the plans, which are as long as the driver likes."""
+        speed_mps = self.speed_mps if self.wheelbase_m is None else None
+        return TrackedTrajectory(
+            times_s=(_LOOKAHEAD_S,),
+            lookahead_m=self.speed_mps * _LOOKAHEAD_S,
+            wheelbase_m=self.wheelbase_m,
+            car_speed_mps=speed_mps,
+        )
 
     def turn_rate_radps(self, control: float) -> float:
         """How fast the car turns under a control."""
@@ -169,7 +174,7 @@ class EgoDriver:
         if not len(plan):
             return 0.0  # a driver without a plan holds its course
         ahead = rig.inverse().transform_points(plan.positions)[None, :, :2]
-        return self.rig.control(float(pursued_curvature_1pm(ahead, self.rig.speed_mps * _LOOKAHEAD_S)[0]))
+        return float(self.rig.tracker.control(ahead)[0])
 
     def _moved(self, pose: list[float], control: float) -> list[float]:
         """The car's pose a tick later: along an arc."""
