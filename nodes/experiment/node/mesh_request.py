@@ -8,10 +8,9 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from advnerf_core.strict import StrictModel
+from nodes.experiment.plan.search_config import ShapeSampling
 
 AboveZero = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
-Samples = Annotated[int, Field(ge=1, le=256)]
 Unit = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -41,12 +40,7 @@ class MeshRequest(StrictModel):
         return self
 
 
-class ShapeRequest(StrictModel):
+class ShapeRequest(ShapeSampling):
     """Shapes are attacked instead of colours, of all objects, which must be meshes."""
 
     bound_m: AboveZero = Field(default=0.2, description="No vertex moves farther [m].")
-    smoothness: NotNegative = Field(
-        default=19.0, description="Lambda of the large-steps preconditioner; 0: none."
-    )
-    samples: Samples = Field(default=4, description="Rays a pixel for the gradient inside the silhouettes.")
-    boundary_samples: Samples = Field(default=1, description="Points a pixel for that of the silhouettes.")

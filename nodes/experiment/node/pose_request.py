@@ -8,6 +8,7 @@ from typing import Annotated
 from pydantic import Field, field_validator
 
 from advnerf_core.strict import StrictModel
+from nodes.experiment.plan.search_config import PlacesBudget
 
 Count = Annotated[int, Field(ge=1)]
 AboveZero = Annotated[float, Field(gt=0)]
@@ -63,8 +64,8 @@ class RobustnessMapRequest(StrictModel):
     )
 
 
-class PosesRequest(StrictModel):
-    """Where objects may stand, and the budget: ``samples * steps`` evaluations, for random poses as well."""
+class PosesRequest(PlacesBudget):
+    """Where objects may stand, and the budget."""
 
     bounds: tuple[PoseBoundsRequest, ...] = Field(
         min_length=1, description="One for each object, in their order."
@@ -72,9 +73,6 @@ class PosesRequest(StrictModel):
     keep_out_m: Annotated[float, Field(ge=0)] = Field(
         default=0.4, description="Least distance of every footprint from the reference path [m]."
     )
-    colours: bool = Field(default=True, description="Whether the colours are searched for too.")
-    samples: Count = Field(default=5, description="Poses that are drawn.")
-    steps: Count = Field(default=10, description="Evaluations of each.")
     pose_rate: AboveZero = Field(
         default=0.1, description="Adam's step of a pose; 2 is the whole width of the bounds."
     )
@@ -87,8 +85,3 @@ class PosesRequest(StrictModel):
     )
     landscape: LandscapeRequest = LandscapeRequest()
     robustness: RobustnessMapRequest = RobustnessMapRequest()
-
-    @property
-    def evaluations(self) -> int:
-        """Closed-loop evaluations of a search."""
-        return self.samples * self.steps

@@ -14,7 +14,6 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from advnerf_core.attack.methods import METHODS, alternatives
-from advnerf_core.attack.objectives import CTE
 from advnerf_core.documents import Document, dump_yaml, parse_yaml, read_yaml
 from advnerf_core.geometry import Array, make_transform, rotation_z
 from advnerf_core.places import expanded
@@ -23,8 +22,9 @@ from advnerf_core.policies.load import is_factory
 from advnerf_core.strict import StrictModel, validate
 from nodes.experiment.node.mesh_request import MeshRequest, ShapeRequest
 from nodes.experiment.node.pose_request import PosesRequest
-from nodes.experiment.plan.method_names import MethodReference, ObjectiveReference
+from nodes.experiment.plan.method_names import MethodReference
 from nodes.experiment.plan.robustness_config import RobustnessConfig
+from nodes.experiment.plan.search_config import SearchBudget
 from nodes.runtime.config import apply_overrides
 
 Count = Annotated[int, Field(ge=1)]
@@ -157,7 +157,7 @@ class DynamicsRequest(StrictModel):
     slew_radps: AboveZero | None = Field(default=None, description="Limit of the wheels' rate [rad/s].")
 
 
-class SearchRequest(StrictModel):
+class SearchRequest(SearchBudget):
     """The adversary and its budget."""
 
     method: MethodReference = Field(
@@ -165,13 +165,6 @@ class SearchRequest(StrictModel):
         description="A method of attack: built in, of an installed package, or file.py:Name, relative to this file.",
     )
     options: dict[str, Any] = Field(default_factory=dict, description="What the method alone knows.")
-    objective: ObjectiveReference = Field(
-        default=CTE,
-        description="What is maximised: cte, peak, time_off_track, collision, or file.py:Class, relative to this file.",
-    )
-    evaluations: Count = Field(
-        default=50, description="Closed-loop evaluations; an iteration of the gradient is one."
-    )
     learning_rate: AboveZero | None = Field(
         default=None,
         description="Of Adam: 0.1 for gradient, gradient_coarse, frame and distilled, 0.3 for guided, 0.5 for evolution, if not given.",
@@ -180,7 +173,6 @@ class SearchRequest(StrictModel):
         default=None,
         description="Spread of theta: 5 for random and its families, 3 to begin with for cem, 1 for evolution, if not given.",
     )
-    population: Annotated[int, Field(ge=4)] = Field(default=10, description="Candidates of a generation.")
     cells: Annotated[int, Field(ge=0)] = Field(
         default=8,
         description="Cells along an edge of coarse textures (cem, evolution, guided, gradient_coarse, random_coarse); 0 for the face's own.",
@@ -196,10 +188,6 @@ class SearchRequest(StrictModel):
     together: bool = Field(
         default=False, description="Gradient: search all seeds in one batch, not one after the other."
     )
-    cache_mib: NotNegative = Field(
-        default=512.0, description="Budget of the frames kept for the gradient [MiB]."
-    )
-    time_batch: Count = Field(default=16, description="Frames per gradient batch.")
 
     @property
     def method_name(self) -> str:

@@ -6,11 +6,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from advnerf_core.attack.objectives import CTE
 from advnerf_core.policies.architecture import PILOTNET, Architecture, require_architecture
 from advnerf_core.strict import StrictModel
-from nodes.experiment.plan.method_names import ArchitectureReference, ObjectiveReference
+from nodes.experiment.plan.method_names import ArchitectureReference
 from nodes.experiment.plan.robustness_config import RobustnessConfig
+from nodes.experiment.plan.search_config import SearchBudget
 
 Count = Annotated[int, Field(ge=0)]
 Positive = Annotated[int, Field(ge=1)]
@@ -209,13 +209,9 @@ class MeasureConfig(StrictModel):
     seed: int = Field(default=10_000, description="Of the starts.")
 
 
-class AttackConfig(StrictModel):
+class AttackConfig(SearchBudget):
     """The adversary, and what it may spend: all methods evaluate equally often."""
 
-    objective: ObjectiveReference = Field(
-        default=CTE,
-        description="What is maximised: cte, peak, time_off_track, collision, or file.py:Class, relative to the experiment file.",
-    )
     starts: Positive = Field(
         default=1, description="Start poses optimised together; the first of seed 0 is the nominal one."
     )
@@ -225,21 +221,15 @@ class AttackConfig(StrictModel):
     start_sigma: Annotated[float, Field(ge=0)] = Field(
         default=0.1, description="Spread of starts [m and rad]; headings a quarter of it."
     )
-    evaluations: Positive = Field(default=50, description="Closed-loop evaluations of each search.")
     horizon: Positive | None = Field(
         default=None,
         description="Control ticks of the drives that are optimised; none: all that are measured.",
     )
     learning_rate: PositiveNumber = 0.1
     random_sigma: PositiveNumber = Field(default=5.0, description="Spread of the random textures' theta.")
-    cem_population: Annotated[int, Field(ge=4)] = Field(default=10, description="Candidates of a generation.")
     robustness: RobustnessConfig = Field(
         default=RobustnessConfig(),
         description="What the attacks shall bear, in expectation.",
-    )
-    time_batch: Positive = Field(default=16, description="Frames per gradient batch.")
-    cache_mib: Annotated[float, Field(ge=0)] = Field(
-        default=512.0, description="Budget of the frame cache [MiB]."
     )
 
 

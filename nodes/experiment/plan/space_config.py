@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from advnerf_core.strict import StrictModel
+from nodes.experiment.plan.search_config import PlacesBudget, ShapeSampling
 
 Positive = Annotated[int, Field(ge=1)]
 PositiveNumber = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -25,7 +26,7 @@ class ColoursConfig(StrictModel):
     )
 
 
-class PlacesConfig(StrictModel):
+class PlacesConfig(PlacesBudget):
     """Where the objects stand, and their colours unless these are kept."""
 
     kind: Literal["places"]
@@ -35,12 +36,9 @@ class PlacesConfig(StrictModel):
         default=0.6,
         description="A car's heading may change by this [rad]; a hydrant may turn all the way round.",
     )
-    samples: Positive = Field(default=5, description="Placements that are drawn.")
-    steps: Positive = Field(default=10, description="Evaluations of each placement.")
     colour_rate: PositiveNumber = Field(
         default=0.5, description="Adam's step of the colours before squashing."
     )
-    colours: bool = Field(default=True, description="Search the colours too; false keeps the plain ones.")
 
 
 class _MeshConfig(StrictModel):
@@ -62,17 +60,12 @@ class MeshTextureConfig(_MeshConfig):
     searched: ClassVar[str] = "The textures of {} as meshes are searched over the world's own pictures"
 
 
-class MeshShapeConfig(_MeshConfig):
+class MeshShapeConfig(_MeshConfig, ShapeSampling):
     """The shapes of the objects as meshes, searched over the world's own pictures."""
 
     kind: Literal["mesh_shape"]
     searched: ClassVar[str] = "The shapes of {} as meshes are searched over the world's own pictures"
     bound_m: PositiveNumber = Field(default=0.4, description="No vertex moves farther [m].")
-    smoothness: NotNegative = Field(
-        default=19.0, description="Lambda of the large-steps preconditioner; 0: none."
-    )
-    samples: Positive = Field(default=4, description="Rays a pixel for the gradient inside the silhouettes.")
-    boundary_samples: Positive = Field(default=1, description="Points a pixel for that of the silhouettes.")
 
 
 SpaceConfig = Annotated[

@@ -189,7 +189,7 @@ def search_settings(experiment: Experiment, method: Method) -> SearchSettings:
         learning_rate=space.learning_rate
         if isinstance(space, (MeshTextureConfig, MeshShapeConfig))
         else None,
-        population=attack.cem_population,
+        population=attack.population,
         cells=cells,
         gradient_rate=attack.learning_rate,
         random_sigma=attack.random_sigma,
@@ -200,11 +200,7 @@ def search_settings(experiment: Experiment, method: Method) -> SearchSettings:
 def planned_evaluations(experiment: Experiment) -> int:
     """Drives of each search."""
     space = experiment.config.space
-    return (
-        space.samples * space.steps
-        if isinstance(space, PlacesConfig)
-        else experiment.config.attack.evaluations
-    )
+    return (space if isinstance(space, PlacesConfig) else experiment.config.attack).evaluations
 
 
 def _search(

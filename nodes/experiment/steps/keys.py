@@ -42,7 +42,7 @@ FREE: Mapping[str, Any] = {
     "deploy": {"world", "laps", "empty_scene", "ready_timeout_s"},
 }
 # What a drive without attack does not depend on besides.
-_SEARCHED_WITH = {"evaluations", "horizon", "learning_rate", "cem_population", "time_batch", "robustness"}
+_SEARCHED_WITH = {"evaluations", "horizon", "learning_rate", "population", "time_batch", "robustness"}
 
 
 class CellError(RuntimeFault):

@@ -47,7 +47,7 @@ READS: Mapping[str, dict[str, Any]] = {
 _UNREAD_BY_RETRAIN: dict[str, Any] = {
     "carrier": {"kind"},
     "policy": NETWORK,
-    "attack": {"objective", "cem_population", "cache_mib"},
+    "attack": {"objective", "population", "cache_mib"},
 }
 # Files that policies are trained with, beside what comes of it.
 _TRAINING_FILES = ("frames", "*.checkpoint.safetensors", "*.shards.json", "settings.json")

@@ -37,7 +37,7 @@ TINY: dict[str, Any] = {
         "deployed_stills": 4, "surrogate_stills": 4, "deployed_drives": 1, "surrogate_drives": 1, "drive_steps": 2,
         "first_steps": 2, "round_steps": 2, "naive_steps": 2, "hidden": [16, 8, 4],
     },
-    "attack": {"evaluations": 2, "cem_population": 4, "time_batch": 2},
+    "attack": {"evaluations": 2, "population": 4, "time_batch": 2},
     "measure": {"starts": 1},
 }  # fmt: skip
 
