@@ -76,7 +76,6 @@ def redrive(
     """
     if not is_kept(published):
         raise RedriveError(f"{published.name} {LOST}")
-    _require_same_drives(experiment, published)
     names = {file.stem for file in published.glob("*.json")}
     known = [cell for cell in experiment.cells if cell.name in names]
     chosen = random.Random(seed).sample(known, min(count, len(known)))
@@ -86,6 +85,7 @@ def redrive(
         said = read_cell(published / f"{cell.name}.json")
         variant = experiment.of(cell)
         _take_stages(variant, said, ReferenceBuild(published.parent / BUILD))
+        _require_same_drives(variant, cell, published)
         again = _again(variant, cell.inside, attack_file(published, said.attack_id or NONE))
         found.append(_compared(cell.name, said.kept["surrogate"], again))
     return found
@@ -99,22 +99,17 @@ def unreadable(published: Path, why: str) -> RedriveError:
         why: What differs.
     """
     commit = last_commit(published)
-    which = f"git checkout {commit[:12]} has" if commit else "check out"
-    return RedriveError(
-        f"{published.name}: {why}; {which} the version that published it, which can drive it again"
-    )
+    of = f", git checkout {commit[:12]}" if commit else ""
+    return RedriveError(f"{published.name}: {why}; drive it again with the version that published it{of}")
 
 
-def _require_same_drives(experiment: Experiment, published: Path) -> None:
+def _require_same_drives(variant: Experiment, cell: Cell, published: Path) -> None:
     """Refuse to compare with drives that were registered otherwise than this version would drive them."""
     registration = read_registration(published)
-    for cell in {cell.scenario: cell for cell in experiment.cells}.values():
-        then = registration.scenario(cell.scenario) if registration is not None else None
-        if then is None:
-            continue
-        now = registered_scenario(experiment.of(cell), cell.path)
-        if differ := [name for name in _DRIVEN if getattr(then, name) != getattr(now, name)]:
-            raise unreadable(published, f"expected the {', '.join(differ)} that were registered, got others")
+    then = None if registration is None else registration.scenario(cell.scenario)
+    now = registered_scenario(variant, cell.path)
+    if differ := [name for name in _DRIVEN if then is not None and getattr(then, name) != getattr(now, name)]:
+        raise unreadable(published, f"expected the {', '.join(differ)} that were registered, got others")
 
 
 def _take_stages(experiment: Experiment, said: CellResult, build: ReferenceBuild) -> None:

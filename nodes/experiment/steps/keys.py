@@ -89,7 +89,7 @@ def cell_settings(experiment: Experiment, cell: Cell, deployed: bool = True) -> 
         )
     kept = {name: digest for name, digest in experiment.kept.items() if name in stages}
     inputs["stages"] = {**kept, **digests_in(experiment.folder, stages)}
-    return Settings.of(experiment.config, None, free, **inputs, **_places(experiment, deployed))
+    return Settings.of(experiment.config, None, free, **inputs, **_common_inputs(experiment, deployed))
 
 
 def _policy_sha256(experiment: Experiment, victim: str) -> str | None:
@@ -99,7 +99,7 @@ def _policy_sha256(experiment: Experiment, victim: str) -> str | None:
     return victim_sha256(experiment, victim)
 
 
-def _places(experiment: Experiment, deployed: bool = True) -> dict[str, Any]:
+def _common_inputs(experiment: Experiment, deployed: bool = True) -> dict[str, Any]:
     """Inputs of all cells of an experiment: versions, worlds and view."""
     config = experiment.config
     # Objectives on the path judge states alone; others may judge by the car's body.
@@ -120,7 +120,7 @@ def registered_settings(experiment: Experiment) -> Settings:
         "objective": objective_key(config.attack.objective),
         "architecture": config.policy.network.described(),
     }
-    return Settings.of(config, None, FREE, **code, **_places(experiment))
+    return Settings.of(config, None, FREE, **code, **_common_inputs(experiment))
 
 
 def settings_hash(experiment: Experiment, cell: Cell) -> str:

@@ -29,7 +29,7 @@ _CARRIER: dict[str, Any] = {"carrier": {"kind", "panel", "plain_rgb", "resolutio
 _OBJECTS: dict[str, Any] = {"objects": True, "object": {"panel_resolution", "panel_rgb"}}
 _DRIVE: dict[str, Any] = {"paths": True, "horizon": True, "dt_s": True}
 READS: Mapping[str, dict[str, Any]] = {
-    "capture": {"capture": True, **_CARRIER, **_OBJECTS, **_DRIVE},
+    "capture": {"capture": True, "objects": True, **_CARRIER, **_DRIVE},
     "scene": {"scene": True, "capture": {"colour_pairs"}},
     "bake": _DRIVE,
     "object": {"object": {"car_resolution", "hydrant_resolution", "mesh_resolution", "fit_steps"}},
@@ -89,7 +89,7 @@ def _stage(
 
 def _capture(experiment: Experiment) -> Stage:
     config = experiment.config
-    unread: dict[str, Any] = {"object": True, "carrier": {"resolution"}}
+    unread: dict[str, Any] = {"carrier": {"resolution"}}
     inputs = {"world": experiment.seen_settings}
     # What a screen shows is photographed; an overlay is drawn into pictures later.
     if not isinstance(config.carrier, ScreenConfig):
@@ -135,11 +135,11 @@ def _learned_from(experiment: Experiment) -> dict[str, Any]:
 
 
 def _policy(experiment: Experiment) -> Stage:
-    config, is_face = experiment.config, has_face(experiment)
+    config = experiment.config
     unread: dict[str, Any] = {"policy": NETWORK}
-    unread |= dict.fromkeys(("objects", "object"), True) if is_face else {"carrier": {"kind"}}
+    unread |= dict.fromkeys(("objects", "object"), True) if has_face(experiment) else {"carrier": {"kind"}}
     # The angle at which a screen is seen follows the drive that is measured, and so do rules in other places.
-    if not (is_face or config.policy.learns_in):
+    if not (isinstance(config.carrier, ScreenConfig) or config.policy.learns_in):
         unread["horizon"] = True
     settings = Settings.of(config, READS["policy"], unread, **_learned_from(experiment))
     return _stage(

@@ -71,7 +71,8 @@ def test_it_is_driven_again_from_the_published_files_alone(published, tmp_path):
     assert not list((tmp_path / "again" / "policy").glob("data*"))  # no victim was trained for it
 
     with pytest.raises(
-        RedriveError, match="expected the held_cap_m that were registered, got others; check out"
+        RedriveError,
+        match="expected the held_cap_m that were registered, got others; drive it again with the version",
     ):
         redrive(experiment_in(tmp_path / "other", "held_cap_m=2"), published, 1, 0, lambda text: None)
 
