@@ -99,11 +99,11 @@ def defaults() -> dict[str, dict[str, Any]]:
     from nodes.experiment.steps import keys
     from nodes.experiment.steps.pipeline import READS
 
-    found = {name: dict(_defaults(ExperimentConfig, include)) for name, include in READS.items()}
+    found = {name: dict(sorted(_defaults(ExperimentConfig, include))) for name, include in READS.items()}
     # Of what stages alone read cells have the digests.
     by_digest = dict.fromkeys(("capture", "scene", "policy"), True)
-    found["cells"] = dict(_defaults(ExperimentConfig, True, {**keys.FREE, **by_digest}))
-    found["requests"] = dict(_defaults(AttackRequest, True, prepare.FREE))
+    found["cells"] = dict(sorted(_defaults(ExperimentConfig, True, {**keys.FREE, **by_digest})))
+    found["requests"] = dict(sorted(_defaults(AttackRequest, True, prepare.FREE)))
     return found
 
 
