@@ -18,7 +18,7 @@ from advnerf_core.places import open_tensors
 
 ATTACK, SEARCHED, STATE = "attack.safetensors", "surrogate.json", "state.safetensors"
 # Spaces whose theta are colours. Of the others, places and shapes, there is no texture to show.
-_COLOURED = ("face", COLOURS, MESH_TEXTURE)
+_COLOURED = (COLOURS, MESH_TEXTURE)
 _PICTURE_PX, _MOST_OBJECTS = 192, 6
 
 Pixels = NDArray[np.uint8]

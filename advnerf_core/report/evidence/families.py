@@ -39,10 +39,11 @@ def lacking_baselines(methods: Collection[str], other_cells: bool, families: Seq
 def coarse_cells_differ(scenario: RegisteredScenario) -> bool:
     """Whether the coarse textures of a scenario have other cells than its gradient.
 
-    Registrations do not say how many cells a panel has, so a panel counts as finer than its coarse textures.
+    Registrations without settings do not say how many cells a panel has; such a panel counts as finer than its coarse textures.
     """
-    cells = int(scenario.space.get("cells", 0))
-    return 0 < cells < int(scenario.space.get("resolution", cells + 1))
+    cells, settings = int(scenario.space.get("cells", 0)), scenario.settings
+    of_panel = settings.get("object", scenario.space).get("panel_resolution", cells + 1)
+    return 0 < cells < int(settings.get("carrier", scenario.space).get("resolution", of_panel))
 
 
 def families_note(registration: Registration) -> list[str]:

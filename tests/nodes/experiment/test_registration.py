@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import pytest
 
+from advnerf_core.report.evidence.families import coarse_cells_differ
 from advnerf_core.report.evidence.registration import FILE, RegistrationError, read_registration
 from nodes.experiment.engine.artefact import Settings, write_key
 from nodes.experiment.run.plan import plan_cells, registered_under
-from nodes.experiment.run.registering import primary_tests, register
+from nodes.experiment.run.registering import primary_tests, register, registered_scenario
 from nodes.experiment.steps.keys import registered_settings
 from tests.support.stage_versions import tiny_experiment
 
@@ -83,6 +84,20 @@ def test_where_coarse_textures_have_other_cells_the_gradient_is_run_in_both(tmp_
     fine, coarse = on_a_face(4, (*methods, "gradient_coarse"))
     assert (fine.method, fine.against) == ("gradient", methods[:-1])
     assert (coarse.method, coarse.against) == ("gradient_coarse", ("random_coarse", "cem"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "differ"),
+    [
+        (("space.cells=4",), True),
+        (("space.cells=8",), False),  # as many as the face has
+        (("space.cells=8", "carrier.resolution=16"), True),
+        (("carrier={kind: native}", "objects=[{name: a, kind: panel, stands: {}}]", "space.cells=64"), False),
+    ],
+)
+def test_a_registration_says_whether_coarse_textures_have_other_cells(tmp_path, changes, differ):
+    made = tiny_experiment(tmp_path / "run", changes)
+    assert coarse_cells_differ(registered_scenario(made, "track")) == differ
 
 
 def test_a_registration_after_the_fact_is_refused(experiment, tmp_path):
