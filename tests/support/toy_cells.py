@@ -81,12 +81,12 @@ def clean_folder(experiment, cell, folder):
 
 
 def search_cell(experiment, cell, folder, report, bench=None):
-    _note(folder, f"search {cell.name}")
+    _note(folder, f"search {folder.name}")
     (folder / "searched").touch()
 
 
 def run_cell(experiment, cell, folder, report, bench=None):
-    _note(folder, f"begin {cell.name} {cell.code} {os.environ.get('OMP_NUM_THREADS')}")
+    _note(folder, f"begin {folder.name} {cell.code} {os.environ.get('OMP_NUM_THREADS')}")
     run = folder.parent.parent
     if (run / "fail").exists() and cell.method == "cem":
         raise RuntimeError("the search came to nothing")
@@ -95,9 +95,9 @@ def run_cell(experiment, cell, folder, report, bench=None):
             (folder / "pid").write_text(str(os.getpid()))
             time.sleep(0.02)
     except BaseException:
-        _note(folder, f"closed {cell.name}")
+        _note(folder, f"closed {folder.name}")
         raise
-    _note(folder, f"end {cell.name}")
+    _note(folder, f"end {folder.name}")
     if cell.method not in FACTORS:
         return _searched(cell)
     none = experiment.data["none_m"] + cell.seed
