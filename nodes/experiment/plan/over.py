@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from nodes.experiment.plan.victims import VictimName
 # Names become parts of file names, which are separated by "_" and "."; a variant may hold "_", victims may not.
 VariantName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_-]*$")]
 OVER, VARIANT = "over", "variant"
+_MOST_VARIANTS = 10_000  # status and table read a file for each cell
 
 
 class OverConfig(StrictModel):
@@ -108,7 +110,7 @@ def variants_in(over: Any) -> dict[str, list[Change]]:
         over: The section as it was read; what is wrong in it is refused where it is validated.
 
     Raises:
-        ValueError: Two have one name.
+        ValueError: Two have one name, or there are too many.
     """
     if not isinstance(over, dict):
         return {}
@@ -118,6 +120,8 @@ def variants_in(over: Any) -> dict[str, list[Change]]:
     )
     if isinstance(named, dict) and named:
         factors.insert(0, [(name, _changes(name, changes)) for name, changes in named.items()])
+    if (count := math.prod(map(len, factors))) > _MOST_VARIANTS:
+        raise ValueError(f"expected at most {_MOST_VARIANTS} variants, got {count}; make several files")
     found: dict[str, list[Change]] = {}
     for combined in itertools.product(*factors) if factors else ():
         name = "_".join(str(each) for each, _ in combined)

@@ -94,6 +94,12 @@ def test_any_key_is_an_axis_and_variants_are_named_by_its_values(file):
     assert "right_evaluations-20_car-own" in paths
 
 
+def test_a_product_without_end_is_refused_before_it_is_read(file):
+    many = [f"over.attack.{key}={list(range(1, 101))}" for key in ("evaluations", "starts", "time_batch")]
+    with pytest.raises(ConfigError, match=r"at most 10000 variants, got 3000000; make several files"):
+        load(file, *many)
+
+
 def test_overrides_hold_for_all_variants(file):
     loaded = load(file, "attack.evaluations=9", "over.seed=[4]")
     assert {each.attack.evaluations for each in loaded.variants.values()} == {9}
