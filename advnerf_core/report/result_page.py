@@ -84,7 +84,7 @@ def outcome_of(cell: CellResult) -> str:
 def text_table(table: ResultTable) -> Table:
     """All lines as text."""
     columns = (
-        "scenario",
+        "path or variant",
         "victim",
         "object shows",
         "driven in",

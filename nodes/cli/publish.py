@@ -31,14 +31,14 @@ def publish(
     withdraw: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="SCENARIO=REASON",
-            help="Give a registered scenario up of which nothing was published; the page says so, and why.",
+            metavar="NAME=REASON",
+            help="Give a registered path or variant up of which nothing was published; the page says so, and why.",
         ),
     ] = None,
     declare: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="SCENARIO.VICTIM=REASON",
+            metavar="NAME.VICTIM=REASON",
             help="Say that a victim breaks the registered rule of what drives well, and why it is shown; the page says so.",
         ),
     ] = None,

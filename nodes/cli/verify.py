@@ -38,7 +38,7 @@ def register(
     found = write_registration(experiment, cells, published)
     print(f"{published / found.name / FILE}: {found.digest[:12]}")
     print(
-        f"{len(found.cells)} cells, {len(found.scenarios)} scenarios, {len(found.primary)} primary tests; commit it, then run the experiment"
+        f"{len(found.cells)} cells, {len(found.scenarios)} paths and variants, {len(found.primary)} primary tests; commit it, then run the experiment"
     )
     for name, scenario in found.scenarios.items():
         limit_m = scenario.drives_well_mean_cte_m
