@@ -16,7 +16,7 @@ from nodes.experiment.engine.progress_record import ProgressRecord
 from nodes.experiment.plan.cell import Cell
 
 CELLS = [Cell("track", "hardened", method, 0) for method in ("none", "random", "gradient")]
-ABOUT = {"name": "room", "setting": "demo", "planned": 5, "space": "face"}
+ABOUT = {"name": "room", "setting": "demo", "planned": 5, "space": "colours"}
 
 
 def record_of(folder: Path) -> ProgressRecord:

@@ -48,7 +48,7 @@ def test_a_policy_that_steers_alike_everywhere_passes_only_if_it_does_in_the_sce
 
 
 def test_a_refused_scene_ends_the_experiment_with_one_line_and_the_key(tiny_room, monkeypatch):
-    folder, _ = tiny_room
+    folder = tiny_room[0]
     changes = [each for each in TINY if not each.startswith("gate")]
     experiment = load_experiment(FILE, "demo", changes, folder)
     assert experiment.config.gate == "steering"
