@@ -43,6 +43,7 @@ def settings_hash(experiment, cell):
     from advnerf_core.attack.methods import method_digest
     from nodes.experiment.engine.artefact import hash_of
 
+    _require_path(experiment, cell)
     code = method_digest(cell.code)
     return hash_of([cell.scenario, cell.victim, cell.method, cell.seed, code, experiment.data])
 
@@ -54,6 +55,7 @@ def registered_settings(experiment):
 
 
 def cell_settings(experiment, cell):
+    _require_path(experiment, cell)
     return registered_settings(experiment)
 
 
@@ -81,11 +83,13 @@ def clean_folder(experiment, cell, folder):
 
 
 def search_cell(experiment, cell, folder, report, bench=None):
+    _require_path(experiment, cell)
     _note(folder, f"search {folder.name}")
     (folder / "searched").touch()
 
 
 def run_cell(experiment, cell, folder, report, bench=None):
+    _require_path(experiment, cell)
     _note(folder, f"begin {folder.name} {cell.code} {os.environ.get('OMP_NUM_THREADS')}")
     run = folder.parent.parent
     if (run / "fail").exists() and cell.method == "cem":
@@ -128,6 +132,11 @@ def _searched(cell):
     found = list(result.best.protocol_cte_m)
     drives = {"total_cte_m": found, "off_track": [False] * len(found), "none_total_cte_m": plain}
     return {"attack_id": None, "surrogate": drives, "extra": {"theta": result.theta.flatten().tolist()}}
+
+
+def _require_path(experiment, cell):
+    """Experiments know cells by their paths, whatever a variant calls them."""
+    assert cell.scenario in experiment.config.paths, cell
 
 
 def _note(folder, text):

@@ -175,7 +175,7 @@ def run_here(job: Job, store: Store, experiment: Experiment, bench: Bench, displ
 
 
 def _begin(job: Job, store: Store, experiment: Experiment) -> Path:
-    return store.begin(job.name, job.settings_hash, cell_settings(experiment, job.cell))
+    return store.begin(job.name, job.settings_hash, cell_settings(experiment, job.cell.inside))
 
 
 def _not_driven(job: Job, store: Store) -> str:
@@ -259,7 +259,7 @@ def _run(
         "method": job.cell.method,
         "seed": job.cell.seed,
         "settings_hash": job.settings_hash,
-        "settings": dict(cell_settings(experiment, job.cell).resolved),
+        "settings": dict(cell_settings(experiment, job.cell.inside).resolved),
         "registration": job.registration,
         "stages": digests_in(experiment.folder, NEEDED),
         "machine": found.get("machine") or machine_name(),

@@ -64,7 +64,7 @@ class Bench:
     def write(self, variants=None, gate=MappingProxyType({}), **over):
         """Write the experiment with other methods and seeds, with more variants beside ``straight``, and with limits of the gate."""
         self.over |= over
-        straight = {"over.path": ["straight"], "run_folder": str(self.folder / "run")}
+        straight = {"over.path": ["loop"], "run_folder": str(self.folder / "run")}
         named = {"variant": {"straight": straight, **(variants or {})}, "victim": ["hardened"], **self.over}
         self._write(
             self.file, run_folder=str(self.folder), gate=None if gate is None else dict(gate), over=named
@@ -78,7 +78,7 @@ class Bench:
 
     def _write(self, file, **keys):
         world = {"kind": "toy", **self.world}
-        data = {"name": "toy", "world": world, "paths": ["straight"], **keys}
+        data = {"name": "toy", "world": world, "paths": ["loop"], **keys}
         file.write_text(json.dumps(data, indent=1))
 
     def load(self):
