@@ -30,7 +30,7 @@ _FACE = np.stack(np.meshgrid(*[np.linspace(-0.95, 0.95, 7)] * 2), axis=-1).resha
 
 
 @dataclass(frozen=True)
-class _View:
+class SeenFrom:
     """What the driving camera sees from one place of the drive: ``T_camera_from_world`` and depth ``[H, W]`` [m]."""
 
     T_camera_from_world: Array
@@ -47,7 +47,7 @@ def place_by_rule(experiment: Experiment, world: World) -> list[PlacedObject]:
     Raises:
         ConfigError: There is no such spot.
     """
-    views: dict[str, list[_View]] = {}
+    views: dict[str, list[SeenFrom]] = {}
     standing = [each for each in experiment.config.objects if isinstance(each, PlacedObject)]
     found: list[PlacedObject] = []
     for wanted in experiment.config.objects:
@@ -88,11 +88,11 @@ def clean_poses(experiment: Experiment, name: str) -> Array:
     return np.asarray(path.pose_at(along_m if path.closed else along_m[along_m <= path.length_m]))
 
 
-def _views(experiment: Experiment, world: World, name: str) -> Iterator[_View]:
+def _views(experiment: Experiment, world: World, name: str) -> Iterator[SeenFrom]:
     for x_m, y_m, yaw_rad in clean_poses(experiment, name).tolist():
         T_world_from_camera = planar_pose(x_m, y_m, yaw_rad) @ experiment.mount
         _, depth_m = require_depth(world.observe_at(x_m, y_m, yaw_rad))
-        yield _View(invert_transform(T_world_from_camera), depth_m)
+        yield SeenFrom(invert_transform(T_world_from_camera), depth_m)
 
 
 def _spots(experiment: Experiment, wanted: RuledObject, name: str) -> Iterator[PlacedObject]:
@@ -118,7 +118,7 @@ def _fits(
     experiment: Experiment,
     spot: PlacedObject,
     standing: Sequence[PlacedObject],
-    views: Sequence[_View],
+    views: Sequence[SeenFrom],
     wanted: RuledObject,
 ) -> bool:
     """Whether a spot is beside the lanes, free of other objects, and seen long enough."""
@@ -131,7 +131,7 @@ def _fits(
     for passed, view in enumerate(views):
         if ticks >= needed or ticks + len(views) - passed < needed:  # decided
             break
-        ticks += _is_seen(experiment, spot, view, wanted.stands.least_px)
+        ticks += is_seen(experiment, spot, view, wanted.stands.least_px)
     return ticks >= needed
 
 
@@ -141,11 +141,11 @@ def seen_from(experiment: Experiment, world: World, panel: PlacedObject, least_p
     poses = [(float(x), float(y), float(yaw)) for x, y, yaw in clean_poses(experiment, name)]
     views = _views(experiment, world, name)
     return [
-        pose for pose, view in zip(poses, views, strict=True) if _is_seen(experiment, panel, view, least_px)
+        pose for pose, view in zip(poses, views, strict=True) if is_seen(experiment, panel, view, least_px)
     ]
 
 
-def _is_seen(experiment: Experiment, spot: PlacedObject, view: _View, least_px: float) -> bool:
+def is_seen(experiment: Experiment, spot: PlacedObject, view: SeenFrom, least_px: float) -> bool:
     """Whether nearly all of a panel is in the policy's window, in front of the scene, facing the camera and large enough."""
     T_camera_from_face = view.T_camera_from_world @ spot.T_world_from_face
     middle, normal = T_camera_from_face[:3, 3], T_camera_from_face[:3, 0]

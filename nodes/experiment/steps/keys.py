@@ -147,6 +147,10 @@ def require_known(experiment: Experiment, cell: Cell) -> None:
             "expected the control empty only where objects are attacked; a panel of the room was photographed with its scene"
         )
     if cell.searched:
+        if not experiment.config.objects and not has_face(experiment):
+            raise CellError(
+                "expected objects, whose colours or places are searched, got none; list some in the section objects"
+            )
         try:
             require_method(cell.code)
         except PluginError as error:

@@ -151,7 +151,7 @@ def _check_photographed(experiment: Experiment, document: Document) -> None:
         (("victims",), config.trains, "victims that exist ({policy: ...})"),
         (
             ("objects",),
-            experiment.has_rules or not config.objects,
+            experiment.has_rules,
             "objects whose places are given (x_m, y_m, yaw_rad)",
         ),
         (("space", "kind"), config.space.kind not in ("colours", "places"), "space.kind colours or places"),

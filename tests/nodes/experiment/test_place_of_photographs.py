@@ -15,8 +15,10 @@ from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import make_transform, planar_pose, rotation_z
 from hardware.worlds.lab.config import LabConfig
 from hardware.worlds.lab.lab import Lab
+from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.whole import run_experiment
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.steps.keys import settings_hash
 from nodes.experiment.steps.run import load_experiment
 from tests.nodes.experiment.test_given_victims import MODULE
 
@@ -95,13 +97,17 @@ def test_the_same_photographs_elsewhere_are_the_same_place(folder: Path, tmp_pat
     assert loaded(tmp_path).world_settings == loaded(folder).world_settings
 
 
+def test_without_an_object_there_is_nothing_to_search(folder: Path) -> None:
+    with pytest.raises(AdvnerfError, match="expected objects, whose colours or places are searched, got none"):
+        settings_hash(loaded(folder, "objects=[]"), Cell("track", "mine", "gradient", 0))
+
+
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
         ("deploy.through=world", "expected deploy.through nothing"),
         ("victims={}", "expected victims that exist"),
         ("objects=[{name: a, kind: panel, stands: {}}]", "expected objects whose places are given"),
-        ("objects=[]", "expected objects whose places are given"),
         ("space={kind: mesh_shape}", "an object with a mesh|objects with a mesh|expected space.kind colours"),
         ("carrier={kind: native}", "expected carrier"),
         ("world.images=nowhere", r"world\.images|images: expected a file or folder"),

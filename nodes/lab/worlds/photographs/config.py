@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, ValidationInfo, computed_field, model_validator
 from pydantic_core import PydanticCustomError
@@ -16,6 +16,7 @@ from advnerf_core.files import sha256_of
 from advnerf_core.geometry import Pinhole
 from advnerf_core.places import expanded
 from advnerf_core.strict import COMPLETE, StrictModel
+from hardware.worlds.world import CarDescription
 
 DRIVEN = "driven"
 AboveZero = Annotated[float, Field(gt=0.0)]
@@ -42,13 +43,26 @@ class DrivenCarConfig(StrictModel):
 
     Attributes:
         speed_mps: Speed of all drives [m/s].
-        wheelbase_m: Distance between the axles [m].
-        max_steering_rad: Largest angle of the front wheels to either side [rad].
+        wheelbase_m: Distance between the axles [m]; None for a car that turns by the difference of its wheels.
+        max_steering_rad: Largest angle of the front wheels to either side [rad]; without a wheelbase, largest turn rate [rad/s].
     """
 
     speed_mps: AboveZero
-    wheelbase_m: AboveZero
-    max_steering_rad: float = Field(gt=0.0, lt=1.5)
+    wheelbase_m: AboveZero | None
+    max_steering_rad: AboveZero
+
+    @model_validator(mode="after")
+    def _wheels_turn_less_than_sideways(self) -> DrivenCarConfig:
+        if self.wheelbase_m is not None and self.max_steering_rad >= 1.5:
+            raise ValueError(f"max_steering_rad: expected less than 1.5 rad, got {self.max_steering_rad:g}")
+        return self
+
+    @property
+    def described(self) -> CarDescription:
+        """The same as worlds describe their cars."""
+        kind: Literal["dubins", "ackermann"] = "dubins" if self.wheelbase_m is None else "ackermann"
+        limits = (-self.max_steering_rad, self.max_steering_rad)
+        return CarDescription(kind, self.speed_mps, limits, self.wheelbase_m)
 
 
 class MountedCameraConfig(StrictModel):
@@ -81,6 +95,10 @@ class PhotographsConfig(StrictModel):
         ground_z_m: Height of the ground in the frame of the photographs [m]; None: below the driven ones, by the camera's height.
         car: The car.
         camera: Its camera.
+        reach_m: Nothing that matters is farther from the cameras [m]: what is learned is then a box, which is drawn ten times as fast; None:
+            everything to the horizon is learned.
+        half: Every second photograph alone is learned from; None: all of them. Two scenes of a place, one from each half, show how much of
+            an attack is the place's and how much is one scene's.
     """
 
     images: Located = Field(exclude=True)
@@ -90,6 +108,8 @@ class PhotographsConfig(StrictModel):
     ground_z_m: float | None = None
     car: DrivenCarConfig
     camera: MountedCameraConfig
+    reach_m: AboveZero | None = None
+    half: Literal["even", "odd"] | None = None
 
     @model_validator(mode="after")
     def _ground_is_known(self) -> PhotographsConfig:

@@ -12,7 +12,7 @@ import numpy as np
 from advnerf_core.data.posed_image import PosedImage
 from advnerf_core.data.view_loading import load_image
 from advnerf_core.geometry import Array, Pinhole, VehicleState, camera_mount, invert_transform, make_transform
-from hardware.worlds.world import Box, CarDescription, Photograph, Rgb, WorldDescription, WorldError
+from hardware.worlds.world import Box, Photograph, Rgb, WorldDescription, WorldError
 from nodes.lab.worlds.photographs.config import PhotographsConfig, read_images
 from nodes.lab.worlds.photographs.track import driven_track, path_along, points_of
 
@@ -84,31 +84,40 @@ class Photographs:
 
     def describe(self) -> WorldDescription:
         """What an experiment must know: the path is that of the photographs that were taken while driving, or of the file."""
-        config, car = self.config, self.config.car
-        points = driven_track(self._cars) if config.shows_path else points_of(Path(config.path))
+        config, points = self.config, self.path_points()
         path = path_along(points, config.off_track_m, config.closed)
         return WorldDescription(
             paths={PATH: path},
             off_track_m=config.off_track_m,
-            car=CarDescription(
-                "ackermann", car.speed_mps, (-car.max_steering_rad, car.max_steering_rad), car.wheelbase_m
-            ),
+            car=config.car.described,
             camera=self.camera_pinhole,
             T_car_from_camera=self.T_car_from_camera,
             box=self._box(points),
             facts={"photographs": len(self._all)},
         )
 
+    def path_points(self) -> Array:
+        """Points ``[N, 2]`` of the path as they were measured [m]."""
+        if self.config.shows_path:
+            return driven_track(self._cars)
+        return points_of(Path(self.config.path))
+
     def _box(self, points: Array) -> Box:
         poses = np.stack([each.T_world_from_camera for each in self._all])
         cameras = (self._T_world_from_images @ poses)[:, :3, 3]
         seen = np.concatenate([cameras, np.column_stack([points, np.zeros(len(points))])])
         low, high = seen.min(axis=0), seen.max(axis=0)
-        beside_m = _BESIDE * float((high - low).max())
+        reach_m = self.config.reach_m
+        beside_m = _BESIDE * float((high - low).max()) if reach_m is None else reach_m
         x, y, z = (high + beside_m).tolist()
-        return Box(
-            (float(low[0] - beside_m), float(low[1] - beside_m), -_BELOW_M), (x, y, z), contraction=True
-        )
+        below = float(low[0] - beside_m), float(low[1] - beside_m), -_BELOW_M
+        return Box(below, (x, y, z), contraction=reach_m is None)
+
+    @property
+    def extent_m(self) -> float:
+        """The longest side of the box around the cameras [m]."""
+        places = np.stack([each.T_world_from_camera[:3, 3] for each in self._all])
+        return float(np.ptp(places, axis=0).max())
 
     def photographs(self, held_out: int) -> tuple[list[Photograph], list[Photograph]]:
         """Photographs to learn from, and views of the driving camera that nothing learns from.
@@ -127,6 +136,8 @@ class Photographs:
         chosen = [along[index] for index in np.linspace(0, len(along) - 1, held_out + 2).astype(int)[1:-1]]
         left_out = {each.path for each in chosen}
         learned = [each for each in self._all if each.path not in left_out]
+        if self.config.half is not None:
+            learned = learned[self.config.half == "odd" :: 2]
         return [self._photograph(each, None) for each in learned], [
             self._photograph(each, self.camera_pinhole) for each in chosen
         ]
