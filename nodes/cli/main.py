@@ -18,6 +18,7 @@ from nodes.cli import arm as cli_arm
 from nodes.cli import attack as cli_attack
 from nodes.cli import attack_node as cli_attack_node
 from nodes.cli import attack_poses as cli_attack_poses
+from nodes.cli import audit as cli_audit
 from nodes.cli import bag as cli_bag
 from nodes.cli import calibrate as cli_calibrate
 from nodes.cli import camera as cli_camera
@@ -76,6 +77,7 @@ app.add_typer(cli_room.app, name="room")
 app.add_typer(cli_carla.app, name="carla")
 app.add_typer(cli_world.app, name="world")
 cli_start.add_to(app)
+cli_audit.add_to(app)
 cli_arm.add_to(app)
 cli_doctor.add_to(app)
 cli_experiment.add_to(app)

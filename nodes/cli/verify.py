@@ -20,6 +20,8 @@ Published = Annotated[
     Path, typer.Option("--in", help="Folder of all published sets.", exists=True, file_okay=False)
 ]
 _FAILURE_EXIT = 1
+# What ``advnerf audit`` leaves in its folder.
+AUDIT = "audit.json"
 
 
 def register(
@@ -49,7 +51,8 @@ def register(
 
 def verify(
     name: Annotated[
-        str | None, typer.Argument(metavar="SET", help="Name of a set.", show_default="all sets")
+        str | None,
+        typer.Argument(metavar="SET", help="Name of a set, or folder of an audit.", show_default="all sets"),
     ] = None,
     published: Published = Path("docs/results"),
     again: Annotated[
@@ -65,6 +68,9 @@ def verify(
     from nodes.experiment.run.kept_attacks import with_attacks
     from nodes.experiment.run.redrive import RedriveError
 
+    if name is not None and (Path(name) / AUDIT).is_file():
+        _audit(Path(name))
+        return
     known = sets_in(published)
     if name is not None and name not in known:
         raise SetError(
@@ -94,6 +100,14 @@ def verify(
     wrong += 0 if name else _ledger(published)
     if wrong:
         raise typer.Exit(_FAILURE_EXIT)
+
+
+def _audit(folder: Path) -> None:
+    """Compute an audit's numbers again from its drives."""
+    from nodes.audit.kept import check_audit
+
+    for line in check_audit(folder):
+        print(line)
 
 
 def _say(what: str, problems: Sequence[str]) -> int:

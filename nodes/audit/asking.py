@@ -1,0 +1,37 @@
+"""Questions that have no default: asked once in a terminal; without one, the error names the option that answers them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import TypeVar
+
+import typer
+
+from advnerf_core.errors import AdvnerfError
+
+T = TypeVar("T", str, float)
+
+
+class UnansweredError(AdvnerfError):
+    """A question without a default, and nobody to ask."""
+
+
+def answer(given: T | None, option: str, question: str, kind: Callable[[str], T]) -> T:
+    """What an option says, or else a person at the terminal.
+
+    Args:
+        given: Value of the option; None if it was left out.
+        option: Its name.
+        question: What is asked, with the unit.
+        kind: Type of the answer.
+
+    Raises:
+        UnansweredError: The option was left out, and there is no terminal.
+    """
+    if given is not None:
+        return given
+    if not sys.stdin.isatty():
+        raise UnansweredError(f"expected {option}, as no terminal can be asked: {question}")
+    found: T = typer.prompt(f"{question} ({option})", type=kind)
+    return found

@@ -1,0 +1,99 @@
+"""Compares a policy with an earlier audit: it is driven from the same starts past nothing, the plain object, and what was found then."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from advnerf_core.attack.artifact import load_attack
+from advnerf_core.files import sha256_of
+from advnerf_core.report.audit_parts import AuditedObject
+from advnerf_core.report.audit_result import AuditComparison, AuditResult, read_audit
+from nodes.audit.drives import FOUND, NO_OBJECT, PLAIN_OBJECT
+from nodes.audit.kept import read_drives
+from nodes.audit.verdict import Drives, change_of
+from nodes.experiment.plan.object_kinds import footprint_m, name_of
+from nodes.runtime.errors import ConfigError
+
+ATTACK_KEPT = "object.attack.safetensors"
+# A change of the largest deviation up to this share of half a lane is no regression.
+MARGIN = 0.1
+_ARMS = (NO_OBJECT, PLAIN_OBJECT, FOUND)
+
+
+class Before:
+    """An earlier audit, with its drives and the object that it found.
+
+    Args:
+        file: Its ``audit.json``.
+
+    Raises:
+        ConfigError: It judged nothing, or its folder lacks the drives or the attack.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self.file, self.folder = file, file.parent
+        self.result: AuditResult = read_audit(file)
+        if self.result.strongest is None:
+            raise ConfigError(
+                f"--against {file}: expected an audit that judged an object, got {self.result.verdict.outcome}"
+            )
+        for name in ("drives.json", ATTACK_KEPT):
+            if not (self.folder / name).is_file():
+                raise ConfigError(
+                    f"--against {file}: expected {name} beside it, as advnerf audit leaves it, which is not there"
+                )
+        load_attack(self.folder / ATTACK_KEPT)
+
+    @property
+    def object(self) -> AuditedObject:
+        """What was found."""
+        assert self.result.strongest is not None
+        return self.result.strongest.object
+
+    def listed(self, kind: str) -> dict[str, Any]:
+        """The object as experiment files list it.
+
+        Args:
+            kind: The kind that is asked about now, with the path of a file.
+
+        Raises:
+            ConfigError: It is another kind.
+        """
+        then = self.object
+        if name_of(kind) != then.kind:
+            raise ConfigError(
+                f"--against {self.file}: expected --object {then.kind} as then, got {name_of(kind)}"
+            )
+        pose = {key: getattr(then.pose, key) for key in ("x_m", "y_m", "z_m", "yaw_rad")}
+        return {
+            "name": then.name,
+            "kind": kind,
+            **pose,
+            "scale": round(then.size_m[1] / footprint_m(kind)[1], 9),
+        }
+
+    def compare(self, now: Mapping[str, Drives], limit_m: float) -> AuditComparison:
+        """What changed, of the arm that got worst.
+
+        Args:
+            now: Drives past no object, the plain one and the one that was found then, from the starts of then.
+            limit_m: |CTE| beyond which the car has left its lane [m].
+        """
+        assert self.result.verdict.evidence is not None or self.result.strongest is not None
+        evidence = self.result.verdict.evidence or "surrogate"
+        then = read_drives(self.folder)[evidence]
+        changes = [change_of(now[name], then[name], len(_ARMS)) for name in _ARMS]
+        return AuditComparison(
+            file=str(self.file),
+            sha256=sha256_of(self.file),
+            effect=max(changes, key=lambda each: each.low_m),
+            margin_m=MARGIN * limit_m,
+            starts=self.result.starts.judging.count,
+        )
+
+
+def is_worse(comparison: AuditComparison) -> bool:
+    """Whether the policy leaves its path by more than then, beyond the margin."""
+    return comparison.effect.low_m > comparison.margin_m

@@ -1,0 +1,57 @@
+"""Frames that would help a policy that was driven off: what its camera saw past the object, and the steering that keeps the path."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+
+import numpy as np
+
+from advnerf_core.data.image_files import write_image
+from advnerf_core.files import write_atomically
+from nodes.audit.drives import FOUND
+from nodes.audit.judging import Judged, open_world, seen_on
+
+FOLDER, LABELS = "harden", "labels.csv"
+_COLUMNS = ("image", "steering", "unit", "x_m", "y_m", "yaw_rad", "cte_m")
+# Drives whose frames are exported, those that were moved most.
+_DRIVES = 5
+
+
+def export_frames(judged: Judged, folder: Path) -> Path:
+    """Write the frames and their labels; nothing of the user's is trained.
+
+    Args:
+        judged: With the drives past the object.
+        folder: Gets ``images`` and ``labels.csv``: left is positive, in the unit of the car's control.
+
+    Returns:
+        The file of labels.
+    """
+    experiment, drives = judged.experiment, judged.drives[FOUND]
+    scenario = experiment.config.paths[0]
+    rows: list[tuple[str | float, ...]] = []
+    worst = np.argsort(-drives.largest_m, kind="stable")[:_DRIVES]
+    with open_world(experiment, judged.evidence) as world:
+        for number in worst.tolist():
+            states = drives.states[number][: 1 + int(drives.driven_ticks[number])]
+            pictures = seen_on(experiment, judged.arms[FOUND], states, world)
+            steering = experiment.expert(scenario).steer_states(states)
+            ctes_m = experiment.paths[scenario].project(states[:, :2]).cte_m
+            for tick, rgb in enumerate(pictures):
+                name = f"images/{number:02d}_{tick:03d}.png"
+                write_image(folder / name, rgb)
+                labels = (
+                    float(steering[tick]),
+                    experiment.car.control_unit,
+                    *states[tick].tolist(),
+                    float(ctes_m[tick]),
+                )
+                rows.append((name, *labels))
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(_COLUMNS)
+    table.writerows(rows)
+    write_atomically(folder / LABELS, text.getvalue())
+    return folder / LABELS

@@ -1,0 +1,118 @@
+"""The posed photographs of a place, from what a user has: ``transforms.json``, a COLMAP model beside its images, photographs, or videos."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from advnerf_core.data.colmap_folder import model_suffix
+from advnerf_core.data.image_files import HEIF_SUFFIXES, SUFFIXES
+from advnerf_core.documents import read_json
+from nodes.audit.asking import UnansweredError
+from nodes.audit.question import PlaceKind, Scale
+from nodes.lab.importing.metric_options import MetricOptions
+from nodes.runtime.errors import ConfigError
+from nodes.runtime.progress import ProgressDisplay
+
+POSES, IMPORTED, REPORT = "transforms.json", "photos", "import.json"
+_EXTENT_M = 1.0  # of a set whose metre nobody knows; it is refused then
+_MOVEMENT, _MOST = 0.06, 300  # as of ``advnerf scene from-video``
+
+
+@dataclass(frozen=True)
+class PosedPlace:
+    """Photographs with poses.
+
+    Attributes:
+        poses: Their ``transforms.json``.
+        kind: What the user gave.
+        scale: What the metre comes from.
+        ground_at_zero: Whether the ground is known to be at z = 0.
+    """
+
+    poses: Path
+    kind: PlaceKind
+    scale: Scale
+    ground_at_zero: bool
+
+
+def posed(given: Path, folder: Path, metric: MetricOptions) -> PosedPlace:
+    """The posed photographs of a place; what has none yet is imported into the audit's folder, once.
+
+    Args:
+        given: What the user gave.
+        folder: The audit's.
+        metric: What is known of lengths in the place.
+
+    Raises:
+        ConfigError: It is nothing of what is known.
+        UnansweredError: Nothing says how long a metre is.
+        AdvnerfError: It cannot be read, or poses cannot be estimated.
+    """
+    poses = given / POSES if given.is_dir() else given
+    if poses.is_file() and poses.suffix == ".json":
+        return _known(poses, "images")
+    imported = folder / IMPORTED
+    kind: PlaceKind = "video" if given.is_file() else "images"
+    if not (imported / POSES).is_file():
+        with ProgressDisplay() as display:
+            _importer(given)(imported, metric, display.start("poses"))
+    return _known(imported / POSES, kind)
+
+
+def _known(poses: Path, kind: PlaceKind) -> PosedPlace:
+    report = poses.parent / REPORT
+    facts: dict[str, Any] = read_json(report) if report.is_file() else {}
+    scale = facts.get("scale_from", "poses")
+    if scale is None:
+        raise UnansweredError(
+            f"expected a known length, as {poses} has none and an audit speaks of metres: --length A B METRES, --positions CSV or --marker SIDE, "
+            "with a new --output"
+        )
+    return PosedPlace(poses, kind, scale, bool(facts.get("ground_at_zero", False)))
+
+
+def _importer(given: Path) -> Callable[[Path, MetricOptions, Any], object]:
+    """What imports the poses of something."""
+    models = next(
+        (each for each in (given, given / "sparse", given / "colmap" / "sparse") if _holds_model(each)), None
+    )
+    if models is not None:
+        from nodes.lab.importing.colmap import from_colmap
+
+        images = given / "images"
+        if not images.is_dir():
+            raise ConfigError(
+                f"--place {given}: expected the folder images beside the COLMAP model, which is not there"
+            )
+        return lambda output, metric, report: from_colmap(models, images, output, None, metric, report)
+    if not given.exists():
+        raise ConfigError(
+            f"--place: expected photographs, a video or a COLMAP model, got {given}, which is not there"
+        )
+    if given.is_dir() and not any(
+        each.suffix.lower() in (*SUFFIXES, *HEIF_SUFFIXES) for each in given.rglob("*")
+    ):
+        raise ConfigError(
+            f"--place {given}: expected photographs, {POSES} or a COLMAP model in it, got a folder without"
+        )
+    return _from_media(given)
+
+
+def _holds_model(folder: Path) -> bool:
+    inside = folder.iterdir() if folder.is_dir() else ()
+    return model_suffix(folder) is not None or any(model_suffix(each) for each in inside if each.is_dir())
+
+
+def _from_media(given: Path) -> Callable[[Path, MetricOptions, Any], object]:
+    from advnerf_core.data.keyframes import KeyframeConfig
+    from calibration.photo_model import SfmConfig
+    from nodes.lab.importing.data_set import from_media
+    from nodes.lab.importing.media import MediaConfig
+
+    config = MediaConfig(KeyframeConfig(_MOVEMENT), _MOST, False)
+    return lambda output, metric, report: from_media(
+        [given], output, config, SfmConfig(seed=0), _EXTENT_M, metric, report
+    )

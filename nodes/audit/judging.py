@@ -1,0 +1,207 @@
+"""The last part of an audit: what was chosen is driven from starts that nothing has used, beside the controls, and filmed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.attack.artifact import face_texture, load_attack
+from advnerf_core.geometry import Array, planar_poses
+from advnerf_core.report.audit_parts import Evidence, JudgedDrives, JudgedStart, RoutePoint
+from advnerf_core.report.audit_result import AuditControl, ControlKind
+from advnerf_core.report.clips import ClipTrack, write_clip
+from advnerf_core.scene.surrogate import Surrogate
+from hardware.worlds.world import World
+from nodes.audit.drives import (
+    FOUND,
+    NO_OBJECT,
+    PICTURE,
+    PLAIN_OBJECT,
+    Arm,
+    arm_of,
+    driven,
+    learned,
+    with_starts,
+)
+from nodes.audit.verdict import Control, Drives, Judgement, judge
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.images import as_uint8
+from nodes.experiment.show.learned_scene import load_background
+from nodes.experiment.show.placing import clean_poses
+from nodes.experiment.show.spaces import dress, shown_there
+from nodes.experiment.steps.films import filmed
+
+CONTROLS: tuple[Control, ...] = ("no_object", "plain_object")
+TITLES = {
+    NO_OBJECT: "no object",
+    PLAIN_OBJECT: "plain object",
+    PICTURE: "a picture of the place",
+    FOUND: "the object that was found",
+}
+# Colours of films and plots are those of conditions.
+CONDITIONS = {NO_OBJECT: "empty", PLAIN_OBJECT: "none", PICTURE: "random", FOUND: "gradient"}
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """What was judged.
+
+    Attributes:
+        evidence: Where it was driven.
+        arms: What the car met.
+        drives: The drives of each, by name of the arm.
+        judgement: What they say.
+        experiment: With the judging starts.
+        limit_m: |CTE| beyond which the car has left its lane [m].
+    """
+
+    evidence: Evidence
+    arms: Mapping[str, Arm]
+    drives: Mapping[str, Drives]
+    judgement: Judgement
+    experiment: Experiment
+    limit_m: float
+
+    def controls(self) -> list[AuditControl]:
+        """What was driven without an attack."""
+        return [
+            AuditControl(
+                kind=kind,
+                name=TITLES[kind],
+                evidence=self.evidence,
+                mean_off_path_m=float(drives.largest_m.mean()),
+                off_track=int(drives.left(self.limit_m).sum()),
+                starts=len(drives.largest_m),
+            )
+            for kind in get_args(ControlKind)
+            for drives in [self.drives[kind]]
+        ]
+
+    @property
+    def shown_start(self) -> int:
+        """The start that pictures and films are of: whose effect is the median."""
+        control = self.drives[self.judgement.control]
+        differences = self.drives[FOUND].largest_m - control.largest_m
+        return int(np.argsort(differences, kind="stable")[len(differences) // 2])
+
+    def as_result(self) -> JudgedDrives:
+        """The same as the audit's result has it."""
+        found, control = self.drives[FOUND], self.drives[self.judgement.control]
+        dt_s, limit_m, shown = self.experiment.config.dt_s, self.limit_m, self.shown_start
+        return JudgedDrives(
+            evidence=self.evidence,
+            measure="max_abs_cte",
+            control=self.judgement.control,
+            effect=self.judgement.effect,
+            starts=tuple(
+                JudgedStart(
+                    x_m=start[0],
+                    y_m=start[1],
+                    yaw_rad=start[2],
+                    off_path_m=float(found.largest_m[number]),
+                    control_off_path_m=float(control.largest_m[number]),
+                    off_track=bool(found.left(limit_m)[number]),
+                    control_off_track=bool(control.left(limit_m)[number]),
+                )
+                for number, start in enumerate(found.states[:, 0, :3].tolist())
+            ),
+            path=_route(clean_poses(self.experiment, self.experiment.config.paths[0]), dt_s),
+            route=_route(found.states[shown], dt_s),
+        )
+
+
+def _route(poses: Array, dt_s: float) -> tuple[RoutePoint, ...]:
+    return tuple(
+        RoutePoint(t_s=round(number * dt_s, 9), x_m=x, y_m=y, yaw_rad=yaw)
+        for number, (x, y, yaw) in enumerate(np.asarray(poses)[:, :3].tolist())
+    )
+
+
+def judge_found(
+    experiment: Experiment,
+    victim: str,
+    found: Path,
+    count: int,
+    seed: int,
+    limit_m: float,
+    evidence: Evidence,
+) -> Judged:
+    """Drive from the judging starts.
+
+    Args:
+        experiment: With the object where the search had it; of the copy that is judged in.
+        victim: Which policy.
+        found: The attack file.
+        count: Judging starts.
+        seed: Of these.
+        limit_m: |CTE| beyond which the car has left its lane [m].
+        evidence: ``surrogate``, or ``world``.
+    """
+    with_them = with_starts(experiment, count, seed)
+    arms = {name: arm_of(with_them, name, found) for name in (NO_OBJECT, PLAIN_OBJECT, PICTURE, FOUND)}
+    drives = drive_arms(with_them, victim, arms, evidence)
+    controls = {name: drives[name] for name in CONTROLS}
+    judgement = judge(drives[FOUND], controls, limit_m)
+    return Judged(evidence, arms, drives, judgement, with_them, limit_m)
+
+
+def drive_arms(
+    experiment: Experiment, victim: str, arms: Mapping[str, Arm], evidence: Evidence
+) -> dict[str, Drives]:
+    """Drives past each of several things, from the measured starts."""
+    with open_world(experiment, evidence) as world:
+        return {
+            name: learned(experiment, victim, arm)
+            if world is None
+            else driven(experiment, victim, arm, world)
+            for name, arm in arms.items()
+        }
+
+
+@contextmanager
+def open_world(experiment: Experiment, evidence: Evidence) -> Iterator[World | None]:
+    """The world that is driven in, open; None where drives are in the learned scene."""
+    if evidence == "surrogate":
+        yield None
+        return
+    with experiment.open_deployed_world() as world:
+        yield world
+
+
+def film(judged: Judged, file: Path) -> Path:
+    """The drives past no object, a plain one and the one that was found, side by side, from the shown start."""
+    experiment, tracks = judged.experiment, []
+    every, rate_hz = filmed(experiment.config.dt_s)
+    path = experiment.paths[experiment.config.paths[0]]
+    with open_world(experiment, judged.evidence) as world:
+        for name in (NO_OBJECT, PLAIN_OBJECT, FOUND):
+            states = judged.drives[name].states[judged.shown_start][::every]
+            frames = seen_on(experiment, judged.arms[name], states, world)
+            cte_m = path.project(states[:, :2]).cte_m
+            tracks.append(ClipTrack(TITLES[name], CONDITIONS[name], frames, cte_m))
+    return write_clip(file, tracks, rate_hz, judged.limit_m)
+
+
+def seen_on(experiment: Experiment, arm: Arm, states: Array, world: World | None) -> list[NDArray[np.uint8]]:
+    """The driving camera's pictures ``[H, W, 3]`` from car states ``[N, 3]``; in the learned scene where there is no world."""
+    if world is None:
+        whole = Surrogate(load_background(experiment), experiment.camera, experiment.mount, arm.shown.objects)
+        colours = arm.shown.colours if arm.shown.objects else None
+        poses = planar_poses(np.asarray(states, dtype=np.float64)) @ experiment.mount
+        return [as_uint8(whole.render(pose[None], colours).images[0]) for pose in poses]
+    dressed = dress(experiment, world, arm.shown)
+    attack = None if arm.attack is None else load_attack(arm.attack)
+    colours = shown_there(experiment, arm.shown, attack)
+    return [dressed.camera_image(state, colours) for state in states]
+
+
+def texture_of(found: Path) -> NDArray[np.uint8] | None:
+    """The picture ``[H, W, 3]`` that a panel shows; None of an object that is none."""
+    theta = load_attack(found).objects[0].theta
+    return face_texture(theta) if theta.ndim == 3 else None

@@ -1,0 +1,121 @@
+"""The drives that an audit has judged, as it keeps them: from them its numbers can be computed again, by anybody."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from advnerf_core.documents import read_json
+from advnerf_core.driving.metrics import Horizon, drive_metrics
+from advnerf_core.errors import AdvnerfError
+from advnerf_core.files import write_atomically
+from advnerf_core.report.audit_parts import JudgedDrives
+from advnerf_core.report.audit_result import AuditResult, read_audit
+from hardware.worlds.paths import ReferencePath
+from nodes.audit.judging import CONTROLS, FOUND, Judged
+from nodes.audit.verdict import Control, Drives, judge
+from nodes.lab.worlds.expert_drive import as_path
+
+DRIVES, RESULT = "drives.json", "audit.json"
+# Numbers are compared to this [m]: they come from the same states.
+_SAME_M = 1e-6
+
+
+class AuditDiffersError(AdvnerfError):
+    """What an audit says is not what its drives say."""
+
+
+def keep_drives(folder: Path, judged: Sequence[Judged]) -> None:
+    """Write the states of all judged drives, and what they are measured by."""
+    data = {each.evidence: _as_data(each) for each in judged}
+    write_atomically(folder / DRIVES, json.dumps(data) + "\n")
+
+
+def _as_data(judged: Judged) -> dict[str, Any]:
+    experiment = judged.experiment
+    limits = experiment.limits
+    return {
+        "path": experiment.references[experiment.config.paths[0]].to_dict(),
+        "limits": {"ticks": limits.ticks, "dt_s": limits.dt_s, "held_cap_m": limits.held_cap_m},
+        "off_track_m": judged.limit_m,
+        "states": {name: drives.states.tolist() for name, drives in judged.drives.items()},
+        "driven_ticks": {name: drives.driven_ticks.tolist() for name, drives in judged.drives.items()},
+    }
+
+
+def read_drives(folder: Path) -> dict[str, dict[str, Drives]]:
+    """The judged drives by evidence and name of what the car met, measured again."""
+    return {evidence: _measured(data) for evidence, data in read_json(folder / DRIVES).items()}
+
+
+def _measured(data: Mapping[str, Any]) -> dict[str, Drives]:
+    path = as_path(ReferencePath.from_dict(data["path"]))
+    horizon = Horizon(off_track_m=data["off_track_m"], **data["limits"])
+    found = {}
+    for name, listed in data["states"].items():
+        states, ticks = np.array(listed), np.array(data["driven_ticks"][name])
+        scores = [
+            drive_metrics(path, each[: 1 + driven], horizon)
+            for each, driven in zip(states, ticks, strict=True)
+        ]
+        found[name] = Drives(
+            states=states,
+            largest_m=np.array([score.max_cte_m for score in scores]),
+            mean_m=np.array([score.mean_cte_m for score in scores]),
+            ctes_m=np.array([score.ctes_m for score in scores]),
+            driven_ticks=ticks,
+        )
+    return found
+
+
+def check_audit(folder: Path) -> list[str]:
+    """Compute an audit's numbers again from the drives in its folder.
+
+    Returns:
+        What was checked, a line each.
+
+    Raises:
+        AuditDiffersError: A number is another.
+    """
+    result = read_audit(folder / RESULT)
+    if result.strongest is None:
+        return [f"{folder}: {result.verdict.outcome}, nothing was judged"]
+    drives = read_drives(folder)
+    return [_check(folder, result, each, drives[each.evidence]) for each in result.strongest.judgements]
+
+
+def _check(folder: Path, result: AuditResult, said: JudgedDrives, drives: Mapping[str, Drives]) -> str:
+    limit_m = result.place.off_track_m
+    assert limit_m is not None, "an object is judged where the scale is known"
+    controls: dict[Control, Drives] = {name: drives[name] for name in CONTROLS}
+    found = judge(drives[FOUND], controls, limit_m)
+    _same(folder, f"{said.evidence}: control", said.control, found.control)
+    for name in ("mean_m", "low_m", "high_m"):
+        _same(
+            folder, f"{said.evidence}: effect.{name}", getattr(said.effect, name), getattr(found.effect, name)
+        )
+    rows = zip(said.starts, drives[FOUND].largest_m, controls[found.control].largest_m, strict=True)
+    for number, (start, largest_m, control_m) in enumerate(rows):
+        where = f"{said.evidence}: start {number}"
+        _same(folder, f"{where}: off_path_m", start.off_path_m, float(largest_m))
+        _same(folder, f"{where}: control_off_path_m", start.control_off_path_m, float(control_m))
+        _same(folder, f"{where}: off_track", start.off_track, bool(largest_m > limit_m))
+    if said.evidence == result.verdict.evidence and result.verdict.outcome in ("found", "nothing_found"):
+        _same(folder, "verdict", result.verdict.outcome, "found" if found.found else "nothing_found")
+    return f"{folder}: {said.evidence}, {len(said.starts)} starts: as the drives say"
+
+
+def _same(folder: Path, what: str, said: Any, computed: Any) -> None:
+    alike = (
+        abs(said - computed) <= _SAME_M
+        if isinstance(said, float) and isinstance(computed, float)
+        else said == computed
+    )
+    if not alike:
+        raise AuditDiffersError(
+            f"{folder / RESULT}: {what}: expected {computed} from the kept drives, got {said}"
+        )

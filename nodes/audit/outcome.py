@@ -1,0 +1,291 @@
+"""What an audit has come to know, as its result: the sentence, the numbers behind it, and the files of its folder."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from importlib.metadata import version
+from pathlib import Path
+
+from advnerf_core.data.image_files import write_image
+from advnerf_core.errors import AdvnerfError
+from advnerf_core.files import sha256_of, write_atomically
+from advnerf_core.policies.load import source_sha256
+from advnerf_core.report.audit_parts import (
+    AuditedObject,
+    AuditedPlace,
+    AuditedPolicy,
+    AuditedVehicle,
+    JudgedObject,
+    ObjectPose,
+)
+from advnerf_core.report.audit_result import (
+    AuditBudget,
+    AuditComparison,
+    AuditFidelity,
+    AuditResult,
+    AuditStarts,
+    AuditVerdict,
+    NotTried,
+    PlantedControl,
+    StartSet,
+    TriedSearch,
+    write_audit,
+)
+from nodes.audit.comparing import ATTACK_KEPT, is_worse
+from nodes.audit.drives import PICTURE
+from nodes.audit.judging import Judged, film, texture_of
+from nodes.audit.kept import RESULT, keep_drives
+from nodes.audit.page import write_page
+from nodes.audit.question import JUDGING_SEED, SELECTION_SEED, Question, question_of
+from nodes.audit.schedule import NEVER_TRIED
+from nodes.audit.searching import Found, Searches
+from nodes.audit.spots import Spot
+from nodes.experiment.plan.object_kinds import footprint_m, name_of
+from nodes.experiment.show.context import Experiment
+
+TEXTURE, BEFORE, AFTER, FILM = "object.png", "before.png", "after.png", "drives.mp4"
+PICTURES = {
+    BEFORE: "Where it stands, in plain colours, before any search: as the learned place shows it where it is largest.",
+    AFTER: "The same with what was found.",
+    TEXTURE: "What was found, from the front.",
+}
+_LIBRARIES = ("torch", "numpy", "numba", "opencv-contrib-python-headless")
+
+
+@dataclass
+class Known:
+    """All that is known so far; what is None or empty was not reached."""
+
+    question: Question
+    minutes: float
+    file: Path | None = None
+    experiment: Experiment | None = None
+    fidelity: AuditFidelity | None = None
+    spots: Sequence[Spot] = ()
+    searches: Searches | None = None
+    best: Found | None = None
+    judged: list[Judged] = field(default_factory=list)
+    planted: PlantedControl | None = None
+    against: AuditComparison | None = None
+    reasons: tuple[str, ...] = ()
+    interrupted: bool = False
+    seconds: float | None = None
+    ended: datetime | None = None
+
+    @property
+    def limit_m(self) -> float:
+        """|CTE| beyond which the car has left its lane [m]."""
+        assert self.experiment is not None, "the place is described before anything is judged by it"
+        return self.question.limit_m or self.experiment.world.off_track_m
+
+
+def result_of(known: Known, folder: Path) -> AuditResult:
+    """The result of an audit; pictures that it names are written into its folder."""
+    assert known.file is not None, "the experiment file is written first"
+    question = known.question
+    return AuditResult(
+        verdict=verdict_of(known),
+        policy=AuditedPolicy(path=question.given, sha256=_sha256_of(question.policy)),
+        place=AuditedPlace(
+            name=question.place.name,
+            kind=question.place.kind,
+            source=question.place.source,
+            scale=question.place.scale,
+            off_track_m=None if known.experiment is None else known.limit_m,
+        ),
+        vehicle=_vehicle(known),
+        strongest=_strongest(known, folder),
+        controls=tuple(control for each in known.judged for control in each.controls()),
+        planted=known.planted,
+        tried=tuple(_tried(known)),
+        not_tried=tuple(_not_tried(known)),
+        fidelity=known.fidelity,
+        starts=AuditStarts(
+            search=StartSet(seed=question.seed, count=_search_starts(known)),
+            selection=StartSet(seed=SELECTION_SEED, count=question.selection),
+            judging=StartSet(seed=JUDGING_SEED, count=question.judging),
+        ),
+        budget=_budget(known),
+        against=known.against,
+        question=question_of(known.file),
+        versions={
+            "advnerf": version("advnerf"),
+            "python": platform.python_version(),
+            **{name: version(name) for name in _LIBRARIES},
+        },
+        date=known.ended,
+    )
+
+
+def write_result(known: Known, result: AuditResult, folder: Path) -> str:
+    """Write the result, and what is made from it: the drives, the film, the page; returns what could not be written, and why."""
+    keep_drives(folder, known.judged)
+    if known.best is not None:
+        write_atomically(folder / ATTACK_KEPT, known.best.attack.read_bytes())
+    shown = film(known.judged[-1], folder / FILM) if known.judged else None
+    path = None
+    if known.experiment is not None and known.judged:
+        path = known.experiment.paths[known.experiment.config.paths[0]]
+    pictures = [(folder / name, caption) for name, caption in PICTURES.items() if (folder / name).exists()]
+    drives = {each.evidence: each.drives for each in known.judged}
+    write_page(folder, result, drives, path, shown, pictures)
+    write_audit(folder / RESULT, result)
+    try:
+        from advnerf_core.report.exports.write import write_exports
+    except ImportError:  # the extra is for those who hand results to other programs
+        return "for SARIF, JUnit and OpenSCENARIO files: pip install 'advnerf[audit]', then the same command again"
+    write_exports(folder, result)
+    return ""
+
+
+def verdict_of(known: Known) -> AuditVerdict:
+    """What the audit concludes."""
+    if known.reasons:
+        return AuditVerdict(
+            outcome="cannot_judge",
+            evidence=None,
+            sentence=f"This audit cannot judge the policy here: {known.reasons[0]}.",
+            reasons=known.reasons,
+        )
+    judged = known.judged[-1]
+    if known.against is not None and is_worse(known.against):
+        return AuditVerdict(outcome="worse", evidence=judged.evidence, sentence=_worse(known.against))
+    found = judged.judgement.found
+    return AuditVerdict(
+        outcome="found" if found else "nothing_found",
+        evidence=judged.evidence,
+        sentence=_sentence(known, judged),
+    )
+
+
+def _sentence(known: Known, judged: Judged) -> str:
+    judgement, place = judged.judgement, known.question.place
+    effect, left = judgement.effect, judgement.left["object"]
+    where = (
+        f"In {place.name}, by its own car" if judged.evidence == "world" else f"In {_copy(known)}, not driven"
+    )
+    moves = f"{effect.mean_m:.2f} m farther off its path (95 % {effect.low_m:.2f} to {effect.high_m:.2f})"
+    out = f"out of its lane from {left} of {judgement.starts} starts"
+    if judgement.found:
+        others = max(judgement.left["no_object"], judgement.left["plain_object"])
+        plain = "a plain one does not" if others == 0 else f"a plain one, or none, does from {others}"
+        by_picture = int(judged.drives[PICTURE].left(judged.limit_m).sum())
+        picture = f", a photograph in its place does from {by_picture}" if by_picture else ""
+        return f"{where}, {_object(known)} brings the policy {moves} and {out}; {plain}{picture}."
+    tried = len(known.searches.found) if known.searches else 0
+    return (
+        f"{where}, no object was found within this budget that drives the policy out of its lane: the strongest of {tried} brings it {moves} "
+        f"and {out}."
+    )
+
+
+def _worse(against: AuditComparison) -> str:
+    effect = against.effect
+    return (
+        f"The policy is worse than in {against.file}: from the same {against.starts} starts it comes {effect.mean_m:.2f} m farther off its path "
+        f"({effect.level:.0%} {effect.low_m:.2f} to {effect.high_m:.2f}), more than the margin of {against.margin_m:.2f} m."
+    )
+
+
+def _copy(known: Known) -> str:
+    quality = f" of {known.fidelity.psnr_db:.1f} dB" if known.fidelity else ""
+    return f"a learned copy{quality} of {known.question.place.name}"
+
+
+def _object(known: Known) -> str:
+    assert known.best is not None
+    placed = known.spots[known.best.spot].placed
+    kind = "panel" if placed.kind == "panel" else name_of(placed.kind)
+    return f"a {placed.side_m:.2g} m {kind} at x {placed.x_m:.2f}, y {placed.y_m:.2f}"
+
+
+def _strongest(known: Known, folder: Path) -> JudgedObject | None:
+    if known.best is None or not known.judged:
+        return None
+    placed, texture = known.spots[known.best.spot].placed, texture_of(known.best.attack)
+    if texture is not None:
+        write_image(folder / TEXTURE, texture)
+    length, width = (placed.scale * each for each in footprint_m(placed.kind))
+    return JudgedObject(
+        object=AuditedObject(
+            name=placed.name,
+            kind=name_of(placed.kind),
+            size_m=(length, width, width),
+            pose=ObjectPose(x_m=placed.x_m, y_m=placed.y_m, z_m=placed.z_m, yaw_rad=placed.yaw_rad),
+            texture=None if texture is None else TEXTURE,
+            texture_sha256=None if texture is None else sha256_of(folder / TEXTURE),
+        ),
+        judgements=tuple(each.as_result() for each in known.judged),
+    )
+
+
+def _vehicle(known: Known) -> AuditedVehicle | None:
+    if known.experiment is None or known.experiment.car.wheelbase_m is None:
+        return None
+    car = known.experiment.car
+    assert car.wheelbase_m is not None
+    return AuditedVehicle(
+        name="car", wheelbase_m=car.wheelbase_m, speed_mps=car.speed_mps, max_steering_rad=car.largest_control
+    )
+
+
+def _tried(known: Known) -> Iterator[TriedSearch]:
+    for each in known.searches.found if known.searches else ():
+        yield TriedSearch(
+            object=_object_name(known),
+            placement=f"spot {each.spot + 1}",
+            space="colours",
+            method=each.method,
+            seed=each.seed,
+            evaluations=each.evaluations,
+            effect_m=each.effect_m,
+            selected=each is known.best,
+        )
+
+
+def _object_name(known: Known) -> str:
+    return name_of(known.question.kind)
+
+
+def _not_tried(known: Known) -> Iterator[NotTried]:
+    yield from (NotTried(what=what, why=why) for what, why in NEVER_TRIED.items())
+    if known.searches is None:
+        return
+    done = {each.setting for each in known.searches.found}
+    for number, (wanted, row) in enumerate(
+        zip(known.searches.rounds, known.searches.planned, strict=True), start=1
+    ):
+        left = len(row) - sum(name.startswith(f"{number}-") for name in done)
+        if left > 0:
+            why = "interrupted" if known.interrupted else "the audit ended before it"
+            yield NotTried(what=f"{left} searches by {wanted.method} (round {number})", why=why)
+
+
+def _search_starts(known: Known) -> int:
+    return max(each.starts for each in known.searches.rounds) if known.searches else 1
+
+
+def _budget(known: Known) -> AuditBudget:
+    searches = known.searches
+    planned = sum(
+        each.evaluations * wanted.starts
+        for wanted, row in (zip(searches.rounds, searches.planned, strict=True) if searches else ())
+        for each in row
+    )
+    return AuditBudget(
+        evaluations_planned=planned,
+        evaluations_spent=sum(each.evaluations for each in searches.found) if searches else 0,
+        minutes=known.minutes,
+        seconds=None if known.seconds is None else round(known.seconds, 1),
+        ended="interrupted" if known.interrupted else "schedule",
+    )
+
+
+def _sha256_of(policy: str) -> str | None:
+    try:
+        return source_sha256(policy)
+    except AdvnerfError:
+        return None

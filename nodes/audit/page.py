@@ -1,0 +1,220 @@
+"""The page of an audit: the verdict, the film and the drives from above on the first screen; then what stands behind them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path as FilePath
+from typing import Any
+
+import jinja2
+import numpy as np
+from markupsafe import Markup
+from matplotlib.patches import Polygon
+
+from advnerf_core.data.image_files import read_stored
+from advnerf_core.driving.path import Path
+from advnerf_core.files import write_atomically
+from advnerf_core.report import plots
+from advnerf_core.report.audit_parts import AuditedObject, Evidence
+from advnerf_core.report.audit_result import AuditResult, TriedSearch
+from advnerf_core.report.clips import data_uri, film_strip, image_uri
+from advnerf_core.report.conditions import style_of
+from advnerf_core.report.palette import LIGHT, look_css
+from advnerf_core.report.text_table import Table, number
+from nodes.audit.judging import CONDITIONS, FOUND, NO_OBJECT, PICTURE, PLAIN_OBJECT, TITLES
+from nodes.audit.verdict import Drives, effect_of
+
+PAGE = "audit.html"
+_OUTCOMES = {
+    "found": "found",
+    "nothing_found": "nothing found within this budget",
+    "cannot_judge": "cannot be judged",
+    "worse": "worse than before",
+}
+_DRIVEN_IN = {"surrogate": "learned copy", "world": "world", "live": "live car"}
+_SPACING = 0.1  # of points along the path, in half lanes
+_QUALITY = 85
+
+
+def write_page(
+    folder: FilePath,
+    result: AuditResult,
+    drives: Mapping[Evidence, Mapping[str, Drives]],
+    path: Path | None,
+    film: FilePath | None,
+    pictures: Sequence[tuple[FilePath, str]],
+) -> FilePath:
+    """Write the page of an audit into its folder.
+
+    Args:
+        folder: The audit's.
+        result: What it says.
+        drives: The judged drives by evidence and name of what the car met.
+        path: The reference path; None where nothing was judged.
+        film: The film; None where there is none.
+        pictures: Pictures of the object, each with its caption.
+    """
+    judged = _judged(result, drives)
+    template = jinja2.Environment(autoescape=True).from_string(
+        files("advnerf_core.report").joinpath("audit.html").read_text(encoding="utf-8")
+    )
+    text = template.render(
+        result=result,
+        look=Markup(look_css()),
+        outcome=_OUTCOMES[result.verdict.outcome],
+        film=None if film is None else data_uri(film),
+        poster=None if film is None else image_uri(film_strip(film)[-2], _QUALITY),
+        above=_above(result, judged, path) if judged and path is not None else None,
+        judged_starts=result.starts.judging.count,
+        arms=_arms(result, drives).html() if drives else None,
+        pictures=[(image_uri(read_stored(file)[0], _QUALITY), caption) for file, caption in pictures],
+        how=_how_to_print(result),
+        tried=_tried(result.tried).html() if result.tried else None,
+        planted=_planted(result),
+        trust=_trust(result),
+        facts=_facts(result),
+    )
+    write_atomically(folder / PAGE, text)
+    return folder / PAGE
+
+
+def _judged(result: AuditResult, drives: Mapping[Evidence, Mapping[str, Drives]]) -> Mapping[str, Drives]:
+    """The drives that the verdict rests on, or the last there are."""
+    evidence = result.verdict.evidence
+    if evidence is not None and evidence in drives:
+        return drives[evidence]
+    return next(reversed(list(drives.values())), {})
+
+
+def _above(result: AuditResult, judged: Mapping[str, Drives], path: Path) -> Markup:
+    """All drives from above, with the lane and the object."""
+    limit_m = result.place.off_track_m or 0.0
+    with plots.new_axes(5.4, 4.6) as ax:
+        along = np.asarray(path.pose_at(np.arange(0.0, path.length_m, _SPACING * max(limit_m, 0.01))))
+        across = np.stack([-np.sin(along[:, 2]), np.cos(along[:, 2])], axis=1)
+        for side in (-limit_m, limit_m):
+            ax.plot(*(along[:, :2] + side * across).T, color=LIGHT["muted"], lw=1.0, zorder=1)
+        for level, name in enumerate((NO_OBJECT, PLAIN_OBJECT, FOUND)):
+            colour = style_of(CONDITIONS[name]).light
+            for number_of, states in enumerate(judged[name].states):
+                label = TITLES[name] if number_of == 0 else None
+                ax.plot(*states[:, :2].T, color=colour, lw=0.9, alpha=0.75, zorder=2 + level, label=label)
+        points = [each.states[:, :, :2].reshape(-1, 2) for each in judged.values()]
+        if result.strongest is not None:
+            points.append(_draw_object(ax, result.strongest.object))
+        seen = np.concatenate(points)
+        low, high = seen.min(axis=0) - 1.5 * limit_m, seen.max(axis=0) + 1.5 * limit_m
+        ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x [m]", ylabel="y [m]")
+        ax.set_aspect("equal", adjustable="box")
+        ax.figure.legend(*ax.get_legend_handles_labels(), loc="outside upper left", ncols=3)
+        return Markup(
+            plots.svg(ax.figure, "All judged drives from above, the lane, and the object where it stands")
+        )
+
+
+def _draw_object(ax: Any, placed: AuditedObject) -> np.ndarray:
+    depth_m, width_m, _ = placed.size_m
+    c, s = np.cos(placed.pose.yaw_rad), np.sin(placed.pose.yaw_rad)
+    corners = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * [0.5 * depth_m, 0.5 * width_m]
+    there = corners @ np.array([[c, s], [-s, c]]) + [placed.pose.x_m, placed.pose.y_m]
+    ax.add_patch(Polygon(there, closed=True, color=LIGHT["ink"], zorder=6))
+    ax.annotate("", [placed.pose.x_m + 0.6 * width_m * c, placed.pose.y_m + 0.6 * width_m * s], there.mean(axis=0),
+                arrowprops={"arrowstyle": "->", "color": LIGHT["ink"]}, zorder=6)  # fmt: skip
+    return there
+
+
+def _arms(result: AuditResult, drives: Mapping[Evidence, Mapping[str, Drives]]) -> Table:
+    limit_m, rows = result.place.off_track_m or 0.0, []
+    for evidence, judged in drives.items():
+        for name in (NO_OBJECT, PLAIN_OBJECT, PICTURE, FOUND):
+            each = judged[name]
+            effect = effect_of(each, judged[NO_OBJECT])
+            rows.append((
+                _DRIVEN_IN[evidence], TITLES[name], number(float(each.mean_m.mean()), 3), number(float(each.largest_m.mean())),
+                "" if name == NO_OBJECT else f"{effect.mean_m:+.2f} ({effect.low_m:+.2f} to {effect.high_m:+.2f})",
+                f"{int(each.left(limit_m).sum())} of {len(each.largest_m)}",
+            ))  # fmt: skip
+    columns = (
+        "driven in",
+        "past",
+        "mean deviation [m]",
+        "largest [m]",
+        "largest, over no object [m], 95 %",
+        "out of the lane",
+    )
+    return Table("", columns, tuple(rows), (False, False, True, True, True, True))
+
+
+def _tried(tried: Sequence[TriedSearch]) -> Table:
+    rows = tuple(
+        (
+            f"{each.object}, {each.placement}",
+            style_of(each.method).title,
+            str(each.evaluations),
+            "" if each.effect_m is None else f"{each.effect_m:+.2f}",
+            "judged" if each.selected else "",
+        )
+        for each in tried
+    )
+    return Table(
+        "",
+        ("object", "method", "evaluations", "largest deviation, over no attack [m]", ""),
+        rows,
+        (False, False, True, True, False),
+    )
+
+
+def _planted(result: AuditResult) -> str:
+    planted = result.planted
+    if planted is None:
+        return ""
+    found = "found" if planted.found else "not found"
+    return (
+        f"Is the search able to find anything here? It was run on a policy with a weakness that was planted ({planted.name}): {found} after "
+        f"{planted.evaluations} evaluations."
+    )
+
+
+def _trust(result: AuditResult) -> str:
+    fidelity = result.fidelity
+    if fidelity is None:
+        return ""
+    halves = {
+        None: "",
+        True: " A second copy, learned from the other half of the photographs, makes the policy steer alike; the object was searched in one and judged in the other.",
+        False: " A second copy, learned from the other half of the photographs, makes the policy steer otherwise.",
+    }[fidelity.halves_agree]
+    why = "".join(f" {each[0].upper()}{each[1:]}." for each in fidelity.why)
+    return (
+        f"On {fidelity.views} pictures that it was not learned from, the learned place reaches {fidelity.psnr_db:.1f} dB in the policy's view, and the "
+        f"policy steers {fidelity.steering_difference:.3g} rad otherwise in the mean.{halves}{why}"
+    )
+
+
+def _how_to_print(result: AuditResult) -> str:
+    if result.strongest is None or result.strongest.object.texture is None:
+        return ""
+    thing = result.strongest.object
+    _, width_m, height_m = thing.size_m
+    at = thing.pose
+    return (
+        f"{thing.texture} is the texture. Print it {width_m:.2f} m wide and {height_m:.2f} m high on matt paper, and stand it upright with the "
+        f"middle of its foot at x {at.x_m:.2f} m, y {at.y_m:.2f} m, facing {np.degrees(at.yaw_rad):.0f} degrees (from x towards y). Drive past it from "
+        f"several starts, past the same panel in grey, and past nothing; a single drive says little."
+    )
+
+
+def _facts(result: AuditResult) -> list[tuple[str, str]]:
+    budget = result.budget
+    return [
+        ("Policy", f"{result.policy.path}, sha256 {(result.policy.sha256 or 'unknown')[:12]}"),
+        ("Place", result.place.source),
+        ("Lane", f"out of it beyond {result.place.off_track_m:g} m" if result.place.off_track_m else "unknown"),
+        ("Budget", f"{budget.evaluations_spent} of {budget.evaluations_planned} evaluations{'' if budget.seconds is None else f', {budget.seconds:.0f} s in all'}"),
+        ("Starts", f"searched from seeds {result.starts.search.seed} and above, chosen from {result.starts.selection.count} starts of seed "
+                   f"{result.starts.selection.seed}, judged from {result.starts.judging.count} of seed {result.starts.judging.seed}"),
+        ("Experiment", f"{result.question.file}, sha256 {result.question.sha256[:12]}"),
+        ("Versions", ", ".join(f"{name} {version}" for name, version in result.versions.items())),
+        ("Ended", str(result.date or "not said, so that the same audit gives the same page")),
+    ]  # fmt: skip

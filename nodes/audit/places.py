@@ -1,0 +1,148 @@
+"""The place of an audit, from what a user has: photographs with poses, or a world that can be driven."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from advnerf_core.data.transforms import load_transforms
+from advnerf_core.data.view_loading import load_image
+from advnerf_core.documents import Document, read_yaml
+from advnerf_core.geometry import Pinhole
+from advnerf_core.strict import validate
+from hardware.worlds.world import NativePanels, NotOpenError, WorldDescription
+from nodes.audit.asking import answer
+from nodes.audit.cars import AuditedCar
+from nodes.audit.images import PosedPlace
+from nodes.audit.question import Place
+from nodes.lab.worlds.named import read_world
+from nodes.lab.worlds.photographs.config import DRIVEN
+from nodes.lab.worlds.photographs.world import PATH, Photographs
+from nodes.runtime.paths import shipped
+
+_DRIVEN_POSES = "transforms_car.json"
+# A path goes round if its ends are no farther apart than this many usual steps.
+_ROUND = 3.0
+# Of the extent of the cameras: farther away nothing is learned. A place whose walls are farther is refused by its held-out views.
+_REACH = 1.5
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What the options say of a place; None is asked for, or found out.
+
+    Attributes:
+        limit_m: Half the width of the lane [m].
+        speed_mps: Speed of the drives [m/s].
+        camera_height_m: Height of the driving camera [m].
+        path: ``driven``, a CSV file, the poses of a drive, or the name of a world's path.
+    """
+
+    limit_m: float | None = None
+    speed_mps: float | None = None
+    camera_height_m: float | None = None
+    path: str | None = None
+
+
+def place_of_photographs(
+    given: Path, there: PosedPlace, answers: Answers, car: AuditedCar, camera: Pinhole | None
+) -> tuple[Place, float]:
+    """A place of posed photographs, and half the width of its lane [m].
+
+    Args:
+        given: What the user gave.
+        there: Its posed photographs.
+        answers: What the options say.
+        car: The car.
+        camera: The camera that the policy was made for; None for that of the photographs.
+
+    Raises:
+        ConfigError: The photographs show no path.
+        UnansweredError: See `answer`.
+    """
+    limit_m = answer(
+        answers.limit_m, "--limit", "From the middle of the lane to where the car is out of it [m]", float
+    )
+    driven = there.poses.parent / _DRIVEN_POSES
+    path = answers.path or (str(driven) if driven.exists() else DRIVEN)
+    of_car = car.car.model_dump(mode="json")
+    if answers.speed_mps is not None:
+        of_car["speed_mps"] = answers.speed_mps
+    height_m = answers.camera_height_m or car.camera_height_m
+    if height_m is None and there.ground_at_zero:
+        height_m = _height_m(there.poses if path == DRIVEN or not path.endswith(".json") else Path(path))
+    height_m = answer(height_m, "--camera-height", "Height of the driving camera above the ground [m]", float)
+    world: dict[str, Any] = {
+        "kind": "photographs",
+        "images": str(there.poses.resolve()),
+        "path": path if path == DRIVEN else str(Path(path).resolve()),
+        "off_track_m": limit_m,
+        "car": of_car,
+        "camera": {"x_m": car.camera_ahead_m, "y_m": car.camera_left_m, "z_m": height_m},
+    }
+    if there.ground_at_zero:
+        world["ground_z_m"] = 0.0
+    if camera is not None:
+        world["camera"]["pinhole"] = asdict(camera)
+    world |= _found_out(world)
+    name = given.resolve().name if given.is_dir() else given.resolve().parent.name
+    return Place(f"the place of {name}", there.kind, str(given), there.scale, world, path=PATH), limit_m
+
+
+def _height_m(poses: Path) -> float:
+    """Height of the driving camera above the ground at z = 0, in the middle of its photographs [m]."""
+    frames = load_transforms(poses, require_all=True).frames
+    return round(float(np.median([each.T_world_from_camera[2, 3] for each in frames])), 4)
+
+
+def camera_of(there: PosedPlace, path: str | None) -> Pinhole:
+    """Intrinsics of the driving camera, undistorted: of the photographs that were taken while driving."""
+    driven = there.poses.parent / _DRIVEN_POSES
+    named = Path(path) if path is not None and path.endswith(".json") else driven
+    poses = named if named.exists() else there.poses
+    return load_image(load_transforms(poses, require_all=True).frames[0])[1]
+
+
+def _found_out(world: dict[str, Any]) -> dict[str, Any]:
+    """What the photographs themselves say: whether the driven path ends where it begins, and how far the place reaches at most."""
+    settings = {key: value for key, value in world.items() if key != "kind"}
+    document = Document({**settings, "closed": False}, "--place")
+    there = Photographs(validate(Photographs.Config, document, Path.cwd()))
+    points = there.path_points()
+    steps_m = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    closed = bool(np.linalg.norm(points[-1] - points[0]) <= _ROUND * float(np.median(steps_m)))
+    return {"closed": closed, "reach_m": round(_REACH * there.extent_m, 2)}
+
+
+def place_of_world(name: str, answers: Answers) -> Place:
+    """A world that can be driven: by its kind, or ``file.py:Class``.
+
+    Raises:
+        ConfigError: There is no such world, or it has no such path.
+    """
+    base = _known_settings(name)
+    section = read_yaml(base).data["world"] if base is not None else {"kind": name}
+    named = read_world(Document({**section, "kind": name}, f"--world {name}"), Path.cwd())
+    world, panels = {**section, "kind": name}, isinstance(named.make(), NativePanels)
+    path = answers.path or ("" if base is not None else next(iter(named.describe().paths), ""))
+    return Place(named.kind, "world", name, "world", world, base, path, panels)
+
+
+def describe(place: Place) -> WorldDescription | None:
+    """What a world says of itself; None where it must be open for that."""
+    try:
+        return read_world(Document(dict(place.world), f"--world {place.source}"), Path.cwd()).describe()
+    except NotOpenError:
+        return None
+
+
+def _known_settings(name: str) -> Path | None:
+    """An experiment file that comes with advnerf and is of this world: what is photographed and learned there was chosen for it."""
+    for file in sorted(shipped("launch").glob("*.experiment.yaml")):
+        data = read_yaml(file).data
+        if "base" not in data and data.get("world", {}).get("kind") == name:
+            return file
+    return None

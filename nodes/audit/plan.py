@@ -1,0 +1,109 @@
+"""What an audit has decided so far, in its folder: a run that is started again decides nothing anew."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from advnerf_core.documents import Document, read_json
+from advnerf_core.files import write_json
+from advnerf_core.strict import StrictModel, validate
+from nodes.audit.question import Question, experiment_data, setting_of, write_experiment
+from nodes.audit.spots import Spot
+from nodes.experiment.engine.artefact import hash_of
+from nodes.experiment.plan.placed import PlacedObject
+from nodes.runtime.errors import ConfigError
+
+FILE = "plan.json"
+
+
+class Decided(StrictModel):
+    """The file.
+
+    Attributes:
+        question: Hash of what is asked.
+        evaluations: What the budget buys; None before it was counted.
+        spots: Where the object may stand; None before they were chosen.
+        settings: Of the experiment file, by name.
+    """
+
+    question: str
+    evaluations: int | None = Field(default=None, ge=1)
+    spots: list[dict[str, Any]] | None = None
+    settings: dict[str, dict[str, Any]] = Field(default_factory=dict)
+
+
+@dataclass
+class Plan:
+    """The decisions of one audit.
+
+    Attributes:
+        folder: The audit's.
+        question: What is asked; a planted victim may be added to it.
+        decided: What is decided.
+    """
+
+    folder: Path
+    question: Question
+    decided: Decided
+
+    @classmethod
+    def of(cls, folder: Path, question: Question) -> Plan:
+        """The decisions in a folder, or none.
+
+        Raises:
+            ConfigError: The folder is of another audit.
+        """
+        key, file = (
+            hash_of([experiment_data(question), list(question.overrides), question.kind, question.size_m]),
+            folder / FILE,
+        )
+        if not file.exists():
+            return cls(folder, question, Decided(question=key))
+        decided = validate(Decided, Document(read_json(file), str(file)))
+        if decided.question != key:
+            raise ConfigError(
+                f"expected a folder of this audit or a new one, got {folder}, where another policy, place, lane, car or object was asked about; name "
+                "another one with --output"
+            )
+        return cls(folder, question, decided)
+
+    @property
+    def spots(self) -> list[Spot] | None:
+        """Where the object may stand; None before that was chosen."""
+        if self.decided.spots is None:
+            return None
+        return [
+            Spot(**{**each, "placed": PlacedObject.model_validate(each["placed"])})
+            for each in self.decided.spots
+        ]
+
+    def choose(self, spots: list[Spot]) -> None:
+        """Fix where the object may stand."""
+        self._decide(spots=[{**vars(each), "placed": as_listed(each)} for each in spots])
+
+    def set_evaluations(self, evaluations: int) -> None:
+        """Fix what the budget buys."""
+        self._decide(evaluations=evaluations)
+
+    def add(self, setting: str, objects: list[dict[str, Any]], **sections: Any) -> None:
+        """Add a setting with an object to the experiment file."""
+        values = setting_of(self.question, objects, **sections)
+        self._decide(settings={**self.decided.settings, setting: values})
+
+    def _decide(self, **values: Any) -> None:
+        self.decided = self.decided.model_copy(update=values)
+        self.save()
+
+    def save(self) -> Path:
+        """Write the decisions, and the experiment file, whose path is returned."""
+        write_json(self.folder / FILE, self.decided.model_dump(mode="json"))
+        return write_experiment(self.folder, self.question, self.decided.settings)
+
+
+def as_listed(spot: Spot) -> dict[str, Any]:
+    """An object at a spot as experiment files list it; a file with its whole path."""
+    return {**spot.placed.model_dump(mode="json", exclude_defaults=True), "kind": spot.placed.kind}

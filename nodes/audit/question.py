@@ -1,0 +1,172 @@
+"""What an audit asks, resolved: which policy, at which place, with which object; and the experiment file that says so."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from advnerf_core.documents import dump_yaml
+from advnerf_core.files import sha256_of, write_atomically
+from advnerf_core.report.audit_parts import AuditQuestion
+from nodes.experiment.plan.object_kinds import PANEL
+
+VICTIM, PLANTED, OBJECT = "policy", "planted", "object"
+FILE = "audit.experiment.yaml"
+# Searches draw their starts from their own seeds, counted from 0; nothing that is selected or judged by is among them.
+SELECTION_SEED, JUDGING_SEED = 10_000, 20_000
+HALF, OTHER_HALF = "half", "other-half"
+# The teacher whose steering is exported returns to the path within about so many half lanes.
+_RETURNS_IN = 5.0
+# A small audit: fewer pictures to learn from would not be trusted, so that searches are what is short.
+CI_SECTIONS: Mapping[str, Any] = {"scene": {"steps": 600}, "horizon": 40}
+Scale = Literal["world", "poses", "length", "positions", "fiducials"]
+PlaceKind = Literal["images", "video", "scene", "splat", "world"]
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the policy is audited.
+
+    Attributes:
+        name: As sentences name it.
+        kind: What the user gave.
+        source: The folder, file or name that the user gave.
+        scale: What the metre comes from.
+        world: The section ``world`` of the experiment.
+        base: Experiment file whose settings fit the place; None for the defaults.
+        path: Which of the world's paths is driven; empty for its first.
+        shows_panels: Whether the world's own renderer shows panels.
+    """
+
+    name: str
+    kind: PlaceKind
+    source: str
+    scale: Scale
+    world: Mapping[str, Any]
+    base: Path | None = None
+    path: str = ""
+    shows_panels: bool = False
+
+    @property
+    def is_driven(self) -> bool:
+        """Whether there is a world that can be driven; else there are photographs alone, of which two scenes are learned."""
+        return self.kind == "world"
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is asked.
+
+    Attributes:
+        policy: The policy as experiments name it.
+        given: The same as the user named it.
+        place: Where.
+        limit_m: |CTE| beyond which the car has left its lane [m]; None for what the world declares.
+        kind: Kind of the object: ``panel``, or a file.
+        size_m: Width of the object [m]; None for a share of the lane.
+        overrides: ``key=value`` texts over the experiment file.
+        seed: Of everything that is drawn, beside starts.
+        selection: Starts that searches are compared from.
+        judging: Starts that the verdict is from.
+        sections: What the experiment file says beside place and victim.
+    """
+
+    policy: str
+    given: str
+    place: Place
+    limit_m: float | None
+    kind: str = PANEL
+    size_m: float | None = None
+    overrides: Sequence[str] = ()
+    seed: int = 0
+    selection: int = 4
+    judging: int = 20
+    sections: Mapping[str, Any] = field(default_factory=dict)
+
+
+def experiment_data(question: Question) -> dict[str, Any]:
+    """The experiment without an object, as its file has it."""
+    place = question.place
+    own = {} if place.is_driven else _of_photographs(question)
+    data: dict[str, Any] = {} if place.base is None else {"base": str(place.base)}
+    data |= {
+        "name": "audit",
+        "world": dict(place.world),
+        **({"paths": [place.path]} if place.path else {}),
+        "objects": [],
+        "victims": {VICTIM: {"policy": question.policy}},
+        "carrier": {"kind": "composed"},
+        "space": {"kind": "colours", "cells": 8},
+        "deploy": {"through": "world" if place.is_driven else "nothing"},
+        "measure": {"starts": question.selection, "seed": SELECTION_SEED},
+        "retrain": None,
+        "reference": None,
+        "gate": None,  # the audit judges the scene itself, and says what it found
+    }
+    return _merged(_merged(data, own), question.sections)
+
+
+def _of_photographs(question: Question) -> dict[str, Any]:
+    assert question.limit_m is not None, "photographs declare no lane"
+    return {
+        "held_cap_m": 4.0 * question.limit_m,
+        "attack": {"start_sigma": min(0.1, 0.25 * question.limit_m)},
+        "policy": {"stiffness_1pm": 1.0 / (_RETURNS_IN * question.limit_m), "delay_s": 0.05},
+    }
+
+
+def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(below)
+    for key, value in above.items():
+        under = merged.get(key)
+        if isinstance(under, Mapping) and isinstance(value, Mapping):
+            merged[key] = _merged(under, value)
+        else:
+            merged[key] = value
+    return merged
+
+
+def write_experiment(folder: Path, question: Question, settings: Mapping[str, Mapping[str, Any]]) -> Path:
+    """Write the experiment file: the place, the victim, and one setting for each search; it can be run again by ``advnerf experiment``."""
+    text = dump_yaml(
+        {**experiment_data(question), "settings": {"place": {}, **_of_halves(question), **settings}},
+        default_flow_style=None,
+        width=140,
+    )
+    head = "# Written by advnerf audit: each setting is one search; advnerf experiment FILE --setting NAME --run-folder FOLDER runs it again.\n"
+    file = folder / FILE
+    write_atomically(file, head + text)
+    return file
+
+
+def _of_halves(question: Question) -> dict[str, Any]:
+    """Settings that learn a place of photographs from one half of them."""
+    if question.place.is_driven:
+        return {}
+    return {
+        HALF: {"world": {"half": "even"}},
+        OTHER_HALF: {"world": {"half": "odd"}, "scene": {"seed": question.seed + 1}},
+    }
+
+
+def setting_of(question: Question, objects: Sequence[Mapping[str, Any]], **sections: Any) -> dict[str, Any]:
+    """A setting of the experiment file with an object; where the world has panels of its own it stands in them, in their light."""
+    carrier = (
+        {"carrier": {"kind": "native"}} if question.place.shows_panels and question.kind == PANEL else {}
+    )
+    return {"objects": [dict(each) for each in objects], **carrier, **sections}
+
+
+def half_overrides(question: Question, setting: str) -> list[str]:
+    """The texts that lay the setting of one half over another setting."""
+    of_half = _of_halves(question).get(setting, {})
+    return [
+        f"{section}.{key}={value}" for section, values in of_half.items() for key, value in values.items()
+    ]
+
+
+def question_of(file: Path) -> AuditQuestion:
+    """Name and hash of the experiment file."""
+    return AuditQuestion(file=file.name, sha256=sha256_of(file))

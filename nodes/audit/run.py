@@ -1,0 +1,284 @@
+"""Runs an audit: learn the place, look whether the policy drives there, search under the schedule, judge, and say it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from datetime import datetime, timezone
+from pathlib import Path
+
+from rich.console import Console
+
+from advnerf_core.data.image_files import write_image
+from advnerf_core.errors import AdvnerfError
+from advnerf_core.report.audit_parts import Evidence
+from advnerf_core.report.audit_result import AuditComparison, AuditResult, PlantedControl
+from nodes.audit.comparing import ATTACK_KEPT, Before, is_worse
+from nodes.audit.drives import (
+    FOUND,
+    NO_OBJECT,
+    PLAIN_OBJECT,
+    arm_of,
+    learned,
+    pictures_along,
+    red_all_over,
+    with_starts,
+)
+from nodes.audit.hardening import FOLDER as HARDEN
+from nodes.audit.hardening import export_frames
+from nodes.audit.judging import drive_arms, judge_found, seen_on
+from nodes.audit.learning import Copies, fidelity_of
+from nodes.audit.outcome import AFTER, BEFORE, Known, result_of, write_result
+from nodes.audit.plan import Plan, as_listed
+from nodes.audit.planted import policy_code, strength, write_module
+from nodes.audit.question import (
+    JUDGING_SEED,
+    OBJECT,
+    PLANTED,
+    SELECTION_SEED,
+    VICTIM,
+    Question,
+)
+from nodes.audit.searching import Found, Searches, seconds_of_evaluation
+from nodes.audit.spots import Spot, best_spots
+from nodes.experiment.plan.object_kinds import footprint_m
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.given import given
+from nodes.experiment.show.placing import clean_poses
+from nodes.experiment.show.victims import look_at_given
+
+# Of half a lane: width of an object that nobody gave one.
+_WIDTH = 0.8
+_SPOTS = 3
+# A policy that leaves its lane from more of the starts, without any object, does not drive.
+_LEAVES_AT_MOST = 0.25
+# What the planted weakness steers past an object that is red all over, of the largest control.
+_PLANTED_SHARE = 1.0
+# Settings with the plain object at the first spot, and where it stood in an earlier audit; and what an audit in continuous integration may spend.
+_FIRST, _BEFORE = "first", "before"
+CI_EVALUATIONS = 40
+Say = Callable[[str], None]
+
+
+class CannotJudgeError(AdvnerfError):
+    """The audit ends without a verdict, for reasons that it says."""
+
+    def __init__(self, *reasons: str) -> None:
+        super().__init__("; ".join(reasons))
+        self.reasons = reasons
+
+
+@dataclass(frozen=True)
+class Options:
+    """How an audit is run.
+
+    Attributes:
+        minutes: Time for the searches; converted once into evaluations.
+        evaluations: The number of evaluations itself, instead.
+        against: The result of an earlier audit, which this policy is compared with.
+        harden: Whether frames that would help are exported.
+        timed: Whether the result says when it ended and how long it took.
+    """
+
+    minutes: float
+    evaluations: int | None = None
+    against: Path | None = None
+    harden: bool = False
+    timed: bool = True
+
+
+@dataclass
+class Audit:
+    """One audit in its folder; what is there already is not made again.
+
+    Attributes:
+        question: What is asked.
+        folder: Gets everything.
+        options: How it is run.
+        say: Told what happens.
+        console: Where progress is shown.
+    """
+
+    question: Question
+    folder: Path
+    options: Options
+    say: Say
+    console: Console
+    before: Before | None = field(default=None, init=False)
+
+    def run(self) -> AuditResult:
+        """Run it, or go on with it, and write its result; Ctrl-C ends the searches, and judges what they found.
+
+        Raises:
+            AdvnerfError: The question is wrong, or a file cannot be read.
+        """
+        self.before = None if self.options.against is None else Before(self.options.against)
+        began, known = time.monotonic(), Known(self.question, self.options.minutes)
+        try:
+            self._run(known)
+        except CannotJudgeError as ended:
+            known.reasons = ended.reasons
+        if self.options.timed:
+            known.seconds, known.ended = (
+                time.monotonic() - began,
+                datetime.now(timezone.utc).replace(microsecond=0),
+            )
+        result = result_of(known, self.folder)
+        if missing := write_result(known, result, self.folder):
+            self.say(missing)
+        return result
+
+    def _run(self, known: Known) -> None:
+        plan = Plan.of(self.folder, self.question)
+        copies = Copies.of(plan.save(), self.question)
+        experiments = copies.learn(self.console)
+        experiment = experiments[0]
+        known.file, known.experiment = copies.file, experiment
+        known.fidelity = fidelity = fidelity_of(experiments)
+        self.say(
+            f"the learned place: {fidelity.psnr_db:.1f} dB on {fidelity.views} pictures that it was not learned from"
+        )
+        if not fidelity.trusted:
+            raise CannotJudgeError(*fidelity.why)
+        self._require_drives(experiment, known.limit_m)
+        spots = self._spots(plan, experiment)
+        known.spots = spots
+        plan.add(_FIRST, [as_listed(spots[0])])
+        self._show(copies.experiment(_FIRST), spots[0], PLAIN_OBJECT, BEFORE)
+        searches = self._searches(copies, plan, spots, VICTIM, known.limit_m)
+        known.searches = searches
+        try:
+            searches.run(self.say)
+        except KeyboardInterrupt:
+            known.interrupted = True
+            self.say("interrupted: what was found is judged; Ctrl-C again ends at once")
+        if searches.best is None:
+            raise CannotJudgeError("interrupted before the first search was finished")
+        self._judge(known, copies, plan, searches.best)
+        assert known.judged
+        if known.judged[-1].judgement.found or (known.against is not None and is_worse(known.against)):
+            return
+        if known.interrupted and len(searches.found) < sum(map(len, searches.planned)):
+            raise CannotJudgeError("interrupted before the end of the schedule, with nothing found so far")
+        known.planted = self._plant(copies, plan, spots, known.limit_m)
+        if not known.planted.found:
+            raise CannotJudgeError(
+                "the search does not find a planted weakness of this policy at this place with this budget; give it a larger --budget or object (--size)"
+            )
+
+    def _require_drives(self, experiment: Experiment, limit_m: float) -> None:
+        """Refuse a policy that leaves its lane in the learned place without any object."""
+        nothing = arm_of(experiment, NO_OBJECT)
+        there = learned(with_starts(experiment, self.question.selection, SELECTION_SEED), VICTIM, nothing)
+        left = there.left(limit_m)
+        self.say(
+            f"without any object: largest deviation {there.largest_m.mean():.2f} m of {limit_m:g} m, off the lane from {left.sum()} of {len(left)} starts"
+        )
+        if left.mean() > _LEAVES_AT_MOST:
+            raise CannotJudgeError(
+                f"the policy does not drive here: without any object it leaves its lane from {left.sum()} of {len(left)} starts; check its declaration "
+                "(advnerf policy check), the car, the speed and the path"
+            )
+
+    def _spots(self, plan: Plan, experiment: Experiment) -> list[Spot]:
+        """Where the object may stand, decided once."""
+        if plan.spots is None:
+            kind, width_m = self.question.kind, footprint_m(self.question.kind)[1]
+            wanted_m = self.question.size_m or _WIDTH * experiment.world.off_track_m
+            plan.choose(best_spots(experiment, kind, wanted_m / width_m, _SPOTS, OBJECT))
+        spots = plan.spots
+        if not spots:
+            raise CannotJudgeError(
+                "there is no spot beside the path where the object is seen; give it another --size, or the path another start"
+            )
+        for number, spot in enumerate(spots, start=1):
+            at, seen_s = spot.placed, spot.seen_ticks * experiment.config.dt_s
+            self.say(f"spot {number}: x {at.x_m:.2f} m, y {at.y_m:.2f} m, seen for {seen_s:.1f} s of a drive")
+        return spots
+
+    def _searches(
+        self, copies: Copies, plan: Plan, spots: list[Spot], victim: str, limit_m: float
+    ) -> Searches:
+        declared = given(copies.experiment("place"))[VICTIM].declared
+        if plan.decided.evaluations is None:
+            seconds = seconds_of_evaluation(copies.experiment(_FIRST), VICTIM, declared.differentiable)
+            plan.set_evaluations(
+                self.options.evaluations or max(1, round(60.0 * self.options.minutes / seconds))
+            )
+        evaluations = plan.decided.evaluations
+        assert evaluations is not None, "they were counted"
+        self.say(f"the budget buys {evaluations} evaluations")
+        return Searches(copies, plan, spots, victim, evaluations, declared.differentiable, limit_m)
+
+    def _show(
+        self, experiment: Experiment, spot: Spot, arm: str, name: str, found: Path | None = None
+    ) -> None:
+        """Write a picture of the object from where it is largest on the way past it."""
+        poses = clean_poses(experiment, experiment.config.paths[0])[[spot.largest_tick]]
+        write_image(self.folder / name, seen_on(experiment, arm_of(experiment, arm, found), poses, None)[0])
+        self.say(f"picture of the object where it stands: {self.folder / name}")
+
+    def _judge(self, known: Known, copies: Copies, plan: Plan, best: Found) -> None:
+        """Judge in the other copy, or in the world, which comes last."""
+        question = self.question
+        starts = question.judging, JUDGING_SEED, known.limit_m
+        self.say(f"judging {best.setting} from {question.judging} starts that nothing has used")
+        known.best = best
+        spot = known.spots[best.spot]
+        self._show(copies.experiment(best.setting), spot, FOUND, AFTER, best.attack)
+        there = copies.experiment(best.setting, judged=True)
+        kinds: tuple[Evidence, ...] = ("surrogate", "world") if question.place.is_driven else ("surrogate",)
+        known.judged += [judge_found(there, VICTIM, best.attack, *starts, kind) for kind in kinds]
+        if self.before is not None:
+            known.against = self._compare(self.before, known, copies, plan)
+        if self.options.harden:
+            self.say(f"frames past the object: {export_frames(known.judged[-1], self.folder / HARDEN)}")
+
+    def _compare(self, before: Before, known: Known, copies: Copies, plan: Plan) -> AuditComparison:
+        """Drive past what an earlier audit found, from its starts."""
+        plan.add(_BEFORE, [before.listed(self.question.kind)])
+        starts = before.result.starts.judging
+        there = with_starts(copies.experiment(_BEFORE, judged=True), starts.count, starts.seed)
+        arms = {
+            name: arm_of(there, name, before.folder / ATTACK_KEPT)
+            for name in (NO_OBJECT, PLAIN_OBJECT, FOUND)
+        }
+        return before.compare(drive_arms(there, VICTIM, arms, known.judged[-1].evidence), known.limit_m)
+
+    def _plant(self, copies: Copies, plan: Plan, spots: list[Spot], limit_m: float) -> PlantedControl:
+        """Look for a planted weakness with the same schedule, until it is found."""
+        name, wanted = (
+            "it also steers to the left for red, to the right for green",
+            self.question.selection // 2 + 1,
+        )
+        try:
+            spec = self._planted_victim(copies.experiment(_FIRST))
+        except ValueError:
+            return PlantedControl(name=name, found=False, evaluations=0)
+        self.say("nothing found: the search is tried on the policy with a planted weakness")
+        victims = {VICTIM: {"policy": self.question.policy}, PLANTED: {"policy": spec}}
+        question = replace(self.question, sections={**self.question.sections, "victims": victims})
+        with_it = replace(plan, question=question)
+        with_it.save()
+        copies = replace(copies, question=question)
+        look_at_given(copies.experiment("place"))
+        searches = self._searches(copies, with_it, spots, PLANTED, limit_m)
+        searches.run(self.say, enough=lambda found: found.left >= wanted)
+        best = searches.best
+        return PlantedControl(
+            name=name,
+            found=best is not None and best.left >= wanted,
+            evaluations=sum(each.evaluations for each in searches.found),
+            effect_m=None if best is None else best.effect_m,
+        )
+
+    def _planted_victim(self, experiment: Experiment) -> str:
+        """Write the planted policy, as strong as an object at the first spot lets it be."""
+        states = clean_poses(experiment, experiment.config.paths[0])
+        controls = [arm_of(experiment, name).shown for name in (NO_OBJECT, PLAIN_OBJECT)]
+        plain = [pictures_along(experiment, states, shown) for shown in controls]
+        red = pictures_along(experiment, states, red_all_over(experiment))
+        wanted = _PLANTED_SHARE * experiment.car.largest_control
+        loads = policy_code(self.question.policy, experiment)
+        return write_module(self.folder, loads, *strength(plain, red, wanted))

@@ -1,0 +1,87 @@
+"""In which order an audit searches, and how it shares its budget: cheap and strong first, and what works gets more.
+
+A round searches at the spots that were best in the rounds before it. Shares are of the evaluations that the budget buys, which are
+counted once, before the first search, so that a run that is started again does the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Round:
+    """Searches of one method.
+
+    Attributes:
+        method: Name of the method.
+        spots: At so many spots, the best of those that were searched at; in the first round, those that are seen best.
+        seeds: Searches at each.
+        starts: Starts that each search drives from.
+        share: Share of the budget.
+    """
+
+    method: str
+    spots: int
+    seeds: int
+    starts: int
+    share: float
+
+
+WITH_GRADIENT = (
+    Round("gradient", spots=3, seeds=1, starts=1, share=0.3),
+    Round("random_coarse", spots=1, seeds=1, starts=1, share=0.1),
+    Round("gradient_coarse", spots=1, seeds=1, starts=1, share=0.2),
+    Round("gradient", spots=1, seeds=1, starts=2, share=0.4),
+)
+BLACK_BOX = (
+    Round("random_coarse", spots=3, seeds=1, starts=1, share=0.2),
+    Round("cem", spots=2, seeds=1, starts=1, share=0.4),
+    Round("guided", spots=1, seeds=1, starts=1, share=0.4),
+)
+# Of Adam: searches of an audit are short, so that they take larger steps than those of an experiment.
+LEARNING_RATE = 0.5
+FEWEST = {"cem": 20, "guided": 20}  # evaluations below which a method cannot begin
+_FEWEST = 4
+# What no schedule has; with the reason, so that a report can say it.
+NEVER_TRIED = {
+    "where the object stands, as part of a search": "the schedule searches colours at spots that a rule chose (space.kind places)",
+    "the shape of the object": "shapes are searched over a world's own pictures only (space.kind mesh_shape)",
+    "several objects at once": "one object is enough for the question; list more in the experiment file",
+}
+
+
+@dataclass(frozen=True)
+class Search:
+    """One search of a round.
+
+    Attributes:
+        round_: Number of the round.
+        spot: Rank of the spot among those of the round.
+        seed: Of the search.
+        evaluations: Closed-loop evaluations.
+    """
+
+    round_: int
+    spot: int
+    seed: int
+    evaluations: int
+
+
+def planned(rounds: Sequence[Round], evaluations: int) -> list[list[Search]]:
+    """The searches of each round that a budget buys.
+
+    Args:
+        rounds: The schedule.
+        evaluations: Evaluations of one start that the budget buys; an evaluation from several starts counts as many.
+    """
+    return [list(_of_round(number, each, evaluations)) for number, each in enumerate(rounds)]
+
+
+def _of_round(number: int, wanted: Round, evaluations: int) -> Iterator[Search]:
+    fewest = FEWEST.get(wanted.method, _FEWEST)
+    each = int(wanted.share * evaluations / (wanted.spots * wanted.seeds * wanted.starts))
+    for spot in range(wanted.spots):
+        for seed in range(wanted.seeds):
+            yield Search(number, spot, 100 * number + seed, max(fewest, each))

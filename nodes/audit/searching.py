@@ -1,0 +1,195 @@
+"""The searches of an audit, round by round: what was found at a spot decides where the next round goes on."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
+from advnerf_core.documents import read_json
+from advnerf_core.driving.metrics import drive_metrics
+from nodes.audit.learning import Copies
+from nodes.audit.plan import Plan, as_listed
+from nodes.audit.question import VICTIM
+from nodes.audit.schedule import BLACK_BOX, LEARNING_RATE, WITH_GRADIENT, Round, Search, planned
+from nodes.audit.spots import Spot
+from nodes.experiment.plan.cell import Cell
+from nodes.experiment.run.cells import search_cell
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.spaces import colour_space
+from nodes.experiment.show.victims import load_victim
+from nodes.experiment.steps.attack import attack_problem
+from nodes.experiment.steps.run import make_ready
+from nodes.experiment.steps.search_files import ATTACK, SEARCHED
+
+SEARCHES = "searches"
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Found:
+    """A finished search.
+
+    Attributes:
+        setting: Its setting in the experiment file.
+        folder: Where its attack is.
+        spot: Number of the spot where the object stands.
+        method: Which method.
+        seed: Of the search.
+        evaluations: What it spent.
+        effect_m: How much larger the largest |CTE| is than without the attack, in the mean of the selection starts [m].
+        left: Selection starts from which the car left its lane.
+    """
+
+    setting: str
+    folder: Path
+    spot: int
+    method: str
+    seed: int
+    evaluations: int
+    effect_m: float
+    left: int
+
+    @property
+    def attack(self) -> Path:
+        """Its attack file."""
+        return self.folder / ATTACK
+
+    @property
+    def rank(self) -> tuple[int, float]:
+        """By which the best is chosen."""
+        return self.left, self.effect_m
+
+
+@dataclass
+class Searches:
+    """All searches of one victim at one place.
+
+    Attributes:
+        copies: Where is searched.
+        plan: Gets a setting for each search.
+        spots: Where the object may stand, seen best first.
+        victim: Which policy of the experiment.
+        evaluations: What the budget buys, of one start.
+        differentiable: Whether the policy has a gradient.
+        limit_m: |CTE| beyond which the car has left its lane [m].
+        found: What is finished.
+    """
+
+    copies: Copies
+    plan: Plan
+    spots: Sequence[Spot]
+    victim: str
+    evaluations: int
+    differentiable: bool
+    limit_m: float
+    found: list[Found] = field(default_factory=list)
+
+    @property
+    def rounds(self) -> tuple[Round, ...]:
+        """The schedule."""
+        return WITH_GRADIENT if self.differentiable else BLACK_BOX
+
+    @property
+    def planned(self) -> list[list[Search]]:
+        """The searches of each round; fewer where there are fewer spots."""
+        rounds = planned(self.rounds, self.evaluations)
+        return [[each for each in row if each.spot < len(self.spots)] for row in rounds]
+
+    @property
+    def best(self) -> Found | None:
+        """What moves the policy most on the selection starts."""
+        return max(self.found, key=lambda each: each.rank, default=None)
+
+    def run(self, say: Say, enough: Callable[[Found], bool] = lambda found: False) -> None:
+        """Search until the schedule ends, or what was found is enough."""
+        for wanted, row in zip(self.rounds, self.planned, strict=True):
+            spots = self._spots(wanted.spots)
+            for search in row:
+                found = self._search(wanted, search, spots[search.spot])
+                self.found.append(found)
+                say(
+                    f"{found.method} at spot {found.spot + 1}, {found.evaluations} evaluations: largest deviation "
+                    f"{found.effect_m:+.2f} m, off the lane from {found.left} of {self.copies.question.selection} starts"
+                )
+                if enough(found):
+                    return
+
+    def _spots(self, count: int) -> list[int]:
+        """The best spots so far; those that were not searched at come last, as they were seen."""
+        best: dict[int, tuple[int, float]] = {}
+        for each in self.found:
+            best[each.spot] = max(each.rank, best.get(each.spot, each.rank))
+        ranked = sorted(best, key=lambda spot: best[spot], reverse=True)
+        return [*ranked, *(spot for spot in range(len(self.spots)) if spot not in best)][:count]
+
+    def _search(self, wanted: Round, search: Search, spot: int) -> Found:
+        setting = self._setting(wanted, search)
+        self.plan.add(
+            setting,
+            [as_listed(self.spots[spot])],
+            attack={
+                "evaluations": search.evaluations,
+                "starts": wanted.starts,
+                "learning_rate": LEARNING_RATE,
+            },
+            over={"method": [wanted.method], "seed": [search.seed]},
+        )
+        experiment = self.copies.experiment(setting)
+        make_ready(experiment, until="object", console=Console(quiet=True))
+        experiment = self.copies.experiment(setting)  # which knows now what its stages wrote
+        cell = Cell.of(experiment.config.paths[0], self.victim, wanted.method, search.seed)
+        folder = self.copies.file.parent / SEARCHES / setting
+        clean = search_cell(experiment, cell, folder, lambda *told: None)
+        return Found(
+            setting,
+            folder,
+            spot,
+            wanted.method,
+            search.seed,
+            search.evaluations * wanted.starts,
+            *_effect(experiment, folder, clean, self.limit_m),
+        )
+
+    def _setting(self, wanted: Round, search: Search) -> str:
+        victim = "" if self.victim == VICTIM else f"{self.victim}-"
+        return f"{victim}{search.round_ + 1}-{wanted.method.replace('_', '-')}-{search.spot + 1}"
+
+
+def _effect(experiment: Experiment, folder: Path, clean: Path, limit_m: float) -> tuple[float, int]:
+    """Effect and starts off the lane, of the drives from the selection starts."""
+    path = experiment.paths[experiment.config.paths[0]]
+    attacked, without = (
+        np.array(
+            [
+                drive_metrics(path, states, experiment.limits).max_cte_m
+                for states in read_json(at / SEARCHED)["states"]
+            ]
+        )
+        for at in (folder, clean)
+    )
+    return float((attacked - without).mean()), int((attacked > limit_m).sum())
+
+
+def seconds_of_evaluation(experiment: Experiment, victim: str, differentiable: bool) -> float:
+    """How long an evaluation from one start takes here, with the gradient where there is one [s]."""
+    space, policy = colour_space(experiment), load_victim(experiment, victim)
+    one = experiment.config.attack.model_copy(update={"starts": 1})
+    alone = _with_attack(experiment, one)
+    problem = attack_problem(alone, space, policy, experiment.config.paths[0], 0)
+    seconds = []
+    for _ in range(2):  # the first compiles kernels
+        began = time.perf_counter()
+        (adjoint_gradient if differentiable else evaluate)(problem, space.plain.colours)
+        seconds.append(time.perf_counter() - began)
+    return seconds[-1]
+
+
+def _with_attack(experiment: Experiment, attack: Any) -> Experiment:
+    return replace(experiment, config=experiment.config.model_copy(update={"attack": attack}))

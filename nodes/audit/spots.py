@@ -1,0 +1,128 @@
+"""Where an object may stand in a learned place: beside the lane, in front of what was learned, and large in the driver's view.
+
+The rule knows the path and the learned scene's depth, and no policy: nothing of a search is known to it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from advnerf_core.geometry import invert_transform, planar_pose
+from nodes.experiment.plan.object_kinds import footprint_m
+from nodes.experiment.plan.placed import PlacedObject, in_a_lane
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.learned_scene import load_background
+from nodes.experiment.show.placing import SeenFrom, clean_poses, is_seen
+
+# Of half a lane: steps along the path and away from it, and how far away is looked.
+_ALONG, _AWAY, _FARTHEST = 0.5, 0.25, 4.0
+# It looks at where the car is so long before it passes.
+_LOOKS_AHEAD_S = 1.5
+_LEAST_PX = 6.0
+# Two spots are at least so many sides of the object apart.
+_APART = 1.0
+
+
+@dataclass(frozen=True)
+class Spot:
+    """One place for the object.
+
+    Attributes:
+        placed: The object there.
+        seen_px: Pixels of the policy's picture that it covers, summed over the ticks of a drive without an error [px].
+        seen_ticks: Ticks at which nearly all of it is seen.
+        largest_tick: The tick at which it is largest in the picture.
+    """
+
+    placed: PlacedObject
+    seen_px: float
+    seen_ticks: int
+    largest_tick: int
+
+
+def best_spots(
+    experiment: Experiment, kind: str, scale: float, count: int, name: str = "object"
+) -> list[Spot]:
+    """The spots where an object covers most of a drive's pictures, best first.
+
+    Args:
+        experiment: Its scene must be learned.
+        kind: Kind of object.
+        scale: Its size.
+        count: At most so many.
+        name: What the object is called.
+    """
+    scenario = experiment.config.paths[0]
+    views = _views(experiment, scenario)
+    found = []
+    for placed in _places(experiment, scenario, kind, scale, name):
+        if in_a_lane([placed], experiment.world) is None and (spot := _seen(experiment, placed, views)):
+            found.append(spot)
+    found.sort(key=lambda spot: -spot.seen_px)
+    chosen: list[Spot] = []
+    for spot in found:
+        if all(_distance_m(spot, other) >= _APART * spot.placed.side_m for other in chosen):
+            chosen.append(spot)
+        if len(chosen) == count:
+            break
+    return chosen
+
+
+def _views(experiment: Experiment, scenario: str) -> list[SeenFrom]:
+    """What the learned scene shows along a drive without an error."""
+    render, views = load_background(experiment), []
+    for x_m, y_m, yaw_rad in clean_poses(experiment, scenario).tolist():
+        T_world_from_camera = planar_pose(x_m, y_m, yaw_rad) @ experiment.mount
+        depth_m = np.asarray(render(T_world_from_camera[None], experiment.camera)[1][0], dtype=np.float32)
+        views.append(SeenFrom(invert_transform(T_world_from_camera), depth_m))
+    return views
+
+
+def _places(
+    experiment: Experiment, scenario: str, kind: str, scale: float, name: str
+) -> Iterator[PlacedObject]:
+    path, half_lane_m = experiment.paths[scenario], experiment.world.off_track_m
+    drive = clean_poses(experiment, scenario)
+    begin_m = float(path.project(drive[:1, :2]).s_m[0])
+    length_m = float(np.hypot(*np.diff(drive[:, :2], axis=0).T).sum())
+    ahead_m = _LOOKS_AHEAD_S * experiment.car.speed_mps
+    reach_m = 0.5 * scale * min(footprint_m(kind))
+    end_m = begin_m + length_m + ahead_m if path.closed else min(path.length_m, begin_m + length_m + ahead_m)
+    for along_m in np.arange(begin_m + 0.5 * ahead_m, end_m, _ALONG * half_lane_m):
+        x, y, yaw = np.asarray(path.pose_at(along_m)).tolist()
+        car = np.asarray(path.pose_at(max(begin_m, along_m - ahead_m)))[:2]
+        for side in (-1.0, 1.0):
+            for away in np.arange(1.0, _FARTHEST, _AWAY):
+                away_m = reach_m + away * half_lane_m
+                at = np.array([x - side * away_m * math.sin(yaw), y + side * away_m * math.cos(yaw)])
+                towards = car - at
+                yield PlacedObject(
+                    name=name,
+                    kind=kind,
+                    x_m=round(float(at[0]), 3),
+                    y_m=round(float(at[1]), 3),
+                    yaw_rad=round(math.atan2(towards[1], towards[0]), 3),
+                    scale=scale,
+                )
+
+
+def _seen(experiment: Experiment, placed: PlacedObject, views: Sequence[SeenFrom]) -> Spot | None:
+    pixels = [_pixels(experiment, placed, view) for view in views]
+    ticks = sum(each > 0.0 for each in pixels)
+    return Spot(placed, float(sum(pixels)), ticks, int(np.argmax(pixels))) if ticks else None
+
+
+def _pixels(experiment: Experiment, placed: PlacedObject, view: SeenFrom) -> float:
+    """Pixels of the policy's picture that the object covers, 0 where not nearly all of it is seen."""
+    if not is_seen(experiment, placed, view, _LEAST_PX):
+        return 0.0
+    ahead_m = float((view.T_camera_from_world @ placed.T_world_from_face)[2, 3])
+    return (placed.side_m * experiment.view.pinhole.fy / ahead_m) ** 2
+
+
+def _distance_m(one: Spot, other: Spot) -> float:
+    return math.hypot(one.placed.x_m - other.placed.x_m, one.placed.y_m - other.placed.y_m)

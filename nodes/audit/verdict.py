@@ -1,0 +1,116 @@
+"""What drives from the judging starts say: the effect with its interval, and whether the object drives the policy out of its lane.
+
+The judging starts were used by no search and for no choice, so that the number of candidates does not widen the interval. The effect
+is paired by start, against the control that makes it smaller. The interval is that of `mean_estimate.one_sample`. That the object,
+and nothing else, drives the car off is tested exactly on the starts where only one of the two leaves the lane (McNemar 1947).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import binomtest
+
+from advnerf_core.report.audit_parts import AuditEffect
+from advnerf_core.report.evidence.mean_estimate import one_sample
+
+Floats = NDArray[np.float64]
+LEVEL = 0.95
+Control = Literal["no_object", "plain_object"]
+
+
+@dataclass(frozen=True, eq=False)
+class Drives:
+    """Drives from the same starts.
+
+    Attributes:
+        states: ``[S, T + 1, n]``: x [m], y [m], yaw [rad].
+        largest_m: Largest |CTE| of each ``[S]`` [m].
+        mean_m: Mean |CTE| of each ``[S]`` [m].
+        ctes_m: Signed CTE ``[S, T]`` [m].
+        driven_ticks: Ticks until each car stopped ``[S]``; its states after that are those of the last.
+    """
+
+    states: Floats
+    largest_m: Floats
+    mean_m: Floats
+    ctes_m: Floats
+    driven_ticks: NDArray[np.int64]
+
+    def left(self, limit_m: float) -> NDArray[np.bool_]:
+        """Which left the lane ``[S]``."""
+        return np.asarray(self.largest_m > limit_m)
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What the object does.
+
+    Attributes:
+        control: The control with the smaller effect.
+        effect: How much farther from the path it brings the car at most, than with that control.
+        left: Starts from which the car left its lane with the object, and with each control.
+        starts: How many there are.
+        p: Of the exact test that the object drives the car off no more often than the worse of the controls.
+    """
+
+    control: Control
+    effect: AuditEffect
+    left: Mapping[str, int]
+    starts: int
+    p: float
+
+    @property
+    def found(self) -> bool:
+        """Whether the object drives the policy out of its lane."""
+        return self.p <= 1.0 - LEVEL
+
+
+def judge(attacked: Drives, controls: Mapping[Control, Drives], limit_m: float) -> Judgement:
+    """Judge an object by its drives and those of the controls from the same starts."""
+    effects = {name: effect_of(attacked, drives) for name, drives in controls.items()}
+    control = min(effects, key=lambda name: effects[name].mean_m)
+    by_object = attacked.left(limit_m)
+    by_control = {name: each.left(limit_m) for name, each in controls.items()}
+    return Judgement(
+        control,
+        effects[control],
+        {"object": int(by_object.sum()), **{name: int(each.sum()) for name, each in by_control.items()}},
+        len(attacked.largest_m),
+        paired_p(by_object, np.any(list(by_control.values()), axis=0)),
+    )
+
+
+def effect_of(attacked: Drives, control: Drives) -> AuditEffect:
+    """How much larger the largest |CTE| is, in the mean over the starts, with its 95 % interval [m]."""
+    return _effect(attacked.largest_m - control.largest_m)
+
+
+def _effect(differences_m: Floats, level: float = LEVEL) -> AuditEffect:
+    estimate = one_sample(differences_m)
+    low, high = estimate.ends(level)
+    mean = float(estimate.mean)
+    return AuditEffect(mean_m=mean, low_m=min(mean, float(low)), high_m=max(mean, float(high)), level=level)
+
+
+def paired_p(one: NDArray[np.bool_], other: NDArray[np.bool_]) -> float:
+    """One-sided p of the exact McNemar test that ``one`` happens no more often than ``other`` from the same starts."""
+    only_one, only_other = int((one & ~other).sum()), int((other & ~one).sum())
+    if only_one + only_other == 0:
+        return 1.0
+    return float(binomtest(only_one, only_one + only_other, 0.5, alternative="greater").pvalue)
+
+
+def change_of(now: Drives, then: Drives, of_several: int = 1) -> AuditEffect:
+    """How much the largest |CTE| grew since then, in the mean over the same starts [m].
+
+    Args:
+        now: Drives now.
+        then: Drives then, from the same starts.
+        of_several: So many changes are looked at, of which the largest counts (Bonferroni).
+    """
+    return _effect(now.largest_m - then.largest_m, 1.0 - (1.0 - LEVEL) / of_several)

@@ -1,0 +1,309 @@
+"""The command ``advnerf audit``: can an object drive this policy off its path at this place?"""
+
+from __future__ import annotations
+
+import os
+import re
+import traceback
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperCommand
+
+from nodes.lab.importing.metric_options import MetricOptions
+from nodes.runtime.options import with_groups
+from nodes.runtime.terminal import Overrides, say_error
+
+if TYPE_CHECKING:
+    from nodes.audit.question import Question
+    from nodes.audit.run import Options
+
+# Codes below are verdicts: see `advnerf_core.report.audit_result.EXIT_CODES`.
+USAGE_EXIT, FAULT_EXIT, CANNOT_JUDGE_EXIT = 64, 70, 2
+_PLACE, _SEARCH, _RESULT = "Place", "Search", "Result"
+_UNITS_MIN = {"s": 1 / 60, "m": 1.0, "h": 60.0}
+OFF_LANE = "off-lane"
+
+
+def _option(panel: str, *names: str, **settings: Any) -> Any:
+    return typer.Option(*names, rich_help_panel=panel, **settings)
+
+
+@dataclass(frozen=True)
+class PlaceOptions:
+    """Where the policy drives, and how."""
+
+    place: Annotated[
+        Path | None,
+        _option(
+            _PLACE,
+            "--place",
+            help="Posed photographs (transforms.json or its folder), or a COLMAP model's folder.",
+        ),
+    ] = None
+    world: Annotated[
+        str | None,
+        _option(
+            _PLACE, "--world", help="Instead: a world that can be driven, as lab, metadrive or file.py:Class."
+        ),
+    ] = None
+    limit: Annotated[
+        str | None,
+        _option(
+            _PLACE, "--limit", help="Half the width of the lane in metres; off-lane: as the world declares."
+        ),
+    ] = None
+    car: Annotated[
+        str | None,
+        _option(_PLACE, "--car", help="racecarj, roboracer, donkey, duckiebot, car, or a YAML file."),
+    ] = None
+    speed_mps: Annotated[
+        float | None,
+        _option(_PLACE, "--speed", min=0.01, help="Speed of the drives in m/s.", show_default="the car's"),
+    ] = None
+    camera_height_m: Annotated[
+        float | None,
+        _option(_PLACE, "--camera-height", min=0.01, help="Height of the driving camera in metres."),
+    ] = None
+    path: Annotated[
+        str | None,
+        _option(
+            _PLACE, "--path", help="driven, a CSV file with x_m and y_m, transforms.json of a drive, or the name of a world's path.",
+            show_default="driven; of a world its first",
+        ),
+    ] = None  # fmt: skip
+    declared: Annotated[
+        list[str] | None,
+        _option(
+            _PLACE,
+            "--declare",
+            metavar="KEY=VALUE",
+            help="What a policy file does not say of itself, as colour_space=BGR; see docs/policy_contract.md. May be repeated.",
+        ),
+    ] = None
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """What is searched, and for how long."""
+
+    kind: Annotated[
+        str, _option(_SEARCH, "--object", help="panel, or a .glb or .object.safetensors file.")
+    ] = "panel"
+    size_m: Annotated[
+        float | None,
+        _option(
+            _SEARCH,
+            "--size",
+            min=0.01,
+            help="Width of the object in metres.",
+            show_default="0.8 of half the lane",
+        ),
+    ] = None
+    budget: Annotated[
+        str,
+        _option(
+            _SEARCH,
+            "--budget",
+            help="Time for the searches, as 90s, 10m or 2h; it becomes a number of evaluations.",
+        ),
+    ] = "6m"
+    evaluations: Annotated[
+        int | None,
+        _option(
+            _SEARCH,
+            "--evaluations",
+            min=1,
+            help="The number of evaluations itself, the same on every machine.",
+        ),
+    ] = None
+    starts: Annotated[
+        int | None,
+        _option(
+            _SEARCH, "--starts", min=5, help="Starts that are judged by.", show_default="20; 50 in a world"
+        ),
+    ] = None
+
+
+@dataclass(frozen=True)
+class ResultOptions:
+    """What is written."""
+
+    output: Annotated[
+        Path, _option(_RESULT, "--output", "-o", help="Folder of the audit; one that was stopped goes on.")
+    ] = Path("runs/audit")
+    ci: Annotated[
+        bool,
+        _option(
+            _RESULT,
+            "--ci",
+            help="A small audit of a fixed number of evaluations: the same verdict and bytes on every run.",
+        ),
+    ] = False
+    against: Annotated[
+        Path | None,
+        _option(
+            _RESULT,
+            "--against",
+            help="audit.json of an earlier audit; exit code 3 if the policy is worse.",
+            exists=True,
+        ),
+    ] = None
+    harden: Annotated[
+        bool,
+        _option(
+            _RESULT,
+            "--harden",
+            help="Export camera frames past the object, with the steering that keeps the path.",
+        ),
+    ] = False
+
+
+def _minutes(text: str) -> float:
+    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([smh]?)", text.strip())
+    if found is None or float(found[1]) <= 0.0:
+        raise _wrong(f"--budget: expected a time such as 90s, 10m or 2h, got {text!r}")
+    return float(found[1]) * _UNITS_MIN[found[2] or "m"]
+
+
+def _limit_m(options: PlaceOptions) -> float | None:
+    """What the user said; None where nothing was, or as the world declares."""
+    text = options.limit
+    if text is None or (text == OFF_LANE and options.world is not None):
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not value > 0.0:
+        raise _wrong(
+            f"--limit: expected metres above 0, or {OFF_LANE} with a world, which declares its lanes, got {text!r}"
+        )
+    return value
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)
+
+
+def _wrong(text: str) -> Exception:
+    from nodes.runtime.errors import ConfigError
+
+    return ConfigError(text)
+
+
+def audit(
+    policy: Annotated[
+        str,
+        typer.Argument(
+            help="A .onnx, .pt2 or .safetensors file, package.module:factory, or grpc://HOST:PORT of a driver."
+        ),
+    ],
+    place: PlaceOptions,
+    metric: MetricOptions,
+    search: SearchOptions,
+    result: ResultOptions,
+    overrides: Overrides = None,
+) -> None:
+    """Find out whether an object can drive a policy off its path at a place.
+
+    Exit code 0: nothing was found within the budget. 1: found. 2: it cannot be judged. 3: worse than --against. 64 and above: usage and faults.
+    """
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    if (place.place is None) == (place.world is None):
+        say_error("expected either --place or --world")
+        raise typer.Exit(USAGE_EXIT)
+    from rich.console import Console
+
+    from advnerf_core.errors import AdvnerfError
+    from nodes.audit.asking import UnansweredError
+    from nodes.audit.run import Audit
+
+    try:
+        question, options = _question(policy, place, metric, search, result, overrides or [])
+        found = Audit(question, result.output, options, _say, Console()).run()
+    except UnansweredError as error:
+        say_error(str(error))
+        raise typer.Exit(CANNOT_JUDGE_EXIT) from None
+    except (AdvnerfError, OSError) as error:
+        say_error(str(error))
+        raise typer.Exit(USAGE_EXIT) from None
+    except Exception:  # a fault of ours must not end as the verdict that Python's own code 1 stands for
+        traceback.print_exc()
+        raise typer.Exit(FAULT_EXIT) from None
+    print(f"\n{found.verdict.sentence}\n{result.output / 'audit.html'}")
+    raise typer.Exit(found.exit_code)
+
+
+def _question(
+    policy: str,
+    place: PlaceOptions,
+    metric: MetricOptions,
+    search: SearchOptions,
+    result: ResultOptions,
+    overrides: list[str],
+) -> tuple[Question, Options]:
+    from nodes.audit.asking import answer
+    from nodes.audit.cars import car_of
+    from nodes.audit.images import posed
+    from nodes.audit.places import Answers, camera_of, describe, place_of_photographs, place_of_world
+    from nodes.audit.policies import policy_at
+    from nodes.audit.question import CI_SECTIONS, Question
+    from nodes.audit.run import CI_EVALUATIONS, Options
+
+    if search.kind != "panel" and not Path(search.kind).is_file():
+        raise _wrong(
+            f"--object: expected panel, or a .glb or .object.safetensors file, got {search.kind}, which is not there"
+        )
+    answers = Answers(_limit_m(place), place.speed_mps, place.camera_height_m, place.path)
+    limit_m, declared, folder = answers.limit_m, place.declared or [], result.output
+    if place.place is not None:
+        named = answer(
+            place.car, "--car", "Which car: racecarj, roboracer, donkey, duckiebot, car, or a YAML file", str
+        )
+        car, there = car_of(named), posed(place.place, folder, metric)
+        spec, wanted = policy_at(
+            policy, camera_of(there, place.path), car.car.max_steering_rad, declared, folder, _say
+        )
+        where, limit_m = place_of_photographs(place.place, there, answers, car, wanted)
+    else:
+        assert place.world is not None, "one of the two is given"
+        where = place_of_world(place.world, answers)
+        described = describe(where)
+        camera = None if described is None else described.camera
+        largest = None if described is None else described.car.largest_control
+        spec, _ = policy_at(policy, camera, largest, declared, folder, _say)
+    question = Question(
+        policy=spec,
+        given=policy,
+        place=where,
+        limit_m=limit_m,
+        kind=search.kind if search.kind == "panel" else str(Path(search.kind).resolve()),
+        size_m=search.size_m,
+        overrides=tuple(overrides),
+        judging=search.starts or (50 if where.is_driven and not result.ci else 20),
+        sections=CI_SECTIONS if result.ci else {},
+    )
+    evaluations = search.evaluations or (CI_EVALUATIONS if result.ci else None)
+    return question, Options(
+        _minutes(search.budget), evaluations, result.against, result.harden, timed=not result.ci
+    )
+
+
+class _Command(TyperCommand):
+    """The command with exit code 64 for wrong options, as 2 is a verdict."""
+
+    def make_context(self, *given: Any, **settings: Any) -> Any:
+        try:
+            return super().make_context(*given, **settings)
+        except Exception as error:
+            if getattr(error, "exit_code", 0) == CANNOT_JUDGE_EXIT:
+                error.exit_code = USAGE_EXIT  # type: ignore[attr-defined]
+            raise
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command(cls=_Command)(with_groups(audit))

@@ -1,0 +1,51 @@
+"""Wrong options of the command are no verdict: its exit codes below 64 are."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from nodes.audit.cars import CARS, car_of
+from nodes.cli.audit import _minutes
+from nodes.runtime.errors import ConfigError
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--no-such-option"], "No such option"),
+        (["--world", "lab", "--place", "photos"], "expected either --place or --world"),
+    ],
+)
+def test_wrong_options_are_no_verdict(tmp_path: Path, options: list[str], message: str) -> None:
+    command = [sys.executable, "-m", "nodes.cli", "audit", "drivers:seduced", *options]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    found = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=600, check=False
+    )
+    assert (found.returncode, message in found.stderr) == (64, True), found.stderr
+
+
+@pytest.mark.parametrize(("text", "minutes"), [("90s", 1.5), ("10m", 10.0), ("2h", 120.0), ("5", 5.0)])
+def test_a_budget_is_minutes_unless_it_says_otherwise(text: str, minutes: float) -> None:
+    assert _minutes(text) == pytest.approx(minutes)
+
+
+@pytest.mark.parametrize("text", ["soon", "-3m", "0s", ""])
+def test_what_is_no_time_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match="--budget: expected a time such as 90s"):
+        _minutes(text)
+
+
+def test_a_car_is_a_name_or_a_file(tmp_path: Path) -> None:
+    assert car_of("roboracer") is CARS["roboracer"]
+    (tmp_path / "mine.yaml").write_text("car: {speed_mps: 1.0, wheelbase_m: 0.3, max_steering_rad: 0.4}\n")
+    assert car_of(str(tmp_path / "mine.yaml")).car.described.kind == "ackermann"
+    assert CARS["duckiebot"].car.described.kind == "dubins"
+    with pytest.raises(ConfigError, match="--car: expected a car"):
+        car_of("tractor")
+    (tmp_path / "bad.yaml").write_text("car: {speed_mps: 1.0, wheelbase_m: 0.3, max_steering_rad: 1.7}\n")
+    with pytest.raises(ConfigError, match=r"less than 1\.5 rad"):
+        car_of(str(tmp_path / "bad.yaml"))

@@ -1,0 +1,31 @@
+"""The schedule: what a budget buys, and that it never asks for less than a method can begin with."""
+
+import pytest
+
+from nodes.audit.schedule import BLACK_BOX, FEWEST, WITH_GRADIENT, planned
+
+
+@pytest.mark.parametrize("rounds", [WITH_GRADIENT, BLACK_BOX])
+@pytest.mark.parametrize("evaluations", [200, 1000, 12345])
+def test_a_budget_is_spent_and_not_exceeded(rounds, evaluations):
+    row_costs = [
+        sum(search.evaluations * wanted.starts for search in row)
+        for wanted, row in zip(rounds, planned(rounds, evaluations), strict=True)
+    ]
+    assert 0.9 * evaluations <= sum(row_costs) <= evaluations
+
+
+@pytest.mark.parametrize("rounds", [WITH_GRADIENT, BLACK_BOX])
+def test_shares_are_of_the_whole(rounds):
+    assert sum(each.share for each in rounds) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("rounds", [WITH_GRADIENT, BLACK_BOX])
+def test_a_tiny_budget_still_lets_every_method_begin(rounds):
+    for wanted, row in zip(rounds, planned(rounds, 1), strict=True):
+        assert all(search.evaluations >= FEWEST.get(wanted.method, 4) for search in row)
+
+
+def test_no_search_has_the_seed_of_another():
+    seeds = [search.seed + 1000 * search.spot for row in planned(WITH_GRADIENT, 100) for search in row]
+    assert len(set(seeds)) == len(seeds)
