@@ -98,7 +98,9 @@ def test_the_same_photographs_elsewhere_are_the_same_place(folder: Path, tmp_pat
 
 
 def test_without_an_object_there_is_nothing_to_search(folder: Path) -> None:
-    with pytest.raises(AdvnerfError, match="expected objects, whose colours or places are searched, got none"):
+    with pytest.raises(
+        AdvnerfError, match="expected objects, whose colours or places are searched, got none"
+    ):
         settings_hash(loaded(folder, "objects=[]"), Cell("track", "mine", "gradient", 0))
 
 
