@@ -161,6 +161,16 @@ class ResultOptions:
     ] = False
 
 
+def _print_schema(wanted: bool) -> None:
+    if wanted:
+        import json
+
+        from advnerf_core.report.audit_result import audit_schema
+
+        print(json.dumps(audit_schema(), indent=1))
+        raise typer.Exit
+
+
 def _minutes(text: str) -> float:
     found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([smh]?)", text.strip())
     if found is None or float(found[1]) <= 0.0:
@@ -206,11 +216,22 @@ def audit(
     search: SearchOptions,
     result: ResultOptions,
     overrides: Overrides = None,
+    schema: Annotated[
+        bool,
+        _option(
+            _RESULT,
+            "--schema",
+            help="Print the JSON schema of audit.json.",
+            is_eager=True,
+            callback=_print_schema,
+        ),
+    ] = False,
 ) -> None:
     """Find out whether an object can drive a policy off its path at a place.
 
     Exit code 0: nothing was found within the budget. 1: found. 2: it cannot be judged. 3: worse than --against. 64 and above: usage and faults.
     """
+    del schema
     os.environ.setdefault("MUJOCO_GL", "egl")
     if (place.place is None) == (place.world is None):
         say_error("expected either --place or --world")

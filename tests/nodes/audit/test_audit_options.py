@@ -1,5 +1,6 @@
 """Wrong options of the command are no verdict: its exit codes below 64 are."""
 
+import json
 import os
 import subprocess
 import sys
@@ -7,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from advnerf_core.report.audit_result import audit_schema
 from nodes.audit.cars import CARS, car_of
 from nodes.cli.audit import _minutes
 from nodes.runtime.errors import ConfigError
@@ -26,6 +28,15 @@ def test_wrong_options_are_no_verdict(tmp_path: Path, options: list[str], messag
         command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=600, check=False
     )
     assert (found.returncode, message in found.stderr) == (64, True), found.stderr
+
+
+def test_the_schema_of_results_is_printed(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "nodes.cli", "audit", "--schema"]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    found = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=600, check=True
+    )
+    assert json.loads(found.stdout) == json.loads(json.dumps(audit_schema()))
 
 
 @pytest.mark.parametrize(("text", "minutes"), [("90s", 1.5), ("10m", 10.0), ("2h", 120.0), ("5", 5.0)])
