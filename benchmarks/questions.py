@@ -80,6 +80,12 @@ QUESTIONS = (
         picture="room_above.webp",
     ),
     Question(
+        "audits",
+        "Does an audit of an own policy tell the truth?",
+        "From an own policy and photographs to the verdict, what the place itself says of it, and audits whose truth is known.",
+        ("own_place", "audit_truth"),
+    ),
+    Question(
         "statistics",
         "Are the intervals and tests right?",
         "Coverage of intervals and error rates of tests on simulated drives whose true effect is known, and what verifying finds.",

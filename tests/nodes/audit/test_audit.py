@@ -2,125 +2,37 @@
 
 import json
 import math
-import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from advnerf_core.data.posed_images import write_posed_images
 from advnerf_core.documents import read_json
-from advnerf_core.geometry import make_transform, planar_pose, rotation_z
 from advnerf_core.report.audit_result import read_audit
-from hardware.worlds.lab.config import LabConfig
-from hardware.worlds.lab.lab import Lab
 from nodes.audit.kept import AuditDiffersError, check_audit
+from tests.support import circle_place
+from tests.support.circle_place import RADIUS_M, WHEELBASE_M
 
 pytestmark = pytest.mark.slow  # a learned place and a dozen searches each
-PHOTOGRAPHS, RADIUS_M, WHEELBASE_M, LIMIT_M = 48, 1.2, 0.25, 0.25
-T_IMAGES_FROM_LAB = make_transform(rotation_z(0.5), [3.0, -2.0, 1.2])
-CAR = f"car: {{speed_mps: 0.8, wheelbase_m: {WHEELBASE_M}, max_steering_rad: 0.35}}\ncamera_ahead_m: 0.3\ncamera_height_m: 0.2\n"
-# All of them drive round the circle: it is held by the steering alone, as in the open air.
-POLICIES = """
-import torch
-from advnerf_core import PolicyContract, PolicyView, adapt
-from hardware.worlds.lab.config import LabConfig
-
-class Driver(torch.nn.Module):
-    def __init__(self, steering_rad, gain_rad):
-        super().__init__()
-        self.steering_rad, self.gain_rad = steering_rad, gain_rad
-
-    def forward(self, images):
-        red = (images[:, 0] - torch.maximum(images[:, 1], images[:, 2]) - 0.2).clamp(min=0.0)
-        return self.steering_rad + self.gain_rad * red.mean(dim=(1, 2))
-
-def driver(steering_rad, gain_rad):
-    view = PolicyView(LabConfig().camera.pinhole, width=100, height=33)
-    return adapt(Driver(steering_rad, gain_rad).eval(), PolicyContract(view))
-
-def blind():
-    return driver(STEERING_RAD, 0.0)
-
-def seduced():
-    return driver(STEERING_RAD, 8.0)
-
-def astray():
-    return driver(0.0, 0.0)
-
-def biased():
-    return driver(STEERING_RAD + 0.03, 8.0)
-""".replace("STEERING_RAD", repr(math.atan(WHEELBASE_M / RADIUS_M)))
-QUICK = [
-    "scene={steps: 80, log2_entries: 12, levels: 4, finest: 64, occupancy: 32}", "horizon=30", "capture.held_out=4",
-    "object.panel_resolution=16",
-]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A user's folder: photographs of a lap in a frame of their own, a car, policies; ``learned`` is what the first audit leaves."""
+    """A user's folder."""
     found = tmp_path_factory.mktemp("user")
-    with Lab(LabConfig()) as lab:
-        turns = 2.0 * np.pi * np.arange(PHOTOGRAPHS) / PHOTOGRAPHS
-        states = [(RADIUS_M * math.sin(turn), -RADIUS_M * math.cos(turn), turn) for turn in turns.tolist()]
-        write_posed_images(
-            found / "photos",
-            [T_IMAGES_FROM_LAB @ planar_pose(*state) @ lab.T_car_from_camera for state in states],
-            lab.camera_pinhole,
-            lambda index: lab.observe_at(*states[index], depth=False)[0],
-            "png",
-        )
-    (found / "car.yaml").write_text(CAR)
-    (found / "drivers.py").write_text(POLICIES)
+    circle_place.make_folder(found)
     return found
 
 
-def audit(folder: Path, name: str, *options: str, output: str = "") -> subprocess.CompletedProcess[str]:
-    """Run the command in the user's folder; what an earlier audit has learned of the place is taken over."""
-    target, learned = folder / (output or name), folder / "seduced"
+def audit(folder: Path, policy: str, *options: str, output: str = "") -> subprocess.CompletedProcess[str]:
+    """Run the command; what an earlier audit has learned of the place is taken over."""
+    target, learned = folder / (output or policy), folder / "seduced"
     for half in ("half", "other-half"):
         if learned.exists() and target != learned and not (target / half).exists():
             shutil.copytree(learned / half, target / half)
-    command = [
-        sys.executable,
-        "-m",
-        "nodes.cli",
-        "audit",
-        f"drivers:{name}",
-        "--place",
-        "photos",
-        "-o",
-        str(target),
-    ]
-    words = [
-        "--car",
-        "car.yaml",
-        "--limit",
-        str(LIMIT_M),
-        "--evaluations",
-        "60",
-        "--starts",
-        "8",
-        "--size",
-        "0.5",
-    ]
-    changes = [word for each in QUICK for word in ("--set", each)]
-    environment = {**os.environ, "PYTHONPATH": f"{Path(__file__).parents[3]}{os.pathsep}{folder}"}
-    return subprocess.run(
-        [*command, *words, *changes, *options],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=1800,
-        check=False,
-        stdin=subprocess.DEVNULL,
-    )
+    return circle_place.audit(folder, policy, *options, output=output)
 
 
 @pytest.fixture(scope="module")
