@@ -40,6 +40,7 @@ class PlaceOptions:
         _option(
             _PLACE,
             "--place",
+            exists=True,
             help="Posed photographs (transforms.json or its folder), or a COLMAP model's folder.",
         ),
     ] = None
