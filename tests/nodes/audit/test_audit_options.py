@@ -18,7 +18,8 @@ from nodes.runtime.errors import ConfigError
     ("options", "message"),
     [
         (["--no-such-option"], "No such option"),
-        (["--world", "lab", "--place", "photos"], "expected either --place or --world"),
+        (["--place", "nowhere"], "nowhere"),
+        (["--world", "lab", "--place", "."], "expected either --place or --world"),
     ],
 )
 def test_wrong_options_are_no_verdict(tmp_path: Path, options: list[str], message: str) -> None:
