@@ -88,9 +88,13 @@ def test_exported_frames_are_labelled_with_steering_back_to_the_path(
     labels = [dict(zip(columns, row.split(","), strict=True)) for row in rows[1:]]
     assert all((folder / "seduced" / "harden" / each["image"]).is_file() for each in labels)
     held = math.atan(WHEELBASE_M / RADIUS_M)
-    off = [each for each in labels if abs(float(each["cte_m"])) > 0.15]
-    assert off
-    assert all((float(each["steering"]) - held) * float(each["cte_m"]) < 0.0 for each in off)
+    # Where a drive first leaves its line; farther off, a car that already turns back steeply is straightened.
+    first: dict[str, dict[str, str]] = {}
+    for each in labels:
+        if abs(float(each["cte_m"])) > 0.15:
+            first.setdefault(each["image"].split("_")[0], each)
+    assert len(first) == 5
+    assert all((float(each["steering"]) - held) * float(each["cte_m"]) < 0.0 for each in first.values())
 
 
 def test_a_blind_policy_is_cleared_once_a_planted_weakness_was_found(
