@@ -8,7 +8,7 @@ from typing import Any
 
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.files import sha256_of
-from advnerf_core.report.audit_parts import AuditedObject
+from advnerf_core.report.audit_parts import AuditedObject, Evidence
 from advnerf_core.report.audit_result import AuditComparison, AuditResult, read_audit
 from nodes.audit.drives import FOUND, NO_OBJECT, PLAIN_OBJECT
 from nodes.audit.kept import read_drives
@@ -74,16 +74,19 @@ class Before:
             "scale": round(then.size_m[1] / footprint_m(kind)[1], 9),
         }
 
-    def compare(self, now: Mapping[str, Drives], limit_m: float) -> AuditComparison:
+    def compare(self, now: Mapping[str, Drives], evidence: Evidence, limit_m: float) -> AuditComparison:
         """What changed, of the arm that got worst.
 
         Args:
             now: Drives past no object, the plain one and the one that was found then, from the starts of then.
+            evidence: Where they were driven.
             limit_m: |CTE| beyond which the car has left its lane [m].
         """
-        assert self.result.verdict.evidence is not None or self.result.strongest is not None
-        evidence = self.result.verdict.evidence or "surrogate"
-        then = read_drives(self.folder)[evidence]
+        then = read_drives(self.folder).get(evidence)
+        if then is None:
+            raise ConfigError(
+                f"--against {self.file}: expected drives of the same kind as now, {evidence}, got none; compare audits of one place"
+            )
         changes = [change_of(now[name], then[name], len(_ARMS)) for name in _ARMS]
         return AuditComparison(
             file=str(self.file),

@@ -59,6 +59,11 @@ class Copies:
         over = [*half_overrides(self.question, folder.name), *self.question.overrides]
         return load_experiment(self.file, setting, over, folder)
 
+    def ready(self, setting: str, judged: bool = False) -> Experiment:
+        """The same with the object of the setting built."""
+        make_ready(self.experiment(setting, judged), until="object", console=Console(quiet=True))
+        return self.experiment(setting, judged)  # which knows now what its stages wrote
+
     def learn(self, console: Console) -> list[Experiment]:
         """Learn the copies that are not there yet; each once."""
         found = []

@@ -143,6 +143,9 @@ def write_result(known: Known, result: AuditResult, folder: Path) -> str:
 
 def verdict_of(known: Known) -> AuditVerdict:
     """What the audit concludes."""
+    if known.against is not None and is_worse(known.against):
+        evidence = known.question.place.evidence
+        return AuditVerdict(outcome="worse", evidence=evidence, sentence=_worse(known.against))
     if known.reasons:
         return AuditVerdict(
             outcome="cannot_judge",
@@ -151,8 +154,6 @@ def verdict_of(known: Known) -> AuditVerdict:
             reasons=known.reasons,
         )
     judged = known.judged[-1]
-    if known.against is not None and is_worse(known.against):
-        return AuditVerdict(outcome="worse", evidence=judged.evidence, sentence=_worse(known.against))
     found = judged.judgement.found
     return AuditVerdict(
         outcome="found" if found else "nothing_found",

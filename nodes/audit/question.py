@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from advnerf_core.documents import dump_yaml
 from advnerf_core.files import sha256_of, write_atomically
-from advnerf_core.report.audit_parts import AuditQuestion
+from advnerf_core.report.audit_parts import AuditQuestion, Evidence
 from nodes.experiment.plan.object_kinds import PANEL
 
 VICTIM, PLANTED, OBJECT = "policy", "planted", "object"
@@ -53,6 +53,11 @@ class Place:
     def is_driven(self) -> bool:
         """Whether there is a world that can be driven; else there are photographs alone, of which two scenes are learned."""
         return self.kind == "world"
+
+    @property
+    def evidence(self) -> Evidence:
+        """The strongest evidence that there can be."""
+        return "world" if self.is_driven else "surrogate"
 
 
 @dataclass(frozen=True)

@@ -141,11 +141,13 @@ class Audit:
         )
         if not fidelity.trusted:
             raise CannotJudgeError(*fidelity.why)
+        if self.before is not None:  # first, as a policy that no longer drives is worse, too
+            known.against = self._compare(self.before, copies, plan, known.limit_m)
         self._require_drives(experiment, known.limit_m)
         spots = self._spots(plan, experiment)
         known.spots = spots
         plan.add(_FIRST, [as_listed(spots[0])])
-        self._show(copies.experiment(_FIRST), spots[0], PLAIN_OBJECT, BEFORE)
+        self._show(copies.ready(_FIRST), spots[0], PLAIN_OBJECT, BEFORE)
         searches = self._searches(copies, plan, spots, VICTIM, known.limit_m)
         known.searches = searches
         try:
@@ -202,7 +204,7 @@ class Audit:
     ) -> Searches:
         declared = given(copies.experiment("place"))[VICTIM].declared
         if plan.decided.evaluations is None:
-            seconds = seconds_of_evaluation(copies.experiment(_FIRST), VICTIM, declared.differentiable)
+            seconds = seconds_of_evaluation(copies.ready(_FIRST), VICTIM, declared.differentiable)
             plan.set_evaluations(
                 self.options.evaluations or max(1, round(60.0 * self.options.minutes / seconds))
             )
@@ -226,25 +228,23 @@ class Audit:
         self.say(f"judging {best.setting} from {question.judging} starts that nothing has used")
         known.best = best
         spot = known.spots[best.spot]
-        self._show(copies.experiment(best.setting), spot, FOUND, AFTER, best.attack)
-        there = copies.experiment(best.setting, judged=True)
+        self._show(copies.ready(best.setting), spot, FOUND, AFTER, best.attack)
+        there = copies.ready(best.setting, judged=True)
         kinds: tuple[Evidence, ...] = ("surrogate", "world") if question.place.is_driven else ("surrogate",)
         known.judged += [judge_found(there, VICTIM, best.attack, *starts, kind) for kind in kinds]
-        if self.before is not None:
-            known.against = self._compare(self.before, known, copies, plan)
         if self.options.harden:
             self.say(f"frames past the object: {export_frames(known.judged[-1], self.folder / HARDEN)}")
 
-    def _compare(self, before: Before, known: Known, copies: Copies, plan: Plan) -> AuditComparison:
+    def _compare(self, before: Before, copies: Copies, plan: Plan, limit_m: float) -> AuditComparison:
         """Drive past what an earlier audit found, from its starts."""
         plan.add(_BEFORE, [before.listed(self.question.kind)])
-        starts = before.result.starts.judging
-        there = with_starts(copies.experiment(_BEFORE, judged=True), starts.count, starts.seed)
+        starts, evidence = before.result.starts.judging, self.question.place.evidence
+        there = with_starts(copies.ready(_BEFORE, judged=True), starts.count, starts.seed)
         arms = {
             name: arm_of(there, name, before.folder / ATTACK_KEPT)
             for name in (NO_OBJECT, PLAIN_OBJECT, FOUND)
         }
-        return before.compare(drive_arms(there, VICTIM, arms, known.judged[-1].evidence), known.limit_m)
+        return before.compare(drive_arms(there, VICTIM, arms, evidence), evidence, limit_m)
 
     def _plant(self, copies: Copies, plan: Plan, spots: list[Spot], limit_m: float) -> PlantedControl:
         """Look for a planted weakness with the same schedule, until it is found."""
@@ -253,7 +253,7 @@ class Audit:
             self.question.selection // 2 + 1,
         )
         try:
-            spec = self._planted_victim(copies.experiment(_FIRST))
+            spec = self._planted_victim(copies.ready(_FIRST))
         except ValueError:
             return PlantedControl(name=name, found=False, evaluations=0)
         self.say("nothing found: the search is tried on the policy with a planted weakness")

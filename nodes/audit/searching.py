@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
 from advnerf_core.documents import read_json
@@ -25,7 +24,6 @@ from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import colour_space
 from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.attack import attack_problem
-from nodes.experiment.steps.run import make_ready
 from nodes.experiment.steps.search_files import ATTACK, SEARCHED
 
 SEARCHES = "searches"
@@ -141,9 +139,7 @@ class Searches:
             },
             over={"method": [wanted.method], "seed": [search.seed]},
         )
-        experiment = self.copies.experiment(setting)
-        make_ready(experiment, until="object", console=Console(quiet=True))
-        experiment = self.copies.experiment(setting)  # which knows now what its stages wrote
+        experiment = self.copies.ready(setting)
         cell = Cell.of(experiment.config.paths[0], self.victim, wanted.method, search.seed)
         folder = self.copies.file.parent / SEARCHES / setting
         clean = search_cell(experiment, cell, folder, lambda *told: None)
