@@ -7,24 +7,28 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from rich.console import Console
 
 from advnerf_core.attack.spaces.space import Shown
 from advnerf_core.documents import read_json
+from advnerf_core.geometry import Array
 from advnerf_core.report.audit_result import AuditFidelity
 from nodes.audit.drives import pictures_along
 from nodes.audit.question import HALF, OTHER_HALF, VICTIM, Question, half_overrides
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.images import as_uint8
 from nodes.experiment.show.learned_scene import FIDELITY
 from nodes.experiment.show.placing import clean_poses
 from nodes.experiment.show.victims import load_victim, told
 from nodes.experiment.steps.run import load_experiment, make_ready
 from nodes.experiment.steps.steering_gate import (
     LEAST_CORRELATION,
-    MOST_DIFFERENCE,
+    SteeringDifference,
     other_steering,
     steering_of_victims,
 )
+from nodes.lab.policy_data.evaluate import predict
 
 # Of the largest control: such a difference drives no car elsewhere, however little the policy steers in all.
 _NEGLIGIBLE = 0.02
@@ -109,30 +113,17 @@ def _apart(one: Experiment, other: Experiment) -> str:
     scenario = one.config.paths[0]
     poses = clean_poses(one, scenario)
     first, second = (_steering_along(each, poses) for each in (one, other))
-    difference, spread = float(np.abs(first - second).mean()), float(np.abs(first - first.mean()).mean())
-    varies = min(np.ptp(first), np.ptp(second)) > 0.0
-    correlation = float(np.corrcoef(first, second)[0, 1]) if varies else float(np.array_equal(first, second))
-    negligible = difference <= _NEGLIGIBLE * one.car.largest_control
-    if negligible or (difference <= MOST_DIFFERENCE * spread and correlation >= LEAST_CORRELATION):
+    found = SteeringDifference.between(first, second)
+    if found.alike or found.mean <= _NEGLIGIBLE * one.car.largest_control:
         return ""
     return (
         f"two scenes, each learned from one half of the photographs, do not agree: along the path the policy's steering differs by "
-        f"{difference:.3g} {one.car.control_unit} in the mean, at most {MOST_DIFFERENCE * spread:.3g} is allowed, and correlates by "
-        f"{correlation:.2f}, at least {LEAST_CORRELATION:g}; take more photographs"
+        f"{found.mean:.3g} {one.car.control_unit} in the mean, at most {found.allowed:.3g} is allowed, and correlates by "
+        f"{found.correlation:.2f}, at least {LEAST_CORRELATION:g}; take more photographs"
     )
 
 
-def _steering_along(experiment: Experiment, poses: np.ndarray) -> np.ndarray:
+def _steering_along(experiment: Experiment, poses: Array) -> NDArray[np.float64]:
     policy = load_victim(experiment, VICTIM).policy
-    goal = told(experiment, policy, experiment.config.paths[0])
-    pictures = pictures_along(experiment, poses, _EMPTY)
-    goals = torch.tensor([goal], dtype=torch.float32).expand(len(pictures), -1) if goal else None
-    with torch.no_grad():
-        if policy.stateless:
-            return np.asarray(policy(pictures, goals).numpy(), dtype=np.float64)
-        memory, found = policy.initial_memory(1), []
-        for number in range(len(pictures)):
-            goal_now = None if goals is None else goals[number : number + 1]
-            steering, memory = policy(pictures[number : number + 1], goal_now, memory)
-            found.append(float(steering[0]))
-    return np.array(found)
+    pictures = np.stack([as_uint8(each) for each in pictures_along(experiment, poses, _EMPTY)])
+    return predict(policy, pictures, told(experiment, policy, experiment.config.paths[0]))

@@ -6,8 +6,10 @@ A mean PSNR does not tell whether the wall by which the car steers was learned. 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from advnerf_core.documents import read_json
 from nodes.experiment.show.context import Experiment
@@ -61,18 +63,44 @@ def steering_of_victims(experiment: Experiment) -> dict[str, list[dict[str, floa
     return found
 
 
+@dataclass(frozen=True)
+class SteeringDifference:
+    """How the steering on some pictures differs from that on others of the same places.
+
+    Attributes:
+        mean: Mean of the absolute differences, in the unit of the car's control.
+        allowed: The largest mean at which both still steer alike.
+        correlation: Of both.
+    """
+
+    mean: float
+    allowed: float
+    correlation: float
+
+    @classmethod
+    def between(cls, one: NDArray[np.float64], other: NDArray[np.float64]) -> SteeringDifference:
+        """The difference of steering ``[N]`` from that on the first pictures."""
+        varies = min(np.ptp(one), np.ptp(other)) > 0.0
+        correlation = np.corrcoef(one, other)[0, 1] if varies else np.array_equal(one, other)
+        spread = float(np.abs(one - one.mean()).mean())
+        return cls(float(np.abs(other - one).mean()), MOST_DIFFERENCE * spread, float(correlation))
+
+    @property
+    def alike(self) -> bool:
+        """Whether both are the same to the gate."""
+        return self.mean <= self.allowed and self.correlation >= LEAST_CORRELATION
+
+
 def other_steering(views: Sequence[dict[str, float]], unit: str) -> str:
     """How the steering on learned pictures departs from that on real ones, in a sentence; empty if it does not."""
     real, learned = (np.array([view[name] for view in views], np.float64) for name in ("real", "surrogate"))
-    difference, spread = float(np.abs(learned - real).mean()), float(np.abs(real - real.mean()).mean())
-    varies = min(np.ptp(real), np.ptp(learned)) > 0.0
-    correlation = float(np.corrcoef(real, learned)[0, 1]) if varies else float(np.array_equal(real, learned))
-    if difference <= MOST_DIFFERENCE * spread and correlation >= LEAST_CORRELATION:
+    found = SteeringDifference.between(real, learned)
+    if found.alike:
         return ""
     worst = int(np.abs(learned - real).argmax())
     return (
-        f"the learned scene lacks what the policy steers by: on {len(views)} held-out views its control differs by {difference:.3g} {unit} "
-        f"in the mean, at most {MOST_DIFFERENCE * spread:.3g} is allowed ({MOST_DIFFERENCE:.0%} of how it varies), and correlates by "
-        f"{correlation:.2f}, at least {LEAST_CORRELATION:g}; worst in view {worst}; look at scene/views, photograph what is missing, or "
+        f"the learned scene lacks what the policy steers by: on {len(views)} held-out views its control differs by {found.mean:.3g} {unit} "
+        f"in the mean, at most {found.allowed:.3g} is allowed ({MOST_DIFFERENCE:.0%} of how it varies), and correlates by "
+        f"{found.correlation:.2f}, at least {LEAST_CORRELATION:g}; worst in view {worst}; look at scene/views, photograph what is missing, or "
         "train longer (scene.steps, policy.first_steps)"
     )
