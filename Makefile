@@ -107,7 +107,7 @@ rooms: setup  ## Draw the rooms of the code into docs/architecture.md
 api: setup  ## Write docs/api.md from the docstrings of the public names
 	@$(BIN)/python docs/write_api.py
 
-docs: setup  ## Build the documentation into site/ (no network; search needs `python -m http.server -d site`)
+docs: setup  ## Build the documentation into site/ (no network; open site/index.html)
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build -q
 	@echo "open site/index.html"
 

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.page_browser import CHROMIUM, available
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -49,3 +51,19 @@ def test_nothing_is_loaded_from_elsewhere(site):
 def test_the_search_finds_what_a_page_says(site):
     index = json.loads((site / "search" / "search_index.json").read_text())
     assert any("stall" in entry["text"] and entry["location"].startswith("faults") for entry in index["docs"])
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(not available(), reason="needs playwright and /usr/bin/chromium")
+@pytest.mark.parametrize("page", ["index.html", "results/room.html"])
+def test_the_search_works_in_pages_opened_as_files(site, page):
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=str(CHROMIUM), args=["--no-sandbox"])
+        tab = browser.new_context(offline=True).new_page()
+        tab.goto((site / page).as_uri())
+        tab.fill("input.md-search__input", "stall")
+        found = tab.wait_for_selector("a.md-search-result__link", state="attached").get_attribute("href")
+        browser.close()
+    assert found.startswith(f"{site.as_uri()}/")
