@@ -2,31 +2,26 @@
 
 First the machine: bandwidth in a row, lines of 64 bytes at random, and multiply-adds (`benchmarks.machine_floors`). Then the parts of a
 tick of the surrogate, of a training step, and the hash encoding, each with what it must do at least (`benchmarks.least_work`). The scene
-is the simulated lab, learned for a thousand steps. The rows also become the table of docs/performance.md.
+is the simulated lab, learned for a thousand steps.
 """
 
 from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import advnerf_core as advnerf_core  # isort: skip  # before torch, as in the commands
 import torch
 
-from advnerf_core.files import write_atomically
 from advnerf_core.parallel import thread_count
 from benchmarks import machine_floors
 from benchmarks.floor_parts import Part, encoding_parts, tick_parts, training_parts
 from benchmarks.machine_floors import Floors, of_one_thread
-from benchmarks.results import REPOSITORY, read_rows, record_row
+from benchmarks.results import record_row
 from benchmarks.timing import seconds_in_turns
 from benchmarks.training_step import photograph_lab, prepare
 
 COMMAND = "python -m benchmarks.floors"
-PAGE = REPOSITORY / "docs" / "performance.md"
-BEGIN, END = "<!-- floors -->", "<!-- end of floors -->"
 UNIT = "x the floor"
 _LARGE_BYTES = 1 << 28  # a table beyond the cache
 
@@ -63,17 +58,11 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--small", action="store_true", help="tiny sizes, to check the command; not recorded")
-    parser.add_argument("--table", action="store_true", help="only write the table of the page from the rows")
     arguments = parser.parse_args()
-    if not arguments.table:
-        rows = measure(SMALL if arguments.small else Sizes())
-        for line, value, unit, note in rows:
-            print(f"{line}: {value:.3g} {unit}; {note}", flush=True)
-            if not arguments.small:
-                record_row(line, value, unit, "printed", None, COMMAND, note)
-        if arguments.small:
-            return
-    write_table(read_rows())
+    for line, value, unit, note in measure(SMALL if arguments.small else Sizes()):
+        print(f"{line}: {value:.3g} {unit}; {note}", flush=True)
+        if not arguments.small:
+            record_row(line, value, unit, "printed", None, COMMAND, note)
 
 
 def measure(sizes: Sizes) -> list[tuple[str, float, str, str]]:
@@ -114,7 +103,7 @@ def machine_rows(floors: Floors, sizes: Sizes) -> list[tuple[str, float, str, st
 
 
 def part_row(part: Part, seconds: float, floors: Floors) -> tuple[str, float, str, str]:
-    """How far a part is from its floor. The note's parts are the columns of the table."""
+    """How far a part is from its floor. The note: time, floor, what bounds it, what was counted."""
     floor_s, bound = part.work.floor_s(floors)
     work = part.work
     note = (
@@ -122,37 +111,6 @@ def part_row(part: Part, seconds: float, floors: Floors) -> tuple[str, float, st
         f"{work.line_count / 1e3:.4g} k lines, {work.flops / 1e6:.4g} MFLOP"
     )
     return f"floor: {part.name}", seconds / floor_s, UNIT, note
-
-
-def write_table(rows: list[dict[str, Any]], page: Path = PAGE) -> None:
-    """Put the rows of this command into the page, between its marks."""
-    text = page.read_text(encoding="utf-8")
-    if BEGIN not in text or END not in text:
-        raise ValueError(
-            f"expected the marks {BEGIN} and {END} in {page.name}; put them where the table belongs"
-        )
-    head, _, rest = text.partition(BEGIN)
-    write_atomically(page, f"{head}{BEGIN}\n{table(rows)}\n{END}{rest.partition(END)[2]}")
-
-
-def table(rows: list[dict[str, Any]]) -> str:
-    """The rows of this command in Markdown: the machine, then the parts with what they took and their floors."""
-    own = [row for row in rows if row["command"] == COMMAND]
-    if not own:
-        return f"`{COMMAND}` has not been run yet."
-    lines = ["| this machine | rate | how |", "|---|---|---|"]
-    for row in own:
-        if row["unit"] != UNIT:
-            lines.append(
-                f"| {row['line'].removeprefix('machine: ')} | {row['value']:.3g} {row['unit']} | {row['note']} |"
-            )
-    lines += ["", "| part | time | floor | ratio | bound by | counted |", "|---|---|---|---|---|---|"]
-    for row in own:
-        if row["unit"] == UNIT:
-            took, floor, bound, counted = row["note"].split("; ")
-            name = row["line"].removeprefix("floor: ")
-            lines.append(f"| {name} | {took} | {floor} | {row['value']:.1f} | {bound} | {counted} |")
-    return "\n".join(lines)
 
 
 if __name__ == "__main__":

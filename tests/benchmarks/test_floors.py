@@ -1,7 +1,5 @@
 """What the floors count, against the kernels themselves and against sizes worked out by hand."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -99,33 +97,8 @@ def test_the_machine_is_measured_on_all_threads_and_on_one() -> None:
     assert machine_floors.latency_s(1 << 16, repeats=1, hops=1000) > 0.0
 
 
-def test_the_table_of_the_page_comes_from_the_rows(tmp_path: Path) -> None:
-    page = tmp_path / "page.md"
-    page.write_text(f"before\n{floors.BEGIN}\nold\n{floors.END}\nafter\n")
+def test_a_row_has_the_ratio_and_says_what_was_counted() -> None:
     part = floors.Part("tick, policy", lambda: None, Work(1e6, {1 << 20: 5e3}, 1e9))
     line, value, unit, note = floors.part_row(part, 0.02, MACHINE)
-    rows = [
-        {"command": floors.COMMAND, "line": line, "value": value, "unit": unit, "note": note},
-        {
-            "command": floors.COMMAND,
-            "line": "machine: bandwidth",
-            "value": 12.34,
-            "unit": "GB/s",
-            "note": "how",
-        },
-        {"command": "python -m benchmarks.fox", "line": "fox", "value": 1.0, "unit": "dB", "note": ""},
-    ]
-    floors.write_table(rows, page)
-    text = page.read_text()
-    assert (
-        "| tick, policy | 20 ms | 10 ms | 2.0 | arithmetic | 1 MB in a row, 5 k lines, 1000 MFLOP |" in text
-    )
-    assert "| bandwidth | 12.3 GB/s | how |" in text
-    assert "fox" not in text
-    assert text.startswith("before\n")
-    assert text.endswith("after\n")
-    floors.write_table([], page)
-    assert "has not been run yet" in page.read_text()
-    page.write_text("no marks")
-    with pytest.raises(ValueError, match="put them where the table belongs"):
-        floors.write_table(rows, page)
+    assert (line, value, unit) == ("floor: tick, policy", pytest.approx(2.0), "x the floor")
+    assert note == "20 ms; 10 ms; arithmetic; 1 MB in a row, 5 k lines, 1000 MFLOP"

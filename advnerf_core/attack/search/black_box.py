@@ -96,7 +96,7 @@ class BlackBoxSearch:
     ) -> BlackBoxSearch:
         """A method with the rate and the probes that suit it, where none are given.
 
-        A budget buys ``guided`` few steps, so each must be long, and questions are worth less than steps; see docs/black_box.md.
+        A budget buys ``guided`` few steps, so each must be long, and questions are worth less than steps; see docs/methods.md.
         """
         rate, pairs = _USUAL[method]
         return cls(method, learning_rate or rate, probes or pairs, **others)

@@ -56,7 +56,7 @@ class ExperimentConfig(StrictModel):
     horizon: Positive = Field(default=60, description="Control ticks of every drive (T).")
     dt_s: PositiveNumber = Field(
         default=0.1,
-        description="Control tick [s]; the paper's CARLA runs have finer ones: docs/intersection_experiment.md.",
+        description="Control tick [s]; the paper's CARLA runs have finer ones: docs/intersection.md.",
     )
     held_cap_m: PositiveNumber = Field(
         default=6.0, description="Largest |CTE| that a stopped car is charged per tick [m]."

@@ -51,7 +51,7 @@ class Holds:
 
 
 def in_ticks_of(dt_s: float, folder: Path) -> Experiment:
-    """The experiment over the same time, as docs/intersection_experiment.md says to ask for it."""
+    """The experiment over the same time, as docs/intersection.md says to ask for it."""
     ticks = round(SECONDS / dt_s)
     changes = [f"dt_s={dt_s}", f"horizon={ticks}", f"policy.drive_steps={ticks}"]
     return load_experiment(LAUNCH, "full", changes, folder)
