@@ -26,9 +26,9 @@ _HEAD_LINES = 8
 _GENERATED = ("results.md", "api.md")
 # How-to and reference pages: their other numbers are settings, limits, formats and sizes of devices.
 SETTINGS = frozenset(
-    """attacks.md bags.md cameras.md carla.md cars.md driving.md faults.md first_day.md intersection.md methods.md objects.md
-    operator_page.md performance.md policies.md policy_contract.md poses.md room.md ros2.md scene_files.md trials.md
-    troubleshooting.md victims.md was_not_run.md wiring.md worlds.md""".split()  # noqa: SIM905
+    """attacks.md bag_format.md bags.md calibration.md cameras.md carla.md cars.md driving.md faults.md first_day.md foreign_worlds.md
+    intersection.md methods.md objects.md operator_page.md performance.md policies.md policy_contract.md poses.md room.md ros2.md
+    scene_files.md trials.md troubleshooting.md two_hosts.md victims.md was_not_run.md wiring.md worlds.md""".split()  # noqa: SIM905
 )
 # Settings on pages that lead to results.
 _SETTINGS_ON = {"README.md": {("250", "ms")}, "evidence.md": {("2", "kB")}}
