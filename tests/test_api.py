@@ -164,7 +164,7 @@ def test_the_page_is_written_from_the_code():
 def test_the_page_shows_types_defaults_shapes_and_methods():
     text = write_api.PAGE.read_text(encoding="utf-8")
     assert "cube_face_object(\n    size_m: float = 0.8,\n    resolution: int = 16," in text
-    assert "- `start_states: Tensor`: `[B, n]`; their dtype is that of states and lambdas." in text
+    assert "- `start_states: Tensor`: `[B, n]`; states and lambdas have their dtype." in text
     assert "- `held_cap_m: float = 1.5`: Cap of the |CTE|" in text
     assert "- **`project(xy_m: ArrayLike) -> Projection`**: Nearest point" in text
     assert "- **`Path.from_segments(start_pose: tuple[float, float, float]" in text

@@ -11,7 +11,7 @@ This is the exact derivative of the rollout with every camera pose frozen at its
 is *not* the derivative of the true closed loop, in which a changed state also changes the image.
 
 For a stateless policy all lambdas follow from states and controls without rendering, and the terms of the sum are independent:
-they are evaluated in time batches of fixed size. What the forward pass rendered is kept up to a byte budget, the rest is
+they are evaluated in time batches of fixed size. Renders of the forward pass are kept up to a byte budget, the rest is
 rendered again, so memory does not grow with the horizon. A policy with memory falls back to one step at a time, backwards.
 """
 
@@ -65,20 +65,20 @@ class AdjointResult:
 
 @dataclass
 class RenderCache:
-    """Renders of a rollout by step, up to a byte budget; what does not fit is not kept."""
+    """Renders of a rollout by step, up to a byte budget; the rest is dropped."""
 
     budget_bytes: int
     used_bytes: int = 0
     _kept: dict[int, Rendered] = field(default_factory=dict)
 
     def offer(self, step: int, rendered: Rendered) -> None:
-        """Keep a render if it fits."""
+        """Keep a render if it fits into the budget."""
         if self.used_bytes + rendered.nbytes <= self.budget_bytes:
             self._kept[step] = rendered
             self.used_bytes += rendered.nbytes
 
     def take(self, step: int) -> Rendered | None:
-        """Give a render away and forget it, or None if it was not kept."""
+        """Remove and return a render; None if it was not kept."""
         rendered = self._kept.pop(step, None)
         if rendered is not None:
             self.used_bytes -= rendered.nbytes
@@ -112,7 +112,7 @@ def roll_out(
 
 
 def evaluate(problem: AttackProblem, theta: Tensor) -> tuple[Rollout, Totals]:
-    """One closed-loop drive with parameters ``theta`` (``theta_shape``), and what it is charged; no gradient."""
+    """One closed-loop drive with parameters ``theta`` (``theta_shape``), and its totals; no gradient."""
     rollout, _ = roll_out(problem, theta, keep_memories=False)
     return rollout, problem.totals(rollout.states)
 
@@ -121,11 +121,11 @@ def adjoint_gradient(problem: AttackProblem, theta: Tensor) -> AdjointResult:
     """Loss and gradient of one rollout; the module's docstring says what the gradient is and is not.
 
     Args:
-        problem: What is attacked.
+        problem: The attack problem.
         theta: Parameters of the objects, ``theta_shape``.
 
     Raises:
-        BlackBoxError: The policy says that it has no gradient.
+        BlackBoxError: The policy declares that it has no gradient.
     """
     problem.require_gradient()
     theta = theta.detach()
@@ -144,10 +144,10 @@ def gradient_pass(
     """The gradient of a rollout that was driven with ``theta``.
 
     Args:
-        problem: What is attacked.
+        problem: The attack problem.
         theta: Parameters of the rollout, without history.
         rollout: Nominal trajectory.
-        cache: Renders that were kept of it; it is emptied.
+        cache: Renders kept from the rollout; it is emptied.
         memories: Memories ``[T + 1]`` of a policy that has one.
     """
     loss, state_slopes = loss_slopes(problem.objective, problem.judged(rollout.states))
@@ -195,8 +195,8 @@ def _batched_terms(
     cache: RenderCache,
     memories: Sequence[Tensor],
 ) -> _Terms:
-    """Gradient terms of a stateless policy, one time batch after the other, each with its count of repeated renders."""
-    del memories  # there are none
+    """Gradient terms of a stateless policy, one time batch after the other, each with its number of repeated renders."""
+    del memories  # a stateless policy has none
     steps, starts = control_slopes.shape
     for first in range(0, steps, problem.time_batch):
         last = min(first + problem.time_batch, steps)
@@ -253,7 +253,7 @@ def _sequential_terms(
     """Gradient terms of a policy with memory, last step first, carrying the adjoint of the memory.
 
     With ``(u_t, m_{t+1}) = pi(o_t, m_t)`` the memory has its own multiplier ``mu_t = (du/dm)^T (df/du)^T lambda_{t+1} +
-    (dm_{t+1}/dm_t)^T mu_{t+1}``, and an image is also charged for what it leaves in the memory.
+    (dm_{t+1}/dm_t)^T mu_{t+1}``, and the gradient of an image includes its effect on the memory.
     """
     memory_slope = torch.zeros_like(memories[-1])
     for t in range(len(control_slopes) - 1, -1, -1):

@@ -1,4 +1,4 @@
-"""The attack file: one ``.safetensors`` file with what an attack found and everything needed to deploy and to trace it.
+"""The attack file: one ``.safetensors`` file with an attack and everything needed to deploy and to trace it.
 
 The compositor, the monitor, the simulators and the report all read this file. Its short hash is the attack id that accompanies
 every attacked image. No torch here: the car's own nodes load it.
@@ -30,26 +30,26 @@ from advnerf_core.places import open_tensors
 FILE_FORMAT = "advnerf-attack-2"
 TEXTURE_PX = 512
 
-# What a search changed.
+# The spaces that a search can change.
 COLOURS, PLACES, MESH_TEXTURE, MESH_SHAPE = "colours", "places", "mesh_texture", "mesh_shape"
 
 
 class AttackFileError(AdvnerfError, ValueError):
-    """An attack file cannot be read, or is not what was saved."""
+    """An attack file cannot be read, or differs from what was saved."""
 
 
 @dataclass(frozen=True, eq=False)
 class AttackedObject:
-    """One object of an attack, as the attack found it.
+    """One object of an attack, in its attacked form.
 
     Attributes:
-        name: What it is, e.g. ``hydrant.object`` or ``face``.
-        theta: What was found for it, ``[..., 3]`` float32: colours before squashing; of an attack on shapes the search's parameters of
+        name: Name of the object, e.g. ``hydrant.object`` or ``face``.
+        theta: Its attacked parameters, ``[..., 3]`` float32: colours before squashing; for an attack on shapes the search's parameters of
             each vertex ``[V, 3]``.
-        T_world_from_object: Its pose, ``[4, 4]``.
+        T_world_from_object: Pose of the object, ``[4, 4]``.
         scale: World metres per object unit.
         sha256: Hash of its geometry and fixed colours.
-        glb: Of a mesh, the found mesh as a binary glTF file, in the object's frame; empty for other objects.
+        glb: The attacked mesh as a binary glTF file, in the object's frame; empty for other objects.
         size_m: Width and height of a panel's texture [m]; None for solid objects, for a face (see `AttackFace`), and in older files.
     """
 
@@ -63,7 +63,7 @@ class AttackedObject:
 
     @property
     def placement(self) -> tuple[float, float, float, float]:
-        """Where it stands: x [m], y [m], yaw [rad] and scale."""
+        """Placement: x [m], y [m], yaw [rad] and scale."""
         T = np.asarray(self.T_world_from_object)
         return float(T[0, 3]), float(T[1, 3]), yaw_of(T), float(self.scale)
 
@@ -87,11 +87,11 @@ class AttackFace:
     """The face of an object that a projection or a display can show.
 
     Attributes:
-        texture: The face as it is displayed, ``[H, W, 3]`` uint8 sRGB.
+        texture: The displayed face, ``[H, W, 3]`` uint8 sRGB.
         size_m: Width and height [m].
         subject: Motion-capture subject that carries the face.
         corners_in_subject: Corners ``[4, 3]`` in the subject's frame: top left, top right, bottom right, bottom left for the viewer [m].
-        carried_by: Number of the object that carries it; its theta is the colour grid ``[N, N, 3]``, row 0 on top, column 0 left for the viewer.
+        carried_by: Number of the object with this face; its theta is the colour grid ``[N, N, 3]``, row 0 on top, column 0 left for the viewer.
     """
 
     texture: NDArray[np.uint8]
@@ -116,13 +116,13 @@ class AttackFace:
 
 @dataclass(frozen=True, eq=False)
 class AttackFile:
-    """An attack, whatever was searched, ready to be shown.
+    """An attack on any space, ready to be deployed.
 
     Attributes:
-        method: Name of the method that found it; ``none`` is the plain object.
-        space: What was searched: ``colours``, ``places`` (with or without colours), ``mesh_texture``, ``mesh_shape``, or a user's own.
-        objects: The objects as they were found, at least one.
-        face: The face that a projection or a display shows; None if no object has one.
+        method: Name of the method; ``none`` is the plain object.
+        space: Searched space: ``colours``, ``places`` (with or without colours), ``mesh_texture``, ``mesh_shape``, or a user's own.
+        objects: The attacked objects, at least one.
+        face: The face for a projection or a display; None if no object has one.
         camera: Intrinsics of the images the policy saw during the attack.
         scene_sha256: Hash of the scene the attack was computed in.
         policy_sha256: Hash of the victim.
@@ -130,9 +130,9 @@ class AttackFile:
         seed: Seed of the attack.
         predicted_total_cte_m: Total CTE the surrogate predicts, averaged over starts [m]; None if it was not computed.
         software_version: Version of advnerf that wrote the file.
-        clean_drive: The victim's drive without an attack, from the same starts in the same scene; None if it was not driven.
-        extra: Anything else worth keeping, as plain data.
-        field_total_cte_m: The predicted total CTE of the same drives through the learned field itself, where the search saw a baked one [m].
+        clean_drive: The victim's drive without an attack, from the same starts in the same scene; None if there was none.
+        extra: Further plain data.
+        field_total_cte_m: The predicted total CTE of the same drives through the learned field itself, if the search used a baked one [m].
     """
 
     method: str
@@ -192,11 +192,11 @@ class AttackFile:
         Args:
             theta: Colour grid before squashing ``[N, N, 3]`` float32.
             size_m: Width and height of the face [m].
-            subject: Motion-capture subject that carries it.
-            corners_in_subject: As of `AttackFace`, ``[4, 3]`` [m].
-            T_world_from_object: Its pose ``[4, 4]``.
-            texture: The face as it is displayed, ``[H, W, 3]`` uint8 sRGB; made of ``theta`` if it is not given.
-            sha256: Hash of its geometry.
+            subject: Motion-capture subject that carries the face.
+            corners_in_subject: Corners ``[4, 3]`` [m], see `AttackFace`.
+            T_world_from_object: Pose of the face, ``[4, 4]``.
+            texture: The displayed face, ``[H, W, 3]`` uint8 sRGB; computed from ``theta`` if not given.
+            sha256: Hash of the face's geometry.
             others: The other attributes of an attack file.
         """
         carrier = AttackedObject(name, theta, T_world_from_object, 1.0, sha256)
@@ -303,7 +303,7 @@ def save_attack(path: str | os.PathLike[str], attack: AttackFile, small: bool = 
     """Write an attack file atomically and return its id.
 
     Args:
-        small: Leave out what follows from the rest, see `advnerf_core.attack.packed`; `load_attack` reads both.
+        small: Leave out derived tensors, see `advnerf_core.attack.packed`; `load_attack` reads both.
     """
     header = {"format": FILE_FORMAT, "sha256": attack.sha256, "metadata": _canonical(attack._metadata())}
     tensors = attack._tensors()
@@ -315,7 +315,7 @@ def save_attack(path: str | os.PathLike[str], attack: AttackFile, small: bool = 
 
 
 def load_attack(path: str | os.PathLike[str]) -> AttackFile:
-    """Read an attack file and check that it is what was saved.
+    """Read an attack file and verify its hash.
 
     Raises:
         AttackFileError: If it is missing, damaged, changed by hand, or something else.
@@ -335,8 +335,8 @@ def load_attack(path: str | os.PathLike[str]) -> AttackFile:
 
 
 def attack_from_bytes(content: bytes, source: str) -> AttackFile:
-    """An attack file's content, checked as `load_attack` does; ``source`` is what messages call it."""
-    # The container begins with the length of its header and the header itself, which is all that its reader of bytes leaves out.
+    """An attack file's content, checked as by `load_attack`; ``source`` names it in messages."""
+    # The container begins with the length of its header and the header itself; its bytes reader checks nothing else.
     try:
         length = int.from_bytes(content[:8], "little")
         header = json.loads(content[8 : 8 + length])["__metadata__"]

@@ -13,7 +13,7 @@ def clean_drive(problem: AttackProblem, plain_theta: Tensor) -> CleanDrive:
     """Drive without disturbances and without an attack.
 
     Args:
-        problem: The problem that is attacked.
+        problem: The attack problem.
         plain_theta: Parameters of the objects without an attack.
     """
     rollout, _ = evaluate(problem.undisturbed(), plain_theta)

@@ -1,4 +1,4 @@
-"""How near the adjoint's gradient is to that of the true closed loop, or that it cannot be told.
+"""How near the adjoint's gradient is to the gradient of the true closed loop, with an interval, if it can be measured.
 
 The true closed loop, in which images follow the states, jumps wherever an edge crosses a pixel. Its finite differences therefore
 depend on their step: a cosine from one step says nothing. Here the loop is differenced over a sweep of steps, along the gradient
@@ -6,8 +6,8 @@ and along random directions at a right angle to it, and a cosine is given only w
 
 With ``a`` the closed loop's slope along the gradient ``g / |g|`` and ``S`` the sum of its squared slopes along ``K`` random
 orthonormal directions in the ``N - 1`` dimensions beside it, the cosine is ``a / sqrt(a^2 + P)``, where ``P``, the squared norm of
-what lies beside the gradient, is estimated by ``S (N - 1) / K``. As the directions are uniform, ``S / P`` follows the
-Beta(K / 2, (N - 1 - K) / 2) distribution whatever the loop is: that gives the interval.
+the part beside the gradient, is estimated by ``S (N - 1) / K``. As the directions are uniform, ``S / P`` follows the
+Beta(K / 2, (N - 1 - K) / 2) distribution for any loop, which gives the interval.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from advnerf_core.geometry import Array
 
 STEPS = (1.0, 1e-1, 1e-2, 1e-3, 1e-4, 1e-5)  # in theta, along unit directions
 CONFIDENCE = 0.95
-# Consecutive steps agree if their slopes differ by at most this share; so many must agree.
+# Consecutive steps agree if their slopes differ by at most this share; at least this many must agree.
 _AGREEMENT, _RUN = 0.25, 3
 
 Loss = Callable[[Tensor], float]
@@ -33,15 +33,15 @@ Loss = Callable[[Tensor], float]
 
 @dataclass(frozen=True)
 class CosineAtStep:
-    """What finite differences of one step say.
+    """Result of finite differences with one step.
 
     Attributes:
         step: Half the distance between the two evaluations, in theta.
-        cosine: Between the gradient and the closed loop's; 0 if the loop does not change.
-        low: Lower end of its interval, for the choice of directions.
-        high: Upper end.
+        cosine: Cosine between the gradient and the closed loop's; 0 if the loop does not change.
+        low: Lower end of its interval over choices of directions.
+        high: Upper end of the interval.
         along: Slope of the closed loop along the gradient.
-        beside: Its slopes along the random directions.
+        beside: Slopes of the closed loop along the random directions.
     """
 
     step: float
@@ -57,7 +57,7 @@ class ClosedLoopCosine:
     """The cosine to the true closed loop.
 
     Attributes:
-        at_steps: For each step of the sweep, the largest first.
+        at_steps: Result for each step of the sweep, the largest first.
         plateau: Steps that agree with one another; None if there are not enough of them.
         dimensions: Length of theta.
     """
@@ -68,7 +68,7 @@ class ClosedLoopCosine:
 
     @property
     def interval(self) -> tuple[float, float, float] | None:
-        """Cosine, lower and upper end over the steps that agree; None if it cannot be told."""
+        """Cosine, lower and upper end over the steps that agree; None if too few agree."""
         if self.plateau is None:
             return None
         agreeing = [at for at in self.at_steps if at.step in self.plateau]
@@ -77,7 +77,7 @@ class ClosedLoopCosine:
 
     @property
     def in_words(self) -> str:
-        """The cosine with its interval, or why there is none."""
+        """The cosine with its interval, or the reason why it is unknown."""
         if self.interval is not None and self.plateau is not None:
             cosine, low, high = self.interval
             return (
@@ -95,7 +95,7 @@ class ClosedLoopCosine:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, with the interval and the words."""
+        """Plain data, with the interval and the text."""
         return {**asdict(self), "interval": self.interval, "in_words": self.in_words}
 
 
@@ -114,11 +114,11 @@ def closed_loop_cosine(
 
     Args:
         loss: Loss of the true closed loop for a theta, with the same draws every time.
-        theta: Where, float64.
+        theta: Point of the comparison, float64.
         gradient: The adjoint's gradient there, of the same shape.
         directions: Random directions beside the gradient; at most as many as there are dimensions beside it.
         steps: Steps of the central differences in theta, along unit directions.
-        told: Called with the share that is done.
+        told: Progress callback, called with the finished share.
 
     Raises:
         ValueError: No direction, or fewer steps than must agree.
@@ -189,6 +189,6 @@ def _plateau(found: Sequence[CosineAtStep], dimensions: int) -> tuple[float, ...
 
 
 def _whole(at: CosineAtStep, dimensions: int) -> Array:
-    """The slopes, those beside the gradient weighted by how many directions each stands for: a vector as long as the loop's gradient."""
+    """The slopes, each beside the gradient weighted by the number of directions that it stands for: a vector as long as the loop's gradient."""
     weight = np.sqrt((dimensions - 1) / max(1, len(at.beside)))
     return np.array([at.along, *(weight * slope for slope in at.beside)])

@@ -1,6 +1,6 @@
-"""Which device a search uses: a matter of the machine, not of the experiment. It is no key of a configuration, and no hash has it.
+"""The device of a search. It belongs to the machine and not to the experiment: it is no configuration key and enters no hash.
 
-Results differ in their last bits between a processor and a GPU, and so does what a chaotic drive makes of them.
+Results differ in their last bits between a CPU and a GPU, and a chaotic drive amplifies the difference.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ _CPU, _CUDA = "cpu", "cuda"
 
 
 def searches_on_gpu() -> bool:
-    """Whether the environment variable ``ADVNERF_DEVICE`` asks for a GPU; without it the processor searches.
+    """Whether the environment variable ``ADVNERF_DEVICE`` asks for a GPU; the default is the CPU.
 
     Raises:
-        DeviceError: It names something else than cpu or cuda.
+        DeviceError: The variable is neither cpu nor cuda.
     """
     named = os.environ.get(VARIABLE) or _CPU
     if named not in (_CPU, _CUDA):
@@ -26,15 +26,15 @@ def searches_on_gpu() -> bool:
 
 
 def use_device(device: str | None) -> None:
-    """Search on ``cpu`` or ``cuda`` from now on, also in processes that are started from here; None leaves it as it is.
+    """Search on ``cpu`` or ``cuda`` from now on, also in child processes; None changes nothing.
 
     Raises:
-        DeviceError: There is no such device.
+        DeviceError: The device is not available.
     """
     if device is not None:
         os.environ[VARIABLE] = device
     if searches_on_gpu():
-        # Only here: torch and the compiler of kernels for a GPU take two seconds to load, and may be absent.
+        # Imported here: torch and the compiler of GPU kernels take two seconds to load, and may be absent.
         from advnerf_core.render.cuda_launch import cuda_device
 
         cuda_device()

@@ -1,6 +1,6 @@
-"""Is the adjoint right, and is it of use, for this scene, this policy and these objects? Measurements; no judgement.
+"""Measures whether the adjoint is right, and useful, for this scene, this policy and these objects. It judges nothing.
 
-The adjoint promises the derivative of the rollout with every camera pose frozen; that is what finite differences here confirm.
+The adjoint promises the derivative of the rollout with every camera pose frozen; finite differences confirm this here.
 The true closed loop, in which images follow the states, is compared for information: it is chaotic, and the method
 does not claim its derivative.
 """
@@ -30,7 +30,7 @@ from advnerf_core.driving.rollout import Remembering, Rollout
 from advnerf_core.geometry import Array
 from advnerf_core.scene.surrogate import PoseBatch, Rendered, Surrogate
 
-# Controls within this share of the steering range of its end count as saturated: nothing more can be asked of them.
+# Controls within this share of the steering range of its end count as saturated: they cannot increase further.
 _SATURATED = 1e-3
 
 
@@ -47,7 +47,7 @@ class RememberedFrames:
         return self._surrogate.theta_shape
 
     def initial_theta(self, generator: torch.Generator) -> Tensor:
-        """Where an attack starts."""
+        """Initial parameters of an attack."""
         return self._surrogate.initial_theta(generator)
 
     def camera_poses(self, states: Tensor) -> Array:
@@ -62,7 +62,7 @@ class RememberedFrames:
         return self._frames[key].render(theta.detach())
 
     def sense(self, states: Tensor, theta: Tensor) -> Rendered:
-        """What the car's camera sees from states ``[B, n]``."""
+        """Images of the car's camera from states ``[B, n]``."""
         return self.render(self.camera_poses(states), theta)
 
 
@@ -116,7 +116,7 @@ def slopes_of(gradient: Tensor, directions: Tensor) -> Array:
 
 
 def relative_error(got: Array, expected: Array) -> float:
-    """Norm of the difference over the norm of what is expected; infinite if nothing is expected but something came."""
+    """Norm of the difference over the norm of the expected values; infinite if only the expected values are zero."""
     difference, size = float(np.linalg.norm(got - expected)), float(np.linalg.norm(expected))
     return difference / size if size > 0.0 else (0.0 if difference == 0.0 else float("inf"))
 
@@ -129,7 +129,7 @@ def cosine(a: Array, b: Array) -> float:
 
 @dataclass(frozen=True)
 class TickHealth:
-    """What a nominal rollout says at each tick, means over the starts.
+    """Diagnostics of a nominal rollout at each tick, means over the starts.
 
     Attributes:
         lambda_position: Norm of the adjoint's position part at ticks 0..T.
@@ -146,7 +146,7 @@ class TickHealth:
 
 def tick_health(problem: AttackProblem, result: AdjointResult) -> TickHealth:
     """Norms of lambda, saturation and visibility over time."""
-    # The loss is a mean over the starts, and so are its adjoints: undo that, so that starts do not matter.
+    # The loss is a mean over the starts, and so are its adjoints: multiply by their number, so that it does not matter.
     lambdas = result.lambdas.double() * len(problem.start_states)
     visible: tuple[float, ...] = ()
     if isinstance(problem.sensor, Surrogate | RememberedFrames):
@@ -167,7 +167,7 @@ def _share_that_sees(problem: AttackProblem, states: Tensor, probe: Tensor) -> f
 
 
 def saturated_shares(problem: AttackProblem, controls: Tensor) -> tuple[float, ...]:
-    """Share of starts at each tick whose control is at its limits: those of the dynamics, and of the policy's own range."""
+    """Share of starts at each tick whose control is at a limit of the dynamics or of the policy's own range."""
     limits: Any = getattr(problem.dynamics, "steering_limits_rad", None)
     reach: Any = getattr(problem.policy, "max_steering_rad", None)
     beyond = torch.zeros_like(controls, dtype=torch.bool)
@@ -183,7 +183,7 @@ class TimeSplit:
     """Where the time of one loss with its gradient goes [s].
 
     Attributes:
-        render_s: Rendering, that of frames that were not kept included.
+        render_s: Rendering, including frames that were not kept.
         drive_s: The rest of the rollout: the policy one tick at a time, and the dynamics.
         backward_s: The policy forward and backward in time batches, and the lambdas.
         vjp_s: From gradients of images to the gradient of theta.
@@ -198,7 +198,7 @@ class TimeSplit:
 
     @property
     def gradient_pass_s(self) -> float:
-        """What the gradient costs beyond the rollout if all frames are kept."""
+        """Extra time of the gradient beyond the rollout if all frames are kept."""
         return self.backward_s + self.vjp_s
 
 
@@ -238,7 +238,7 @@ class _TimedSensor:
 
 
 def time_split(problem: AttackProblem, theta: Tensor) -> tuple[TimeSplit, AdjointResult]:
-    """Time one loss with its gradient by part; one tick is run before, so that kernels are compiled."""
+    """Time one loss with its gradient by part; one tick runs first, so that kernels are compiled."""
     adjoint_gradient(replace(problem, steps=1), theta)
     sensor = _TimedSensor(problem.sensor)
     timed, cache = replace(problem, sensor=sensor), RenderCache(problem.cache_bytes)

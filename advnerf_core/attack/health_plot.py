@@ -23,13 +23,13 @@ def draw_health(
     memory_mib: Mapping[int, float],
     split: TimeSplit,
 ) -> bytes:
-    """PNG of what was measured.
+    """PNG of the measurements.
 
     Args:
         adjoint: Derivatives along random directions by the adjoint.
         frozen: The same by finite differences with frozen poses.
         closed: The cosine to the true closed loop, over the steps of the finite differences.
-        ticks: Over time.
+        ticks: Diagnostics over time.
         memory_mib: Peak above idle by horizon; may be empty.
     """
     figure = Figure(figsize=(11.0, 6.0), layout="constrained", facecolor=LIGHT["paper"])

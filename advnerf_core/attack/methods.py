@@ -49,7 +49,7 @@ class MethodError(AdvnerfError, ValueError):
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """What a search may spend, and how it searches. A method reads what concerns it.
+    """Budget and settings of a search. A method ignores those that do not concern it.
 
     Attributes:
         evaluations: Budget: closed-loop drives from all start poses, or as many policy calls as these make.
@@ -57,11 +57,11 @@ class SearchSettings:
         sigma: Spread of the method's candidates; None for the method's own default.
         population: Candidates of a generation.
         cells: Cells along an edge of coarse textures, where a method searches or draws these; 0 for the objects' own grids.
-        probes: Pairs of textures asked about after each drive; None for the method's own default.
+        probes: Pairs of textures queried after each drive; None for the method's own default.
         warm_pairs: Pairs of a student's first lesson; None for the default.
-        gradient_rate: Step of Adam along a gradient, where neither ``learning_rate`` nor the sensor says another one.
-        random_sigma: Spread of random textures' theta, where neither ``sigma`` nor the sensor says another one.
-        options: What the method alone knows: its `Method.Options`.
+        gradient_rate: Step of Adam along a gradient, unless ``learning_rate`` or the sensor gives another one.
+        random_sigma: Spread of random textures' theta, unless ``sigma`` or the sensor gives another one.
+        options: The method's own options: its `Method.Options`.
     """
 
     evaluations: int = 50
@@ -81,9 +81,9 @@ class SearchRun:
     """One run of a search.
 
     Attributes:
-        seed: Of everything that the search draws.
-        state_path: State file, written after every evaluation; if it exists, the search goes on from it. None keeps none.
-        on_evaluation: Called after every evaluation, when the state is on disk; what it raises ends the search.
+        seed: Seed of all random draws.
+        state_path: State file, written after every evaluation; if it exists, the search resumes from it. None keeps none.
+        on_evaluation: Called after every evaluation, when the state is on disk; an exception ends the search.
         settings_hash: Hash of scene, policy and configuration; a state file of another one is refused.
     """
 
@@ -107,17 +107,17 @@ def _all_evaluations(problem: AttackProblem, settings: SearchSettings) -> int:
 
 @dataclass(frozen=True)
 class Method:
-    """A method of attack. Its name is that of its row, of its entry point, or of the attribute of its file.
+    """A method of attack. Its name is its row's, its entry point's, or its attribute's in the file.
 
     Attributes:
         search: ``search(problem, settings, run)`` maximises the objective of a problem within the budget.
-        needs_gradient: Whether it needs a policy with a gradient; else it asks the policy for answers only.
-        single_images: Whether it asks about images outside a drive, which a policy with a memory cannot answer.
+        needs_gradient: Whether it needs a policy with a gradient; else it only queries the policy.
+        single_images: Whether it queries single images outside a drive, which a policy with a memory cannot answer.
         reads_scale: Whether it asks the sensor for the scale of theta (`search.gradient_step`, `search.random_spread`), so that it also
             searches shapes; else theta must be colours.
-        evaluations: ``evaluations(problem, settings)``: how many drives the budget allows it, for the progress.
+        evaluations: ``evaluations(problem, settings)``: number of drives that the budget allows, for the progress.
         Options: Dataclass or pydantic model of options that only this method has; None if it has none.
-        title: What readers call it, in a few words; empty for its name.
+        title: Title for readers, in a few words; empty for its name.
     """
 
     search: Search
@@ -137,11 +137,11 @@ class Method:
         raise MethodError(f"expected Options to be a dataclass or a pydantic model, got {own!r:.80}")
 
     def options(self, written: Mapping[str, Any], key: str = "options") -> Any:
-        """The options as `SearchSettings` carries them.
+        """The options in the form that `SearchSettings` carries.
 
         Args:
             written: Keys and values as a user wrote them.
-            key: What stands before each key in messages.
+            key: Prefix of each key in messages.
 
         Raises:
             MethodError: An unknown key, or a wrong value.
@@ -158,7 +158,7 @@ def _late(module: str, function: str = "search") -> Callable[..., Any]:
     return call
 
 
-# In the order of tables. One row and one file in `search/` make a method.
+# In the order of tables. A method is one row here and one file in `search/`.
 METHODS: Mapping[str, Method] = MappingProxyType(
     {
         "random": Method(_late("random_search"), reads_scale=True),
@@ -188,14 +188,14 @@ METHODS: Mapping[str, Method] = MappingProxyType(
 
 
 def load_method(reference: str, folder: Path | None = None) -> Method:
-    """The method that a reference stands for.
+    """The method that a reference names.
 
     Args:
         reference: A built-in name, an entry point's name, or ``file.py:Name``.
         folder: Folder that a relative ``file.py`` is relative to; the working folder if it is not given.
 
     Raises:
-        PluginError: There is no such method, its code cannot be loaded, or it is none.
+        PluginError: The method is unknown, its code cannot be loaded, or it is not a `Method`.
     """
     require_method(reference, folder)
     found: Any = resolve(reference, _WHAT, {name: _row(name) for name in METHODS}, GROUP, folder)
@@ -207,14 +207,14 @@ def load_method(reference: str, folder: Path | None = None) -> Method:
 
 
 def require_method(reference: str, folder: Path | None = None) -> None:
-    """Refuse a reference that stands for no method; nothing is loaded.
+    """Raise unless a reference names a method; nothing is loaded.
 
     Args:
-        reference: As of `load_method`.
-        folder: As of `load_method`.
+        reference: See `load_method`.
+        folder: See `load_method`.
 
     Raises:
-        PluginError: There is no such method, or its name cannot be told from another's.
+        PluginError: The method is unknown, or its name is ambiguous.
     """
     require_known(reference, _WHAT, METHODS, GROUP, folder)
     name = name_in_results(reference)
@@ -235,12 +235,12 @@ def method_digest(reference: str) -> str:
 
 
 def method_names() -> tuple[str, ...]:
-    """Built-in methods, then those of installed packages."""
+    """Names of the built-in methods, then of methods in installed packages."""
     return known_names(METHODS, GROUP)
 
 
 def black_box_methods(stateless: bool = True) -> tuple[str, ...]:
-    """Built-in methods that ask a policy for its answers only.
+    """Built-in methods that only query a policy for its answers.
 
     Args:
         stateless: Whether the policy has no memory.
@@ -253,7 +253,7 @@ def black_box_methods(stateless: bool = True) -> tuple[str, ...]:
 
 
 def alternatives(names: Iterable[str]) -> str:
-    """Names in words: ``a, b or c``."""
+    """Names as text: ``a, b or c``."""
     *first, last = names
     return f"{', '.join(first)} or {last}" if first else last
 

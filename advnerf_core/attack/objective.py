@@ -1,8 +1,8 @@
-"""What an attack maximises: the contract of an objective, and the built-in ones.
+"""The goal of an attack: the contract of an objective, and the built-in ones.
 
-An objective judges drives. Its ``value`` is reported, and a search keeps the theta with the highest value. Its ``loss`` is what gradients
-follow, and what searches without a gradient minimise. The loss defaults to minus the value; an objective whose value is a count or a
-maximum, or stops with the car, has a relaxation of its own.
+An objective judges drives. Its ``value`` is reported, and a search keeps the theta with the highest value. Gradients follow its ``loss``,
+and searches without a gradient minimise it. The loss defaults to minus the value; an objective whose value is a count or a
+maximum, or stops with the car, defines a relaxation.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ class ObjectiveError(AdvnerfError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class JudgedDrives:
-    """Drives from several starts, and what an objective may need to judge them.
+    """Drives from several starts, with the data that objectives need.
 
     Attributes:
         states: ``[T + 1, B, n]``: x [m], y [m], yaw [rad] first; ``states[0]`` are the starts. Gradients flow through them.
-        path: What the car should follow.
+        path: Reference path of the car.
         horizon: Ticks, their length, and limits of the cross-track error.
         fence_m: Half side of the square beyond which the deployed car is stopped [m]; None without a fence.
-        solids: What the car can hit; None where the place does not say.
+        solids: Obstacles; None if the place does not define any.
     """
 
     states: Tensor
@@ -84,7 +84,7 @@ class Objective:
     """What an attack maximises. Derive from it, and define at least ``value``; see docs/methods.md.
 
     Attributes:
-        title: What it is, in one line for lists.
+        title: Description in one line for lists.
         needs_solids: Whether it needs a place with solids.
     """
 
@@ -93,11 +93,11 @@ class Objective:
     needs_solids: ClassVar[bool] = False
 
     def value(self, drives: JudgedDrives) -> Tensor:
-        """How far each drive is what the attacker wants, ``[B]``; higher is a stronger attack."""
+        """Success of the attacker in each drive, ``[B]``; higher is a stronger attack."""
         raise NotImplementedError
 
     def loss(self, drives: JudgedDrives) -> Tensor:
-        """What a search minimises, ``[B]``, differentiable in ``drives.states``; minus the value unless it is overridden."""
+        """Loss of each drive, ``[B]``, differentiable in ``drives.states``; minus the value unless it is overridden."""
         return -self.value(drives)
 
 
@@ -105,8 +105,8 @@ class Objective:
 class CrossTrackError(Objective):
     """``cte``: the total cross-track error.
 
-    The value is that of the protocol: ``sum_t |c_t|`` over t = 1..T, where the car stops at the fence and is then charged its last
-    error, capped. The loss is ``-sum_t |c_t|`` of a car that goes on driving beyond the fence, as the gradient would be zero there.
+    The value follows the protocol: ``sum_t |c_t|`` over t = 1..T, where the car stops at the fence and is then charged its last
+    error, capped. The loss is ``-sum_t |c_t|`` of a car that continues beyond the fence, where the gradient would else be zero.
     """
 
     title = "Total cross-track error"
@@ -181,7 +181,7 @@ class Collision(Objective):
 
     The value is ``-min d_tk`` over ticks t and solids k, where ``d_tk`` is the signed clearance (`Solids.clearances_m`): above 0 the car
     hits. The loss is minus the softplus of its smooth maximum, ``-w log(1 + sum_tk exp(-d_tk / w))`` with ``w = width * off_track_m``.
-    The car of the surrogate drives on through what it hits.
+    The car of the surrogate drives on through obstacles.
 
     Attributes:
         width: Share of the off-track limit.

@@ -1,6 +1,6 @@
 """The objectives of attacks: one table of the built-in ones, and those that users bring as an entry point or a file.
 
-An objective is a class that derives from `advnerf_core.attack.objective.Objective` and is made without arguments. A user's is an entry
+An objective is a class that derives from `advnerf_core.attack.objective.Objective` and is constructed without arguments. A user's is an entry
 point of the group ``advnerf.objectives`` or ``file.py:Class``, see docs/methods.md. Names are known without torch.
 """
 
@@ -31,19 +31,19 @@ _WHAT, _MODULE = "objective", "advnerf_core.attack.objective"
 OBJECTIVES: Mapping[str, str] = MappingProxyType(
     {CTE: "CrossTrackError", "peak": "Peak", "time_off_track": "TimeOffTrack", "collision": "Collision"}
 )
-# These depend on states and the path alone, not on what the car can hit.
+# These depend on states and the path alone, not on obstacles.
 ON_THE_PATH = (CTE, "peak", "time_off_track")
 
 
 def load_objective(reference: str, folder: Path | None = None) -> Objective:
-    """The objective that a reference stands for.
+    """The objective that a reference names.
 
     Args:
         reference: A built-in name, an entry point's name, or ``file.py:Class``.
         folder: Folder that a relative ``file.py`` is relative to; the working folder if it is not given.
 
     Raises:
-        PluginError: There is no such objective, its code cannot be loaded, or it is none.
+        PluginError: The objective is unknown, its code cannot be loaded, or it is not an `Objective`.
     """
     base: type[Objective] = import_module(_MODULE).Objective
     require_objective(reference, folder)
@@ -64,14 +64,14 @@ def load_objective(reference: str, folder: Path | None = None) -> Objective:
 
 
 def require_objective(reference: str, folder: Path | None = None) -> None:
-    """Refuse a reference that stands for no objective; nothing is loaded.
+    """Raise unless a reference names an objective; nothing is loaded.
 
     Args:
-        reference: As of `load_objective`.
-        folder: As of `load_objective`.
+        reference: See `load_objective`.
+        folder: See `load_objective`.
 
     Raises:
-        PluginError: There is no such objective, or its name is that of a built-in one.
+        PluginError: The objective is unknown, or it has the name of a built-in one.
     """
     require_known(reference, _WHAT, OBJECTIVES, GROUP, folder)
     name = name_in_results(reference)
@@ -82,20 +82,20 @@ def require_objective(reference: str, folder: Path | None = None) -> None:
 
 
 def objective_key(reference: str) -> str | list[str]:
-    """What a result depends on: the name of a built-in objective; name and digest of a user's, wherever its file lies."""
+    """Key of a result: the name of a built-in objective; name and digest of a user's, independent of its file's folder."""
     code = code_sha256(reference, OBJECTIVES, GROUP)[:16]
     return [name_in_results(reference), code] if code else reference
 
 
 def objective_entry(reference: str, objective: Objective, value: float) -> dict[str, Any]:
-    """What an attack file says of its objective: name, unit and value. Nothing for ``cte``, whose value is the predicted total CTE."""
+    """Entry of the objective in an attack file: name, unit and value. Empty for ``cte``, whose value is the predicted total CTE."""
     if reference == CTE:
         return {}
     return {"objective": {"name": name_in_results(reference), "unit": objective.unit, "value": value}}
 
 
 def objective_names() -> tuple[str, ...]:
-    """Built-in objectives, then those of installed packages."""
+    """Names of the built-in objectives, then of objectives in installed packages."""
     return known_names(OBJECTIVES, GROUP)
 
 

@@ -1,4 +1,4 @@
-"""Searches on a GPU: the sensor and the policy of a problem go there, everything else stays on the processor."""
+"""Searches on a GPU: the problem's sensor and policy are moved there, everything else stays on the CPU."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from advnerf_core.attack.spaces.displayed import DisplayedSensor
 
 
 def on_chosen_device(problem: AttackProblem) -> AttackProblem:
-    """The problem as a search on the device that `use_device` chose sees it; itself on the processor.
+    """The problem for a search on the device that `use_device` chose; unchanged on the CPU.
 
     Raises:
-        DeviceError: There is no such device, or it cannot show what is searched.
+        DeviceError: The device is not available, or it cannot render the searched objects.
     """
     if not searches_on_gpu():
         return problem
-    # Only here: the compiler of kernels for a GPU takes a while to load, and may be absent.
+    # Imported here: the compiler of GPU kernels takes a while to load, and may be absent.
     from advnerf_core.scene.cuda_surrogate import on_cuda
 
     behind = problem.sensor.sensor if isinstance(problem.sensor, DisplayedSensor) else problem.sensor
@@ -39,20 +39,20 @@ def all_on_chosen_device(problems: Sequence[AttackProblem]) -> list[AttackProble
 
 
 def said_of_device() -> dict[str, str]:
-    """What an attack file says of the device it was searched on: nothing on the processor."""
+    """Device metadata for an attack file: empty on the CPU."""
     if not searches_on_gpu():
         return {}
     return {"device": torch.cuda.get_device_name() if torch.cuda.is_available() else "simulated GPU"}
 
 
 class PolicyThere:
-    """A frozen policy that takes images on a device and steers on the processor; differentiable as the policy is.
+    """A frozen policy that takes images on a device and steers on the CPU; differentiable as the policy is.
 
-    A network of torch is copied to the device. One without weights of torch, such as an ONNX policy, stays where it is, and the images are
-    brought to it.
+    A torch network is copied to the device. A policy without torch weights, such as ONNX, stays on the CPU, and the images are
+    copied to it.
 
     Args:
-        policy: In eval mode.
+        policy: The policy, in eval mode.
     """
 
     def __init__(self, policy: Any, device: torch.device) -> None:
@@ -63,7 +63,7 @@ class PolicyThere:
         self.differentiable = bool(getattr(policy, "differentiable", True))
         self.training = bool(getattr(policy, "training", False))
         self.goal_size = int(getattr(policy, "goal_size", 0))
-        # The same bits every time, and no convolutions of ten bits: gradients keep their direction.
+        # Deterministic bits, and no convolutions in TF32: gradients keep their direction.
         torch.backends.cudnn.deterministic, torch.backends.cudnn.benchmark = True, False
         torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
 
@@ -73,7 +73,7 @@ class PolicyThere:
         return memory.cpu()
 
     def __call__(self, images: Tensor, goals: Tensor | None = None, *memory: Tensor) -> Any:
-        """What the policy gives for images on any device, on the processor."""
+        """The policy's outputs on the CPU for images on any device."""
         there = [None if each is None else each.to(self._device) for each in (images, goals, *memory)]
         given = self._policy(*there)
         return given.cpu() if isinstance(given, Tensor) else tuple(each.cpu() for each in given)

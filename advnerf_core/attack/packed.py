@@ -1,6 +1,6 @@
-"""Packed attack files: what is published of an attack, a fortieth of its size, from which the attack file is restored to the bit.
+"""Packed attack files: the published form of an attack, a fortieth of its size, from which the attack file is restored to the bit.
 
-Left out is what follows from the rest: the displayed texture of a face. Theta that is exact in half precision is kept in half precision.
+It leaves out derived data, the displayed texture of a face. Theta that is exact in half precision is kept in half precision.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ Texture = Callable[[NDArray[Any]], NDArray[np.uint8]]
 
 
 def packed(tensors: Mapping[str, NDArray[Any]], carried_by: int | None, texture: Texture) -> Tensors:
-    """The tensors of an attack file without what follows from the others.
+    """The tensors of an attack file without the derived ones.
 
     Args:
-        tensors: As the attack file has them.
-        carried_by: Number of the object that carries the face; None without a face.
-        texture: Makes the displayed texture ``[H, W, 3]`` of theta ``[N, N, 3]``.
+        tensors: Tensors of the attack file.
+        carried_by: Number of the object with the face; None without a face.
+        texture: Computes the displayed texture ``[H, W, 3]`` from theta ``[N, N, 3]``.
     """
     found = {name: _narrowed(each) if name.endswith(".theta") else each for name, each in tensors.items()}
     if carried_by is not None and np.array_equal(tensors[_TEXTURE], texture(tensors[_theta(carried_by)])):
@@ -32,7 +32,7 @@ def packed(tensors: Mapping[str, NDArray[Any]], carried_by: int | None, texture:
 
 
 def unpacked(tensors: Mapping[str, NDArray[Any]], carried_by: int | None, texture: Texture) -> Tensors:
-    """The tensors of the attack file again; see `packed`.
+    """Restore the tensors of the attack file; see `packed`.
 
     Raises:
         KeyError: The theta of the face is missing.

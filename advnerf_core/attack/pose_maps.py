@@ -1,7 +1,7 @@
-"""Maps of the total cross-track error: over where an object stands (a loss landscape), and over start and object poses (robustness).
+"""Maps of the total cross-track error: over the position of an object (a loss landscape), and over start and object poses (robustness).
 
-Every cell is one closed-loop evaluation with true edges. Finished cells are kept in a file after each one, so a map that was stopped goes
-on where it was, to the bit.
+Every cell is one closed-loop evaluation with true edges. Each finished cell is saved, so that an interrupted map resumes
+to the bit.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ OnCell = Callable[[int, int], None]
 
 
 class PoseMapError(AdvnerfError, ValueError):
-    """A map that cannot be made, or cannot go on from its file."""
+    """A map cannot be computed, or cannot be resumed from its file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ class RobustnessMap:
 
     Attributes:
         starts: Start poses ``[S, 3]``: x [m], y [m], yaw [rad].
-        moves: What is added to the placement of the moved object, ``[M, 3]``: x [m], y [m], yaw [rad].
+        moves: Offsets added to the placement of the moved object, ``[M, 3]``: x [m], y [m], yaw [rad].
         total_cte_m: With the attack ``[M, S]`` [m]; NaN where an object would stand on the lane.
         plain_cte_m: The same with plain colours.
         worst_cte_m: Largest |CTE| with the attack, ``[M, S]`` [m].
@@ -109,12 +109,12 @@ def landscape(
         problem: With a `PlacedSensor`.
         theta: Placements of all objects, and colours.
         grid: x [m], y [m] and yaw [rad] of the object's origin.
-        file: Finished cells are kept here; if it exists, the map goes on from it.
+        file: File of finished cells; if it exists, the map resumes from it.
         on_cell: Called after every cell.
         settings_hash: Hash of scene, policy and configuration; a file of another one is refused.
 
     Raises:
-        PoseMapError: An object that is not there, an empty grid, or the file of another map.
+        PoseMapError: A wrong object number, an empty grid, or the file of another map.
     """
     sensor = _sensor(problem)
     if not 0 <= number < len(sensor.space.objects):
@@ -148,19 +148,19 @@ def robustness_map(
     on_cell: OnCell | None = None,
     settings_hash: str = "",
 ) -> RobustnessMap:
-    """Drive from other starts past objects that stand elsewhere than where they were attacked, with the attack's and with plain colours.
+    """Drive from other starts past displaced objects, with the attack's and with plain colours.
 
     Args:
         problem: With a `PlacedSensor`; with goals, all drives have the first.
-        theta: What was found: placements and colours.
+        theta: Result of the search: placements and colours.
         starts: Start poses ``[S, 3]``: x [m], y [m], yaw [rad].
-        moves: Of the object, ``[M, 3]``: x [m], y [m], yaw [rad].
-        file: Finished rows are kept here; if it exists, the map goes on from it.
+        moves: Offsets of the object, ``[M, 3]``: x [m], y [m], yaw [rad].
+        file: File of finished rows; if it exists, the map resumes from it.
         on_cell: Called after every row of the map.
         settings_hash: Hash of scene, policy and configuration; a file of another one is refused.
 
     Raises:
-        PoseMapError: An object that is not there, no starts or moves, or the file of another map.
+        PoseMapError: A wrong object number, no starts or moves, or the file of another map.
     """
     sensor = _sensor(problem)
     begin, shifts = np.asarray(starts, dtype=np.float64), np.asarray(moves, dtype=np.float64)
@@ -209,7 +209,7 @@ def _cells(
     fingerprint: str,
     on_cell: OnCell | None,
 ) -> list[Any]:
-    """All cells of a map, those of the file first."""
+    """All cells of a map, starting with the cells in the file."""
     done = {} if file is None or not file.exists() else _kept(file, fingerprint)
     for index in range(count):
         if index not in done:

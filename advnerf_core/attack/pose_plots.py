@@ -1,4 +1,4 @@
-"""Pictures of pose attacks: loss landscapes, robustness maps, and where objects were put."""
+"""Pictures of pose attacks: loss landscapes, robustness maps, and placements."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _COLOURS = "magma"
 def draw_landscape(
     found: Landscape, paths: Sequence[Path], marked: dict[str, tuple[float, float]] | None = None
 ) -> bytes:
-    """PNG of a landscape, one panel for each yaw, seen from above; grey is the lane that stays free.
+    """PNG of a landscape, one panel for each yaw, seen from above; grey is the lane that must stay free.
 
     Args:
         paths: Reference paths, drawn over it.
@@ -104,10 +104,10 @@ def draw_robustness(found: RobustnessMap) -> bytes:
 def draw_placements(
     space: PoseSpace, placements: Tensor, paths: Sequence[Path], drives: dict[str, Array]
 ) -> bytes:
-    """PNG of where objects stand, seen from above: bounds, footprints before and after, paths and drives.
+    """PNG of the objects' placements, seen from above: bounds, footprints before and after, paths and drives.
 
     Args:
-        placements: Where they stand now ``[K, 4]``.
+        placements: Current placements ``[K, 4]``.
         paths: Reference paths.
         drives: Positions ``[T + 1, 2]`` of drives by name.
     """

@@ -1,4 +1,4 @@
-"""What an attack is given: a frozen policy, a differentiable sensor, dynamics, a path and start poses."""
+"""Inputs of an attack: a frozen policy, a differentiable sensor, dynamics, a path and start poses."""
 
 from __future__ import annotations
 
@@ -36,22 +36,22 @@ class SearchDivergedError(AdvnerfError, ArithmeticError):
 
 
 class BlackBoxError(AdvnerfError, TypeError):
-    """A gradient was asked for of a policy that has none."""
+    """A gradient was requested from a policy that has none."""
 
 
 class NoColoursError(AdvnerfError, TypeError):
-    """A search that needs colours was given other parameters."""
+    """A search that needs colours got other parameters."""
 
 
 class Sensor(Protocol):
-    """A differentiable sensor; the attack does not know which renderer is behind it."""
+    """A differentiable sensor; the attack does not depend on its renderer."""
 
     @property
     def theta_shape(self) -> tuple[int, ...]:
         """Shape of the attacked parameters."""
 
     def initial_theta(self, generator: torch.Generator) -> Tensor:
-        """Where an attack starts, ``theta_shape``."""
+        """Initial parameters of an attack, ``theta_shape``."""
 
     def sense(self, states: Tensor, theta: Tensor) -> Rendered:
         """Images at detached states ``[B, n]`` and parameters ``theta`` (``theta_shape``), with their vjp."""
@@ -59,19 +59,19 @@ class Sensor(Protocol):
 
 @runtime_checkable
 class ColouringSensor(Protocol):
-    """A sensor whose theta are the colours of objects, in their order, as a ``Surrogate``'s."""
+    """A sensor whose theta is the objects' colours, in order, such as a ``Surrogate``."""
 
     @property
     def objects(self) -> Sequence[ColouredObject]:
         """The objects; one, or several."""
 
     def plain_theta(self) -> Tensor:
-        """Their colours without an attack, ``theta_shape``."""
+        """The objects' colours without an attack, ``theta_shape``."""
 
 
 @runtime_checkable
 class ScaledSensor(Protocol):
-    """A sensor whose theta is not colours before squashing, so that searches need steps and spreads of another size."""
+    """A sensor whose theta is not colours before squashing, so that searches need other steps and spreads."""
 
     @property
     def learning_rate(self) -> float:
@@ -99,24 +99,24 @@ class AttackProblem:
     """Everything an attack needs except ``theta``.
 
     Attributes:
-        policy: Frozen policy in eval mode; ``stateless`` says which adjoint is used.
+        policy: Frozen policy in eval mode; ``stateless`` decides which adjoint is used.
         sensor: Differentiable sensor, usually a ``Surrogate``.
         dynamics: Vehicle model with Jacobians.
         path: Reference path.
-        start_states: ``[B, n]``; their dtype is that of states and lambdas.
+        start_states: ``[B, n]``; states and lambdas have their dtype.
         steps: Horizon T in control ticks.
         goals: ``[B, goal_size]`` or None.
         time_batch: Steps whose policy gradients are evaluated at once.
         cache_bytes: Budget for renders kept from the forward to the backward pass [bytes]; 0 keeps none.
         fence_m: Half side of the square |x|, |y| beyond which the car is stopped in deployment [m]; None if there is no fence.
-            It shapes reported values only: the built-in losses go on driving, as their gradients would else be zero.
+            It affects reported values only: the built-in losses continue beyond it, as their gradients would else be zero.
         held_cap_m: Cap of the |CTE| that a stopped car is charged per tick in the reported total [m].
-        off_track_m: |CTE| beyond which the car is off the track [m]; it says whether the drive without an attack is one.
-        disturbances: Random disturbances of what is seen; None changes nothing.
-        draw: Which draw of the disturbances; searches count their evaluations here.
+        off_track_m: |CTE| beyond which the car is off the track [m]; it decides whether the drive without an attack stays on it.
+        disturbances: Random disturbances of the images; None changes nothing.
+        draw: Number of the disturbances' draw; searches count their evaluations here.
         regulariser: Added to the loss, for example `Smoothness`; None adds nothing.
-        objective: What the attack maximises.
-        solids: What the car can hit, for objectives that ask for it.
+        objective: The objective that the attack maximises.
+        solids: Obstacles, for objectives that need them.
     """
 
     policy: Any
@@ -138,7 +138,7 @@ class AttackProblem:
     solids: Solids | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what would give a wrong gradient silently."""
+        """Reject combinations that would give a wrong gradient silently."""
         if getattr(self.policy, "training", False):
             raise ValueError("expected the policy in eval mode, got one in training mode; call policy.eval()")
         size = self.dynamics.state_size
@@ -163,14 +163,14 @@ class AttackProblem:
 
     @property
     def differentiable(self) -> bool:
-        """Whether the policy has a gradient; one without declares ``differentiable = False``."""
+        """Whether the policy has a gradient; a policy without one declares ``differentiable = False``."""
         return bool(getattr(self.policy, "differentiable", True))
 
     def require_gradient(self) -> None:
-        """Refuse a policy without a gradient.
+        """Raise for a policy without a gradient.
 
         Raises:
-            BlackBoxError: The policy says that it has none.
+            BlackBoxError: The policy declares that it has none.
         """
         if not self.differentiable:
             raise BlackBoxError(
@@ -179,10 +179,10 @@ class AttackProblem:
             )
 
     def coloured(self, method: str) -> ColouringSensor:
-        """The sensor, which must show colours for a method to search them.
+        """The sensor, whose theta must be colours for a method to search them.
 
         Raises:
-            NoColoursError: Its theta is something else, such as shapes or places.
+            NoColoursError: The sensor's theta is not colours, but shapes or places.
         """
         if not isinstance(self.sensor, ColouringSensor):
             raise NoColoursError(
@@ -192,10 +192,10 @@ class AttackProblem:
         return self.sensor
 
     def sense(self, ticks: Sequence[int], states: Tensor, theta: Tensor) -> Rendered:
-        """What the policy sees at some ticks of a drive.
+        """The policy's images at some ticks of a drive.
 
         Args:
-            ticks: Their numbers.
+            ticks: Tick numbers.
             states: ``[ticks * B, n]``, ordered by tick.
             theta: Parameters of the objects, ``theta_shape``.
         """
@@ -210,17 +210,17 @@ class AttackProblem:
         return self.disturbances.disturb(rendered, ticks, self.draw)
 
     def at_draw(self, draw: int) -> AttackProblem:
-        """The problem of one evaluation of a search; itself where nothing is drawn."""
+        """The problem of one evaluation of a search; itself if it has no disturbances."""
         return self if self.disturbances is None else replace(self, draw=draw)
 
     def undisturbed(self) -> AttackProblem:
-        """The same problem without disturbances and regulariser: what an attack is judged by."""
+        """The same problem without disturbances and regulariser, as attacks are judged."""
         if self.disturbances is None and self.regulariser is None:
             return self
         return replace(self, disturbances=None, draw=0, regulariser=None)
 
     def judged(self, states: Tensor) -> JudgedDrives:
-        """Drives of states ``[T + 1, B, n]`` as an objective judges them."""
+        """Drives of states ``[T + 1, B, n]`` in the form that an objective judges."""
         return JudgedDrives(states, self.path, horizon_of(self), self.fence_m, self.solids)
 
     def losses(self, states: Tensor) -> Tensor:
@@ -237,13 +237,13 @@ class AttackProblem:
 
 @dataclass(frozen=True, eq=False)
 class Totals:
-    """What each start of a rollout adds up to.
+    """Sums over each start's rollout.
 
     Attributes:
         total_cte_m: |CTE| summed over t = 1..T, ``[B]`` [m].
-        protocol_cte_m: What is compared between domains (``driving/metrics``): the car stops at the fence, ``[B]`` [m].
+        protocol_cte_m: Total |CTE| by the protocol (``driving/metrics``), for comparison between domains: the car stops at the fence, ``[B]`` [m].
         losses: Loss of the problem's objective, ``[B]``.
-        values: Its value, ``[B]``.
+        values: Value of the problem's objective, ``[B]``.
     """
 
     total_cte_m: Tensor
@@ -252,14 +252,14 @@ class Totals:
     values: Tensor
 
     def rows(self, chosen: slice) -> Totals:
-        """Those of some starts."""
+        """Totals of some starts."""
         return Totals(
             self.total_cte_m[chosen], self.protocol_cte_m[chosen], self.losses[chosen], self.values[chosen]
         )
 
 
 def horizon_of(problem: AttackProblem) -> Horizon:
-    """What the protocol sums over in a problem's drives."""
+    """Horizon over which the protocol sums a problem's drives."""
     return Horizon(problem.steps, problem.dynamics.dt_s, problem.off_track_m, problem.held_cap_m)
 
 

@@ -1,4 +1,4 @@
-"""Projection of an attacked face into a camera image: what the deployment's compositor does. numpy and OpenCV only.
+"""Projection of an attacked face into a camera image, as in the deployment's compositor. numpy and OpenCV only.
 
 Every sample of the image (``supersample^2`` a pixel) is traced to the face's plane, so clipping at the near plane and lens
 distortion need no special cases; the samples are averaged over the pixel's area. The same face rendered by the surrogate looks
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from advnerf_core.geometry import Array, Pinhole, transform_points
 
-NEAR_M = 0.02  # as in the surrogate: nearer to the camera nothing is drawn
+NEAR_M = 0.02  # as in the surrogate: anything nearer to the camera is not drawn
 _CORNER_TOLERANCE_M = 0.02  # measured corners may be this far from a parallelogram; the nearest one is drawn
 _EDGE_ON = 1e-4  # sine of the angle between ray and face below which the face is a line
 
@@ -72,7 +72,7 @@ class FaceOverlay:
             T_camera_from_subject: Pose ``[4, 4]`` of the subject in the camera frame (OpenCV axes).
 
         Returns:
-            The image with the face and True; the very same image and False if the face is out of view or turned away.
+            The image with the face and True; the unchanged image and False if the face is out of view or turned away.
         """
         if image.shape != (self._camera.height, self._camera.width, 3) or image.dtype != np.uint8:
             expected = f"[{self._camera.height}, {self._camera.width}, 3] uint8"
@@ -152,7 +152,7 @@ def faces_camera(corners_in_camera: ArrayLike) -> bool:
 
 
 def clip_near(polygon_in_camera: ArrayLike, near_m: float = NEAR_M) -> Array:
-    """The part of a convex polygon ``[N, 3]`` at planar depth above ``near_m``, ``[M, 3]``; M is 0 if there is none."""
+    """The part of a convex polygon ``[N, 3]`` at planar depth above ``near_m``, ``[M, 3]``; M may be 0."""
     points = np.asarray(polygon_in_camera, dtype=np.float64)
     kept = []
     for start, end in zip(points, np.roll(points, -1, axis=0), strict=True):
@@ -165,7 +165,7 @@ def clip_near(polygon_in_camera: ArrayLike, near_m: float = NEAR_M) -> Array:
 
 
 def _nearest_parallelogram(corners: Array) -> Array:
-    """Least squares fit; corners of a parallelogram are kept as they are."""
+    """Least squares fit; corners of a parallelogram are not changed."""
     right = 0.5 * (corners[1] - corners[0] + corners[2] - corners[3])
     down = 0.5 * (corners[3] - corners[0] + corners[2] - corners[1])
     first = corners.mean(axis=0) - 0.5 * (right + down)

@@ -1,8 +1,8 @@
-"""What makes a texture bear more than the frames it was optimised on: random disturbances of what is seen, and smoothness.
+"""Regularises textures so that they hold beyond the frames they were optimised on: random image disturbances, and smoothness.
 
 A disturbed attack minimises an expectation (Athalye et al. 2018, "Synthesizing Robust Adversarial Examples"): every evaluation draws
-the exposure of each drive and the noise and camera jitter of each frame anew. A draw depends on seed, number of the evaluation
-and tick only, so the backward pass meets the very frames of the forward pass, and a resumed attack those of an
+the exposure of each drive and the noise and camera jitter of each frame. A draw depends on seed, number of the evaluation
+and tick only, so the backward pass gets exactly the frames of the forward pass, and a resumed attack gets the same as an
 uninterrupted one.
 """
 
@@ -25,13 +25,13 @@ from advnerf_core.scene.surrogate import Rendered, split_theta
 
 # Streams of draws: per drive, and per frame.
 _DRIVE, _FRAME = 0, 1
-# Differences of colour much below this are smooth already; it keeps the slope of |difference| finite at zero.
+# Colour differences much below this count as smooth; it keeps the slope of |difference| finite at zero.
 _SOFT_DIFFERENCE = 1e-2
 
 
 @runtime_checkable
 class PosedSensor(Protocol):
-    """A sensor whose camera can be moved, as a ``Surrogate`` is."""
+    """A sensor whose camera can be moved, such as a ``Surrogate``."""
 
     def camera_poses(self, states: Tensor) -> Array:
         """``T_world_from_camera [B, 4, 4]`` at car states ``[B, n]``, detached."""
@@ -42,14 +42,14 @@ class PosedSensor(Protocol):
 
 @dataclass(frozen=True)
 class Disturbances:
-    """Random disturbances of the images; all are spreads of normal distributions.
+    """Random disturbances of the images; all are standard deviations of normal distributions.
 
     Attributes:
-        noise: Of each channel of each pixel, in 0..1, anew in each frame.
-        gain: Of the logarithm of a drive's exposure.
-        brightness: Of a drive's additive brightness, in 0..1.
-        jitter_m: Of the camera's position along each of its axes, anew in each frame [m].
-        jitter_rad: Of the camera's rotation about each of its axes, anew in each frame [rad].
+        noise: Noise of each channel of each pixel, in 0..1, independent in each frame.
+        gain: Logarithm of a drive's exposure.
+        brightness: Additive brightness of a drive, in 0..1.
+        jitter_m: Camera position along each of its axes, independent in each frame [m].
+        jitter_rad: Camera rotation about each of its axes, independent in each frame [rad].
     """
 
     noise: float = 0.0
@@ -66,7 +66,7 @@ class Disturbances:
 
     @property
     def moves_the_camera(self) -> bool:
-        """Whether frames are taken from other poses than the nominal ones."""
+        """Whether camera poses differ from the nominal ones."""
         return self.jitter_m > 0.0 or self.jitter_rad > 0.0
 
     def camera_poses(self, poses: Array, ticks: Sequence[int], draw: int) -> Array:
@@ -81,7 +81,7 @@ class Disturbances:
         return poses @ moves
 
     def disturb(self, rendered: Rendered, ticks: Sequence[int], draw: int) -> Rendered:
-        """Expose and add noise; what leaves 0..1 is clipped and has no gradient."""
+        """Apply exposure and noise; values outside 0..1 are clipped and have no gradient."""
         images = rendered.images
         starts = len(images) // len(ticks)
         drive = self._generator(_DRIVE, draw, 0).standard_normal((starts, 2))
@@ -119,7 +119,7 @@ class Smoothness:
 
     Args:
         objects: The attacked objects, in the order of theta.
-        weight: What a TV of one adds to the loss [m].
+        weight: Loss [m] added by a TV of one.
     """
 
     def __init__(self, objects: Sequence[ColouredObject], weight: float) -> None:
@@ -131,7 +131,7 @@ class Smoothness:
         self._count = max(1, sum(len(pairs) for pairs in self._pairs))
 
     def __call__(self, theta: Tensor) -> tuple[float, Tensor]:
-        """Its part of the loss, and the gradient with respect to ``theta``, of its shape."""
+        """The regulariser's part of the loss, and its gradient with respect to ``theta``, of the same shape."""
         total, slopes = 0.0, []
         for part, pairs in zip(split_theta(self._objects, theta.detach()), self._pairs, strict=True):
             colours = squash(part).reshape(-1, 3)

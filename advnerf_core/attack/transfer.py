@@ -1,15 +1,15 @@
-"""A prediction of how far an attack drives the car where it is deployed, before it is deployed.
+"""Predicts how far an attack will drive the deployed car off its path, before it is deployed.
 
-Model. On held-out real views the object is composed into the picture, and the policy is asked with and without it. That gives the share
+Model. On held-out real views the object is composed into the picture, and the policy runs with and without it. That gives the share
 ``r`` of the attack's effect on the steering that survives in real pictures, its residuals, and the disagreement ``d = learned - real`` of
 the steering on views without the attack. Then the loop is driven in the surrogate with a steering as a real picture would give it::
 
     u_t = pi(plain_t) - d_t + r (pi(attacked_t) - pi(plain_t)) + e_t
 
-where ``d`` and ``e`` are drawn from what was measured, in blocks of neighbouring views, as errors along a path are alike from tick to tick
-(block bootstrap, Kunsch 1989). Several draws give a distribution of the total CTE. The baseline without attack is predicted alike, so that
-the excess is predicted too. The car is that of the problem: give it one with the deployed car's measured response
-(`advnerf_core.driving.measured_car`). What the model does not know: obstacles but the fence, and states far from the held-out views.
+where ``d`` and ``e`` are drawn from the measured values, in blocks of neighbouring views, as errors along a path are alike from tick to tick
+(block bootstrap, Kunsch 1989). Several draws give a distribution of the total CTE. The baseline without attack is predicted in the same way, so that
+the excess is predicted too. The car is the problem's: give it the deployed car's measured response
+(`advnerf_core.driving.measured_car`). The model ignores obstacles other than the fence, and states far from the held-out views.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from advnerf_core.scene.fidelity import Effect, SceneAgreement
 
 Floats = NDArray[np.float64]
 _BLOCK = 8
-# A next drive lies below the smallest of n draws with probability 1 / (n + 1): from fewer draws no 10 % quantile can be had.
+# A next drive lies below the smallest of n draws with probability 1 / (n + 1): fewer draws give no 10 % quantile.
 FEWEST_DRAWS = 9
 DEFAULT_DRAWS = 20
 
@@ -43,11 +43,11 @@ class AttackableScene(Protocol):
 
 @dataclass(frozen=True)
 class TransferPrediction:
-    """Total CTE to be expected where an attack is deployed.
+    """Predicted total CTE of a deployed attack.
 
     Attributes:
-        attacked_m: Of each draw, with the attack [m].
-        none_m: Of each draw, without [m].
+        attacked_m: Total CTE of each draw with the attack [m].
+        none_m: Total CTE of each draw without the attack [m].
         retained: Share of the effect on the steering that survives in real pictures.
         ticks: Ticks of a drive.
     """
@@ -59,7 +59,7 @@ class TransferPrediction:
 
     @property
     def excess_m_per_tick(self) -> tuple[float, float, float]:
-        """Excess |CTE| per tick of one drive [m], each draw against its own without attack: low end of the 80 % band, mean, and high end."""
+        """Excess |CTE| per tick of one drive [m], each draw against the same draw without attack: low end of the 80 % band, mean, and high end."""
         excess = (np.array(self.attacked_m) - np.array(self.none_m)) / self.ticks
         low, high = _band(excess)
         return low, float(excess.mean()), high
@@ -96,16 +96,16 @@ def predict_transfer(
         clean: Agreement of the steering on held-out views without attack, in the order of the path.
         effect: Effect of this attack on the same views.
         starts: Start states ``[S, n]`` of the deployed drives; the draws take turns.
-        horizon: Over which a drive is measured.
+        horizon: Horizon of a drive.
         draws: Drives of each kind.
-        none_m: The draws without attack, where a prediction with the same clean views, starts, draws and seed made them; they do not
+        none_m: The draws without attack from a prediction with the same clean views, starts, draws and seed; they do not
             depend on the attack.
 
     Returns:
         The prediction.
 
     Raises:
-        ValueError: There are fewer than `FEWEST_DRAWS` draws.
+        ValueError: Fewer than `FEWEST_DRAWS` draws.
     """
     if draws < FEWEST_DRAWS:
         raise ValueError(f"expected at least {FEWEST_DRAWS} draws for a band that holds 80 %, got {draws}")
@@ -143,7 +143,7 @@ def _blocks(values: Floats, ticks: int, draws: int, rng: np.random.Generator) ->
 
 
 class _AsDeployed:
-    """The policy as `drive` sees it: its image is the state itself, from which it looks with and without the attack."""
+    """The policy for `drive`: its image is the state itself, from which it renders with and without the attack."""
 
     stateless = True
 

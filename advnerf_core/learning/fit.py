@@ -1,7 +1,7 @@
 """Supervised training of the policy on frames: deterministic, and resumable to the bit.
 
 Everything random in step ``t`` is drawn from a generator seeded by ``(seed, t)``, so a checkpoint needs no generator state:
-weights, optimiser moments and the step number are all there is.
+weights, optimiser moments and the step number are its whole state.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def fit(
         policy: The network; its weights are the start unless the checkpoint holds a later step.
         frames: Training frames.
         checkpoint: File to continue from and to write every ``checkpoint_every`` steps and at the end.
-        report: Told the step and the running mean square error [rad^2].
+        report: Called with the step and the running mean square error [rad^2].
     """
     if len(frames.training) == 0:
         raise FrameStoreError(
@@ -108,7 +108,7 @@ def _train_step(
     images, labels, goals = frames.batch(rows)
     inputs = torch.from_numpy(augment(images, config.augment, rng)).permute(0, 3, 1, 2)  # stays channels-last
     target = torch.from_numpy(labels)
-    with torch.random.fork_rng(devices=[]):  # a dropout's draws; everything after is independent of them
+    with torch.random.fork_rng(devices=[]):  # for dropout's draws; later draws do not depend on them
         torch.manual_seed(int(np.random.default_rng([config.seed, step, 1]).integers(2**31)))
         output: Tensor = policy(inputs, torch.from_numpy(goals) if policy.goal_size else None)
     loss = F.huber_loss(output, target, delta=config.huber_rad) / config.huber_rad**2
@@ -137,7 +137,7 @@ def _write(path: Path, policy: SteeringNetwork, optimiser: Adam, step: int, conf
 def _resume(
     path: Path, policy: SteeringNetwork, config: FitConfig
 ) -> tuple[int, dict[str, dict[str, Tensor]]]:
-    """Load the checkpoint if there is one; returns the number of finished steps, and Adam's moments after them."""
+    """Load the checkpoint if it exists; returns the number of finished steps, and Adam's moments after them."""
     if not path.is_file():
         return 0, {}
     try:

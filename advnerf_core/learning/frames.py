@@ -22,7 +22,7 @@ class FrameStoreError(AdvnerfError, ValueError):
 
 @dataclass(frozen=True)
 class Frames:
-    """What was seen, and what the expert would have done.
+    """Images, and the expert's controls for them.
 
     Attributes:
         images: ``[N, 66, 200, 3]`` uint8 RGB policy images.
@@ -64,7 +64,7 @@ class FrameStore:
     """A folder of named shards.
 
     Args:
-        folder: Where the shards live; made on the first write.
+        folder: Folder of the shards; created on the first write.
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
@@ -112,12 +112,12 @@ class FrameStore:
 
 
 class FrameSet:
-    """Several shards seen as one, and a choice of their frames.
+    """Several shards as one, and a selection of their frames.
 
     Args:
         shards: At least one shard; all with the same goal size.
-        include_textured: Whether frames with random textures belong to the choice.
-        holdout_every: Every n-th block of 16 consecutive chosen frames is kept for validation; 0 keeps none. Blocks, because
+        include_textured: Whether frames with random textures are selected.
+        holdout_every: Every n-th block of 16 consecutive selected frames is kept for validation; 0 keeps none. Blocks, because
             neighbours show the same pose in several textures, or the next moment of the same drive.
     """
 

@@ -2,7 +2,7 @@
 
 :func:`train_policy` is the whole recipe. It collects frames at random poses about the path, clones the expert, then in each
 DAgger round lets the current policy drive, labels what it saw by the expert, and continues training on everything. Every
-step leaves its result on disk, so a run that was killed goes on where it was; the same settings give the same policy.
+step stores its result, so that an interrupted run resumes there; the same settings give the same policy.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from advnerf_core.policies.view import PolicyView
 
 
 class Learned(NamedTuple):
-    """How well a network in training fits its frames.
+    """Training error of a network in training.
 
     Attributes:
-        naive: Whether it is the policy of plain frames only.
-        step: Optimiser steps of this policy so far, over all rounds.
+        naive: Whether this is the policy trained on plain frames only.
+        step: Optimiser steps of this policy over all rounds.
         error_rad: Running root mean square error of the control on training frames [rad, or rad/s where it is a turn rate].
     """
 
@@ -48,7 +48,7 @@ class ImitationProgress(Protocol):
     """Progress callback of a training."""
 
     def __call__(self, fraction: float, text: str, learned: Learned | None = None) -> None:
-        """Report the finished fraction (0..1), the current step, and in training the error so far."""
+        """Report the finished fraction (0..1), the current step, and in training the running error."""
 
 
 def train_policy(
@@ -62,13 +62,13 @@ def train_policy(
     """Collect, clone, and improve by DAgger; writes ``policy.safetensors`` (and ``naive.safetensors``) into ``out_dir``.
 
     Args:
-        plans: At least one source with the amount to take from it; their names differ. Plans with goals and experts of their own make
-            one policy that learns several paths.
-        expert: The teacher of plans without one; its path is where poses are drawn about.
-        view: How camera images become policy images; stored in the policy file.
-        out_dir: Keeps frames and checkpoints too. Calling again with the same settings continues or returns at once; with
+        plans: At least one source with its amounts; names differ. Plans with different goals and experts train
+            one policy on several paths.
+        expert: The teacher of plans without one; poses are drawn around its path.
+        view: Conversion of camera images to policy images; stored in the policy file.
+        out_dir: Also keeps frames and checkpoints. Calling again with the same settings continues or returns at once; with
             other settings it is an error.
-        progress: Told how far it is.
+        progress: Progress callback.
     """
     return _Recipe(config, plans, expert, view, out_dir, progress).run()
 
@@ -93,12 +93,12 @@ class _Recipe:
         self.seconds = {"collect": 0.0, "train": 0.0}
         self._goal_size = len(plans[0].goal)
         self._progress = progress
-        # Rough seconds of one look or driven tick, and of one optimiser step, only to make the bar move evenly.
+        # Rough seconds per still or driven tick, and per optimiser step; only for an even progress bar.
         looks = sum(p.stills + config.dagger_rounds * p.drives * p.drive_steps for p in plans)
         steps = config.first_steps + config.dagger_rounds * config.round_steps + config.naive_steps
         self._total_work = 0.02 * looks + 0.0022 * config.batch_size * steps
         self._done_work = 0.0
-        self._steps = 0  # of the policy in training, in the rounds before
+        self._steps = 0  # of the current policy, in earlier rounds
 
     def run(self) -> TrainedPolicy:
         self._claim_folder()
@@ -238,7 +238,7 @@ class _Recipe:
             learned = Learned(not textured, self._steps + step, loss**0.5)
             self._advance(0.0, f"training {stage}: step {step}/{steps}, error {loss**0.5:.3f} rad", learned)
 
-        # Later shards must not change what an earlier stage saw, so a resumed stage reads the shards it began with.
+        # Later shards must not change the data of an earlier stage, so a resumed stage reads the shards it began with.
         shard_names = self._claim_shards(stage)
         frames = FrameSet([self.store.load(name) for name in shard_names], textured, config.holdout_every)
         fit(policy, frames, settings, self.out_dir / f"{stage}.checkpoint.safetensors", report)
@@ -269,7 +269,7 @@ class _Recipe:
         return {**self.config.settings(), "plans": plans}
 
     def _claim_folder(self) -> None:
-        """Frames of other settings must not be mixed in."""
+        """Raise if the folder has frames of other settings."""
         record = self.out_dir / "settings.json"
         data = {"settings": self._settings(), "expert": self.expert.to_dict(), "view": self.view.to_dict()}
         text = json.dumps(data, sort_keys=True, indent=1)

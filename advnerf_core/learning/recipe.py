@@ -1,4 +1,4 @@
-"""What a training recipe is given, and what it gives: settings, sources with their goals and teachers, and where poses are drawn."""
+"""Inputs and outputs of a training recipe: settings, sources with their goals and teachers, and the distribution of poses."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from advnerf_core.policies.architecture import Architecture
 
 @dataclass(frozen=True)
 class SourcePlan:
-    """How much is taken from one source.
+    """The amounts taken from one source.
 
     Attributes:
-        stills: States that are looked at before the first training.
+        stills: Number of stills before the first training.
         drives: Drives in each DAgger round.
         drive_steps: Ticks of each of these drives.
-        goal: What the policy is told in these frames, for example a one-hot exit; as long in all plans.
-        expert: Their teacher, about whose path poses are drawn; None for the recipe's own.
-        driven_m: Poses are drawn so far along an open path [m]; None for all of it.
-        drives_from_m: Drives start so far along the path at most [m], so that they pass what is to be learned; None for all of it.
+        goal: Goal vector of these frames, for example a one-hot exit; the same length in all plans.
+        expert: Their teacher, around whose path poses are drawn; None for the recipe's own.
+        driven_m: Poses are drawn along this length of an open path [m]; None for all of it.
+        drives_from_m: Drives start within this length of the path [m], so that they pass the places to learn; None for all of it.
     """
 
     source: FrameSource
@@ -39,7 +39,7 @@ class SourcePlan:
     drives_from_m: float | None = None
 
     def settings(self) -> dict[str, Any]:
-        """As plain data; what only goal-conditioned recipes have is named only where it is given."""
+        """As plain data; keys that only goal-conditioned recipes have are left out without a goal."""
         values = {
             "source": self.source.name,
             "stills": self.stills,
@@ -60,7 +60,7 @@ class ImitationConfig:
     """Settings of the recipe.
 
     Attributes:
-        seed: Of poses, textures, initial weights, batches and augmentation.
+        seed: Seed of poses, textures, initial weights, batches and augmentation.
         dagger_rounds: Rounds of driving, labelling and continued training.
         first_steps: Optimiser steps of behaviour cloning.
         round_steps: Optimiser steps after each DAgger round.
@@ -70,12 +70,12 @@ class ImitationConfig:
         lateral_m: Stills are up to this far from the path [m].
         heading_rad: Stills are turned up to this much from the path's heading [rad].
         drive_lateral_m: DAgger drives start up to this far from the path [m].
-        drive_heading_rad: And turned up to this much [rad].
+        drive_heading_rad: DAgger drives are turned up to this much from the path's heading [rad].
         give_up_m: A drive ends when |CTE| exceeds this [m]; frames from further away teach little.
         max_steering_rad: Bound of the policy's output [rad].
         architecture: Architecture of the policy, with its settings.
         augment: Image augmentation.
-        holdout_every: One block in so many is kept for validation.
+        holdout_every: One block of frames in this many is kept for validation.
     """
 
     seed: int = 0
@@ -96,7 +96,7 @@ class ImitationConfig:
     holdout_every: int = 20
 
     def settings(self) -> dict[str, Any]:
-        """As plain data, which is the same on every machine: it stands in policy files."""
+        """As plain data, equal on every machine: it is stored in policy files."""
         values = asdict(self)
         del values["architecture"]
         return {**values, **self.architecture.described()}
@@ -104,13 +104,13 @@ class ImitationConfig:
 
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """What the recipe made.
+    """Result of the recipe.
 
     Attributes:
         path: Policy file.
         validation_mae_rad: Mean absolute steering error on held-out frames [rad].
         naive_path: File of the policy that never saw a random texture, if one was asked for.
-        naive_validation_mae_rad: Its error on held-out plain frames [rad].
+        naive_validation_mae_rad: Mean absolute error of that policy on held-out plain frames [rad].
         frames: Number of collected frames.
         seconds: Time spent in this call on each part: collect, train [s].
     """

@@ -1,6 +1,6 @@
-"""Fine-tuning a policy on what led it astray: its old frames and new ones, in one set, from its own weights.
+"""Fine-tuning of a policy on the attacks that misled it: old and new frames in one set, starting from its own weights.
 
-The paper's defence (section 4, "Retraining"): drive with the objects that were found, label every frame with the expert's steering, and go on
+The paper's defence (section 4, "Retraining"): drive with the attacked objects, label every frame with the expert's steering, and continue
 training on old and new data together. New frames are fewer than old ones, so a batch takes a fixed share of them.
 """
 
@@ -28,10 +28,10 @@ class FineTuneConfig:
     Attributes:
         steps: Optimiser steps.
         batch_size: Frames per step.
-        learning_rate: Peak; lower than for training from nothing.
-        new_share: Share of the training frames that is new, by repeating them; 0.5 weighs old and new alike. None takes the frames as many as
-            they are.
-        holdout_every: One block of frames in so many is kept out of the training and judges it.
+        learning_rate: Peak; lower than for training from scratch.
+        new_share: Share of the training frames that is new, by repeating them; 0.5 weighs old and new alike. None repeats
+            nothing.
+        holdout_every: One block of frames in this many is held out for validation.
         augment: Image augmentation.
     """
 
@@ -109,18 +109,18 @@ def fine_tune(
     out_file: Path,
     report: Callable[[int, float], None] | None = None,
 ) -> Retrained:
-    """Go on training a policy on old and new frames; a checkpoint beside ``out_file`` makes it resumable to the bit.
+    """Continue training a policy on old and new frames; a checkpoint beside ``out_file`` makes it resumable to the bit.
 
     Args:
-        policy: Where to begin; it is not changed.
+        policy: The policy to start from; it is not changed.
         old: Shards it was trained on.
-        new: Shards that were seen with the found objects, labelled by the expert.
+        new: Shards with the found objects, labelled by the expert.
         out_file: Policy file to write.
-        report: Told the step and the running mean square error [rad^2].
+        report: Called with the step and the running mean square error [rad^2].
 
     Raises:
         FrameStoreError: No frames of one kind, goals of another size, or a checkpoint of other settings.
-        PolicyFileError: The policy is not of an architecture that is trained here.
+        PolicyFileError: The policy's architecture cannot be trained here.
     """
     frames = MixedFrames(old, new, config.new_share, config.holdout_every)
     if frames.goal_size != policy.policy.goal_size:
@@ -160,5 +160,5 @@ def _errors(network: SteeringNetwork, frames: MixedFrames) -> tuple[float, float
 
 
 def _finite(value: float) -> float | None:
-    """What JSON can hold."""
+    """A number as JSON can hold it: None for infinity or NaN."""
     return value if np.isfinite(value) else None

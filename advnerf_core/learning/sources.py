@@ -1,7 +1,7 @@
-"""Where training frames come from: a scene that steps itself (lab, simulator) or a batch renderer (surrogate).
+"""Sources of training frames: a scene that steps itself (lab, simulator) or a batch renderer (surrogate).
 
-Both give the same two things: looks at chosen states, and closed-loop drives for DAgger, each state seen with the object
-plain and, if it is in view, with random textures too. No simulator and no renderer is imported here: callables are given.
+Both offer the same two calls: stills at given states, and closed-loop drives for DAgger. Each state is seen with the object
+plain and, if it is in view, with random textures too. No simulator and no renderer is imported here; they are passed as callables.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class PolicyImages:
 
     Attributes:
         images: ``[M, 66, 200, 3]`` uint8.
-        states: ``[M, 3]`` where each was seen.
-        textured: ``[M]`` whether the object showed a random texture.
+        states: ``[M, 3]`` state of each image.
+        textured: ``[M]`` bool: the object showed a random texture.
     """
 
     images: Image
@@ -47,7 +47,7 @@ class PolicyImages:
 
     @staticmethod
     def join(parts: list[PolicyImages]) -> PolicyImages:
-        """All parts in one, in order."""
+        """Concatenate parts, in order."""
         return PolicyImages(
             np.concatenate([part.images for part in parts]),
             np.concatenate([part.states for part in parts]),
@@ -59,15 +59,15 @@ class FrameSource(Protocol):
     """A domain that frames can be taken from."""
 
     name: str
-    batch_size: int  # how many states, or drives, it likes to handle at once
+    batch_size: int  # preferred number of states, or drives, per call
 
     def look(self, states: Array, rng: np.random.Generator) -> PolicyImages:
-        """What is seen from the states ``[B, 3]``."""
+        """Images from the states ``[B, 3]``."""
 
     def drive(
         self, steer: Steer, starts: Array, steps: int, keep_driving: KeepDriving, rng: np.random.Generator
     ) -> PolicyImages:
-        """Closed-loop drives of up to ``steps`` ticks from ``starts [B, 3]``: everything seen on the way."""
+        """Closed-loop drives of up to ``steps`` ticks from ``starts [B, 3]``: all images on the way."""
 
 
 class SteppedScene(Protocol):
@@ -83,7 +83,7 @@ class SteppedScene(Protocol):
         """RGB ``[H, W, 3]`` uint8 of the driving camera, without depth."""
 
     def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool) -> tuple[Image, Any]:
-        """The same, as if the car stood there."""
+        """The same, with the car at this pose."""
 
 
 class SceneSource:
@@ -92,7 +92,7 @@ class SceneSource:
     Args:
         name: Name of the shards.
         scene: The scene, for instance the synchronous lab.
-        view: How camera images become policy images.
+        view: Conversion of camera images to policy images.
         speed_mps: Commanded speed [m/s].
         dt_s: Control tick [s].
         overlay: Shows the object with a texture parameter; None for scenes without a changing object.
@@ -121,7 +121,7 @@ class SceneSource:
         self._sample, self._variants = sample_texture, variants
 
     def look(self, states: Array, rng: np.random.Generator) -> PolicyImages:
-        """What is seen from the states ``[B, 3]``."""
+        """Images from the states ``[B, 3]``."""
         parts = []
         for state in states:
             x, y, yaw = map(float, state)
@@ -172,7 +172,7 @@ class RenderedSource:
 
     Args:
         name: Name of the shards.
-        prepare: Takes states ``[B, 3]``, does what does not depend on the texture (the background), returns ``Show``.
+        prepare: Takes states ``[B, 3]``, renders everything that does not depend on the texture (the background), returns ``Show``.
         dynamics: Vehicle model for drives.
         sample_texture: Draws a texture parameter for ``Show``; None for scenes without a changing object.
         variants: Textured images per state in which the object is in view.
@@ -197,7 +197,7 @@ class RenderedSource:
         )
 
     def look(self, states: Array, rng: np.random.Generator) -> PolicyImages:
-        """What is seen from the states ``[B, 3]``."""
+        """Images from the states ``[B, 3]``."""
         return self._seen(states, rng, None)[0]
 
     def drive(
@@ -221,7 +221,7 @@ class RenderedSource:
         return PolicyImages.join(parts)
 
     def _seen(self, states: Array, rng: np.random.Generator, held: Any) -> tuple[PolicyImages, Image, Image]:
-        """Plain and (where they differ) textured views; and per state the plain view and that with the held texture."""
+        """Plain and (where they differ) textured views; and per state the plain view and the view with the held texture."""
         show = self._prepare(states)
         plain = _as_uint8(show(None))
         painted = plain if held is None else _as_uint8(show(held))

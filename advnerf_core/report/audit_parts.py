@@ -1,6 +1,6 @@
-"""What was audited and judged: the policy, the place, the objects, and the drives past them.
+"""Parts of an audit's result: the policy, the place, the objects, and the drives past them.
 
-Distances are in metres and angles in radians, in the world frame of the place (z up). A vehicle's pose is that of its rear axle's
+Distances are in metres and angles in radians, in the world frame of the place (z up). A vehicle's pose is its rear axle's
 centre on the ground.
 """
 
@@ -20,7 +20,7 @@ Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 Positive = Annotated[float, Field(gt=0.0)]
 NotNegative = Annotated[float, Field(ge=0.0)]
 Share = Annotated[float, Field(gt=0.0, lt=1.0)]
-# Stored means are compared with those of the stored drives to this [m]; both come from the same numbers.
+# Stored means must equal those of the stored drives up to this [m]; both come from the same numbers.
 _ROUNDING_M = 1e-6
 
 
@@ -39,7 +39,7 @@ class AuditedPolicy(StrictModel):
 
 
 class AuditedPlace(StrictModel):
-    """Where the policy was audited."""
+    """The place of the audit."""
 
     name: Text = Field(description="As sentences name it: MetaDrive, the hall.")
     kind: Literal["images", "video", "scene", "splat", "world"]
@@ -93,7 +93,7 @@ class AuditedObject(StrictModel):
 
 
 class RoutePoint(StrictModel):
-    """ObjectPose of the vehicle at a time."""
+    """Pose of the vehicle at a time."""
 
     t_s: NotNegative
     x_m: float
@@ -170,7 +170,7 @@ class JudgedDrives(StrictModel):
 
 
 class JudgedObject(StrictModel):
-    """The object that was strongest on the selection starts, and what it does from the judging starts."""
+    """The object that was strongest on the selection starts, and its effect from the judging starts."""
 
     object: AuditedObject
     judgements: tuple[JudgedDrives, ...] = Field(min_length=1, description="One for each kind of evidence.")
@@ -183,5 +183,5 @@ class JudgedObject(StrictModel):
         return self
 
     def judgement(self, evidence: Evidence | None) -> JudgedDrives | None:
-        """The judgement with this kind of evidence; None if there is none."""
+        """The judgement with this kind of evidence; None without one."""
         return next((each for each in self.judgements if each.evidence == evidence), None)

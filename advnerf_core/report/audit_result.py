@@ -38,7 +38,7 @@ Count = Annotated[int, Field(ge=0)]
 
 
 class AuditControl(StrictModel):
-    """Drives without an attack, or past an object that was not searched."""
+    """Drives without an attack, or past an object without a search."""
 
     kind: ControlKind
     name: Text = Field(description="For readers: no object, grey panel, photograph of leaves.")
@@ -75,14 +75,14 @@ class TriedSearch(StrictModel):
 
 
 class NotTried(StrictModel):
-    """Something that the schedule names and the audit did not try."""
+    """An item of the schedule that the audit did not try."""
 
     what: Text
     why: Text
 
 
 class AuditFidelity(StrictModel):
-    """How well the learned copy of the place agrees with images that it did not learn from."""
+    """Agreement of the learned copy of the place with images that were held out from learning."""
 
     views: Count
     psnr_db: float
@@ -105,14 +105,14 @@ class AuditFidelity(StrictModel):
 
 
 class StartSet(StrictModel):
-    """Starts that are drawn from a seed."""
+    """Starts drawn from a seed."""
 
     seed: int
     count: Annotated[int, Field(ge=1)]
 
 
 class AuditStarts(StrictModel):
-    """The three disjoint sets of starts, which are fixed before anything is driven."""
+    """The three disjoint sets of starts, fixed before the first drive."""
 
     search: StartSet
     selection: StartSet
@@ -127,7 +127,7 @@ class AuditStarts(StrictModel):
 
 
 class AuditBudget(StrictModel):
-    """Evaluations that were planned and spent; an evaluation is one drive."""
+    """Planned and spent evaluations; an evaluation is one drive."""
 
     evaluations_planned: Count
     evaluations_spent: Count
@@ -141,7 +141,7 @@ class AuditBudget(StrictModel):
 
 
 class AuditComparison(StrictModel):
-    """The difference to an earlier audit, from the starts that both judged."""
+    """The difference to an earlier audit, over the starts that both judged."""
 
     file: Text
     sha256: Sha256
@@ -151,7 +151,7 @@ class AuditComparison(StrictModel):
 
 
 class AuditVerdict(StrictModel):
-    """What the audit concludes."""
+    """The conclusion of the audit."""
 
     outcome: Outcome = Field(
         description="The command's exit code is 0, 1, 2 or 3 in this order: nothing_found, found, cannot_judge, worse."
@@ -173,7 +173,7 @@ class AuditVerdict(StrictModel):
 
 
 class AuditResult(StrictModel):
-    """All that an audit found."""
+    """The complete result of an audit."""
 
     format: Literal["advnerf-audit-1"] = FORMAT
     verdict: AuditVerdict
@@ -212,7 +212,7 @@ class AuditResult(StrictModel):
 
     @property
     def judgement(self) -> JudgedDrives | None:
-        """The judgement that the verdict rests on; None if no object was judged."""
+        """The judgement behind the verdict; None if no object was judged."""
         return self.strongest.judgement(self.verdict.evidence) if self.strongest else None
 
 
@@ -250,7 +250,7 @@ def read_audit(file: Path) -> AuditResult:
     """The result of an audit in a JSON file.
 
     Raises:
-        ConfigError: The file does not hold one; a line for each wrong key.
+        ConfigError: The file does not contain one; a line for each wrong key.
     """
     return validate(AuditResult, Document(read_json(file), str(file)))
 

@@ -1,4 +1,4 @@
-"""One cell of an experiment: a scenario, a victim, a method and a seed, with its drives in the surrogate and where it is deployed."""
+"""One cell of an experiment: a scenario, a victim, a method and a seed, with its drives in the surrogate and in the deployment."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Metres = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 
 
 class CellError(AdvnerfError, ValueError):
-    """A cell's file is not what a cell's file is."""
+    """A cell's file is invalid."""
 
 
 class Drives(StrictModel):
@@ -51,7 +51,7 @@ class Drives(StrictModel):
 
 
 class CellResult(StrictModel):
-    """What a finished cell found. The drives of both domains begin at the same starts in the same order; one domain may have only the first of them.
+    """Result of a finished cell. The drives of both domains begin at the same starts in the same order; one domain may have only the first of them.
 
     Attributes:
         scenario: straight, right, left, green_screen, monitor or another.
@@ -61,19 +61,19 @@ class CellResult(StrictModel):
         placement: Name of the placement; empty for the scenario's own.
         attack_id: Id of the attack file; None for none.
         settings_hash: Hash of everything that the result depends on.
-        settings: The same in full, those that are left at their defaults too; empty in cells from before they were kept.
-        stages: Digests of what capture, scene, object and policy stages had written; empty in cells from before they were kept.
-        seconds: Time it took [s].
-        machine: Where.
-        date: When, ISO.
-        surrogate: Drives in the learned scene; of an attack over the deployment scene's own frames (meshes) those of the ideal car there.
-        deployed: Drives where it is deployed; None as long as they were not driven.
-        not_driven_live: Why live nodes could not drive it, because load or a fault of the stack spoiled all tries; empty otherwise. Such
+        settings: All of these settings, including defaults; empty in cells from before they were stored.
+        stages: Digests of the capture, scene, object and policy stages' outputs; empty in cells from before they were stored.
+        seconds: Duration of the cell [s].
+        machine: Machine that ran the cell.
+        date: Date and time, ISO.
+        surrogate: Drives in the learned scene; for an attack over the deployment scene's own frames (meshes) the ideal car's drives there.
+        deployed: Drives in the deployment; None until they are driven.
+        not_driven_live: Reason why live nodes could not drive it, because load or a fault of the stack spoiled all tries; else empty. Such
             a cell is never evidence.
-        registration: Digest of the registration that the cell was run under; empty if there was none.
-        policy_sha256: Content hash of the victim; empty in cells from before it was kept.
-        kept: The drives of each domain, for whoever computes the numbers again; empty in cells from before they were kept.
-        extra: Anything else, such as the file of a clip.
+        registration: Digest of the registration that the cell was run under; empty without one.
+        policy_sha256: Content hash of the victim; empty in cells from before it was stored.
+        kept: Published data of each domain's drives, for recomputing the numbers; empty in cells from before they were stored.
+        extra: Further data, such as the file of a clip.
     """
 
     model_config = ConfigDict(extra="allow")
@@ -111,20 +111,20 @@ class CellResult(StrictModel):
 
     @property
     def key(self) -> tuple[str, str, str, str]:
-        """Scenario, placement, victim and method: what a row of a table sums up over seeds."""
+        """Scenario, placement, victim and method: the cells of a table row, over seeds."""
         return self.scenario, self.placement, self.victim, self.method
 
     @property
     def ticks(self) -> int:
-        """Control ticks of a drive; 0 in cells from before they were kept."""
+        """Control ticks of a drive; 0 in cells from before they were stored."""
         return int(self.extra.get("horizon") or 0)
 
     def drives(self, domain: Domain) -> Drives | None:
-        """The drives in a domain; None where there are none."""
+        """The drives in a domain; None without any."""
         return self.surrogate if domain == "surrogate" else self.deployed
 
     def obstacles(self, domain: Domain) -> list[str | None]:
-        """What each drive in a domain ran into; None where it ran into nothing."""
+        """Obstacle that each drive in a domain hit; None for drives without a collision."""
         if kept := self.kept.get(domain):
             return [drive.obstacle for drive in kept]
         driven = self.drives(domain)
@@ -140,7 +140,7 @@ def cell_name(scenario: str, victim: str, method: str, seed: int, placement: str
 
 
 def cell_from(data: Any, source: str) -> CellResult:
-    """A cell of JSON values; ``source`` is what the error calls it."""
+    """A cell from JSON values; ``source`` names it in errors."""
     try:
         return CellResult.model_validate(data)
     except ValidationError as error:
@@ -155,7 +155,7 @@ def read_cell(path: Path) -> CellResult:
     """Read one cell's file.
 
     Raises:
-        CellError: It is not there, not JSON, or not a cell's.
+        CellError: The file is missing, not JSON, or not a cell.
     """
     try:
         data = read_json(path)

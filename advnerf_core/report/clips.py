@@ -1,6 +1,6 @@
-"""First-person clips: one or several drives side by side, captioned, small enough to sit inside a page.
+"""First-person clips: one or several drives side by side, captioned, small enough to embed in a page.
 
-H.264 in MP4 where PyAV's FFmpeg has libx264, else VP9 in WebM: browsers play both.
+H.264 in MP4 if PyAV's FFmpeg has libx264, else VP9 in WebM: browsers play both.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ class ClipTrack:
     """One drive in a clip.
 
     Attributes:
-        title: What is seen, such as "deployed, gradient".
-        condition: What the object shows, by the name in `conditions`; gives the colour.
+        title: Caption, such as "deployed, gradient".
+        condition: Condition of the object, by its name in `conditions`; selects the colour.
         frames: First-person images, ``[N]`` of uint8 RGB ``[height, width, 3]``, one per control tick.
         cte_m: Signed cross-track error at the frames, ``[N]`` [m].
         attack_id: Short hash of the attack file; "" for none.
-        note: Said after the last frame, such as "stopped by the fence".
+        note: Shown after the last frame, such as "stopped by the fence".
     """
 
     title: str
@@ -70,7 +70,7 @@ def write_clip(
     """Write drives side by side as one video, atomically, as fine as the size limit allows.
 
     Args:
-        path: Where to; the suffix is replaced by that of the container used.
+        path: Output file; the suffix is replaced by the container's.
         tracks: The drives, left to right, of one frame size; a shorter one holds its last frame.
         rate_hz: Frames per second.
         off_track_m: ``|CTE|`` above this is shown as off-track [m].
@@ -154,8 +154,8 @@ def image_uri(image: Frames, quality: int | None = None) -> str:
 
 
 def film_strip(path: Path, count: int = 4) -> list[Frames]:
-    """Frames ``[height, width, 3]`` of a clip at equal intervals, the last one included, for print and posters."""
-    # Two passes: a long clip does not fit into memory, and WebM does not say how long it is.
+    """Frames ``[height, width, 3]`` of a clip at equal intervals, including the last one, for print and posters."""
+    # Two passes: a long clip does not fit into memory, and WebM does not store its length.
     with av.open(str(path)) as container:
         length = sum(1 for _ in container.decode(video=0))
     chosen = set(np.linspace(0, length - 1, min(count, length) + 1).round().astype(int)[1:].tolist())
@@ -171,7 +171,7 @@ def _encode(path: Path, codec: str, quality: int, rate_hz: float, frames: Iterat
         if codec == "libx264"
         else {"b": "0", "deadline": "good", "cpu-used": "3"}
     )
-    # The index in front lets a page play the clip while it is read.
+    # With the index in front a page can play the clip while it loads.
     container_options = {"movflags": "+faststart"} if path.suffix == ".mp4" else {}
     with av.open(str(path), "w", options=container_options) as container:
         stream: Any = None
@@ -216,13 +216,13 @@ def _draw_title(canvas: Image.Image, track: ClipTrack) -> None:
 
 
 def _draw_status(canvas: Image.Image, time_s: float, cte_m: float, off_track_m: float, note: str) -> None:
-    """Time, cross-track error as a number and as a needle over the track's width, and OFF TRACK in words."""
+    """Draws time, cross-track error as a number and as a needle over the track's width, and the text OFF TRACK."""
     draw = ImageDraw.Draw(canvas)
     middle = _TITLE_PX + _STATUS_PX / 2 - 2
     draw.text((2, middle), f"{time_s:4.1f} s", fill=_rgb("ink"), font=_font(12), anchor="lm")
     draw.text((62, middle), f"CTE {cte_m:+.2f} m", fill=_rgb("ink"), font=_font(12), anchor="lm")
     off = abs(cte_m) > off_track_m
-    # The needle moves as the car does on the screen: left of the path is left.
+    # The needle moves like the car on the screen: left of the path is left.
     left, right = 160, 236
     centre, metre = (left + right) / 2, (right - left) / 4 / off_track_m
     draw.rectangle((left, middle - 4, right, middle + 4), fill=_rgb("grid"))

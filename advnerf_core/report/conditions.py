@@ -1,8 +1,8 @@
-"""What an attacked drive is compared by: the conditions, what they are called, and how they are drawn. The one table of both.
+"""The conditions that drives are compared under, with their names and styles in one table.
 
-A condition says what the objects show: nothing but their own colours (``none``), what a method of attack found (named by the
-method), or a special drive (``empty``, ``laps``). A method that is not in the table is called by its title or name and gets a spare
-style: always the same one, unless two such methods of one table would share it (`know_methods`).
+A condition says what the objects show: only their own colours (``none``), the result of a method of attack (named by the
+method), or a special drive (``empty``, ``laps``). A method outside the table is called by its title or name and gets a spare
+style: always the same one, unless two such methods in one table would share it (`know_methods`).
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from types import MappingProxyType
 
 NONE = "none"
 EMPTY = "empty"
-# Drives that no search belongs to: the objects in their own colours, and no objects at all.
+# Drives without a search: the objects in their own colours, and no objects at all.
 CONTROLS = (NONE, EMPTY)
 
 
 @dataclass(frozen=True)
 class Style:
-    """How a condition is called and drawn.
+    """Name and style of a condition.
 
     Attributes:
-        title: Its name for readers.
+        title: Name for readers.
         key: Name of its colour in the palettes, and of the page's CSS variable.
         light: Colour on a light page, ``#rrggbb``.
         dark: Colour on a dark page, ``#rrggbb``.
         marker: Marker of matplotlib: a name, or corners, kind (0: polygon, 1: star) and angle [deg].
-        climbs: Whether each evaluation of its search starts from the one before, so that a line joins them; else they are dots.
+        climbs: Whether each evaluation of its search starts from the one before, so that a line joins them; else they are drawn as dots.
     """
 
     title: str
@@ -66,7 +66,7 @@ CONDITIONS: Mapping[str, Style] = _rows(
 
 
 def _generated(number: int) -> Style:
-    """A spare style of its own for each number; hues go round by the golden angle."""
+    """A distinct spare style for each number; hues advance by the golden angle."""
     hue = 0.618034 * number % 1.0
     light, dark = (
         "#" + "".join(f"{round(255 * part):02x}" for part in colorsys.hls_to_rgb(hue, lightness, 0.55))
@@ -75,7 +75,7 @@ def _generated(number: int) -> Style:
     return Style("", f"spare-{number}", light, dark, (3 + number, 1, 15))
 
 
-# Of methods that the table does not have; the titles stand for their names. The first ones are told apart best.
+# For methods outside the table; their titles replace the names. The first ones are the most distinct.
 _PREFERRED = _rows(
     Style("", "spare-1", "#5c7a00", "#b6d957", "<"),
     Style("", "spare-2", "#a63d00", "#ff9466", ">"),
@@ -88,18 +88,18 @@ _MOST = 24
 SPARE: Mapping[str, Style] = MappingProxyType(
     {**_PREFERRED, **_rows(*(_generated(number) for number in range(len(_PREFERRED) + 1, _MOST + 1)))}
 )
-# Styles of the methods that `know_methods` was told of.
+# Styles of the methods passed to `know_methods`.
 _known: ContextVar[Mapping[str, Style]] = ContextVar("_known", default=MappingProxyType({}))
 
 
 def know_methods(names: Iterable[str], titles: Mapping[str, str] | None = None) -> None:
-    """Give methods that stand in one table colours of their own, from here on in this context.
+    """Give the methods of one table distinct colours, from here on in this context.
 
-    The colours depend on all names that were given, not on their order. Above 24 methods that are not in the table, colours repeat.
+    The colours depend on all given names, not on their order. With more than 24 methods outside `CONDITIONS`, colours repeat.
 
     Args:
-        names: Conditions of the table; those of `CONDITIONS` keep their style.
-        titles: What readers call them; others are called by their names.
+        names: Conditions of the table; those in `CONDITIONS` keep their style.
+        titles: Names for readers; others keep their names.
     """
     known = _known.get()
     styles: dict[str, Style] = {}
@@ -119,7 +119,7 @@ def _preferred(name: str) -> Style:
 
 
 def style_of(name: str) -> Style:
-    """The style of a condition; one that is in no table has its name as title and a spare colour that depends on the name only."""
+    """The style of a condition; an unknown one has its name as title and a spare colour that depends on the name only."""
     if name in CONDITIONS:
         return CONDITIONS[name]
     return _known.get().get(name) or replace(_preferred(name), title=name)

@@ -1,4 +1,4 @@
-"""What the page of an experiment is made of: plain records with units, filled by the experiment and read by the plots and the page.
+"""The data of an experiment's page: plain records with units, filled by the experiment and read by the plots and the page.
 
 Everything optional may be missing; the page then says so. Images are ``[height, width, 3]`` uint8 RGB.
 """
@@ -17,7 +17,7 @@ from advnerf_core.report.reference import Domain
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
-_TICKS_COMPARED = (50, 400)  # horizons whose memory is compared
+_TICKS_COMPARED = (50, 400)  # horizons whose memory use is compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,16 +25,16 @@ class Run:
     """One drive over the horizon.
 
     Attributes:
-        domain: Where it was driven: in the learned scene or by the live node graph.
-        condition: What the object shows: "none" plain colours, the name of a method what it found, "empty" no object at all;
+        domain: Domain of the drive: the learned scene or the live node graph.
+        condition: Condition of the object: "none" plain colours, a method's name the result of its search, "empty" no object at all;
             see `conditions`.
-        victim: Name of the policy: "hardened" has seen random textures in training, "naive" has not, others are a user's.
-        seed: Seed of the attack; 0 where nothing is random.
-        start: Number of its start.
+        victim: Name of the policy: "hardened" was trained with random textures, "naive" was not, others are a user's.
+        seed: Seed of the attack; 0 without randomness.
+        start: Number of the start.
         states: Pose of the rear axle at the control ticks, ``[T + 1, 3]``: x [m], y [m], yaw [rad], world.
         cte_m: Signed cross-track error at the control ticks, left positive, ``[T + 1]`` [m].
         total_cte_m: Sum of ``|CTE|`` over the horizon [m].
-        note: What a reader must know, such as "stopped by the fence at 5.1 s".
+        note: Remark for readers, such as "stopped by the fence at 5.1 s".
     """
 
     domain: Domain
@@ -50,13 +50,13 @@ class Run:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What a map shows besides drives, all in world metres.
+    """Contents of a map besides drives, all in world metres.
 
     Attributes:
         path_xy_m: Reference path, ``[N, 2]``.
         off_track_m: Half width of the band around it that counts as on track [m].
         closed: Whether the path is a loop.
-        edges_m: Lines ``[N, 2]`` where the road or the room ends.
+        edges_m: Lines ``[N, 2]`` at the end of the road or the room.
         objects_m: Corners ``[N, 2]`` of each object from above.
         faces_m: Ends ``[2, 2]`` of faces from above, by name; the front is on the right of first to second.
         fence_m: Corners of the geofence, ``[M, 2]``; None without one.
@@ -89,7 +89,7 @@ class LossCurve:
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """What the face shows: row 0 is its top, column 0 its left for a viewer in front of it."""
+    """The displayed face: row 0 is its top, column 0 its left for a viewer in front of it."""
 
     label: str
     condition: str
@@ -104,13 +104,13 @@ class Drives:
     """All drives of one scenario.
 
     Attributes:
-        scenario: Its name.
-        scene: What its maps show.
+        scenario: Name of the scenario.
+        scene: Contents of its maps.
         dt_s: Time between control ticks [s].
         runs: The drives.
-        curves: Of the searches.
-        film: What the driving camera saw; None without one.
-        seen: What the camera saw of the objects, by method.
+        curves: Loss curves of the searches.
+        film: Images of the driving camera; None without a film.
+        seen: Camera images of the objects, by method.
     """
 
     scenario: str
@@ -127,7 +127,7 @@ class Drives:
         return tuple(dict.fromkeys(run.victim for run in self.runs))
 
     def select(self, **equal: object) -> tuple[Run, ...]:
-        """Runs whose fields equal the given values, such as ``domain="deployed"``."""
+        """Runs with the given field values, such as ``domain="deployed"``."""
         return tuple(
             run for run in self.runs if all(getattr(run, key) == value for key, value in equal.items())
         )
@@ -156,7 +156,7 @@ class FidelityView:
         ssim_policy: SSIM at the policy's size.
         steering_real_rad: The policy's output on the real image [rad].
         steering_surrogate_rad: The policy's output on the surrogate's image [rad].
-        real: The real image, for the few views to be shown.
+        real: The real image, for the few views that are shown.
         surrogate: The surrogate's image.
     """
 
@@ -173,19 +173,19 @@ class FidelityView:
 
 @dataclass(frozen=True, eq=False)
 class Fidelity:
-    """All held-out views; the aggregates are means over them, None where nothing was measured. ``unit`` is that of the policy's control."""
+    """All held-out views; the aggregates are means over them, None without any measured value. ``unit`` is the unit of the policy's control."""
 
     views: tuple[FidelityView, ...]
     unit: str = "rad"
 
     def mean(self, name: str) -> float | None:
-        """Mean of one numeric field of `FidelityView` over the views that have it."""
+        """Mean of one numeric field of `FidelityView` over the views with a value."""
         values = [getattr(v, name) for v in self.views if getattr(v, name) is not None]
         return float(np.mean(values)) if values else None
 
     @property
     def steering_rad(self) -> NDArray[np.float64]:
-        """Steering on the real and on the surrogate's image, ``[n, 2]`` [rad], of the views that have both."""
+        """Steering on the real and on the surrogate's image, ``[n, 2]`` [rad], of the views with both."""
         pairs = [
             (v.steering_real_rad, v.steering_surrogate_rad)
             for v in self.views
@@ -253,15 +253,15 @@ class MemoryRow:
 
 @dataclass(frozen=True, eq=False)
 class Manifest:
-    """How to make this report again.
+    """Commands and versions that reproduce this report.
 
     Attributes:
         command: The exact command line.
         created: Time of the report, ISO 8601 with zone.
-        hashes: Of scene, policy, config, attack files, code, ...
-        versions: Of the software.
+        hashes: Hashes of scene, policy, config, attack files, code, ...
+        versions: Versions of the software.
         machine: Processor, cores, memory, system.
-        settings: What was run, name to text.
+        settings: Settings of the run, name to text.
         timings: Wall time of each stage [s].
     """
 
@@ -276,19 +276,19 @@ class Manifest:
 
 @dataclass(frozen=True, eq=False)
 class ReportData:
-    """Everything that the sections of an experiment's page need.
+    """Input of the sections of an experiment's page.
 
     Attributes:
-        drives: By scenario.
-        manifest: How to make the page again.
-        overview: The world from above; None where it has no picture of itself.
-        textures: What faces show.
-        fidelity: How true the learned scene is.
-        live: Whether the drives were live; then what follows is shown, or named as missing.
+        drives: Drives by scenario.
+        manifest: Commands and versions that reproduce the page.
+        overview: The world from above; None if it has no such picture.
+        textures: Displayed faces.
+        fidelity: Fidelity of the learned scene.
+        live: Whether the drives were live; the following fields are then shown, or named as missing.
         latency: Live timing.
-        memory: Of the adjoint.
+        memory: Memory use of the adjoint.
         laps: The live drive without attack.
-        not_measured: Why a part is missing, by the name of its field.
+        not_measured: Reason for a missing part, by the name of its field.
     """
 
     drives: tuple[Drives, ...]
@@ -304,7 +304,7 @@ class ReportData:
 
     @property
     def measured(self) -> dict[str, float | None]:
-        """Measures besides those of drives, by the name that a `Limit` has for them; None or absent where this run has none."""
+        """Measures besides those of drives, by their name in a `Limit`; None or absent if this run has none."""
         found: dict[str, float | None] = {}
         if self.fidelity is not None:
             found |= {name: self.fidelity.mean(name) for name in ("psnr_full_db", "psnr_policy_db")}

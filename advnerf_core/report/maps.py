@@ -1,4 +1,4 @@
-"""A place from above: path, edges and objects, and where the car went."""
+"""A place from above: path, edges, objects and drives."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MARGIN_M = 0.15  # white around what a map shows
 
 
 def trajectory_map(drives: Drives, victim: str, zoom: bool = True) -> Figure:
-    """All drives of one victim from above: only where the car went, or everything that the scene has."""
+    """All drives of one victim from above: either the driven part, or the whole scene."""
     runs = drives.select(victim=victim)
     box = _driven_box(drives.scene, runs) if zoom else _whole_box(drives.scene)
     with new_axes(6.0, _height_in(box, legend=zoom)) as ax:
@@ -147,7 +147,7 @@ def _driven_box(scene: Scene, runs: Sequence[Run]) -> Floats:
 
 
 def _whole_box(scene: Scene) -> Floats:
-    """Corners ``[2, 2]`` of everything that stays where it is [m]."""
+    """Corners ``[2, 2]`` of everything static [m]."""
     xy = np.concatenate([scene.path_xy_m, *scene.edges_m])
     return np.stack([xy.min(axis=0), xy.max(axis=0)])
 

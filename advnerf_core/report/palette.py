@@ -1,4 +1,4 @@
-"""One palette for plots, page and clips. Conditions differ in lightness as well as hue, and plots add line style and marker.
+"""The palette of plots, page and clips. Conditions differ in lightness as well as hue, and plots add line style and marker.
 
 The keys are also the names of the page's CSS variables: a figure drawn in the light palette is re-coloured by `themed_svg`.
 """
@@ -35,7 +35,7 @@ DARK: Mapping[str, str] = MappingProxyType(
     }
 )
 
-# What is not drawn in plots: boxes, marks of good and bad, what has the focus or can be pressed.
+# Colours that plots do not use: boxes, marks of good and bad, focus and buttons.
 SURFACE_LIGHT: Mapping[str, str] = MappingProxyType(
     {
         "panel": "#f7f8f9",
@@ -68,7 +68,7 @@ def css_variables(palette: Mapping[str, str]) -> str:
 
 
 def look_css() -> str:
-    """The style sheet that all pages share: the palette in both themes, and ``look.css``."""
+    """The common style sheet of all pages: the palette in both themes, and ``look.css``."""
     light, dark = css_variables({**LIGHT, **SURFACE_LIGHT}), css_variables({**DARK, **SURFACE_DARK})
     shared = files("advnerf_core.report").joinpath("look.css").read_text(encoding="utf-8")
     return f":root {{ {light} }}\n@media (prefers-color-scheme: dark) {{ :root {{ {dark} }} }}\n{shared}"

@@ -1,4 +1,4 @@
-"""The curves of the report. Each function returns a matplotlib figure drawn without a display; `svg` makes it part of a page.
+"""The curves of the report. Each function returns a matplotlib figure drawn without a display; `svg` embeds it in a page.
 
 Conditions keep their colour in every figure; the surrogate is dashed, the deployed drive solid.
 """
@@ -205,7 +205,7 @@ def laps_cte(laps: Laps, period_s: float, off_track_m: float) -> Figure:
 
 
 def run_style(run: Run) -> dict[str, Any]:
-    """How a drive is drawn: colour by condition, line by domain."""
+    """Style of a drive: colour by condition, line by domain."""
     style = style_of(run.condition)
     # Attacks in front of drives without one, and these in front of the empty scene.
     front = {EMPTY: 2.0, NONE: 2.1}.get(run.condition, 2.2 + 0.01 * order_of(run.condition)[0])
@@ -220,7 +220,7 @@ def end_style(run: Run) -> dict[str, Any]:
 
 
 def add_run_legend(ax: Any, runs: Iterable[Run]) -> None:
-    """A legend of the cells that occur, above the axes."""
+    """A legend of the present conditions and domains, above the axes."""
     cells: dict[tuple[str, str], Run] = {(r.condition, r.domain): r for r in runs}
     handles = []
     for condition in sorted({condition for condition, _ in cells}, key=order_of):
@@ -245,7 +245,7 @@ def svg(figure: Figure, description: str) -> str:
 
     Args:
         figure: The figure.
-        description: What it shows, for those who cannot see it (plain text; it is escaped).
+        description: Alternative text for readers who cannot see it (plain text; it is escaped).
     """
     buffer = io.StringIO()
     nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))

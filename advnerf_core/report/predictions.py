@@ -1,4 +1,4 @@
-"""Predicted and measured excess of attacks. No prediction has seen a drive with its attack."""
+"""Predicted and measured excess of attacks. No prediction used a drive with its attack."""
 
 # ruff: noqa: RUF001 (typography for readers: dashes)
 
@@ -22,17 +22,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Predicted:
-    """One attack: what was expected of it, and what it did. Lengths are excess |CTE| per tick over the plain object.
+    """Prediction and measurement of one attack. Lengths are excess |CTE| per tick over the plain object.
 
     Attributes:
         name: Name of the cell.
-        method: Which search found it.
-        expected_m: Expected of a deployed drive [m].
+        method: Method of the search.
+        expected_m: Predicted excess of a deployed drive [m].
         low_m: Lower end of its 80 % band [m].
         high_m: Upper end [m].
         retained: Share of the effect on single views that survives in real pictures.
-        surrogate_m: Of the drives in the surrogate from the same starts, mean [m]: what one would expect without predicting.
-        drives_m: Of each deployed drive [m].
+        surrogate_m: Mean excess in the surrogate from the same starts [m]: the expectation without a prediction.
+        drives_m: Excess of each deployed drive [m].
     """
 
     name: str
@@ -80,7 +80,7 @@ def prediction_table(pairs: Sequence[Predicted]) -> Table:
 
 
 def skill_text(pairs: Sequence[Predicted]) -> str:
-    """One sentence on how good the predictions were."""
+    """One sentence on the accuracy of the predictions."""
     if not pairs:
         return "No attack was both predicted and deployed."
     scores = [score_bands(np.array([[p.low_m, p.high_m]]), np.array(p.drives_m)) for p in pairs]

@@ -1,4 +1,4 @@
-"""What a report is held to: limits, as data that an experiment file names."""
+"""The limits that a report is compared with, as data that an experiment file names."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from advnerf_core.strict import StrictModel
 
 Domain = Literal["surrogate", "deployed"]
 DOMAINS: tuple[Domain, ...] = get_args(Domain)
-# Measures of drives, which a limit gives a method for.
+# Measures of drives, which a limit names a method for.
 DriveMeasure = Literal["excess_m", "ratio", "mean_abs_cte_m", "spread", "off_track", "off_track_share"]
 LiveMeasure = Literal[
     "laps",
@@ -26,23 +26,23 @@ LiveMeasure = Literal[
 
 
 class Limit(StrictModel):
-    """What one measure must be.
+    """The limit of one measure.
 
     Attributes:
         of: The measure. ``excess_m`` is the excess |CTE| per tick over the plain object, ``ratio`` the total CTE over that past the plain
             object (publications in other units give this), ``mean_abs_cte_m`` per tick, ``spread`` the standard deviation of the total over
             its mean, ``memory_ratio`` the peak memory of the adjoint over 400 ticks against that over 50.
-        what: The measure in words; empty to put them together from the keys.
-        scenario: Whose drives; empty for the first scenario.
-        victim: Whose drives.
-        method: Whose drives.
-        domain: Where they were driven.
+        what: Title of the measure; empty to derive it from the keys.
+        scenario: Scenario of the drives; empty for the first one.
+        victim: Victim of the drives.
+        method: Method of the drives.
+        domain: Domain of the drives.
         at_least: Smallest value.
         at_most: Largest value.
         above: Another method, whose value must be exceeded.
-        said: The limit in words; empty for the plain number.
-        paper: What the publication has there, in words.
-        headline: Title among the key figures of the page; empty leaves it out there.
+        said: The limit as text; empty for the plain number.
+        paper: The publication's value, as text.
+        headline: Title among the page's key figures; empty leaves it out there.
     """
 
     of: DriveMeasure | LiveMeasure = "ratio"

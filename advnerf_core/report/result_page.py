@@ -1,4 +1,4 @@
-"""The table of results to look at: in the terminal, as CSV, Markdown and JSON, and as a page with the drives' clips."""
+"""The table of results for readers: in the terminal, as CSV, Markdown and JSON, and as a page with the drives' clips."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ class ShownClip:
     """A clip of a cell.
 
     Attributes:
-        cell: Whose drive it is.
+        cell: Name of the drive's cell.
         outcome: One of `OUTCOMES`.
-        file: Where it is, relative to the page.
+        file: Path relative to the page.
     """
 
     cell: CellResult
@@ -63,7 +63,7 @@ class ShownClip:
 
     @property
     def caption(self) -> str:
-        """What is seen."""
+        """Caption of the clip."""
         drives = self.cell.deployed or self.cell.surrogate
         return (
             f"total CTE {sum(drives.total_cte_m):.2f} m, without attack {sum(drives.none_total_cte_m):.2f} m"
@@ -71,7 +71,7 @@ class ShownClip:
 
 
 def outcome_of(cell: CellResult) -> str:
-    """How the deployed drives of a cell ended; those in the surrogate where it was not deployed."""
+    """Outcome of a cell's deployed drives; of the surrogate's if it was not deployed."""
     drives = cell.deployed or cell.surrogate
     if any(drives.off_track):
         return LEFT
@@ -110,7 +110,7 @@ def text_table(table: ResultTable) -> Table:
         cells.append((where if new_scenario else "", row.victim if new_victim else "", name, *_numbers(row)))
         classes.append(row.method if row.seeds else "unmeasured")
         last = row
-    # A column that says nothing in any line, as of a control that nobody drove, goes.
+    # Drop a column that is empty in all lines, such as a control without drives.
     kept = [index for index in range(len(columns)) if any(row[index] not in _SAYS_NOTHING for row in cells)]
     return Table(
         "Results",
@@ -123,7 +123,7 @@ def text_table(table: ResultTable) -> Table:
 
 
 def not_driven(table: ResultTable) -> str:
-    """Which cells live nodes could not drive, and what that means; empty if all were driven."""
+    """Names the cells that live nodes could not drive, and the consequence; empty if all were driven."""
     missing = [cell for cell in table.cells.values() if cell.not_driven_live]
     if not missing:
         return ""
@@ -157,7 +157,7 @@ def as_json(table: ResultTable, targets: Sequence[Target] = ()) -> dict[str, Any
 
 
 def as_csv(table: ResultTable) -> str:
-    """The lines, one column per number; empty where there is none."""
+    """The lines, one column per number; missing numbers are empty."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     records = [row.record() for row in table.rows]
@@ -185,12 +185,12 @@ def as_markdown(table: ResultTable, targets: Sequence[Target] = ()) -> str:
 
 
 def gather_clips(table: ResultTable, cells_folder: Path, page_folder: Path) -> list[ShownClip]:
-    """Put the cells' clips beside the page, in one folder per outcome; as links of the same file where the disk has them.
+    """Put the cells' clips beside the page, in one folder per outcome; as hard links if the disk has the file.
 
     Args:
-        table: Whose cells.
-        cells_folder: What the cells' clip names are relative to.
-        page_folder: Folder of the page; older clips in its ``videos`` go.
+        table: The table with the cells.
+        cells_folder: Folder that the cells' clip names are relative to.
+        page_folder: Folder of the page; older clips in its ``videos`` are deleted.
     """
     shutil.rmtree(page_folder / "videos", ignore_errors=True)
     shown = []
@@ -223,8 +223,8 @@ def render_page(
         table: The table.
         clips: Clips beside the page.
         sections: Further parts: heading and HTML.
-        lead: Paragraphs, or HTML, before the table; none: what such a table is.
-        targets: What it is held to.
+        lead: Paragraphs, or HTML, before the table; empty for the standard introduction.
+        targets: Targets of the results.
     """
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True

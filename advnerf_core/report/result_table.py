@@ -1,7 +1,7 @@
 """The table of results: every scenario, victim and method, in the surrogate and deployed, from finished cells.
 
-A row has totals and the excess in metres over both controls; `evidence.rows` computes it as for published sets. What was not run is
-missing, and says so.
+A row has totals and the excess in metres over both controls; `evidence.rows` computes it as for published sets. Missing runs are
+named as missing.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from advnerf_core.report.reference import DOMAINS, Domain
 
 @dataclass(frozen=True)
 class Wanted:
-    """A row that a table should have, and how many seeds.
+    """A row that a table should have, with its seeds.
 
     Attributes:
         scenario: Name of the scenario.
         placement: Name of the placement; empty for the scenario's own.
-        victim: Which policy.
-        method: Which search.
-        seeds: Its seeds.
-        deployed: Whether it is driven where it is deployed.
+        victim: Name of the victim.
+        method: Name of the method.
+        seeds: Requested seeds.
+        deployed: Whether deployed drives are requested.
     """
 
     scenario: str
@@ -39,34 +39,34 @@ class Wanted:
 
     @property
     def domains(self) -> tuple[Domain, ...]:
-        """Where it is driven."""
+        """Domains of its drives."""
         return tuple(each for each in DOMAINS if self.deployed or each == "surrogate")
 
     @property
     def key(self) -> Key:
-        """The same without seeds."""
+        """The row's key without seeds."""
         return self.scenario, self.placement, self.victim, self.method
 
 
 @dataclass(frozen=True)
 class TableRow:
-    """One line of the table: all seeds of a scenario, victim and method in one domain. None where nothing was run.
+    """One line of the table: all seeds of a scenario, victim and method in one domain. None for missing values.
 
     Attributes:
         scenario: Name of the scenario.
         placement: Name of the placement.
-        victim: Which policy.
-        method: Which search.
+        victim: Name of the victim.
+        method: Name of the method.
         domain: surrogate or deployed.
-        seeds: Seeds that are there.
-        missing: Seeds that are not.
+        seeds: Finished seeds.
+        missing: Missing seeds.
         drives: Number of drives.
         off_track: Drives that left the track.
         total_m: Mean total CTE [m].
-        total_std_m: Standard deviation over seeds of their mean totals [m]; None of one seed.
+        total_std_m: Standard deviation over seeds of their mean totals [m]; None for one seed.
         plain_total_m: Mean total CTE from the same starts past the plain object [m].
-        ticks: Control ticks of a drive; 0 where the cells do not say.
-        excess: Excess per tick over both controls; None where the ticks are not known.
+        ticks: Control ticks of a drive; 0 if the cells do not store it.
+        excess: Excess per tick over both controls; None if the ticks are unknown.
     """
 
     scenario: str
@@ -91,7 +91,7 @@ class TableRow:
 
     @property
     def ratio(self) -> float | None:
-        """Total CTE over that past the plain object."""
+        """Total CTE divided by the total past the plain object."""
         return self.total_m / self.plain_total_m if self.total_m is not None and self.plain_total_m else None
 
     @property
@@ -105,7 +105,7 @@ class TableRow:
         return self.total_m / self.ticks if self.total_m is not None and self.ticks else None
 
     def record(self) -> dict[str, Any]:
-        """JSON-ready values, those of the excess among them."""
+        """JSON-ready values, including the excess."""
         own = {name: value for name, value in asdict(self).items() if name != "excess"}
         excess = vars(self.excess) if self.excess else dict.fromkeys(Row.__dataclass_fields__)
         return {**excess, **own}
@@ -113,10 +113,10 @@ class TableRow:
 
 @dataclass(frozen=True)
 class ResultTable:
-    """All lines, and the cells they came from.
+    """All lines, and their cells.
 
     Attributes:
-        rows: The lines, in the order asked for.
+        rows: The lines, in the requested order.
         cells: The cells, by name.
         name: Name of the experiment.
     """
@@ -128,21 +128,21 @@ class ResultTable:
     def find(
         self, scenario: str, victim: str, method: str, domain: Domain, placement: str = ""
     ) -> TableRow | None:
-        """One line; None where it was not asked for."""
+        """One line; None if it was not requested."""
         key = (scenario, placement, victim, method)
         return next((row for row in self.rows if row.key == key and row.domain == domain), None)
 
     def cells_of(self, row: TableRow) -> list[CellResult]:
-        """The cells that a line sums up."""
+        """The cells that a line summarises."""
         return [cell for cell in self.cells.values() if cell.key == row.key]
 
 
 def make_table(wanted: Sequence[Wanted], cells: Iterable[CellResult], name: str = "") -> ResultTable:
-    """Sum cells up.
+    """Summarise cells.
 
     Args:
-        wanted: What the table should have; it says what is missing.
-        cells: What is there; cells that were not asked for are left out.
+        wanted: Requested rows; the table names missing ones.
+        cells: Existing cells; unrequested ones are left out.
         name: Name of the experiment.
     """
     seeds = {want.key: want.seeds for want in wanted}

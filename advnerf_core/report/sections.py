@@ -1,4 +1,4 @@
-"""Sections of an experiment's page: maps, films, textures, fidelity, and of live drives their timing and memory."""
+"""Sections of an experiment's page: maps, films, textures, fidelity, and for live drives their timing and memory."""
 
 # ruff: noqa: RUF001 (typography for readers: dashes)
 
@@ -22,7 +22,7 @@ from advnerf_core.report.reference import DOMAINS, Domain
 from advnerf_core.report.result_table import ResultTable, TableRow
 from advnerf_core.report.text_table import Table, count, number
 
-# Films beyond this stay beside the page: browsers open a 20 MB page at once, a 200 MB page not.
+# Films beyond this stay beside the page: browsers open a 20 MB page at once, but not a 200 MB page.
 MAX_EMBEDDED_BYTES = 12_000_000
 _SHOWN_VIEWS = 6
 _DIFFERENCE_GAIN = 4
@@ -44,7 +44,7 @@ def page_sections(data: ReportData, table: ResultTable) -> list[tuple[str, Marku
 
 
 def what_it_did(data: ReportData, table: ResultTable, victim: str) -> list[str]:
-    """What the attack did to one victim in each scenario, as plain text."""
+    """Effect of the attack on one victim in each scenario, as plain text."""
     deployed = any(row.domain == "deployed" for row in table.rows)
     return [
         f"{each.scenario.capitalize()}: in the learned scene the cross-track error (CTE, the distance from the path) "
@@ -74,7 +74,7 @@ def _effect(table: ResultTable, driven: Drives, victim: str, domain: Domain) -> 
 
 
 def _warning(plain: TableRow, off_track_m: float) -> str:
-    """What must be said of a victim that does not drive without an attack; empty if it drives."""
+    """Warning for a victim that does not drive well without an attack; else empty."""
     mean_m = plain.mean_abs_cte_m or 0.0
     if drives(mean_m, plain.off_track > 0, off_track_m):
         return ""
@@ -111,7 +111,7 @@ def _fragments(data: ReportData, table: ResultTable) -> Any:
 
 
 def _driven(data: ReportData) -> Iterator[dict[str, Any]]:
-    """What the section of each scenario shows; films are embedded while there is room."""
+    """Content of each scenario's section; films are embedded while there is room."""
     room = MAX_EMBEDDED_BYTES
     for each in data.drives:
         size = _size(each.film)
@@ -138,7 +138,7 @@ def _size(film: Path | None) -> int:
 
 
 def _figures(data: ReportData) -> dict[str, Any]:
-    """Inline SVG of all figures whose data there is, by name."""
+    """Inline SVG of all figures with data, by name."""
     figures: dict[str, Any] = {}
     if data.laps is not None:
         scene, dt_s = data.drives[0].scene, data.drives[0].dt_s
@@ -191,7 +191,7 @@ def _video(film: Path) -> dict[str, Any]:
 
 
 def _views(data: ReportData) -> list[dict[str, Any]]:
-    """Image pairs with their difference, of the first few views that carry images."""
+    """Image pairs with their difference, of the first few views with images."""
     out: list[dict[str, Any]] = []
     for view in data.fidelity.views if data.fidelity else ():
         if view.real is not None and view.surrogate is not None and len(out) < _SHOWN_VIEWS:
@@ -248,7 +248,7 @@ def _hop_table(data: ReportData) -> Table:
 
 
 def _tries_table(table: ResultTable) -> Table:
-    """Tries of the live drives of each cell, with the reasons of those that did not count."""
+    """Tries of the live drives of each cell, with the reasons of discarded ones."""
     cells = []
     for cell in table.cells.values():
         spoiled = [reason for tries in cell.extra.get("spoiled_tries", ()) for reason in tries]

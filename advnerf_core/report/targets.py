@@ -1,4 +1,4 @@
-"""Targets: what was promised, what was measured, and whether it was met. Nothing is rounded in our favour."""
+"""Targets: the limit, the measured value, and whether it was met. Nothing is rounded in our favour."""
 
 # ruff: noqa: RUF001 (typography for readers: multiplication signs and dashes)
 
@@ -16,18 +16,18 @@ from advnerf_core.report.text_table import Table, count, number
 
 @dataclass(frozen=True)
 class Target:
-    """A limit and what was measured.
+    """A limit and the measured value.
 
     Attributes:
-        what: What is measured, in words.
-        target: The limit, in words.
-        value: What was measured; None where nothing was.
-        measured: The same in words.
-        met: Whether the limit is kept; None where nothing was measured, or seeds are missing.
-        verdict: The answer in words.
-        paper: What the publication has there.
-        headline: Title among the key figures of the page; empty leaves it out there.
-        method: Whose drives it is about; empty for other measures.
+        what: Title of the measure.
+        target: The limit, as text.
+        value: The measured value; None without one.
+        measured: The measured value as text.
+        met: Whether the limit is kept; None without a measurement, or if seeds are missing.
+        verdict: The answer as text.
+        paper: The publication's value.
+        headline: Title among the page's key figures; empty leaves it out there.
+        method: Method of the drives; empty for other measures.
     """
 
     what: str
@@ -41,13 +41,13 @@ class Target:
     method: str
 
     def record(self) -> dict[str, Any]:
-        """JSON-ready values, of which ``Target(**record)`` makes it again."""
+        """JSON-ready values, from which ``Target(**record)`` restores it."""
         return asdict(self)
 
 
 @dataclass(frozen=True)
 class _Measure:
-    """How a measure is called and printed."""
+    """Title and format of a measure."""
 
     title: str
     digits: int
@@ -84,9 +84,9 @@ def evaluate(
     """The targets of some limits; those on rows that the table does not have are left out.
 
     Args:
-        limits: What must be reached.
+        limits: The limits.
         table: The drives.
-        measured: What was measured besides, by measure; None leaves these limits out.
+        measured: Further measured values, by measure; None leaves these limits out.
     """
     found = []
     for limit in limits:
@@ -117,7 +117,7 @@ def _target(limit: Limit, value: float | None, lower: float | None, complete: bo
         met, short = None, 0.0
     else:
         lacking = value - bound if limit.at_most is not None else bound - value
-        # A method that is as good as the one that it must exceed does not exceed it.
+        # A method as good as the one that it must exceed does not exceed it.
         met = lacking < 0.0 if limit.above else lacking <= 0.0
         short = max(lacking, 0.0) / (bound or 1.0)  # of a limit of zero any excess counts by its own size
     if met is None:
@@ -155,7 +155,7 @@ def target_table(targets: Sequence[Target]) -> Table:
 
 
 def verdict(targets: Sequence[Target]) -> str:
-    """Which targets were met, missed, and not measured, in words; empty without any."""
+    """Summary of met, missed and unmeasured targets, as text; empty without any."""
     met, missed = ([target for target in targets if target.met is wanted] for wanted in (True, False))
     judged = len(met) + len(missed)
     if not targets:

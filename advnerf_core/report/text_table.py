@@ -1,4 +1,4 @@
-"""A table of text: made once, shown in the terminal, in the page and in Markdown."""
+"""A table of text: made once, for the terminal, the page and Markdown."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from rich.text import Text
 
 
 def number(value: float | None, digits: int = 2, unit: str = "") -> str:
-    """A number for a reader; an en dash where there is none."""
+    """A formatted number; an en dash for None."""
     return "–" if value is None else f"{value:.{digits}f}{unit}"  # noqa: RUF001 (typography for readers)
 
 
 def count(number_of: int, noun: str) -> str:
-    """A number of things, such as ``3 drives``."""
+    """A count with its noun, such as ``3 drives``."""
     return f"{number_of} {noun}" if number_of == 1 else f"{number_of} {noun}s"
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table of text that knows how to show itself.
+    """A table of text with its output formats.
 
     Attributes:
         title: Heading in the terminal.
         columns: Column headings.
         rows: Cells, one text per column.
-        right: Which columns are numbers, aligned right.
+        right: Columns with numbers, aligned right.
         groups: Rows before which a new group starts.
         classes: One CSS class per row, or "" (page only).
     """
@@ -72,7 +72,7 @@ class Table:
         return "\n".join([_markdown_row(self.columns), rule, *map(_markdown_row, self.rows), ""])
 
     def rich(self) -> rich.table.Table:
-        """The table for the terminal; `Text` keeps rich from reading units in brackets as markup."""
+        """The table for the terminal; `Text` keeps rich from parsing units in brackets as markup."""
         table = rich.table.Table(title=self.title or None, box=rich.box.SIMPLE_HEAD, title_justify="left")
         for heading, right in zip(self.columns, self.right, strict=True):
             table.add_column(Text(heading), justify="right" if right else "left")

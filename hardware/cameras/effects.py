@@ -46,7 +46,7 @@ class CameraEffects(StrictModel):
         k2: The second one.
         jpeg_quality: Quality of JPEG compression, 1 to 100; None for none.
         lost: Share of frames that never arrive.
-        seed: Of all draws.
+        seed: Seed of all draws.
     """
 
     exposure_s: _NotNegative = 0.0
@@ -135,7 +135,7 @@ class ImperfectCamera:
 
         Args:
             draw: Ideal pictures.
-            state: Where the car is now ``[3]``; the last row ends its exposure there.
+            state: Current state of the car ``[3]``; the exposure of the last row ends there.
             dt_s: Time since the call before [s].
         """
         now = np.array(state[:3], dtype=np.float64)

@@ -25,12 +25,12 @@ _PAGE = "docs/cameras.md"
 
 
 class ForeignSource(Source):
-    """A camera that is not one of ours.
+    """A camera of a user or of another package.
 
     Attributes:
         kind: Entry point or ``file.py:Class``, as the user wrote it.
-        camera_class: What it stands for.
-        config: Its checked ``Config``.
+        camera_class: The camera's class.
+        config: The class's validated ``Config``.
     """
 
     kind: str
@@ -51,10 +51,10 @@ class ForeignSource(Source):
 def foreign_source(
     written: Mapping[str, Any], built_in: Collection[str], folder: Path | None = None
 ) -> ForeignSource | None:
-    """The settings of a camera that is not one of ours.
+    """The settings of a camera that is not built in.
 
     Args:
-        written: The section ``source``: ``kind``, the camera's own keys, and those of every source.
+        written: The section ``source``: ``kind``, the camera's own keys, and the keys of every source.
         built_in: Kinds that this project brings.
         folder: Folder that a relative ``file.py`` is relative to; the working folder if it is not given.
 
@@ -62,7 +62,7 @@ def foreign_source(
         The settings; None for a built-in kind.
 
     Raises:
-        ValidationError: There is no such camera, it cannot be loaded, or one of its keys is unknown or wrong.
+        ValidationError: The camera is unknown or cannot be loaded, or one of its keys is unknown or wrong.
     """
     kind = written["kind"]
     try:
@@ -84,10 +84,10 @@ def foreign_source(
 
 
 def find_camera(name: str, folder: Path | None = None) -> Any:
-    """The class that a camera's name stands for.
+    """The class behind a camera's name.
 
     Raises:
-        PluginError: There is none, it cannot be loaded, or it is no class with a ``Config``.
+        PluginError: The camera is unknown, cannot be loaded, or is not a class with a ``Config``.
     """
     found: Any = resolve(name, "camera", {}, GROUP, folder)
     config = getattr(found, "Config", None)

@@ -25,7 +25,7 @@ class OakSource(Source):
 
     Attributes:
         kind: ``oak``.
-        device: Its id, IP address or USB port; empty for the only one.
+        device: Id, IP address or USB port of the device; empty for the only one.
         socket: Board socket of the camera.
         width: Columns [px].
         height: Rows [px].
@@ -92,7 +92,7 @@ class OakCamera(Camera):
 
     Args:
         settings: Settings of the camera. Images of another size are an error.
-        build: Makes the pipeline from the depthai module and the settings: that of a device, or a replay on the host.
+        build: Makes the pipeline from the depthai module and the settings, for a device or for a replay on the host.
         stamper: Converts and checks the stamps.
     """
 

@@ -56,5 +56,5 @@ class PlayedCamera(Camera):
         """Pixels ``[H, W, 3]`` of the next image.
 
         Raises:
-            LinkLost: There is none, or it cannot be decoded.
+            LinkLost: The source has ended, or the image cannot be decoded.
         """

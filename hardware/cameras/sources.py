@@ -168,7 +168,7 @@ class FileSource(Source):
     Attributes:
         kind: ``file``.
         path: The video.
-        rate_hz: Frame rate; None uses that of the video [Hz].
+        rate_hz: Frame rate; None uses the video's [Hz].
         loop: Start over after the last frame.
     """
 

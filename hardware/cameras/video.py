@@ -16,7 +16,7 @@ class VideoCamera(PlayedCamera):
 
     Args:
         path: The file, in a format that OpenCV's FFmpeg reads.
-        rate_hz: Frame rate; None uses that of the file [Hz].
+        rate_hz: Frame rate; None uses the file's [Hz].
         loop: Start over after the last frame. Otherwise the device is lost, like an unplugged camera.
     """
 

@@ -1,7 +1,7 @@
 """The simulated lab in real time, behind the real protocols: a VESC on a pty, VICON packets, stamped frames on a socket.
 
 Four threads share one car: the VESC's (bytes in, bytes out), physics (200 Hz, absolute schedule; time held up is made up for,
-as real time would), VICON (100 Hz), and the camera, which owns the OpenGL context and draws the world as it was at the stamp.
+as in real time), VICON (100 Hz), and the camera, which owns the OpenGL context and draws the world at the time of the stamp.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ class LiveLabConfig(StrictModel):
         vesc: The motor controller.
         vicon: The motion capture system.
         physics_rate_hz: Steps of the car per second.
-        start_pose: Where the car stands at first: x [m], y [m], yaw [rad].
-        camera_effects: What the camera adds to an ideal picture: ``ideal``, ``webcam``, ``zed``, or the effects themselves.
+        start_pose: Initial pose of the car: x [m], y [m], yaw [rad].
+        camera_effects: Imperfections of the camera: ``ideal``, ``webcam``, ``zed``, or the effects themselves.
     """
 
     lab: LabConfig = LabConfig()
@@ -113,7 +113,7 @@ class LiveLab:
         config: All numbers.
         run_dir: Folder for the link and the log.
         socket_dir: Folder for the socket, whose path may have 107 characters at most; None is the run folder.
-        ready_timeout_s: How long building the world may take [s].
+        ready_timeout_s: Limit for building the world [s].
     """
 
     def __init__(

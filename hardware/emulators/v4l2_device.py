@@ -63,10 +63,10 @@ class VideoDevice:
     Attributes:
         formats: Sizes by pixel format.
         rates: Frames per second that it can do.
-        metadata_only: It is the second device of a webcam, which delivers no pictures.
+        metadata_only: Whether this is the second device of a webcam, which delivers no pictures.
         padding_bytes: Unused bytes at the end of every row.
         stamp_flags: Clock and event of its stamps, as in ``v4l2_buffer.flags``.
-        after_start: What it does to itself when the stream starts.
+        after_start: Changes that the device applies to itself when the stream starts.
         extension: Answers requests to the extension units of a UVC device: unit, selector, query, data.
     """
 

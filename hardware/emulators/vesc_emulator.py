@@ -112,7 +112,7 @@ class VescEmulator:
             return state
 
     def place(self, x_m: float, y_m: float, yaw_rad: float) -> None:
-        """Lift the car to another place; refused while it moves or is told to."""
+        """Put the car at another pose; refused while it moves or has a motor command."""
         with self._lock:
             speed = self.vehicle.state.speed_mps
             if self._firmware.commanded or abs(speed) > 0.05:

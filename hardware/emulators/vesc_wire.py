@@ -17,8 +17,8 @@ def wire_chunks(reply: bytes, fault: str | None, rng: random.Random) -> list[byt
     Args:
         reply: One or more frames.
         fault: ``dribble``: byte by byte; ``noise``: random bytes between intact frames; ``garbage``: random bytes instead of
-            them, many of them start and end bytes; ``bad_crc``: every frame with a wrong sum; ``silent``: nothing; None: as it is.
-        rng: Where random bytes come from.
+            them, many of them start and end bytes; ``bad_crc``: every frame with a wrong sum; ``silent``: nothing; None: unchanged.
+        rng: Source of random bytes.
     """
     if fault is None or not reply:
         return [reply] if reply else []

@@ -78,7 +78,7 @@ class ViconFrames:
             raise ValueError(f"expected a form of occlusion of {', '.join(OCCLUSION_FORMS)}, got {form!r}")
 
     def displace(self, name: str, T_there_from_true: Array | None) -> None:
-        """Measure a subject elsewhere, moved by a transform ``[4, 4]`` in the world; None measures the truth again."""
+        """Report a subject displaced by a transform ``[4, 4]`` in the world; None reports the truth again."""
         if T_there_from_true is None:
             self._displaced.pop(name, None)
         else:
@@ -159,7 +159,7 @@ class ViconEmulator:
             self._frames.occlude(name, form)
 
     def displace(self, name: str, T_there_from_true: Array | None) -> None:
-        """Measure a subject elsewhere, moved by a transform ``[4, 4]`` in the world; None measures the truth again."""
+        """Report a subject displaced by a transform ``[4, 4]`` in the world; None reports the truth again."""
         with self._lock:
             self._frames.displace(name, T_there_from_true)
 

@@ -1,8 +1,8 @@
 """Motion capture through the library ``motioncapture``, one backend for Vicon's DataStream, OptiTrack, Qualisys and others.
 
 The library is optional (``pip install 'advnerf[mocap]'``; Linux on x86 only) and is imported when it is used. It leaves subjects
-out that it does not see; whatever else means "lost" (zeros, not a number, the same bits again and again) is decided as for
-Tracker's own stream. Its wait for a frame has no end when the host falls silent, so it happens in a thread of its own.
+out that it does not see; other forms of "lost" (zeros, not a number, the same bits again and again) are detected as for
+Tracker's own stream. Its wait for a frame has no time-out when the host falls silent, so it runs in a separate thread.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class LibraryReceiver:
 
     @property
     def counts(self) -> ViconCounts:
-        """Counts of frames and poses so far."""
+        """Counts of frames and poses."""
         return self._tracker.counts
 
     @property

@@ -190,7 +190,7 @@ class ViconReceiver:
 
     @property
     def counts(self) -> ViconCounts:
-        """Counts of datagrams and poses so far."""
+        """Counts of datagrams and poses."""
         return self._tracker.counts
 
     @property

@@ -1,7 +1,7 @@
 """Detects measurements of a subject that cannot come from one continuously running motion-capture system.
 
 Tracker's object stream names no system. Two computers that send the same subject, or two streams behind one address, make the
-subject jump between two places. Nobody can tell which of them is right, so neither is trusted while both are heard.
+subject jump between two places. The receiver cannot know which of them is right, so it trusts neither while it hears both.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Limits of the car and the map from speed and steering to what its motor controller takes.
 
-This is the lowest layer above the wire: nothing faster, sharper or more sudden than stated here leaves the computer, whoever
-asks. The driver reports what it really sent, so a clipped command is visible in every recording.
+This is the lowest layer above the wire: no caller can send anything faster, sharper or more sudden than stated here.
+The driver reports what it really sent, so a clipped command is visible in every recording.
 """
 
 from __future__ import annotations
@@ -173,7 +173,7 @@ class DriveLimiter:
         return min(max(current_a, -self.limits.current_max_a), self.limits.current_max_a)
 
     def stop(self) -> None:
-        """Note that the car was told to stop, so that the next speed starts from standstill."""
+        """Record a stop, so that the next speed starts from standstill."""
         self._last = replace(self._last, speed_mps=0.0)
         self._last_s = None
 

@@ -1,4 +1,4 @@
-"""Dead reckoning of a car from what its motor controller measures (speed) and was told (servo): a bicycle, exact arc by arc.
+"""Dead reckoning of a car from its motor controller's measured speed and commanded servo position: a bicycle, exact arc by arc.
 
 The servo has no read-back, so the steering is the commanded one; after ``vesc_to_odom`` of the MIT RACECAR stack, whose explicit
 Euler step is replaced by the arc, and whose covariances are kept.

@@ -38,9 +38,9 @@ class Vesc:
     Args:
         port: Serial device, e.g. ``/dev/vesc``, or the pty of the twin.
         gains: The car's measured gains.
-        limits: What may be sent.
+        limits: Limits of the sent commands.
         stop_brake_current_a: Brake current for commands that are not finite, and on leaving the context [A].
-        write_timeout_s: How long the kernel may refuse bytes before the link counts as hung [s].
+        write_timeout_s: After this time without accepted bytes the link counts as hung [s].
     """
 
     def __init__(
@@ -169,7 +169,7 @@ class Vesc:
         return self._sent(erpm=as_sent(CommandId.SET_RPM, erpm))
 
     def brake(self, current_a: float) -> Sent:
-        """Brake with a motor current [A]; steering stays where it is."""
+        """Brake with a motor current [A]; steering does not change."""
         current_a = self.limiter.current(
             abs(current_a) if math.isfinite(current_a) else self._stop_brake_current_a
         )
@@ -220,7 +220,7 @@ class Vesc:
 
     @property
     def servo(self) -> float:
-        """Last servo value sent; before the first one, that of straight wheels."""
+        """Last servo value sent; before the first one, the value of straight wheels."""
         return self._servo
 
     def _decode(self, payload: bytes) -> Reply | None:

@@ -83,11 +83,11 @@ def encode_frame(payload: bytes) -> bytes:
 class FrameDecoder:
     """Finds frames in a stream of bytes that may be cut, concatenated or damaged.
 
-    Whatever does not check out (start, length, end, CRC) costs one byte, never a whole frame, as in the firmware: the bytes of a
-    good frame that follows a damaged one are still in the buffer when the search goes on.
+    A byte sequence that fails a check (start, length, end, CRC) costs one byte, never a whole frame, as in the firmware: the bytes of a
+    good frame that follows a damaged one are still in the buffer when the search continues.
 
     Attributes:
-        skipped_bytes: Bytes thrown away so far.
+        skipped_bytes: Number of discarded bytes.
     """
 
     def __init__(self, max_payload_bytes: int = MAX_PAYLOAD_BYTES) -> None:

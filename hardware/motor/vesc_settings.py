@@ -1,7 +1,7 @@
 """The two settings of a VESC that decide how far a car rolls on when its computer is gone: command time-out and brake current.
 
 They lie at the head of the controller's application configuration, which is read as a whole, changed in eight bytes and written
-back as a whole: everything behind them differs between firmware versions and stays as it was. Three heads are known (firmware
+back as a whole: everything behind them differs between firmware versions and is not changed. Three heads are known (firmware
 sources ``commands.c`` of 2.x, 3.x and 4.0x, ``confgenerator.c`` of 5.x and later); none of them names itself:
 
 - ``scaled`` (before 3.07): controller id u8, time-out u32 [ms], brake current i32 [mA];
@@ -60,7 +60,7 @@ class AppConfiguration:
 
     Attributes:
         data: The bytes after the command id.
-        layout: Which head it has: ``scaled``, ``plain`` or ``signed``.
+        layout: Layout of its head: ``scaled``, ``plain`` or ``signed``.
     """
 
     data: bytes

@@ -2,7 +2,7 @@
 older joystick devices (``/dev/input/js*``).
 
 Sources: ``linux/input.h`` (struct input_event, EVIOCGABS, EVIOCGKEY), ``linux/input-event-codes.h``, ``linux/joystick.h``
-(struct js_event). Buttons count as held whatever else is pressed; the MIT stack's exact match lets go when one more is.
+(struct js_event). A button counts as held regardless of others; the MIT stack's exact match lets go when one more is pressed.
 SYN_DROPPED means that the kernel has dropped events, possibly the release of a button, so the state is read again.
 """
 

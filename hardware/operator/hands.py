@@ -14,9 +14,9 @@ class Hands:
         autonomy: The button that lets the software drive is held.
         throttle: -1..1, forward positive.
         steering: -1..1, left positive.
-        stops: How often e-stop was pressed since the device was opened.
-        rearms: How often re-arm was pressed.
-        connected: Whether the device is there; nothing is held where it is not.
+        stops: Number of e-stop presses since the device was opened.
+        rearms: Number of re-arm presses since then.
+        connected: Whether the device is connected; a lost device holds no button.
         text: For people.
     """
 

@@ -61,13 +61,13 @@ class PygameDisplay:
     """A whole screen through SDL, without border and without scaling.
 
     Args:
-        index: Which screen, as the window system counts them.
-        size_px: Width and height it must have; None takes the desktop's.
-        edid: What the monitor says, for its size in millimetres.
+        index: Number of the screen in the window system.
+        size_px: Required width and height; None takes the desktop's.
+        edid: The monitor's EDID, for its size in millimetres.
 
     Raises:
-        DeviceNotFound: There is no such screen, or no window system.
-        HardwareError: The window did not get the size that was asked for (scaling, another resolution).
+        DeviceNotFound: The screen or the window system does not exist.
+        HardwareError: The window did not get the requested size (scaling, another resolution).
     """
 
     def __init__(

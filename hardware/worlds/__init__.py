@@ -1,4 +1,4 @@
-"""Places that are driven. `WORLDS` names those that this project brings; the contract is `hardware.worlds.world.World`."""
+"""The places that can be driven. `WORLDS` lists the built-in ones; the contract is `hardware.worlds.world.World`."""
 
 from __future__ import annotations
 

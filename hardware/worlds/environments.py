@@ -1,6 +1,6 @@
-"""Environments of simulators of other people: where they are, and whether one is there that fits its lock file.
+"""Environments of third-party simulators: where they are installed, and whether they match their lock file.
 
-``advnerf world install NAME`` makes one (`nodes.lab.worlds.install`); the worlds only look for its interpreter.
+``advnerf world install NAME`` creates one (`nodes.lab.worlds.install`); the worlds only look for its interpreter.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ MADE = "advnerf.json"
 
 @dataclass(frozen=True)
 class Environment:
-    """What a foreign world needs to run.
+    """What a third-party world needs to run.
 
     Attributes:
-        licence: What whoever installs it agrees to.
-        pythons: Versions of Python that it runs on, the preferred one first.
-        size_mb: About how much is installed [MB].
-        system: Debian packages that it needs beside Python's.
+        licence: Licence that the user accepts by installing it.
+        pythons: Supported Python versions, the preferred one first.
+        size_mb: Approximate installed size [MB].
+        system: Debian packages that it also needs.
     """
 
     name: str
@@ -39,23 +39,23 @@ class Environment:
 
     @property
     def lock(self) -> Path:
-        """Its packages, each with its version."""
+        """The lock file: its packages with their versions."""
         return SERVERS / f"{self.name}.lock.txt"
 
     @property
     def simulator(self) -> Path:
-        """Its file for ``serve.py``."""
+        """The simulator's file for ``serve.py``."""
         return SERVERS / f"{self.name}.py"
 
     @property
     def folder(self) -> Path:
-        """Where it is installed: in ``$ADVNERF_WORLDS``, or among this user's data."""
+        """Installation folder: in ``$ADVNERF_WORLDS``, or in the user's data folder."""
         chosen = os.environ.get(FOLDER_VARIABLE)
         return (Path(chosen) if chosen else user_place("data") / "worlds") / self.name
 
     @property
     def interpreter(self) -> Path:
-        """Its Python, whether it is there or not."""
+        """Path of its Python, whether installed or not."""
         return self.folder / "bin" / "python"
 
     @property
@@ -68,10 +68,10 @@ class Environment:
         return "installed" if fits else "installed from another lock file"
 
     def python(self) -> Path:
-        """Its Python.
+        """Path of its installed Python.
 
         Raises:
-            WorldNotInstalled: It is not there, or was made from another lock file.
+            WorldNotInstalled: It is not installed, or was installed from another lock file.
         """
         if (state := self.state) != "installed":
             raise WorldNotInstalled(

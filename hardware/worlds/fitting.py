@@ -14,24 +14,24 @@ from hardware.worlds.paths import ReferencePath, Segment
 _STRAIGHT_M = 2e-3
 _STRAIGHT_RAD = 1e-3
 _MAX_RADIUS_M = 1e5
-_CLOSING_RADIUS_M = 1e8  # what is straighter than this misses its end by less than 1e-7 m over some metres
+_CLOSING_RADIUS_M = 1e8  # anything straighter than this misses its end by less than 1e-7 m over some metres
 _MAX_TURN_RAD = (
     0.75 * math.pi
-)  # no lane turns so far in one piece; where one seems to, its points do not belong together
+)  # no lane turns this far in one piece; if one seems to, its points do not belong together
 
 
 def fit_lines_and_arcs(poses: ArrayLike, tolerance_m: float = 0.02) -> tuple[Segment, ...]:
     """Lines and arcs that start at the first pose and pass the others within a tolerance.
 
-    From wherever the chain stands, the farthest pose is sought that one line, or two arcs with a common tangent (a biarc), reach
-    without leaving the poses between by more than the tolerance. What a piece misses, the next one makes up for.
+    From the end of the chain, search the farthest pose that one line, or two arcs with a common tangent (a biarc), reaches
+    without leaving the poses between by more than the tolerance. The next piece corrects the error of the last one.
 
     Args:
         poses: x [m], y [m], yaw [rad] ``[N, 3]`` in driving order, at least two, at most a few metres apart.
         tolerance_m: Largest distance of a pose from the chain [m].
 
     Raises:
-        ValueError: There are fewer than two poses, or they are not in driving order on one smooth way.
+        ValueError: Fewer than two poses, or they do not lie on one smooth route in driving order.
     """
     listed = np.asarray(poses, dtype=np.float64)
     if listed.ndim != 2 or listed.shape[1] != 3 or len(listed) < 2 or not np.isfinite(listed).all():
@@ -56,12 +56,12 @@ def path_through(
     Args:
         points_m: x [m], y [m] ``[N, 2]`` in driving order, at least three, at most a few metres apart; the first one is not repeated at the
             end of a closed path.
-        goal: What a goal-conditioned policy is told on it.
-        closed: Whether the path goes on from the last point to the first.
+        goal: Goal input of a goal-conditioned policy on this path.
+        closed: Whether the path continues from the last point to the first.
         tolerance_m: Largest distance of a point from the path [m].
 
     Raises:
-        ValueError: There are too few points, two of them are the same, or they are on no smooth way.
+        ValueError: Too few points, a repeated point, or no smooth route through them.
     """
     points = np.asarray(points_m, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3 or not np.isfinite(points).all():
@@ -128,10 +128,10 @@ def advance(pose: ArrayLike, segment: Segment) -> Array:
 
 
 def _farthest(here: Array, ahead: Array, tolerance_m: float) -> tuple[int, list[Segment]]:
-    """How many of the poses ahead one piece covers, and the piece."""
+    """Number of poses ahead that one piece covers, and the piece."""
     best, found = 1, _connect(here, ahead[0])
     step, reach = 1, 2
-    # Doubling, then closer and closer: pieces are long and few.
+    # Doubling, then bisection: pieces are long and few.
     while step >= 1:
         pieces = _connect(here, ahead[reach - 1]) if reach <= len(ahead) else None
         if pieces is not None and _misses_m(here, pieces, ahead[:reach]) <= tolerance_m:
@@ -148,7 +148,7 @@ def _farthest(here: Array, ahead: Array, tolerance_m: float) -> tuple[int, list[
 
 
 def _connect(start: Array, end: Array) -> list[Segment] | None:
-    """A line if it ends at the pose well enough, else two arcs; None if the pose cannot be driven to."""
+    """A line if it ends at the pose well enough, else two arcs; None if the pose cannot be reached."""
     dx, dy = end[:2] - start[:2]
     c, s = math.cos(start[2]), math.sin(start[2])
     along, aside, turn = c * dx + s * dy, c * dy - s * dx, float(wrap_angle(end[2] - start[2]))
@@ -190,7 +190,7 @@ def _arc(chord: Array, turn: float, max_radius_m: float) -> list[Segment]:
 
 
 def _misses_m(here: Array, pieces: list[Segment], poses: Array) -> float:
-    """Largest distance of the poses from the pieces, both seen as they are driven [m]."""
+    """Largest distance of the poses from the pieces, matched in driving order [m]."""
     worst, start = np.full(len(poses), np.inf), here
     for piece in pieces:
         worst = np.minimum(worst, _distances_m(start, piece, poses))

@@ -1,4 +1,4 @@
-"""Rectangles on the floor: the car's body, and what it can run into."""
+"""Rectangles on the floor: the car's body, and its obstacles."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Footprint(Rectangle):
     """An obstacle, or the car's body.
 
     Attributes:
-        name: What it is, for reports.
+        name: Name for reports.
     """
 
     name: str = ""
@@ -48,12 +48,12 @@ class Footprint(Rectangle):
 
 
 def touched_by(body: Footprint, obstacles: Iterable[Footprint], half_m: float, edge: str) -> str:
-    """Name of what a body stands against: the nearest thing within 0.2 m, as a car stops just before it; empty if there is none.
+    """Name of the obstacle that a body stands against: the nearest within 0.2 m, as a car stops just before it; empty if none is near.
 
     Args:
         obstacles: Named footprints.
-        half_m: The world ends at plus and minus this [m].
-        edge: Name of that end, such as wall.
+        half_m: The world ends at plus and minus this in x and y [m].
+        edge: Name for the world's end, such as wall.
     """
     for reach_m in _REACHES_M:
         grown = replace(

@@ -1,4 +1,4 @@
-"""What the foreign worlds that ``advnerf world install`` brings have in common."""
+"""Common base of the third-party worlds that ``advnerf world install`` installs."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ class InstalledWorld(RemotePanelWorld):
     """A remote world whose simulator runs in an environment of `ENVIRONMENTS`.
 
     Args:
-        name: Name of the environment, and what messages call the world.
-        config: Its configuration, with ``camera``, ``photo`` and ``server``.
+        name: Name of the environment, and of the world in messages.
+        config: The world's configuration, with ``camera``, ``photo`` and ``server``.
         range_m: See `RemoteWorld`.
         lowest_m: See `RemoteWorld`.
-        unsent: Keys of the configuration that the simulator does not know, beside those three.
+        unsent: Further keys of the configuration that the simulator does not know.
     """
 
     def __init__(

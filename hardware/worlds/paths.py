@@ -19,11 +19,11 @@ class ReferencePath(PlainData):
     `hardware.worlds.fitting.path_through` makes one from points.
 
     Attributes:
-        start_pose: x [m], y [m], yaw [rad] where the path begins.
-        segments: In driving order, ``("line", length_m)`` or ``("arc", radius_m, angle_rad)``, left positive.
-        goal: What a goal-conditioned policy is told on this drive, such as a one-hot exit; empty where it is told nothing.
+        start_pose: x [m], y [m], yaw [rad] of the path's start.
+        segments: ``("line", length_m)`` or ``("arc", radius_m, angle_rad)`` in driving order, left positive.
+        goal: Goal input of a goal-conditioned policy on this drive, such as a one-hot exit; empty without a goal.
         closed: Whether the end of the path is its start.
-        drive_from: Where drives start, if that is not where the path begins, as on a closed path; x [m], y [m], yaw [rad].
+        drive_from: Start of the drives if it differs from the path's start, as on a closed path; x [m], y [m], yaw [rad].
     """
 
     start_pose: Pose
@@ -33,7 +33,7 @@ class ReferencePath(PlainData):
     drive_from: Pose | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what is no path."""
+        """Raise for an invalid path."""
         numbers = [
             *self.start_pose,
             *self.drive_start,
@@ -53,7 +53,7 @@ class ReferencePath(PlainData):
 
     @property
     def drive_start(self) -> Pose:
-        """x [m], y [m], yaw [rad] where drives start."""
+        """x [m], y [m], yaw [rad] of the drives' start."""
         return self.start_pose if self.drive_from is None else self.drive_from
 
     @property
@@ -64,7 +64,7 @@ class ReferencePath(PlainData):
     def pose_at(self, s_m: float) -> Pose:
         """Point and heading (x [m], y [m], yaw [rad]) at a distance along the path.
 
-        A closed path goes round again; an open one is extended straight beyond its ends.
+        A closed path wraps around; an open one is extended straight beyond its ends.
         """
         x, y, yaw = self.start_pose
         left = s_m % self.length_m if self.closed else s_m
@@ -84,7 +84,7 @@ class ReferencePath(PlainData):
         return x, y, math.remainder(yaw, 2.0 * math.pi)
 
     def mirrored(self, across: Literal["x", "y"]) -> ReferencePath:
-        """The same drive seen in a mirror along the x or the y axis of the world: what was on the left of the axis is on its right."""
+        """The same drive mirrored at the x or the y axis of the world: left and right of the axis are swapped."""
 
         def turned_over(pose: Pose) -> Pose:
             x, y, yaw = pose

@@ -1,4 +1,4 @@
-"""A simulator in a process and an environment of its own: starting it, asking it, and ending it whatever happens.
+"""Runs a simulator in a separate process and environment: starts it, calls it, and ends it in every case.
 
 The other end is ``hardware/worlds/servers/serve.py``, which also describes the messages. Every call has a deadline. A process that was
 killed, hangs, is late, or sends anything but the answer to the question is ended at once, and the call raises a named error.
@@ -44,11 +44,11 @@ _TOLD_LINES = 3
 
 @dataclass(frozen=True, eq=False)
 class ServerReply:
-    """What a server answered.
+    """The answer of a server.
 
     Attributes:
         result: JSON data.
-        arrays: Arrays by name; they may be written to.
+        arrays: Arrays by name; writable.
     """
 
     result: dict[str, Any]
@@ -59,15 +59,15 @@ class RemoteServer:
     """The process of one simulator.
 
     Args:
-        python: Interpreter of its environment.
-        simulator: Its file, which ``serve.py`` loads.
-        server: What serves it; another one than ``serve.py`` only in tests.
+        python: Interpreter of the simulator's environment.
+        simulator: The simulator's file, which ``serve.py`` loads.
+        server: Server script; another one than ``serve.py`` only in tests.
         starting_s: Deadline of the first answer, which needs no simulator [s].
 
     Raises:
         ServerLost: The process does not start.
-        ServerTimeout: It does not answer in time.
-        ServerVersionError: It speaks another version of the protocol.
+        ServerTimeout: The server does not answer in time.
+        ServerVersionError: The server uses another version of the protocol.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class RemoteServer:
         starting_s: float = _STARTING_S,
     ) -> None:
         self.name, self._sequence = name, 0
-        # The folder is this user's alone, and so is the socket in it.
+        # The folder, and so the socket in it, is accessible to this user only.
         self._folder = Path(tempfile.mkdtemp(prefix="advnerf-world-"))
         self._log = self._folder / "log"
         self._context = zmq.Context()
@@ -101,7 +101,7 @@ class RemoteServer:
 
     def _start(self, command: Sequence[str]) -> subprocess.Popen[bytes]:
         with self._log.open("wb") as log:
-            # A session of its own: Ctrl-C reaches the client, which ends the server with all that it started.
+            # A separate session: Ctrl-C reaches the client only, which ends the server with all that it started.
             return subprocess.Popen(
                 command,
                 stdin=subprocess.PIPE,
@@ -123,13 +123,13 @@ class RemoteServer:
         return self._end.alive and self._process is not None and self._process.poll() is None
 
     def call(self, name: str, arguments: Mapping[str, Any], arrays: Arrays, deadline_s: float) -> ServerReply:
-        """Ask, and wait for the answer.
+        """Call the simulator and wait for the answer.
 
         Args:
             name: Name of the call.
             arguments: JSON data.
             arrays: Arrays by name: uint8, float32 or float64.
-            deadline_s: How long the answer may take [s].
+            deadline_s: Largest time until the answer [s].
 
         Raises:
             RemoteWorldError: One of `hardware.worlds.remote_errors`; the process was ended.
@@ -137,7 +137,7 @@ class RemoteServer:
         try:
             return self._call(name, arguments, arrays, deadline_s)
         except BaseException:
-            # Also after Ctrl-C: what is under way would be taken for the answer to the next question.
+            # Also after Ctrl-C: an outstanding answer would be taken for the answer to the next question.
             self.kill()
             raise
 
@@ -169,14 +169,14 @@ class RemoteServer:
         try:
             self._socket.send_multipart([head, *(frame.tobytes() for frame in frames)], flags=zmq.NOBLOCK)
         except zmq.Again:
-            # Before the server has connected there is nobody to send to.
+            # Before the server has connected there is no peer to send to.
             self._wait(name, zmq.POLLOUT, end_s, deadline_s)
             self._socket.send_multipart([head, *(frame.tobytes() for frame in frames)])
         self._wait(name, zmq.POLLIN, end_s, deadline_s)
         return self._read(name, self._socket.recv_multipart())
 
     def _wait(self, name: str, event: int, end_s: float, deadline_s: float) -> None:
-        """Until the socket is ready, the process ends, or time is up."""
+        """Wait until the socket is ready, the process ends, or time is up."""
         assert self._process is not None, "it was started by the constructor"
         while True:
             left_ms = math.ceil(1e3 * (end_s - time.monotonic()))
@@ -243,7 +243,7 @@ class RemoteServer:
         )
 
     def _said(self) -> str:
-        """The end of what the process wrote, for messages."""
+        """The end of the process's output, for messages."""
         with contextlib.suppress(OSError):
             lines = self._log.read_bytes()[-4000:].decode("utf-8", "replace").strip().splitlines()
             if lines:
@@ -252,11 +252,11 @@ class RemoteServer:
 
 
 def _end(process: subprocess.Popen[bytes] | None, context: zmq.Context[Any], folder: Path) -> None:
-    """End the process, in order if it listens, and free what was opened for it."""
+    """End the process, gracefully if it listens, and free its resources."""
     if process is not None:
         if process.stdin is not None:
             with contextlib.suppress(OSError):
-                process.stdin.close()  # what the server takes as the order to end
+                process.stdin.close()  # the server takes this as the request to end
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(_ENDING_S)
         _kill_all(process)
@@ -265,7 +265,7 @@ def _end(process: subprocess.Popen[bytes] | None, context: zmq.Context[Any], fol
 
 
 def _kill_all(process: subprocess.Popen[bytes]) -> None:
-    """Kill a process with all that it started; it leads a session of its own."""
+    """Kill a process with all that it started; it leads its own session."""
     with contextlib.suppress(ProcessLookupError, PermissionError):
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()

@@ -1,4 +1,4 @@
-"""What a simulator in another process may answer: pictures, depth and poses are looked at before anybody uses them.
+"""Checks the pictures, depth and poses that a simulator in another process returns.
 
 Each function raises a named error of `hardware.worlds.remote_errors` that says what was expected and what came.
 """
@@ -16,11 +16,11 @@ from advnerf_core.geometry import Array, Pinhole, VehicleState, transform_points
 from hardware.worlds.remote_errors import WrongDepthError, WrongPictureError, WrongPoseError
 from hardware.worlds.world import Depth, Rgb
 
-_POSE_TOLERANCE = 1e-3  # of poses that are asked for [m, and entries of rotations]
+_POSE_TOLERANCE = 1e-3  # of requested poses [m, and entries of rotations]
 _PUT_TOLERANCE = 1e-4  # of the car after a reset [m, rad and m/s]
-# What no car does between two commands: beyond its speed [m, and as a factor], and turning [rad/s].
+# More than a car can move between two commands: beyond its speed [m, and as a factor], and turning [rad/s].
 _JUMP_M, _JUMP_FACTOR, _JUMP_RADPS, _SHORTEST_S = 0.5, 1.6, 6.0, 0.1
-# So many of the points that a camera sees may seem to lie under the lowest ground, by more than this and this share of their distance.
+# Largest share of a camera's points that may seem to lie under the lowest ground, by more than this and this share of their distance.
 _BELOW_SHARE, _BELOW_M, _BELOW_RANGE, _EVERY_PX = 0.1, 0.3, 0.03, 4
 # The lower edge of the driving camera's picture shows the ground, not something at this share of the camera's height.
 _EDGE_ROWS, _EDGE_HEIGHT = 0.06, 0.4
@@ -28,10 +28,10 @@ _LEAST_FINITE, _RANGE_TOLERANCE = 0.02, 0.01
 
 
 def state_in(result: Mapping[str, Any]) -> tuple[VehicleState, bool]:
-    """State of the car and whether it is blocked, out of an answer.
+    """State of the car and whether it is blocked, from an answer.
 
     Raises:
-        WrongPoseError: They are not there, or not finite.
+        WrongPoseError: The state is missing or not finite.
     """
     listed, blocked = result.get("state"), result.get("blocked")
     numbers = [value for value in listed if type(value) in (int, float)] if isinstance(listed, list) else []
@@ -43,10 +43,10 @@ def state_in(result: Mapping[str, Any]) -> tuple[VehicleState, bool]:
 
 
 def require_put_down(state: VehicleState, x_m: float, y_m: float, yaw_rad: float) -> None:
-    """The car is at rest where it was put.
+    """Check that the car is at rest at the requested pose.
 
     Raises:
-        WrongPoseError: It is elsewhere, or moves.
+        WrongPoseError: The car is at another pose, or moves.
     """
     apart = math.dist((state.x_m, state.y_m), (x_m, y_m))
     turned = abs(float(wrap_angle(state.yaw_rad - yaw_rad)))
@@ -57,10 +57,10 @@ def require_put_down(state: VehicleState, x_m: float, y_m: float, yaw_rad: float
 
 
 def require_driven(before: VehicleState, after: VehicleState, speed_mps: float, duration_s: float) -> None:
-    """The car has not moved or turned farther than a car can.
+    """Check that the car has not moved or turned farther than a car can.
 
     Raises:
-        WrongPoseError: It has.
+        WrongPoseError: The car has moved or turned too far.
     """
     fastest_mps = max(abs(before.speed_mps), abs(speed_mps))
     way_m = math.dist((after.x_m, after.y_m), (before.x_m, before.y_m))
@@ -73,11 +73,11 @@ def require_driven(before: VehicleState, after: VehicleState, speed_mps: float, 
 
 
 def picture_in(arrays: Mapping[str, NDArray[Any]], pinhole: Pinhole, T_world_from_camera: Array) -> Rgb:
-    """The picture ``[H, W, 3]`` out of an answer, taken from where it was asked for.
+    """The picture ``[H, W, 3]`` of an answer, taken from the requested pose.
 
     Raises:
-        WrongPictureError: It is missing, of another size or type, or of one value.
-        WrongPoseError: It was taken from elsewhere.
+        WrongPictureError: The picture is missing, of another size or type, or of one value.
+        WrongPoseError: The picture was taken from another pose.
     """
     rgb, taken = arrays.get("rgb"), arrays.get("T_world_from_camera")
     size = (pinhole.height, pinhole.width, 3)
@@ -104,15 +104,15 @@ def depth_in(
     range_m: tuple[float, float],
     lowest_m: float,
 ) -> Depth:
-    """Planar depth ``[H, W]`` [m] out of an answer: within the camera's range or infinite, and not under the ground.
+    """Planar depth ``[H, W]`` [m] of an answer: within the camera's range or infinite, and not under the ground.
 
     Args:
-        T_world_from_camera: Where it is ``[4, 4]``.
+        T_world_from_camera: Pose ``[4, 4]`` of the camera.
         range_m: Nearest and farthest depth [m].
         lowest_m: Height of the lowest ground [m].
 
     Raises:
-        WrongDepthError: It is something else.
+        WrongDepthError: The array is not such a depth map.
     """
     depth_m, size = arrays.get("depth"), (pinhole.height, pinhole.width)
     if depth_m is None or depth_m.shape != size or depth_m.dtype != np.float32:
@@ -140,10 +140,10 @@ def depth_in(
 
 
 def require_ground_ahead(depth_m: Depth, pinhole: Pinhole, T_world_from_camera: Array) -> None:
-    """The lower edge of the driving camera's picture shows ground, where all of it is nearer than infinity.
+    """Check that the lower edge of the driving camera's picture shows ground; not checked where part of it is at infinite depth.
 
     Raises:
-        WrongDepthError: It shows something in the air, right before the camera.
+        WrongDepthError: An object is in the air right before the camera.
     """
     rows = slice(pinhole.height - max(int(_EDGE_ROWS * pinhole.height), 1), None)
     z_m = depth_m[rows]

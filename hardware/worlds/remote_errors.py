@@ -1,4 +1,4 @@
-"""What can go wrong with a world in another process, each with what to do about it. None of these ends as a result."""
+"""Errors of a world in another process; each message says what to do. A drive that raises one has no result."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ class RemoteWorldError(WorldError):
 
 
 class WorldNotInstalled(RemoteWorldError):
-    """The world's own environment is not there, or was made from another lock file."""
+    """The world's environment is not installed, or was installed from another lock file."""
 
 
 class ServerLost(RemoteWorldError):
@@ -22,7 +22,7 @@ class ServerTimeout(RemoteWorldError):
 
 
 class ServerVersionError(RemoteWorldError):
-    """The process of the world speaks another version of the protocol."""
+    """The process of the world uses another version of the protocol."""
 
 
 class ServerProtocolError(RemoteWorldError):
@@ -30,16 +30,16 @@ class ServerProtocolError(RemoteWorldError):
 
 
 class SimulatorError(RemoteWorldError):
-    """The simulator raised an error of its own."""
+    """The simulator raised an error."""
 
 
 class WrongPictureError(RemoteWorldError):
-    """A picture is not what a camera of the world gives: its size, its type, or a picture of one colour."""
+    """A picture has a wrong size or type, or is of one colour."""
 
 
 class WrongDepthError(RemoteWorldError):
-    """Depth is not what a camera of the world gives: its size, its type, or values that are no planar depth in metres."""
+    """Depth has a wrong size or type, or values that are not planar depth in metres."""
 
 
 class WrongPoseError(RemoteWorldError):
-    """A picture was taken from elsewhere, or the car is where no car can be."""
+    """A picture was taken from another pose, or the car is where no car can be."""

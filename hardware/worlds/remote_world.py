@@ -1,7 +1,7 @@
-"""The `World` contract on top of a simulator in another process, which is trusted with nothing.
+"""The `World` contract on top of a simulator in another process, whose answers are all checked.
 
-Whatever does not fit ends the process and raises a named error (`hardware.worlds.remote_errors`): the drive in which that happens has no
-result. The next `reset`, or the next picture from elsewhere, starts the process again, so that other drives go on.
+A wrong answer ends the process and raises a named error (`hardware.worlds.remote_errors`): the current drive has no
+result. The next `reset`, or the next picture from another pose, restarts the process, so that other drives continue.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _Arrays = Mapping[str, NDArray[Any]]
 
 
 class ServerDeadlines(StrictModel):
-    """How long the process of a world may take; nothing that results depend on.
+    """Time limits for the process of a world; results do not depend on them.
 
     Attributes:
         open_s: Opening the simulator: loading its models, compiling its shaders [s].
@@ -51,17 +51,17 @@ class ServerDeadlines(StrictModel):
 class RemoteWorld(ABC):
     """A world whose simulator runs in another process; a `hardware.worlds.world.World`.
 
-    A subclass says which interpreter runs it (`python`), what its map is (`description_of`), and from where it is photographed.
+    A subclass defines the interpreter (`python`), the map (`description_of`), and the poses of the photographs.
 
     Args:
         simulator: The simulator's file, for ``serve.py``.
-        settings: What the simulator is opened with, as JSON data.
+        settings: Settings that the simulator is opened with, as JSON data.
         cameras: Intrinsics of the driving camera, and of the camera of `photograph`.
-        T_car_from_camera: Where the driving camera sits on the car ``[4, 4]``.
-        range_m: Nearest and farthest depth that the cameras give [m]; what is farther is infinite.
+        T_car_from_camera: Pose ``[4, 4]`` of the driving camera on the car.
+        range_m: Nearest and farthest depth that the cameras give [m]; anything farther is infinite.
         lowest_m: Height of the lowest ground [m].
-        deadlines: How long calls may take.
-        server: What serves the simulator; another file than ``serve.py`` only in tests.
+        deadlines: Time limits of calls.
+        server: Server script; another file than ``serve.py`` only in tests.
 
     Attributes:
         camera_pinhole: Intrinsics of the driving camera.
@@ -97,24 +97,24 @@ class RemoteWorld(ABC):
         """Interpreter of the simulator's environment.
 
         Raises:
-            WorldNotInstalled: There is none.
+            WorldNotInstalled: The environment is not installed.
         """
 
     @abstractmethod
     def description_of(self, facts: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> WorldDescription:
-        """What the simulator said when it was opened, as a description."""
+        """The description from the facts that the simulator returned when it was opened."""
 
     def opened_with(self) -> _Arrays:
-        """Arrays by name that the simulator is opened with beside its settings, such as files; none unless a subclass says so."""
+        """Arrays by name that the simulator is opened with beside its settings, such as files; empty by default."""
         return {}
 
     @abstractmethod
     def photo_poses(self, count: int, rng: np.random.Generator, /) -> list[Array]:
-        """From where it is photographed for learning; see `World.photo_poses`."""
+        """Poses of the photographs for learning; see `World.photo_poses`."""
 
     @property
     def T_car_from_camera(self) -> Array:
-        """Where the driving camera sits on the car ``[4, 4]``."""
+        """Pose ``[4, 4]`` of the driving camera on the car."""
         return self._mount.copy()
 
     @property
@@ -134,11 +134,11 @@ class RemoteWorld(ABC):
     @property
     def blocked(self) -> bool:
         """Whether the car stands against something."""
-        _ = self.state  # nothing is known of a car that was not put down
+        _ = self.state  # raises for a car that was not put down
         return self._blocked
 
     def describe(self) -> WorldDescription:
-        """What the simulator says of its map.
+        """The simulator's description of its map.
 
         Raises:
             NotOpenError: The world was never opened.
@@ -228,7 +228,7 @@ class RemoteWorld(ABC):
                     "expected the same map as when it was opened before; got another one"
                 )
         self._description = said
-        # The first picture of a camera may take as long as opening, as shaders are compiled for it.
+        # The first picture of a camera may take as long as opening, because its shaders are compiled then.
         place = planar_pose(*next(iter(said.paths.values())).start_pose) @ self._mount
         for camera in cameras:
             asked = {"camera": camera, "depth": False}
@@ -238,14 +238,14 @@ class RemoteWorld(ABC):
         try:
             return self.description_of(answer.result, answer.arrays)
         except WorldError:
-            raise  # a map that is none for this configuration
+            raise  # the map does not fit this configuration
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise ServerProtocolError(
                 f"expected a map that can be driven; got {type(error).__name__}: {error}"
             ) from error
 
     def _ask(self, call: str, arguments: Mapping[str, Any], arrays: _Arrays | None = None) -> ServerReply:
-        """Call the open simulator; where it was lost it is opened again."""
+        """Call the open simulator; it is reopened if it was lost."""
         self._require_open()
         if self.server is None:
             self._open()
@@ -261,7 +261,7 @@ class RemoteWorld(ABC):
 
     @contextmanager
     def _or_lost(self) -> Iterator[None]:
-        """An answer that is refused ends the process; the error says of which world it is."""
+        """End the process on a wrong answer; the error names the world."""
         try:
             yield
         except WorldError as error:
@@ -286,14 +286,14 @@ class RemoteWorld(ABC):
 
 
 class RemotePanelWorld(RemoteWorld):
-    """A remote world whose simulator takes textured panels into its own scene; a `hardware.worlds.world.NativePanels`."""
+    """A remote world whose simulator adds textured panels to its own scene; a `hardware.worlds.world.NativePanels`."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self._panels: dict[str, tuple[Panel, Rgb]] = {}
 
     def add_panel(self, name: str, panel: Panel, rgb: Rgb | None) -> None:
-        """Put a textured panel into the simulator's scene, or take it out; see `hardware.worlds.world.NativePanels`."""
+        """Add a textured panel to the simulator's scene, or remove it; see `hardware.worlds.world.NativePanels`."""
         if rgb is None:
             self._panels.pop(name, None)
             self._ask("add_panel", {"name": name, "size_m": None})

@@ -1,4 +1,4 @@
-"""From where a road is photographed for learning: along its lanes, off them, and from above."""
+"""Poses from which a road is photographed for learning: along its lanes, off them, and from above."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def road_photo_poses(
     """Poses that cover the paths evenly, mixed so that any prefix covers them too.
 
     Of ten photographs six are taken close to a lane's middle at about the driving camera's height, two from a car that has left its lane and
-    looks elsewhere, and two from above the lane, looking down its course or across it. Lengths are in the camera's height and the lane's width, so
+    looks aside, and two from above the lane, looking along it or across it. Lengths are in units of the camera's height and the lane's width, so
     that a street of model cars is photographed as a street of cars.
 
     Args:

@@ -1,4 +1,4 @@
-"""What worlds share whose cameras see the place from any pose."""
+"""Common base of worlds whose cameras see the place from any pose."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hardware.worlds.world import View
 
 
 class SeenWorld(ABC):
-    """A world whose driving camera sees from any pose of the car: pictures from where it is, from elsewhere, and the end."""
+    """A world whose driving camera sees from any pose of the car, the current one and others."""
 
     @property
     @abstractmethod
@@ -22,7 +22,7 @@ class SeenWorld(ABC):
         return self._see(self.state.T_world_from_car, depth)
 
     def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True) -> View:
-        """What the driving camera would see from another pose of the car (see :meth:`observe`); the car stays where it is."""
+        """The driving camera's view from another pose of the car (see :meth:`observe`); the car does not move."""
         return self._see(planar_pose(x_m, y_m, yaw_rad), depth)
 
     @abstractmethod

@@ -1,7 +1,7 @@
-"""The contract of a place that is driven: a world has a car, a camera with depth, photographs, and says about itself what an experiment needs.
+"""The contract of a place that can be driven: a world has a car, a camera with depth, photographs, and a description for an experiment.
 
 The simulated junction (`hardware.worlds.junction.scene.Intersection`) and a junction of a CARLA map (`hardware.worlds.carla.scene.CarlaScene`)
-are worlds; a world of yours is one class in one file (docs/worlds.md), and ``advnerf world check`` says whether it keeps this contract.
+are worlds; your own world is one class in one file (docs/worlds.md), and ``advnerf world check`` checks it against this contract.
 
 Axes are right-handed, the world's z points up; metres, radians, seconds. Cameras have OpenCV axes: x right, y down, z forward. The car's frame lies on
 the ground under the point whose x, y and heading are its state, x forward, y left.
@@ -31,16 +31,16 @@ View = tuple[Rgb, Depth | None]
 
 
 class WorldError(AdvnerfError, ValueError):
-    """A world's description, or what was kept of one, is not usable."""
+    """A world's description, or a stored one, is not usable."""
 
 
 class NotOpenError(AdvnerfError, RuntimeError):
-    """Something was asked of a world that it knows only between ``__enter__`` and ``__exit__``."""
+    """The world must be open for this call, that is between ``__enter__`` and ``__exit__``."""
 
 
 @dataclass(frozen=True)
 class CarDescription(PlainData):
-    """The car as an attack believes it to be: without lag and errors, which the world's own car may have.
+    """The car as an attack models it: without the lag and errors that the world's own car may have.
 
     Attributes:
         kind: ``dubins``: a control is a turn rate [rad/s]; ``ackermann``: it is a wheel angle [rad]. Left is positive in both.
@@ -55,7 +55,7 @@ class CarDescription(PlainData):
     wheelbase_m: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what cannot drive."""
+        """Raise for a car that cannot drive."""
         right, left = self.control_limits
         if self.kind not in ("dubins", "ackermann") or not (
             0.0 < self.speed_mps < np.inf and -np.inf < right < left < np.inf
@@ -81,13 +81,13 @@ class CarDescription(PlainData):
 
 @dataclass(frozen=True)
 class Box(PlainData):
-    """The part of the world that is learned.
+    """The learned part of the world.
 
     Attributes:
         min_m: Low corner [m].
         max_m: High corner [m].
-        contraction: Whether there is more to see outside the box, such as a town and its sky; it is then learned with less detail. Without
-            it the box holds everything that any camera sees.
+        contraction: Whether there is more to see outside the box, such as a town and its sky, which is then learned with less detail. Otherwise
+            the box holds everything that any camera sees.
     """
 
     min_m: Vector3
@@ -108,8 +108,8 @@ class Panel(PlainData):
 
     Attributes:
         T_world_from_face: Frame ``[4, 4]`` at its centre: x out of it towards a viewer, z up.
-        width_m: Its width [m].
-        height_m: Its height [m].
+        width_m: Width of the panel [m].
+        height_m: Height of the panel [m].
         screen_px: Width and height [px] of a screen, which shows pictures by itself (`Screens.show`); None for a board.
     """
 
@@ -120,22 +120,22 @@ class Panel(PlainData):
 
     @property
     def square_m(self) -> float:
-        """Side of the largest square in its middle [m]."""
+        """Side of the largest square in the panel's middle [m]."""
         return min(self.width_m, self.height_m)
 
 
 @dataclass(frozen=True, eq=False)
 class WorldDescription(PlainData):
-    """What an experiment must know of a world, as plain data: it is kept beside the photographs, and read where the world is not open.
+    """A world's description for an experiment, as plain data: stored beside the photographs, and read where the world is not open.
 
     Attributes:
-        paths: What is driven, by name; goals are equally long.
+        paths: Paths to drive, by name; all goals have the same length.
         off_track_m: Cross-track error beyond which the car has left its lane [m]: half a lane's width.
         car: The car.
         camera: Intrinsics of the driving camera.
-        T_car_from_camera: Where it sits on the car ``[4, 4]``.
-        box: What is learned.
-        lanes: Middles of the lanes in which no object may stand: at least the paths, which stand here if nothing is given.
+        T_car_from_camera: Pose ``[4, 4]`` of the driving camera on the car.
+        box: The learned part of the world.
+        lanes: Middles of the lanes that objects must keep clear of: at least the paths, which are the default.
         road_edge: Lines ``[N, 2]`` [m] where the road ends, for drawings.
         panels: Boards and screens that can carry a texture, by name.
         fence_m: The car is stopped where abs(x) or abs(y) exceeds this [m]; None without a fence.
@@ -157,7 +157,7 @@ class WorldDescription(PlainData):
     facts: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check what the parts must have in common."""
+        """Check that the parts fit together."""
         if not self.paths:
             raise WorldError("expected at least one path; got none")
         if len({len(path.goal) for path in self.paths.values()}) != 1:
@@ -180,11 +180,11 @@ class WorldDescription(PlainData):
 class World(Protocol):
     """A place with one car in it that is observed and driven step by step; time passes only in ``step``.
 
-    Use it as a context manager: renderers and servers are opened by ``__enter__``, so that making one is cheap. The same configuration and the same
+    Use it as a context manager: ``__enter__`` opens renderers and servers, so that construction is cheap. The same configuration and the same
     calls give the same results.
 
     Its class has an attribute ``Config``, a pydantic model or a dataclass, and is called with one: ``Intersection(Intersection.Config())``. All of the
-    configuration counts as something that results depend on, but fields with ``exclude=True``: a server's address, or its patience.
+    configuration counts as something that results depend on, except fields with ``exclude=True``, such as a server's address or time limits.
     """
 
     @property
@@ -199,7 +199,7 @@ class World(Protocol):
 
     @property
     def T_car_from_camera(self) -> Array:
-        """Where the driving camera sits on the car ``[4, 4]``."""
+        """Pose ``[4, 4]`` of the driving camera on the car."""
         ...
 
     @property
@@ -213,15 +213,15 @@ class World(Protocol):
         ...
 
     def describe(self) -> WorldDescription:
-        """What an experiment must know; the same every time.
+        """The world's description; the same every time.
 
         Raises:
-            NotOpenError: The world must be asked first, as a server for its map. Others may be described without being opened.
+            NotOpenError: The world must be opened first, such as one that asks a server for its map. Others may be described without being opened.
         """
         ...
 
     def photo_poses(self, count: int, rng: np.random.Generator, /) -> list[Array]:
-        """From where it is photographed for learning: ``count`` transforms ``T_world_from_camera`` ``[4, 4]``, mixed so that any prefix covers the paths."""
+        """Poses of the photographs for learning: ``count`` transforms ``T_world_from_camera`` ``[4, 4]``, mixed so that any prefix covers the paths."""
         ...
 
     def reset(self, x_m: float, y_m: float, yaw_rad: float, /) -> VehicleState:
@@ -243,7 +243,7 @@ class World(Protocol):
         ...
 
     def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True) -> View:
-        """What the driving camera would see from another pose of the car (see :meth:`observe`); the car stays where it is."""
+        """The driving camera's view from another pose of the car (see :meth:`observe`); the car does not move."""
         ...
 
     def photograph(self, T_world_from_camera: Array, /) -> Rgb:
@@ -258,7 +258,7 @@ class World(Protocol):
 
 
 class WorldClass(Protocol):
-    """What a world's name stands for: a class that is called with its configuration.
+    """The class behind a world's name, which is called with its configuration.
 
     Attributes:
         Config: A pydantic model or a dataclass; all of its fields have defaults.
@@ -273,14 +273,14 @@ class WorldClass(Protocol):
 
 @dataclass(frozen=True)
 class Traits:
-    """What is known of a world before it is opened. A world without the attribute ``traits`` has these defaults.
+    """Properties of a world that are known before it is opened. A world without the attribute ``traits`` has these defaults.
 
     Attributes:
         unseen: Keys of the configuration (``car.turn_rate_lag_s``) that change how the world's own car moves, and neither a picture nor the
             description: what was captured and learned stays valid when they change.
-        exclusive: Whether only one may be open at a time, as where one server steps one world.
+        exclusive: Whether only one may be open at a time, such as a server that steps one world.
         step_s: Every step is a whole multiple of this [s]; None for any duration.
-        own_photo_colours: Whether ``photograph`` has colours of its own, as a phone has: an experiment then fits a map to those of the driving camera.
+        own_photo_colours: Whether ``photograph`` has other colours than the driving camera, as a phone has: an experiment then fits a colour map between them.
     """
 
     unseen: tuple[str, ...] = ()
@@ -295,13 +295,13 @@ class HasTraits(Protocol):
 
     @property
     def traits(self) -> Traits:
-        """What is known of it before it is opened."""
+        """Properties that are known before the world is opened."""
         ...
 
 
 @runtime_checkable
 class Overview(Protocol):
-    """A world that can be seen from above, for reports."""
+    """A world with a view from above, for reports."""
 
     def overview(self) -> tuple[Rgb, Pinhole, Array]:
         """A picture ``[H, W, 3]``, and the camera that took it: its intrinsics and ``T_world_from_camera`` ``[4, 4]``."""
@@ -310,7 +310,7 @@ class Overview(Protocol):
 
 @runtime_checkable
 class NamesObstacles(Protocol):
-    """A world that says what its car ran into."""
+    """A world that names what its car ran into."""
 
     def touches(self, x_m: float, y_m: float, yaw_rad: float, /) -> str:
         """Name of what the car stands against at a pose, such as ``wall``; empty if nothing is near."""
@@ -319,7 +319,7 @@ class NamesObstacles(Protocol):
 
 @runtime_checkable
 class HasSolids(Protocol):
-    """A world that says what its car can run into, open or not: the objective ``collision`` needs it."""
+    """A world that lists what its car can run into, open or not: the objective ``collision`` needs it."""
 
     @property
     def car_body(self) -> Footprint:
@@ -333,10 +333,10 @@ class HasSolids(Protocol):
 
 
 def require_depth(view: View) -> tuple[Rgb, Depth]:
-    """A view that was asked for with depth.
+    """A view that must have depth.
 
     Raises:
-        WorldError: It has none.
+        WorldError: The view has no depth.
     """
     rgb, depth_m = view
     if depth_m is None:
@@ -348,11 +348,11 @@ def require_depth(view: View) -> tuple[Rgb, Depth]:
 
 @dataclass(frozen=True, eq=False)
 class Photograph:
-    """A photograph that was taken before.
+    """A stored photograph.
 
     Attributes:
-        T_world_from_camera: Its pose ``[4, 4]``.
-        look: Reads it: colours ``[h, w, 3]``, undistorted, and their intrinsics.
+        T_world_from_camera: Pose ``[4, 4]`` of the camera.
+        look: Reads the photograph: colours ``[h, w, 3]``, undistorted, and their intrinsics.
     """
 
     T_world_from_camera: Array
@@ -361,47 +361,47 @@ class Photograph:
 
 @runtime_checkable
 class Photographed(Protocol):
-    """A place that is known by photographs alone: no others can be taken, and nothing drives there."""
+    """A place that is known by photographs alone: no new ones can be taken, and nothing drives there."""
 
     def photographs(self, held_out: int, /) -> tuple[Sequence[Photograph], Sequence[Photograph]]:
-        """Photographs to learn from, and as many views of the driving camera as are asked for, which nothing learns from."""
+        """Photographs to learn from, and ``held_out`` views of the driving camera that are not learned from."""
         ...
 
 
 def collided_with(world: World, pose: ArrayLike) -> str:
-    """Name of what the car ran into that was stopped at a pose (x [m], y [m], yaw [rad]); ``obstacle`` where the world names nothing there."""
+    """Name of the obstacle that stopped the car at a pose (x [m], y [m], yaw [rad]); ``obstacle`` if the world names none there."""
     x_m, y_m, yaw_rad = map(float, np.asarray(pose)[:3])
     return (world.touches(x_m, y_m, yaw_rad) if isinstance(world, NamesObstacles) else "") or "obstacle"
 
 
 def traits_of(world: World) -> Traits:
-    """What is known of a world before it is opened."""
+    """Properties of a world that are known before it is opened."""
     return world.traits if isinstance(world, HasTraits) else Traits()
 
 
 def members_of_a_world() -> tuple[str, ...]:
-    """Names of everything that a world must have."""
+    """Names of the members that every world must have."""
     named = [name for name in vars(World) if not name.startswith("_") or name in ("__enter__", "__exit__")]
     return tuple(sorted(named))
 
 
 @runtime_checkable
 class Screens(Protocol):
-    """A world that has screens among its panels."""
+    """A world with screens among its panels."""
 
     def show(self, panel: str, rgb: Rgb | None, /) -> None:
-        """Show a picture ``[h, w, 3]`` (row 0 on top) on the whole of a screen; None shows what it shows when nothing is asked."""
+        """Show a picture ``[h, w, 3]`` (row 0 on top) on a whole screen; None shows the screen's idle picture."""
 
 
 @runtime_checkable
 class NativePanels(Protocol):
-    """A world that takes textured panels into its own scene: its own renderer lights, shades and occludes them."""
+    """A world that adds textured panels to its own scene: its own renderer lights, shades and occludes them."""
 
     def add_panel(self, name: str, panel: Panel, rgb: Rgb | None, /) -> None:
-        """Put a panel into the scene, in the place of one of the same name; it stays until it is taken out, or the world is closed.
+        """Add a panel to the scene, replacing one of the same name; it stays until it is removed, or the world is closed.
 
         Args:
-            name: Of the panel.
-            panel: Pose and true size; its ``screen_px`` means nothing here.
-            rgb: Texture ``[h, w, 3]``, row 0 on top for a viewer; None takes the panel out.
+            name: Name of the panel.
+            panel: Pose and true size; its ``screen_px`` is ignored here.
+            rgb: Texture ``[h, w, 3]``, row 0 on top for a viewer; None removes the panel.
         """

@@ -1,4 +1,4 @@
-"""Where each cell of a run folder is, from its files: also of cells that other processes run."""
+"""Progress of each cell of a run folder, read from its files: also of cells that other processes run."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from advnerf_core.documents import read_json
 
-# Clocks of a file system and of this computer may differ by so much.
+# Clocks of a file system and of this computer may differ by this much.
 _SLACK_S = 1.0
 _LOG_BYTES = 2000
 
@@ -17,12 +17,12 @@ _LOG_BYTES = 2000
 def cell_part(
     folder: Path, cell: Mapping[str, Any], part: Mapping[str, Any], began_s: float
 ) -> dict[str, Any]:
-    """State of a cell: what the record says, unless the cell's files are newer.
+    """State of a cell: the record's, unless the cell's files are newer.
 
     Args:
         folder: Folder of the cells.
-        cell: The cell, as the record has it.
-        part: Its part of the record.
+        cell: The cell's entry in the record.
+        part: The cell's progress in the record.
         began_s: When the experiment was started [s since 1970]; older files are of an earlier run.
     """
     name, work = cell["name"], folder / cell["name"]
@@ -44,7 +44,7 @@ def cell_part(
 
 
 def result_of(folder: Path, name: str) -> dict[str, Any]:
-    """Seconds of a finished cell and what it measured; empty if there is no result."""
+    """Seconds of a finished cell and its measured values; empty without a result."""
     file = folder / f"{name}.json"
     try:
         return dict(_result(file, file.stat().st_mtime_ns))

@@ -1,4 +1,4 @@
-"""Runs an experiment with its page: the page is served from before the first stage until the user ends it."""
+"""Runs an experiment with its page: the page is served from before the first stage until the user stops it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Say = Callable[[str], None]
 
 
 class ExperimentPage:
-    """The server's process. Whatever happens to it, the experiment goes on.
+    """The server's process. The experiment continues even if this process fails.
 
     Args:
         port: TCP port; 0 selects a free one.
@@ -61,7 +61,7 @@ class ExperimentPage:
 
     @property
     def is_served(self) -> bool:
-        """Whether the server is still there."""
+        """Whether the server still runs."""
         return self._process.poll() is None
 
     def wait(self) -> None:
@@ -88,8 +88,8 @@ def run_with_page(
 
     Args:
         port: TCP port; 0 selects a free one.
-        run: Runs it, with what keeps its progress.
-        say: Told the address, and what to do at the end.
+        run: Runs the experiment with the given progress record.
+        say: Callback for messages: the address, and what to do at the end.
 
     Raises:
         BusError: The port is taken; nothing was run.

@@ -1,4 +1,4 @@
-"""What the searches of a run folder have found so far, read from the files that they keep anyway."""
+"""Current results of the searches of a run folder, read from their state files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.places import open_tensors
 
 ATTACK, SEARCHED, STATE = "attack.safetensors", "surrogate.json", "state.safetensors"
-# Spaces whose theta are colours. Of the others, places and shapes, there is no texture to show.
+# Spaces whose theta are colours. The others, places and shapes, have no texture to show.
 _COLOURED = (COLOURS, MESH_TEXTURE)
 _PICTURE_PX, _MOST_OBJECTS = 192, 6
 
@@ -26,11 +26,11 @@ Pixels = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Search:
-    """A search so far.
+    """A running or finished search.
 
     Attributes:
         totals_m: Total CTE of each evaluation [m].
-        version: Changes with every change of what was found.
+        version: Changes whenever the result changes.
         finished: Whether it has ended.
     """
 
@@ -45,7 +45,7 @@ class Search:
 
 
 def read_search(folder: Path, state: str = STATE) -> Search | None:
-    """The search of a cell's folder; None if there is none yet.
+    """The search of a cell's folder; None before it has results.
 
     Args:
         state: Name of the state file that a running search keeps.
@@ -55,7 +55,7 @@ def read_search(folder: Path, state: str = STATE) -> Search | None:
             changed_ns = (folder / name).stat().st_mtime_ns
             found = read(folder / name, changed_ns)
         except (OSError, ValueError, KeyError, TypeError, SafetensorError):
-            continue  # not there, or replaced while it was read
+            continue  # missing, or replaced while it was read
         if found:
             return Search(found, f"{changed_ns:x}", name == SEARCHED)
     return None
@@ -76,12 +76,12 @@ def _running(file: Path, changed_ns: int) -> tuple[float, ...]:
 
 
 def has_texture(space: str) -> bool:
-    """Whether a search of this space, as an experiment file names it, finds colours."""
+    """Whether a search of this space, by its name in an experiment file, finds colours."""
     return space in _COLOURED
 
 
 def texture_png(folder: Path) -> bytes | None:
-    """Texture of the best evaluation so far of a cell, as a PNG file; None if there is none."""
+    """Texture of a cell's best evaluation, as a PNG file; None before the first one."""
     try:
         pictures = (
             _attack_pictures(folder / ATTACK)
@@ -110,7 +110,7 @@ def _state_pictures(file: Path) -> list[Pixels]:
 
 
 def _picture(theta: NDArray[np.float32]) -> Pixels:
-    """Colours before squashing as a picture: a grid as it is, free voxels or texels ``[K, 3]`` in rows of a square."""
+    """Colours before squashing as a picture: a grid unchanged, free voxels or texels ``[K, 3]`` in rows of a square."""
     if theta.ndim != 3:
         flat = theta.reshape(-1, 3)
         side = int(np.ceil(np.sqrt(len(flat))))

@@ -1,7 +1,7 @@
-"""The web server of the experiment page, in a process of its own: ``python -m nodes.experiment_page.server RUN_FOLDER SOCKET``.
+"""The web server of the experiment page, run as a separate process: ``python -m nodes.experiment_page.server RUN_FOLDER SOCKET``.
 
-It only reads, has the lowest priority, and ends with the process that started it, whose end it sees at its standard input. All
-requests are answered from a run folder: what is written there by an experiment is all that the two processes share.
+It only reads, has the lowest priority, and ends when its standard input closes, that is with its parent process. All
+requests are answered from a run folder; the two processes share nothing but the files that the experiment writes there.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ PACKAGES = ("starlette", "uvicorn")
 _PACKAGE = "nodes.experiment_page"
 _MOST_CONNECTIONS = 64
 _STATE_PERIOD_S = 0.5
-# The report has its style and its pictures inside; it runs no script.
+# The report contains its style and pictures and runs no script.
 _REPORT_POLICY = (
     "default-src 'none'; img-src 'self' data:; media-src 'self' data:; style-src 'unsafe-inline'; base-uri 'none'; "
     "form-action 'none'; frame-ancestors 'none'"
@@ -50,7 +50,7 @@ class RequestHandler:
         self._state: tuple[float, bytes, str] = (0.0, b"", "")
 
     def start(self, request: Any) -> Any:
-        """The report once the experiment has ended with one, else how it runs."""
+        """The report once the experiment has ended with one, else the page of the run."""
         from starlette.responses import RedirectResponse
 
         shown = report_is_shown(self._folder, read_progress(self._folder))
@@ -69,7 +69,7 @@ class RequestHandler:
         return web_file("icon.svg")
 
     def state(self, request: Any) -> Any:
-        """What the page shows now; without content where the browser has it."""
+        """The page's current data; without content if the browser has it already."""
         from starlette.responses import Response
 
         body, tag = self._state_now()
@@ -78,7 +78,7 @@ class RequestHandler:
         return Response(body, headers={"etag": tag}, media_type="application/json")
 
     def texture(self, request: Any) -> Any:
-        """The best texture so far of a cell."""
+        """The best texture of a cell."""
         from starlette.responses import Response
 
         record, name = read_progress(self._folder), request.path_params["name"]

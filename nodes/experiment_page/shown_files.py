@@ -16,7 +16,7 @@ _TYPES = {
     ".jpg": "image/jpeg",
     ".mp4": "video/mp4",
 }
-# Pictures of stages, in the order of the stages. Of many views the first few are enough.
+# Pictures of stages, in the order of the stages; only the first few of many views.
 _PICTURES = (("scene", "views/*.png", 6), ("policy", "*.png", 8), ("retrain", "*.png", 2))
 
 
@@ -26,7 +26,7 @@ def type_of(file: Path) -> str:
 
 
 def pictures(folder: Path) -> dict[str, Path]:
-    """Pictures that stages have left, by their path in the run folder."""
+    """Pictures that stages have written, by their path in the run folder."""
     found = [
         file for stage, pattern, most in _PICTURES for file in sorted((folder / stage).glob(pattern))[:most]
     ]
@@ -34,12 +34,12 @@ def pictures(folder: Path) -> dict[str, Path]:
 
 
 def films(folder: Path, cells: Sequence[str]) -> dict[str, Path]:
-    """Films of cells that there are, by their path in the run folder."""
+    """Existing films of cells, by their path in the run folder."""
     return _named(folder, [folder / "cells" / name / "clip.mp4" for name in cells])
 
 
 def report_files(folder: Path) -> dict[str, Path]:
-    """The report and what it shows, by their path in the run folder."""
+    """The report and its pictures, by their path in the run folder."""
     return _named(folder, sorted((folder / "report").rglob("*")))
 
 

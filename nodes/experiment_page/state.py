@@ -1,4 +1,4 @@
-"""What the page shows of a run folder, as JSON data: from its progress record, and from the files of its cells."""
+"""The page's data of a run folder, as JSON: from its progress record, and from the files of its cells."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _LINES = 40
 
 
 def read_state(folder: Path, now_s: float) -> dict[str, Any]:
-    """What the page shows now.
+    """The page's current data.
 
     Args:
         now_s: Seconds since 1970.
@@ -46,7 +46,7 @@ def read_state(folder: Path, now_s: float) -> dict[str, Any]:
         "report": report_is_shown(folder, record),
         "parts": [_shown(part, now_s) for part in parts],
         "curves": _curves(record),
-        # What still runs comes first.
+        # Running parts come first.
         "searches": sorted(_searches(folder, record, cells), key=lambda search: search["finished"]),
         "pictures": list(shown_files.pictures(folder)),
         "films": list(shown_files.films(folder, cell_names(record))),
@@ -101,7 +101,7 @@ def _curves(record: Mapping[str, Any]) -> list[dict[str, Any]]:
 def _searches(
     folder: Path, record: Mapping[str, Any], cells: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
-    # What lies in the folder of a waiting cell may be of other settings.
+    # Files in the folder of a waiting cell may belong to other settings.
     begun = {part["name"] for part in cells if part["state"] != "waiting"}
     return [*_cell_searches(folder / _CELLS, record, begun), *_other_searches(folder)]
 
@@ -118,7 +118,7 @@ def _cell_searches(cells_folder: Path, record: Mapping[str, Any], begun: set[str
 
 
 def _title(cell: Mapping[str, Any]) -> str:
-    """A cell as its readers call it."""
+    """Title of a cell for readers."""
     seed = f", seed {cell['seed']}" if cell["searched"] else ""
     return f"{cell['scenario']}, {cell['victim']}, {style_of(cell['method']).title}{seed}"
 

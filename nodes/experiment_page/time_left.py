@@ -1,17 +1,17 @@
-"""How long an experiment still takes, from what its parts took so far. Times come as arguments."""
+"""Estimates the remaining time of an experiment from the time its parts took. Times come as arguments."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-# Before so much is done, a fraction says nothing about the speed.
+# Below this fraction, progress is no measure of the speed.
 _TOO_EARLY = 0.02
 _REPORT = "report"
 
 
 def part_left_s(part: Mapping[str, Any], now_s: float) -> float | None:
-    """Time that a running part still takes [s]; None if it is too early to tell."""
+    """Remaining time of a running part [s]; None if it is too early to tell."""
     done = part["fraction"] - part["first_fraction"]
     if part["state"] != "running" or done < _TOO_EARLY:
         return None
@@ -21,7 +21,7 @@ def part_left_s(part: Mapping[str, Any], now_s: float) -> float | None:
 def all_left_s(
     stages: Sequence[Mapping[str, Any]], cells: Sequence[Mapping[str, Any]], now_s: float
 ) -> tuple[float, bool]:
-    """Time that everything still takes [s], and whether all of it is known.
+    """Remaining time of all parts [s], and whether it is complete.
 
     A waiting cell takes as long as finished cells of its kind, a search or a control, did on average. A waiting stage is not
     known. The report is left out: it takes seconds.

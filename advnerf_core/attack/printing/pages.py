@@ -1,4 +1,4 @@
-"""The pages of a printed attack: its tiles, and the sheet that says how to print, check and hang them."""
+"""The pages of a printed attack: its tiles, and the sheet that explains how to print, check and hang them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from advnerf_core.attack.printing.poster import Poster, pixels_of
 from advnerf_core.attack.printing.sheet import RULER_MM, overview, ruler
 from advnerf_core.attack.printing.tiles import FOOTER_MM, Layout, Paper, Tile
 
-# Crop marks begin this far from the picture, so that none is left on it by an uneven cut.
+# Crop marks begin this far from the picture, so that an uneven cut leaves none on it.
 _GAP_MM = 0.8
 
 

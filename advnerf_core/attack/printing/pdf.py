@@ -1,9 +1,9 @@
-"""A PDF of lines, texts and pictures whose measures are exact and whose pictures keep every pixel.
+"""A PDF of lines, texts and pictures with exact dimensions, whose pictures keep every pixel.
 
 Plotting libraries hold all pictures of a document in memory until it is closed; a board in tiles is gigabytes. Here a page is
 compressed when it is added.
 
-Source: ISO 32000-1:2008, by section where it is used.
+Source: ISO 32000-1:2008; sections are given in the code.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 _POINTS_PER_MM = 72.0 / 25.4
-_FONTS = ("Helvetica", "Helvetica-Bold")  # of the fourteen that every reader has (9.6.2.2): nothing to embed
+_FONTS = ("Helvetica", "Helvetica-Bold")  # built into every reader (9.6.2.2): nothing to embed
 _CATALOG, _PAGES, _FIRST_FONT = 1, 2, 3
 
 
 class Page:
-    """What is drawn on a page, in millimetres from its upper left corner, y down.
+    """Content of a page, in millimetres from its upper left corner, y down.
 
     Args:
         size_mm: Width and height.
@@ -87,7 +87,7 @@ class PdfDocument:
     """Pages in order.
 
     Args:
-        title: Of the window that shows it.
+        title: Title of the reader's window.
     """
 
     def __init__(self, title: str) -> None:

@@ -1,4 +1,4 @@
-"""The texture of an attack that can be printed: which object carries it, how large it is, and its pixels at any resolution."""
+"""The printable texture of an attack: the object that carries it, its size, and its pixels at any resolution."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from advnerf_core.plugins import unknown
 
 Rgb = NDArray[np.uint8]
 MM_PER_INCH, MM_PER_M = 25.4, 1000.0
-# Of one picture; at three bytes a pixel, and as much again while it is compressed.
+# Per picture; at three bytes a pixel, and as much again while it is compressed.
 _MAX_PIXELS = 200_000_000
 _STRIP_ROWS = 256
 
@@ -31,9 +31,9 @@ class Poster:
     """A flat texture and its true size.
 
     Attributes:
-        attack: The attack that it belongs to.
+        attack: The attack of this texture.
         name: The object that carries it.
-        texture: As it is displayed, ``[H, W, 3]`` uint8 sRGB; row 0 on top, column 0 left for the viewer.
+        texture: The displayed texture, ``[H, W, 3]`` uint8 sRGB; row 0 on top, column 0 left for the viewer.
         size_m: Width and height [m].
         T_world_from_face: Frame ``[4, 4]`` at its centre: x out of it towards a viewer, z up.
     """
@@ -66,14 +66,14 @@ class Poster:
 
 
 def poster_of(attack: AttackFile, name: str | None = None, edge_m: float | None = None) -> Poster:
-    """The texture of an attack that can be printed.
+    """The printable texture of an attack.
 
     Args:
         name: The object, by name or number; None if only one can be printed.
-        edge_m: Edge of a square panel [m], for attack files that do not hold it.
+        edge_m: Edge of a square panel [m], for attack files without a size.
 
     Raises:
-        PrintError: Nothing flat is there, several things are, or the size is unknown.
+        PrintError: The attack has no flat texture, or several, or the size is unknown.
     """
     flat = {number: each for number, each in enumerate(attack.objects) if _is_flat(attack, number)}
     number = _chosen(attack, flat, name)
@@ -102,7 +102,7 @@ def pixels_of(size_mm: tuple[float, float], dpi: float) -> tuple[int, int]:
 
 
 def png_bytes(poster: Poster, dpi: float) -> bytes:
-    """The whole poster as a PNG that says how large it is.
+    """The whole poster as a PNG with its physical size.
 
     Source: PNG specification, second edition, 11.3.5.3: ``pHYs`` holds whole pixels per metre, anywhere before the image data.
     """

@@ -102,7 +102,7 @@ def _print_lines(layout: Layout, paper: Paper) -> list[str]:
 
 
 def _mount_lines(poster: Poster) -> list[str]:
-    """Where the poster hangs, from the attack file's pose; frames are those of the scene."""
+    """Mounting position of the poster, from the attack file's pose; in the scene's frames."""
     T = np.asarray(poster.T_world_from_face)
     x, y, z = T[:3, 3]
     half = 0.5 * poster.size_m[1] * T[2, 2]
@@ -135,7 +135,7 @@ def _colour_strip(page: Page, top_mm: float) -> None:
 
 
 def _paragraph(page: Page, top_mm: float, title: str, lines: list[str]) -> float:
-    """A title and lines; where the next begins [mm]."""
+    """A title and lines; returns where the next paragraph begins [mm]."""
     page.text((_LEFT_MM, top_mm + 5.0), title, 11.0, bold=True)
     for number, line in enumerate(lines):
         page.text((_LEFT_MM, top_mm + 10.5 + number * _LINE_MM), line)

@@ -19,7 +19,7 @@ PAPERS_MM: dict[str, tuple[float, float]] = {
     "letter": (215.9, 279.4),
     "tabloid": (279.4, 431.8),
 }
-# Below each tile: the ruler, and which tile it is.
+# Below each tile: the ruler, and the tile's number.
 FOOTER_MM = 10.0
 _LEAST_MARGIN_MM, _LARGEST_MARGIN_MM, _LARGEST_OVERLAP_MM = 4.0, 40.0, 50.0
 # Readers of PDF refuse larger pages (ISO 32000-1, annex C: 14,400 units).
@@ -31,10 +31,10 @@ class Tile:
     """One page's part of a poster.
 
     Attributes:
-        row: From the top, from 0.
-        column: From the left, from 0.
-        left_mm: Its left edge, from the poster's [mm].
-        top_mm: Its upper edge, from the poster's [mm].
+        row: Row from the top, from 0.
+        column: Column from the left, from 0.
+        left_mm: Left edge, from the poster's [mm].
+        top_mm: Upper edge, from the poster's [mm].
     """
 
     row: int
@@ -45,15 +45,15 @@ class Tile:
 
 @dataclass(frozen=True)
 class Layout:
-    """Equal tiles on equal pages. Each tile repeats the first ``overlap_mm`` of those right of it and below it: there the next one is glued on.
+    """Equal tiles on equal pages. Each tile repeats the first ``overlap_mm`` of the tiles right of it and below it, where these are glued on.
 
     Attributes:
         page_mm: Width and height of a page [mm].
         tile_mm: Width and height of a tile, with its overlap [mm].
         rows: Tiles above one another.
         columns: Tiles side by side.
-        margin_mm: White on every side of a page; 0 for a page that is the poster.
-        overlap_mm: Of neighbours [mm].
+        margin_mm: White margin on every side of a page; 0 for a page of the poster's own size.
+        overlap_mm: Overlap of neighbours [mm].
     """
 
     page_mm: tuple[float, float]
@@ -65,7 +65,7 @@ class Layout:
 
     @property
     def step_mm(self) -> tuple[float, float]:
-        """From one tile to the next [mm]."""
+        """Step from one tile to the next [mm]."""
         return self.tile_mm[0] - self.overlap_mm, self.tile_mm[1] - self.overlap_mm
 
     @property
@@ -80,11 +80,11 @@ def layout_of(size_mm: tuple[float, float], paper: Paper, margin_mm: float, over
 
     Args:
         paper: Paper size; ``none`` is one page as large as the poster.
-        margin_mm: White on every side [mm].
-        overlap_mm: Of neighbouring tiles [mm].
+        margin_mm: White margin on every side [mm].
+        overlap_mm: Overlap of neighbouring tiles [mm].
 
     Raises:
-        PrintError: A margin or overlap that leaves no room, or a page that PDF does not know.
+        PrintError: A margin or overlap that leaves no room, or a page that PDF does not support.
     """
     if paper == "none":
         if max(size_mm) > _LARGEST_PAGE_MM:

@@ -1,1 +1,1 @@
-"""Searches for an attack: the loop that all share, and one module for each method."""
+"""Searches for an attack: the common loop, and one module for each method."""

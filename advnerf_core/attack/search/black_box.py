@@ -1,10 +1,10 @@
-"""The attack on a policy that can only be asked: the adjoint, with the one factor that a black box hides put in from outside.
+"""The attack on a policy that can only be queried: the adjoint, with the one factor that a black box hides replaced by an estimate.
 
 Of the adjoint's ``dJ/dtheta = sum_t (do_t/dtheta)^T (dpi/do)^T s_t``, ``s_t = (df/du)^T lambda_{t+1}``, the attacker knows everything but
 ``dpi/do``: states and controls are the victim's own, lambdas follow from them and the car's model. Two ways to replace it:
 
 - ``distilled``: ``dpi/do`` of a student that was trained on the victim's answers (`distil.Student`), at the frames that the *victim* visited.
-- ``guided``: along a unit direction ``d`` of theta the victim's own slope is measured by an antithetic pair of questions about the visited
+- ``guided``: along a unit direction ``d`` of theta the victim's own slope is measured by an antithetic pair of queries about the visited
   frames, ``d . dJ/dtheta = sum_t s_t (pi(o_t(theta + h d)) - pi(o_t(theta - h d))) / 2h``. The directions are the student's gradient, the
   running mean of earlier estimates, and random coarse textures, made orthonormal; the estimate is the projection of the true gradient
   onto their span. As the student's gradient lies in the span, the estimate is never further from the truth than a rescaled student,
@@ -12,10 +12,10 @@ Of the adjoint's ``dJ/dtheta = sum_t (do_t/dtheta)^T (dpi/do)^T s_t``, ``s_t = (
   "Guided evolutionary strategies: augmenting random search with surrogate gradients") with orthogonal directions (Choromanski et al. 2018,
   "Structured Evolution with Compact Architectures for Scalable Policy Optimization").
 
-Both drive by the victim's controls, never by the student's: the student need only be right about slopes where the victim goes, and no
-error of its steering adds up over a drive. Pairs of questions use frozen frames: closed-loop differences, as plain evolution takes them,
+Both drive by the victim's controls, never by the student's: the student need only be right about slopes where the victim drives, and
+errors of its steering do not add up over a drive. Pairs of queries use frozen frames: closed-loop differences, as in plain evolution,
 pay for the chaos of the loop with variance, and every one needs new backgrounds. The pairs are also the student's next lesson, so it is
-refreshed on the attack's own trajectory at no cost. Everything the victim is asked is counted (`query_count`).
+refreshed on the attack's own trajectory at no cost. All queries of the victim are counted (`query_count`).
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ from advnerf_core.errors import AdvnerfError
 Method = Literal["distilled", "guided"]
 _USUAL: dict[Method, tuple[float, int]] = {"guided": (0.3, 3), "distilled": (0.1, 1)}
 _ADAM = (0.9, 0.999, 1e-8)
-# A probe changes no single value of theta by more than so many times its root mean square.
+# A probe changes no single value of theta by more than this many times its root mean square.
 _STEEPEST = 5.0
 
 
@@ -68,14 +68,14 @@ class BudgetError(AdvnerfError, ValueError):
 
 @dataclass(frozen=True)
 class BlackBoxSearch:
-    """How a policy without a gradient is attacked.
+    """Settings of an attack on a policy without a gradient.
 
     Attributes:
-        method: See the module.
-        probes: Antithetic pairs of textures asked about at every visited frame, after every drive. ``distilled`` uses them as lessons only.
+        method: See the module's docstring.
+        probes: Antithetic pairs of textures queried at every visited frame, after every drive. ``distilled`` uses them as lessons only.
         probe_sigma: Root mean square of a probe's change of theta.
         cells: Cells along an edge of the random textures; see `Coarse`.
-        student: Makes it.
+        student: Makes the student.
     """
 
     method: Method = "guided"
@@ -94,9 +94,9 @@ class BlackBoxSearch:
     def usual(
         cls, method: Method, learning_rate: float | None = None, probes: int | None = None, **others: Any
     ) -> BlackBoxSearch:
-        """A method with the rate and the probes that suit it, where none are given.
+        """A method with its default rate and probes, where none are given.
 
-        A budget buys ``guided`` few steps, so each must be long, and questions are worth less than steps; see docs/methods.md.
+        A budget buys ``guided`` few steps, so each must be long, and queries are worth less than steps; see docs/methods.md.
         """
         rate, pairs = _USUAL[method]
         return cls(method, learning_rate or rate, probes or pairs, **others)
@@ -106,14 +106,14 @@ class BlackBoxSearch:
         return 2 * self.distillation.warm_pairs
 
     def step_calls(self, problem: AttackProblem) -> int:
-        """Policy calls of one drive and what is asked about it."""
+        """Policy calls of one drive and its queries."""
         return calls_per_evaluation(problem) * (1 + 2 * self.probes)
 
     def evaluations(self, problem: AttackProblem, calls: int) -> int:
         """Drives, each with its gradient, that a budget of policy calls allows.
 
         Raises:
-            BudgetError: Not even one.
+            BudgetError: The budget allows not even one.
         """
         least = self.first_calls() + self.step_calls(problem)
         if calls < least:
@@ -124,7 +124,7 @@ class BlackBoxSearch:
         return (calls - self.first_calls()) // self.step_calls(problem)
 
     def settings(self) -> str:
-        """What must not change between a search and its resumption."""
+        """Settings that must be the same when a search is resumed."""
         student = self.student
         if isinstance(student, ArchitectureStudent):
             name = student.name
@@ -139,13 +139,13 @@ def black_box_attack(
     calls: int,
     run: SearchRun = FRESH_RUN,
 ) -> SearchResult:
-    """Maximise the objective by questions alone.
+    """Maximise the objective by queries alone.
 
     Args:
-        problem: What is attacked; its policy is asked for steering only, also where it has a gradient.
+        problem: The attack problem; its policy is only queried for steering, even if it has a gradient.
         search: Method and settings.
-        calls: Policy calls (images) in all, those of a resumed state included; never exceeded.
-        run: Seed of the start, the student and the probes, state file and callback; a search goes on from its state file to the bit.
+        calls: Total policy calls (images), including a resumed state's; never exceeded.
+        run: Seed of the start, the student and the probes, state file and callback; a search resumes from its state file to the bit.
 
     Raises:
         BudgetError: ``calls`` do not allow one step.
@@ -173,7 +173,7 @@ def black_box_attack(
 def search_as(
     method: Method, problem: AttackProblem, settings: SearchSettings, run: SearchRun
 ) -> SearchResult:
-    """`black_box_attack` with the settings of a method; see there for what it raises."""
+    """`black_box_attack` with the settings of a method; it raises the same errors."""
     return black_box_attack(problem, _asked(method, settings), _policy_calls(problem, settings), run)
 
 
@@ -181,7 +181,7 @@ def planned_evaluations(method: Method, problem: AttackProblem, settings: Search
     """Drives that the budget allows a method.
 
     Raises:
-        BudgetError: Not even one.
+        BudgetError: The budget allows not even one.
     """
     return _asked(method, settings).evaluations(problem, _policy_calls(problem, settings))
 
@@ -189,7 +189,7 @@ def planned_evaluations(method: Method, problem: AttackProblem, settings: Search
 def _asked(method: Method, settings: SearchSettings) -> BlackBoxSearch:
     lessons = Distillation() if settings.warm_pairs is None else Distillation(warm_pairs=settings.warm_pairs)
     options = settings.options or StudentOptions()
-    # The default keeps the name that stands in the state files of interrupted searches.
+    # The default keeps its name from the state files of interrupted searches.
     default = options == StudentOptions()
     return BlackBoxSearch.usual(
         method,
@@ -213,7 +213,7 @@ def _fresh(problem: AttackProblem, generator: torch.Generator) -> dict[str, Tens
 
 
 class _Loop:
-    """One step: drive, ask, learn, estimate, move."""
+    """One step: drive, query, learn, estimate, move."""
 
     def __init__(
         self,
@@ -287,14 +287,14 @@ class _Loop:
         directions: Tensor,
         result: AdjointResult,
     ) -> Tensor:
-        """The victim's slopes ``[probes]`` of the loss along directions; what it said becomes a lesson."""
+        """The victim's slopes ``[probes]`` of the loss along directions; its answers become a lesson."""
         assert self._student is not None
         weights = _control_slopes(problem, result)
         settings = self._search.distillation
         share = min(weights.numel(), math.ceil(settings.fresh_pairs / len(directions)))
         slopes = torch.zeros(len(directions), dtype=torch.float64)
         goals = _goals(problem, weights.shape[0])
-        # As many questions as were announced, also where theta has fewer values than there are probes.
+        # As many queries as announced, even if theta has fewer values than there are probes.
         for k in range(self._search.probes):
             direction = directions[k % len(directions)]
             size = self._search.probe_sigma * min(
@@ -321,7 +321,7 @@ def _first_lessons(
     settings: Distillation,
     generator: torch.Generator,
 ) -> Lessons:
-    """Places about the first drive, each in two random textures about the first one."""
+    """Places around the first drive, each in two random textures around the first one."""
     places = driven.rollout.states[:-1].flatten(0, 1)
     chosen = torch.randint(len(places), (settings.warm_pairs,), generator=generator)
     states = places[chosen].clone()
@@ -348,7 +348,7 @@ def _goals(problem: AttackProblem, ticks: int) -> Tensor | None:
 
 
 def _control_slopes(problem: AttackProblem, result: AdjointResult) -> Tensor:
-    """``(df/du)^T lambda_{t+1}``, how the loss hangs on each control of the drive, ``[T, B]`` float64."""
+    """``(df/du)^T lambda_{t+1}``, the derivative of the loss with respect to each control of the drive, ``[T, B]`` float64."""
     states, controls = result.rollout.states, result.rollout.controls
     slopes = [
         (problem.dynamics.jacobians(states[t], controls[t])[1] * result.lambdas[t + 1]).sum(-1)

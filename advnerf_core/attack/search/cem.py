@@ -15,11 +15,11 @@ from advnerf_core.attack.search.search import SearchResult
 _SIGMA = 3.0
 _ELITE_SHARE = 0.3
 _CEM_SMOOTHING = 0.7
-_LEAST_SIGMA = 0.1  # of the first one; a spread of zero finds nothing new
+_LEAST_SIGMA = 0.1  # relative to the first one; a spread of zero finds nothing new
 
 
 def search(problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
-    """The method as `advnerf_core.attack.methods` has it."""
+    """The method; see `advnerf_core.attack.methods`."""
     return search_with(CrossEntropy(settings.sigma or _SIGMA), problem, settings, run)
 
 

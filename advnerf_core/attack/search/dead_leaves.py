@@ -3,7 +3,7 @@
 Discs of random colours occlude one another, and their radii follow a power law, so that the picture looks alike at every scale: Lee, Mumford and
 Huang 2001, "Occlusion models for natural images: a statistical study of a scale-invariant dead leaves model". Leaves are drawn from
 the front until no place is left open, which gives an exact sample (Kendall and Thoennes 1999, "Perfect simulation in stochastic geometry").
-Each leaf is shaded by a linear gradient of its own, as lit surfaces are.
+Each leaf is shaded by its own linear gradient, like a lit surface.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-# Radii in units of the longest edge. Below the least one a face of 64 cells has no room for a disc; the largest covers most of it.
+# Radii in units of the longest edge. Below the smallest, a face of 64 cells has no room for a disc; the largest covers most of it.
 _LEAST_RADIUS, _LARGEST_RADIUS = 1.0 / 32.0, 0.5
-_SHADING = 0.25  # share of the variance that lies in the gradients within leaves
+_SHADING = 0.25  # share of the variance due to the gradients within leaves
 _AT_ONCE = 64
 
 
 @dataclass(frozen=True, eq=False)
 class _Leaves:
-    """Leaves from the front.
+    """Leaves, front to back.
 
     Attributes:
         centres: ``[N, d]``.
         radii: ``[N]``.
-        colours: Of their centres ``[N, 3]``.
+        colours: Colours at their centres ``[N, 3]``.
         slopes: Change of each channel from the centre to the edge along each axis ``[N, 3, d]``.
     """
 
@@ -58,7 +58,7 @@ def dead_leaves(places: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def _drawn(extent: Tensor, generator: torch.Generator) -> _Leaves:
-    """Leaves of which each place of ``extent [d]`` is equally likely to see any part."""
+    """Leaves such that each place of ``extent [d]`` is equally likely to see any part of one."""
     dims = len(extent)
     # The density of radii is r^-(d+1): r^-3 on a plane, as of Lee et al., and plane cuts of balls have it too.
     share = torch.rand(_AT_ONCE, generator=generator)

@@ -1,4 +1,4 @@
-"""A theta that goes downhill by Adam, and the tensors of a state file from which it goes on."""
+"""Descent of a theta by Adam, and its tensors in a state file."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from advnerf_core.adam import Adam
 
 
 class Descent:
-    """Where a search is, and how it got there.
+    """State of a descent.
 
     Args:
-        tensors: ``theta`` to begin with, or all `tensors` of a descent that is to go on; copied.
+        tensors: ``theta`` to begin with, or all `tensors` of a descent to resume; copied.
 
     Attributes:
-        theta: Where it is; each step changes it in place.
+        theta: Current point; each step changes it in place.
     """
 
     def __init__(self, tensors: Mapping[str, Tensor], learning_rate: float) -> None:

@@ -1,8 +1,8 @@
-"""A student of a policy that can only be asked: a network trained on its answers, which has the gradient that the policy hides.
+"""A student of a policy that can only be queried: a network trained on its answers, which provides the gradient that the policy hides.
 
 An attack needs the student's *slope* with respect to colours, not only its steering. Therefore every example is a pair: one place seen
 with two textures, and the student is charged for the error of the difference too. That is Sobolev training (Czarnecki et al. 2017,
-"Sobolev Training for Neural Networks") with finite differences in the place of derivatives that nobody can ask for.
+"Sobolev Training for Neural Networks") with finite differences instead of derivatives, which cannot be queried.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ _LEAST_BOUND_RAD = 0.1
 
 @dataclass(frozen=True)
 class Distillation:
-    """How a student learns.
+    """Training settings of a student.
 
     Attributes:
-        warm_pairs: Pairs of the first lesson, at random places about the first drive in random textures.
+        warm_pairs: Pairs of the first lesson, at random places around the first drive in random textures.
         warm_passes: Passes over the first lesson.
         fresh_pairs: Pairs that each later drive adds, at most.
         steps: Optimiser steps after each drive, at most; never more than two passes over all lessons.
-        memory_pairs: Pairs that are kept; fresh ones then replace others at random.
+        memory_pairs: Largest number of stored pairs; fresh ones then replace others at random.
         batch_pairs: Pairs of one step.
-        difference_weight: Weight of the squared error of a pair's difference, beside that of its two values.
-        place_sigma: Spread of the random places about the first drive [m and rad].
+        difference_weight: Weight of the squared error of a pair's difference, relative to the errors of its two values.
+        place_sigma: Spread of the random places around the first drive [m and rad].
         texture_sigma: Spread of the random textures' theta.
     """
 
@@ -102,7 +102,7 @@ class ArchitectureStudent:
 
     @property
     def name(self) -> str:
-        """What must not change between a search and its resumption."""
+        """Name that must be the same when a search is resumed."""
         return json.dumps(self.architecture.described(), sort_keys=True)
 
     def __call__(self, image_shape: tuple[int, ...], goal_size: int, bound_rad: float) -> nn.Module:
@@ -112,8 +112,8 @@ class ArchitectureStudent:
 
 
 def pilotnet_student(image_shape: tuple[int, ...], goal_size: int, bound_rad: float) -> nn.Module:
-    """The default student: what nobody knows of a victim is guessed to be like the policies of this field."""
-    del image_shape  # any is resized
+    """The default student: an unknown victim is assumed to resemble the usual policies of this field."""
+    del image_shape  # any size is resized
     return Resized(PilotNet(goal_size, bound_rad))
 
 
@@ -136,7 +136,7 @@ class Lessons:
         return len(self.answers)
 
     def add(self, other: Lessons, capacity: int, generator: torch.Generator) -> None:
-        """Take pairs in; when there is no room, each replaces another at random."""
+        """Add pairs; when there is no room, each replaces another at random."""
         free = min(max(0, capacity - len(self)), len(other))
         if len(other) > free:
             taken = torch.randperm(len(self), generator=generator)[: len(other) - free]
@@ -153,19 +153,19 @@ class Lessons:
 
 
 def to_bytes(images: Tensor) -> Tensor:
-    """Images 0..1 as they are kept."""
+    """Images 0..1 in their stored form."""
     return (images * 255.0).round().clamp(0, 255).to(torch.uint8).cpu()
 
 
 class Student:
-    """A network, its optimiser and what it learns from; everything it knows is in tensors.
+    """A network, its optimiser and its lessons; its whole state is in tensors.
 
     Args:
         factory: Makes the network.
         bound_rad: Bound of its steering [rad]; twice the greatest answer of the first lessons if None.
 
     Attributes:
-        network: In eval mode but while it learns.
+        network: The network, in eval mode except while it learns.
     """
 
     stateless = True
@@ -202,7 +202,7 @@ class Student:
         return self.learn(math.ceil(passes * len(self.lessons) / self._batch), generator)
 
     def go_on(self, generator: torch.Generator) -> float:
-        """What is learned after a drive; see `learn`."""
+        """Learn after a drive; see `learn`."""
         return self.learn(min(self.settings.steps, math.ceil(2 * len(self.lessons) / self._batch)), generator)
 
     @property
@@ -210,7 +210,7 @@ class Student:
         return min(self.settings.batch_pairs, len(self.lessons))
 
     def learn(self, steps: int, generator: torch.Generator) -> float:
-        """So many steps; the root mean square error of their last quarter [rad]."""
+        """Run optimiser steps; returns the root mean square error of their last quarter [rad]."""
         errors = []
         self.network.train().requires_grad_(True)
         for _ in range(steps):
@@ -241,7 +241,7 @@ class Student:
     def from_tensors(
         cls, tensors: dict[str, Tensor], settings: Distillation, factory: StudentFactory = pilotnet_student
     ) -> Student:
-        """The student that `tensors` described."""
+        """Restore a student from its `tensors`."""
         kept = {
             key.removeprefix("student."): value
             for key, value in tensors.items()

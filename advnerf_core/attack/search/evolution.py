@@ -18,7 +18,7 @@ _ADAM = (0.9, 0.999, 1e-8)
 
 
 def search(problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
-    """The method as `advnerf_core.attack.methods` has it."""
+    """The method; see `advnerf_core.attack.methods`."""
     strategy = Evolution(settings.sigma or _SIGMA, settings.learning_rate or _LEARNING_RATE)
     return search_with(strategy, problem, settings, run)
 
@@ -48,7 +48,7 @@ class Evolution:
         }
 
     def ask(self, known: dict[str, Tensor], population: int, generator: torch.Generator) -> Tensor:
-        """Pairs on opposite sides of the mean; of an odd number the last is alone."""
+        """Pairs on opposite sides of the mean; the last of an odd number is single."""
         half = torch.randn(((population + 1) // 2, *known["mean"].shape), generator=generator)
         return known["mean"] + self.sigma * torch.stack([half, -half], dim=1).flatten(0, 1)[:population]
 

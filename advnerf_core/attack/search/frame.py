@@ -1,7 +1,7 @@
 """The method ``frame``: a gradient attack on frames, without the car's dynamics.
 
-The frames are those of the drive without an attack, and they stay these. Theta follows the gradient of the steering's deviation there, summed over
-the ticks: what a drive adds up from each deviation, and where else it leads, is left out. So the difference to ``gradient`` is what
+It uses the fixed frames of the drive without an attack. Theta follows the gradient of the steering's deviation there, summed over
+the ticks; how deviations accumulate in a drive, and where they lead, is left out. So the difference to ``gradient`` is what
 the dynamics are worth. Attacks of this kind are known for steering networks (Zhou et al. 2020, "DeepBillboard: systematic
 physical-world testing of autonomous driving systems").
 """
@@ -23,20 +23,20 @@ from advnerf_core.attack.search.search import SearchResult, gradient_step
 from advnerf_core.attack.search.visited import Visited
 
 _NAME = "frame"
-# How far in theta both sides are looked at before one is chosen: strong colours, as far as `random` spreads them.
+# Distance in theta at which both sides are tried before one is chosen: strong colours, as far as `random` spreads them.
 _LOOK = 5.0
 
 
 def search(problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
-    """The method as `advnerf_core.attack.methods` has it.
+    """The method; see `advnerf_core.attack.methods`.
 
-    Each evaluation is one closed-loop drive, which only tells which theta is the best, and one gradient on the frames. The drive without an attack,
-    and the looks that choose a side, are not counted.
+    Each evaluation is one closed-loop drive, which only ranks the thetas, and one gradient on the frames. The drive without an attack,
+    and the renders that choose a side, are not counted.
 
     Raises:
         BlackBoxError: The policy has no gradient.
-        NoColoursError: Theta is no colours.
-        VictimError: The policy has a memory, so that a frame alone does not tell its steering.
+        NoColoursError: Theta is not colours.
+        VictimError: The policy has a memory, so that a frame alone does not determine its steering.
     """
     problem.require_gradient()
     if not problem.policy.stateless:
@@ -59,12 +59,12 @@ def search(problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> 
 
 
 class CleanFrames:
-    """The frames of the drive without an attack, seen with any theta.
+    """The frames of the drive without an attack, rendered with any theta.
 
-    What does not depend on theta is kept as long as it fits into the problem's cache.
+    Data that does not depend on theta is kept as long as it fits into the problem's cache.
 
     Args:
-        problem: What is attacked; its policy is stateless.
+        problem: The attack problem; its policy is stateless.
         plain_theta: The colours without an attack.
     """
 
@@ -76,7 +76,7 @@ class CleanFrames:
             self._kept = list(self._visited(problem))
 
     def deviation(self, theta: Tensor, draw: int = 0) -> tuple[float, Tensor]:
-        """How far the frames steer to the left of the drive without an attack.
+        """Deviation of the steering to the left, relative to the drive without an attack.
 
         Args:
             theta: Colours, ``theta_shape``.

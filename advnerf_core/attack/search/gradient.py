@@ -1,4 +1,4 @@
-"""The method ``gradient``: Adam on the grid values, the gradient from the discrete adjoint, several start poses together."""
+"""The method ``gradient``: Adam on the grid values, with the gradient from the discrete adjoint over several start poses."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from advnerf_core.attack.search.search import (
 
 
 def search(problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
-    """The method as `advnerf_core.attack.methods` has it."""
+    """The method; see `advnerf_core.attack.methods`."""
     return gradient_attack(problem, settings.evaluations, gradient_step(problem, settings), run)
 
 
@@ -41,7 +41,7 @@ def gradient_attack(
     Each iteration is one evaluation: a closed-loop rollout and its gradient. Iteration 0 evaluates the start.
 
     Args:
-        iterations: Evaluations in all, those of a resumed state included.
+        iterations: Total evaluations, including a resumed state's.
         run: Seed of the starting noise, state file and callback.
     """
     return climb(problem, adjoint_slope, iterations, learning_rate, run, method="gradient")
@@ -53,7 +53,7 @@ class Slope:
 
     Attributes:
         loss_m: Loss of the closed-loop drive [m].
-        gradient: Against which theta moves, ``theta_shape``.
+        gradient: Gradient that theta descends, ``theta_shape``.
     """
 
     loss_m: float
@@ -83,11 +83,11 @@ def climb(
     """Follow a gradient with Adam from the sensor's start, and keep the best theta by the objective's value.
 
     Args:
-        slope_of: Gives drive and gradient.
-        evaluations: In all, those of a resumed state included.
+        slope_of: Computes drive and gradient.
+        evaluations: Total evaluations, including a resumed state's.
         run: Seed of the starting noise, state file and callback.
-        cells: Of the coarse texture that is searched instead of theta, see `Coarse`; 0 searches theta.
-        settings: What else a state file must agree in, the method's name among it.
+        cells: Size of the coarse texture that is searched instead of theta, see `Coarse`; 0 searches theta.
+        settings: Further settings that a state file must match, including the method's name.
 
     Raises:
         SearchDivergedError: A loss or gradient is not finite.

@@ -1,6 +1,6 @@
 """The method ``gradient_coarse``: the gradient attack in the coarse textures that ``cem`` and ``evolution`` search.
 
-It tells what the gradient is worth apart from what the finer texture is worth: same parameters, same evaluations, other steps.
+It separates the value of the gradient from the value of the finer texture: same parameters, same evaluations, other steps.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from advnerf_core.errors import AdvnerfError
 
 
 class NoFinerFaceError(AdvnerfError, ValueError):
-    """There is nothing that a coarse texture would be coarser than."""
+    """The object is not finer than the coarse texture."""
 
 
 def search(problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
-    """The method as `advnerf_core.attack.methods` has it.
+    """The method; see `advnerf_core.attack.methods`.
 
     Raises:
-        NoFinerFaceError: What is attacked is no single face, or has no more cells than the coarse texture.
+        NoFinerFaceError: The object is not a single face, or has no more cells than the coarse texture.
     """
     problem.coloured("gradient_coarse")
     shape, cells = tuple(problem.sensor.theta_shape), settings.cells

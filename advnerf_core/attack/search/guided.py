@@ -9,10 +9,10 @@ from advnerf_core.attack.search.search import SearchResult
 
 
 def search(problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
-    """The method as `advnerf_core.attack.methods` has it."""
+    """The method; see `advnerf_core.attack.methods`."""
     return search_as("guided", problem, settings, run)
 
 
 def evaluations(problem: AttackProblem, settings: SearchSettings) -> int:
-    """Drives that the budget allows; the questions about each drive count too."""
+    """Drives that the budget allows; the queries about each drive count too."""
     return planned_evaluations("guided", problem, settings)

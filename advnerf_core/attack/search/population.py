@@ -1,7 +1,7 @@
-"""Searches by populations of candidates, which need no gradient, so a policy may be a black box: `cem`, `evolution`, and others alike.
+"""Searches by populations of candidates, which need no gradient, so a policy may be a black box: `cem`, `evolution`, and similar ones.
 
-A strategy samples candidates around a mean; what is searched is a coarse texture, as a few dozen evaluations cannot tell thousands
-of cells apart. One evaluation is one closed-loop rollout from all start poses, as for the gradient attack and for random
+A strategy samples candidates around a mean. The searched texture is coarse, as a few dozen evaluations cannot distinguish thousands
+of cells. One evaluation is one closed-loop rollout from all start poses, as for the gradient attack and for random
 search, so methods compare at equal evaluations.
 """
 
@@ -29,7 +29,7 @@ from advnerf_core.attack.search.search import (
 
 @dataclass(frozen=True)
 class Coarse:
-    """A coarse texture on a face, interpolated bilinearly to theta; objects that are no single face keep all their colours.
+    """A coarse texture on a face, interpolated bilinearly to theta; objects other than a single face keep all their colours.
 
     Attributes:
         theta_shape: Shape of theta.
@@ -41,7 +41,7 @@ class Coarse:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of what is searched."""
+        """Shape of the searched parameters."""
         face = len(self.theta_shape) == 3 and self.theta_shape[0] == self.theta_shape[1]
         return (
             (self.cells, self.cells, 3) if face and 0 < self.cells < self.theta_shape[0] else self.theta_shape
@@ -56,7 +56,7 @@ class Coarse:
         return torch.nn.functional.interpolate(images, size, mode="bilinear")[0].permute(1, 2, 0).contiguous()
 
     def sampled(self, theta: Tensor) -> Tensor:
-        """The coarse texture with the values that theta has in the middle of its cells; what has one colour keeps it."""
+        """The coarse texture with theta's values in the middle of its cells; uniform colours are preserved."""
         if self.shape == self.theta_shape:
             return theta
         images = theta.permute(2, 0, 1)[None]
@@ -64,7 +64,7 @@ class Coarse:
         return small[0].permute(1, 2, 0).contiguous()
 
     def gathered(self, gradient: Tensor) -> Tensor:
-        """The gradient with respect to the coarse texture of what has this one with respect to theta."""
+        """The gradient with respect to the coarse texture, from the gradient with respect to theta."""
         if self.shape == self.theta_shape:
             return gradient
         with torch.enable_grad():
@@ -74,20 +74,20 @@ class Coarse:
 
 
 class Strategy(Protocol):
-    """How candidates are drawn, and what is learned from them; everything it knows is in tensors."""
+    """How candidates are drawn, and what is learned from them; its whole state is in tensors."""
 
     @property
     def name(self) -> str:
         """Name of the method."""
 
     def fresh(self, shape: tuple[int, ...]) -> dict[str, Tensor]:
-        """What is known before the first generation."""
+        """State before the first generation."""
 
     def ask(self, known: dict[str, Tensor], population: int, generator: torch.Generator) -> Tensor:
         """Candidates ``[population, *shape]``."""
 
     def tell(self, known: dict[str, Tensor], candidates: Tensor, losses: Tensor) -> dict[str, Tensor]:
-        """What is known after their losses ``[population]``."""
+        """State after the candidates' losses ``[population]``."""
 
 
 def population_search(
@@ -102,10 +102,10 @@ def population_search(
 
     Args:
         strategy: How candidates are drawn, such as `cem.CrossEntropy` or `evolution.Evolution`.
-        evaluations: Rollouts in all, those of a resumed state included; a last generation may stay unfinished.
+        evaluations: Total rollouts, including a resumed state's; a last generation may stay unfinished.
         population: Candidates of a generation.
         cells: See `Coarse`.
-        run: Seed of the candidates, state file and callback; a search goes on from its state file to the bit.
+        run: Seed of the candidates, state file and callback; a search resumes from its state file to the bit.
     """
     if population < 4:
         raise ValueError(f"expected a population >= 4, got {population}")

@@ -1,9 +1,9 @@
-"""Pose attacks: where objects stand, alone or together with their colours, searched through the same adjoint.
+"""Pose attacks: the objects' positions, alone or together with their colours, searched through the same adjoint.
 
-The total cross-track error is rough over poses: a gradient step from one pose ends in the next dent. So several poses are drawn within
+The total cross-track error is rough over poses: a gradient step from one pose ends in the next local minimum. So several poses are drawn within
 the bounds, each is refined by a few gradient steps, and the best of all evaluations is kept (Abeysirigoonawardena et al. 2023: 5 poses,
 10 steps, best of 50). Random poses, and colours, at as many evaluations are the baseline. Both drive past objects with their true edges, as a
-deployment shows them; the gradient is that of the same frames, from the same states, with soft edges (`PlacedSensor`).
+deployment shows them; the gradient comes from the same frames, from the same states, with soft edges (`PlacedSensor`).
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ class MultiStart:
     """The budget of a multi-start search; it evaluates ``samples * steps`` drives.
 
     Attributes:
-        samples: Poses that are drawn.
-        steps: Evaluations of each, the drawn one included.
+        samples: Number of drawn poses.
+        steps: Evaluations of each, including the drawn one.
         pose_rate: Adam's step along a coordinate of the unit box: 0.1 is a twentieth of the bounds.
         colour_rate: Adam's step of the colours before squashing.
     """
@@ -75,7 +75,7 @@ def multi_start(
     """Draw poses, refine each by projected gradient steps, keep the best evaluation of all.
 
     Args:
-        problem: What is attacked; its sensor must be a `PlacedSensor`.
+        problem: The attack problem; its sensor must be a `PlacedSensor`.
         budget: Samples, steps and rates.
         run: Seed of the poses and of the colours' starting noise, state file and callback.
 
@@ -120,11 +120,11 @@ def random_poses(
     sigma: float = 5.0,
     run: SearchRun = FRESH_RUN,
 ) -> SearchResult:
-    """The baseline: poses drawn evenly from what is allowed and, if colours are free, these from ``N(0, sigma^2)``; the best is kept.
+    """The baseline: poses drawn uniformly from the allowed ones and, if colours are free, colours from ``N(0, sigma^2)``; the best is kept.
 
     Args:
-        problem: What is attacked; its sensor must be a `PlacedSensor`.
-        evaluations: Drives in all, those of a resumed state included; as many as a multi-start's, for a fair comparison.
+        problem: The attack problem; its sensor must be a `PlacedSensor`.
+        evaluations: Total drives, including a resumed state's; as many as a multi-start's, for a fair comparison.
         sigma: Spread of the colours before squashing.
         run: Seed of the draws, state file and callback.
 
@@ -157,19 +157,19 @@ def random_poses(
 def placed_problem(
     problem: AttackProblem, theta: Tensor, opaque: bool | None = None
 ) -> tuple[AttackProblem, Tensor]:
-    """The problem with the objects at the places of ``theta``, with true edges, and its theta: the colours.
+    """The problem with the objects at the places of ``theta``, with true edges, and its theta, which is the colours.
 
     Args:
-        problem: With a `PlacedSensor`.
+        problem: The attack problem, with a `PlacedSensor`.
         theta: Placements and colours.
-        opaque: True composes as a deployment does that cannot blend.
+        opaque: True composes without blending, as some deployments do.
     """
     surrogate, colours = _sensor(problem).sharp(theta, opaque)
     return replace(problem, sensor=surrogate), colours
 
 
 def judge(problem: AttackProblem, theta: Tensor, opaque: bool | None = None) -> Totals:
-    """Totals of what a search found, without disturbances: those of its best evaluation where nothing is disturbed."""
+    """Totals of a search's result without disturbances; equal to its best evaluation if the problem has none."""
     return evaluate(*placed_problem(problem.undisturbed(), theta, opaque))[1]
 
 
@@ -185,7 +185,7 @@ def _gradient(problem: AttackProblem, theta: Tensor) -> AdjointResult:
 
 
 class _Climb:
-    """One drawn pose on its way: coordinates and colours with their Adam, which has no other state."""
+    """One drawn pose in refinement: coordinates and colours with their Adam, which has no other state."""
 
     def __init__(
         self,
@@ -208,7 +208,7 @@ class _Climb:
 
     @classmethod
     def resumed(cls, sensor: PlacedSensor, budget: MultiStart, tensors: dict[str, Tensor]) -> _Climb:
-        """Where ``tensors`` left it; of no meaning if they hold none."""
+        """Restore from ``tensors``; meaningless if they are empty."""
         if "unit" not in tensors:
             return cls(sensor, budget, torch.zeros(0, 4), torch.zeros(0))
         moments: dict[str, dict[str, Tensor]] = {}
@@ -220,11 +220,11 @@ class _Climb:
 
     @property
     def theta(self) -> Tensor:
-        """Where it is."""
+        """Current theta."""
         return self._sensor.join(self._parts["unit"], self._parts["colours"])
 
     def step(self, gradient: Tensor) -> None:
-        """One step downhill; the pose stays within what is allowed."""
+        """One descent step; the pose stays within the allowed ones."""
         unit, before = self._parts["unit"], self._parts["unit"].clone()
         slopes = {
             "unit": self._sensor.unit(gradient),
@@ -235,7 +235,7 @@ class _Climb:
         unit.copy_(self._sensor.space.project(unit, before))
 
     def tensors(self) -> dict[str, Tensor]:
-        """Everything it needs to go on."""
+        """Everything that is needed to resume."""
         out: dict[str, Tensor] = {}
         for name, part in self._parts.items():
             out[name] = part.clone()
@@ -255,7 +255,7 @@ def _sensor(problem: AttackProblem) -> PlacedSensor:
 
 
 def _fingerprint(problem: AttackProblem, method: str, **settings: Any) -> str:
-    """Hash of all that a pose search depends on, except its length."""
+    """Hash of everything that a pose search depends on, except its length."""
     sensor = _sensor(problem)
     keep_out = sensor.space.keep_out
     lane = None if keep_out is None else [keep_out.clearance_m, *(path.to_dict() for path in keep_out.paths)]

@@ -1,4 +1,4 @@
-"""A victim that is asked for steering only, and how often it is asked: attacks on black boxes are compared by that."""
+"""A victim that only answers queries, with a counter: attacks on black boxes are compared by the number of queries."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from advnerf_core.errors import AdvnerfError
 
 
 class VictimError(AdvnerfError, TypeError):
-    """A policy that this attack cannot be made against."""
+    """This attack does not support the policy."""
 
 
 class CountedPolicy:
-    """A stateless policy behind a counter, without its gradient whatever it has: an attack can only ask it.
+    """A stateless policy behind a counter, which hides any gradient: an attack can only query it.
 
     One call is one image, alone or in a batch.
 
     Args:
         policy: The victim, in eval mode.
-        calls: Asked so often already.
+        calls: Initial count.
 
     Attributes:
-        calls: Images it has been asked about.
+        calls: Number of queried images.
     """
 
     stateless = True

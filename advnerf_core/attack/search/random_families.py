@@ -1,6 +1,6 @@
-"""Random textures with a structure in space: the methods ``random_coarse``, ``random_levels``, ``random_pink`` and ``random_natural``.
+"""Random textures with spatial structure: the methods ``random_coarse``, ``random_levels``, ``random_pink`` and ``random_natural``.
 
-They are ``random`` with other pictures: as many evaluations, the same spread of theta, the best is kept. So a gradient that beats ``random`` cannot owe it
+They are ``random`` with other pictures: as many evaluations, the same spread of theta, the best is kept. So a gradient that beats them cannot owe it
 to smoothness, to large areas of one colour, or to edges alone.
 """
 
@@ -20,23 +20,23 @@ from advnerf_core.fields.colour_grid import colour_grid
 
 
 def search_coarse(problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
-    """The method ``random_coarse``, as `advnerf_core.attack.methods` has it."""
+    """The method ``random_coarse``; see `advnerf_core.attack.methods`."""
     family = textures.coarse(settings.cells)
     return _search("random_coarse", family, problem, settings, run, cells=settings.cells)
 
 
 def search_levels(problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
-    """The method ``random_levels``, as `advnerf_core.attack.methods` has it."""
+    """The method ``random_levels``; see `advnerf_core.attack.methods`."""
     return _search("random_levels", textures.levels, problem, settings, run)
 
 
 def search_pink(problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
-    """The method ``random_pink``, as `advnerf_core.attack.methods` has it."""
+    """The method ``random_pink``; see `advnerf_core.attack.methods`."""
     return _search("random_pink", textures.pink, problem, settings, run)
 
 
 def search_natural(problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
-    """The method ``random_natural``, as `advnerf_core.attack.methods` has it."""
+    """The method ``random_natural``; see `advnerf_core.attack.methods`."""
     return _search("random_natural", textures.natural, problem, settings, run)
 
 

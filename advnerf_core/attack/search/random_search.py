@@ -1,4 +1,4 @@
-"""The method ``random``, the baseline: random textures, the best of as many as the gradient attack may evaluate."""
+"""The method ``random``, the baseline: the best of as many random textures as the gradient attack may evaluate."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from advnerf_core.attack.search.search import (
 
 
 def search(problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
-    """The method as `advnerf_core.attack.methods` has it."""
+    """The method; see `advnerf_core.attack.methods`."""
     return random_search(problem, settings.evaluations, random_spread(problem, settings), run)
 
 
@@ -36,8 +36,8 @@ def random_search(
     """Draw grid values from ``N(0, sigma^2)`` and keep the best by the objective's value.
 
     Args:
-        evaluations: Textures in all, those of a resumed state included.
-        sigma: Spread of theta; 5 matches what gradient attacks end at.
+        evaluations: Total textures, including a resumed state's.
+        sigma: Spread of theta; 5 matches the results of gradient attacks.
         run: Seed of the textures, state file and callback.
     """
     shape = problem.sensor.theta_shape
@@ -58,10 +58,10 @@ def best_drawn(
     """Evaluate thetas that are drawn one after the other, and keep the best.
 
     Args:
-        draw: Draws one; all its randomness is the generator's.
-        evaluations: Thetas in all, those of a resumed state included.
+        draw: Draws one theta, with all randomness from the generator.
+        evaluations: Total thetas, including a resumed state's.
         run: Seed, state file and callback.
-        settings: What a state file must agree in: the method's name, and all that ``draw`` depends on.
+        settings: Settings that a state file must match: the method's name, and everything that ``draw`` depends on.
     """
     fingerprint = search_fingerprint(
         problem, problem.sensor.theta_shape, seed=run.seed, hash=run.settings_hash, **settings

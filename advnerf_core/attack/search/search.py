@@ -1,4 +1,4 @@
-"""What every search for a texture shares: its record of evaluations, the best so far, and a state file to resume from.
+"""Common parts of all searches: the record of evaluations, the best evaluation, and a state file to resume from.
 
 The closed loop is chaotic, so the last evaluation is rarely the best: every search keeps the best by the value of the problem's
 objective. A state file is written after every evaluation, whole or not at all; a search resumed from it gives the same bits (on one machine
@@ -42,11 +42,11 @@ class Evaluation:
     """One closed-loop evaluation of a search.
 
     Attributes:
-        iteration: Its number, from 0.
+        iteration: Number of the evaluation, from 0.
         loss_m: The objective's loss, mean over starts, with the regulariser's part; for ``cte`` in metres.
         total_cte_m: Sum of |CTE| of each start [m].
         protocol_cte_m: Total CTE of each start by the protocol, which stops the car at the fence [m].
-        seconds: Time it took, with its gradient if it had one [s].
+        seconds: Time of the evaluation, including its gradient if any [s].
         values: The objective's value of each start, in the objective's unit; for ``cte`` these are ``protocol_cte_m``.
     """
 
@@ -70,11 +70,11 @@ class Evaluation:
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """What a search found.
+    """Result of a search.
 
     Attributes:
         theta: The best parameters, ``theta_shape``.
-        best: The evaluation that found them.
+        best: Evaluation of ``theta``.
         history: All evaluations, in order.
     """
 
@@ -88,12 +88,12 @@ OnEvaluation = Callable[[Evaluation], None]
 
 @dataclass
 class SearchState:
-    """Everything a search needs to go on; ``tensors`` is what is special to the kind of search.
+    """Everything a search needs to resume; ``tensors`` depends on the kind of search.
 
     Attributes:
         tensors: Search-specific tensors: current theta, optimiser moments, random generator.
-        best_theta: Best parameters so far; None before the first evaluation.
-        history: Evaluations so far.
+        best_theta: Best parameters yet; None before the first evaluation.
+        history: Finished evaluations.
     """
 
     tensors: dict[str, Tensor]
@@ -102,7 +102,7 @@ class SearchState:
 
     @property
     def best(self) -> Evaluation:
-        """The best evaluation so far; the first of equals."""
+        """The best finished evaluation; the first of equals."""
         return max(self.history, key=lambda e: (e.value, -e.iteration))
 
     def record(self, theta: Tensor, loss_m: float, totals: Totals, seconds: float) -> Evaluation:
@@ -121,15 +121,15 @@ class SearchState:
         return evaluation
 
     def result(self) -> SearchResult:
-        """What was found so far; needs at least one evaluation."""
+        """The current result; needs at least one evaluation."""
         assert self.best_theta is not None
         return SearchResult(self.best_theta, self.best, tuple(self.history))
 
     def save(self, path: Path, fingerprint: str) -> None:
-        """Write the state file. Each name gets a tensor of its own, also where a method has two names for one.
+        """Write the state file. Each name gets its own tensor, even if a method has two names for one.
 
         Raises:
-            SearchStateError: Something in ``tensors`` is no tensor, or has the name of the best theta.
+            SearchStateError: A value in ``tensors`` is not a tensor, or has the name of the best theta.
         """
         assert self.best_theta is not None
         wrong = [name for name, value in self.tensors.items() if not isinstance(value, Tensor)]
@@ -175,7 +175,7 @@ def load_state(path: Path, fingerprint: str) -> SearchState:
 
 
 def begin(path: Path | None, fingerprint: str, fresh: Callable[[], dict[str, Tensor]]) -> SearchState:
-    """The state to go on from if there is one at ``path``, else a fresh one with these tensors."""
+    """The state in ``path`` if the file exists, else a fresh one with these tensors."""
     if path is not None and path.exists():
         return load_state(path, fingerprint)
     return SearchState(fresh())
@@ -184,11 +184,11 @@ def begin(path: Path | None, fingerprint: str, fresh: Callable[[], dict[str, Ten
 def begin_drawing(
     run: SearchRun, fingerprint: str, fresh: Callable[[torch.Generator], dict[str, Tensor]]
 ) -> tuple[SearchState, torch.Generator]:
-    """The state of a search that draws, and its generator where the state left it.
+    """The state of a search that draws, and its generator in the state's position.
 
     Args:
         run: Seed and state file.
-        fresh: Tensors of a search that begins; those that it draws come from the generator.
+        fresh: Tensors of a new search; their random values come from the generator.
     """
     generator = torch.Generator().manual_seed(run.seed)
 
@@ -204,12 +204,12 @@ def begin_drawing(
 def go_on(
     state: SearchState, run: SearchRun, fingerprint: str, evaluations: int, step: Callable[[], Evaluation]
 ) -> SearchResult:
-    """Evaluate until a state has so many evaluations.
+    """Evaluate until a state has ``evaluations`` evaluations.
 
     Args:
-        run: Where the state is kept, and its callback, which is called when the state is on disk.
-        evaluations: In all, those of a resumed state included.
-        step: Makes and records the next evaluation, and leaves the tensors to go on with in the state.
+        run: State file, and callback, which is called when the state is on disk.
+        evaluations: Total evaluations, including a resumed state's.
+        step: Makes and records the next evaluation, and updates the tensors of the state.
     """
     if evaluations < 1:
         raise ValueError(f"expected at least one evaluation, got {evaluations}")
@@ -227,7 +227,7 @@ def _keep(evaluation: Evaluation, state: SearchState, run: SearchRun, fingerprin
 
 
 def without_gradient(problem: AttackProblem, theta: Tensor, number: int) -> tuple[float, Totals]:
-    """Loss and totals of evaluation ``number`` of a search that asks for no gradient.
+    """Loss and totals of evaluation ``number`` of a search without a gradient.
 
     Raises:
         SearchDivergedError: The loss is not finite.
@@ -255,13 +255,13 @@ def require_finite(loss_m: float, gradient: Tensor, number: int) -> None:
 def evaluate_theta(
     problem: AttackProblem, theta: Tensor, state: SearchState, run: SearchRun, fingerprint: str
 ) -> Evaluation:
-    """The next evaluation of a search that asks for no gradient: driven, recorded, on disk, then told.
+    """The next evaluation of a search without a gradient: driven, recorded, saved, then reported to the callback.
 
     Args:
-        theta: What is evaluated, of the sensor's ``theta_shape``.
-        state: Of the search; its tensors must be those to go on with.
-        run: Where the state is kept and who is told.
-        fingerprint: Of the search, see `search_fingerprint`.
+        theta: Theta to evaluate, of the sensor's ``theta_shape``.
+        state: State of the search, with tensors ready to be saved.
+        run: State file and callback.
+        fingerprint: Fingerprint of the search, see `search_fingerprint`.
 
     Raises:
         SearchDivergedError: The loss is not finite.
@@ -273,7 +273,7 @@ def evaluate_theta(
 
 
 def gradient_step(problem: AttackProblem, settings: SearchSettings) -> float:
-    """Step of Adam along a gradient: as asked, or as the sensor says, or the usual one of colours."""
+    """Step of Adam along a gradient: from the settings, else from the sensor, else the usual one of colours."""
     if settings.learning_rate is not None:
         return settings.learning_rate
     return (
@@ -282,14 +282,14 @@ def gradient_step(problem: AttackProblem, settings: SearchSettings) -> float:
 
 
 def random_spread(problem: AttackProblem, settings: SearchSettings) -> float:
-    """Spread of random thetas: as asked, or as the sensor says, or the usual one of colours."""
+    """Spread of random thetas: from the settings, else from the sensor, else the usual one of colours."""
     if settings.sigma is not None:
         return settings.sigma
     return problem.sensor.random_sigma if isinstance(problem.sensor, ScaledSensor) else settings.random_sigma
 
 
 def evaluation_from_json(entry: dict[str, Any]) -> Evaluation:
-    """The evaluation that ``dataclasses.asdict`` and JSON made this of; state files without values are of ``cte``."""
+    """Restore an evaluation from the JSON of its ``dataclasses.asdict``; state files without values belong to ``cte``."""
     values: dict[str, Any] = {
         key: tuple(value) if isinstance(value, list) else value for key, value in entry.items()
     }
@@ -298,7 +298,7 @@ def evaluation_from_json(entry: dict[str, Any]) -> Evaluation:
 
 
 def search_fingerprint(problem: AttackProblem, theta_shape: tuple[int, ...], **settings: Any) -> str:
-    """Hash of what must not change between a search and its resumption (its length may)."""
+    """Hash of everything that must be the same when a search is resumed (its length may differ)."""
     if problem.objective != CrossTrackError():
         settings["objective"] = type(problem.objective).__qualname__, repr(vars(problem.objective))
     text = json.dumps({"steps": problem.steps, "theta_shape": list(theta_shape), **settings}, sort_keys=True)
@@ -323,9 +323,9 @@ def draw_start_states(
         nominal: x [m], y [m], yaw [rad].
         count: Number of starts.
         sigma: Spread of x and y [m]; of headings a quarter of it [rad], as a tenth of a radian is 2.4 m of error at the junction.
-        seed: Drawn once per attack.
-        path: Number of the path, so that paths have other starts.
-        nominal_first: Whether the first is the nominal one.
+        seed: Seed, drawn once per attack.
+        path: Number of the path, so that paths have different starts.
+        nominal_first: Whether the first start is the nominal one.
     """
     if count < 1:
         raise ValueError(f"expected at least one start, got {count}")

@@ -1,4 +1,4 @@
-"""What a user may say about the student of a black-box method. Imports no torch."""
+"""User options of a black-box method's student. Imports no torch."""
 
 from __future__ import annotations
 

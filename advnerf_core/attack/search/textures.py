@@ -1,4 +1,4 @@
-"""Families of random textures that differ in their structure in space, and in nothing else.
+"""Families of random textures that differ only in their spatial structure.
 
 Each family draws one value of spread one for every row of theta and every channel: its variance, averaged over the cells of the grid, is one in
 expectation. Channels are independent. Multiplied by the same sigma, textures of all families are equally strong in contrast.
@@ -38,7 +38,7 @@ def coarse(cells: int) -> Family:
 def levels(grid: ColourGrid, generator: torch.Generator) -> Tensor:
     """Sum of levels of 2 to 64 cells along each edge, each with the same variance, as far as the grid resolves them.
 
-    The sizes are those of `advnerf_core.fields.summed_levels`: up to 16, growing geometrically.
+    The sizes match `advnerf_core.fields.summed_levels`: up to 16, growing geometrically.
     """
     wanted = torch.logspace(math.log2(_COARSEST), math.log2(_FINEST), _LEVELS, base=2.0)
     longest = max(grid.shape)
@@ -50,7 +50,7 @@ def levels(grid: ColourGrid, generator: torch.Generator) -> Tensor:
 def pink(grid: ColourGrid, generator: torch.Generator) -> Tensor:
     """Noise with equal power in every octave: amplitudes ``f^(-d/2)`` in d dimensions, periodic at the edges.
 
-    On a texture that is 1/f, as of natural images (Field 1987, "Relations between the statistics of natural images and the response
+    On a texture this is 1/f, as in natural images (Field 1987, "Relations between the statistics of natural images and the response
     properties of cortical cells"). In a box it is ``f^-1.5``, and every plane cut of it is 1/f again. The mean counts as the lowest frequency.
     """
     axes = tuple(range(1, len(grid.shape) + 1))

@@ -1,8 +1,8 @@
-"""The gradient attack for several seeds at once: their drives are one batch, their textures and optimisers stay apart.
+"""The gradient attack for several seeds at once: their drives are one batch, their textures and optimisers stay separate.
 
 Adam works on each number by itself, so Adam on stacked textures is as many independent Adams. Frames are rendered, and the policy is
-evaluated, for all seeds in one call: that is what an accelerator wants, and what saves the fixed costs on a CPU. Sums over a larger batch
-round differently, so a seed searched together with others ends near, not at, the bits that it ends at alone.
+evaluated, for all seeds in one call, which suits an accelerator and saves fixed costs on a CPU. Sums over a larger batch
+round differently, so a seed searched together with others ends near, not at, the bits that it reaches alone.
 """
 
 from __future__ import annotations
@@ -95,13 +95,13 @@ def gradient_attacks(
     on_evaluation: OnSeedEvaluation | None = None,
     settings_hash: str = "",
 ) -> list[SearchResult]:
-    """What ``gradient_attack`` does, for several seeds in one batch.
+    """``gradient_attack`` for several seeds in one batch.
 
     Args:
-        problems: One for each seed; they differ in start poses and disturbances only. Of the disturbances the first one's seed is
-            used, with other numbers for every drive.
-        iterations: Evaluations of each seed in all, those of a resumed state included.
-        state_path: One state file for all, written after every iteration; if it exists, the attack goes on from it.
+        problems: One for each seed; they differ in start poses and disturbances only. The disturbances' seed is the first problem's,
+            with different numbers for every drive.
+        iterations: Total evaluations of each seed, including a resumed state's.
+        state_path: Common state file, written after every iteration; if it exists, the attack resumes from it.
         on_evaluation: Called after every iteration, once for each seed.
         settings_hash: Hash of scene, policy and configuration; a state file of another one is refused.
 

@@ -1,6 +1,6 @@
-"""Frames at given states that are looked at again with other textures.
+"""Frames at given states, rendered again with other textures.
 
-Geometry and background of a frame cost most of its render and do not depend on theta; a search that asks a policy about many textures
+Geometry and background of a frame cost most of its render and do not depend on theta; a search that queries a policy about many textures
 from the same places keeps them.
 """
 
@@ -21,7 +21,7 @@ from advnerf_core.scene.surrogate import PoseBatch, Rendered
 
 @runtime_checkable
 class PreparingSensor(Protocol):
-    """A sensor whose frames can be kept without their colours, as a ``Surrogate``'s."""
+    """A sensor whose frames can be kept without their colours, such as a ``Surrogate``."""
 
     def camera_poses(self, states: Tensor) -> Array:
         """``T_world_from_camera [B, 4, 4]``."""
@@ -31,9 +31,9 @@ class PreparingSensor(Protocol):
 
 
 class Visited:
-    """The frames of some ticks, rendered for as many thetas as wanted.
+    """The frames of some ticks, rendered for any number of thetas.
 
-    A disturbed problem, or a sensor that cannot keep frames, renders each again: the same images, more slowly.
+    A disturbed problem, or a sensor that cannot keep frames, renders each time again: the same images, more slowly.
 
     Args:
         ticks: Numbers of the ticks.
@@ -54,20 +54,20 @@ class Visited:
         return self._frames.background.nbytes + self._frames.weights_nbytes
 
     def render(self, theta: Tensor) -> Rendered:
-        """What is seen with this theta."""
+        """Images with this theta."""
         if self._frames is None:
             return self._problem.sense(self._ticks, self._states, theta)
         return self._frames.render(theta)
 
     def forget(self) -> None:
-        """Give the memory back; from now on each render is made from the beginning."""
+        """Free the memory; later renders start from the beginning."""
         self._frames = None
 
 
 class VisitedDrive:
     """A closed loop that was driven with ``theta``, and its frames by tick.
 
-    Half of the problem's cache budget is for frames without colours, half for the renders that the first gradient takes.
+    Half of the problem's cache budget is for frames without colours, half for the first gradient's renders.
 
     Attributes:
         cache: Renders with ``theta``, for ``gradient_pass``.

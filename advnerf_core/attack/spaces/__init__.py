@@ -1,1 +1,1 @@
-"""What is searched: colours of placed objects, the picture on a display."""
+"""Search spaces: colours of placed objects, their places and shapes, the picture on a display."""

@@ -1,7 +1,7 @@
-"""An attack on what a monitor shows, seen by the camera as the monitor and the room let it: `advnerf_core.display` with gradients.
+"""An attack on a monitor's picture, seen by the camera through monitor and room optics: `advnerf_core.display` with gradients.
 
 ``DisplayedSensor`` stands before any sensor whose ``theta`` is the squash-inverse of colours. The attack then searches the colours that are
-*shown*; the renderer gets those that are *seen*. Nothing else changes, and the result goes to the monitor as it is.
+*shown*; the renderer gets the colours that are *seen*. Nothing else changes, and the result goes to the monitor unchanged.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _MARGIN = 1e-4
 
 
 def displayed(model: DisplayModel, shown: Tensor, cos_angle: float | Tensor = 1.0) -> Tensor:
-    """What the camera sees ``[..., 3]`` of shown colours ``[..., 3]`` in 0..1; differentiable. See `DisplayModel.forward`."""
+    """Seen colours ``[..., 3]`` of shown colours ``[..., 3]`` in 0..1; differentiable. See `DisplayModel.forward`."""
     curves, mixing, ambient = (torch.tensor(v).to(shown) for v in (model.curves, model.mixing, model.ambient))
     last = curves.shape[1] - 1
     position = shown.clamp(0.0, 1.0) * last
@@ -45,7 +45,7 @@ class DisplayedSensor:
     Attributes:
         sensor: Renders ``theta`` with the last axis red, green, blue before squashing.
         model: The monitor before the camera.
-        cos_angle: Cosine of the angle at which the camera looks at the panel, in the mean of a drive.
+        cos_angle: Cosine of the camera's viewing angle to the panel, averaged over a drive.
     """
 
     sensor: Sensor
@@ -54,20 +54,20 @@ class DisplayedSensor:
 
     @property
     def theta_shape(self) -> tuple[int, ...]:
-        """Of the sensor behind it."""
+        """Shape of theta, from the sensor behind it."""
         return self.sensor.theta_shape
 
     @property
     def objects(self) -> Sequence[ColouredObject]:
-        """Of the sensor behind it, which must have them (`ColouringSensor`)."""
+        """Objects of the sensor behind it, which must have them (`ColouringSensor`)."""
         return self._coloured.objects
 
     def plain_theta(self) -> Tensor:
-        """Showing the plain colours of the sensor behind it, as `initial_theta` does."""
+        """Shown colours that look like the plain colours of the sensor behind it, as in `initial_theta`."""
         return self._coloured.plain_theta()
 
     def initial_theta(self, generator: torch.Generator) -> Tensor:
-        """Where an attack starts: showing what the sensor behind it starts with."""
+        """Initial parameters: shown colours that look like those of the sensor behind it."""
         return self.sensor.initial_theta(generator)
 
     def seen_theta(self, theta: Tensor) -> Tensor:
@@ -75,11 +75,11 @@ class DisplayedSensor:
         return torch.logit(displayed(self.model, torch.sigmoid(theta), self.cos_angle), eps=_MARGIN)
 
     def sense(self, states: Tensor, theta: Tensor) -> Rendered:
-        """Images at detached states with their vjp with respect to what is shown."""
+        """Images at detached states with their vjp with respect to the shown colours."""
         return self._shown(lambda seen: self.sensor.sense(states, seen), theta)
 
     def camera_poses(self, states: Tensor) -> Array:
-        """Of the sensor behind it, which must have them (`PosedSensor`)."""
+        """Camera poses of the sensor behind it, which must have them (`PosedSensor`)."""
         return self._posed.camera_poses(states)
 
     def render(self, T_world_from_camera: Array, theta: Tensor) -> Rendered:

@@ -1,4 +1,4 @@
-"""The space of a face: one flat texture that a board or a screen carries, alone or behind a measured display."""
+"""The space of a face: one flat texture on a board or a screen, alone or behind a measured display."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from advnerf_core.scene.surrogate import Surrogate
 
 @dataclass(frozen=True, eq=False)
 class FaceMount:
-    """Where a face is.
+    """Mounting of a face.
 
     Attributes:
-        subject: What carries it: the panel's name, which is also that of the motion-capture subject.
+        subject: Name of the panel, which is also the name of its motion-capture subject.
         size_m: Width and height [m].
-        corners_in_subject: As of `advnerf_core.attack.artifact.AttackFace`, ``[4, 3]`` [m].
+        corners_in_subject: Corners ``[4, 3]`` [m], see `advnerf_core.attack.artifact.AttackFace`.
     """
 
     subject: str
@@ -35,12 +35,12 @@ class FaceMount:
 
 
 class FaceSpace:
-    """Colours of a face, which hides what carries it; without an attack what carries it is seen, as it was learned.
+    """Colours of a face that hides its panel; without an attack the learned panel is seen.
 
     Args:
         surrogate: The scene with the face as its only object.
-        named: What attack files say of the face.
-        display: What a screen and the room do to its colours; None for a board, or for a screen that is taken for ideal.
+        named: Entries of the face in attack files.
+        display: Optics of the screen and the room; None for a board, or for a screen that is assumed ideal.
         cos_angle: Cosine of the angle at which the camera looks at a screen; see `DisplayedSensor`.
     """
 
@@ -63,7 +63,7 @@ class FaceSpace:
 
     @property
     def plain(self) -> Shown:
-        """The scene as it was learned, with no face in it."""
+        """The learned scene without the face."""
         return Shown((), torch.zeros(0, 3, dtype=self.surrogate.dtype))
 
     def search(
@@ -73,7 +73,7 @@ class FaceSpace:
         return load_method(method).search(problem, settings, run)
 
     def attacked(self, theta: Tensor) -> tuple[AttackedObject, ...]:
-        """The colours that are shown."""
+        """The shown colours."""
         (field,) = self.surrogate.objects
         colours = theta.detach().numpy().astype(np.float32)
         return (
@@ -83,12 +83,12 @@ class FaceSpace:
         )
 
     def face(self, theta: Tensor) -> AttackFace:
-        """The face as it is displayed."""
+        """The displayed face."""
         texture = face_texture(theta.detach().numpy().astype(np.float32))
         return AttackFace(texture, self.mount.size_m, self.mount.subject, self.mount.corners_in_subject)
 
     def restored(self, attack: AttackFile) -> Shown:
-        """The face in the colours that are seen, behind the display if there is one; see `Space.restored`."""
+        """The face in the seen colours, behind the display if there is one; see `Space.restored`."""
         require_same(attack, [self._named])
         shown = torch.from_numpy(np.array(attack.face_object.theta)).to(self.surrogate.dtype)
         seen = self.sensor.seen_theta(shown) if isinstance(self.sensor, DisplayedSensor) else shown

@@ -1,8 +1,8 @@
-"""The sensor of a pose attack: a surrogate whose objects stand where theta says, with exact derivatives and bounded memory.
+"""The sensor of a pose attack: a surrogate whose objects are placed by theta, with exact derivatives and bounded memory.
 
 ``theta`` is one vector: coordinates of the placements in the unit box of a `PoseSpace`, four for each object, then the objects' colours if
 they are free too. The objects have soft edges (``fields/soft_edges``) so that the picture changes smoothly as they move; searches take
-gradients of these pictures, and drive past the true edges (`sharp`), as a deployment does. What a render keeps for its vector-Jacobian product are the covered pixels.
+gradients of these pictures, and drive past the true edges (`sharp`), as a deployment does. A render keeps only the covered pixels for its vector-Jacobian product.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ class PlacedSensor:
 
     Args:
         surrogate: The scene with the objects.
-        space: Where they may stand; of the same objects.
+        space: Allowed placements of the same objects.
         free_colours: Whether the colours belong to theta.
         colours: The colours if they are not free, of the surrogate's ``theta_shape``; plain ones if not given.
         edge_width: Width of the soft edges in object units, see ``with_soft_edges``.
 
     Raises:
-        ValueError: A space of other objects, or colours of another shape.
+        ValueError: The space belongs to other objects, or the colours have another shape.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class PlacedSensor:
 
     @property
     def pose_count(self) -> int:
-        """Length of the part of theta that holds the placements."""
+        """Length of theta's part with the placements."""
         return 4 * len(self._soft)
 
     @property
@@ -87,7 +87,7 @@ class PlacedSensor:
         return self.join(unit, self.surrogate.initial_theta(generator, torch.float64))
 
     def join(self, unit: Tensor, colours: Tensor) -> Tensor:
-        """Theta of coordinates ``[K, 4]`` and colours; these are left out if they are not free."""
+        """Theta of coordinates ``[K, 4]`` and colours, which are left out if they are not free."""
         return torch.cat([unit.double().flatten(), colours.double().flatten()])[: self.theta_shape[0]]
 
     def unit(self, theta: Tensor) -> Tensor:
@@ -109,7 +109,7 @@ class PlacedSensor:
 
         Args:
             theta: Placements and colours.
-            opaque: True composes as a deployment does that cannot blend; None as the surrogate does.
+            opaque: True composes without blending, as some deployments do; None as the surrogate does.
         """
         objects = placed(self.space.objects, self.placements(theta.detach()))
         return self.surrogate.with_objects(objects, opaque), self.colours(theta.detach()).to(
@@ -157,7 +157,7 @@ class PlacedSensor:
         return torch.cat([(torch.stack(by_place) * self.space.half).flatten(), *by_colour])
 
     def _parts(self, theta: Tensor) -> _Parts:
-        """The parts of theta; kept for the next call, as a drive and its gradient ask for the same one again and again."""
+        """The parts of theta; cached, as a drive and its gradient ask for the same ones repeatedly."""
         if self._last is not None and self._last[0] is theta and self._last[1] == theta._version:
             return self._last[2]
         if tuple(theta.shape) != self.theta_shape:
@@ -174,11 +174,11 @@ class PlacedSensor:
 
 @dataclass(frozen=True, eq=False)
 class _Stack:
-    """All layers at the pixels that some object covers; the scene is the last layer.
+    """All layers at the pixels that objects cover; the scene is the last layer.
 
     Attributes:
         pixels: Flat indices ``[U]`` into ``[B, H, W]``.
-        rows: Of each object, where its own pixels are among these.
+        rows: For each object, the indices of its own pixels among these.
         colours: ``[L, U, 3]``, premultiplied.
         alphas: ``[L, U]``.
         depths_m: ``[L, U]``.
@@ -217,7 +217,7 @@ class _Stack:
         return (visible_shares(self.alphas, self.depths_m)[..., None] * self.colours).sum(0)
 
     def slopes(self, grad: Tensor) -> Tensor:
-        """Derivatives ``[L, U, 4]`` with respect to premultiplied colour and alpha, from those of the composed colours ``[U, 3]``."""
+        """Derivatives ``[L, U, 4]`` with respect to premultiplied colour and alpha, from the composed colours' ``[U, 3]``."""
         colours, alphas = self.colours.clone().requires_grad_(), self.alphas.clone().requires_grad_()
         with torch.enable_grad():
             composed = (visible_shares(alphas, self.depths_m)[..., None] * colours).sum(0)

@@ -1,8 +1,8 @@
-"""Where objects may stand: bounds of each object's place, and the lane that stays free.
+"""Allowed placements of objects: bounds of each object's place, and the lane that must stay free.
 
-A search sees the unit box: a coordinate of -1 is the lower bound of an axis, 1 the upper. It keeps within by projection, not by a squash:
-a squash's slope dies where bounds are met, which is where many good poses lie, and cannot know the lane. A step that leads out of the
-box is cut off at its border (a heading that may turn all the way round goes on at the other side); an object that then stands on the
+A search sees the unit box: a coordinate of -1 is the lower bound of an axis, 1 the upper. It stays inside by projection, not by a squash:
+a squash's slope vanishes at the bounds, where many good poses lie, and cannot represent the lane. A step that leads out of the
+box is cut off at its border (a heading that may turn all the way round wraps around); an object that then stands on the
 lane is pushed sideways off it, and if that fails the step is shortened until the object stands clear.
 """
 
@@ -25,24 +25,24 @@ from advnerf_core.render.soft_pose import placed_at, placement_of
 
 AXES = ("x_m", "y_m", "yaw_rad", "scale")
 Interval = tuple[float, float]
-# Points of a path are so far apart: the distance to a straight between two of them is off by less than 1 mm beyond 0.3 m.
+# Points of a path have this spacing: the distance to a straight between two of them is off by less than 1 mm beyond 0.3 m.
 _PATH_SPACING_M = 0.05
 _TRIES, _PUSHES, _HALVINGS = 1000, 8, 12
 
 
 class PoseBoundsError(AdvnerfError, ValueError):
-    """Bounds of poses that are none, or that leave no place beside the lane."""
+    """Invalid pose bounds, or bounds that leave no place beside the lane."""
 
 
 @dataclass(frozen=True)
 class PoseBounds:
-    """Where one object may stand; an axis that is None stays as it is.
+    """Allowed placements of one object; an axis that is None is fixed.
 
     Attributes:
         x_m: Lowest and highest x of the object's origin [m].
-        y_m: The same of y [m].
-        yaw_rad: Of the heading [rad]; an interval of a whole turn or more has no ends.
-        scale: Of the world metres per object unit.
+        y_m: Lowest and highest y [m].
+        yaw_rad: Interval of the heading [rad]; a whole turn or more is unbounded.
+        scale: Interval of the world metres per object unit.
     """
 
     x_m: Interval | None = None
@@ -51,7 +51,7 @@ class PoseBounds:
     scale: Interval | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what is no interval."""
+        """Raise for an empty interval."""
         for name in AXES:
             interval = getattr(self, name)
             if interval is not None and not (
@@ -64,10 +64,10 @@ class PoseBounds:
 
 @dataclass(frozen=True, eq=False)
 class KeepOut:
-    """The driven lane, on which nothing may stand.
+    """The driven lane, where no object may stand.
 
     Attributes:
-        paths: Reference paths; with several drives, those of all of them.
+        paths: Reference paths of all drives.
         clearance_m: Least distance of an object's footprint from each of them [m]; half a lane keeps the lane free.
     """
 
@@ -109,7 +109,7 @@ class KeepOut:
 
 
 def footprint(field: VoxelGridObject) -> tuple[Array, Array]:
-    """Corners ``[2]`` of the rectangle around what is not empty of an object, seen from above, in axes that turn with its yaw.
+    """Corners ``[2]`` of the bounding rectangle of an object's non-empty part, seen from above, in axes that turn with its yaw.
 
     They are in object units: an object of scale 2 covers twice as many metres.
     """
@@ -134,10 +134,10 @@ class PoseSpace:
 
     Args:
         objects: The objects where they stand now.
-        keep_out: Where none may stand; None allows everything within the bounds.
+        keep_out: Lanes that must stay free; None allows everything within the bounds.
 
     Raises:
-        PoseBoundsError: A number of bounds that is not that of the objects.
+        PoseBoundsError: The number of bounds differs from the number of objects.
     """
 
     def __init__(
@@ -165,7 +165,7 @@ class PoseSpace:
         self.half[:, 2] = self.half[:, 2].clamp(max=np.pi)
 
     def placements(self, unit: Tensor) -> Tensor:
-        """Placements ``[K, 4]`` of coordinates ``[K, 4]``; within the bounds to the last bit where these are in the unit box."""
+        """Placements ``[K, 4]`` of coordinates ``[K, 4]``; within the bounds to the last bit if these are in the unit box."""
         placements = self.middle + self.half * unit.double()
         return torch.where(unit.abs() <= 1.0, placements.clamp(self._lowest, self._highest), placements)
 
@@ -180,7 +180,7 @@ class PoseSpace:
             self._turns, torch.remainder(offset[:, 2] + np.pi, 2 * np.pi) - np.pi, offset[:, 2]
         )
         unit = torch.where(self.half > 0.0, offset / self.half.clamp_min(1e-300), torch.zeros_like(offset))
-        # A search ends on its bounds, from where division leads one bit beyond.
+        # A search ends on its bounds, and division may lead one bit beyond.
         within = unit.clamp(-1.0, 1.0)
         if bool((offset.abs() > self.half + 1e-9).any()) or not self.allows(within):
             raise PoseBoundsError(
@@ -222,7 +222,7 @@ class PoseSpace:
         return unit
 
     def project(self, unit: Tensor, before: Tensor) -> Tensor:
-        """What a step from allowed coordinates ``before`` to ``unit`` becomes; always allowed."""
+        """Projects a step from allowed coordinates ``before`` to ``unit``; the result is always allowed."""
         out = before.clone()
         for k in range(len(self.objects)):
             out[k] = self._projected(k, unit[k].double(), before[k])
@@ -250,7 +250,7 @@ class PoseSpace:
         return boxed
 
     def _pushed(self, k: int, unit: Tensor) -> Tensor:
-        """Moved straight away from the nearest path, by what is missing, within the box."""
+        """Moved straight away from the nearest path, by the missing distance, within the box."""
         assert self.keep_out is not None
         free = self.half[k, :2] > 0.0
         for _ in range(_PUSHES):

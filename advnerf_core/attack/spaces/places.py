@@ -1,4 +1,4 @@
-"""The space of places: where objects stand beside the lanes, alone or together with their colours."""
+"""The space of places: objects' positions beside the lanes, alone or together with their colours."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ METHODS = ("random", "gradient")
 
 @dataclass(frozen=True)
 class PlaceLimits:
-    """Where objects may stand.
+    """Limits of the objects' places.
 
     Attributes:
         keep_out: Lanes that stay free; None allows everything within the bounds.
@@ -41,9 +41,9 @@ class PlaceSpace:
     """Places of voxel objects; its methods are ``gradient`` (several drawn placements, each refined) and ``random``.
 
     Args:
-        surrogate: The scene with the objects where they stand without an attack.
-        named: What attack files say of them, in their order.
-        budget: Placements that are drawn, and steps of each.
+        surrogate: The scene with the objects at their places without an attack.
+        named: Entries of the objects in attack files, in their order.
+        budget: Number of drawn placements, and steps of each.
 
     Raises:
         PoseBoundsError: Not one bound for each object, or bounds that leave no place beside the lanes.
@@ -67,13 +67,13 @@ class PlaceSpace:
 
     @property
     def plain(self) -> Shown:
-        """The objects where they stand without an attack, in their own colours."""
+        """The objects at their places without an attack, in their own colours."""
         return Shown(self.surrogate.objects, self.surrogate.plain_theta())
 
     def search(
         self, method: str, problem: AttackProblem, settings: SearchSettings, run: SearchRun
     ) -> SearchResult:
-        """Search places; see `Space.search`. The budget is that of the space."""
+        """Search places with the space's budget; see `Space.search`."""
         if method not in METHODS:
             raise SpaceError(f"expected a method that searches places, {' or '.join(METHODS)}, got {method}")
         if method == "gradient":
@@ -98,7 +98,7 @@ class PlaceSpace:
         )
 
     def face(self, theta: Tensor) -> None:
-        """None: a solid object is no face."""
+        """None: a solid object has no face."""
 
     def restored(self, attack: AttackFile) -> Shown:
         """The objects at the places of the file; see `Space.restored`."""
@@ -113,7 +113,7 @@ class PlaceSpace:
 def randomly_placed(
     objects: Sequence[VoxelGridObject], limits: PlaceLimits, count: int, seed: int = 0
 ) -> list[tuple[VoxelGridObject, ...]]:
-    """The objects at ``count`` random allowed placements: a victim is retrained on them to bear moved objects.
+    """The objects at ``count`` random allowed placements, for retraining a victim to tolerate moved objects.
 
     Raises:
         PoseBoundsError: Not one bound for each object, or bounds that leave no place beside the lanes.

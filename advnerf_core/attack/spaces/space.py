@@ -1,6 +1,6 @@
-"""What a search may change: the contract of a space, and the spaces of colours and of meshes.
+"""The contract of a search space, and the spaces of colours and of meshes.
 
-A space turns objects in a scene into a `Sensor` for the search, and turns what was found into objects that can be written into an attack
+A space turns objects in a scene into a `Sensor` for the search, and turns the result into objects that can be written into an attack
 file, put into a deployment, or driven past in the learned scene.
 """
 
@@ -38,17 +38,17 @@ from advnerf_core.scene.surrogate import Surrogate, split_theta
 
 
 class SpaceError(AdvnerfError, ValueError):
-    """A method that does not search a space."""
+    """The method does not search this space."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """Objects as they stand in a scene.
+    """Objects in a scene with their colours.
 
     Attributes:
         objects: Geometry and pose of each.
         colours: Their colours before squashing, of the ``theta_shape`` of a `Surrogate` with these objects.
-        painted: What is painted on them, where the place's light changes how that is seen; None where the colours are painted.
+        painted: Painted colours, if they differ from the seen ones in the place's light; None if they are equal.
     """
 
     objects: Sequence[ColouredObject]
@@ -56,13 +56,13 @@ class Shown:
     painted: Tensor | None = None
 
     def seen_by(self, surrogate: Surrogate) -> Surrogate:
-        """The surrogate with these objects in the place of its own."""
+        """The surrogate with these objects instead of its own."""
         return surrogate.with_objects(self.objects)
 
 
 @dataclass(frozen=True)
 class NamedObject:
-    """What an attack file says of an object beside what was found.
+    """Entry of an object in attack files, besides its attacked parameters.
 
     Attributes:
         sha256: Hash of its geometry and fixed colours.
@@ -73,25 +73,25 @@ class NamedObject:
 
 
 def half_precision(theta: Tensor) -> Tensor:
-    """Theta as half precision has it, in its own type: what is kept of an attack is what is driven past."""
+    """Theta rounded to half precision, in its own type: drives use the theta that is stored."""
     largest = torch.finfo(torch.float16).max
     return theta.detach().clamp(-largest, largest).half().to(theta.dtype)
 
 
 class Space(Protocol):
-    """What is searched."""
+    """A search space."""
 
     @property
     def name(self) -> str:
-        """As attack files have it: ``colours``, ``places``, ``mesh_texture``, ``mesh_shape``, or a user's own."""
+        """Name in attack files: ``colours``, ``places``, ``mesh_texture``, ``mesh_shape``, or a user's own."""
 
     @property
     def surrogate(self) -> Surrogate:
-        """The scene with the objects as they are without an attack."""
+        """The scene with the objects without an attack."""
 
     @property
     def sensor(self) -> Sensor:
-        """What a search looks through; its theta is what is searched."""
+        """The sensor of a search; its theta is the searched parameters."""
 
     @property
     def plain(self) -> Shown:
@@ -100,28 +100,28 @@ class Space(Protocol):
     def search(
         self, method: str, problem: AttackProblem, settings: SearchSettings, run: SearchRun
     ) -> SearchResult:
-        """Search with a method for the theta of the problem's sensor, which is this space's.
+        """Search the theta of the problem's sensor, which is this space's, with a method.
 
         Raises:
             SpaceError: The method does not search this space.
         """
 
     def attacked(self, theta: Tensor) -> tuple[AttackedObject, ...]:
-        """What an attack file keeps of ``theta``."""
+        """The attacked objects of ``theta`` for an attack file."""
 
     def face(self, theta: Tensor) -> AttackFace | None:
-        """The face that a projection or a display can show; None where the objects are none."""
+        """The face for a projection or a display; None if the objects have none."""
 
     def restored(self, attack: AttackFile) -> Shown:
-        """The objects of an attack file, as a deployment shows them.
+        """The objects of an attack file, in their deployed form.
 
         Raises:
-            AttackFileError: The attack is on other objects.
+            AttackFileError: The attack belongs to other objects.
         """
 
 
 def require_same(attack: AttackFile, named: Sequence[NamedObject]) -> None:
-    """Refuse an attack file of other objects.
+    """Raise for an attack file of other objects.
 
     Raises:
         AttackFileError: Another number of objects, or other geometry.
@@ -141,12 +141,12 @@ def colours_of(attack: AttackFile, dtype: torch.dtype) -> Tensor:
 
 
 class ColourSpace:
-    """Colours of objects that stay where they are: voxels, faces, or textures of meshes.
+    """Colours of objects with fixed places: voxels, faces, or textures of meshes.
 
     Args:
         surrogate: The scene with the objects.
-        named: What attack files say of them, in their order.
-        light: What the camera sees of a painted colour, as measured; None where it is seen as it is painted.
+        named: Entries of the objects in attack files, in their order.
+        light: Measured response from painted to seen colours; None for the identity.
     """
 
     def __init__(
@@ -160,7 +160,7 @@ class ColourSpace:
 
     @property
     def sensor(self) -> Surrogate | DisplayedSensor:
-        """The surrogate, in the light if that is measured: its theta are the colours that are painted."""
+        """The surrogate, behind the measured light if there is one: its theta is the painted colours."""
         return self._lit or self.surrogate
 
     @property
@@ -175,17 +175,17 @@ class ColourSpace:
         return load_method(method).search(problem, settings, run)
 
     def attacked(self, theta: Tensor) -> tuple[AttackedObject, ...]:
-        """Colours of each object; of a mesh also the mesh with the found texture."""
+        """Colours of each object; for a mesh also the mesh with its attacked texture."""
         rows = zip(
             self._named, self.surrogate.objects, split_theta(self.surrogate.objects, theta), strict=True
         )
         return tuple(_attacked(named, field, part, _textured_glb(field, part)) for named, field, part in rows)
 
     def face(self, theta: Tensor) -> None:
-        """None: a solid object is no face."""
+        """None: a solid object has no face."""
 
     def restored(self, attack: AttackFile) -> Shown:
-        """The objects where they are, in the colours of the file; see `Space.restored`."""
+        """The objects at their places, in the colours of the file; see `Space.restored`."""
         require_same(attack, self._named)
         return self._in_light(colours_of(attack, self.surrogate.dtype))
 
@@ -200,8 +200,8 @@ class ShapeSpace:
 
     Args:
         surrogate: The scene with the meshes.
-        named: What attack files say of them, in their order.
-        limits: How far vertices may move.
+        named: Entries of the objects in attack files, in their order.
+        limits: Largest displacement of vertices.
     """
 
     name = MESH_SHAPE
@@ -227,7 +227,7 @@ class ShapeSpace:
         return found.search(problem, settings, run)
 
     def attacked(self, theta: Tensor) -> tuple[AttackedObject, ...]:
-        """The search's parameters of each vertex, and the meshes in the found shape."""
+        """The search's parameters of each vertex, and the meshes in the attacked shape."""
         parts = theta.detach().split([len(each.mesh.vertices) for each in self.sensor.meshes])
         colours = split_theta(self.surrogate.objects, self.sensor.colours)
         rows = zip(self._named, self.sensor.shaped(theta), parts, colours, strict=True)
@@ -236,7 +236,7 @@ class ShapeSpace:
         )
 
     def face(self, theta: Tensor) -> None:
-        """None: a mesh is no face."""
+        """None: a mesh has no face."""
 
     def restored(self, attack: AttackFile) -> Shown:
         """The meshes in the shapes of the file; see `Space.restored`."""
@@ -254,5 +254,5 @@ def _attacked(named: NamedObject, field: ColouredObject, part: Tensor, glb: byte
 
 
 def _textured_glb(field: ColouredObject, colours: Tensor) -> bytes:
-    """A mesh in its colours as a GLB file; empty for what is no mesh."""
+    """A mesh in its colours as a GLB file; empty for other objects."""
     return glb_bytes(field.mesh.with_texture(field.texture(colours))) if isinstance(field, MeshField) else b""

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     )
     from advnerf_core.report.evidence.outcome import Outcome, drive_outcome
 else:
-    # Whoever reads a cell does not need SciPy.
+    # Reading a cell needs no SciPy.
     __getattr__, __dir__ = lazy_names(
         __name__,
         {

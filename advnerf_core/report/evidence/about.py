@@ -1,4 +1,4 @@
-"""What a person says about each published set: exploration or confirmation, what changed since the sets before, and where its object stands."""
+"""Hand-written facts about each published set: exploration or confirmation, changes since earlier sets, and the position of its object."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from advnerf_core.documents import Document, read_json
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.strict import StrictModel, parse_value
 
-# Beside the folders of the sets; written by hand.
+# Beside the folders of the sets.
 ABOUT = "sets_about.json"
 Text = Annotated[str, Field(min_length=1)]
 Positive = Annotated[float, Field(gt=0)]
@@ -23,15 +23,15 @@ class AboutError(AdvnerfError, ValueError):
 
 
 class ObjectPlace(StrictModel):
-    """Where the face of the object stands, as seen from above.
+    """Position of the object's face, seen from above.
 
     Attributes:
-        x_m: Its middle [m], in the axes of the kept drives.
-        y_m: The same [m].
-        yaw_rad: Direction that it faces [rad].
-        width_m: Its width [m].
-        source: Where these numbers come from.
-        estimated: Whether they were estimated from pictures; else they were kept.
+        x_m: Its middle [m], in the axes of the published drives.
+        y_m: Its middle [m].
+        yaw_rad: Direction of its front [rad].
+        width_m: Width of the face [m].
+        source: Source of these numbers.
+        estimated: Whether they were estimated from pictures; else they were stored.
     """
 
     x_m: float
@@ -43,14 +43,14 @@ class ObjectPlace(StrictModel):
 
 
 class SetAbout(StrictModel):
-    """What is said about one set.
+    """Facts about one set.
 
     Attributes:
-        world: Where it was driven, for readers.
+        world: Name of the world for readers.
         role: Exploration tries something for the first time; confirmation repeats an earlier result with other searches and starts.
-        after: What was known when it was registered: earlier sets or cells; empty for nothing.
-        changed: What changed since then.
-        object: Where the object stands; None where that was not kept.
+        after: Earlier sets or cells that were known when it was registered; empty for none.
+        changed: Changes since those.
+        object: Position of the object; None if it was not stored.
     """
 
     world: Text
@@ -67,7 +67,7 @@ def read_about(published: Path) -> dict[str, SetAbout]:
         published: Folder of all published sets.
 
     Raises:
-        ConfigError: The file is not of this form; the message names the line.
+        ConfigError: The file is invalid; the message names the line.
     """
     file = published / ABOUT
     if not file.exists():
@@ -77,10 +77,10 @@ def read_about(published: Path) -> dict[str, SetAbout]:
 
 
 def check_about(published: Path, sets: Collection[str]) -> None:
-    """Check that the file, if it is there, has one entry for each set.
+    """Check that the file, if it exists, has one entry for each set.
 
     Raises:
-        AboutError: An entry is missing, or names no set.
+        AboutError: An entry is missing, or has no set.
     """
     if not (published / ABOUT).exists():
         return

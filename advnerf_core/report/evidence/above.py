@@ -1,4 +1,4 @@
-"""The picture of a set: all deployed drives from above and over time, and what the camera saw with and without the attack."""
+"""The picture of a set: all deployed drives from above and over time, and camera images with and without the attack."""
 
 from __future__ import annotations
 
@@ -35,22 +35,22 @@ _SIZE_IN, _DPI = (12.0, 6.2), 100
 _MAP, _TIME = (0.055, 0.085, 0.455, 0.8), (0.59, 0.085, 0.4, 0.165)
 _STILLS_LEFT, _STILLS_BOTTOM, _STILL = (0.545, 0.772), (0.35, 0.645), (0.22, 0.24)
 _QUALITIES = (90, 80, 65, 50)
-# Share of a film's height that its captions take, and how many of its frames there are per second.
+# Height of a film's captions as a share, and its frames per second.
 _CAPTION, _FILM_HZ, _COLUMNS = 0.2, 5.0, 3
-_BEFORE_S = 1.0  # of the moment, when the object is in sight
-_SPACING = 0.05  # of points along the path, in half lanes
+_BEFORE_S = 1.0  # before the key moment, when the object is in sight
+_SPACING = 0.05  # between points along the path, in half lanes
 
 
 @dataclass(frozen=True)
 class _Group:
-    """All deployed drives past what the object shows.
+    """All deployed drives with one condition of the object.
 
     Attributes:
-        title: What it shows.
-        colour: Of its lines.
+        title: Name of the condition.
+        colour: Colour of the lines.
         poses: ``[T + 1, 3]`` of each drive: x [m], y [m], yaw [rad].
         ctes_m: ``[T]`` signed cross-track error of each drive [m].
-        off_track: Drives that left the track.
+        off_track: Number of drives that left the track.
     """
 
     title: str
@@ -61,10 +61,10 @@ class _Group:
 
 
 def write_above_of(folder: Path) -> Path | None:
-    """Write the picture of a published set beside its folder, of its last primary test; None where it has none.
+    """Write the picture of a published set beside its folder, for its last primary test; None if it has none.
 
     Args:
-        folder: Of the set, with its ``set.json``.
+        folder: Folder of the set, with its ``set.json``.
     """
     registration, primary = read_registration(folder), read_json(folder / SET)["primary"]
     if registration is None or not primary:
@@ -87,11 +87,11 @@ def write_above(
 
     Args:
         evidence: All drives of the set.
-        shown: A primary test as in ``set.json``: which drives are drawn.
-        filmed: The primary test that the film shows.
-        place: Where the object stands; None where that was not kept.
-        film: The kept film; without the file there are no stills.
-        target: The picture, a ``.webp``.
+        shown: A primary test from ``set.json`` whose drives are drawn.
+        filmed: The primary test of the film.
+        place: Position of the object; None if it was not stored.
+        film: The published film; without it there are no stills.
+        target: Output file, a ``.webp``.
     """
     test = PrimaryTest.model_validate(shown["test"])
     groups = _groups(evidence, test, shown["baseline"])
@@ -122,7 +122,7 @@ def moment_of(evidence: Evidence, test: PrimaryTest) -> tuple[float, bool]:
 
 
 def _groups(evidence: Evidence, test: PrimaryTest, baseline: str) -> list[_Group]:
-    # Three fixed colours, of different lightness, whatever the method.
+    # Three fixed colours of different lightness, for any method.
     colours = {NONE: LIGHT[NONE], baseline: LIGHT["random"], test.method: LIGHT["gradient"]}
     found = []
     for method, colour in colours.items():
@@ -165,7 +165,7 @@ def _draw_map(
 
 
 def _in_shape(low: Floats, high: Floats) -> tuple[Floats, Floats]:
-    """Corners of a box around another one that has the shape of the map."""
+    """Corners of a box around another one, in the map's aspect ratio."""
     wanted = _MAP[2] * _SIZE_IN[0] / (_MAP[3] * _SIZE_IN[1])
     size = np.maximum(high - low, [wanted * (high - low)[1], (high - low)[0] / wanted])
     middle = 0.5 * (low + high)
@@ -173,12 +173,12 @@ def _in_shape(low: Floats, high: Floats) -> tuple[Floats, Floats]:
 
 
 def _width(group: _Group) -> float:
-    """Thin where there are many drives."""
+    """Thinner lines for more drives."""
     return 1.2 if len(group.poses) <= 20 else 0.6
 
 
 def _draw_object(ax: Any, place: ObjectPlace) -> Floats:
-    """Draw the face from above, with an arrow to where it faces; its middle."""
+    """Draw the face from above, with an arrow along its front direction; returns its middle."""
     middle = np.array([place.x_m, place.y_m])
     front = np.array([np.cos(place.yaw_rad), np.sin(place.yaw_rad)])
     half = 0.5 * place.width_m * np.array([-front[1], front[0]])
@@ -208,7 +208,7 @@ def _draw_deviation(ax: Any, groups: Sequence[_Group], off_track_m: float, dt_s:
 
 
 def _draw_stills(figure: Figure, evidence: Evidence, filmed: Mapping[str, Any], film: Path) -> None:
-    """What the camera saw at the moment and a second before: above with the attack, below past the plain object."""
+    """Camera images at the key moment and a second before: above with the attack, below past the plain object."""
     when_s, left = moment_of(evidence, PrimaryTest.model_validate(filmed["test"]))
     moment = "it leaves the track" if left else "it deviates most"
     for at_s, x in zip((max(when_s - _BEFORE_S, 0.0), when_s), _STILLS_LEFT, strict=True):
@@ -228,7 +228,7 @@ def _draw_stills(figure: Figure, evidence: Evidence, filmed: Mapping[str, Any], 
 
 
 def _frame_at(film: Path, when_s: float) -> list[NDArray[np.uint8]]:
-    """The pictures of the three drives, without captions, in the kept frame that is nearest to a time."""
+    """The pictures of the three drives, without captions, in the film's frame that is nearest to a time."""
     with Image.open(film) as opened:
         opened.seek(min(round(when_s * _FILM_HZ), int(getattr(opened, "n_frames", 1)) - 1))
         frame = np.asarray(opened.convert("RGB"))

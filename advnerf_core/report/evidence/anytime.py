@@ -1,11 +1,11 @@
 """A test that stays valid while searches are added: stop when it decides, or when the budget ends.
 
 Under the null hypothesis all searches of both methods come from one distribution, so every order of their values is
-equally likely. Under the alternative with odds c, the values of the attack have the distribution F^c where those of
-the baseline have F (Lehmann 1953): the largest value is an attack's with probability ``c n / (c n + m)``, and so on
-downwards. The ratio of the two probabilities of the order that was observed is a martingale under the null hypothesis
+equally likely. Under the alternative with odds c, the values of the attack have the distribution F^c if the baseline's
+have F (Lehmann 1953): the largest value is an attack's with probability ``c n / (c n + m)``, and similarly
+downwards. The ratio of the two probabilities of the observed order is a martingale under the null hypothesis
 as searches are added, and so is its mean over several odds, the e-value. By Ville's inequality it ever reaches
-``1 / alpha`` with probability at most alpha, whatever rule stops the experiment (Ramdas et al. 2023, "Game-theoretic
+``1 / alpha`` with probability at most alpha, for any rule that stops the experiment (Ramdas et al. 2023, "Game-theoretic
 statistics and safe anytime-valid inference"). Which method the next search belongs to must be fixed beforehand.
 """
 
@@ -28,9 +28,9 @@ class AnytimeTest:
     """Result of the test over pairs of searches, one of each method, in the order in which they were added.
 
     Attributes:
-        p: Anytime-valid one-sided p-value after the last pair: 1 / the largest e-value so far, at most 1.
+        p: Anytime-valid one-sided p-value after the last pair: 1 / the largest e-value yet, at most 1.
         pairs: Pairs after which p was at most alpha for the first time; None if it never was.
-        of_pairs: Pairs that there were.
+        of_pairs: Total number of pairs.
     """
 
     p: float
@@ -43,7 +43,7 @@ def anytime_test(a: ArrayLike, b: ArrayLike, alpha: float = 0.05) -> AnytimeTest
 
     Args:
         a: Mean over starts of each search of method a ``[n]``, in the order of its searches.
-        b: The same of method b ``[m]``, from the same starts. Searches beyond the shorter one are left out.
+        b: The same of method b ``[m]``, from the same starts. Surplus searches of the longer one are ignored.
         alpha: Level of the test, within 0..1.
     """
     ours, theirs = (np.asarray(each, np.float64) for each in (a, b))
@@ -58,24 +58,24 @@ def anytime_test(a: ArrayLike, b: ArrayLike, alpha: float = 0.05) -> AnytimeTest
     found = np.maximum.accumulate(
         [float(e_value(ours[:pairs], theirs[:pairs])) for pairs in range(1, count + 1)]
     )
-    # The bound itself counts as reached, also where rounding leaves the e-value below it.
+    # The bound itself counts as reached, even if rounding leaves the e-value below it.
     decided = np.flatnonzero(found >= (1.0 - 1e-12) / alpha)
     return AnytimeTest(min(1.0, 1.0 / float(found[-1])), int(decided[0]) + 1 if decided.size else None, count)
 
 
 def e_value(a: ArrayLike, b: ArrayLike) -> Floats:
-    """e-values ``[...]`` of searches ``[..., n]`` of method a and ``[..., m]`` of method b; large ones say that a is larger.
+    """e-values ``[...]`` of searches ``[..., n]`` of method a and ``[..., m]`` of method b; large ones are evidence that a is larger.
 
     A value of a that ties with one of b counts as the smaller one.
     """
     ours, theirs = np.asarray(a, np.float64), np.asarray(b, np.float64)
     values = np.concatenate([ours, theirs], axis=-1)
     is_ours = np.arange(values.shape[-1]) < ours.shape[-1]
-    # Ascending; a stable sort keeps ours, which stand first, below equal ones of theirs.
+    # Ascending; a stable sort keeps ours, which come first, below equal ones of theirs.
     ordered = is_ours[np.argsort(values, axis=-1, kind="stable")]
     logs = []
     for odds in ODDS:
-        # From the largest value downwards, each is drawn from those that are left, with its weight.
+        # From the largest value downwards, each is drawn from the remaining ones, with its weight.
         left = np.cumsum(np.where(ordered, odds, 1.0), axis=-1)
         logs.append(ours.shape[-1] * math.log(odds) - np.log(left).sum(axis=-1))
     return np.asarray(np.exp(np.array(logs) + math.lgamma(values.shape[-1] + 1)).mean(axis=0))

@@ -1,4 +1,4 @@
-"""Registered contrasts: the same attacks under two conditions, drive by drive, so that one thing that differs can be told from the others."""
+"""Registered contrasts: the same attacks under two conditions, drive by drive, which isolate the effect of one difference."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ class ContrastRow:
     """One contrast of one method against one victim.
 
     Attributes:
-        name: Of the contrast.
-        victim: Which policy.
-        method: Which search.
+        name: Name of the contrast.
+        victim: Name of the victim.
+        method: Name of the method.
         before_m: Mean excess |CTE| per tick under the first condition [m].
         after_m: The same under the second, over the same searches and starts [m].
         difference_m: After minus before, paired by search and start [m].
-        low_m: Lower end of its interval [m]; None where there are too few drives.
+        low_m: Lower end of its interval [m]; None with too few drives.
         high_m: Upper end [m].
-        searches: Searches that both conditions have.
+        searches: Searches under both conditions.
         drives: Pairs of drives.
         registered: Whether all cells were registered; else it is exploration.
     """
@@ -48,7 +48,7 @@ class ContrastRow:
 
 
 def contrast_rows(evidence: Evidence) -> list[ContrastRow]:
-    """All registered contrasts, for each victim and method that both conditions have searched."""
+    """All registered contrasts, for each victim and method with searches under both conditions."""
     found = []
     for contrast in evidence.registration.contrasts:
         keys = dict.fromkeys(
@@ -63,7 +63,7 @@ def contrast_rows(evidence: Evidence) -> list[ContrastRow]:
 
 
 def contrast_data(evidence: Evidence) -> dict[str, Any]:
-    """The contrasts as JSON data; empty where none is registered."""
+    """The contrasts as JSON data; empty without any."""
     if not evidence.registration.contrasts:
         return {}
     return {"contrasts": [vars(row) for row in contrast_rows(evidence)]}
@@ -75,7 +75,7 @@ def _row(evidence: Evidence, contrast: Contrast, victim: str, method: str) -> Co
         for scenario in (contrast.before, contrast.after)
     )
     pairs = [(before[seed], after[seed]) for seed in sorted(before.keys() & after.keys())]
-    # Another attack under the second condition would be a difference of its own.
+    # Another attack under the second condition would add a second difference.
     if not pairs or any(one.attack_id != other.attack_id for one, other in pairs):
         return None
     values = [

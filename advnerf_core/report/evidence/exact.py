@@ -1,4 +1,4 @@
-"""Exact tests of registered comparisons, and their adjustment for being several."""
+"""Exact tests of registered comparisons, adjusted for multiple testing."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class PermutationTest:
     """Result of an exact permutation test.
 
     Attributes:
-        p: One-sided p-value; None where no test is claimed.
+        p: One-sided p-value; None if no test is claimed.
         difference: Mean of a minus mean of b, in the unit of the values.
         splits: Number of ways to split the searches into two methods; no p is below ``1 / splits``.
         reason: Why p is None; empty otherwise.
@@ -54,7 +54,7 @@ def permutation_test(a: ArrayLike, b: ArrayLike) -> PermutationTest:
 
     p is the share of all ``C(n + m, n)`` splits of the searches into two methods in which a is ahead by at
     least as much. The null hypothesis is that both methods draw their searches from one distribution.
-    If both drive from the same starts, then the claim is about these starts only: p does not tell whether
+    If both drive from the same starts, then the claim is about these starts only: p does not show whether
     a is better from new starts.
 
     Args:

@@ -1,4 +1,4 @@
-"""Which baselines a registered set runs: families of random textures, a coarse search, and the gradient in the cells of both."""
+"""Baselines that a registered set must run: families of random textures, a coarse search, and the gradient with the cells of both."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from advnerf_core.report.conditions import CONTROLS, style_of
 from advnerf_core.report.evidence.registration import RegisteredScenario, Registration
 
 RANDOM_FAMILIES = ("random", "random_coarse", "random_levels", "random_pink", "random_natural")
-# They search a coarse texture, with the answers of the policy alone.
+# These search a coarse texture by the policy's answers alone.
 COARSE_SEARCHES = ("cem", "evolution")
 GRADIENT, COARSE_GRADIENT = "gradient", "gradient_coarse"
-# Baselines whose texture has `cells` cells along an edge; all others have those of the object.
+# Baselines whose texture has `cells` cells along an edge; all others have the object's.
 COARSE_BASELINES = ("random_coarse", *COARSE_SEARCHES)
 LEAST_FAMILIES = 3
 
 
 def lacking_baselines(methods: Collection[str], other_cells: bool, families: Sequence[str]) -> list[str]:
-    """What a set with a primary test of the gradient must also run, in words; empty if nothing is missing.
+    """Baselines that a set with a primary test of the gradient lacks, as text; empty if complete.
 
     Args:
-        methods: Methods of one scenario, without those that the victim was trained or validated on.
+        methods: Methods of one scenario, except those that the victim was trained or validated on.
         other_cells: Whether coarse textures have fewer cells than the object.
         families: Families of random textures that may be baselines.
     """
@@ -37,9 +37,9 @@ def lacking_baselines(methods: Collection[str], other_cells: bool, families: Seq
 
 
 def coarse_cells_differ(scenario: RegisteredScenario) -> bool:
-    """Whether the coarse textures of a scenario have other cells than its gradient.
+    """Whether the coarse textures of a scenario have another number of cells than its gradient.
 
-    Registrations without settings do not say how many cells a panel has; such a panel counts as finer than its coarse textures.
+    Registrations without settings do not give a panel's number of cells; such a panel counts as finer than its coarse textures.
     """
     cells, settings = int(scenario.space.get("cells", 0)), scenario.settings
     of_panel = settings.get("object", scenario.space).get("panel_resolution", cells + 1)
@@ -47,7 +47,7 @@ def coarse_cells_differ(scenario: RegisteredScenario) -> bool:
 
 
 def families_note(registration: Registration) -> list[str]:
-    """Sentences for the page: which baselines the primary tests have, and what they lack; none without primary tests."""
+    """Sentences for the page: baselines of the primary tests, and missing ones; empty without primary tests."""
     said = dict.fromkeys(_note(registration, scenario) for scenario in registration.scenarios)
     return [f"{text}\n" for text in said if text]
 

@@ -1,7 +1,7 @@
 """Whether a victim withstands random textures: the worst of N of each validation family, judged before any gradient runs against it.
 
-A victim that was trained with textures is called *hardened* only with a passing verdict of its very policy, which every gradient search
-against it has recorded. `victim_title` decides what pages call it.
+A victim that was trained with textures is called *hardened* only with a passing verdict of exactly its policy, recorded in every gradient search
+against it. `victim_title` decides its name on pages.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from advnerf_core.report.cells import CellResult, read_cell
 from advnerf_core.strict import StrictModel
 
 FORMAT: Literal["advnerf-hardness-1"] = "advnerf-hardness-1"
-# In a run folder; of a published set in its folder ``set``.
+# In a run folder; for a published set in its folder ``set``.
 FILE, PUBLISHED_FILE = "hardness.json", "set/hardness.json"
 MOST_RECIPES = 3
 HARDENED, TRAINED_WITH_TEXTURES = "hardened", "trained with textures"
@@ -39,10 +39,10 @@ class FamilyHardness(StrictModel):
     """One victim with N random textures of one family, in the surrogate.
 
     Attributes:
-        scenario: Which path.
+        scenario: Name of the path.
         family: Method that draws the textures.
         excess_m: Excess |CTE| per tick of each texture, mean over the starts [m].
-        upper_m: One-sided upper bound of the worst texture's mean over starts [m]; None with one start, which gives none.
+        upper_m: One-sided upper bound of the worst texture's mean over starts [m]; None with a single start.
     """
 
     scenario: str
@@ -52,13 +52,13 @@ class FamilyHardness(StrictModel):
 
     @classmethod
     def of(cls, scenario: str, family: str, excess_m: ArrayLike, level: float = LEVEL) -> FamilyHardness:
-        """From the excess of every texture and start ``[N, S]`` [m].
+        """Compute from the excess of every texture and start ``[N, S]`` [m].
 
         Args:
-            scenario: Which path.
+            scenario: Name of the path.
             family: Method that drew the textures.
-            excess_m: As above.
-            level: Of the one-sided bound: Student's t over the starts of the texture with the largest mean.
+            excess_m: Excess |CTE| per tick ``[N, S]`` [m].
+            level: Level of the one-sided bound: Student's t over the starts of the texture with the largest mean.
         """
         from scipy.special import stdtrit  # reading verdicts needs no SciPy
 
@@ -78,19 +78,19 @@ class FamilyHardness(StrictModel):
 
 
 class HardnessVerdict(StrictModel):
-    """What N textures of each validation family did to one policy.
+    """Effect of N textures of each validation family on one policy.
 
     Attributes:
         victim: Name of the victim.
         policy_sha256: Content hash of its policy.
-        recipe: Settings that it was trained with.
+        recipe: Training settings of the victim.
         trained_on: Families of its training.
         validated_on: Families that judge it; the baselines of the tests are others.
         textures: Textures of each family, N.
-        seed: Of the textures.
-        starts: Starts of each texture, those that are measured.
-        margin_m: Largest excess of the worst texture that counts as none [m per tick].
-        level: Of the one-sided bounds.
+        seed: Seed of the textures.
+        starts: Measured starts of each texture.
+        margin_m: Largest excess of the worst texture that counts as no effect [m per tick].
+        level: Level of the one-sided bounds.
         families: Results, per scenario and family.
     """
 
@@ -126,15 +126,15 @@ class HardnessVerdict(StrictModel):
 
     @property
     def digest(self) -> str:
-        """SHA-256 of everything in it."""
+        """SHA-256 of its content."""
         return hashlib.sha256(json.dumps(self.model_dump(mode="json"), sort_keys=True).encode()).hexdigest()
 
 
 class HardnessRecord(StrictModel):
-    """All verdicts of one victim's recipes, in the order of their making; at most three recipes.
+    """All verdicts of one victim's recipes, oldest first; at most three recipes.
 
     Attributes:
-        format: Of the file.
+        format: Format of the file.
         verdicts: The verdicts.
     """
 
@@ -142,7 +142,7 @@ class HardnessRecord(StrictModel):
     verdicts: tuple[HardnessVerdict, ...] = ()
 
     def with_verdict(self, verdict: HardnessVerdict) -> HardnessRecord:
-        """The record with one more verdict; the same one again changes nothing.
+        """The record with one more verdict; a repeated one changes nothing.
 
         Raises:
             HardnessError: The policy has another verdict, or three other recipes were tried.
@@ -169,7 +169,7 @@ class HardnessRecord(StrictModel):
 
 
 def read_hardness(file: Path) -> HardnessRecord:
-    """The verdicts in a file; none if there is no file.
+    """The verdicts in a file; an empty record without a file.
 
     Raises:
         HardnessError: The file is not a record of verdicts.
@@ -194,7 +194,7 @@ def merged(records: Iterable[HardnessRecord]) -> HardnessRecord:
     """One record of all verdicts.
 
     Raises:
-        HardnessError: As of `HardnessRecord.with_verdict`.
+        HardnessError: See `HardnessRecord.with_verdict`.
     """
     found = HardnessRecord()
     for verdict in (each for record in records for each in record.verdicts):
@@ -205,13 +205,13 @@ def merged(records: Iterable[HardnessRecord]) -> HardnessRecord:
 def victim_title(
     victim: str, cells: Iterable[CellResult], record: HardnessRecord, baselines: Collection[str] = ()
 ) -> str:
-    """What pages call a victim; the name ``hardened`` of files and keys is only a name.
+    """Name of a victim on pages, which may differ from the ``hardened`` of files and keys.
 
     Args:
-        victim: Its name in files.
+        victim: Name of the victim in files.
         cells: Cells of the set; read only if a verdict passed.
-        record: The verdicts that are published with the set.
-        baselines: Methods that the set's tests compare with; a verdict on one of these families counts for nothing.
+        record: The verdicts published with the set.
+        baselines: Methods that the set's tests compare with; a verdict on one of these families does not count.
     """
     if victim != HARDENED:
         return victim
@@ -223,11 +223,11 @@ def victim_title(
 
 
 def titles_of(folder: Path, data: Mapping[str, Any]) -> dict[str, str]:
-    """What pages call the victims of a set, by their names in files.
+    """Names of a set's victims on pages, by their names in files.
 
     Args:
-        folder: Of the set.
-        data: What is in its ``set.json``.
+        folder: Folder of the set.
+        data: Content of its ``set.json``.
     """
     record = read_hardness(folder / PUBLISHED_FILE)
     baselines = {name for test in data["primary"] for name in test["test"]["against"]}
@@ -240,11 +240,11 @@ def titles_of(folder: Path, data: Mapping[str, Any]) -> dict[str, str]:
 
 
 def with_titles(folder: Path, data: Mapping[str, Any]) -> dict[str, Any]:
-    """The published numbers of a set with its victims as pages call them.
+    """The published numbers of a set with its victims' names on pages.
 
     Args:
-        folder: Of the set.
-        data: What is in its ``set.json``.
+        folder: Folder of the set.
+        data: Content of its ``set.json``.
     """
     titles = titles_of(folder, data)
 
@@ -264,7 +264,7 @@ def with_titles(folder: Path, data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _judged_before(cell: CellResult, record: HardnessRecord, baselines: Collection[str]) -> bool:
-    """Whether a passing verdict of the cell's policy, on other families than the baselines, was there when its search began."""
+    """Whether a passing verdict of the cell's policy, on other families than the baselines, existed before its search began."""
     verdict = record.passing(cell.policy_sha256)
     if verdict is None or cell.extra.get("hardness") != verdict.digest:
         return False

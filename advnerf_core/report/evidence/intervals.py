@@ -29,7 +29,7 @@ class ClusteredInterval:
         high: Upper end.
         level: Nominal coverage.
         standard_error: Clustered standard error of the mean.
-        degrees_of_freedom: Of the standard error.
+        degrees_of_freedom: Degrees of freedom of the standard error.
         over: The population of the interval. ``"searches and starts"``: new searches driven from new
             starts. ``"searches"``: new searches driven from this one start. ``"starts"``: this one search
             driven from new starts.
@@ -99,7 +99,7 @@ def clustered_interval(
 
 
 def difference_interval(one: ArrayLike, other: ArrayLike, level: float = LEVEL) -> ClusteredInterval | None:
-    """Interval of the mean of one method minus that of another, over new searches of both and new starts.
+    """Interval of one method's mean minus another's, over new searches of both and new starts.
 
     Only starts are paired. The order of the searches does not matter, and the methods may have different
     numbers of searches.
@@ -172,7 +172,7 @@ def _rows(values: Iterable[ArrayLike], shared_starts: bool) -> list[Floats]:
 
 
 def _estimate(rows: list[Floats], shared_starts: bool) -> tuple[MeanEstimate, Over] | None:
-    """Estimate the mean, and name the population that its standard error speaks for."""
+    """Estimate the mean, and name the population of its standard error."""
     if len(rows) == 1:
         return (one_sample(rows[0]), "starts") if rows[0].size > 1 else None
     if not shared_starts:

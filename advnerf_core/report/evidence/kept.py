@@ -1,4 +1,4 @@
-"""Published drives: what is kept of each, so that every number can be computed again without driving."""
+"""Published drives: the data stored of each, from which every number can be recomputed without driving."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from advnerf_core.driving.path import Path
 from advnerf_core.strict import StrictModel
 
 Floats = NDArray[np.float64]
-# Metres and radians. A total over 60 ticks then differs from that of the drive itself by less than a millimetre.
+# Metres and radians. A total over 60 ticks then differs from the drive's own by less than a millimetre.
 _DIGITS = 5
 
 
@@ -31,12 +31,12 @@ class KeptDrive(StrictModel):
 
     Attributes:
         x_m: ``T + 1`` positions, from the start [m], as numbers with spaces between them.
-        y_m: The same.
-        yaw_rad: The same [rad].
-        command: What the policy commanded at ``T`` ticks [rad, or rad/s]; empty for a live drive, whose bag has it.
+        y_m: The same for y [m].
+        yaw_rad: The same for yaw [rad].
+        command: Commands of the policy at ``T`` ticks [rad, or rad/s]; empty for a live drive, whose bag has them.
         driven_ticks: Ticks until the car stopped; its last |CTE| counts for the rest.
         collided: Whether the car ran into something.
-        collided_with: Name of it; empty if the world named nothing.
+        collided_with: Name of the obstacle; empty if the world named none.
     """
 
     x_m: Series
@@ -56,7 +56,7 @@ class KeptDrive(StrictModel):
         collided: bool = False,
         collided_with: str = "",
     ) -> KeptDrive:
-        """Keep a drive of states ``[T + 1, >= 3]``."""
+        """Convert a drive of states ``[T + 1, >= 3]``."""
         columns = [_text(column) for column in np.asarray(states, np.float64)[:, :3].T]
         return cls(
             x_m=columns[0],
@@ -83,7 +83,7 @@ class KeptDrive(StrictModel):
 
     @property
     def obstacle(self) -> str | None:
-        """Name of what the car ran into; None if it ran into nothing."""
+        """Name of the obstacle that the car hit; None without a collision."""
         return (self.collided_with or "obstacle") if self.collided else None
 
     def metrics(self, path: Path, horizon: Horizon) -> DriveMetrics:

@@ -1,4 +1,4 @@
-"""Whether the scene and the victim of a published set are kept beside it, so that it can be driven again."""
+"""Whether the scene and the victim of a published set are stored beside it, so that it can be driven again."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from pathlib import Path
 from advnerf_core.documents import read_json
 from advnerf_core.report.evidence.registration import Registration, read_registration
 
-# Folder of the stages that are kept, beside the sets; each has its record.
+# Folder of the published stages, beside the sets; each has its record.
 BUILD, RECORD = "reference", "stage.json"
-# Stages without which nothing can be driven again.
+# Stages that are required for driving again.
 _NEEDED = ("scene", "policy")
 LOST = "cannot be driven again: its scene and victim were not kept"
 
 
 def is_kept(folder: Path) -> bool:
-    """Whether the reference build has the scene and the victim that every scenario of a set was run with.
+    """Whether the reference build has the scene and the victim of every scenario of a set.
 
     Args:
-        folder: Of the set; the reference build lies beside it.
+        folder: Folder of the set; the reference build lies beside it.
     """
     registration = read_registration(folder)
     kept = {read_json(file).get("digest") for file in (folder.parent / BUILD).glob(f"*/{RECORD}")}
@@ -32,7 +32,7 @@ def lost_note(folder: Path) -> list[str]:
 
 
 def _digests_used(folder: Path, registration: Registration) -> list[str | None]:
-    """Digests of scene and victim, of the first cell of every scenario: `verify` checks that the others have the same."""
+    """Digests of scene and victim, of the first cell of every scenario: `verify` checks that the others are equal."""
     first = {(cell.scenario, cell.placement): cell.name for cell in reversed(registration.cells)}
     files = [file for name in first.values() if (file := folder / f"{name}.json").exists()]
     return [read_json(file).get("stages", {}).get(stage) for file in files for stage in _NEEDED]

@@ -1,4 +1,4 @@
-"""Searches that are strong where they search: what is left of each where it is deployed."""
+"""Searches that are strong in the surrogate, and the surviving share of their effect in the deployment."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ class Luck:
     """The baseline's searches against the method's. A share is deployed over surrogate excess.
 
     Attributes:
-        method_shares: Share that is left of each search of the method.
-        baseline_shares: The same of each search of the baseline.
+        method_shares: Surviving share of each search of the method.
+        baseline_shares: Surviving share of each search of the baseline.
         lucky: Searches of the baseline that are stronger in the surrogate than every search of the method, strongest first.
         other_side: Whether all of these push the car to the other side than every search of the method does.
-        difference_without_m: The method's mean excess in the surrogate minus that of the other baseline searches [m]; None without any.
+        difference_without_m: The method's mean excess in the surrogate minus the other baseline searches' [m]; None without any.
     """
 
     method_shares: tuple[float, ...]
@@ -33,7 +33,7 @@ class Luck:
 
     @property
     def lucky_shares(self) -> tuple[float, ...]:
-        """What is left of the lucky searches."""
+        """Surviving shares of the lucky searches."""
         return tuple(_share(each) for each in self.lucky)
 
 
@@ -54,7 +54,7 @@ def luck_of(test: Mapping[str, Any]) -> Luck:
 
 
 def luck_sentences(test: Mapping[str, Any], alpha: float = 0.05) -> str:
-    """Why a method is no better than the baseline where it searches; empty where it is better, or no test is claimed."""
+    """Explains why a method is no better than the baseline in the surrogate; empty if it is better, or no test is claimed."""
     if test["p_surrogate"] is None or test["p_surrogate"] <= alpha:
         return ""
     found = luck_of(test)

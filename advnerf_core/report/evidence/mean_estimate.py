@@ -6,8 +6,8 @@ The crossed design has I searches, each driven from the same J starts. Its model
 
 with independent random effects of search (a), start (b), and of the drive itself (e). From the mean squares
 A (searches), B (starts) and E (residual), the unbiased estimate of the variance is ``(A + B - E) / (I J)``:
-the variance of the search means, plus that of the start means, minus what both count. This has the form of
-the two-way cluster estimate (Cameron, Gelbach and Miller 2011). Its degrees of freedom are those of
+the variance of the search means, plus the variance of the start means, minus the part that both count. This has the form of
+the two-way cluster estimate (Cameron, Gelbach and Miller 2011). Its degrees of freedom follow
 Satterthwaite (1946). If A <= E, then the data show no search effect, and the start means are one sample.
 If B <= E, then the search means are one sample. If both hold, then all drives are one sample.
 
@@ -50,7 +50,7 @@ class MeanEstimate:
     Attributes:
         mean: Mean of each data set ``[...]``, in the unit of its values.
         standard_error: Standard error of the mean ``[...]``, same unit.
-        degrees_of_freedom: Of the standard error ``[...]``.
+        degrees_of_freedom: Degrees of freedom of the standard error ``[...]``.
         skewness: Estimated skewness of the mean ``[...]``: its third cumulant over the cubed standard error.
     """
 
@@ -77,7 +77,7 @@ class MeanEstimate:
     def _statistic(self, bound: float) -> Floats:
         """Transformed t statistic ``[...]`` of the hypothesis that the true mean is ``bound``."""
         distance = np.asarray(self.mean - bound)
-        # Without spread, every other bound is infinitely far away.
+        # Without spread, any other bound is infinitely far away.
         far = np.asarray(np.sign(distance) * _LARGEST_T)
         t = np.divide(distance, self.standard_error, out=far, where=self.standard_error > 0.0)
         return _transformed(np.clip(t, -_LARGEST_T, _LARGEST_T), self.skewness)
@@ -105,7 +105,7 @@ def crossed(values: Floats) -> MeanEstimate:
     skew_searches = _third_cumulant(search_means) / searches**2
     skew_starts = _third_cumulant(start_means) / starts**2
     flat = values.reshape(*values.shape[:-2], count)
-    # An effect that the data do not show is dropped, and what is left is one sample.
+    # An effect that the data do not show is dropped, and the rest is one sample.
     no_search, no_start = of_searches <= of_residual, of_starts <= of_residual
     cases = [no_search & no_start, no_search, no_start]
     both = of_searches + of_starts - of_residual
@@ -149,7 +149,7 @@ def difference(one: Floats, other: Floats) -> MeanEstimate:
 
 @dataclass(frozen=True)
 class _Method:
-    """What the drives of one method add to the variance of a difference; each an array ``[...]``.
+    """Contributions of one method's drives to the variance of a difference; each an array ``[...]``.
 
     Attributes:
         searches: Variance of the mean if the searches are the sample.
@@ -202,7 +202,7 @@ def _satterthwaite(total: Floats, squares: tuple[Floats, ...], freedoms: tuple[f
 
 
 def _third_cumulant(values: Floats) -> Floats:
-    """Unbiased third cumulant ``[...]`` of values ``[..., n]``; 0 where n < 3 tells nothing about it."""
+    """Unbiased third cumulant ``[...]`` of values ``[..., n]``; 0 if n < 3, which cannot show it."""
     count = values.shape[-1]
     if count < 3:
         return np.zeros(values.shape[:-1])

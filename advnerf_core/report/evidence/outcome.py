@@ -14,14 +14,14 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Outcome:
-    """What an attack did to one drive.
+    """Effect of an attack on one drive.
 
     Attributes:
-        excess_cte_m_per_tick: Mean |CTE| of the attacked drive minus that of the drive without attack [m].
+        excess_cte_m_per_tick: Mean |CTE| of the attacked drive minus the mean of the drive without attack [m].
         off_track: Whether |CTE| of the attacked drive ever exceeded the off-track limit.
-        collided_with: Name of what the attacked car hit; None if it hit nothing.
-        time_to_leaving_s: Time of the first tick off the track [s]; None if the car never left it, or where only totals are kept.
-        share_off_lane: Share of the ticks off the track, within 0..1; None where only totals are kept.
+        collided_with: Name of the obstacle that the attacked car hit; None without a collision.
+        time_to_leaving_s: Time of the first tick off the track [s]; None if the car never left it, or if only totals are stored.
+        share_off_lane: Share of the ticks off the track, within 0..1; None if only totals are stored.
     """
 
     excess_cte_m_per_tick: float
@@ -39,13 +39,13 @@ def drive_outcome(
 ) -> Outcome:
     """Compare an attacked drive with the drive from the same start without attack.
 
-    The arrays are those of :attr:`DriveMetrics.ctes_m`, where the ticks after a stop are already filled in.
+    The arrays come from :attr:`DriveMetrics.ctes_m`, where the ticks after a stop are already filled in.
 
     Args:
         attacked_cte_m: ``[T]`` signed CTE of the attacked drive at the ticks 1..T [m].
         none_cte_m: ``[T]`` signed CTE of the drive without attack [m].
         horizon: Number of ticks T, length of a tick and the off-track limit.
-        collided_with: Name of what the attacked car hit, if it hit something.
+        collided_with: Name of the obstacle that the attacked car hit, if any.
     """
     limits = horizon or Horizon()
     attacked = _magnitudes_m("attacked", attacked_cte_m, limits.ticks)

@@ -38,7 +38,7 @@ Intervals are nominal 95 % intervals. On simulated drives with a known truth the
 least where a few searches differ strongly from the rest: [statistics](statistics.md). *Decided after*
 is when a test that may be read after every pair of searches would have ended; it claims nothing.
 """.format(*MEASURED_COVERAGE)
-# Columns that are left out where they tell no line from another.
+# Columns that are left out if they are equal in all lines.
 _OPTIONAL = ("condition", "collided")
 
 
@@ -46,14 +46,14 @@ def results_page(sets: Mapping[str, Mapping[str, Any]]) -> str:
     """The page in Markdown.
 
     Args:
-        sets: By name, what is in each ``set.json``, with the registration under ``registered``, its entry of `ABOUT` under ``about`` (None
-            without one), under ``filmed`` whether there is a film, and under ``notes`` paragraphs about its baselines and about what is kept.
+        sets: Content of each ``set.json`` by name, with the registration under ``registered``, its entry of `ABOUT` under ``about`` (None
+            without one), under ``filmed`` whether there is a film, and under ``notes`` paragraphs about its baselines and stored files.
     """
     return "\n".join([_HEAD, *_overview(sets), *(_section(name, sets) for name in sorted(sets))])
 
 
 def groups_of_searches(sets: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
-    """Names of sets, together where they share searches."""
+    """Names of sets, grouped by shared searches."""
     groups: list[tuple[set[str], list[str]]] = []
     for name, data in sorted(sets.items()):
         attacks, names = {each["attack_id"] for each in data["searches"]}, [name]
@@ -80,7 +80,7 @@ def film_of(name: str) -> str:
 
 
 def _overview(sets: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Which sets there are, how many of them are independent, and what each was for."""
+    """The list of sets, how many of them are independent, and the purpose of each."""
     said = {name: data["about"] for name, data in sets.items() if data.get("about")}
     if not said:
         return []
@@ -101,7 +101,7 @@ def _overview(sets: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 
 def _shared(name: str, sets: Mapping[str, Mapping[str, Any]]) -> str:
-    """Other sets that drove the same searches, and how many of them; empty without any."""
+    """Other sets with the same searches, and how many of them; empty without any."""
     own = {each["attack_id"] for each in sets[name]["searches"]}
     counts = {
         other: len(own & {each["attack_id"] for each in data["searches"]})
@@ -171,7 +171,7 @@ def _role(name: str, sets: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 
 def _where(through: Sequence[str]) -> str:
-    """Where it was deployed, so that no simulation passes for a real car."""
+    """The deployment, so that no simulation passes for a real car."""
     known = {
         "nodes": "the simulated lab, driven by the live nodes",
         "world": "the simulator, with its own car unless the condition says ideal",
@@ -181,7 +181,7 @@ def _where(through: Sequence[str]) -> str:
 
 
 def _withdrawn(data: Mapping[str, Any]) -> list[str]:
-    """Sentences about what was registered and given up."""
+    """Sentences about withdrawn scenarios."""
     sentences = []
     for scenario, reason in data.get("withdrawn", {}).items():
         cells, tests = (
@@ -196,7 +196,7 @@ def _withdrawn(data: Mapping[str, Any]) -> list[str]:
 
 
 def _drives_badly(data: Mapping[str, Any]) -> list[str]:
-    """Sentences about victims that break the registered rule of what drives well."""
+    """Sentences about victims that break the registered rule of driving well."""
     return [
         f"**Does not drive well:** past the plain object, the victim {row['victim']} has a mean abs. CTE of {row['mean_cte_m']:.4f} m {row['domain']} in "
         f"{place_of(row)}, and {row['off_track']} drives leave the track. Registered were at most {row['limit_m']:.4f} m, and none. {row['reason']}\n"
@@ -205,7 +205,7 @@ def _drives_badly(data: Mapping[str, Any]) -> list[str]:
 
 
 def _tests(tests: Sequence[Mapping[str, Any]]) -> str:
-    """The primary tests: deployed excess of the attack minus that of the baseline."""
+    """The primary tests: deployed excess of the attack minus the baseline's."""
     return _lines(
         [
             {
@@ -226,7 +226,7 @@ def _tests(tests: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _decided(found: Mapping[str, Any]) -> str:
-    """After how many pairs of searches the anytime-valid test would have decided."""
+    """Number of search pairs after which the anytime-valid test would have decided."""
     return f"{found['pairs'] or '-'} of {found['of_pairs']} pairs" if found["of_pairs"] else ""
 
 
@@ -253,7 +253,7 @@ def _contrasts(found: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """One line for each method and domain. Conditions of the same searches share their drives in the learned scene, which stand once."""
+    """One line for each method and domain. Conditions of the same searches share their drives in the learned scene, which appear once."""
     shown: list[dict[str, str]] = []
     for cells in map(_cells, rows):
         before = [
@@ -267,7 +267,7 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _lines(lines: Sequence[Mapping[str, str]]) -> str:
-    """A table of lines by column, without those of `_OPTIONAL` that say the same in all lines."""
+    """A table of lines by column, without columns of `_OPTIONAL` that are equal in all lines."""
     columns = tuple(
         name
         for name in (lines[0] if lines else {})

@@ -19,11 +19,11 @@ _MOST_COLUMNS = 8
 
 
 def excess_plot(evidence: Evidence, titles: Mapping[str, str] = MappingProxyType({})) -> Figure:
-    """Excess |CTE| per tick of each drive, one column per search; of sets with many conditions the means, one line per condition.
+    """Excess |CTE| per tick of each drive, one column per search; for sets with many conditions the means, one line per condition.
 
     Args:
         evidence: The set.
-        titles: What its victims are called, by name, where that is another.
+        titles: Names of its victims on pages, if they differ.
     """
     shown = [row for row in rows(evidence) if row.method != NONE]
     return _drives(evidence, shown, titles) if len(shown) <= _MOST_COLUMNS else _means(shown, titles)
@@ -57,7 +57,7 @@ def _drives(evidence: Evidence, shown: list[Row], titles: Mapping[str, str]) -> 
 
 
 def _means(shown: list[Row], titles: Mapping[str, str]) -> Figure:
-    """Means with their intervals: deployed ones filled, those in the learned scene hollow."""
+    """Means with their intervals: deployed ones filled, surrogate ones hollow."""
     places = list(dict.fromkeys((row.scenario, row.placement, row.victim) for row in shown))
     methods = list(dict.fromkeys(row.method for row in shown))
     with new_axes(7.2, 0.9 + 0.42 * len(places)) as ax:

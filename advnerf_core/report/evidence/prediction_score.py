@@ -1,4 +1,4 @@
-"""How good predicted bands of deployed excess were, drive by drive and set by set."""
+"""Scores of predicted bands of deployed excess, drive by drive and set by set."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ LEVEL = 0.8
 
 @dataclass(frozen=True)
 class Score:
-    """Bands of the drives of one set against what was driven.
+    """Comparison of one set's bands with its measured drives.
 
     Attributes:
-        held: Drives within their bands.
-        drives: Drives.
+        held: Number of drives within their bands.
+        drives: Number of drives.
         score: Mean interval score, in the unit of the bands; smaller is better.
     """
 

@@ -32,7 +32,7 @@ def write_numbers(folder: Path) -> Path:
     """Write the manifest, the numbers and the pictures of a set, and beside its folder its digest.
 
     Raises:
-        SetError: Nothing was registered there, its cells contradict the registration, or a victim does not drive well and that is not
+        SetError: The folder has no registration, its cells contradict it, or a victim does not drive well and that is not
             declared.
     """
     registration, cells = read_set(folder)
@@ -57,7 +57,7 @@ def write_numbers(folder: Path) -> Path:
 
 
 def write_page(published: Path) -> Path:
-    """Write the page of all sets, and the manifest of what lies beside them; last of all, when pictures and films are there."""
+    """Write the page of all sets, and the manifest of the files beside them; call it last, after pictures and films."""
     write_atomically(published / PAGE, page_text(published))
     write_beside(published)
     return published / PAGE

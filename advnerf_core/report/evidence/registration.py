@@ -1,4 +1,4 @@
-"""A registration: what will be run, and which tests will be claimed, written before anything is run."""
+"""A registration: the planned cells and the tests to be claimed, written before anything is run."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from advnerf_core.report.reference import Domain
 from advnerf_core.strict import StrictModel
 
 FORMAT: Literal["advnerf-registration-1"] = "advnerf-registration-1"
-# In the folder of the published cells: what was registered, and which scenarios of it were given up later.
+# In the folder of the published cells: the registration, and its scenarios that were withdrawn later.
 FILE, WITHDRAWN = "set/registration.json", "set/withdrawn.json"
 Pose = tuple[float, float, float]
 Share = Annotated[float, Field(gt=0, lt=1)]
@@ -35,16 +35,16 @@ class RegisteredScenario(StrictModel):
 
     Attributes:
         settings_sha256: Hash of the world and of all settings that a result depends on.
-        settings: The same in full, those that are left at their defaults too; empty in registrations from before it was kept.
-        path: The reference path, as `Path.to_dict` writes it.
+        settings: All of these settings, including defaults; empty in registrations from before they were stored.
+        path: The reference path, as written by `Path.to_dict`.
         ticks: Control ticks of a drive.
         dt_s: Length of a tick [s].
         off_track_m: |CTE| beyond which the car is off the track [m].
         held_cap_m: Largest |CTE| that a stopped car is charged per tick [m].
-        starts: Start poses that are measured: x [m], y [m], yaw [rad]; no search has them.
-        deployed_starts: How many of them, the first ones, are deployed.
+        starts: Measured start poses: x [m], y [m], yaw [rad]; no search uses them.
+        deployed_starts: Number of starts, from the first, that are deployed.
         evaluations: Closed-loop drives of each search.
-        space: What a search may change.
+        space: Name of the search space.
         victims: Recipe of the victims: teacher, data, optimiser steps, network.
         drives_well_mean_cte_m: A victim drives well if its mean |CTE| without attack is at most this [m], and it never leaves the track.
     """
@@ -74,7 +74,7 @@ class RegisteredScenario(StrictModel):
 
     @property
     def horizon(self) -> Horizon:
-        """What is summed, and the limits."""
+        """Horizon of the sums, and the limits."""
         return Horizon(self.ticks, self.dt_s, self.off_track_m, self.held_cap_m)
 
     def reference_path(self) -> Path:
@@ -88,9 +88,9 @@ class RegisteredCell(StrictModel):
     Attributes:
         scenario: Name of the scenario.
         placement: Name of the placement; empty for the scenario's own.
-        victim: Which policy.
-        method: Which search, or ``none``.
-        seed: Of the search.
+        victim: Name of the victim.
+        method: Name of the method, or ``none``.
+        seed: Seed of the search.
     """
 
     scenario: str
@@ -106,13 +106,13 @@ class RegisteredCell(StrictModel):
 
 
 class PrimaryTest(StrictModel):
-    """A test that is claimed: the method's deployed excess against that of the baseline that is strongest in the surrogate.
+    """A claimed test: the method's deployed excess against the baseline's that is strongest in the surrogate.
 
     Attributes:
         scenario: Name of the scenario.
         placement: Name of the placement.
-        victim: Which policy.
-        method: Which search.
+        victim: Name of the victim.
+        method: Name of the method.
         against: The baselines.
     """
 
@@ -124,14 +124,14 @@ class PrimaryTest(StrictModel):
 
 
 class Contrast(StrictModel):
-    """Two conditions that the same attacks are driven under, and what differs between them.
+    """Two conditions for the same attacks, and the difference between them.
 
     Attributes:
-        name: What differs, for readers.
-        before: A scenario.
+        name: The difference, for readers.
+        before: Name of a scenario.
         after: Another scenario of the same attacks, or the same one.
-        before_in: Which of its drives.
-        after_in: Which of its drives.
+        before_in: Domain of the drives under the first condition.
+        after_in: Domain of the drives under the second condition.
     """
 
     name: str = Field(min_length=1)
@@ -142,20 +142,20 @@ class Contrast(StrictModel):
 
 
 class Registration(StrictModel):
-    """What will be run.
+    """The planned cells and tests of a set.
 
     Attributes:
-        format: Of the file.
+        format: Format of the file.
         name: Name of the set of results.
-        file: The experiment file; `launch_file` says what it is called now.
-        setting: Its setting.
-        overrides: Changes of it on the command line.
-        date: When it was registered, ISO.
-        software_version: Of advnerf.
-        scenarios: By name, ``NAME`` or ``NAME.PLACEMENT``.
+        file: The experiment file; `launch_file` gives its current name.
+        setting: The file's setting.
+        overrides: Changes of the setting on the command line.
+        date: Date of the registration, ISO.
+        software_version: Version of advnerf.
+        scenarios: Scenarios by name, ``NAME`` or ``NAME.PLACEMENT``.
         cells: All cells.
-        primary: The tests that are claimed; Holm's adjustment is over these.
-        contrasts: What is told apart by the same attacks under other conditions.
+        primary: The claimed tests; Holm's adjustment is over these.
+        contrasts: Comparisons of the same attacks under two conditions.
         level: Coverage of all intervals.
         alpha: Level of the tests.
     """
@@ -179,31 +179,31 @@ class Registration(StrictModel):
         return self.scenarios.get(scenario_key(name, placement))
 
     def as_filed(self) -> Registration:
-        """The registration as `read_registration` reads it once it is written: its defaults are said."""
+        """The registration as `read_registration` would read it from its file, with explicit defaults."""
         return Registration.model_validate(self.model_dump(mode="json"))
 
     @property
     def digest(self) -> str:
-        """SHA-256 of everything that its file says but its date; what was added to the format later is not in older files."""
+        """SHA-256 of the file's content except its date; keys that were added to the format later are not in older files."""
         data = self.model_dump(mode="json", exclude={"date"}, exclude_unset=True)
         return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
 def launch_file(text: str) -> str:
-    """A registered file, or a recorded command, with the name that the file has now: registrations and rows keep the old one."""
+    """A registered file, or a recorded command, with the file's current name: registrations and rows keep the old one."""
     return text.replace(".campaign.yaml", ".experiment.yaml")
 
 
 def scenario_key(name: str, placement: str) -> str:
-    """How a registration names a scenario with a placement."""
+    """Name of a scenario with a placement in a registration."""
     return f"{name}.{placement}" if placement else name
 
 
 def read_registration(folder: FilePath) -> Registration | None:
-    """The registration in the folder of a set of results; None if there is none.
+    """The registration in the folder of a set of results; None without one.
 
     Raises:
-        RegistrationError: The file is not a registration's.
+        RegistrationError: The file is not a registration.
     """
     file = folder / FILE
     if not file.exists():
@@ -218,23 +218,23 @@ def read_registration(folder: FilePath) -> Registration | None:
 
 
 def read_withdrawn(folder: FilePath) -> dict[str, str]:
-    """Registered scenarios of a set that were given up, each with the reason; empty without any.
+    """Withdrawn scenarios of a set, each with the reason; empty without any.
 
     Raises:
-        RegistrationError: The file does not say so.
+        RegistrationError: The file is invalid.
     """
     return read_reasons(folder / WITHDRAWN, "withdrawn scenarios")
 
 
 def read_reasons(file: FilePath, what: str) -> dict[str, str]:
-    """Things of a set, each with a reason; empty without the file.
+    """Reasons by name, from a file of a set; empty without the file.
 
     Args:
-        file: In the folder of a set.
-        what: They are, for messages: ``withdrawn scenarios``.
+        file: File in the folder of a set.
+        what: Kind of the names, for messages: ``withdrawn scenarios``.
 
     Raises:
-        RegistrationError: The file does not say so.
+        RegistrationError: The file is invalid.
     """
     if not file.exists():
         return {}
@@ -250,10 +250,10 @@ def read_reasons(file: FilePath, what: str) -> dict[str, str]:
 
 
 def withdraw(folder: FilePath, scenarios: Mapping[str, str]) -> None:
-    """Give registered scenarios up, for reasons that the page of results tells.
+    """Withdraw registered scenarios, with reasons that the page of results shows.
 
     Raises:
-        RegistrationError: One was not registered, has no reason, or has results already: these are published, whatever they say.
+        RegistrationError: A scenario was not registered, has no reason, or already has results: these are published, good or bad.
     """
     registration = read_registration(folder)
     if registration is None:

@@ -1,4 +1,4 @@
-"""The published numbers of a set of cells, in metres, computed from the kept drives alone."""
+"""The published numbers of a set of cells, in metres, computed from the published drives alone."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SearchMeans:
-    """What one search does, mean over its starts.
+    """Effect of one search, mean over its starts.
 
     Attributes:
         surrogate_m: Excess |CTE| per tick in the surrogate [m].
         deployed_m: The same deployed [m].
-        shift_m: Signed CTE minus that without attack, per tick in the surrogate [m]; positive is to the left.
+        shift_m: Signed CTE minus the one without attack, per tick in the surrogate [m]; positive is to the left.
     """
 
     surrogate_m: float
@@ -45,21 +45,21 @@ class SearchMeans:
 
 @dataclass(frozen=True)
 class TestResult:
-    """A primary test.
+    """Result of a primary test.
 
     Attributes:
-        test: Which, as it was registered.
+        test: The registered test.
         baseline: The baseline that is strongest in the surrogate.
-        difference_m: Mean excess of the method minus that of the baseline, deployed [m].
-        low_m: Lower end of its interval over new searches of both and new starts [m]; None where there are too few.
+        difference_m: Mean excess of the method minus the baseline's, deployed [m].
+        low_m: Lower end of its interval over new searches of both and new starts [m]; None with too few.
         high_m: Upper end [m].
-        p: Exact p of the permutation test; None where none is claimed.
-        p_holm: Adjusted for all primary tests.
-        reason: Why there is no p.
-        difference_surrogate_m: The difference where both search, in the surrogate [m].
+        p: Exact p of the permutation test; None if no test is claimed.
+        p_holm: p adjusted for all primary tests.
+        reason: Reason for a missing p.
+        difference_surrogate_m: The same difference in the surrogate [m].
         p_surrogate: p of the same test there; a description, not adjusted, and too large if there are several baselines, since
             the strongest one is chosen from these drives.
-        searches: What each search of the two does, by method.
+        searches: Means of each search of both, by method.
         anytime: The test that could have stopped earlier, deployed; a description, not adjusted.
         mcnemar: Off-track against the baseline, search by search.
     """
@@ -83,8 +83,8 @@ class Evidence(CellDrives):
     """Outcomes of all drives of a registered set.
 
     Args:
-        registration: What was registered.
-        cells: The cells that are there; those without kept drives, not driven live, or of a scenario that was not registered, are left out.
+        registration: The registration.
+        cells: The existing cells; those without published drives, not driven live, or of an unregistered scenario, are left out.
     """
 
     def __init__(self, registration: Registration, cells: Sequence[CellResult]) -> None:
@@ -111,7 +111,7 @@ class Evidence(CellDrives):
         return cell.name in self._named and cell.registration == self._digest
 
     def metrics(self, cell: CellResult, domain: Domain) -> list[DriveMetrics]:
-        """Metrics of the drives of a cell, computed from what is kept."""
+        """Metrics of the drives of a cell, computed from their published poses."""
         key = cell.name, domain
         if key not in self._metrics:
             path, horizon = (
@@ -122,7 +122,7 @@ class Evidence(CellDrives):
         return self._metrics[key]
 
     def has(self, cell: CellResult, domain: Domain) -> bool:
-        """Whether drives of a cell are kept."""
+        """Whether drives of a cell are published."""
         return bool(cell.kept.get(domain))
 
     def share_starts(self, cells: Sequence[CellResult], domain: Domain) -> bool:
@@ -134,7 +134,7 @@ class Evidence(CellDrives):
         return [metrics.mean_cte_m for metrics in self.metrics(cell, domain)]
 
     def outcomes(self, cell: CellResult, domain: Domain, control: str = NONE) -> list[Outcome]:
-        """Outcomes of the drives of a cell, each against the drive past a control from the same start; none without such drives."""
+        """Outcomes of the drives of a cell, each against the control's drive from the same start; empty without such drives."""
         clean, horizon = self.without(cell, control), self.scenario_of(cell).horizon
         if clean is None:
             return []
@@ -151,7 +151,7 @@ class Evidence(CellDrives):
 
 
 def rows(evidence: Evidence) -> list[Row]:
-    """All rows, in the order of the registration; what was not registered comes last."""
+    """All rows, in the order of the registration; unregistered ones come last."""
     keys: dict[Key, None] = {}
     for cell in evidence.registration.cells:
         keys[cell.scenario, cell.placement, cell.victim, cell.method] = None
@@ -161,11 +161,11 @@ def rows(evidence: Evidence) -> list[Row]:
 
 
 def primary_tests(evidence: Evidence) -> list[TestResult]:
-    """The registered tests, adjusted by Holm over all that were registered: one that cannot be made counts as p = 1."""
+    """The registered tests, adjusted by Holm over all registered ones: one that cannot be made counts as p = 1."""
     found = [test for each in evidence.registration.primary if (test := _test(evidence, each)) is not None]
     p_values = [test.p for test in found if test.p is not None]
     absent = [1.0] * (len(evidence.registration.primary) - len(found))
-    # Too few searches for any: the intervals remain.
+    # Too few searches for any test: the intervals remain.
     adjusted = iter(holm([*p_values, *absent]) if p_values else ())
     return [test if test.p is None else replace(test, p_holm=next(adjusted)) for test in found]
 
@@ -191,7 +191,7 @@ def as_data(evidence: Evidence) -> dict[str, Any]:
 
 
 def search_list(evidence: Evidence) -> list[dict[str, Any]]:
-    """The searches of a set, each once: conditions, and other sets, may have driven what one search found."""
+    """The searches of a set, each once: several conditions, and other sets, may have driven the result of one search."""
     found = {
         (cell.victim, cell.method, cell.seed, cell.attack_id or "")
         for cell in evidence.cells.values()
@@ -202,7 +202,7 @@ def search_list(evidence: Evidence) -> list[dict[str, Any]]:
 
 
 def _test(evidence: Evidence, test: PrimaryTest) -> TestResult | None:
-    """A test whose cells are all there; None otherwise."""
+    """A test whose cells all exist; else None."""
     by_method = {
         method: evidence.searches((test.scenario, test.placement, test.victim, method))
         for method in (test.method, *test.against)

@@ -1,4 +1,4 @@
-"""The one row of results: a method against a victim in one domain, in metres per tick over both controls, with intervals."""
+"""A row of results: a method against a victim in one domain, in metres per tick over both controls, with intervals."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ class Row:
     Attributes:
         scenario: Name of the scenario.
         placement: Name of the placement.
-        victim: Which policy.
-        method: Which search, or ``none``.
+        victim: Name of the victim.
+        method: Name of the method, or ``none``.
         domain: surrogate or deployed.
         searches: Number of searches.
         drives: Number of drives.
-        excess_m: Mean excess |CTE| per tick over the plain object [m]; of ``none`` its mean |CTE|.
-        low_m: Lower end of its interval [m]; None where there are too few drives.
+        excess_m: Mean excess |CTE| per tick over the plain object [m]; for ``none`` its mean |CTE|.
+        low_m: Lower end of its interval [m]; None with too few drives.
         high_m: Upper end [m].
-        over_no_object_m: Mean excess over no object [m]; None where no drive without object was made, and of these drives themselves.
+        over_no_object_m: Mean excess over no object [m]; None without such drives, and for these drives themselves.
         over_no_object_low_m: Lower end of its interval [m].
         over_no_object_high_m: Upper end [m].
-        over: What the interval is over.
+        over: Population of the interval.
         off_track: Drives that left the track.
-        collided: Drives that ended in a collision, by what the car ran into.
-        off_lane_share: Share of all ticks off the track; None where only totals are kept.
-        leaving_s: Median time to leaving the track of the drives that left it [s].
+        collided: Drives that ended in a collision, by obstacle.
+        off_lane_share: Share of all ticks off the track; None if only totals are stored.
+        leaving_s: Median time to leaving the track, over the drives that left it [s].
         registered: Whether all its cells were registered; else it is exploration.
     """
 
@@ -65,7 +65,7 @@ class Row:
 
 
 class CellDrives:
-    """Outcomes of the drives of cells, from the totals in them. `Evidence` computes them from kept poses.
+    """Outcomes of the drives of cells, from their stored totals. `Evidence` computes them from published poses.
 
     Args:
         cells: The cells.
@@ -81,7 +81,7 @@ class CellDrives:
         return sorted((cell for cell in self.cells.values() if cell.key == key), key=lambda cell: cell.seed)
 
     def without(self, cell: CellResult, control: str = NONE) -> CellResult | None:
-        """The cell of the same drives past a control: the plain object (``none``) or no object (``empty``)."""
+        """The cell of the same drives with a control: the plain object (``none``) or no object (``empty``)."""
         return self.cells.get(cell_name(cell.scenario, cell.victim, control, 0, cell.placement))
 
     def is_registered(self, cell: CellResult) -> bool:
@@ -93,21 +93,21 @@ class CellDrives:
         return cell.drives(domain) is not None
 
     def share_starts(self, cells: Sequence[CellResult], domain: Domain) -> bool:
-        """Whether the drives of all cells begin at the same starts; then those without attack are the same drives."""
+        """Whether the drives of all cells begin at the same starts; then they share the drives without attack."""
         return len({driven.none_total_cte_m for cell in cells if (driven := cell.drives(domain))}) == 1
 
     def mean_ctes_m(self, cell: CellResult, domain: Domain) -> list[float]:
-        """Mean |CTE| of each drive of a cell [m]; none where the number of ticks is not known."""
+        """Mean |CTE| of each drive of a cell [m]; empty if the number of ticks is unknown."""
         driven = cell.drives(domain)
         return [total / cell.ticks for total in driven.total_cte_m] if driven and cell.ticks else []
 
     def outcomes(self, cell: CellResult, domain: Domain, control: str = NONE) -> list[Outcome]:
-        """Outcomes of the drives of a cell, each against the drive past a control from the same start; none without such drives."""
+        """Outcomes of the drives of a cell, each against the control's drive from the same start; empty without such drives."""
         driven, clean = cell.drives(domain), self.without(cell, control)
         against = clean.drives(domain) if clean else None
         if driven is None or not cell.ticks or (control != NONE and against is None):
             return []
-        # A cell has the drives past the plain object in itself.
+        # A cell contains its drives past the plain object.
         totals_m = driven.none_total_cte_m if control == NONE or against is None else against.total_cte_m
         return [
             Outcome((attacked - other) / cell.ticks, off_track, hit, None, None)
@@ -118,12 +118,12 @@ class CellDrives:
 
 
 def make_row(drives: CellDrives, key: Key, domain: Domain) -> Row | None:
-    """The row of one method against one victim; None where nothing was driven, or nothing that it can be compared with."""
+    """The row of one method against one victim; None if it has no drives, or no drives to compare with."""
     cells = [cell for cell in drives.searches(key) if drives.has(cell, domain)]
     outcomes = [drives.outcomes(cell, domain) for cell in cells]
     if not cells or not all(outcomes):
         return None
-    # The excess of the plain object over itself is zero: its row says what the others are an excess over.
+    # The excess of the plain object over itself is zero: its row shows what the other rows exceed.
     values = [
         drives.mean_ctes_m(cell, domain) if cell.method == NONE else _excesses_m(found)
         for cell, found in zip(cells, outcomes, strict=True)
@@ -160,7 +160,7 @@ def _excesses_m(outcomes: Sequence[Outcome]) -> list[float]:
 
 
 def _over_no_object_m(drives: CellDrives, cells: Sequence[CellResult], domain: Domain) -> list[list[float]]:
-    """Excess of each drive over no object, by cell; empty where a cell has no drives to compare with, or is the control itself."""
+    """Excess of each drive over no object, by cell; empty if a cell has no drives to compare with, or is the control itself."""
     found = [drives.outcomes(cell, domain, EMPTY) for cell in cells if cell.method != EMPTY]
     return [_excesses_m(outcomes) for outcomes in found] if all(found) else []
 

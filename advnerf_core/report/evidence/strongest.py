@@ -21,7 +21,7 @@ from advnerf_core.report.reference import DOMAINS
 
 @dataclass(frozen=True)
 class Reached:
-    """What searches of one method reached in one domain.
+    """Results of the searches of one method in one domain.
 
     Attributes:
         best_m: Excess of the best search, mean over its starts [m per tick].
@@ -41,7 +41,7 @@ class Reached:
 
     @property
     def text(self) -> str:
-        """All of it, in words."""
+        """All of it as text."""
         return (
             f"up to {self.best_m:.3f} m per tick ({self.off_track} of {self.drives} drives off the track), {self.mean_m:.3f} m in the mean of the "
             f"searches ({self.all_off_track} of {self.all_drives})"
@@ -50,18 +50,18 @@ class Reached:
 
 @dataclass(frozen=True)
 class Strongest:
-    """The method without a gradient that moves a victim most where it is deployed, of one scenario.
+    """The method without a gradient that moves a deployed victim most in one scenario.
 
     Attributes:
         scenario: Name of the scenario.
         placement: Name of the placement.
         victim: Name of the victim.
         method: The method.
-        searches: Searches of it.
+        searches: Number of searches.
         evaluations: Textures that each search tried.
-        surrogate: What they reached in the learned scene.
-        deployed: What they reached where they were deployed.
-        margin_m: Excess that counts as none for a victim that is called hardened [m per tick].
+        surrogate: Results in the learned scene.
+        deployed: Results in the deployment.
+        margin_m: Largest excess of a victim that may be called hardened [m per tick].
     """
 
     scenario: str
@@ -76,15 +76,15 @@ class Strongest:
 
     @property
     def how(self) -> str:
-        """How it was searched, in words."""
+        """Settings of the searches, as text."""
         return f"{style_of(self.method).title}, {self.searches} searches, each the best of {self.evaluations} textures"
 
 
 def strongest_random(folder: Path) -> list[Strongest]:
-    """The strongest method without a gradient in every scenario of a published set; none where none was deployed.
+    """The strongest method without a gradient in every scenario of a published set; empty if none was deployed.
 
     Args:
-        folder: Of the set.
+        folder: Folder of the set.
     """
     registration = read_registration(folder)
     if registration is None:

@@ -1,7 +1,7 @@
-"""Predicting deployed excess from that in the surrogate: one unknown factor for each set, known from earlier sets.
+"""Predicts deployed excess from the surrogate's: one unknown factor for each set, estimated from earlier sets.
 
 Drive by drive, deployed = a x surrogate with one factor a for a set of results (correlations of 0.92 to 1.00), so a set
-is one observation of a however many drives it has. The model is
+is one observation of a, regardless of its number of drives. The model is
 
     log a ~ N(mu, tau^2),    deployed_ij = a surrogate_ij + m r_ij,
 
@@ -24,7 +24,7 @@ from advnerf_core.report.evidence.results import Evidence
 
 Floats = NDArray[np.float64]
 PRIOR_SPREAD, PRIOR_RESIDUAL = float(np.log(1.5)), 0.1
-# An attack that does nothing where it is deployed, or less, has no logarithm.
+# An attack with no effect in the deployment, or a negative one, has no logarithm.
 _LEAST_FACTOR = 0.01
 _NODES = (np.arange(99) + 0.5) / 99
 
@@ -34,7 +34,7 @@ class Transfer:
     """The attacks of one method of a set under one condition. Lengths in half lanes per tick.
 
     Attributes:
-        name: Of the set.
+        name: Name of the set.
         cells: Names of the cells, one for each search.
         surrogate: Excess of each drive in the surrogate ``[searches, starts]``.
         deployed: The same of the deployed drives, from the same starts.
@@ -47,17 +47,17 @@ class Transfer:
 
     @property
     def scale(self) -> float:
-        """Mean |excess| in the surrogate, known before anything is deployed."""
+        """Mean |excess| in the surrogate, known before any deployment."""
         return float(np.abs(self.surrogate).mean())
 
     @property
     def factor(self) -> float:
-        """The factor that was: least squares of deployed = a x surrogate."""
+        """The measured factor: least squares of deployed = a x surrogate."""
         return _factor(self.surrogate, self.deployed)
 
     @property
     def factors(self) -> list[float]:
-        """The same of each search."""
+        """The measured factor of each search."""
         return [_factor(*pair) for pair in zip(self.surrogate, self.deployed, strict=True)]
 
     def residuals(self, factor: float) -> Floats:
@@ -67,11 +67,11 @@ class Transfer:
 
 @dataclass(frozen=True)
 class FactorBelief:
-    """What earlier sets say about the factor of the next one: log a is Student t.
+    """The factor of the next set, predicted from earlier sets: log a is Student t.
 
     Attributes:
-        location: Of log a.
-        scale: Of log a.
+        location: Location of log a.
+        scale: Scale of log a.
         freedom: Degrees of freedom.
         residuals: Equally likely residuals of a drive, over the mean |excess| in the surrogate ``[nodes]``.
     """
@@ -96,7 +96,7 @@ class FactorBelief:
 
 
 def belief(earlier: Sequence[Transfer]) -> FactorBelief:
-    """What earlier sets, maybe none, say about the factor of the next one."""
+    """The factor of the next set, predicted from earlier sets, if any."""
     logs = np.log([max(each.factor, _LEAST_FACTOR) for each in earlier])
     count, mean = len(logs), float(logs.mean()) if len(logs) else 0.0
     square = PRIOR_SPREAD**2 + float(((logs - mean) ** 2).sum()) + count / (count + 1.0) * mean**2
@@ -109,13 +109,13 @@ def belief(earlier: Sequence[Transfer]) -> FactorBelief:
 
 
 def rival_bands(earlier: Sequence[Transfer], surrogate: Floats, level: float) -> Floats:
-    """Bands ``[..., 2]`` of the rival: the surrogate's excess times the ratios deployed / surrogate that drives of earlier sets had.
+    """Bands ``[..., 2]`` of the rival: the surrogate's excess times the ratios deployed / surrogate of earlier sets' drives.
 
     Of the simple rivals (residuals about the median factor or ratios, drives pooled or sets weighted equally), it scores best on
     the published sets.
 
     Raises:
-        ValueError: There is no earlier set.
+        ValueError: No earlier set is given.
     """
     if not earlier:
         raise ValueError("expected at least one earlier set, got none; the rival knows nothing else")
@@ -125,9 +125,9 @@ def rival_bands(earlier: Sequence[Transfer], surrogate: Floats, level: float) ->
 
 
 def transfer_of(evidence: Evidence, baseline: bool = False) -> Transfer | None:
-    """The attacks of a set's last primary test that was run, or its strongest baseline's; None if none was.
+    """The attacks of a set's last primary test that was run, or its strongest baseline's; None without one.
 
-    With contrasts, everything is the world's own under the last condition.
+    With contrasts, all values are the world's own under the last condition.
     """
     for test in reversed(evidence.registration.primary):
         found = [

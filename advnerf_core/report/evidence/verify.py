@@ -1,6 +1,6 @@
-"""Verifying what is published: every number is computed again, and every file, cell, drive and start is what was registered.
+"""Verifies published results: recomputes every number, and compares every file, cell, drive and start with the registration.
 
-A set is a folder: its registration, one file per cell with the kept drives, and `SET`, which lists the files with their digests and holds
+A set is a folder: its registration, one file per cell with its drives, and `SET`, which lists the files with their digests and holds
 the published numbers. Beside the folders are the digests of all sets (`DIGESTS`), of everything else (`BESIDE`), and the page. Nothing
 here needs torch or a simulator. Each kind of check is a file in `verifying`.
 """
@@ -39,15 +39,15 @@ from advnerf_core.report.evidence.verifying.victims import drives_badly, read_de
 
 @dataclass(frozen=True)
 class Verified:
-    """What verifying a set found.
+    """Result of verifying a set.
 
     Attributes:
-        name: Of the set.
-        numbers: Published numbers that were computed again.
-        drives: Drives that they were computed from.
-        problems: What is wrong, in words; none if all is well.
-        findings: What the set declares against itself, in words.
-        awaits_results: It is registered, and nothing of it was published yet.
+        name: Name of the set.
+        numbers: Number of recomputed published numbers.
+        drives: Number of drives behind them.
+        problems: Problems as text; empty if all is well.
+        findings: Findings against itself that the set declares, as text.
+        awaits_results: Whether it is registered and nothing of it was published yet.
     """
 
     name: str
@@ -59,7 +59,7 @@ class Verified:
 
 
 def verify_set(folder: Path) -> Verified:
-    """Compute everything in a set again, and compare."""
+    """Recompute everything in a set, and compare."""
     try:
         registration, cells = read_set(folder)
         withdrawn, declared = read_withdrawn(folder), read_declared(folder)
@@ -89,14 +89,14 @@ def _verified(
 ) -> Verified:
     problems = [*file_problems(folder), *set_problems(folder, evidence, cells)]
     numbers = 0
-    if not problems:  # numbers of damaged drives say nothing more
+    if not problems:  # numbers of damaged drives add nothing
         numbers, problems = number_problems(folder, published_numbers(evidence, withdrawn, declared))
     drives = sum(len(kept) for cell in cells for kept in cell.kept.values())
     return Verified(folder.name, numbers, drives, tuple(problems), tuple(_findings(evidence, problems)))
 
 
 def verify_beside(published: Path) -> tuple[str, ...]:
-    """What is wrong with the page of all sets, the pictures and films, the reference build and the sets without a registration."""
+    """Problems of the page of all sets, the pictures and films, the reference build and the sets without a registration."""
     problems = list(beside_problems(published))
     page = published / PAGE
     try:

@@ -1,4 +1,4 @@
-"""Names and sentences that the pages of results share: each thing has one name, and a claim is over the control that leaves less."""
+"""Common names and sentences of the results pages: one name per concept, and claims over the control with the smaller excess."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Excess:
 
     Attributes:
         mean_m: Mean over the drives [m].
-        low_m: Lower end of its interval [m]; None where there are too few drives.
+        low_m: Lower end of its interval [m]; None with too few drives.
         high_m: Upper end [m].
         over: Name of the control.
     """
@@ -32,12 +32,12 @@ class Excess:
 
     @property
     def is_shown(self) -> bool:
-        """Whether its interval is above zero."""
+        """Whether its interval lies above zero."""
         return self.low_m is not None and self.low_m > 0.0
 
 
 def excesses(row: Mapping[str, Any]) -> list[Excess]:
-    """The excess of a row over the plain object, and over no object where that was driven."""
+    """The excess of a row over the plain object, and over no object if that was driven."""
     found = [Excess(row["excess_m"], row["low_m"], row["high_m"], style_of(NONE).title)]
     if row["over_no_object_m"] is not None:
         ends = row["over_no_object_low_m"], row["over_no_object_high_m"]
@@ -46,23 +46,23 @@ def excesses(row: Mapping[str, Any]) -> list[Excess]:
 
 
 def smaller_excess(row: Mapping[str, Any]) -> Excess:
-    """The excess that a sentence may use: the smaller one."""
+    """The excess that a claim may use: the smaller one."""
     return min(excesses(row), key=lambda excess: excess.mean_m)
 
 
 def row_of(rows: Sequence[Mapping[str, Any]], test: Mapping[str, Any], domain: Domain) -> Mapping[str, Any]:
-    """The row of a primary test's method in one domain, both as in ``set.json``."""
+    """The row of a primary test's method in one domain, both from ``set.json``."""
     wanted = [test["test"][key] for key in _KEY]
     return next(row for row in rows if row["domain"] == domain and [row[key] for key in _KEY] == wanted)
 
 
 def place_of(row: Mapping[str, Any]) -> str:
-    """A condition as readers see it."""
+    """Name of a condition for readers."""
     return f"{row['scenario']} {row['placement']}".strip().replace("_", " ")
 
 
 def ends(low_m: float | None, high_m: float | None) -> str:
-    """Both ends of an interval; empty where there is none."""
+    """Both ends of an interval; empty without one."""
     return "" if low_m is None or high_m is None else f"{low_m:.3f} to {high_m:.3f}"
 
 
@@ -77,18 +77,18 @@ def excess_cells(row: Mapping[str, Any]) -> tuple[str, str, str, str]:
 
 
 def collisions(counts: Mapping[str, int]) -> str:
-    """How many drives ended against something, and against what: ``3 (2 board, 1 wall)``."""
+    """Number of collisions, and obstacles: ``3 (2 board, 1 wall)``."""
     what = ", ".join(f"{count} {name}" for name, count in counts.items())
     return f"{sum(counts.values())} ({what})" if counts else "0"
 
 
 def p_text(value: float) -> str:
-    """A p-value as it is written on pages."""
+    """A p-value in the format of the pages."""
     return f"{value:.4f}" if value >= 0.001 else f"{value:.1e}"
 
 
 def claim(test: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
-    """What a primary test says, in four short sentences."""
+    """The statement of a primary test, in four short sentences."""
     which, row = test["test"], row_of(rows, test, "deployed")
     excess = smaller_excess(row)
     between = f" (95 % interval {ends(excess.low_m, excess.high_m)} m)" if excess.low_m is not None else ""

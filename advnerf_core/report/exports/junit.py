@@ -1,4 +1,4 @@
-"""An audit's result as a JUnit report: one test for each thing that had to hold, so that CI systems show which one did not."""
+"""An audit's result as a JUnit report: one test per requirement, so that CI systems show which one failed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def write_junit(file: Path, result: AuditResult) -> None:
     """Write the result as JUnit XML (extra ``audit``).
 
     The test of the verdict fails if an object was found, or if the policy is worse than before. It is an error if the audit cannot
-    judge. What the audit needs for a verdict are tests too: a trusted copy of the place, and the planted control.
+    judge. The conditions of a verdict are tests too: a trusted copy of the place, and the planted control.
     """
     from junitparser import TestSuite
 
@@ -38,7 +38,7 @@ def write_junit(file: Path, result: AuditResult) -> None:
 
 
 def _needs(result: AuditResult) -> Iterator[TestCase]:
-    """What has to hold before a verdict is possible. What a verdict did not need is skipped."""
+    """The conditions of a verdict. Those that a verdict did not need are skipped."""
     from junitparser import Failure, Skipped, TestCase
 
     problem = Failure if result.verdict.outcome == "cannot_judge" else Skipped

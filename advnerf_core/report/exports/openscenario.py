@@ -1,10 +1,10 @@
 """An audit's object and the vehicle's route as ASAM OpenSCENARIO XML 1.2.
 
 The scenario puts the object where the audit judged it, and the vehicle at the start of its reference path, which is assigned as a route: a
-simulator then drives the user's own policy past the object. With the parameter ``replay`` the vehicle follows instead what the audit's
-vehicle drove. A place without an OpenDRIVE file has no road network, and none is made up: all positions are world positions.
+simulator then drives the user's own policy past the object. With the parameter ``replay`` the vehicle follows the audit's drive
+instead. A place without an OpenDRIVE file has no road network, and none is made up: all positions are world positions.
 
-OpenSCENARIO has the frames of advnerf (ISO 8855): x forward, y left, z up, a vehicle's origin at its rear axle.
+OpenSCENARIO has the same frames as advnerf (ISO 8855): x forward, y left, z up, a vehicle's origin at its rear axle.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ _MINOR_VERSION = 2
 # The format asks for a date; without one the library would write today's.
 _NO_DATE = datetime(1970, 1, 1, tzinfo=timezone.utc)
 _WAYPOINTS = 30
-# What the format asks of a vehicle and an audit need not know, in shares of the wheelbase; the file lists what was assumed.
+# Required by the format and not known to an audit, in shares of the wheelbase; the file lists these assumptions.
 _LENGTH, _WIDTH, _HEIGHT, _WHEEL, _REAR_OVERHANG = 1.6, 0.65, 0.55, 0.24, 0.3
 _MAX_STEERING_RAD, _MAX_ACCELERATION, _OBJECT_MASS_KG = 0.6, 10.0, 1.0
 
 
 class ExportError(AdvnerfError, ValueError):
-    """The result of an audit has nothing that the format can hold."""
+    """The audit's result has nothing to export to this format."""
 
 
 def write_openscenario(file: Path, result: AuditResult) -> None:
@@ -146,7 +146,7 @@ def _storyboard(vehicle: AuditedVehicle, placed: AuditedObject, drives: JudgedDr
 
 
 def _start(drives: JudgedDrives) -> Any:
-    """Position of the vehicle at the beginning: of the drive that is kept, else of the path, else the first judging start."""
+    """Position of the vehicle at the beginning: of the stored drive, else of the path, else the first judging start."""
     from scenariogeneration import xosc
 
     points: list[RoutePoint | JudgedStart] = [*drives.route, *drives.path, *drives.starts]
@@ -155,7 +155,7 @@ def _start(drives: JudgedDrives) -> Any:
 
 
 def _route(path: tuple[RoutePoint, ...]) -> Any:
-    """The path as waypoints: evenly spread points of it, both ends included."""
+    """The path as waypoints: evenly spread points of it, including both ends."""
     from scenariogeneration import xosc
 
     count = min(_WAYPOINTS, len(path))

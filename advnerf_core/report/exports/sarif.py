@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
 OFF_PATH, WORSE = "ADV1001", "ADV1002"
-# Of each rule: its name, what it says, and how to act on it.
+# Name, message and advice of each rule.
 _RULES = {
     OFF_PATH: (
         "ObjectDrivesPolicyOffPath",
@@ -68,7 +68,7 @@ def _result(result: AuditResult) -> Result:
     if _KINDS[result.verdict.outcome] == "fail":
         level = Level.WARNING if result.verdict.evidence == "surrogate" else Level.ERROR
     text = " ".join((result.verdict.sentence, *result.verdict.reasons))
-    # The same finding in the next audit of the same policy in the same place, whatever its numbers are then.
+    # The same finding in the next audit of the same policy in the same place, even with other numbers.
     same = hashlib.sha256(f"{rule}\n{result.policy.path}\n{result.place.name}".encode()).hexdigest()
     return Result(
         rule_id=rule,

@@ -1,6 +1,6 @@
 """The part of Linux's video interface that we use: structures, request numbers, constants.
 
-Source: ``linux/videodev2.h`` and ``linux/uvcvideo.h``; layouts are those of 64-bit machines (x86-64, aarch64), where a ``timeval``
+Source: ``linux/videodev2.h`` and ``linux/uvcvideo.h``; layouts apply to 64-bit machines (x86-64, aarch64), where a ``timeval``
 is two 64-bit numbers. The tests compare sizes, offsets and numbers with what a C compiler makes of these headers.
 """
 

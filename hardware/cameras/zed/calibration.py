@@ -102,7 +102,7 @@ def _sections(path: Path) -> dict[str, dict[str, str]]:
 class Rectifier:
     """Removes the distortion from images of one size and scales them down.
 
-    The field of view of the ideal camera lies within that of the real one, so there are no black corners.
+    The field of view of the ideal camera lies within the real one's, so there are no black corners.
 
     Args:
         size: Width and height of the result [px].

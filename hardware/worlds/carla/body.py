@@ -1,4 +1,4 @@
-"""The car in CARLA's world: a Dubins car of ours, a body that is put where it is, and what it runs into."""
+"""The car in CARLA's world: the experiment's Dubins car, the vehicle actor that shows it, and collision tests."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from hardware.worlds.carla.frames import CarlaPose, SceneFrame
 from hardware.worlds.carla.undo import Undo
 from hardware.worlds.junction.car import DubinsCar
 
-_AWAY_M = 100.0  # where the body is kept while it must not be seen: above everything
-_FEELER_M = 0.6  # height at which the bumper feels its way
-_INSIDE_M = 0.3  # the feelers start so far behind the bumper
+_AWAY_M = 100.0  # height at which the body is hidden: above everything
+_FEELER_M = 0.6  # height of the rays that test the bumper's way
+_INSIDE_M = 0.3  # the rays start this far behind the bumper
 
 
 class CarlaCar:
-    """Moves as the experiment's Dubins car and shows in CARLA.
+    """A car that moves as the experiment's Dubins car and is shown by a CARLA vehicle.
 
-    The motion is ours, not that of CARLA's physics: the surrogate optimises over a Dubins car, so the deployment's car must be one
-    (with the flaws of its configuration), whose state is known exactly; a physics vehicle would need a steering controller of its own,
-    whose errors would be mixed into the result. Physics is switched off, which also keeps the body where it is put.
+    The motion is computed here and not by CARLA's physics: the surrogate optimises over a Dubins car, so the deployed car must be one
+    (with the flaws of its configuration), with an exactly known state. A physics vehicle would need a steering controller, whose
+    errors would be mixed into the result. Physics is switched off, which also keeps the body where it is put.
 
     Args:
         world: A ``carla.World``.
         library: The ``carla`` module.
-        config: Body, bounds, labels of what is solid.
-        undo: Gets what removes the body.
+        config: Body, limits, and the labels of solid objects.
+        undo: Receives the action that removes the body.
 
     Raises:
         CarlaError: The server does not have the vehicle.
-        CarlaMapError: A label of what is solid does not exist.
+        CarlaMapError: CARLA has no object label of that name.
     """
 
     def __init__(self, world: Any, library: Any, frame: SceneFrame, config: CarlaConfig, undo: Undo) -> None:
@@ -61,18 +61,18 @@ class CarlaCar:
 
     @property
     def blocked(self) -> bool:
-        """Whether it stands against something solid or at the end of the world."""
+        """Whether the car stands against something solid or at the end of the world."""
         return self._hit or self._car.blocked
 
     def reset(self, x_m: float, y_m: float, yaw_rad: float) -> VehicleState:
-        """Put it down at rest."""
+        """Put the car down at rest."""
         self._hit = False
         state = self._car.reset(x_m, y_m, yaw_rad)
         self.show()
         return state
 
     def advance(self, turn_rate_radps: float, speed_mps: float, duration_s: float) -> VehicleState:
-        """Hold one command for a while; it stays where it is if something solid is in the way."""
+        """Hold one command for a while; the car does not move if something solid blocks it."""
         before = self._car.state
         after = self._car.advance(turn_rate_radps, speed_mps, duration_s)
         self._hit = self._runs_into_something(before, after)
@@ -89,7 +89,7 @@ class CarlaCar:
         self._put(self._frame.body_pose(self._car.state.T_world_from_car @ ahead))
 
     def hide(self) -> bool:
-        """Take the body out of sight, for pictures of the scene without it; False if there is none yet."""
+        """Take the body out of sight, for pictures of the scene without it; False if it was not spawned yet."""
         if self._actor is None:
             return False
         away = planar_pose(0.0, 0.0, 0.0)
@@ -105,7 +105,7 @@ class CarlaCar:
             self._shown = pose
 
     def _spawn(self) -> None:
-        """In the air, where nothing is in the way; physics off, so that it does not fall."""
+        """Spawn the body in the air, where nothing is in the way, with physics off so that it does not fall."""
         name = self._config.body.blueprint
         away = planar_pose(0.0, 0.0, 0.0)
         away[2, 3] = _AWAY_M

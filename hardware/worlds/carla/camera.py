@@ -1,4 +1,4 @@
-"""A camera in CARLA's world, and the picture that belongs to a tick."""
+"""A camera in CARLA's world that returns the picture of a given tick."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hardware.worlds.carla.frames import CarlaPose
 from hardware.worlds.carla.undo import Undo
 
 RGB, DEPTH = "sensor.camera.rgb", "sensor.camera.depth"
-# What the server writes into a picture must be where the camera was put, up to single precision some kilometres from the origin.
+# The pose that the server writes into a picture must equal the requested pose, up to single precision some kilometres from the origin.
 POSITION_TOLERANCE_M, ANGLE_TOLERANCE_RAD = 5e-3, 1e-3
 _KEPT = 8
 
@@ -26,7 +26,7 @@ class Mailbox:
         self._came = threading.Condition()
 
     def put(self, picture: Any) -> None:
-        """Take a picture in."""
+        """Store a picture."""
         with self._came:
             self._pictures[int(picture.frame)] = picture
             for old in sorted(self._pictures)[:-_KEPT]:
@@ -34,10 +34,10 @@ class Mailbox:
             self._came.notify_all()
 
     def wait(self, frame: int, timeout_s: float) -> Any:
-        """The picture of a frame; it stays, so that it can be had again.
+        """The picture of a frame; it stays in the mailbox.
 
         Raises:
-            CarlaFrameError: It did not come in time; the message tells a camera that is silent from one that left a frame out.
+            CarlaFrameError: No picture came in time; the message says whether the camera is silent or skipped this frame.
         """
         with self._came:
             if self._came.wait_for(lambda: frame in self._pictures, timeout_s):
@@ -55,25 +55,25 @@ class Mailbox:
 
 
 class CarlaCamera:
-    """One camera of the server, without distortion, that is put where it is needed.
+    """One CARLA camera without distortion that can be moved to any pose.
 
-    It hangs on nothing: a camera that rides on a vehicle sees from wherever suspension and terrain leave it, and the drive needs
+    It is attached to nothing: a camera on a vehicle moves with suspension and terrain, and the drive needs
     the exact pose that the surrogate renders.
 
     Args:
         world: A ``carla.World``.
         library: The ``carla`` module.
         kind: `RGB` or `DEPTH`.
-        pinhole: Size and focal length; the principal point must be in the middle, which is all that CARLA has.
-        pose: Where it is at first.
+        pinhole: Size and focal length; the principal point must be in the middle, as CARLA supports no other.
+        pose: Initial pose.
         render: Attributes and exposure.
-        undo: Gets what removes it.
+        undo: Receives the action that removes the camera.
 
     Raises:
         CarlaError: The server does not have such a camera, or one of its attributes.
 
     Attributes:
-        pose: Where it was put last.
+        pose: Last requested pose.
         settled: Whether it has seen some ticks since it jumped.
     """
 
@@ -101,15 +101,15 @@ class CarlaCamera:
         self._actor.listen(self._mailbox.put)
 
     def aim(self, pose: CarlaPose, jump: bool) -> None:
-        """Put it somewhere; the next tick's picture is from there. ``jump`` if that is not where it was on its way to."""
+        """Move the camera; the next tick's picture is from there. ``jump`` if the move does not continue the camera's motion."""
         self.pose, self.settled = pose, self.settled and not jump
         self._actor.set_transform(pose.to_transform(self._library))
 
     def picture(self, frame: int, timeout_s: float) -> Any:
-        """The raw picture (``carla.Image``) of a frame, from the pose that was asked for.
+        """The raw picture (``carla.Image``) of a frame, from the requested pose.
 
         Raises:
-            CarlaFrameError: It did not come in time, or it was taken from elsewhere.
+            CarlaFrameError: No picture came in time, or it was taken from another pose.
         """
         image = self._mailbox.wait(frame, timeout_s)
         taken = CarlaPose.of(image.transform)
@@ -126,7 +126,7 @@ def camera_blueprint(world: Any, kind: str, pinhole: Pinhole, render: RenderConf
     """A blueprint with all attributes set.
 
     Raises:
-        CarlaError: The server does not have it, or one of the attributes.
+        CarlaError: The server lacks this camera or one of the attributes.
     """
     try:
         blueprint = world.get_blueprint_library().find(kind)

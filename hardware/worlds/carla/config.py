@@ -15,18 +15,18 @@ _WHOLE_TICK_S = 1e-6
 
 
 class ServerConfig(StrictModel):
-    """Where the server is, and how long it may take. Only the map is something that results depend on.
+    """Address of the server and its time limits. Results depend on the map only.
 
     Attributes:
-        host: Computer of the server.
-        port: Its first port; the second one, for images, is the next number unless the server was told otherwise.
-        timeout_s: For connecting, for a call, and for a tick [s].
-        load_timeout_s: For loading a map [s].
-        frame_timeout_s: From a tick's end to the arrival of its pictures [s].
-        town: The map; None takes the one that is loaded.
-        load_town: Load the map if another one is loaded; it removes whatever else is in the world.
-        take_over: Go on where the world is synchronous already: another client drives it, or one was killed.
-        allow_traffic: Go on where there are other vehicles or walkers, which would be in the pictures.
+        host: Host name of the server.
+        port: First port; images use the next number unless the server is configured otherwise.
+        timeout_s: Limit for connecting, for a call, and for a tick [s].
+        load_timeout_s: Limit for loading a map [s].
+        frame_timeout_s: Limit from the end of a tick to the arrival of its pictures [s].
+        town: The map; None uses the one that is loaded.
+        load_town: Load the map if another one is loaded; this removes everything in the world.
+        take_over: Continue if the world is already synchronous: another client drives it, or was killed.
+        allow_traffic: Continue if the world has other vehicles or walkers, which would be in the pictures.
     """
 
     host: str = Field(default="127.0.0.1", exclude=True)
@@ -41,14 +41,14 @@ class ServerConfig(StrictModel):
 
 
 class JunctionConfig(StrictModel):
-    """Which junction, and how much road around it.
+    """The junction, and how much road around it is used.
 
     Attributes:
-        id: OpenDRIVE id; None takes the map's first junction of three roads that is flat and has roads long enough.
-        choice: Which of its sets of drives.
-        approach_m: The drives start so far before the junction's middle [m].
+        id: OpenDRIVE id; None selects the map's first flat junction of three roads that are long enough.
+        choice: Index among the junction's sets of drives.
+        approach_m: Distance of the drives' starts from the junction's middle [m].
         beyond_m: Length of the road after the junction that belongs to the reference paths [m].
-        max_height_range_m: The drives' points may differ so much in height [m]; the car moves in a plane.
+        max_height_range_m: Largest height difference along the drives [m]; the car moves in a plane.
         reach_m: The world ends at plus and minus this in x and y of the scene's frame [m].
     """
 
@@ -61,7 +61,7 @@ class JunctionConfig(StrictModel):
 
 
 class RenderConfig(StrictModel):
-    """How the server draws.
+    """The server's rendering.
 
     Attributes:
         fixed_delta_s: Simulated time of one tick [s]; CARLA's physics wants no more than 0.1.
@@ -70,8 +70,8 @@ class RenderConfig(StrictModel):
         settle_ticks: Extra ticks after a camera has jumped: exposure, anti-aliasing over time and texture streaming catch up.
         exposure: ``fixed`` pins both bounds of the automatic exposure to one value, so that a place has one colour; ``automatic``
             leaves it alone.
-        exposure_bright: That value; None takes the server's upper bound, where daylight is.
-        camera_attributes: Attributes of ``sensor.camera.rgb``; names that the server does not have are an error.
+        exposure_bright: The fixed exposure; None uses the server's upper bound, which suits daylight.
+        camera_attributes: Attributes of ``sensor.camera.rgb``; a name that the server does not have is an error.
     """
 
     fixed_delta_s: float = Field(default=0.1, gt=0.0, le=0.1)
@@ -90,7 +90,7 @@ class RenderConfig(StrictModel):
         """Ticks that a duration takes.
 
         Raises:
-            ValueError: It is not a whole number of ticks.
+            ValueError: The duration is not a whole number of ticks.
         """
         ticks = round(duration_s / self.fixed_delta_s) if math.isfinite(duration_s) else -1
         if ticks < 0 or abs(ticks * self.fixed_delta_s - duration_s) > _WHOLE_TICK_S:
@@ -101,10 +101,10 @@ class RenderConfig(StrictModel):
 
 
 class BodyConfig(StrictModel):
-    """The car that is seen in CARLA. It has no physics: it is put where the Dubins car of the experiment is.
+    """The car that is shown in CARLA. It has no physics: it is placed at the pose of the experiment's Dubins car.
 
     Attributes:
-        blueprint: Which vehicle; None for no body, only cameras.
+        blueprint: Name of the vehicle blueprint; None shows no body.
         origin_ahead_m: The blueprint's origin, the middle of the body, ahead of the reference point that moves along the heading
             [m]; about half the wheelbase, so that the reference point is the rear axle.
         half_length_m: From the origin to the front bumper [m].
@@ -132,12 +132,12 @@ class CarlaConfig(StrictModel):
 
     Attributes:
         server: Server and map.
-        junction: Where in the map.
-        render: How it is drawn.
+        junction: Junction of the map.
+        render: Weather, lights and exposure.
         body: The body of the car.
         camera: Driving camera, relative to the car's reference point. The default sits over the bonnet, which it does not see.
         photo: Camera of the posed images.
-        car: How the car moves.
+        car: Dynamics of the car.
     """
 
     server: ServerConfig = ServerConfig()

@@ -1,4 +1,4 @@
-"""Finding a server, and finding out whether it is the right one: reachable, same version, right map, nobody else's."""
+"""Connecting to a CARLA server and checking that it is reachable, has the right version and map, and has no other client."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ def connect(server: ServerConfig, library: Any) -> Any:
     """A ``carla.Client`` of a server that answers and has the client library's version.
 
     Raises:
-        CarlaUnreachable: Nothing listens there, or what listens does not answer as CARLA does.
+        CarlaUnreachable: Nothing listens there, or the listener does not answer as CARLA does.
         CarlaVersionMismatch: The server has another version.
     """
     where = f"{server.host}:{server.port}"
-    # The library takes its whole time-out to find out that nobody listens; a socket knows at once, and why.
+    # The library takes its whole time-out to notice that nothing listens; a plain socket knows at once, and why.
     try:
         socket.create_connection((server.host, server.port), min(_PROBE_S, server.timeout_s)).close()
     except OSError as error:
@@ -43,7 +43,7 @@ def connect(server: ServerConfig, library: Any) -> Any:
 
 
 def check_versions(server: str, client: str, where: str) -> None:
-    """Raise `CarlaVersionMismatch` unless the releases are the same; what a build adds after a dash does not count."""
+    """Raise `CarlaVersionMismatch` unless the releases are equal; a build suffix after a dash is ignored."""
     if server.split("-")[0] != client.split("-")[0]:
         raise CarlaVersionMismatch(
             f"expected CARLA {client} at {where}, as the client library is, got {server}: start that version of the server, or "
@@ -60,7 +60,7 @@ def open_world(client: Any, server: ServerConfig) -> Any:
     """The world of the wanted map.
 
     Raises:
-        CarlaMapError: Another map is loaded and may not be replaced, or the server does not have the wanted one.
+        CarlaMapError: Another map is loaded and may not be replaced, or the server does not have the requested one.
         CarlaUnreachable: The server did not answer in time.
     """
     with server_answers(f"opening its world at {server.host}:{server.port}"):
@@ -84,7 +84,7 @@ def open_world(client: Any, server: ServerConfig) -> Any:
 
 
 def check_nobody_else(world: Any, server: ServerConfig) -> None:
-    """Raise `CarlaBusy` where the world is in another client's hands, or where somebody would be in the pictures."""
+    """Raise `CarlaBusy` if another client controls the world, or if other actors would be in the pictures."""
     if world.get_settings().synchronous_mode and not server.take_over:
         raise CarlaBusy(
             "expected a world that ticks by itself, got a synchronous one: another client drives it, or one was killed and could not "

@@ -1,4 +1,4 @@
-"""The drives through a junction of a CARLA map: where they are, and as plain data for where no server is at hand."""
+"""The drives through a junction of a CARLA map, and the same as plain data for use without a server."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from hardware.worlds.paths import ReferencePath
 class JunctionDrives:
     """The three drives, in the scene's own frame: x along the straight drive, origin in the junction's middle on the ground.
 
-    The frame and the names are those of the simulated intersection: straight leaves to the east, right to the south; left comes
+    The frame and the names match the simulated intersection: straight leaves to the east, right to the south; left comes
     from the south and leaves to the west.
 
     Attributes:
         junction_id: OpenDRIVE id of the junction.
-        frame: Where the scene's frame is in CARLA's world.
+        frame: The scene's frame in CARLA's world.
         paths: Straight, right and left.
         lane_width_m: Width of the narrowest lane driven on [m].
         height_range_m: Highest minus lowest point of all three drives [m].
@@ -37,7 +37,7 @@ class JunctionDrives:
 
     @property
     def place(self) -> dict[str, Any]:
-        """Which junction it is and where, as JSON data."""
+        """Id and position of the junction, as JSON data."""
         T = self.frame.T_mirrored_from_world
         return {
             "junction_id": self.junction_id,
@@ -47,7 +47,7 @@ class JunctionDrives:
         }
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data (JSON types) from which :meth:`from_dict` makes the same drives, where no server is at hand."""
+        """Plain data (JSON types) from which :meth:`from_dict` rebuilds the drives without a server."""
         paths = {name: path.to_dict() for name, path in self.paths.items()}
         return {**self.place, "paths": paths, "lane_width_m": self.lane_width_m}
 
@@ -56,7 +56,7 @@ class JunctionDrives:
         """Rebuild drives from :meth:`to_dict`.
 
         Raises:
-            CarlaMapError: The data is something else.
+            CarlaMapError: The data does not describe drives.
         """
         try:
             paths: dict[PathName, ReferencePath] = {

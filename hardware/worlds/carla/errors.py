@@ -1,4 +1,4 @@
-"""What can go wrong with a CARLA server, each with what to do about it."""
+"""Errors of a CARLA server; each message says what to do."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class CarlaNotInstalled(CarlaError):
 
 
 class CarlaUnreachable(CarlaError, ConnectionError):
-    """There is no server where one was expected, or it went away."""
+    """No server answers, or the connection was lost."""
 
 
 class CarlaVersionMismatch(CarlaError):
@@ -22,7 +22,7 @@ class CarlaVersionMismatch(CarlaError):
 
 
 class CarlaBusy(CarlaError):
-    """Somebody else drives the server's world."""
+    """Another client controls the server's world."""
 
 
 class CarlaMapError(CarlaError, ValueError):
@@ -30,4 +30,4 @@ class CarlaMapError(CarlaError, ValueError):
 
 
 class CarlaFrameError(CarlaError):
-    """The server ticked, and the picture that belongs to the tick did not come, or is not the one asked for."""
+    """No picture of this tick arrived, or it is not the requested one."""

@@ -1,4 +1,4 @@
-"""CARLA's left-handed world and ours.
+"""Conversion between CARLA's left-handed world and our right-handed one.
 
 CARLA (Unreal Engine) has x forward, y to the *right*, z up, rotations in degrees: yaw turns x towards y (clockwise seen from above),
 pitch raises the nose, roll lowers the right side. They apply in the order roll, pitch, yaw about fixed axes. Ours is right-handed:
@@ -94,7 +94,7 @@ class CarlaPose:
         )
 
     def distance_to(self, other: CarlaPose) -> tuple[float, float]:
-        """How far [m] and by how much turned [rad] another pose is."""
+        """Distance [m] and rotation angle [rad] to another pose."""
         apart = invert_transform(self.matrix) @ other.matrix
         # The angle from the sine of its half: exact for small turns, unlike the arc cosine of the trace.
         sine = np.linalg.norm(apart[:3, :3] - np.eye(3)) / math.sqrt(8.0)
@@ -120,13 +120,13 @@ class SceneFrame:
         self.T_mirrored_from_world[2, 3] = z_m
 
     def body_pose(self, T_world_from_body: ArrayLike) -> CarlaPose:
-        """Where CARLA must put an actor whose pose ``[4, 4]`` in our world is given (its axes: forward, left, up)."""
+        """CARLA pose of an actor whose pose ``[4, 4]`` in our world is given (its axes: forward, left, up)."""
         return CarlaPose.from_matrix(
             self.T_mirrored_from_world @ np.asarray(T_world_from_body, dtype=np.float64)
         )
 
     def camera_pose(self, T_world_from_camera: ArrayLike) -> CarlaPose:
-        """Where CARLA must put a camera whose pose ``[4, 4]`` in our world is given (OpenCV axes)."""
+        """CARLA pose of a camera whose pose ``[4, 4]`` in our world is given (OpenCV axes)."""
         return self.body_pose(np.asarray(T_world_from_camera, dtype=np.float64) @ BODY_FROM_CAMERA.T)
 
     def world_from_body(self, pose: CarlaPose) -> Array:

@@ -32,8 +32,8 @@ class Crossing:
     """One lane through a junction.
 
     Attributes:
-        begin: Waypoint (``carla.Waypoint``) where it enters.
-        end: Waypoint where it leaves.
+        begin: Waypoint (``carla.Waypoint``) at the entry.
+        end: Waypoint at the exit.
         entry: x [m], y [m], yaw [rad] of ``begin``.
         exit: The same of ``end``.
     """
@@ -58,7 +58,7 @@ class JunctionInfo:
         x_m: Middle, in CARLA's axes [m].
         y_m: Middle, in CARLA's axes [m].
         arms: Roads that lead into it.
-        drives: How many ways there are to find a straight, a right and a left drive that belong together.
+        drives: Number of matching sets of a straight, a right and a left drive.
     """
 
     id: int
@@ -79,7 +79,7 @@ def list_junctions(carla_map: Any, library: Any) -> list[JunctionInfo]:
 
 
 def _arms(crossings: Sequence[Crossing]) -> int:
-    """How many roads lanes come from; lanes that head the same way come from one."""
+    """Number of roads that the lanes come from; lanes with the same heading belong to one road."""
     headings: list[float] = []
     for crossing in crossings:
         heading = float(crossing.entry[2])
@@ -103,15 +103,15 @@ def find_drives(
     Args:
         carla_map: A ``carla.Map``.
         library: The ``carla`` module.
-        junction_id: OpenDRIVE id; None takes the first junction of three roads that has such drives.
-        choice: Which of the junction's sets of drives, by the heading of the straight one; a crossing of four roads has four.
-        approach_m: The drives start so far before the junction's middle, along the road [m].
+        junction_id: OpenDRIVE id; None selects the first junction of three roads that has such drives.
+        choice: Index among the junction's sets of drives, ordered by the heading of the straight one; a crossing of four roads has four.
+        approach_m: Distance of the drives' starts from the junction's middle, along the road [m].
         beyond_m: Length of the road after the junction that belongs to the paths [m].
-        max_height_range_m: The drives' points may differ so much in height [m].
-        tolerance_m: How closely lines and arcs follow the lanes [m].
+        max_height_range_m: Largest height difference along the drives [m].
+        tolerance_m: Largest distance of the lines and arcs from the lanes [m].
 
     Raises:
-        CarlaMapError: There is no such junction, or it has no such drives: its roads are too short, or not flat enough.
+        CarlaMapError: The map has no such junction, or its roads are too short or not flat enough.
     """
     candidates, reasons = _candidates(carla_map, library, junction_id), []
     for junction in candidates:
@@ -183,7 +183,7 @@ def _candidates(carla_map: Any, library: Any, junction_id: int | None) -> list[A
 def _crossings(junction: Any, library: Any) -> list[Crossing]:
     pairs = junction.get_waypoints(library.LaneType.Driving)
     crossings = [Crossing(begin, end, _pose(begin), _pose(end)) for begin, end in pairs]
-    # Their order in the map means nothing; by place it is the same every time.
+    # The map's order is arbitrary; sorting by position makes it repeatable.
     return sorted(crossings, key=lambda c: (*np.round(c.entry[:2], 2), *np.round(c.exit[:2], 2)))
 
 
@@ -247,7 +247,7 @@ def _along(crossing: Crossing, frame: SceneFrame, approach_m: float, beyond_m: f
 
 
 def _walk(start: Any, length_m: float, backwards: bool, what: str) -> list[Any]:
-    """Waypoints from one on, the straightest way where roads part; the last one is ``length_m`` away."""
+    """Waypoints from ``start``, taking the straightest branch at each fork; the last one is ``length_m`` away."""
     points: list[Any] = []
     here, left = start, length_m
     while left > 1e-6:

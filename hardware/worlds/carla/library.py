@@ -1,4 +1,4 @@
-"""The one place that imports ``carla``, so that everything else works without it and its absence is one clear error."""
+"""The only module that imports ``carla``, so that everything else works without it and its absence gives one clear error."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def load_carla() -> Any:
     """The client library.
 
     Raises:
-        CarlaNotInstalled: It is not installed, or cannot be loaded on this machine.
+        CarlaNotInstalled: The library is not installed, or cannot be loaded on this machine.
     """
     try:
         return importlib.import_module("carla")
@@ -28,10 +28,10 @@ def load_carla() -> Any:
 
 @contextlib.contextmanager
 def server_answers(doing: str) -> Iterator[None]:
-    """Turn what the library raises when the server does not answer (a bare ``RuntimeError``) into `CarlaUnreachable`.
+    """Turn the bare ``RuntimeError`` that the library raises when the server does not answer into `CarlaUnreachable`.
 
     Args:
-        doing: What the server was asked for, for the message.
+        doing: The action under way, for the message.
     """
     try:
         yield

@@ -1,4 +1,4 @@
-"""From where a junction of a CARLA map is photographed for learning: along the lanes, off them, and from above them."""
+"""Poses from which a junction of a CARLA map is photographed for learning: along the lanes, off them, and from above."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from hardware.worlds.carla.config import CarlaConfig
 from hardware.worlds.carla.drives import JunctionDrives
 from hardware.worlds.lab.config import CameraConfig
 
-BEHIND_M = 4.0  # photographs begin so far before the drives' starts
-DRIVEN_M = 44.0  # and go on so far behind them: the drive, and what a car sees that runs on
+BEHIND_M = 4.0  # photographs begin this far before the drives' starts
+DRIVEN_M = 44.0  # and end this far after them: the drive, and what a car sees that overshoots
 
 
 def photo_poses(
@@ -21,8 +21,8 @@ def photo_poses(
     """Poses that cover the three drives evenly, mixed so that any prefix covers them too.
 
     Of ten photographs six are taken close to a lane's middle at about the driving camera's height, two from a car that has left
-    its lane and looks elsewhere, and two from 3 to 6 m above a lane towards the junction. Nothing is known of what stands beside the
-    road, so no camera goes farther from a lane's middle than about a lane's width.
+    its lane and looks aside, and two from 3 to 6 m above a lane towards the junction. The surroundings of the
+    road are unknown, so no camera goes farther from a lane's middle than about a lane's width.
 
     Args:
         config: Driving camera.
@@ -52,7 +52,7 @@ def photo_poses(
 def held_out_states(
     drives: JunctionDrives, count: int, rng: np.random.Generator
 ) -> list[tuple[float, float, float]]:
-    """Poses of the car (x [m], y [m], yaw [rad]) about the drives, whose views nothing learns from."""
+    """Poses of the car (x [m], y [m], yaw [rad]) around the drives, whose views are held out from learning."""
     paths, states = list(drives.paths.values()), []
     for index in range(count):
         path = paths[index % len(paths)]

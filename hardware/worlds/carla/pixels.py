@@ -1,4 +1,4 @@
-"""Colours and depth out of the BGRA bytes of a ``carla.Image``."""
+"""Decodes colours and depth from the BGRA bytes of a ``carla.Image``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hardware.worlds.carla.errors import CarlaFrameError
 # CARLA's sensor reference, "Depth camera": planar depth in 24 bits of R (least), G, B, from 0 to the far plane.
 FAR_M = 1000.0
 _STEPS = 256**3 - 1
-# The sky is at the far plane; nothing in a map is that far, and a filter between it and an edge may take off a little.
+# The sky is at the far plane; nothing in a map is that far, and a filter at an edge may reduce the value a little.
 _NOTHING_M = 0.999 * FAR_M
 
 
@@ -20,7 +20,7 @@ def rgb_of(image: Any, width: int, height: int) -> NDArray[np.uint8]:
     """Colours ``[H, W, 3]`` of a camera image, copied.
 
     Raises:
-        CarlaFrameError: The image does not have the size that was asked for.
+        CarlaFrameError: The image does not have the requested size.
     """
     return np.ascontiguousarray(_bgra(image, width, height)[..., 2::-1])
 
@@ -31,7 +31,7 @@ def depth_of(image: Any, width: int, height: int) -> NDArray[np.float32]:
     ``depth = 1000 m (R + 256 G + 65536 B) / (2^24 - 1)``: steps of 0.06 mm.
 
     Raises:
-        CarlaFrameError: The image does not have the size that was asked for.
+        CarlaFrameError: The image does not have the requested size.
     """
     bgra = _bgra(image, width, height).astype(np.uint32)
     steps = bgra[..., 2] + 256 * bgra[..., 1] + 65536 * bgra[..., 0]

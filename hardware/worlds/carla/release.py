@@ -1,4 +1,4 @@
-"""Freeing a world that a killed client left standing still."""
+"""Releases a world that a killed client left in synchronous mode."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from hardware.worlds.carla.library import load_carla, server_answers
 
 
 def release(server: ServerConfig, library: Any = None) -> bool:
-    """Let the world tick by itself again, and its traffic lights change; False if it did so already.
+    """Switch the world back to running freely, with changing traffic lights; False if it already ran.
 
     Raises:
-        CarlaUnreachable: There is no server, or it does not answer.
+        CarlaUnreachable: No server answers.
     """
     client = connect(server, load_carla() if library is None else library)
     with server_answers("freeing its world"):

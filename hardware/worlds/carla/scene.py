@@ -33,8 +33,8 @@ from hardware.worlds.world import Box, NotOpenError, Rgb, Traits, View, WorldDes
 _log = logging.getLogger(__name__)
 _CLOSING_TIMEOUT_S = 5.0
 _ATTEMPTS = 3  # ticks until a picture of the wanted pose must have come
-_LOW_M, _HIGH_M = -0.5, 20.0  # of the box that is learned
-_FROM_ABOVE_M = (-18.0, 0.0, 22.0)  # from where reports show the junction
+_LOW_M, _HIGH_M = -0.5, 20.0  # lower and upper end of the learned box
+_FROM_ABOVE_M = (-18.0, 0.0, 22.0)  # camera position of the reports' overview
 
 
 class CarlaScene:
@@ -43,9 +43,9 @@ class CarlaScene:
     CARLA's world belongs to the scene while it is open: synchronous, weather and traffic lights fixed, the server draws only when asked.
     Closing puts all of it back, also after an error, or when the program ends without closing.
 
-    ``step`` moves the car and ticks; pictures are those of the last tick. A picture from elsewhere (``observe`` after ``reset``,
-    ``observe_at``, ``photograph``) takes ticks of its own, in which the car stands. A picture counts only if its frame number is the
-    tick's and its pose is the one asked for; where the server leaves a frame out, or moves the camera a tick late, another tick
+    ``step`` moves the car and ticks; pictures belong to the last tick. A picture from another pose (``observe`` after ``reset``,
+    ``observe_at``, ``photograph``) takes extra ticks during which the car stands still. A picture counts only if its frame number is the
+    tick's and its pose is the requested one; if the server skips a frame, or moves the camera a tick late, another tick
     follows, up to three.
 
     Args:
@@ -53,14 +53,14 @@ class CarlaScene:
         library: The ``carla`` module; None imports it when the scene is opened.
 
     Raises:
-        CarlaError: When it is opened; one of `hardware.worlds.carla.errors`, for what is missing or wrong.
+        CarlaError: Opening failed; one of `hardware.worlds.carla.errors`.
 
     Attributes:
         camera_pinhole: Intrinsics of the driving camera.
         photo_pinhole: Intrinsics of the camera of ``photograph``.
-        T_car_from_camera: Where the driving camera sits on the car ``[4, 4]``.
-        drives: Junction, frame and lanes, as the map has them; known from the moment the scene was opened.
-        repeated_frames: How often a picture did not come, or came from elsewhere, and another tick followed.
+        T_car_from_camera: Pose ``[4, 4]`` of the driving camera on the car.
+        drives: Junction, frame and lanes read from the map; available once the scene was opened.
+        repeated_frames: Number of extra ticks because a picture did not come or came from another pose.
     """
 
     Config: ClassVar[type[CarlaConfig]] = CarlaConfig
@@ -73,13 +73,13 @@ class CarlaScene:
         self.repeated_frames = 0
         self._drives: JunctionDrives | None = None
         self._opened = False
-        self._changed = True  # whether something stands elsewhere since the last tick
+        self._changed = True  # whether an actor was moved since the last tick
         self._library = library
         self._cameras: dict[str, CarlaCamera] = {}
         self._undo = Undo()
         self._client: Any = None
         self._car: CarlaCar | None = None
-        # Also where nobody closes the scene: a world left synchronous stands still for everybody.
+        # Also if the scene is never closed: a world left synchronous stands still for every client.
         self._at_exit = weakref.finalize(self, self._undo.run)
 
     @property
@@ -114,7 +114,7 @@ class CarlaScene:
 
     @property
     def drives(self) -> JunctionDrives:
-        """Junction, frame and lanes, as the map has them.
+        """Junction, frame and lanes read from the map.
 
         Raises:
             NotOpenError: The scene was never opened.
@@ -126,7 +126,7 @@ class CarlaScene:
         return self._drives
 
     def describe(self) -> WorldDescription:
-        """What the map says: drives, lanes and place; the town and the sky outside the box are contracted.
+        """The drives, lanes and place from the map; the town and the sky outside the box are contracted.
 
         Raises:
             NotOpenError: The scene was never opened.
@@ -247,7 +247,7 @@ class CarlaScene:
         if kind is None:
             self.close()
             return
-        # The error under way is the one to be seen; what could not be put back, often for the same reason, is only noted.
+        # Raise the original error; failures to restore, often for the same reason, are only added as notes.
         for what in self._put_back():
             _log.warning("could not put back %s", what)
 
@@ -256,7 +256,7 @@ class CarlaScene:
         self._cameras.clear()
         self._at_exit.detach()
         if self._client is not None:
-            # A server that is gone is not waited for again and again.
+            # Do not wait again and again for a server that is gone.
             self._client.set_timeout(min(_CLOSING_TIMEOUT_S, self.config.server.timeout_s))
         return self._undo.run()
 
@@ -301,7 +301,7 @@ class CarlaScene:
         return rgb_of(images[0], p.width, p.height), depth_of(images[1], p.width, p.height) if depth else None
 
     def _pictures(self, wanted: dict[str, tuple[str, Pinhole]], T_world_from_camera: Array) -> list[Any]:
-        """Raw pictures of one tick from one pose, by several cameras (made when they are first wanted)."""
+        """Raw pictures of one tick from one pose, by several cameras (created on first use)."""
         self._require_open()
         pose = self.drives.frame.camera_pose(T_world_from_camera)
         for name, (kind, pinhole) in wanted.items():
@@ -334,7 +334,7 @@ def drives_in(carla_map: Any, library: Any, config: CarlaConfig) -> JunctionDriv
     """The drives of the configured junction, on ground that is flat enough for a car that moves in a plane.
 
     Raises:
-        CarlaMapError: The junction is not there, its roads are too short, or they are not flat.
+        CarlaMapError: The map has no such junction, or its roads are too short or not flat.
     """
     j = config.junction
     return find_drives(carla_map, library, j.id, j.choice, j.approach_m, j.beyond_m, j.max_height_range_m)

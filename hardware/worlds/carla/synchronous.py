@@ -1,4 +1,4 @@
-"""A world that moves only when told to, and is put back as it was."""
+"""CARLA's world in synchronous mode; its settings are restored afterwards."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class TickedWorld:
     Args:
         world: A ``carla.World``.
         fixed_delta_s: Simulated time of one tick [s].
-        timeout_s: For one tick [s].
-        undo: Gets what puts the world's settings back, before they are changed.
+        timeout_s: Limit for one tick [s].
+        undo: Receives the action that restores the world's settings, before they are changed.
 
     Attributes:
         frame: Number of the last tick; -1 before the first.
@@ -27,7 +27,7 @@ class TickedWorld:
         self.world, self.fixed_delta_s, self._timeout_s = world, fixed_delta_s, timeout_s
         self.frame = -1
         before, ours = world.get_settings(), world.get_settings()
-        # A world that was synchronous when we came (`take_over`) has nobody left who ticks it: it would stand still for ever.
+        # A world that was already synchronous (`take_over`) has no other client that ticks it: it would stand still for ever.
         before.synchronous_mode = False
         undo.push("the world's settings", lambda: world.apply_settings(before))
         ours.synchronous_mode, ours.fixed_delta_seconds, ours.no_rendering_mode = True, fixed_delta_s, False
@@ -35,7 +35,7 @@ class TickedWorld:
             world.apply_settings(ours)
 
     def tick(self) -> int:
-        """Let ``fixed_delta_s`` pass; the frame number.
+        """Advance by ``fixed_delta_s`` and return the frame number.
 
         Raises:
             CarlaUnreachable: The server did not finish the tick in time.
@@ -61,13 +61,13 @@ def weather_of(library: Any, name: str) -> Any:
     """A preset without wind, so that leaves do not move between pictures.
 
     Raises:
-        CarlaMapError: There is no such preset.
+        CarlaMapError: CARLA has no preset of that name.
     """
     kinds = library.WeatherParameters
     presets = [each for each in dir(kinds) if isinstance(getattr(kinds, each), kinds)]
     if name not in presets:
         raise CarlaMapError(f"expected a weather of {', '.join(presets)}, got {name!r}")
-    # A copy: the library's presets are shared, and can be written to.
+    # A copy, because the library's presets are shared and mutable.
     preset, weather = getattr(kinds, name), kinds()
     for each in dir(preset):
         if isinstance(getattr(preset, each), float):

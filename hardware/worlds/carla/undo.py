@@ -1,4 +1,4 @@
-"""What has to be put back when a scene is closed, whatever happened in between."""
+"""Clean-up actions that run when a scene is closed, also after an error."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from collections.abc import Callable
 
 
 class Undo:
-    """A list of things to put back, last one first; one that fails does not keep the others from being done."""
+    """A list of clean-up actions, run last one first; a failing action does not stop the others."""
 
     def __init__(self) -> None:
         self._entries: list[tuple[str, Callable[[], object]]] = []
 
     def push(self, what: str, action: Callable[[], object]) -> None:
-        """Remember an action; ``what`` it does is for the message if it fails."""
+        """Add an action; ``what`` describes it in the message if it fails."""
         self._entries.append((what, action))
 
     def run(self) -> list[str]:
-        """Do everything, and forget it. Returns what failed, and how."""
+        """Run and forget all actions. Returns what failed, and how."""
         failed = []
         while self._entries:
             what, action = self._entries.pop()

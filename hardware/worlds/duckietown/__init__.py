@@ -1,1 +1,1 @@
-"""Duckietown as a world, in a process and an environment of its own: ``advnerf world install duckietown``."""
+"""Duckietown as a world, in a separate process and environment: ``advnerf world install duckietown``."""

@@ -17,7 +17,7 @@ class RobotConfig(StrictModel):
 
     Attributes:
         speed_mps: Speed of the experiments [m/s].
-        max_turn_rate_radps: Largest turn rate that is asked for [rad/s]; at 0.25 m/s the motors reach 4.3.
+        max_turn_rate_radps: Largest commanded turn rate [rad/s]; at 0.25 m/s the motors reach 4.3.
     """
 
     speed_mps: float = Field(default=0.25, gt=0.0, le=0.5)
@@ -28,8 +28,8 @@ class DuckietownConfig(StrictModel):
     """The whole world.
 
     Attributes:
-        map_name: Which of Duckietown's maps; it must have a way round.
-        seed: Of what the map leaves open.
+        map_name: Name of a Duckietown map with a closed route.
+        seed: Seed of everything that the map leaves open.
         camera: Driving camera, mounted relative to the middle of the axle; the default is the robot's own.
         photo: Camera of the posed images that a surrogate is learned from.
         robot: The car.

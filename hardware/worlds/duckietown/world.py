@@ -25,7 +25,7 @@ _LOWEST_M, _LOW_M, _HIGH_M, _BESIDE_M = -0.1, -0.05, 0.6, 0.3
 class Duckietown(InstalledWorld):
     """A map of Duckietown with its own renderer and its differential drive.
 
-    Its paths are the closed ways along the lanes' middles, named by the way round: ``left`` (seen from above counter-clockwise) and ``right``. The
+    Its paths are the closed routes along the lanes' middles, named by direction: ``left`` (counter-clockwise from above) and ``right``. The
     world's x is Duckietown's, its y is Duckietown's -z, and z points up. The robot is in no picture.
 
     Args:
@@ -40,10 +40,10 @@ class Duckietown(InstalledWorld):
         super().__init__("duckietown", self.config, RANGE_M, _LOWEST_M, frozenset({"robot"}))
 
     def description_of(self, facts: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> WorldDescription:
-        """The ways round the map.
+        """The closed routes of the map.
 
         Raises:
-            WorldError: It has none.
+            WorldError: The map has no closed route.
         """
         if not facts["ways"]:
             raise WorldError(
@@ -67,14 +67,14 @@ class Duckietown(InstalledWorld):
         )
 
     def photo_poses(self, count: int, rng: np.random.Generator) -> list[Array]:
-        """Along and beside the ways, and from above them; see `road_photo_poses`."""
+        """Poses along, beside and above the routes; see `road_photo_poses`."""
         description = self.describe()
         paths, lane_m = list(description.paths.values()), 2.0 * description.off_track_m
         return road_photo_poses(paths, lane_m, self.config.camera, count, rng)
 
 
 def _named(lines: list[Array]) -> dict[str, ReferencePath]:
-    """The ways by their names, each with a goal of its own; the longest of those that turn to one side has the side's name."""
+    """The routes by name, each with a one-hot goal; the longest route in each direction gets the direction's name."""
     areas = [
         0.5 * float(np.sum(line[:, 0] * np.roll(line[:, 1], -1) - line[:, 1] * np.roll(line[:, 0], -1)))
         for line in lines

@@ -1,4 +1,4 @@
-"""What the lab's other renderer adds to the lab's numbers."""
+"""Settings that the lab's other renderer adds to the lab's."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class FilamentConfig(StrictModel):
     Attributes:
         lab: The room, its cameras and its car, as in the world ``lab``.
         brightness: Factor on the light that MuJoCo 4 puts into a scene whose lights have no intensities; with 4 the floor is as bright as the lab's.
-        ambient_occlusion: Whether Filament darkens corners. It does so by what is in the picture, so that a place looks different from elsewhere.
+        ambient_occlusion: Whether Filament darkens corners. The effect is computed in screen space, so a place changes with the viewpoint.
         server: Deadlines of its process.
     """
 

@@ -24,10 +24,10 @@ _BEFORE_SCREEN_M = 0.002
 
 
 class Filament(InstalledWorld):
-    """The lab with another renderer: the room, the cameras and the car are those of `hardware.worlds.lab.lab.Lab`.
+    """The lab with another renderer: room, cameras and car are those of `hardware.worlds.lab.lab.Lab`.
 
-    The scene is composed here and sent as files. The car drives here too, by the same code, so that the same commands move it as in the lab, to
-    the bit; the other process only draws. The car's own body is in no picture.
+    The scene is composed here and sent as files. The car drives here too, by the same code, so that the same commands move it exactly as in the
+    lab; the other process only draws. The car's own body is in no picture.
 
     Args:
         config: All numbers of the world.
@@ -41,7 +41,7 @@ class Filament(InstalledWorld):
     def __init__(self, config: FilamentConfig | None = None) -> None:
         self.config = FilamentConfig() if config is None else config
         super().__init__("filament", self.config, RANGE_M, 0.0)
-        # Never opened: what it says of itself needs no renderer.
+        # Never opened: the lab's description needs no renderer.
         self._room = Lab(self.config.lab)
         self._car = DrivenCar(self.config.lab)
 
@@ -51,11 +51,11 @@ class Filament(InstalledWorld):
         return {name: np.frombuffer(data, np.uint8) for name, data in files.items()}
 
     def description_of(self, facts: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> WorldDescription:
-        """The lab's, and which renderer it is."""
+        """The lab's description, and the renderer's name."""
         return replace(self._room.describe(), facts={"simulator": str(facts["simulator"])})
 
     def photo_poses(self, count: int, rng: np.random.Generator) -> list[Array]:
-        """Those of the lab."""
+        """The lab's photo poses."""
         return self._room.photo_poses(count, rng)
 
     def touches(self, x_m: float, y_m: float, yaw_rad: float) -> str:
@@ -72,8 +72,8 @@ class Filament(InstalledWorld):
         return self._state
 
     def step(self, steering_rad: float, speed_mps: float, duration_s: float) -> VehicleState:
-        """Send one command, which takes the way of the real driver's, and let time pass."""
-        _ = self.state  # a drive whose process was lost does not go on
+        """Send one command with the lab's delays and limits, and let time pass."""
+        _ = self.state  # raises if the process was lost during this drive
         self._state = self._car.step(steering_rad, speed_mps, duration_s)
         self._blocked = self._car.blocked
         return self._state

@@ -1,4 +1,4 @@
-"""The car of the intersection: a Dubins car whose turn rate lags behind its command and is a little off."""
+"""The car of the intersection: a Dubins car whose turn rate lags behind its command and has a gain error."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class DubinsCar:
 
     Args:
         config: Bounds and flaws of the car.
-        fits: Whether the car may stand at x [m], y [m], yaw [rad]; it stops before a pose where it does not.
+        fits: Whether the car may stand at x [m], y [m], yaw [rad]; the car stops before a pose where it may not.
     """
 
     def __init__(self, config: DubinsConfig, fits: Callable[[float, float, float], bool]) -> None:
@@ -49,7 +49,7 @@ class DubinsCar:
         Args:
             turn_rate_radps: Commanded turn rate, left positive [rad/s]; clipped to the car's bound.
             speed_mps: Speed, reached at once [m/s].
-            duration_s: For how long [s].
+            duration_s: Duration [s].
 
         Raises:
             ValueError: A value is not finite, or the duration is negative.

@@ -46,7 +46,7 @@ UNSEEN_OF_A_CAR = (
 
 
 class DubinsConfig(StrictModel):
-    """The car: what the experiment asks of it, and how it really behaves.
+    """The car: its nominal behaviour, and its true one.
 
     Attributes:
         speed_mps: Speed of the experiments [m/s].
@@ -68,12 +68,12 @@ class DubinsConfig(StrictModel):
 
     @classmethod
     def ideal(cls) -> DubinsConfig:
-        """The car that the surrogate believes in: no lag, no gain error."""
+        """The car as the surrogate models it: no lag, no gain error."""
         return cls(turn_rate_lag_s=0.0, turn_rate_gain=1.0)
 
     @property
     def description(self) -> CarDescription:
-        """What an attack is told of the car."""
+        """The description of the car for an attack."""
         bound = self.max_turn_rate_radps
         return CarDescription("dubins", self.speed_mps, (-bound, bound))
 
@@ -86,7 +86,7 @@ class IntersectionConfig(StrictModel):
         camera: Driving camera, mounted relative to the car's reference point.
         photo: Camera of the posed images that a surrogate is learned from.
         car: Vehicle.
-        approach_m: How far from the junction's middle the drives start [m].
+        approach_m: Distance of the drives' starts from the junction's middle [m].
         left_radius_m: Radius of the left turn [m]; the right turn is concentric with the kerb.
         beyond_m: Length of the road after a turn that belongs to the reference path [m].
         supersampling: Images are drawn this many times larger per axis and averaged.
@@ -146,7 +146,7 @@ class IntersectionConfig(StrictModel):
         return math.hypot(abs(x_m) - width - radius, y_m + width + radius) > radius
 
     def lanes(self) -> tuple[ReferencePath, ...]:
-        """Middles of all lanes: the drives', and those that nobody drives here, in which nothing may stand either."""
+        """Middles of all lanes, also of those that no drive uses; no object may stand in any of them."""
         driven = self.paths()
         return (*driven.values(), driven["straight"].mirrored("x"), driven["right"].mirrored("y"))
 

@@ -29,12 +29,12 @@ def facade(
     """One wall of a house.
 
     Args:
-        width_m: Its width [m].
-        height_m: Its height [m].
-        wall_rgb: Its colour, 0..1.
-        style: What kind of house it is.
-        front: Whether the door is here.
-        rng: Source of what differs from house to house.
+        width_m: Width of the wall [m].
+        height_m: Height of the wall [m].
+        wall_rgb: Colour of the wall, 0..1.
+        style: Kind of house.
+        front: Whether this wall has the door.
+        rng: Source of the variation between houses.
 
     Returns:
         Picture ``[H, W, 3]``, row 0 on top, unlit.

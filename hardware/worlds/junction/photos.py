@@ -1,4 +1,4 @@
-"""From where the intersection is photographed for learning: along the drives, off them, and from above."""
+"""Poses from which the intersection is photographed for learning: along the drives, off them, and from above."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hardware.worlds.junction.config import IntersectionConfig
 from hardware.worlds.junction.town import TREES, obstacles
 from hardware.worlds.paths import ReferencePath
 
-DRIVEN_M = 44.0  # how far along each path photos are taken: the drive, and what a car sees that runs on
+DRIVEN_M = 44.0  # photos cover this length of each path: the drive, and views of a car that overshoots
 MAX_TRIES = 1000
 
 
@@ -20,7 +20,7 @@ def photo_poses(config: IntersectionConfig, count: int, rng: np.random.Generator
     """Poses that cover the three drives evenly, mixed so that any prefix covers them too.
 
     Of ten photos six are taken close to a path at about the driving camera's height, two from a car that has left its lane
-    and looks elsewhere, and two from 3 to 7 m above the ground looking at the junction.
+    and looks aside, and two from 3 to 7 m above the ground looking at the junction.
 
     Args:
         rng: Source of all randomness.
@@ -59,7 +59,7 @@ def _pose(config: IntersectionConfig, path: ReferencePath, kind: int, rng: np.ra
 
 
 def _raised(x_m: float, y_m: float, rng: np.random.Generator) -> Array:
-    """A view over the junction from a ladder, as it were: the ground from steeper angles than a car has."""
+    """A raised view over the junction, as from a ladder: the ground from steeper angles than a car has."""
     position = np.array([x_m + rng.normal(), y_m + rng.normal(), rng.uniform(3.0, 7.0)])
     bearing = rng.uniform(0.0, 2.0 * math.pi)
     target = np.array([9.0 * math.cos(bearing), 9.0 * math.sin(bearing) - 4.0, 0.0])

@@ -29,7 +29,7 @@ _CELL_PX, _ROWS_PX = 16, 64
 
 
 def swatch_u(name: str) -> float:
-    """Where a swatch lies in the picture of swatches."""
+    """Picture coordinate u of a swatch."""
     return (list(SWATCHES).index(name) + 0.5) / len(SWATCHES)
 
 

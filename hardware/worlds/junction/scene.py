@@ -47,7 +47,7 @@ class Intersection(SeenWorld):
         self._renderer: Renderer | None = None
 
     def describe(self) -> WorldDescription:
-        """The drives, and all lanes: within half a lane of their middles lies the whole asphalt. The box holds the painted sky: nothing lies outside."""
+        """The drives, and all lanes, which together cover the asphalt. The box holds the painted sky: nothing lies outside."""
         config, road = self.config, self.config.road
         return WorldDescription(
             paths={str(name): path for name, path in config.paths().items()},
@@ -125,7 +125,7 @@ class Intersection(SeenWorld):
         return self._open_renderer().render_rgb(T_world_from_camera, self.photo_pinhole)
 
     def overview(self, width: int = 960, height: int = 720) -> tuple[Rgb, Pinhole, Array]:
-        """The junction from above the south, and the camera that sees it so: intrinsics and ``T_world_from_camera`` ``[4, 4]``."""
+        """The junction from above the south, and the camera of this view: intrinsics and ``T_world_from_camera`` ``[4, 4]``."""
         focal = 1.0 * width
         pinhole = Pinhole(width, height, focal, focal, 0.5 * width, 0.5 * height)
         T = look_at([0.0, -46.0, 62.0], [0.0, -7.0, 0.0])

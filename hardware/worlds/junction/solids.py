@@ -1,7 +1,7 @@
 """Triangles for everything that is not a flat picture: strips of ground, roofs, trees, posts, markings.
 
 A piece of geometry carries its picture coordinates ``uv`` in 0..1, u to the right and v up. Solids take their colour from
-the swatches: u picks the colour and v its brightness, so that a tone per corner costs no picture of its own.
+the swatches: u picks the colour and v its brightness, so that a different tone needs no extra picture.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def fan(middle: tuple[float, float], line: Array, z_m: float, half_m: float) -> 
 
 
 def polygon(corners: ArrayLike, uv: ArrayLike) -> TexturedSolid:
-    """A flat convex polygon of corners ``[N, 3]``, counter-clockwise from where it is seen."""
+    """A flat convex polygon of corners ``[N, 3]``, counter-clockwise for the viewer."""
     points = np.asarray(corners, dtype=np.float64)
     i = np.arange(1, len(points) - 1)
     faces = np.c_[np.zeros_like(i), i, i + 1].astype(np.int32)

@@ -1,4 +1,4 @@
-"""What stands where beside the roads: houses, trees, hedges, lamps and a sign, and which of it a car runs into."""
+"""Layout of the town: houses, trees, hedges, lamps and a sign, and the obstacles among them."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ class House:
     """A house with upright walls over a rectangle.
 
     Attributes:
-        x: Its extent along x [m].
-        y: Its extent along y [m].
+        x: Extent along x [m].
+        y: Extent along y [m].
         eaves_m: Height of the walls [m].
         ridge_m: Height of the roof above the walls [m]; 0 for a flat roof.
         wall: Name of the walls' colour.
         roof: Name of the roof's swatch.
         front: Side with the door.
-        style: What its front looks like.
+        style: Style of the front.
     """
 
     x: tuple[float, float]
@@ -40,7 +40,7 @@ class House:
 
 @dataclass(frozen=True)
 class Tree:
-    """A tree: where its trunk stands [m], its height [m], the radius of its crown [m] and the crown's swatch."""
+    """A tree: position of its trunk [m], its height [m], the radius of its crown [m] and the crown's swatch."""
 
     x_m: float
     y_m: float
@@ -108,12 +108,12 @@ BOXES: tuple[tuple[float, float, float, float, float, str], ...] = (
     (-17.3, -16.7, 5.6, 6.1, 1.3, "yellow"), (12.8, 14.6, -11.6, -11.1, 0.5, "wood"), (-1.2, -0.7, 5.8, 6.3, 1.0, "blue"),
     (-5.6, -5.1, -17.6, -17.1, 1.0, "blue"), (24.0, 24.6, 5.7, 6.2, 1.1, "sign_red"),
 )  # fmt: skip
-# Where the stop sign of the side road stands; it faces south.
+# Position of the side road's stop sign, which faces south.
 STOP_SIGN = (4.5, -14.2)
 
 
 def obstacles(config: IntersectionConfig) -> list[Footprint]:
-    """What the car cannot drive through: houses, trunks, hedges, boxes and posts. The attacked objects are not part of the world."""
+    """Everything solid: houses, trunks, hedges, boxes and posts. The attacked objects are not part of the world."""
     found = []
     for house in HOUSES:
         (x0, x1), (y0, y1) = house.x, house.y

@@ -1,4 +1,4 @@
-"""The intersection as a MuJoCo model, built in memory: pictures that shine as they are painted, and no lights."""
+"""The intersection as a MuJoCo model, built in memory: unlit pictures that keep their painted colours, and no lights."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def build_model(config: IntersectionConfig) -> Any:
         0  # the renderer averages a larger image instead, which also filters textures
     )
     surfaces, solids, plans = _painted(config.road)
-    # Drawn in this order, so from what hides others (trees, houses) to what is hidden (the road, the sky behind it).
+    # Drawn front to back: first what hides others (trees, houses), last what is hidden (the road, the sky).
     for name in ("swatches", "pavement", "garden"):
         _add_solid(mujoco, spec, name, solids[name], plans[name])
     for surface in reversed(surfaces):
@@ -73,7 +73,7 @@ def _painted(road: RoadConfig) -> tuple[list[Surface], dict[str, TexturedSolid],
 
 
 def _walls(name: str, house: House, ground_m: float, rng: np.random.Generator) -> list[Surface]:
-    """The walls of a house that can be seen from the roads: all but the one at its back."""
+    """The walls of a house that are visible from the roads: all but the back wall."""
     (x0, x1), (y0, y1) = house.x, house.y
     middle = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1), ground_m + 0.5 * house.eaves_m])
     back = {"north": "south", "south": "north", "east": "west", "west": "east"}[house.front]
@@ -92,7 +92,7 @@ def _walls(name: str, house: House, ground_m: float, rng: np.random.Generator) -
 
 
 def _furniture(road: RoadConfig, rng: np.random.Generator) -> list[TexturedSolid]:
-    """Markings, roofs, trees, lamps and the stop sign: all that takes its colour from the swatches."""
+    """Markings, roofs, trees, lamps and the stop sign: everything coloured by the swatches."""
     kerb = road.kerb_height_m
     white = (swatch_u("paint"), float(shade(UP)) / BRIGHTEST)
     solids = [polygon(np.c_[piece, np.full(len(piece), PAINT_M)], white) for piece in markings(road)]

@@ -147,14 +147,14 @@ class PanelConfig(StrictModel):
 
 
 class MonitorOpticsConfig(StrictModel):
-    """What the camera sees of a colour on the monitor; see `hardware.worlds.lab.monitor`. The default is seen as it is.
+    """Optics from monitor to camera; see `hardware.worlds.lab.monitor`. The default is the identity.
 
     Attributes:
         gamma: Exponent from shown value to light, by channel.
         mixing: Light of the screen's channels (columns) in the camera's (rows), at full drive and straight on.
         glare: Light of the room reflected by the glass, in the camera's channels.
         falloff: Power of the cosine of the viewing angle with which the panel dims.
-        response: The camera's answer to light is its power of one over this.
+        response: The camera's response is light to the power of one over this.
     """
 
     gamma: Colour = (1.0, 1.0, 1.0)
@@ -182,7 +182,7 @@ class MonitorOpticsConfig(StrictModel):
 
 
 class CarConfig(StrictModel):
-    """A RACECAR/J-sized car: what the driver believes (nominal) and how it really behaves (true).
+    """A RACECAR/J-sized car: its nominal (assumed by the driver) and its true behaviour.
 
     Attributes:
         wheelbase_m: Distance between the axles [m].
@@ -252,7 +252,7 @@ class LabConfig(StrictModel):
         phone: Camera that photographs the room.
         board: Green board at the bottom right corner of the track, motion-capture subject "board".
         monitor: 27-inch screen at the top right corner, motion-capture subject "monitor".
-        monitor_optics: What the cameras see of the monitor's colours.
+        monitor_optics: Optics from the monitor to the cameras.
         car: Vehicle.
         shadows: Whether the furniture casts shadows.
         supersampling: Images are drawn this many times larger per axis and averaged.
@@ -262,7 +262,7 @@ class LabConfig(StrictModel):
     track: TrackConfig = TrackConfig()
     camera: CameraConfig = CameraConfig()
     phone: PhoneConfig = PhoneConfig()
-    # Facing back down the bottom straight, turned 8 degrees towards its start.
+    # Faces back down the bottom straight, turned 8 degrees towards its start.
     board: PanelConfig = PanelConfig(
         x_m=3.05,
         y_m=-1.80,
@@ -292,7 +292,7 @@ class LabConfig(StrictModel):
     @field_validator("board", "monitor", mode="before")
     @classmethod
     def _the_rest_as_it_is(cls, value: Any, info: ValidationInfo) -> Any:
-        """A panel that is moved keeps what was not said: ``--set lab.board.x_m=2.8``."""
+        """A moved panel keeps the keys that were not given: ``--set lab.board.x_m=2.8``."""
         if not isinstance(value, dict):
             return value
         return {**cls.model_fields[info.field_name or ""].default.model_dump(), **value}

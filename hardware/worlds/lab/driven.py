@@ -1,4 +1,4 @@
-"""The lab's car under commands that arrive late: what moves in the synchronous lab, whoever draws the room."""
+"""The lab's car with delayed commands: the dynamics of the synchronous lab, independent of the renderer."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hardware.worlds.lab.furniture import vehicle_in_room
 
 
 class DrivenCar:
-    """The car among the room's furniture, commanded the way of the real driver's. Two that get the same calls move identically to the bit.
+    """The car among the room's furniture, commanded like the real car. Two cars with the same calls move identically to the bit.
 
     Attributes:
         time_s: Lab time since the last reset [s].

@@ -1,4 +1,4 @@
-"""What stands in the room, as plain solids: drawn by the world, casting shadows, and obstacles to the car."""
+"""The room's furniture as plain solids: drawn, casting shadows, and obstacles to the car."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Solid:
         half_m: Half extents along the solid's own axes [m].
         rgb: Colour, 0..1.
         yaw_rad: Turn about the vertical axis [rad].
-        name: Of the thing that it is a part of.
+        name: Name of the piece of furniture.
     """
 
     kind: Literal["box", "cylinder", "ellipsoid"]
@@ -279,7 +279,7 @@ def _cartons(x: float, y: float) -> _LocalSolids:
 
 
 def _island() -> _LocalSolids:
-    """Low things within 1 m of the middle: they must not hide one side of the track from the other."""
+    """Low furniture within 1 m of the middle, which must not hide one side of the track from the other."""
     p = _LocalSolids(0.0, 0.0, 0.0)
     p.cylinder(0.12, 0.22, 0.0, 0.30, 0.05, DARK_WOOD)
     p.cylinder(0.12, 0.22, 0.05, 0.06, 0.36, DARK_WOOD)

@@ -1,4 +1,4 @@
-"""The one place that imports MuJoCo, so that a missing package or a missing EGL library gives one clear error."""
+"""The only module that imports MuJoCo, so that a missing package or a missing EGL library gives one clear error."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ EGL_HELP = (
 
 
 class TwinUnavailable(HardwareError):
-    """The simulated lab cannot run on this machine as it is set up; the message says what to install."""
+    """The simulated lab cannot run on this machine; the message says what to install."""
 
 
 def load_mujoco() -> Any:

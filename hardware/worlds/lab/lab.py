@@ -36,7 +36,7 @@ from hardware.worlds.world import (
 
 HALF_LANE_M = 0.4
 FENCE_MARGIN_M = 0.5
-# The true car behind the nominal one: how it answers, not what it is asked.
+# The true car's response to commands; the nominal car and the commands do not depend on it.
 _UNSEEN = (
     "car.true_servo_gain", "car.true_servo_offset", "car.true_erpm_gain", "car.steering_lag_s", "car.steering_slew_radps", "car.motor_lag_s",
     "car.drag_stop_lag_s", "car.friction_mps2", "car.acceleration_per_amp_mps2", "car.grip_mps2", "car.command_delay_s",
@@ -66,9 +66,9 @@ class Lab(SeenWorld):
         self.T_car_from_camera: Array = self.config.camera.T_car_from_camera
         self._car = DrivenCar(self.config)
         self._stood: dict[str, tuple[Panel, Rgb]] = {}
-        self._shown: dict[str, Rgb] = {}  # textures that are no longer those of the model
+        self._shown: dict[str, Rgb] = {}  # textures that differ from the model's
         self._open_renderer: Renderer | None = None
-        # None where colours are seen as they are shown: nothing to compute from frame to frame.
+        # None where the optics are the identity: nothing to compute per frame.
         self._optics: ScreenOptics | None = None
         if self.config.monitor_optics != MonitorOpticsConfig():
             self._optics = ScreenOptics(self.config.monitor_optics, self.config.monitor, MONITOR_PIXELS)
@@ -113,7 +113,7 @@ class Lab(SeenWorld):
         """Poses ``T_world_from_camera [4, 4]`` from the car, and on a walk around the room, in turn."""
         driven = car_mounted_poses(self.config, (count + 1) // 2, rng)
         walked = walk_around_poses(self.config, count // 2, rng)
-        # Each list goes round once: shuffled, so that any prefix covers the track.
+        # Each list is used once: shuffled, so that any prefix covers the track.
         both = [[each[index] for index in rng.permutation(len(each))] for each in (driven, walked)]
         return [both[index % 2][index // 2] for index in range(count)]
 
@@ -138,8 +138,8 @@ class Lab(SeenWorld):
     def step(self, steering_rad: float, speed_mps: float, duration_s: float) -> VehicleState:
         """Send one command and let time pass.
 
-        The command goes the way of the real driver's: nominal gains, servo clipped to its limits, speeds below the motor
-        controller's minimum become a drag stop; and it reaches the actuators ``car.command_delay_s`` after this call.
+        The command passes through a model of the real driver: nominal gains, servo clipped to its limits, speeds below the motor
+        controller's minimum become a drag stop; it reaches the actuators ``car.command_delay_s`` after this call.
 
         Args:
             steering_rad: Commanded wheel angle, left positive [rad].
@@ -210,13 +210,13 @@ class Lab(SeenWorld):
         self._screen_seen_from = None
 
     def add_panel(self, name: str, panel: Panel, rgb: Rgb | None) -> None:
-        """Stand a panel in the room, lit as the furniture is, or take it out; see `hardware.worlds.world.NativePanels`.
+        """Add a panel to the room, lit like the furniture, or remove it; see `hardware.worlds.world.NativePanels`.
 
-        A new picture on a panel that stands there takes no time; anything else builds the room again. Nothing collides with it.
+        A new picture on an existing panel takes no time; anything else rebuilds the room. Nothing collides with the panel.
 
         Args:
             panel: Pose and size.
-            rgb: Texture ``[h, w, 3]`` uint8, row 0 on top; None takes the panel out.
+            rgb: Texture ``[h, w, 3]`` uint8, row 0 on top; None removes the panel.
         """
         texture, before = f"panel {name}", self._stood.get(f"panel {name}")
         if rgb is None:
@@ -231,7 +231,7 @@ class Lab(SeenWorld):
             self._rebuild()
 
     def _rebuild(self) -> None:
-        """Another model; what board and monitor show stays."""
+        """Rebuild the model; board and monitor keep their pictures."""
         self._renderer.close()
         self._open_renderer = self._new_renderer()
         for name, rgb in self._shown.items():
@@ -278,7 +278,7 @@ class Lab(SeenWorld):
         return rgb, self._renderer.render_depth(T, self.camera_pinhole) if depth else None
 
     def _light_screen(self, T_world_from_camera: Array) -> None:
-        """Give the monitor the colours that are seen from where the camera is."""
+        """Give the monitor the colours seen from the camera's position."""
         if self._optics is None:
             return
         place = T_world_from_camera[:3, 3]

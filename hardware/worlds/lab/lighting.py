@@ -14,8 +14,8 @@ import numpy as np
 from advnerf_core.geometry import Array
 from hardware.worlds.lab.furniture import Solid
 
-AMBIENT = 0.56  # share of the light that has bounced so often that it comes from everywhere
-LAMP_POWER = 11.0  # of all lamps together [m2]: a floor point under a lamp gets about 1 in all
+AMBIENT = 0.56  # share of light scattered so often that it is uniform
+LAMP_POWER = 11.0  # all lamps together [m2]: a floor point under a lamp gets about 1 in all
 
 
 def lamp_samples(room_half_m: float, room_height_m: float) -> Array:

@@ -1,7 +1,7 @@
-"""The optics of the simulated monitor: what a camera sees of the pixels that it shows.
+"""The optics of the simulated monitor: the colours that a camera sees of its pixels.
 
 ``seen = (glare + cos(angle)^falloff  M shown^gamma) ^ (1 / response)`` per pixel of the screen, with the angle between the panel's normal and the
-way from that pixel to the camera. The default is a monitor whose colours are seen as they are.
+direction from that pixel to the camera. The default is the identity.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class ScreenOptics:
 
     @property
     def depends_on_place(self) -> bool:
-        """Whether what is seen depends on where the camera is."""
+        """Whether the seen colours depend on the camera's position."""
         return self._config.falloff > 0.0
 
     def show(self, rgb: Rgb) -> None:

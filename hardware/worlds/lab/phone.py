@@ -1,4 +1,4 @@
-"""The phone that photographs the room: where it is held, and its colours."""
+"""The phone that photographs the room: its poses and its colours."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def video_poses(config: LabConfig, count: int) -> list[Array]:
     Neighbours overlap, as structure from motion needs, and the last lap sees what a driving camera sees.
 
     Args:
-        count: How many frames over all laps.
+        count: Number of frames over all laps.
 
     Returns:
         ``T_world_from_camera`` ``[4, 4]`` each.
@@ -96,7 +96,7 @@ def video_poses(config: LabConfig, count: int) -> list[Array]:
     for index in range(count):
         along = len(laps) * index / count
         height, yaw, pitch = laps[int(along)]
-        # Nobody walks straight or holds a phone still; periods without a common multiple, so that no two laps are alike.
+        # A person neither walks straight nor holds a phone still; the periods have no common multiple, so that no two laps are alike.
         sway_m, bob_m = 0.12 * math.sin(2.3 * index), 0.06 * math.sin(1.7 * index)
         pose = planar_pose(*track_pose(config.track, length * (along % 1.0)))
         poses.append(
@@ -108,7 +108,7 @@ def video_poses(config: LabConfig, count: int) -> list[Array]:
 def car_mounted_poses(config: LabConfig, count: int, rng: np.random.Generator) -> list[Array]:
     """Photos with the phone on the car, pushed round the track: on the line, beside it, and straight on at corners.
 
-    The camera height varies over ``phone.mount_height_m``, the pitch is that of the driving camera give or take 3 degrees.
+    The camera height varies over ``phone.mount_height_m``, the pitch is the driving camera's plus or minus 3 degrees.
     Places where the car's body would not fit are left out.
 
     Args:
@@ -140,7 +140,7 @@ def _held_position(
 ) -> Array:
     # A ray from the middle comes within 0.5 m of the square's wall at this distance.
     reach = (half_m - 0.5) / max(abs(math.cos(bearing)), abs(math.sin(bearing)))
-    # Who looks in steps back to the wall, who looks at the wall steps back to the middle.
+    # Looking in, step back to the wall; looking at the wall, step back to the middle.
     radius = rng.uniform(0.6 * reach, reach) if inwards else rng.uniform(0.8, 0.6 * reach)
     return np.array(
         [radius * math.cos(bearing), radius * math.sin(bearing), rng.uniform(*phone.walk_height_m)]
@@ -178,7 +178,7 @@ def _driven_pose(
 ) -> tuple[float, float, float]:
     x, y, yaw = track_pose(track, s_m)
     if index % 4 == 3:
-        # Where a car ends up that misses a corner: on from the end of the straight before this point.
+        # Where a car ends up that misses a corner: beyond the end of the straight before this point.
         straight, arc = track.side_m - 2.0 * track.corner_radius_m, 0.5 * math.pi * track.corner_radius_m
         x, y, yaw = track_pose(track, s_m // (straight + arc) * (straight + arc) + straight)
         ahead, offset = rng.uniform(0.0, 1.6), rng.normal(0.0, 0.3)

@@ -22,13 +22,13 @@ class Renderer:
     """Draws one static model off-screen. Use it, and close it, in the thread that made it.
 
     Colour is drawn at ``supersampling`` times the size and averaged, which is what a real pixel does to the floor at a
-    grazing angle; depth is that of the pixel centre.
+    grazing angle; depth is taken at the pixel centre.
 
     Args:
         model: A ``mujoco.MjModel``.
         supersampling: Factor per axis.
         hidden_groups: Geom groups that are not drawn unless asked for.
-        range_m: Planar depth of the nearest and the farthest thing that is drawn [m].
+        range_m: Nearest and farthest planar depth that is drawn [m].
     """
 
     def __init__(

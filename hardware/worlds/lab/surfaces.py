@@ -1,4 +1,4 @@
-"""The room's painted surfaces with their light: what is computed once, before MuJoCo sees anything."""
+"""The room's painted surfaces with their light: computed once, before MuJoCo is involved."""
 
 from __future__ import annotations
 

@@ -251,7 +251,7 @@ def ceiling_image(side_m: float, rng: np.random.Generator, pixels_per_m: float =
 
 
 def screen_image(width: int, height: int) -> Image:
-    """What the monitor shows until it is told otherwise: a dark desktop with a soft glow."""
+    """The monitor's idle picture: a dark desktop with a soft glow."""
     x, y = np.meshgrid(np.linspace(-1.0, 1.0, width), np.linspace(-1.0, 1.0, height))
     glow = np.exp(-1.5 * ((x - 0.2) ** 2 + (y - 0.3) ** 2)).astype(np.float32)[..., None]
     return np.array((0.06, 0.08, 0.12), np.float32) + glow * np.array((0.10, 0.16, 0.24), np.float32)

@@ -1,4 +1,4 @@
-"""The simulated car: a bicycle with servo slew and lag, a first-order motor, imperfect gains, and things to bump into.
+"""The simulated car: a bicycle with servo slew and lag, a first-order motor, imperfect gains, and obstacles to hit.
 
 The same class drives the synchronous lab and the VESC emulator, which is why it takes what a VESC takes: a servo position
 and one motor mode (speed, duty, current or brake current).
@@ -18,7 +18,7 @@ SUBSTEP_S = 0.004  # 3 mm at 0.8 m/s, and 1/15 of the fastest time constant
 
 
 def require_jam(how: str | None) -> None:
-    """Refuse what is no jam."""
+    """Raise unless ``how`` is a known kind of jam."""
     if how not in (None, *JAMS):
         raise ValueError(f"expected a jam of {', '.join(JAMS)}, got {how!r}")
 
@@ -35,7 +35,7 @@ class TwinVehicle:
         params: Gains, lags and sizes.
         obstacles: Footprints the body cannot enter.
         room_half_m: The walls are at plus and minus this [m]; infinite without a room.
-        start: Where it stands at first: x [m], y [m], yaw [rad].
+        start: Initial pose: x [m], y [m], yaw [rad].
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class TwinVehicle:
         current_a: float | None = None,
         brake_current_a: float | None = None,
     ) -> None:
-        """Change the servo target, the motor mode, or both; what is not given stays as it was.
+        """Change the servo target, the motor mode, or both; None keeps the current value.
 
         Args:
             servo: Servo position 0..1, as the VESC's ``SET_SERVO_POS``.
@@ -101,7 +101,7 @@ class TwinVehicle:
             self._mode, self._value = name, value
 
     def jam(self, how: str | None) -> None:
-        """Hold the car where it is, with its wheels ``locked`` or ``spinning`` on the spot; None lets it go."""
+        """Hold the car in place, with its wheels ``locked`` or ``spinning`` on the spot; None releases it."""
         require_jam(how)
         self._jam = how
 
@@ -126,16 +126,16 @@ class TwinVehicle:
 
     @property
     def servo(self) -> float:
-        """Servo position in force, 0..1."""
+        """Current servo position, 0..1."""
         return self._servo
 
     @property
     def body(self) -> Footprint:
-        """Where the body stands."""
+        """Footprint of the body."""
         return self.body_at(self._x, self._y, self._yaw)
 
     def touches(self, x_m: float, y_m: float, yaw_rad: float) -> str:
-        """Name of what the body stands against with the rear axle at this pose; empty if nothing is near."""
+        """Name of the obstacle that the body touches with the rear axle at this pose; empty if nothing is near."""
         return touched_by(self.body_at(x_m, y_m, yaw_rad), self._obstacles, self._room_half_m, "wall")
 
     def fits(self, x_m: float, y_m: float, yaw_rad: float) -> bool:

@@ -30,13 +30,13 @@ LIGHTS = (((0.30, 0.18, -0.94), 0.44), ((-0.82, 0.45, -0.35), 0.16), ((0.55, -0.
 def build_model(config: LabConfig, stood: Mapping[str, tuple[Panel, Rgb]] = MappingProxyType({})) -> Any:
     """Compile the room.
 
-    The body "car" is a mocap body whose frame is the car's. The materials' textures "board" and "monitor", and those of panels that
-    stand in the room, can be replaced while it runs (``Renderer.set_texture``).
+    The body "car" is a mocap body whose frame is the car's. The textures "board" and "monitor", and the textures of added panels,
+    can be replaced while it runs (``Renderer.set_texture``).
 
     Args:
         config: All numbers of the lab.
-        stood: Panels that stand in the room besides, each with its texture ``[h, w, 3]``, by the texture's name. The lights that shade
-            the furniture shade them.
+        stood: Additional panels, each with its texture ``[h, w, 3]``, by the texture's name. The furniture's
+            lights shade them.
 
     Returns:
         A ``mujoco.MjModel``.
@@ -87,7 +87,7 @@ def _add_lights(mujoco: Any, spec: Any) -> None:
 
 
 def shading(normal: Array) -> float:
-    """What the rasteriser multiplies a matte surface's colour with."""
+    """Factor by which the rasteriser multiplies a matte surface's colour."""
     total = AMBIENT
     for direction, strength in LIGHTS:
         total += strength * max(-float(np.dot(normal, direction)) / math.hypot(*direction), 0.0)
@@ -95,7 +95,7 @@ def shading(normal: Array) -> float:
 
 
 def _add_surface(mujoco: Any, spec: Any, surface: Surface) -> Any:
-    """Add a one-sided rectangle whose picture is seen as it is, whatever the rasteriser's lights do to its normal."""
+    """Add a one-sided rectangle whose picture is seen unchanged, independent of the rasteriser's lights."""
     factor = shading(surface.normal)
     add_texture(mujoco, spec, surface.name, textures.to_uint8(surface.image / np.float32(max(factor, 1.0))))
     material = add_material(mujoco, spec, surface.name)
@@ -108,7 +108,7 @@ def _add_surface(mujoco: Any, spec: Any, surface: Surface) -> Any:
 
 
 def wxyz(rotation: Array) -> list[float]:
-    """A rotation in MuJoCo's order w, x, y, z."""
+    """A rotation as a quaternion in MuJoCo's order w, x, y, z."""
     x, y, z, w = quaternion_from_rotation(rotation)
     return [w, x, y, z]
 
@@ -123,7 +123,7 @@ def add_texture(mujoco: Any, spec: Any, name: str, rgb: textures.Rgb) -> None:
 
 
 def add_material(mujoco: Any, spec: Any, name: str) -> Any:
-    """Add a matte material that wears the texture of the same name."""
+    """Add a matte material with the texture of the same name."""
     material = spec.add_material()
     material.name = name
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
@@ -132,7 +132,7 @@ def add_material(mujoco: Any, spec: Any, name: str) -> Any:
 
 
 def add_geom(body: Any, kind: Any, size: tuple[float, ...]) -> Any:
-    """Add a geom that is only looked at."""
+    """Add a geom that is only drawn."""
     geom = body.add_geom()
     geom.type = kind
     geom.size = size
@@ -165,7 +165,7 @@ def _add_panel(
 def _add_rectangle(
     mujoco: Any, spec: Any, name: str, T_world_from_face: Array, width_m: float, height_m: float
 ) -> None:
-    """Add a one-sided rectangle that wears the material of a name."""
+    """Add a one-sided rectangle with the named material."""
     geom = add_geom(spec.worldbody, mujoco.mjtGeom.mjGEOM_PLANE, (0.5 * width_m, 0.5 * height_m, 0.1))
     geom.pos = T_world_from_face[:3, 3]
     # A MuJoCo plane faces its z; its x is to the viewer's right, which is the panel's +y.

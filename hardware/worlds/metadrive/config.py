@@ -13,17 +13,17 @@ from hardware.worlds.remote_world import ServerDeadlines
 
 
 class MetaDriveRoadConfig(StrictModel):
-    """A road of MetaDrive's generator, and the stretch of its route that is driven.
+    """A road of MetaDrive's generator, and the driven stretch of its route.
 
     Attributes:
         blocks: One letter per block after the straight that every road begins with: S straight, C curve, r and R ramps, X crossing, O roundabout,
             T junction, P parking, y and Y lanes that merge and split, and others of MetaDrive's documentation.
-        seed: Of the generator: lengths, radii, directions.
+        seed: Seed of the generator: lengths, radii, directions.
         lanes: Lanes per direction.
         lane_width_m: Width of a lane [m].
-        lane: Which lane is driven; 0 is the one beside the middle of the road.
-        from_m: Where on the route the driven stretch begins [m].
-        length_m: Its length [m]; a route that ends before is driven to its end.
+        lane: Index of the driven lane; 0 is beside the middle of the road.
+        from_m: Start of the driven stretch along the route [m].
+        length_m: Length of the driven stretch [m]; a shorter route is driven to its end.
     """
 
     blocks: str = Field(default="CS", min_length=1, pattern="^[A-Za-z$]+$")
@@ -39,8 +39,8 @@ class MetaDriveCarConfig(StrictModel):
     """The car: MetaDrive's own Bullet vehicle under a speed and steering controller, or an ideal one.
 
     Attributes:
-        own: Whether MetaDrive's vehicle drives; else a kinematic bicycle that does what it is told.
-        model: Which of MetaDrive's vehicles; it also sets the wheelbase.
+        own: Whether MetaDrive's vehicle drives; else an ideal kinematic bicycle.
+        model: MetaDrive's vehicle model; it also sets the wheelbase.
         speed_mps: Speed of the experiments [m/s].
         max_wheel_rad: Wheel angles are clipped to plus and minus this [rad].
     """
@@ -55,7 +55,7 @@ class MetaDriveConfig(StrictModel):
     """The whole world.
 
     Attributes:
-        road: Which road.
+        road: Road and driven stretch.
         camera: Driving camera, mounted relative to the rear axle.
         photo: Camera of the posed images that a surrogate is learned from.
         car: The car.
@@ -63,7 +63,7 @@ class MetaDriveConfig(StrictModel):
         supersampling: Every pixel is the mean of this number squared.
         sky: Whether MetaDrive's sky is drawn.
         terrain: Whether its grass is drawn.
-        anisotropic: Whether textures are filtered as MetaDrive asks for, 8 and 16 samples long; in software the frame then takes several times as long.
+        anisotropic: Whether textures use MetaDrive's anisotropic filters, 8 and 16 samples long; software rendering then takes several times as long.
         server: Deadlines of its process.
     """
 

@@ -18,8 +18,8 @@ from hardware.worlds.world import Box, CarDescription, Traits, WorldDescription,
 ROUTE = "route"
 RANGE_M = (0.2, 1000.0)
 _LOWEST_M = -0.1  # the grass lies a little under the road
-_SPACING_M = 1.0  # of the route's poses
-# The learned box reaches so far beyond the driven stretch; lanes as far away are described.
+_SPACING_M = 1.0  # between the route's poses
+# The learned box extends this far beyond the driven stretch; lanes within this distance are described.
 _BESIDE_M, _HIGH_M, _LOW_M = 25.0, 12.0, -0.5
 
 
@@ -44,7 +44,7 @@ class MetaDrive(InstalledWorld):
         """The driven stretch of the route, the lanes near it, and the box about it.
 
         Raises:
-            WorldError: The route is shorter than where the stretch begins, or the lane ends on the way.
+            WorldError: The route is shorter than the start of the stretch, or the lane ends within it.
         """
         road, car = self.config.road, self.config.car
         stretch = self._stretch(arrays["route"])
@@ -73,7 +73,7 @@ class MetaDrive(InstalledWorld):
         )
 
     def photo_poses(self, count: int, rng: np.random.Generator) -> list[Array]:
-        """Along and beside the driven stretch, and from above it; see `road_photo_poses`."""
+        """Poses along, beside and above the driven stretch; see `road_photo_poses`."""
         description = self.describe()
         return road_photo_poses(
             list(description.paths.values()), 2.0 * description.off_track_m, self.config.camera, count, rng
@@ -91,7 +91,7 @@ class MetaDrive(InstalledWorld):
             ) from error
 
     def _stretch(self, route: Array) -> Array:
-        """Poses ``[N, 3]`` of the part of the route that is driven."""
+        """Poses ``[N, 3]`` of the driven part of the route."""
         road = self.config.road
         first, last = round(road.from_m / _SPACING_M), round((road.from_m + road.length_m) / _SPACING_M)
         if len(route) < first + 11:
@@ -103,7 +103,7 @@ class MetaDrive(InstalledWorld):
 
 
 def _near(points: Array, counts: list[int], stretch: Array) -> list[Array]:
-    """Of lines ``[N, 2]`` that follow each other those that come near the stretch."""
+    """The lines ``[N, 2]`` of a concatenated array that come near the stretch."""
     found = []
     for line in np.split(np.asarray(points, dtype=np.float64), np.cumsum(counts)[:-1]):
         apart = np.linalg.norm(line[:, None] - stretch[None, :, :2], axis=2)

@@ -76,13 +76,13 @@ class Map:
         return facts, {"ways": np.concatenate(ways) if ways else np.zeros((0, 2))}
 
     def render(self, camera: str, depth: bool, T_world_from_camera: np.ndarray) -> Reply:
-        """A picture, and its depth where it is wanted."""
+        """A picture, and its depth if requested."""
         view, sim = self._views[camera], self._sim
         kept = sim.cur_pos, sim.cur_angle
         self._aim(T_world_from_camera, view)
         sim.objects = [*self._things, *self._panels.values()]
         fine = sim._render_img(*view.size, view.drawn, view.resolved, view.pixels, top_down=False)
-        sim.objects = self._things  # a panel is no thing that a robot runs into
+        sim.objects = self._things  # the robot does not collide with panels
         found = {"rgb": view.mean(fine), "T_world_from_camera": taken_from()}
         if depth:
             found["depth"] = view.depth()
@@ -121,7 +121,7 @@ class Map:
         return self._state()
 
     def add_panel(self, name: str, size_m: list[float] | None, **arrays: np.ndarray) -> Reply:
-        """Put a panel with ``T_world_from_face`` and texture ``rgb`` into the scene; without a size, take it out."""
+        """Put a panel with ``T_world_from_face`` and texture ``rgb`` into the scene; without a size, remove it."""
         self._panels.pop(name, None)
         if size_m is not None:
             self._panels[name] = PygletPanel(size_m, **arrays)
@@ -166,7 +166,7 @@ class Map:
 
 
 def _closed_ways(curves: list[np.ndarray]) -> list[np.ndarray]:
-    """Ways ``[N, 2]`` round the map: from each curve on to the one that begins at its end, where there are several the straightest."""
+    """Closed routes ``[N, 2]`` round the map: each curve is followed by the straightest one that begins at its end."""
     left, found = list(range(len(curves))), []
     while left:
         way = [left[0]]
@@ -179,7 +179,7 @@ def _closed_ways(curves: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def _next(curves: list[np.ndarray], index: int) -> int | None:
-    """The curve that goes on from the end of one."""
+    """The curve that continues from the end of one."""
     end, course = curves[index][3], curves[index][3] - curves[index][0]
     begins = [other for other, curve in enumerate(curves) if np.linalg.norm(curve[0] - end) < _JOINED_M]
     return max(begins, key=lambda other: float((curves[other][3] - curves[other][0]) @ course), default=None)

@@ -1,6 +1,6 @@
-"""MuJoCo 4.0.0's renderer Filament on software Vulkan for ``serve.py``: a MuJoCo scene that is sent as files, drawn physically based.
+"""MuJoCo 4.0.0's renderer Filament on software Vulkan for ``serve.py``: draws a MuJoCo scene that is sent as files, physically based.
 
-Runs in an environment of its own, and imports nothing of advnerf. Nothing moves here: the car drives in the other process.
+Runs in a separate environment, and imports nothing of advnerf. Nothing moves here: the car drives in the other process.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from mujoco import mjrf
 SCENE = "room.xml"
 NEAR_M, FAR_M = 0.02, 30.0
 BACK_M, BACK_RGB = 0.005, (0.2, 0.2, 0.2)
-# What MuJoCo 4 lights a scene with whose lights have no intensities of their own [lux]: its environment, and all lights together.
+# MuJoCo 4's default lighting for scenes whose lights have no intensities [lux]: its environment, and all lights together.
 _ENVIRONMENT_LX, _LIGHTS_LX = 5000.0, 80000.0
 _COLOURS, _NUMBERS = mjrf.PixelFormat.PIXEL_FORMAT_RGB8, mjrf.PixelFormat.PIXEL_FORMAT_R32F
 Reply = tuple[dict[str, Any], dict[str, np.ndarray]]
@@ -43,7 +43,7 @@ class Room:
         self._panels: dict[str, list[Any]] = {}
 
     def _fill(self, model: Any) -> None:
-        """Put the model into the scene; what it consists of must be kept while it is drawn."""
+        """Put the model into the scene; its parts must stay referenced while it is drawn."""
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
         resources = mjrf.ModelResources(self._context, model)
@@ -55,11 +55,11 @@ class Room:
         self._kept = (model, data, resources, lights, solids)
 
     def describe(self) -> Reply:
-        """Which renderer it is."""
+        """Name of the renderer."""
         return {"simulator": f"Filament of MuJoCo {mujoco.mj_versionString()}"}, {}
 
     def render(self, camera: str, depth: bool, T_world_from_camera: np.ndarray) -> Reply:
-        """A picture, and its depth where it is wanted."""
+        """A picture, and its depth if requested."""
         view = self._views[camera]
         eye = view.aimed(T_world_from_camera)
         found = {"rgb": view.rgb(eye), "T_world_from_camera": _pose_of(eye)}
@@ -68,7 +68,7 @@ class Room:
         return {}, found
 
     def add_panel(self, name: str, size_m: list[float] | None, **arrays: np.ndarray) -> Reply:
-        """Put a panel with ``T_world_from_face`` and texture ``rgb`` into the scene; without a size, take it out."""
+        """Put a panel with ``T_world_from_face`` and texture ``rgb`` into the scene; without a size, remove it."""
         for solid in self._panels.pop(name, [])[:2]:
             self._scene.remove_renderable(solid)
         if size_m is not None:
@@ -78,7 +78,7 @@ class Room:
         return {}, {}
 
     def _panel(self, size_m: list[float], T_world_from_face: np.ndarray, rgb: np.ndarray) -> list[Any]:
-        """A face that is lit as every other matte surface, a plain thin box behind it, and the face's texture, which must be kept."""
+        """A face that is lit like other matte surfaces, a plain thin box behind it, and the face's texture, which must stay referenced."""
         half_m = 0.5 * size_m[0], 0.5 * size_m[1]
         # A plane faces its z; its x is to the viewer's right, which is the face's y.
         axes, place = T_world_from_face[:3, [1, 2, 0]], T_world_from_face[:3, 3]
@@ -184,7 +184,7 @@ class FilamentView:
 
 
 class RenderTarget:
-    """Where a frame is drawn, and the array that it is read into."""
+    """The target of a frame, and the array that it is read into."""
 
     def __init__(self, context: Any, buffer: np.ndarray) -> None:
         self.buffer = buffer
@@ -199,7 +199,7 @@ class RenderTarget:
 
 
 def _model(config: dict[str, Any], files: dict[str, bytes]) -> Any:
-    """The scene with what Filament is to make of it."""
+    """The scene with the settings for Filament."""
     spec = mujoco.MjSpec.from_string(files[SCENE].decode(), assets=files)
     for texture in spec.textures:
         # Pictures of the scene are display values; Filament computes with light.

@@ -1,4 +1,4 @@
-"""MetaDrive 0.3.0.1 for ``serve.py``: a road by block string and seed, a camera of its own, and a Bullet vehicle under a controller.
+"""MetaDrive 0.3.0.1 for ``serve.py``: a road by block string and seed, our own camera, and a Bullet vehicle under a controller.
 
 It imports nothing of advnerf. Its axes are Panda3D's, z up; MetaDrive's own y and heading have the other sign.
 """
@@ -87,7 +87,7 @@ class Simulator:
         return {"wheelbase_m": self._wheelbase_m, **facts}, {"route": np.array(route), **lines}
 
     def render(self, camera: str, depth: bool, T_world_from_camera: np.ndarray) -> Reply:
-        """A picture, and its depth where it is wanted; photographs show no traffic."""
+        """A picture, and its depth if requested; photographs show no traffic."""
         view, hidden = (
             self._views[camera],
             self._engine.traffic_manager.traffic_vehicles if camera == "photo" else [],
@@ -106,7 +106,7 @@ class Simulator:
         return {}, found
 
     def reset(self, x_m: float, y_m: float, yaw_rad: float) -> Reply:
-        """Put the vehicle down, at rest on its springs; the traffic begins anew."""
+        """Put the vehicle down, at rest on its springs; the traffic restarts."""
         self._pose, self._speed_mps = (x_m, y_m, math.remainder(yaw_rad, 2.0 * math.pi)), 0.0
         if self._config["traffic_density"]:
             self._restart_traffic()
@@ -131,7 +131,7 @@ class Simulator:
         return self._state(wheel_rad)
 
     def add_panel(self, name: str, size_m: list[float] | None, **arrays: np.ndarray) -> Reply:
-        """Put a card with ``T_world_from_face`` and texture ``rgb`` into the scene; without a size, take it out."""
+        """Put a card with ``T_world_from_face`` and texture ``rgb`` into the scene; without a size, remove it."""
         if name in self._panels:
             self._panels.pop(name).removeNode()
         if size_m is not None:
@@ -140,7 +140,7 @@ class Simulator:
         return {}, {}
 
     def _put(self, height_m: float, speed_mps: float) -> None:
-        """The vehicle at its pose without memory of what it did before."""
+        """Place the vehicle at its pose without memory of earlier motion."""
         x, y, yaw = self._pose
         vehicle, turn, back = self._vehicle, yaw - 0.5 * math.pi, self._vehicle.REAR_WHEELBASE
         c, s = math.cos(yaw), math.sin(yaw)
@@ -179,7 +179,7 @@ class Simulator:
         self._put(self._height_m, speed_mps)
 
     def _read(self) -> None:
-        """Where the Bullet vehicle's rear axle is."""
+        """Read the pose of the Bullet vehicle's rear axle."""
         if not self._config["car"]["own"]:
             return
         forward, at = self._vehicle.system.getForwardVector(), self._vehicle.origin.getPos()
@@ -192,7 +192,7 @@ class Simulator:
         return {"state": [*self._pose, self._speed_mps, wheel_rad], "blocked": self._touches()}, {}
 
     def _touches(self) -> bool:
-        """Whether the vehicle's body touches another one, as of the traffic."""
+        """Whether the vehicle's body touches another one, such as the traffic's."""
         found = self._physics.contactTest(self._vehicle.body, True).getContacts()
         return any(
             each.getNode0().getName() == each.getNode1().getName() == BodyName.Vehicle for each in found
@@ -208,7 +208,7 @@ class Simulator:
         return float(self._vehicle.origin.getZ())
 
     def _prepare(self) -> None:
-        """What a reset of MetaDrive makes anew: its vehicle, which no camera sees, the light, and textures."""
+        """Repeat what MetaDrive's reset recreates: its vehicle, which no camera sees, the light, and textures."""
         self._vehicle = self._env.vehicle
         self._vehicle.origin.hide(CamMask.RgbCam)
         self._engine.world_light.step((0.0, 0.0))
@@ -216,7 +216,7 @@ class Simulator:
             texture.setAnisotropicDegree(1)
 
     def _restart_traffic(self) -> None:
-        """MetaDrive's traffic as it was in the beginning, without vehicles where the car is put down."""
+        """Restore MetaDrive's traffic to its initial state, without vehicles at the car's pose."""
         self._env.reset(force_seed=self._config["road"]["seed"])
         self._prepare()
         manager, x, y = self._engine.traffic_manager, *self._pose[:2]
@@ -233,7 +233,7 @@ class Simulator:
 
 
 def _nearest(lanes: list[Any], pose: tuple[float, float, float]) -> Any:
-    """Of lanes the one that begins nearest to a pose."""
+    """The lane that begins nearest to a pose."""
     return min(lanes, key=lambda lane: math.dist(_pose(lane, 0.0)[:2], pose[:2]))
 
 

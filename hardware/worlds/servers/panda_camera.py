@@ -23,7 +23,7 @@ NEAR_M, SKY_M, FAR_M = 0.2, 30_000.0, 1000.0
 
 
 class PandaView:
-    """One camera: every pixel is the mean of ``supersampling`` squared ones, its depth that of the one in the middle."""
+    """One camera: each pixel is the mean of ``supersampling`` squared samples; its depth is the middle sample's."""
 
     def __init__(self, engine: Any, name: str, lens: dict[str, Any], supersampling: int, mask: Any) -> None:
         width, height, self._fine = lens["width"], lens["height"], supersampling
@@ -54,7 +54,7 @@ class PandaView:
         self._size, self._tones = size, _tone_table(255 * supersampling**2)
 
     def aim(self, T: np.ndarray) -> np.ndarray:
-        """Put the camera at ``T_world_from_camera``; where it is then."""
+        """Put the camera at ``T_world_from_camera``; returns its pose afterwards."""
         right, forward, up, at = T[:3, 0], T[:3, 2], -T[:3, 1], T[:3, 3]
         self.node.setMat(_matrix(right, forward, up, at))
         found = np.array(self.node.getMat(self.node.getTop())).reshape(4, 4)
@@ -86,7 +86,7 @@ class PandaView:
 
 
 def panel_card(name: str, size_m: list[float], T_world_from_face: np.ndarray, rgb: np.ndarray) -> Any:
-    """A card of this size and texture, lit as everything else in linear light; its back is plain."""
+    """A card of this size and texture, lit like everything else in linear light; its back is plain."""
     root, maker, texture = NodePath(name), CardMaker(name), Texture(name)
     maker.setFrame(-0.5 * size_m[0], 0.5 * size_m[0], -0.5 * size_m[1], 0.5 * size_m[1])
     maker.setHasNormals(True)
@@ -99,7 +99,7 @@ def panel_card(name: str, size_m: list[float], T_world_from_face: np.ndarray, rg
     back = root.attachNewNode(maker.generate())
     back.setH(180.0)
     back.setColor(0.2, 0.2, 0.2, 1.0)
-    # A card's x is to the right and its z is up for who looks along its y: against the face's x.
+    # For a viewer who looks along a card's y, its x is to the right and its z is up: against the face's x.
     R = T_world_from_face[:3, :3]
     root.setMat(_matrix(R[:, 1], -R[:, 0], R[:, 2], T_world_from_face[:3, 3]))
     return root

@@ -11,11 +11,11 @@ import pyglet
 from gym_duckietown.graphics import create_frame_buffers
 from pyglet import gl
 
-NEAR_M, FAR_M = 0.04, 100.0  # of Duckietown's projection
+NEAR_M, FAR_M = 0.04, 100.0  # as in Duckietown's projection
 
 
 class PygletView:
-    """A frame buffer with colours and depth; every pixel is the mean of ``supersampling`` squared ones."""
+    """A frame buffer with colours and depth; each pixel is the mean of ``supersampling`` squared samples."""
 
     def __init__(self, lens: dict[str, Any], supersampling: int) -> None:
         if (lens["cx"], lens["cy"]) != (0.5 * lens["width"], 0.5 * lens["height"]) or lens["fx"] != lens[
@@ -61,7 +61,7 @@ class PygletView:
 
 
 class PygletPanel:
-    """A textured rectangle that is lit as everything else; its back is plain."""
+    """A textured rectangle that is lit like everything else; its back is plain."""
 
     def __init__(self, size_m: list[float], T_world_from_face: np.ndarray, rgb: np.ndarray) -> None:
         image = pyglet.image.ImageData(
@@ -77,8 +77,8 @@ class PygletPanel:
         ]
 
     def render(self, draw_bbox: bool, segment: bool, enable_leds: bool) -> None:
-        """Called by Duckietown as for each of its objects."""
-        # Duckietown draws its road with whatever normal and texture came last.
+        """Called by Duckietown for each of its objects."""
+        # Duckietown draws its road with the normal and texture that were set last.
         gl.glPushAttrib(gl.GL_ALL_ATTRIB_BITS)
         gl.glEnable(gl.GL_TEXTURE_2D)
         gl.glBindTexture(self._texture.target, self._texture.id)
@@ -90,7 +90,7 @@ class PygletPanel:
         gl.glPopAttrib()
 
     def _draw(self, corners: list[Any], normal: np.ndarray, brightness: float) -> None:
-        """One side of it."""
+        """Draw one side of the panel."""
         gl.glColor4f(brightness, brightness, brightness, 1.0)
         gl.glBegin(gl.GL_QUADS)
         gl.glNormal3f(*normal)

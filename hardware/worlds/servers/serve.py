@@ -90,7 +90,7 @@ class Server:
 
 
 def end_with_client() -> None:
-    """Die with the client, also where it is killed, or where the simulator hangs."""
+    """Die with the client, also if the client is killed or the simulator hangs."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
@@ -103,7 +103,7 @@ def end_with_client() -> None:
 
 
 def load(file: str) -> Any:
-    """The module in a file; it finds modules beside it, after those of its environment."""
+    """Import a file as a module; its imports search its environment first, then its folder."""
     sys.path.append(os.path.dirname(os.path.abspath(file)))
     spec = importlib.util.spec_from_file_location("simulator", file)
     if spec is None or spec.loader is None:

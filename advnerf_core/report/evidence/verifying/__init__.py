@@ -1,1 +1,1 @@
-"""The checks of ``advnerf verify``, one kind in each file. Each yields what is wrong, in words."""
+"""The checks of ``advnerf verify``, one kind in each file. Each yields its problems as text."""

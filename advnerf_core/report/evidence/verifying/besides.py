@@ -1,4 +1,4 @@
-"""Whether the predictions and the fidelity gate's verdicts beside the cells agree with the cells and with themselves."""
+"""Whether the predictions and the fidelity gate's verdicts beside the cells are consistent with the cells and with themselves."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _CORRELATIONS = ("correlation", "ssim")
 
 
 def prediction_problems(folder: Path, evidence: Evidence) -> Iterator[str]:
-    """Whether each prediction is of an attacked cell with these settings, and its numbers agree."""
+    """Whether each prediction belongs to an attacked cell with these settings, and its numbers are consistent."""
     for file in sorted(path for part in _PREDICTIONS for path in folder.glob(f"{part}/*.json")):
         cell = evidence.cells.get(file.stem)
         if cell is None or cell.method in CONTROLS:
@@ -46,7 +46,7 @@ def _disagrees(said: Mapping[str, Any], ticks: int) -> Iterator[str]:
 
 
 def gate_problems(folder: Path, evidence: Evidence) -> Iterator[str]:
-    """Whether each verdict of the fidelity gate is of a victim of this set, passed where it has no reason against it, and has possible numbers."""
+    """Whether each verdict of the fidelity gate belongs to a victim of this set, passed unless it lists a reason, and has possible numbers."""
     victims = {
         f"{scenario_key(cell.scenario, cell.placement)}_{cell.victim}" for cell in evidence.cells.values()
     }
@@ -63,7 +63,7 @@ def gate_problems(folder: Path, evidence: Evidence) -> Iterator[str]:
                 0.0 <= numbers["steering"] <= numbers["steering_worst"]
             ):
                 yield f"{file}: its numbers are not possible"
-            # Scenarios that share scene and victim share the held-out views, and drive past them with a car of their own.
+            # Scenarios with the same scene and victim share the held-out views, but each may drive past them with another car.
             if not file.name.endswith(".drive.json") and verdicts.setdefault(said["key"], said) != said:
                 yield f"{file}: another verdict than that of the same scene and victim beside it"
         except (OSError, ValueError, KeyError, TypeError) as error:

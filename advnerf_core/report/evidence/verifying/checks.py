@@ -16,7 +16,7 @@ from advnerf_core.report.evidence.verifying.victims import declaration_problems,
 
 
 def set_problems(folder: Path, evidence: Evidence, cells: Sequence[CellResult]) -> Iterator[str]:
-    """What is wrong with the cells of a set and with what lies beside them."""
+    """Problems of the cells of a set and of the files beside them."""
     damaged = False
     for check in (cell_problems(evidence, cells, read_withdrawn(folder)), drive_problems(evidence)):
         for problem in check:

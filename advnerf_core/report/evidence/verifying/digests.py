@@ -1,4 +1,4 @@
-"""Whether every published file is the one that was published: manifests with the digest of each file."""
+"""Whether every published file is unchanged: manifests with the digest of each file."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from advnerf_core.documents import read_json
 from advnerf_core.files import sha256_of, write_atomically
 from advnerf_core.report.evidence.verifying.layout import BESIDE, DIGESTS, SET, sets_in
 
-# Its pages are computed again from what is listed, and the log of what was removed only ever grows.
+# Its pages are recomputed from the listed files, and the log of removals only ever grows.
 _NOT_LISTED = (BESIDE, DIGESTS, "removed.json")
 
 
 def digests_of(folder: Path) -> dict[str, str]:
-    """SHA-256 of every file below the folder of a set but its manifest, by path."""
+    """SHA-256 of every file in the folder of a set except its manifest, by path."""
     return _digests(folder, lambda name: name != SET)
 
 
 def digests_beside(published: Path) -> dict[str, str]:
-    """SHA-256 of every published file that is in no registered set and is no page, by path."""
+    """SHA-256 of every published file that belongs to no registered set and is no page, by path."""
     sets = set(sets_in(published))
 
     def listed(name: str) -> bool:
@@ -39,19 +39,19 @@ def known_digests(published: Path) -> dict[str, str]:
 
 
 def write_known_digest(folder: Path) -> None:
-    """Put the digest of a set's manifest beside the folders of all sets."""
+    """Write the digest of a set's manifest beside the folders of all sets."""
     known = known_digests(folder.parent)
     known[folder.name] = sha256_of(folder / SET)
     _write(folder.parent / DIGESTS, known)
 
 
 def write_beside(published: Path) -> None:
-    """Write the manifest of everything that is in no registered set."""
+    """Write the manifest of every file that belongs to no registered set."""
     _write(published / BESIDE, digests_beside(published))
 
 
 def file_problems(folder: Path) -> Iterator[str]:
-    """Whether the files of a set are those of its manifest, and the manifest is the one that was published."""
+    """Whether a set's files match its manifest, and the manifest is the published one."""
     file = folder / SET
     try:
         listed = read_json(file)["files"]
@@ -65,7 +65,7 @@ def file_problems(folder: Path) -> Iterator[str]:
 
 
 def beside_problems(published: Path) -> Iterator[str]:
-    """Whether pictures, films, the reference build and sets without a registration are those of their manifest."""
+    """Whether pictures, films, the reference build and sets without a registration match their manifest."""
     try:
         listed = read_json(published / BESIDE)
         missing = sorted(known_digests(published).keys() - sets_in(published))

@@ -1,4 +1,4 @@
-"""Whether the kept drives are drives of this car from the registered starts, and the totals are theirs."""
+"""Whether the published drives are possible drives of this car from the registered starts, with matching totals."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from advnerf_core.report.evidence.registration import RegisteredScenario
 from advnerf_core.report.evidence.results import Evidence
 from advnerf_core.report.reference import DOMAINS, Domain
 
-# Kept poses are rounded; a total of some hundred ticks then differs by less.
+# Published poses are rounded; a total of some hundred ticks then differs by less.
 _TOTAL_TOLERANCE_M = 2e-3
-# A surrogate drive begins at its start to the bit. Live, a car is put down so well [m, rad].
+# A surrogate drive begins at its start to the bit. Live, a car is put down with this accuracy [m, rad].
 _SURROGATE_START, _DEPLOYED_START = (2e-5, 2e-5), (0.05, 0.1)
-# An attack turns the wheels and nothing else: no step is longer than those without attack, up to noise of motion capture.
+# An attack affects only the wheel angle: no step is longer than without attack, up to noise of motion capture.
 _LONGEST_STEP = 1.25
 # A rear axle rolls along the car's heading. Its tyres slip as far as without attack, a few times at most [rad].
 _LEAST_SLIP_RAD: Mapping[Domain, float] = {"surrogate": 2e-3, "deployed": 1.5e-2}
@@ -27,7 +27,7 @@ _ROUNDING_M, _MOVING = 2e-5, 0.2
 
 @dataclass(frozen=True)
 class Motion:
-    """What a car can do in a tick.
+    """Limits of a car's motion in a tick.
 
     Attributes:
         step_m: Longest distance between two poses [m].
@@ -39,11 +39,11 @@ class Motion:
 
 
 def drive_problems(evidence: Evidence) -> Iterator[str]:
-    """Whether each cell has one drive from each registered start in each domain, which the car can have driven and its totals are of."""
+    """Whether each cell has one possible drive from each registered start in each domain, with matching totals."""
     able: dict[tuple[str, Domain], Motion] = {}
     for cell in evidence.cells.values():
         if not evidence.is_registered(cell) and cell.registration:
-            continue  # named already
+            continue  # reported already
         for domain in DOMAINS:
             yield from _in_domain(evidence, cell, domain, able)
         yield from _largest(evidence, cell)
@@ -52,7 +52,7 @@ def drive_problems(evidence: Evidence) -> Iterator[str]:
 def _in_domain(
     evidence: Evidence, cell: CellResult, domain: Domain, able: dict[tuple[str, Domain], Motion]
 ) -> Iterator[str]:
-    """One cell in one domain; ``able`` keeps what the car does without attack, by name of that cell."""
+    """One cell in one domain; ``able`` caches the car's motion without attack, by name of that cell."""
     scenario = evidence.scenario_of(cell)
     count = len(scenario.starts) if domain == "surrogate" else scenario.deployed_starts
     kept, where = cell.kept.get(domain, ()), f"{cell.name}, {domain}"
@@ -88,7 +88,7 @@ def _starts(
 
 
 def _motion(cell: CellResult, domain: Domain, able: Motion, where: str) -> Iterator[str]:
-    """Whether the car can have moved so: no further in a tick than without attack, and along its heading."""
+    """Whether the motion is possible: no further in a tick than without attack, and along the car's heading."""
     for number, drive in enumerate(cell.kept[domain]):
         found = _moved(drive, able.step_m)
         if found.step_m > _LONGEST_STEP * able.step_m:
@@ -98,7 +98,7 @@ def _motion(cell: CellResult, domain: Domain, able: Motion, where: str) -> Itera
 
 
 def _able(clean: CellResult, domain: Domain) -> Motion:
-    """What the car does without attack: the median over drives, so that one bad drive does not excuse the others."""
+    """The car's motion without attack: the median over drives, so that one bad drive does not excuse the others."""
     longest_m = float(np.median([_moved(drive, 0.0).step_m for drive in clean.kept[domain]]))
     slip_rad = float(np.median([_moved(drive, longest_m).slip_rad for drive in clean.kept[domain]]))
     return Motion(longest_m, max(_LEAST_SLIP_RAD[domain], _SLIP_RATIO * slip_rad))
@@ -137,11 +137,11 @@ def _totals(evidence: Evidence, cell: CellResult, domain: Domain, where: str) ->
 
 
 def _largest(evidence: Evidence, cell: CellResult) -> Iterator[str]:
-    """Whether what a cell notes of its deployed drives beside their totals is what the poses say."""
+    """Whether a cell's further values of its deployed drives agree with the poses."""
     try:
         found = evidence.metrics(cell, "deployed")
     except ValueError:
-        return  # named already
+        return  # reported already
     said_m = cell.extra.get("max_abs_cte_m")
     if said_m is not None and found:
         largest_m = max(each.max_cte_m for each in found)

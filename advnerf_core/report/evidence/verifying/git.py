@@ -1,4 +1,4 @@
-"""What git keeps of a folder's past: which commits changed which file, and the order of the commits. Read only, in a few calls."""
+"""A folder's history in git: which commits changed which file, and the order of the commits. Read only, in a few calls."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _SEPARATOR = "\x01"
 
 
 class NoHistory(AdvnerfError):
-    """Git cannot say what happened to a folder."""
+    """Git has no history of a folder."""
 
 
 @dataclass(frozen=True)
@@ -24,9 +24,9 @@ class Change:
     """One commit's change of one file.
 
     Attributes:
-        commit: Its hash.
+        commit: Hash of the commit.
         status: ``A`` added, ``M`` modified, ``D`` deleted.
-        blob: Hash of the file's content after it.
+        blob: Hash of the file's new content.
     """
 
     commit: str
@@ -35,14 +35,14 @@ class Change:
 
 
 class History:
-    """The past of some files of a repository, from its current commit back.
+    """The history of some files of a repository, from its current commit back.
 
     Args:
-        folder: In the repository.
-        paths: Files and folders that are looked at, relative to ``folder``.
+        folder: A folder in the repository.
+        paths: Files and folders to read, relative to ``folder``.
 
     Raises:
-        NoHistory: There is no git, no repository, no commit, or only a shallow clone.
+        NoHistory: Git, a repository or a commit is missing, or the clone is shallow.
     """
 
     def __init__(self, folder: Path, paths: Sequence[str]) -> None:
@@ -73,7 +73,7 @@ class History:
         return self.changes.get(os.path.normpath(self.prefix + path), [])
 
     def below(self) -> list[str]:
-        """All files that ever were below the folder, relative to it."""
+        """All files that ever were in the folder, relative to it."""
         return [name.removeprefix(self.prefix) for name in self.changes if name.startswith(self.prefix)]
 
     def contents(self, blobs: Iterable[str]) -> Iterator[bytes]:
@@ -91,7 +91,7 @@ class History:
             at = end + size + 2
 
     def is_before(self, commit: str, other: str) -> bool:
-        """Whether a commit is an ancestor of another one, and not that one."""
+        """Whether a commit is a proper ancestor of another one."""
         return commit != other and commit in self._ancestors(other)
 
     def _ancestors(self, commit: str) -> set[str]:
@@ -130,7 +130,7 @@ class History:
 
 
 def last_commit(folder: Path) -> str:
-    """The commit that last changed a file of a folder; empty where git does not say."""
+    """The commit that last changed a file of a folder; empty if git does not know."""
     try:
         newest = next(iter(History(folder, ["."]).changes.values()))
     except NoHistory:
@@ -139,14 +139,14 @@ def last_commit(folder: Path) -> str:
 
 
 def blob_of(file: Path, like: str) -> str:
-    """The hash that git gives a file's content, of the kind of another hash."""
+    """The hash that git gives a file's content, of the same kind as another hash."""
     data = file.read_bytes()
     kind = hashlib.sha1 if len(like) == 40 else hashlib.sha256
     return kind(b"blob %d\0" % len(data) + data).hexdigest()
 
 
 def _changes(text: str) -> dict[str, list[Change]]:
-    """Changes of each file, oldest first, of the raw log; a merge lists what differs from all of its parents."""
+    """Changes of each file, oldest first, from the raw log; a merge lists files that differ from all of its parents."""
     found: dict[str, list[Change]] = {}
     commit = ""
     for line in text.split("\n"):

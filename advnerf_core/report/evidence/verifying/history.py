@@ -1,6 +1,6 @@
-"""Git as the witness of what the files themselves cannot show: what came first, what was changed, and what is gone.
+"""Uses git as the witness for what the files cannot show: what came first, what was changed, and what is gone.
 
-By ancestry of commits, not by dates. Whoever can write the whole history again can still deceive it, but not those who have a clone.
+It relies on ancestry of commits, not on dates. A full rewrite of the history can deceive it, but not readers with a clone.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from advnerf_core.report.evidence.verifying.layout import BUILD, SET, cell_files
 from advnerf_core.report.evidence.verifying.removed import LOG, read_removed, value_entry
 
 LEDGER = "../results.json"
-# What names one measurement of a row.
+# Keys that identify one measurement of a row.
 _MEASUREMENT = ("date", "machine", "command", "note", "unit")
 Log = Mapping[tuple[str, str], str]
 
 
 @dataclass(frozen=True)
 class Witnessed:
-    """What git says of the published results.
+    """Git's evidence about the published results.
 
     Attributes:
-        not_checked: Why it says nothing; empty if it does.
-        problems: What is wrong, in words.
-        files: Files of sets whose past was looked at.
+        not_checked: Reason why there is none; else empty.
+        problems: Problems as text.
+        files: Number of checked files of sets.
         removed: Logged removals, which readers should know of.
     """
 
@@ -40,7 +40,7 @@ class Witnessed:
 
 
 def verify_history(published: Path) -> Witnessed:
-    """Hold the published results against the history of their repository.
+    """Compare the published results with the history of their repository.
 
     Raises:
         SetError: The log of removals is damaged.
@@ -62,7 +62,7 @@ def verify_history(published: Path) -> Witnessed:
 
 
 def _set_problems(history: History, folder: Path, log: Log) -> Iterator[str]:
-    """Whether the registration is as it was committed, before every cell."""
+    """Whether the registration is unchanged since its commit, which precedes every cell."""
     name = folder.name
     cells = [(file, _since_added(history.of(f"{name}/{file.name}"))) for file in cell_files(folder)]
     registered = _since_added(history.of(f"{name}/{FILE}"))
@@ -81,7 +81,7 @@ def _set_problems(history: History, folder: Path, log: Log) -> Iterator[str]:
 
 
 def _changed(history: History, published: Path, log: Log) -> Iterator[str]:
-    """Files of registered sets and of the reference build, and films, that were changed since they were committed, and that is not logged."""
+    """Files of registered sets and of the reference build, and films, that were changed after their commit without a log entry."""
     folders = [published / name for name in (*sets_in(published), BUILD)]
     for part in (*(folder.rglob("*") for folder in folders), published.glob("*.webp")):
         for file in sorted(path for path in part if path.is_file()):
@@ -94,7 +94,7 @@ def _changed(history: History, published: Path, log: Log) -> Iterator[str]:
 
 
 def _since_added(changes: list[Change]) -> list[Change]:
-    """Changes of a file since it was last added; empty if it is not there in the last commit."""
+    """Changes of a file since it was last added; empty if the last commit does not have it."""
     if not changes or changes[-1].status == "D":
         return []
     added = [number for number, change in enumerate(changes) if change.status == "A"]
@@ -102,7 +102,7 @@ def _since_added(changes: list[Change]) -> list[Change]:
 
 
 def _gone(history: History, published: Path, log: Log) -> Iterator[str]:
-    """Sets, their files and registered scenarios that were committed once and are not there now, and whose removal is not logged."""
+    """Sets, their files and registered scenarios that were committed once and are now missing without a log entry."""
     once = [name for name in history.below() if _is_kept(name)]
     for kind, names in (
         ("set", {name.split("/")[0] for name in once if not (published / name.split("/")[0]).is_dir()}),
@@ -116,7 +116,7 @@ def _gone(history: History, published: Path, log: Log) -> Iterator[str]:
 
 
 def _is_kept(name: str) -> bool:
-    """Whether a published file is of a set and not made from its other files."""
+    """Whether a published file belongs to a set and is not generated from its other files."""
     return (
         "/" in name
         and name.endswith(".json")
@@ -126,7 +126,7 @@ def _is_kept(name: str) -> bool:
 
 
 def _scenarios_once(history: History) -> set[str]:
-    """Scenarios of all registrations that were ever committed, ``SET/SCENARIO``."""
+    """Scenarios of all registrations ever committed, ``SET/SCENARIO``."""
     pairs = [
         (name.split("/")[0], change.blob)
         for name in history.below()
@@ -153,12 +153,12 @@ def _scenarios_now(published: Path) -> set[str]:
         try:
             found |= {f"{name}/{each}" for each in read_json(published / name / FILE)["scenarios"]}
         except (OSError, ValueError, KeyError, TypeError):
-            continue  # verifying the set says so
+            continue  # verifying the set reports it
     return found
 
 
 def _rows(history: History, published: Path, log: Log) -> Iterator[str]:
-    """Missed rows of the ledger that are gone, and rows with another value or verdict though nothing was measured again."""
+    """Missed rows of the ledger that are gone, and rows with another value or verdict of the same measurement."""
     changes = [change for change in history.of(LEDGER) if change.status != "D"]
     if not changes:
         return
@@ -177,7 +177,7 @@ def _rows(history: History, published: Path, log: Log) -> Iterator[str]:
 
 
 def _row_problem(once: Mapping[str, Any], now: Mapping[str, Any] | None) -> str:
-    """What happened to a row that must be logged; empty if nothing."""
+    """The change of a row that must be logged; empty if nothing."""
     if now is None:
         return "was missed and is gone" if once["met"] is False else ""
     if any(once.get(key) != now.get(key) for key in _MEASUREMENT):

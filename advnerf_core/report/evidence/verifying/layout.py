@@ -1,4 +1,4 @@
-"""Where the files of published sets are, and how a set is read."""
+"""Locations of the files of published sets, and how a set is read."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from advnerf_core.report.cells import CellResult, read_cell
 from advnerf_core.report.evidence.registration import FILE, Registration, read_registration
 
 SET, DIGESTS, PAGE, FORMAT = "set/set.json", "sets.json", "transfer.md", "advnerf-set-1"
-# Digests of everything else below the folder of all sets: pictures, films, the reference build, sets without a registration.
+# Digests of all other published files: pictures, films, the reference build, sets without a registration.
 BESIDE = "files.json"
 # Folder of the reference build: scenes, victims and objects.
 BUILD = "reference"
 
 
 class SetError(AdvnerfError, ValueError):
-    """A folder is no set of results."""
+    """A folder is not a set of results."""
 
 
 def sets_in(published: Path) -> list[str]:
-    """Names of the registered sets in the folder of all that is published."""
+    """Names of the registered sets in the folder of published results."""
     return sorted(file.parents[1].name for file in published.glob(f"*/{FILE}"))
 
 
@@ -33,7 +33,7 @@ def read_set(folder: Path) -> tuple[Registration, list[CellResult]]:
     """The registration and the cells of a set.
 
     Raises:
-        SetError: Nothing was registered there.
+        SetError: The folder has no registration.
         RegistrationError: The registration is damaged.
         CellError: A cell is damaged.
     """

@@ -1,4 +1,4 @@
-"""Whether the published numbers of a set are what its drives give."""
+"""Whether the published numbers of a set agree with its drives."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _TABLES = ("rows", "primary", "contrasts", "does_not_drive_well")
 def published_numbers(
     evidence: Evidence, withdrawn: Mapping[str, str], declared: Mapping[str, str]
 ) -> dict[str, Any]:
-    """All numbers of a set as JSON data, and what it says of itself."""
+    """All numbers of a set as JSON data, with its declarations."""
     return {
         "format": FORMAT,
         "name": evidence.registration.name,
@@ -34,11 +34,11 @@ def published_numbers(
 
 
 def number_problems(folder: Path, expected: Mapping[str, Any]) -> tuple[int, list[str]]:
-    """How many published numbers there are, and those that are not what the drives give.
+    """Count of published numbers, and those that disagree with the drives.
 
     Args:
-        folder: Of the set.
-        expected: As `published_numbers` computes them.
+        folder: Folder of the set.
+        expected: Numbers from `published_numbers`.
     """
     published, found = read_json(folder / SET), json.loads(json.dumps(expected))
     count, wrong = 0, []

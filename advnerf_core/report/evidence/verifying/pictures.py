@@ -1,4 +1,4 @@
-"""Whether the picture of a set shows what its drives give: it is drawn again. Needs matplotlib."""
+"""Whether the picture of a set agrees with its drives: it is drawn again. Needs matplotlib."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _BLOCK_PX, _LARGEST = 8, 24.0
 
 
 def write_picture(evidence: Evidence, folder: Path, into: Path) -> Path:
-    """Draw the picture of a set into a folder, that of all sets or another one."""
+    """Draw the picture of a set into a folder, such as the folder of all sets."""
     from advnerf_core.report.evidence.plot import excess_plot  # loads matplotlib
     from advnerf_core.report.plots import write_png
 
@@ -34,7 +34,7 @@ def write_picture(evidence: Evidence, folder: Path, into: Path) -> Path:
 
 
 def picture_problems(folder: Path) -> Iterator[str]:
-    """Whether the picture beside a set is that of its drives, up to the letters of another machine."""
+    """Whether the picture beside a set agrees with its drives, up to another machine's letters."""
     file = folder.parent / picture_of(folder.name)
     try:
         published = _pixels(file)
@@ -56,7 +56,7 @@ def _pixels(file: Path) -> NDArray[np.float64]:
 
 
 def _blocks(pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Means of square blocks, so that a letter that is moved by a pixel stays where it is."""
+    """Means of square blocks, which hardly change if a letter moves by a pixel."""
     rows, columns = (length // _BLOCK_PX for length in pixels.shape)
     whole = pixels[: rows * _BLOCK_PX, : columns * _BLOCK_PX]
     return np.asarray(whole.reshape(rows, _BLOCK_PX, columns, _BLOCK_PX).mean((1, 3)))

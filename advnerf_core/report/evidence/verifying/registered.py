@@ -1,4 +1,4 @@
-"""Whether the cells of a set are what was registered: which, with what search, when, and of one build."""
+"""Whether the cells of a set match the registration: which, with what search, when, and of one build."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from advnerf_core.report.evidence.results import Evidence
 def cell_problems(
     evidence: Evidence, cells: Sequence[CellResult], withdrawn: Collection[str]
 ) -> Iterator[str]:
-    """Whether all that was registered and not withdrawn is there, and nothing else passes for registered."""
+    """Whether every registered cell that was not withdrawn exists, and no other passes for registered."""
     there = {cell.name for cell in cells}
     for wanted in evidence.registration.cells:
         name = wanted.name
@@ -36,7 +36,7 @@ def cell_problems(
 
 
 def _as_registered(evidence: Evidence, cell: CellResult) -> Iterator[str]:
-    """Whether a cell's own notes on its search and limits are those of the registration, and it is no older than that."""
+    """Whether a cell's own notes on its search and limits match the registration, and it is no older than that."""
     scenario = evidence.scenario_of(cell)
     evaluations = 0 if cell.method in CONTROLS else scenario.evaluations
     wanted = {
@@ -46,7 +46,7 @@ def _as_registered(evidence: Evidence, cell: CellResult) -> Iterator[str]:
         "off_track_m": scenario.off_track_m,
     }
     for key, value in wanted.items():
-        if (found := cell.extra.get(key, value)) != value:  # a cell from before it was kept does not say
+        if (found := cell.extra.get(key, value)) != value:  # an older cell has no such note
             yield f"{cell.name}: expected {key} {value} as registered, got {found}"
     clip = str(cell.extra.get("clip") or cell.name)
     if not clip.startswith(cell.name):
@@ -64,7 +64,7 @@ def _not_before(date: str, other: str) -> bool:
 
 
 def build_problems(evidence: Evidence) -> Iterator[str]:
-    """Whether all cells of a scenario are of the same stages, and each victim is one policy."""
+    """Whether all cells of a scenario have the same stages, and each victim is one policy."""
     stages: dict[tuple[str, str], dict[str, str]] = {}
     policies: dict[tuple[str, str, str], str] = {}
     for cell in evidence.cells.values():

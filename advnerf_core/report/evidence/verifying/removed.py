@@ -1,4 +1,4 @@
-"""The log of what was removed from the published results, or written again: each with the reason."""
+"""The log of published results that were removed or rewritten, each with the reason."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ LOG = "removed.json"
 
 
 class Removed(StrictModel):
-    """Things that were removed or written again for one reason.
+    """Results that were removed or rewritten for one reason.
 
     Attributes:
-        kind: What they are: rows of the ledger that are gone, values of rows that took the place of others of one measurement, registered
-            scenarios (``SET/SCENARIO``), files (by path), sets, or registrations that were written again before anything of their sets
+        kind: Kind of the entries: removed rows of the ledger, values of rows that replaced others of one measurement, registered
+            scenarios (``SET/SCENARIO``), files (by path), sets, or registrations that were rewritten before anything of their sets
             was run (``SET``).
-        names: Of each.
+        names: Name of each entry.
         reason: Why.
-        stands: Of ``value``, the value that each row has since; a later one is not covered.
-        commit: Which one, as far as its number goes; for readers.
+        stands: For ``value``, the new value of each row; a later one is not covered.
+        commit: The commit, if its number is known; for readers.
     """
 
     kind: Literal["row", "value", "scenario", "file", "set", "registration"]
@@ -43,7 +43,7 @@ class Removed(StrictModel):
         return self
 
     def entries(self) -> Iterator[tuple[str, str]]:
-        """Kind and name of each, as checks look them up; a value with its row (`value_entry`)."""
+        """Kind and name of each entry, as checks look them up; a value with its row (`value_entry`)."""
         if self.kind == "value":
             yield from (value_entry(line, value) for line, value in self.stands.items())
         else:
@@ -51,7 +51,7 @@ class Removed(StrictModel):
 
 
 def value_entry(line: str, value: float | str) -> tuple[str, str]:
-    """How the log is asked whether a row may have its value though it had another one in the same measurement."""
+    """Log key of a row's value that replaced another one of the same measurement."""
     return "value", f"{line}: {value}"
 
 
@@ -59,7 +59,7 @@ def read_removed(published: Path) -> dict[tuple[str, str], str]:
     """The reason of each logged removal, by kind and name; empty without a log.
 
     Raises:
-        SetError: The file is no such log.
+        SetError: The file is not such a log.
     """
     file = published / LOG
     if not file.exists():

@@ -1,4 +1,4 @@
-"""Whether searches are distinct: one attack is of one search, and no drive was copied from another search."""
+"""Whether searches are distinct: each attack belongs to one search, and no drive was copied from another search."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from advnerf_core.report.evidence.results import Evidence
 
 
 def search_problems(evidence: Evidence) -> Iterator[str]:
-    """Whether each search has an attack of its own, which it may drive under several conditions."""
+    """Whether each search has its own attack, possibly driven under several conditions."""
     attacked = [cell for cell in evidence.cells.values() if cell.method not in CONTROLS]
     yield from _attacks(attacked)
     yield from _copies(attacked)
@@ -43,7 +43,7 @@ def _copies(attacked: list[CellResult]) -> Iterator[str]:
 
 
 def _shared_searches(evidence: Evidence, attacked: list[CellResult]) -> Iterator[str]:
-    """Whether an attack that is driven under several conditions has the same drives in the learned scene under each, from the same starts."""
+    """Whether an attack under several conditions has the same drives in the learned scene under each, from the same starts."""
     first: dict[tuple[object, ...], CellResult] = {}
     for cell in attacked:
         starts = evidence.scenario_of(cell).starts

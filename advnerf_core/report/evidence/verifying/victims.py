@@ -1,4 +1,4 @@
-"""The registered rule of what drives well, and which victims of a set fail it."""
+"""The registered rule of driving well, and the victims of a set that fail it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from advnerf_core.report.evidence.registration import RegistrationError, read_re
 from advnerf_core.report.evidence.results import Evidence
 from advnerf_core.report.reference import DOMAINS
 
-# In the folder of a set: victims that fail the rule, each with what its authors say about it.
+# In the folder of a set: victims that fail the rule, each with its authors' explanation.
 DECLARED = "set/does_not_drive_well.json"
 
 
@@ -42,24 +42,24 @@ def drives_badly(evidence: Evidence) -> list[dict[str, Any]]:
 
 
 def victim_key(row: Mapping[str, Any]) -> str:
-    """How a declaration names a victim, ``SCENARIO.VICTIM`` or ``SCENARIO.PLACEMENT.VICTIM``."""
+    """Name of a victim in a declaration, ``SCENARIO.VICTIM`` or ``SCENARIO.PLACEMENT.VICTIM``."""
     return f"{scenario_key(row['scenario'], row['placement'])}.{row['victim']}"
 
 
 def read_declared(folder: Path) -> dict[str, str]:
-    """Victims of a set that are declared not to drive well, each with the reason why they are shown; empty without any.
+    """Victims of a set that are declared not to drive well, each with the reason for showing them; empty without any.
 
     Raises:
-        RegistrationError: The file does not say so.
+        RegistrationError: The file is invalid.
     """
     return read_reasons(folder / DECLARED, "victims")
 
 
 def declare(folder: Path, victims: Mapping[str, str]) -> None:
-    """Say of victims that they do not drive well, and why they are shown all the same.
+    """Declare that victims do not drive well, with the reason for showing them.
 
     Raises:
-        RegistrationError: One has no reason.
+        RegistrationError: A victim has no reason.
     """
     for victim, reason in victims.items():
         if not reason.strip():
@@ -82,6 +82,6 @@ def declaration_problems(evidence: Evidence, declared: Mapping[str, str]) -> Ite
 
 
 def declared_data(evidence: Evidence, declared: Mapping[str, str]) -> dict[str, Any]:
-    """What ``set.json`` and the page say of such victims; empty without any."""
+    """The entry about such victims in ``set.json`` and on the page; empty without any."""
     rows = [{**row, "reason": declared.get(victim_key(row), "")} for row in drives_badly(evidence)]
     return {"does_not_drive_well": rows} if rows else {}
