@@ -49,7 +49,7 @@ def open_simulator(config: dict[str, Any], cameras: dict[str, Any]) -> Map:
 
 
 class Map:
-    """One map of Duckietown; see docs/foreign_worlds.md for the calls."""
+    """One map of Duckietown; see docs/worlds.md for the calls."""
 
     def __init__(self, config: dict[str, Any], cameras: dict[str, Any]) -> None:
         self._sim = Simulator(

@@ -27,7 +27,7 @@ def open_simulator(config: dict[str, Any], cameras: dict[str, Any], **files: np.
 
 
 class Room:
-    """One static scene; see docs/foreign_worlds.md for the calls."""
+    """One static scene; see docs/worlds.md for the calls."""
 
     def __init__(self, config: dict[str, Any], cameras: dict[str, Any], files: dict[str, bytes]) -> None:
         asked = mjrf.ContextConfig()

@@ -33,7 +33,7 @@ Reply = tuple[dict[str, Any], dict[str, np.ndarray]]
 
 
 class Simulator:
-    """One MetaDrive engine; see docs/foreign_worlds.md for the calls."""
+    """One MetaDrive engine; see docs/worlds.md for the calls."""
 
     def __init__(self, config: dict[str, Any], cameras: dict[str, Any]) -> None:
         self._config = config

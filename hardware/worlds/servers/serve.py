@@ -2,7 +2,7 @@
 
 This file runs in the simulator's own environment. It needs Python 3.10, pyzmq and numpy, and nothing of advnerf, so that the two
 environments never meet. ``SIMULATOR.py`` defines ``open_simulator(config, cameras)``, which also takes arrays where its world sends some;
-docs/foreign_worlds.md says what it returns.
+docs/worlds.md says what it returns.
 
 A message is a header of JSON and one frame of raw bytes for each array, C-contiguous, little-endian, in the header's order:
 
