@@ -60,7 +60,8 @@ if TYPE_CHECKING:
     from advnerf_core.attack.problem import AttackProblem, Sensor
     from advnerf_core.attack.search.gradient import gradient_attack
     from advnerf_core.attack.search.random_search import random_search
-    from advnerf_core.attack.search.search import SearchResult, draw_start_states
+    from advnerf_core.attack.search.record import SearchResult
+    from advnerf_core.attack.search.search import draw_start_states
     from advnerf_core.data.transforms import load_transforms
     from advnerf_core.data.views import PosedImages
     from advnerf_core.driving.dynamics import Ackermann, Dubins, Dynamics
@@ -88,7 +89,8 @@ else:
             "advnerf_core.attack.problem": "AttackProblem Sensor",
             "advnerf_core.attack.search.random_search": "random_search",
             "advnerf_core.attack.search.gradient": "gradient_attack",
-            "advnerf_core.attack.search.search": "SearchResult draw_start_states",
+            "advnerf_core.attack.search.record": "SearchResult",
+            "advnerf_core.attack.search.search": "draw_start_states",
             "advnerf_core.data.transforms": "load_transforms",
             "advnerf_core.data.views": "PosedImages",
             "advnerf_core.driving.dynamics": "Ackermann Dubins Dynamics",

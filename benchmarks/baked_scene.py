@@ -29,7 +29,7 @@ from safetensors.torch import save_file
 
 from advnerf_core.attack.adjoint import AttackProblem, evaluate
 from advnerf_core.attack.methods import SearchRun, load_method
-from advnerf_core.attack.search.search import Evaluation
+from advnerf_core.attack.search.record import Evaluation
 from advnerf_core.documents import read_json
 from advnerf_core.geometry import planar_poses
 from advnerf_core.learning.recipe import recovery_states

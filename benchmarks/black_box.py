@@ -34,7 +34,8 @@ from advnerf_core.attack.search.black_box import BlackBoxSearch, black_box_attac
 from advnerf_core.attack.search.distil import Distillation
 from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.search.query_count import CountedPolicy, calls_per_evaluation
-from advnerf_core.attack.search.search import Evaluation, OnEvaluation, draw_start_states
+from advnerf_core.attack.search.record import Evaluation, OnEvaluation
+from advnerf_core.attack.search.search import draw_start_states
 from advnerf_core.documents import read_json
 from advnerf_core.fields.voxel_grid import cube_face_object
 from advnerf_core.files import write_atomically, write_json

@@ -17,7 +17,8 @@ from torch import Tensor
 
 import advnerf_core as adv
 from advnerf_core.attack.methods import Method, SearchRun, SearchSettings, load_method
-from advnerf_core.attack.search.search import SearchResult, begin, evaluate_theta, search_fingerprint
+from advnerf_core.attack.search.record import SearchResult
+from advnerf_core.attack.search.search import begin, evaluate_theta, search_fingerprint
 
 CAMERA, EVALUATIONS = adv.Pinhole(width=48, height=24, fx=30.0, fy=30.0, cx=24.0, cy=12.0), 10
 

@@ -1,7 +1,9 @@
 """The pictures and tables of the architecture page are those of the code; ``make rooms`` draws them again."""
 
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
+import grimp
 import pytest
 
 from docs import draw_rooms
@@ -27,6 +29,16 @@ def test_floors_put_every_room_above_what_it_imports():
     assert draw_rooms.reduced(arrows) == {"roof": {"a"}, "a": {"b"}, "b": {"base"}, "base": set()}
     with pytest.raises(ValueError, match="circle of imports, got a -> b -> a"):
         draw_rooms.floors({"a": frozenset({"b"}), "b": frozenset({"a"})})
+
+
+def test_no_module_imports_itself_in_a_circle_not_even_for_types():
+    graph = grimp.build_graph(*draw_rooms.PACKAGES, cache_dir=None)
+    imports = {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
+    assert sum(map(len, imports.values())) > len(imports), "there are imports at all"
+    try:
+        TopologicalSorter(imports).prepare()
+    except CycleError as error:
+        pytest.fail(f"circle of imports: {' -> '.join(error.args[1])}")
 
 
 def test_the_top_of_nodes_holds_processes_only():

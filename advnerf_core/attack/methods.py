@@ -35,7 +35,7 @@ from advnerf_core.report.conditions import CONDITIONS
 
 if TYPE_CHECKING:
     from advnerf_core.attack.problem import AttackProblem
-    from advnerf_core.attack.search.search import OnEvaluation, SearchResult
+    from advnerf_core.attack.search.record import OnEvaluation, SearchResult
 
 GROUP = "advnerf.methods"
 _WHAT = "attack method"

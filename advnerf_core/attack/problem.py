@@ -9,7 +9,6 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from advnerf_core.attack.methods import alternatives, black_box_methods
 from advnerf_core.attack.objective import (
     CrossTrackError,
     JudgedDrives,
@@ -174,8 +173,8 @@ class AttackProblem:
         """
         if not self.differentiable:
             raise BlackBoxError(
-                "expected a policy with a gradient, got one that declares differentiable = False; search with the methods "
-                f"{alternatives(black_box_methods())} instead"
+                "expected a policy with a gradient, got one that declares differentiable = False; search with a "
+                "method that asks for answers only (advnerf list methods)"
             )
 
     def coloured(self, method: str) -> ColouringSensor:

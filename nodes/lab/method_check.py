@@ -18,7 +18,8 @@ from torch import Tensor
 
 from advnerf_core.attack.methods import Method, SearchRun, SearchSettings, load_method
 from advnerf_core.attack.problem import AttackProblem, BlackBoxError
-from advnerf_core.attack.search.search import Evaluation, SearchResult, SearchStateError
+from advnerf_core.attack.search.record import Evaluation, SearchResult
+from advnerf_core.attack.search.search import SearchStateError
 from advnerf_core.driving.dynamics import Ackermann
 from advnerf_core.driving.path import Line
 from advnerf_core.driving.path import Path as Reference

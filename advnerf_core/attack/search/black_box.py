@@ -42,9 +42,8 @@ from advnerf_core.attack.search.distil import (
 )
 from advnerf_core.attack.search.population import Coarse
 from advnerf_core.attack.search.query_count import CountedPolicy, calls_per_evaluation
+from advnerf_core.attack.search.record import Evaluation, SearchResult
 from advnerf_core.attack.search.search import (
-    Evaluation,
-    SearchResult,
     SearchState,
     begin_drawing,
     go_on,

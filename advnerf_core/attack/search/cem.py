@@ -10,7 +10,7 @@ from torch import Tensor
 from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.attack.methods import SearchRun, SearchSettings
 from advnerf_core.attack.search.population import search_with
-from advnerf_core.attack.search.search import SearchResult
+from advnerf_core.attack.search.record import SearchResult
 
 _SIGMA = 3.0
 _ELITE_SHARE = 0.3

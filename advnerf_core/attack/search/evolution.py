@@ -11,7 +11,7 @@ from torch import Tensor
 from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.attack.methods import SearchRun, SearchSettings
 from advnerf_core.attack.search.population import search_with
-from advnerf_core.attack.search.search import SearchResult
+from advnerf_core.attack.search.record import SearchResult
 
 _SIGMA, _LEARNING_RATE = 1.0, 0.5
 _ADAM = (0.9, 0.999, 1e-8)

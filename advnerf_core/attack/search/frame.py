@@ -19,7 +19,8 @@ from advnerf_core.attack.methods import SearchRun, SearchSettings
 from advnerf_core.attack.problem import AttackProblem, SearchDivergedError
 from advnerf_core.attack.search.gradient import Slope, climb
 from advnerf_core.attack.search.query_count import VictimError
-from advnerf_core.attack.search.search import SearchResult, gradient_step
+from advnerf_core.attack.search.record import SearchResult
+from advnerf_core.attack.search.search import gradient_step
 from advnerf_core.attack.search.visited import Visited
 
 _NAME = "frame"

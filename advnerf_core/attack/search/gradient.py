@@ -14,9 +14,8 @@ from advnerf_core.attack.adjoint import AttackProblem, Totals, adjoint_gradient
 from advnerf_core.attack.methods import FRESH_RUN, SearchRun, SearchSettings
 from advnerf_core.attack.search.descent import Descent
 from advnerf_core.attack.search.population import Coarse
+from advnerf_core.attack.search.record import Evaluation, SearchResult
 from advnerf_core.attack.search.search import (
-    Evaluation,
-    SearchResult,
     begin,
     go_on,
     gradient_step,

@@ -9,7 +9,8 @@ from advnerf_core.attack.methods import SearchRun, SearchSettings
 from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.attack.search.gradient import adjoint_slope, climb
 from advnerf_core.attack.search.population import Coarse
-from advnerf_core.attack.search.search import SearchResult, gradient_step
+from advnerf_core.attack.search.record import SearchResult
+from advnerf_core.attack.search.search import gradient_step
 from advnerf_core.errors import AdvnerfError
 
 

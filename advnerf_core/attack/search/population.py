@@ -16,9 +16,8 @@ from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.attack.methods import FRESH_RUN, SearchRun, SearchSettings
+from advnerf_core.attack.search.record import Evaluation, SearchResult
 from advnerf_core.attack.search.search import (
-    Evaluation,
-    SearchResult,
     SearchState,
     begin_drawing,
     go_on,

@@ -28,9 +28,8 @@ from advnerf_core.attack.adjoint import (
     roll_out,
 )
 from advnerf_core.attack.methods import FRESH_RUN, SearchRun
+from advnerf_core.attack.search.record import Evaluation, SearchResult
 from advnerf_core.attack.search.search import (
-    Evaluation,
-    SearchResult,
     begin_drawing,
     go_on,
     require_finite,

@@ -15,7 +15,8 @@ from advnerf_core.attack.methods import SearchRun, SearchSettings
 from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.attack.search import textures
 from advnerf_core.attack.search.random_search import best_drawn
-from advnerf_core.attack.search.search import SearchResult, random_spread
+from advnerf_core.attack.search.record import SearchResult
+from advnerf_core.attack.search.search import random_spread
 from advnerf_core.fields.colour_grid import colour_grid
 
 

@@ -22,9 +22,8 @@ from torch import Tensor
 from advnerf_core.attack.adjoint import AttackProblem, Sensor, Totals, adjoint_gradient
 from advnerf_core.attack.problem import SearchDivergedError
 from advnerf_core.attack.search.descent import Descent
+from advnerf_core.attack.search.record import Evaluation, SearchResult
 from advnerf_core.attack.search.search import (
-    Evaluation,
-    SearchResult,
     SearchState,
     SearchStateError,
     evaluation_from_json,

@@ -11,7 +11,7 @@ from torch import Tensor
 from advnerf_core.attack.artifact import COLOURS, AttackedObject, AttackFace, AttackFile, face_texture
 from advnerf_core.attack.methods import SearchRun, SearchSettings, load_method
 from advnerf_core.attack.problem import AttackProblem
-from advnerf_core.attack.search.search import SearchResult
+from advnerf_core.attack.search.record import SearchResult
 from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.attack.spaces.space import NamedObject, Shown, require_same
 from advnerf_core.display import DisplayModel

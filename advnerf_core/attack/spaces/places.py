@@ -13,7 +13,7 @@ from advnerf_core.attack.artifact import PLACES, AttackedObject, AttackFile
 from advnerf_core.attack.methods import SearchRun, SearchSettings
 from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.attack.search.poses import MultiStart, multi_start, random_poses
-from advnerf_core.attack.search.search import SearchResult
+from advnerf_core.attack.search.record import SearchResult
 from advnerf_core.attack.spaces.placed_sensor import PlacedSensor
 from advnerf_core.attack.spaces.placement import KeepOut, PoseBounds, PoseSpace, placed
 from advnerf_core.attack.spaces.space import NamedObject, Shown, SpaceError, colours_of, require_same

@@ -25,7 +25,7 @@ from advnerf_core.attack.artifact import (
 )
 from advnerf_core.attack.methods import SearchRun, SearchSettings, load_method
 from advnerf_core.attack.problem import AttackProblem, Sensor
-from advnerf_core.attack.search.search import SearchResult
+from advnerf_core.attack.search.record import SearchResult
 from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.display import DisplayModel
 from advnerf_core.errors import AdvnerfError

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from advnerf_core.attack.objective import CrossTrackError, Objective
-from advnerf_core.attack.search.search import Evaluation, OnEvaluation
+from advnerf_core.attack.search.record import Evaluation, OnEvaluation
 from advnerf_core.driving.clean_drive import CleanDrive
 
 

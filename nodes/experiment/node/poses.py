@@ -14,7 +14,7 @@ from advnerf_core.attack.artifact import PLACES, AttackFile, load_attack, save_a
 from advnerf_core.attack.methods import SearchRun
 from advnerf_core.attack.pose_plots import draw_placements
 from advnerf_core.attack.search.poses import MultiStart, judge, multi_start, placed_problem, random_poses
-from advnerf_core.attack.search.search import SearchResult
+from advnerf_core.attack.search.record import SearchResult
 from advnerf_core.attack.spaces.placed_sensor import PlacedSensor
 from advnerf_core.attack.spaces.placement import KeepOut, PoseBounds, PoseSpace, placed
 from advnerf_core.fields.voxel_grid import VoxelGridObject

@@ -27,7 +27,8 @@ from advnerf_core.attack.methods import method_digest
 from advnerf_core.attack.objectives import load_objective, objective_entry, objective_key
 from advnerf_core.attack.on_device import said_of_device
 from advnerf_core.attack.problem import Totals
-from advnerf_core.attack.search.search import SearchResult, draw_start_states
+from advnerf_core.attack.search.record import SearchResult
+from advnerf_core.attack.search.search import draw_start_states
 from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.driving.actuated import ActuatedAckermann
 from advnerf_core.driving.clean_drive import CleanDrive

@@ -17,7 +17,7 @@ from advnerf_core.attack.methods import (
 )
 from advnerf_core.attack.objectives import load_objective
 from advnerf_core.attack.on_device import all_on_chosen_device, on_chosen_device
-from advnerf_core.attack.search.search import Evaluation, OnEvaluation, SearchResult
+from advnerf_core.attack.search.record import Evaluation, OnEvaluation, SearchResult
 from advnerf_core.attack.search.together import gradient_attacks
 from advnerf_core.files import write_atomically, write_json
 from advnerf_core.places import require_utf8

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from advnerf_core.attack.artifact import face_texture, load_attack
-from advnerf_core.attack.search.search import Evaluation, evaluation_from_json
+from advnerf_core.attack.search.record import Evaluation
+from advnerf_core.attack.search.search import evaluation_from_json
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.places import open_tensors
 from advnerf_core.scene.surrogate import split_theta

@@ -17,7 +17,7 @@ from advnerf_core.attack.clean import clean_drive
 from advnerf_core.attack.methods import Method, SearchRun, SearchSettings, load_method
 from advnerf_core.attack.objectives import CTE, load_objective, objective_entry, objective_key
 from advnerf_core.attack.on_device import on_chosen_device, said_of_device
-from advnerf_core.attack.search.search import SearchResult
+from advnerf_core.attack.search.record import SearchResult
 from advnerf_core.attack.spaces.space import Shown, Space, half_precision
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically

@@ -122,7 +122,7 @@ def test_a_black_box_can_be_searched_but_not_differentiated(problem):
     assert len(result.history) == 6
     with pytest.raises(
         BlackBoxError,
-        match=r"differentiable = False; search with the methods random, .*, cem, evolution, guided or distilled",
+        match=r"differentiable = False; search with a method that asks for answers only",
     ):
         adjoint_gradient(closed, result.theta)
 
