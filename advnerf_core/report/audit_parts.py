@@ -132,6 +132,22 @@ class JudgedStart(StrictModel):
     control_off_track: bool
 
 
+class DisturbedDrives(StrictModel):
+    """Drives from the judging starts with a worse camera: what was found is not always what bears noise and a shaking mount.
+
+    Noise and jitter are drawn for each picture, gain and brightness for each drive; all are standard deviations.
+    """
+
+    noise: NotNegative = Field(description="Of each channel of each pixel, in 0..1.")
+    gain: NotNegative = Field(description="Of the logarithm of the exposure.")
+    brightness: NotNegative = Field(description="Added to all pixels, in 0..1.")
+    jitter_m: NotNegative = Field(description="Of the camera's position along each axis [m].")
+    jitter_rad: NotNegative = Field(description="Of the camera's rotation about each axis [rad].")
+    effect: AuditEffect = Field(description="Over the plain object under the same camera.")
+    off_track: Annotated[int, Field(ge=0)]
+    plain_off_track: Annotated[int, Field(ge=0)]
+
+
 class JudgedDrives(StrictModel):
     """Drives past an object from the judging starts, which neither search nor selection used."""
 
@@ -143,6 +159,9 @@ class JudgedDrives(StrictModel):
         description="Which control gives the smaller effect."
     )
     effect: AuditEffect
+    disturbed: DisturbedDrives | None = Field(
+        default=None, description="The same under a worse camera; null where the camera is the world's own."
+    )
     starts: tuple[JudgedStart, ...] = Field(min_length=2)
     path: tuple[RoutePoint, ...] = Field(
         default=(), description="The reference path that the vehicle should follow."

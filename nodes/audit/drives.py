@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from advnerf_core.attack.artifact import load_attack
+from advnerf_core.attack.robustness import Disturbances
 from advnerf_core.attack.spaces.space import ColourSpace, Shown
 from advnerf_core.data.transforms import load_transforms
 from advnerf_core.driving.metrics import DriveMetrics
@@ -27,6 +28,11 @@ from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.attack import attack_problem, from_measured_starts
 
 NO_OBJECT, PLAIN_OBJECT, PICTURE, FOUND = "no_object", "plain_object", "natural_picture", "object"
+# The same two under `camera_effects`.
+PLAIN_DISTURBED, FOUND_DISTURBED = "plain_object_disturbed", "object_disturbed"
+# Whether what was found survives another camera: as far as cheap cameras and their mounts differ from day to day.
+NOISE, GAIN, BRIGHTNESS, JITTER_RAD = 0.02, 0.1, 0.02, 0.01
+_JITTER = 0.04  # of the lane's half width
 
 
 def with_starts(experiment: Experiment, count: int, seed: int) -> Experiment:
@@ -91,15 +97,23 @@ def _picture(experiment: Experiment, space: ColourSpace) -> Tensor:
     return torch.from_numpy(inverse_squash(small / 255.0)).to(plain.dtype).reshape(plain.shape)
 
 
-def learned(experiment: Experiment, victim: str, arm: Arm) -> Drives:
+def camera_effects(limit_m: float, seed: int) -> Disturbances:
+    """Noise, exposure and a shaking mount, for a lane that ends at a |CTE| of ``limit_m``."""
+    return Disturbances(NOISE, GAIN, BRIGHTNESS, _JITTER * limit_m, JITTER_RAD, seed)
+
+
+def learned(
+    experiment: Experiment, victim: str, arm: Arm, disturbances: Disturbances | None = None
+) -> Drives:
     """Drives in the learned scene, as fast as searches see it, from the measured starts."""
     scenario = experiment.config.paths[0]
     policy = load_victim(experiment, victim)
     space = colour_space(experiment)
     problem = attack_problem(experiment, space, policy, scenario, 0)
     there = replace(problem, sensor=arm.shown.seen_by(space.surrogate))
+    measured = from_measured_starts(experiment, scenario, there)
     states, _, scores = learned_drives(
-        experiment, from_measured_starts(experiment, scenario, there), arm.shown.colours
+        experiment, replace(measured, disturbances=disturbances), arm.shown.colours
     )
     return _drives(experiment, list(states), scores)
 

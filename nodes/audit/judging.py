@@ -13,23 +13,26 @@ from numpy.typing import NDArray
 
 from advnerf_core.attack.artifact import face_texture, load_attack
 from advnerf_core.geometry import Array, planar_poses
-from advnerf_core.report.audit_parts import Evidence, JudgedDrives, JudgedStart, RoutePoint
+from advnerf_core.report.audit_parts import DisturbedDrives, Evidence, JudgedDrives, JudgedStart, RoutePoint
 from advnerf_core.report.audit_result import AuditControl, ControlKind
 from advnerf_core.report.clips import ClipTrack, write_clip
 from advnerf_core.scene.surrogate import Surrogate
 from hardware.worlds.world import World
 from nodes.audit.drives import (
     FOUND,
+    FOUND_DISTURBED,
     NO_OBJECT,
     PICTURE,
+    PLAIN_DISTURBED,
     PLAIN_OBJECT,
     Arm,
     arm_of,
+    camera_effects,
     driven,
     learned,
     with_starts,
 )
-from nodes.audit.verdict import Control, Drives, Judgement, judge
+from nodes.audit.verdict import Control, Drives, Judgement, effect_of, judge
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.images import as_uint8
 from nodes.experiment.show.learned_scene import load_background
@@ -43,6 +46,8 @@ TITLES = {
     PLAIN_OBJECT: "plain object",
     PICTURE: "a picture of the place",
     FOUND: "the object that was found",
+    PLAIN_DISTURBED: "plain object, a worse camera",
+    FOUND_DISTURBED: "the object that was found, a worse camera",
 }
 # Colours of films and plots are those of conditions.
 CONDITIONS = {NO_OBJECT: "empty", PLAIN_OBJECT: "none", PICTURE: "random", FOUND: "gradient"}
@@ -99,6 +104,7 @@ class Judged:
             measure="max_abs_cte",
             control=self.judgement.control,
             effect=self.judgement.effect,
+            disturbed=self._disturbed(),
             starts=tuple(
                 JudgedStart(
                     x_m=start[0],
@@ -113,6 +119,22 @@ class Judged:
             ),
             path=_route(clean_poses(self.experiment, self.experiment.config.paths[0]), dt_s),
             route=_route(found.states[shown], dt_s),
+        )
+
+    def _disturbed(self) -> DisturbedDrives | None:
+        if FOUND_DISTURBED not in self.drives:
+            return None
+        found, plain = self.drives[FOUND_DISTURBED], self.drives[PLAIN_DISTURBED]
+        effects = camera_effects(self.limit_m, self.experiment.config.measure.seed)
+        return DisturbedDrives(
+            noise=effects.noise,
+            gain=effects.gain,
+            brightness=effects.brightness,
+            jitter_m=effects.jitter_m,
+            jitter_rad=effects.jitter_rad,
+            effect=effect_of(found, plain),
+            off_track=int(found.left(self.limit_m).sum()),
+            plain_off_track=int(plain.left(self.limit_m).sum()),
         )
 
 
@@ -146,6 +168,10 @@ def judge_found(
     with_them = with_starts(experiment, count, seed)
     arms = {name: arm_of(with_them, name, found) for name in (NO_OBJECT, PLAIN_OBJECT, PICTURE, FOUND)}
     drives = drive_arms(with_them, victim, arms, evidence)
+    if evidence == "surrogate":
+        effects = camera_effects(limit_m, seed)
+        drives[PLAIN_DISTURBED] = learned(with_them, victim, arms[PLAIN_OBJECT], effects)
+        drives[FOUND_DISTURBED] = learned(with_them, victim, arms[FOUND], effects)
     controls = {name: drives[name] for name in CONTROLS}
     judgement = judge(drives[FOUND], controls, limit_m)
     return Judged(evidence, arms, drives, judgement, with_them, limit_m)

@@ -16,8 +16,9 @@ from advnerf_core.files import write_atomically
 from advnerf_core.report.audit_parts import JudgedDrives
 from advnerf_core.report.audit_result import AuditResult, read_audit
 from hardware.worlds.paths import ReferencePath
-from nodes.audit.judging import CONTROLS, FOUND, Judged
-from nodes.audit.verdict import Control, Drives, judge
+from nodes.audit.drives import FOUND, FOUND_DISTURBED, PLAIN_DISTURBED
+from nodes.audit.judging import CONTROLS, Judged
+from nodes.audit.verdict import Control, Drives, effect_of, judge
 from nodes.lab.worlds.expert_drive import as_path
 
 DRIVES, RESULT = "drives.json", "audit.json"
@@ -104,6 +105,11 @@ def _check(folder: Path, result: AuditResult, said: JudgedDrives, drives: Mappin
         _same(folder, f"{where}: off_path_m", start.off_path_m, float(largest_m))
         _same(folder, f"{where}: control_off_path_m", start.control_off_path_m, float(control_m))
         _same(folder, f"{where}: off_track", start.off_track, bool(largest_m > limit_m))
+    if said.disturbed is not None:
+        worse, plain = drives[FOUND_DISTURBED], drives[PLAIN_DISTURBED]
+        where = f"{said.evidence}: disturbed"
+        _same(folder, f"{where}.effect.mean_m", said.disturbed.effect.mean_m, effect_of(worse, plain).mean_m)
+        _same(folder, f"{where}.off_track", said.disturbed.off_track, int(worse.left(limit_m).sum()))
     if said.evidence == result.verdict.evidence and result.verdict.outcome in ("found", "nothing_found"):
         _same(folder, "verdict", result.verdict.outcome, "found" if found.found else "nothing_found")
     return f"{folder}: {said.evidence}, {len(said.starts)} starts: as the drives say"

@@ -60,8 +60,12 @@ class Copies:
     def experiment(self, setting: str, judged: bool = False) -> Experiment:
         """The experiment of a setting, in the copy that is searched or judged in."""
         folder = self.judged if judged else self.searched
-        over = [*half_overrides(self.question, folder.name), *self.question.overrides]
-        return load_experiment(self.file, setting, over, folder)
+        return load_experiment(self.file, setting, self.overrides(judged), folder)
+
+    def overrides(self, judged: bool) -> list[str]:
+        """Changes of the experiment file in the copy that is searched or judged in."""
+        folder = self.judged if judged else self.searched
+        return [*half_overrides(self.question, folder.name), *self.question.overrides]
 
     def ready(self, setting: str, judged: bool = False) -> Experiment:
         """The same with the object of the setting built."""

@@ -22,7 +22,7 @@ from advnerf_core.report.clips import data_uri, film_strip, image_uri
 from advnerf_core.report.conditions import style_of
 from advnerf_core.report.palette import LIGHT, look_css
 from advnerf_core.report.text_table import Table, number
-from nodes.audit.judging import CONDITIONS, FOUND, NO_OBJECT, PICTURE, PLAIN_OBJECT, TITLES
+from nodes.audit.judging import CONDITIONS, FOUND, NO_OBJECT, PLAIN_OBJECT, TITLES
 from nodes.audit.verdict import Drives, effect_of
 
 PAGE = "audit.html"
@@ -68,6 +68,7 @@ def write_page(
         above=_above(result, judged, path) if judged and path is not None else None,
         judged_starts=result.starts.judging.count,
         arms=_arms(result, drives).html() if drives else None,
+        worse_camera=_worse_camera(result),
         pictures=[(image_uri(read_stored(file)[0], _QUALITY), caption) for file, caption in pictures],
         how=_how_to_print(result),
         tried=_tried(result.tried).html() if result.tried else None,
@@ -127,8 +128,7 @@ def _draw_object(ax: Any, placed: AuditedObject) -> np.ndarray:
 def _arms(result: AuditResult, drives: Mapping[Evidence, Mapping[str, Drives]]) -> Table:
     limit_m, rows = result.place.off_track_m or 0.0, []
     for evidence, judged in drives.items():
-        for name in (NO_OBJECT, PLAIN_OBJECT, PICTURE, FOUND):
-            each = judged[name]
+        for name, each in judged.items():
             effect = effect_of(each, judged[NO_OBJECT])
             rows.append((
                 _DRIVEN_IN[evidence], TITLES[name], number(float(each.mean_m.mean()), 3), number(float(each.largest_m.mean())),
@@ -144,6 +144,19 @@ def _arms(result: AuditResult, drives: Mapping[Evidence, Mapping[str, Drives]]) 
         "out of the lane",
     )
     return Table("", columns, tuple(rows), (False, False, True, True, True, True))
+
+
+def _worse_camera(result: AuditResult) -> str:
+    found = (
+        [each.disturbed for each in result.strongest.judgements if each.disturbed] if result.strongest else []
+    )
+    if not found:
+        return ""
+    worse = found[0]
+    return (
+        f"A worse camera: noise of {worse.noise:g} and an exposure that differs by {worse.gain:.0%} and {worse.brightness:g}, on a mount that "
+        f"shakes by {1e3 * worse.jitter_m:.0f} mm and {1e3 * worse.jitter_rad:.0f} mrad (standard deviations)."
+    )
 
 
 def _tried(tried: Sequence[TriedSearch]) -> Table:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,77 +26,71 @@ Say = Callable[[str], None]
 _USUAL = {"colour_space": "RGB", "value_max": 1.0, "output_unit": "normalised", "positive": "left"}
 
 
-def policy_at(
-    given: str,
-    camera: Pinhole | None,
-    largest_rad: float | None,
-    declared: Sequence[str],
-    folder: Path,
-    say: Say,
-) -> tuple[str, Pinhole | None]:
-    """How experiments name the policy, and the camera that it was made for.
+@dataclass(frozen=True)
+class GivenPolicy:
+    """The policy as the user named it, and what is known where it will drive.
 
-    Args:
-        given: As the user named it.
+    Attributes:
+        given: File, ``package.module:factory`` or address.
         camera: The driving camera of the place, for a policy that names none; None where only the world knows.
         largest_rad: Largest wheel angle of the car, which a normalised output of 1 means [rad].
         declared: ``key=value`` texts of a declaration.
         folder: Of the audit; gets a copy of the file with its declaration, if it has none.
-        say: Told what is taken for granted.
-
-    Returns:
-        The name, and the camera; None for a driver behind a socket.
-
-    Raises:
-        ConfigError: The file is not there.
-        AdvnerfError: It cannot be loaded.
+        say: Called with what is assumed.
     """
-    if is_address(given):
-        return given, None
-    if is_code(given):
-        return given, load_any_policy(given).view.camera
-    file = Path(given)
-    if not file.is_file():
-        raise ConfigError(
-            f"expected a policy file, package.module:factory or grpc://HOST:PORT, got {given}, which is not there"
-        )
-    contract, questions = guess_contract(file)
-    if not questions and not declared:
-        return str(file.resolve()), contract.view.camera
-    return _declared(file, contract, questions, camera, largest_rad, declared, folder, say)
 
+    given: str
+    camera: Pinhole | None
+    largest_rad: float | None
+    declared: Sequence[str]
+    folder: Path
+    say: Say
 
-def _declared(
-    file: Path,
-    contract: PolicyContract,
-    questions: Sequence[Question],
-    camera: Pinhole | None,
-    largest_rad: float | None,
-    declared: Sequence[str],
-    folder: Path,
-    say: Say,
-) -> tuple[str, Pinhole | None]:
-    values, answers = contract.to_dict(), _read(declared)
-    if any(question.key == "view" for question in questions):
-        values["view"] = _whole_picture(values["view"], camera)
-    for question in questions:
-        if question.key in answers or question.key == "view":
-            continue
-        values[question.key] = _answered(question, _USUAL.get(question.key, values.get(question.key)), say)
-    values |= answers
-    if values.get("output_unit") == "normalised" and values.get("full_steering_rad") is None:
-        if largest_rad is None:
+    def resolve(self) -> tuple[str, Pinhole | None]:
+        """The name that experiments use, and the camera that the policy was made for; None for a driver behind a socket.
+
+        Raises:
+            ConfigError: The file is not there.
+            AdvnerfError: It cannot be loaded.
+        """
+        if is_address(self.given):
+            return self.given, None
+        if is_code(self.given):
+            return self.given, load_any_policy(self.given).view.camera
+        file = Path(self.given)
+        if not file.is_file():
             raise ConfigError(
-                "expected --declare full_steering_rad=RAD, the wheel angle at an output of 1, as the car is not known yet"
+                f"expected a policy file, package.module:factory or grpc://HOST:PORT, got {self.given}, which is not there"
             )
-        values["full_steering_rad"] = largest_rad
-    checked = PolicyContract.from_dict(values, "--declare")
-    target = folder / FOLDER / file.name
-    target.parent.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(file, target)
-    text = dump_yaml(checked.to_dict())
-    write_atomically(target.with_name(target.name + DECLARATION_SUFFIX), text)
-    return str(target.resolve()), checked.view.camera
+        contract, questions = guess_contract(file)
+        if not questions and not self.declared:
+            return str(file.resolve()), contract.view.camera
+        return self._with_declaration(file, self._contract(contract, questions))
+
+    def _contract(self, guessed: PolicyContract, questions: Sequence[Question]) -> PolicyContract:
+        """The contract with what was declared, answered or is usual."""
+        values, answers = guessed.to_dict(), _read(self.declared)
+        for question in questions:
+            if question.key == "view":
+                values["view"] = _whole_picture(values["view"], self.camera)
+            elif question.key not in answers:
+                usual = _USUAL.get(question.key, values.get(question.key))
+                values[question.key] = _answered(question, usual, self.say)
+        values |= answers
+        if values.get("output_unit") == "normalised" and values.get("full_steering_rad") is None:
+            if self.largest_rad is None:
+                raise ConfigError(
+                    "expected --declare full_steering_rad=RAD, the wheel angle at an output of 1, as the car is not known yet"
+                )
+            values["full_steering_rad"] = self.largest_rad
+        return PolicyContract.from_dict(values, "--declare")
+
+    def _with_declaration(self, file: Path, contract: PolicyContract) -> tuple[str, Pinhole | None]:
+        target = self.folder / FOLDER / file.name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file, target)
+        write_atomically(target.with_name(target.name + DECLARATION_SUFFIX), dump_yaml(contract.to_dict()))
+        return str(target.resolve()), contract.view.camera
 
 
 def _read(declared: Sequence[str]) -> dict[str, Any]:

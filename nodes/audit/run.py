@@ -40,7 +40,7 @@ from nodes.audit.question import (
     VICTIM,
     Question,
 )
-from nodes.audit.searching import Found, Searches, seconds_of_evaluation
+from nodes.audit.searching import Found, Searches, SearchesElsewhere, seconds_of_evaluation
 from nodes.audit.spots import Spot, best_spots
 from nodes.experiment.plan.object_kinds import footprint_m
 from nodes.experiment.show.context import Experiment
@@ -79,6 +79,7 @@ class Options:
         against: The result of an earlier audit, which this policy is compared with.
         harden: Whether frames that would help are exported.
         timed: Whether the result says when it ended and how long it took.
+        cluster: Machines that search; None for this process.
     """
 
     minutes: float
@@ -86,6 +87,7 @@ class Options:
     against: Path | None = None
     harden: bool = False
     timed: bool = True
+    cluster: SearchesElsewhere | None = None
 
 
 @dataclass
@@ -211,7 +213,16 @@ class Audit:
         evaluations = plan.decided.evaluations
         assert evaluations is not None, "they were counted"
         self.say(f"the budget buys {evaluations} evaluations")
-        return Searches(copies, plan, spots, victim, evaluations, declared.differentiable, limit_m)
+        return Searches(
+            copies,
+            plan,
+            spots,
+            victim,
+            evaluations,
+            declared.differentiable,
+            limit_m,
+            self.options.cluster,
+        )
 
     def _show(
         self, experiment: Experiment, spot: Spot, arm: str, name: str, found: Path | None = None

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -65,6 +65,34 @@ class Found:
         return self.left, self.effect_m
 
 
+@dataclass(frozen=True)
+class Wanted:
+    """A search to run; plain data, so that it can go to another machine.
+
+    Attributes:
+        file: Experiment file.
+        setting: Its setting.
+        overrides: Changes of it.
+        run_folder: Of the copy that is searched in.
+        cell: Which cell.
+        folder: Gets the search.
+    """
+
+    file: str
+    setting: str
+    overrides: tuple[str, ...]
+    run_folder: str
+    cell: Cell
+    folder: str
+
+
+class SearchesElsewhere(Protocol):
+    """Other machines that run the searches of a round beside each other."""
+
+    def search(self, searches: Sequence[Wanted]) -> None:
+        """Run searches until all have left their results in their folders."""
+
+
 @dataclass
 class Searches:
     """All searches of one victim at one place.
@@ -77,6 +105,7 @@ class Searches:
         evaluations: What the budget buys, of one start.
         differentiable: Whether the policy has a gradient.
         limit_m: |CTE| beyond which the car has left its lane [m].
+        elsewhere: Machines that search; None for this process.
         found: What is finished.
     """
 
@@ -87,6 +116,7 @@ class Searches:
     evaluations: int
     differentiable: bool
     limit_m: float
+    elsewhere: SearchesElsewhere | None = None
     found: list[Found] = field(default_factory=list)
 
     @property
@@ -109,6 +139,8 @@ class Searches:
         """Search until the schedule ends, or what was found is enough."""
         for wanted, row in zip(self.rounds, self.planned, strict=True):
             spots = self._spots(wanted.spots)
+            if self.elsewhere is not None:  # what it leaves in the folders is then only read here
+                self.elsewhere.search([self._wanted(wanted, search, spots[search.spot]) for search in row])
             for search in row:
                 found = self._search(wanted, search, spots[search.spot])
                 self.found.append(found)
@@ -128,6 +160,21 @@ class Searches:
         return [*ranked, *(spot for spot in range(len(self.spots)) if spot not in best)][:count]
 
     def _search(self, wanted: Round, search: Search, spot: int) -> Found:
+        described = self._wanted(wanted, search, spot)
+        experiment, folder = self.copies.experiment(described.setting), Path(described.folder)
+        clean = search_cell(experiment, described.cell, folder, lambda *told: None)
+        return Found(
+            described.setting,
+            folder,
+            spot,
+            wanted.method,
+            search.seed,
+            search.evaluations * wanted.starts,
+            *_effect(experiment, folder, clean, self.limit_m),
+        )
+
+    def _wanted(self, wanted: Round, search: Search, spot: int) -> Wanted:
+        """The search, whose setting is in the experiment file and whose object is built."""
         setting = self._setting(wanted, search)
         self.plan.add(
             setting,
@@ -140,17 +187,13 @@ class Searches:
             over={"method": [wanted.method], "seed": [search.seed]},
         )
         experiment = self.copies.ready(setting)
-        cell = Cell.of(experiment.config.paths[0], self.victim, wanted.method, search.seed)
-        folder = self.copies.file.parent / SEARCHES / setting
-        clean = search_cell(experiment, cell, folder, lambda *told: None)
-        return Found(
+        return Wanted(
+            str(self.copies.file),
             setting,
-            folder,
-            spot,
-            wanted.method,
-            search.seed,
-            search.evaluations * wanted.starts,
-            *_effect(experiment, folder, clean, self.limit_m),
+            tuple(self.copies.overrides(judged=False)),
+            str(self.copies.searched),
+            Cell.of(experiment.config.paths[0], self.victim, wanted.method, search.seed),
+            str(self.copies.file.parent / SEARCHES / setting),
         )
 
     def _setting(self, wanted: Round, search: Search) -> str:

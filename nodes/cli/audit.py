@@ -17,11 +17,12 @@ from nodes.runtime.options import with_groups
 from nodes.runtime.terminal import Overrides, say_error
 
 if TYPE_CHECKING:
+    from nodes.audit.cluster import Cluster
     from nodes.audit.question import Question
     from nodes.audit.run import Options
 
 # Codes below are verdicts: see `advnerf_core.report.audit_result.EXIT_CODES`.
-USAGE_EXIT, FAULT_EXIT, CANNOT_JUDGE_EXIT = 64, 70, 2
+USAGE_EXIT, FAULT_EXIT, INTERRUPTED_EXIT, CANNOT_JUDGE_EXIT = 64, 70, 130, 2
 _PLACE, _SEARCH, _RESULT = "Place", "Search", "Result"
 _UNITS_MIN = {"s": 1 / 60, "m": 1.0, "h": 60.0}
 OFF_LANE = "off-lane"
@@ -118,6 +119,14 @@ class SearchOptions:
             "--evaluations",
             min=1,
             help="The number of evaluations itself, the same on every machine.",
+        ),
+    ] = None
+    cluster: Annotated[
+        str | None,
+        _option(
+            _SEARCH,
+            "--cluster",
+            help="Search over a Ray cluster: HOST:PORT of its head, auto, or here to start one on this machine.",
         ),
     ] = None
     starts: Annotated[
@@ -252,6 +261,9 @@ def audit(
     except (AdvnerfError, OSError) as error:
         say_error(str(error))
         raise typer.Exit(USAGE_EXIT) from None
+    except typer.Abort:  # Ctrl-C at a question
+        say_error("interrupted before the audit began")
+        raise typer.Exit(INTERRUPTED_EXIT) from None
     except Exception:  # a fault of ours must not end as the verdict that Python's own code 1 stands for
         traceback.print_exc()
         raise typer.Exit(FAULT_EXIT) from None
@@ -271,7 +283,7 @@ def _question(
     from nodes.audit.cars import car_of
     from nodes.audit.images import posed
     from nodes.audit.places import Answers, camera_of, describe, place_of_photographs, place_of_world
-    from nodes.audit.policies import policy_at
+    from nodes.audit.policies import GivenPolicy
     from nodes.audit.question import CI_SECTIONS, Question
     from nodes.audit.run import CI_EVALUATIONS, Options
 
@@ -286,17 +298,16 @@ def _question(
             place.car, "--car", "Which car: racecarj, roboracer, donkey, duckiebot, car, or a YAML file", str
         )
         car, there = car_of(named), posed(place.place, folder, metric)
-        spec, wanted = policy_at(
-            policy, camera_of(there, place.path), car.car.max_steering_rad, declared, folder, _say
-        )
+        camera = camera_of(there, place.path)
+        spec, wanted = GivenPolicy(policy, camera, car.car.max_steering_rad, declared, folder, _say).resolve()
         where, limit_m = place_of_photographs(place.place, there, answers, car, wanted)
     else:
         assert place.world is not None, "one of the two is given"
         where = place_of_world(place.world, answers)
         described = describe(where)
-        camera = None if described is None else described.camera
+        seen = None if described is None else described.camera
         largest = None if described is None else described.car.largest_control
-        spec, _ = policy_at(policy, camera, largest, declared, folder, _say)
+        spec, _ = GivenPolicy(policy, seen, largest, declared, folder, _say).resolve()
     question = Question(
         policy=spec,
         given=policy,
@@ -310,8 +321,21 @@ def _question(
     )
     evaluations = search.evaluations or (CI_EVALUATIONS if result.ci else None)
     return question, Options(
-        _minutes(search.budget), evaluations, result.against, result.harden, timed=not result.ci
+        _minutes(search.budget),
+        evaluations,
+        result.against,
+        result.harden,
+        timed=not result.ci,
+        cluster=_cluster(search.cluster),
     )
+
+
+def _cluster(address: str | None) -> Cluster | None:
+    if address is None:
+        return None
+    from nodes.audit.cluster import Cluster
+
+    return Cluster(address)
 
 
 class _Command(TyperCommand):

@@ -91,13 +91,22 @@ def make_folder(folder: Path) -> None:
     (folder / "drivers.py").write_text(_POLICIES)
 
 
-def audit(folder: Path, policy: str, *options: str, output: str = "") -> subprocess.CompletedProcess[str]:
-    """Run the command in that folder for one of its policies."""
+def command(policy: str, *options: str, output: str = "") -> list[str]:
+    """The command that audits one of the policies, run in their folder."""
     words = ["--place", "photos", "-o", output or policy, "--car", "car.yaml", "--limit", str(LIMIT_M)]
     words += ["--evaluations", "60", "--starts", "8", "--size", "0.5"]
     changes = [word for each in CHANGES for word in ("--set", each)]
-    environment = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{folder}"}
+    return [sys.executable, "-m", "nodes.cli", "audit", f"drivers:{policy}", *words, *changes, *options]
+
+
+def environment(folder: Path) -> dict[str, str]:
+    """In which a command finds this package and the policies."""
+    return {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{folder}"}
+
+
+def audit(folder: Path, policy: str, *options: str, output: str = "") -> subprocess.CompletedProcess[str]:
+    """Run the command in that folder for one of its policies."""
     return subprocess.run(
-        [sys.executable, "-m", "nodes.cli", "audit", f"drivers:{policy}", *words, *changes, *options],
-        cwd=folder, env=environment, capture_output=True, text=True, timeout=1800, check=False, stdin=subprocess.DEVNULL,
+        command(policy, *options, output=output),
+        cwd=folder, env=environment(folder), capture_output=True, text=True, timeout=1800, check=False, stdin=subprocess.DEVNULL,
     )  # fmt: skip

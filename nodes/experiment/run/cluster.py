@@ -31,7 +31,7 @@ def ray_session(address: str, cores: int) -> Iterator[int]:
         import ray
     except ModuleNotFoundError:
         raise ConfigError(
-            "--backend ray needs ray, which is not installed: pip install 'advnerf[cluster]'"
+            "a Ray cluster needs ray, which is not installed: pip install 'advnerf[cluster]'"
         ) from None
     joining = address or os.environ.get("RAY_ADDRESS", "")
     _require_reachable(joining)

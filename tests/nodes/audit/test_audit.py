@@ -56,6 +56,9 @@ def test_a_policy_that_red_leads_astray_is_found_and_the_numbers_are_those_of_th
     }
     assert result.strongest is not None
     assert (folder / "seduced" / result.strongest.object.texture).is_file()
+    worse = result.strongest.judgements[0].disturbed
+    assert worse is not None
+    assert (worse.off_track, worse.plain_off_track) == (8, 0), "red leads it astray through noise, too"
     assert check_audit(folder / "seduced")
     page = (folder / "seduced" / "audit.html").read_text()
     assert page.index(result.verdict.sentence) < page.index("<video") < page.index("<svg")
@@ -78,6 +81,14 @@ def test_a_second_run_gives_the_same_bytes(folder: Path, seduced: subprocess.Com
     again = audit(folder, "seduced", "--ci")
     assert again.returncode == seduced.returncode
     assert (folder / "seduced" / "audit.json").read_bytes() == before
+
+
+def test_a_cluster_finds_the_same(folder: Path, seduced: subprocess.CompletedProcess[str]) -> None:
+    pytest.importorskip("ray")
+    found = audit(folder, "seduced", "--ci", "--cluster", "here", output="spread")
+    assert found.returncode == seduced.returncode, found.stdout + found.stderr
+    for name in ("audit.json", "object.attack.safetensors"):
+        assert (folder / "spread" / name).read_bytes() == (folder / "seduced" / name).read_bytes(), name
 
 
 def test_exported_frames_are_labelled_with_steering_back_to_the_path(
