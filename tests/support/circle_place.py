@@ -70,7 +70,7 @@ def late():
     return adapt(Late(Driver(STEERING_RAD, 8.0)).eval(), PolicyContract(view, stateless=False))
 """.replace("STEERING_RAD", repr(math.atan(WHEELBASE_M / RADIUS_M)))
 CHANGES = (
-    "scene={steps: 80, log2_entries: 12, levels: 4, finest: 64, occupancy: 32}", "horizon=30", "capture.held_out=4",
+    "scene.steps=80", "scene.log2_entries=12", "scene.levels=4", "scene.finest=64", "scene.occupancy=32", "horizon=30", "capture.held_out=4",
     "object.panel_resolution=16",
 )  # fmt: skip
 

@@ -4,10 +4,12 @@ import json
 import math
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from advnerf_core.documents import read_json
 from advnerf_core.report.audit_result import read_audit
@@ -89,6 +91,33 @@ def test_a_cluster_finds_the_same(folder: Path, seduced: subprocess.CompletedPro
     assert found.returncode == seduced.returncode, found.stdout + found.stderr
     for name in ("audit.json", "object.attack.safetensors"):
         assert (folder / "spread" / name).read_bytes() == (folder / "seduced" / name).read_bytes(), name
+
+
+def test_the_action_for_continuous_integration_gives_the_same_bytes(
+    folder: Path, seduced: subprocess.CompletedProcess[str], tmp_path: Path
+) -> None:
+    action = yaml.safe_load((circle_place.ROOT / ".github/actions/audit/action.yml").read_text())
+    step = next(each for each in action["runs"]["steps"] if each.get("name") == "audit")
+    given = {name: str(row.get("default", "")) for name, row in action["inputs"].items()}
+    options = circle_place.command("seduced")[circle_place.command("seduced").index("--evaluations") :]
+    given |= {
+        "policy": "drivers:seduced",
+        "place": "photos",
+        "car": "car.yaml",
+        "limit": str(circle_place.LIMIT_M),
+        "output": "action",
+        "options": " ".join(options),
+    }
+    (tmp_path / "advnerf").write_text(f'#!/bin/sh\nexec {sys.executable} -m nodes.cli "$@"\n')
+    (tmp_path / "advnerf").chmod(0o755)
+    environment = circle_place.environment(folder)
+    environment |= {name: given[text.split(".")[1].split()[0]] for name, text in step["env"].items()}
+    environment["PATH"] = f"{tmp_path}:{environment['PATH']}"
+    done = subprocess.run(
+        ["bash", "-euo", "pipefail", "-c", step["run"]], cwd=folder, env=environment, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == seduced.returncode, done.stdout + done.stderr
+    assert (folder / "action/audit.json").read_bytes() == (folder / "seduced/audit.json").read_bytes()
 
 
 def test_exported_frames_are_labelled_with_steering_back_to_the_path(
