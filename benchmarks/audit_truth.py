@@ -22,7 +22,7 @@ from nodes.audit.drives import FOUND, NO_OBJECT, PLAIN_OBJECT, Arm, arm_of, lear
 from nodes.audit.judging import CONTROLS
 from nodes.audit.learning import OTHER_HALF
 from nodes.audit.question import FILE, VICTIM
-from nodes.audit.verdict import Drives, change_of, judge
+from nodes.audit.verdict import ArmDrives, change_of, judge
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.victims import look_at_given
 from nodes.experiment.steps.run import load_experiment
@@ -51,18 +51,18 @@ def experiment_of(folder: Path, policy: str) -> Experiment:
     return load_experiment(*arguments)
 
 
-def groups_of(experiment: Experiment, folder: Path, count: int) -> list[dict[str, Drives]]:
+def groups_of(experiment: Experiment, folder: Path, count: int) -> list[dict[str, ArmDrives]]:
     """Drives past nothing, the plain object and the one that was found, from the starts of each group."""
     arms = {name: arm_of(experiment, name, folder / "seduced" / ATTACK_KEPT) for name in _ARMS}
     return [_group(experiment, arms, number) for number in range(count)]
 
 
-def _group(experiment: Experiment, arms: dict[str, Arm], number: int) -> dict[str, Drives]:
+def _group(experiment: Experiment, arms: dict[str, Arm], number: int) -> dict[str, ArmDrives]:
     there = with_starts(experiment, STARTS, FIRST_SEED + number)
     return {name: learned(there, VICTIM, arm) for name, arm in arms.items()}
 
 
-def joined(groups: list[dict[str, Drives]], name: str) -> Drives:
+def joined(groups: list[dict[str, ArmDrives]], name: str) -> ArmDrives:
     """The drives of all groups as one."""
     first = groups[0][name]
     fields = ("states", "largest_m", "mean_m", "ctes_m", "driven_ticks")
@@ -71,7 +71,7 @@ def joined(groups: list[dict[str, Drives]], name: str) -> Drives:
     )
 
 
-def record_coverage(groups: list[dict[str, Drives]]) -> None:
+def record_coverage(groups: list[dict[str, ArmDrives]]) -> None:
     """How often the interval holds the truth, and how wide it is."""
     judged = [judge(each[FOUND], {name: each[name] for name in CONTROLS}, LIMIT_M) for each in groups]
     everything = judge(joined(groups, FOUND), {name: joined(groups, name) for name in CONTROLS}, LIMIT_M)
@@ -91,7 +91,7 @@ def record_coverage(groups: list[dict[str, Drives]]) -> None:
     )  # fmt: skip
 
 
-def alarms(now: list[dict[str, Drives]], then: list[dict[str, Drives]]) -> int:
+def alarms(now: list[dict[str, ArmDrives]], then: list[dict[str, ArmDrives]]) -> int:
     """In how many groups ``--against`` says that the policy is worse."""
     count = 0
     for new, old in zip(now, then, strict=False):
@@ -124,7 +124,7 @@ def main() -> None:
         _record_regressions(folder, then)
 
 
-def _record_regressions(folder: Path, then: list[dict[str, Drives]]) -> None:
+def _record_regressions(folder: Path, then: list[dict[str, ArmDrives]]) -> None:
     text = (folder / "drivers.py").read_text()
     named = {f"bias_{1e4 * bias:.0f}": bias for bias in BIASES_RAD}
     text += "".join(f"\ndef {name}():\n    return biased({bias})\n" for name, bias in named.items())

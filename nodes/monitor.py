@@ -39,7 +39,7 @@ _PLAIN_PX = 8
 Colour = tuple[float, float, float]
 
 
-class ScreenConfig(StrictModel):
+class MonitorOutputConfig(StrictModel):
     """A real screen.
 
     Attributes:
@@ -81,7 +81,9 @@ class MonitorConfig(StrictModel):
 
     attack: Path | None = None
     target: Path
-    display: Annotated[ScreenConfig | TwinScreenConfig, Field(discriminator="kind")] = ScreenConfig()
+    display: Annotated[MonitorOutputConfig | TwinScreenConfig, Field(discriminator="kind")] = (
+        MonitorOutputConfig()
+    )
     size_mm: tuple[float, float] | None = None
     plain_rgb: Colour = (0.20, 0.62, 0.28)
     face_m: float | None = Field(default=None, gt=0.0)
@@ -303,7 +305,7 @@ class MonitorNode(Node):
         self._trouble = f"new attack refused: {why}"
 
 
-def _open(config: ScreenConfig | TwinScreenConfig) -> Display:
+def _open(config: MonitorOutputConfig | TwinScreenConfig) -> Display:
     if isinstance(config, TwinScreenConfig):
         deadline = time.monotonic() + config.wait_s
         while not config.path.exists() and time.monotonic() < deadline:

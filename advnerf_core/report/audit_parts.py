@@ -67,7 +67,7 @@ class AuditedVehicle(StrictModel):
     height_m: Positive | None = None
 
 
-class ObjectPose(StrictModel):
+class PlacedPose(StrictModel):
     """Position of an object's origin [m] and its attitude [rad], yaw then pitch then roll about z, y and x."""
 
     x_m: float
@@ -86,7 +86,7 @@ class AuditedObject(StrictModel):
     size_m: tuple[Positive, Positive, Positive] = Field(
         description="Extent along the object's own x (depth), y (width) and z (height) [m]; its origin is the middle of its foot."
     )
-    pose: ObjectPose
+    pose: PlacedPose
     texture: Text | None = Field(description="Picture in the audit's folder; null if it has none.")
     texture_sha256: Sha256 | None = None
     model: Text | None = Field(default=None, description="GLB file in the audit's folder.")
@@ -148,7 +148,7 @@ class DisturbedDrives(StrictModel):
     plain_off_track: Annotated[int, Field(ge=0)]
 
 
-class JudgedDrives(StrictModel):
+class AuditedDrives(StrictModel):
     """Drives past an object from the judging starts, which neither search nor selection used."""
 
     evidence: Evidence = Field(
@@ -171,7 +171,7 @@ class JudgedDrives(StrictModel):
     )
 
     @model_validator(mode="after")
-    def _agrees(self) -> JudgedDrives:
+    def _agrees(self) -> AuditedDrives:
         mean_m = sum(each.off_path_m - each.control_off_path_m for each in self.starts) / len(self.starts)
         if abs(mean_m - self.effect.mean_m) > _ROUNDING_M:
             raise ValueError(
@@ -192,7 +192,7 @@ class JudgedObject(StrictModel):
     """The object that was strongest on the selection starts, and its effect from the judging starts."""
 
     object: AuditedObject
-    judgements: tuple[JudgedDrives, ...] = Field(min_length=1, description="One for each kind of evidence.")
+    judgements: tuple[AuditedDrives, ...] = Field(min_length=1, description="One for each kind of evidence.")
 
     @model_validator(mode="after")
     def _one_each(self) -> JudgedObject:
@@ -201,6 +201,6 @@ class JudgedObject(StrictModel):
             raise ValueError(f"expected one judgement for each kind of evidence, got {', '.join(kinds)}")
         return self
 
-    def judgement(self, evidence: Evidence | None) -> JudgedDrives | None:
+    def judgement(self, evidence: Evidence | None) -> AuditedDrives | None:
         """The judgement with this kind of evidence; None without one."""
         return next((each for each in self.judgements if each.evidence == evidence), None)

@@ -14,13 +14,13 @@ from pydantic import AwareDatetime, Field, model_validator
 from advnerf_core.documents import Document, read_json
 from advnerf_core.files import write_json
 from advnerf_core.report.audit_parts import (
+    AuditedDrives,
     AuditedPlace,
     AuditedPolicy,
     AuditedVehicle,
     AuditEffect,
     AuditQuestion,
     Evidence,
-    JudgedDrives,
     JudgedObject,
     NotNegative,
     Positive,
@@ -211,7 +211,7 @@ class AuditResult(StrictModel):
         return EXIT_CODES[self.verdict.outcome]
 
     @property
-    def judgement(self) -> JudgedDrives | None:
+    def judgement(self) -> AuditedDrives | None:
         """The judgement behind the verdict; None if no object was judged."""
         return self.strongest.judgement(self.verdict.evidence) if self.strongest else None
 

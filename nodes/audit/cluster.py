@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from advnerf_core.run_module import search_folder_last
-from nodes.audit.searching import Wanted
+from nodes.audit.searching import SearchJob
 from nodes.experiment.run.cells import search_cell
 from nodes.experiment.run.cluster import ray_session
 from nodes.experiment.steps.run import load_experiment
@@ -27,7 +27,7 @@ class Cluster:
 
     address: str
 
-    def search(self, searches: Sequence[Wanted]) -> None:
+    def search(self, searches: Sequence[SearchJob]) -> None:
         """Run searches until all have left their results in their folders.
 
         Raises:
@@ -46,7 +46,7 @@ class Cluster:
                 ) from None
 
 
-def _search(wanted: Wanted, folder: str) -> None:
+def _search(wanted: SearchJob, folder: str) -> None:
     """One search, in a worker of the cluster."""
     os.environ.setdefault("MUJOCO_GL", "egl")
     search_folder_last(folder)

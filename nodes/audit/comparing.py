@@ -12,7 +12,7 @@ from advnerf_core.report.audit_parts import AuditedObject, Evidence
 from advnerf_core.report.audit_result import AuditComparison, AuditResult, read_audit
 from nodes.audit.drives import FOUND, NO_OBJECT, PLAIN_OBJECT
 from nodes.audit.kept import read_drives
-from nodes.audit.verdict import Drives, change_of
+from nodes.audit.verdict import ArmDrives, change_of
 from nodes.experiment.plan.object_kinds import footprint_m, name_of
 from nodes.runtime.errors import ConfigError
 
@@ -74,7 +74,7 @@ class Before:
             "scale": round(then.size_m[1] / footprint_m(kind)[1], 9),
         }
 
-    def compare(self, now: Mapping[str, Drives], evidence: Evidence, limit_m: float) -> AuditComparison:
+    def compare(self, now: Mapping[str, ArmDrives], evidence: Evidence, limit_m: float) -> AuditComparison:
         """What changed, of the arm that got worst.
 
         Args:

@@ -19,7 +19,7 @@ from advnerf_core.driving.metrics import DriveMetrics
 from advnerf_core.fields.voxel_grid import inverse_squash
 from advnerf_core.geometry import Array
 from hardware.worlds.world import World
-from nodes.audit.verdict import Drives
+from nodes.audit.verdict import ArmDrives
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.drives import deployed_drives, learned_drives
 from nodes.experiment.show.learned_scene import HELD_OUT
@@ -104,7 +104,7 @@ def camera_effects(limit_m: float, seed: int) -> Disturbances:
 
 def learned(
     experiment: Experiment, victim: str, arm: Arm, disturbances: Disturbances | None = None
-) -> Drives:
+) -> ArmDrives:
     """Drives in the learned scene, as fast as searches see it, from the measured starts."""
     scenario = experiment.config.paths[0]
     policy = load_victim(experiment, victim)
@@ -118,7 +118,7 @@ def learned(
     return _drives(experiment, list(states), scores)
 
 
-def driven(experiment: Experiment, victim: str, arm: Arm, world: World) -> Drives:
+def driven(experiment: Experiment, victim: str, arm: Arm, world: World) -> ArmDrives:
     """Drives through an open world, by its own car, from the measured starts."""
     scenario = experiment.config.paths[0]
     policy = load_victim(experiment, victim).policy
@@ -131,14 +131,14 @@ def driven(experiment: Experiment, victim: str, arm: Arm, world: World) -> Drive
     return _drives(experiment, [each.states for each in found], [each.metrics for each in found])
 
 
-def _drives(experiment: Experiment, states: Sequence[Array], scores: Sequence[DriveMetrics]) -> Drives:
+def _drives(experiment: Experiment, states: Sequence[Array], scores: Sequence[DriveMetrics]) -> ArmDrives:
     ticks = experiment.config.horizon + 1
     whole = [np.asarray(each)[:, :3] for each in states]
     held = [
         np.concatenate([each, np.repeat(each[-1:], max(0, ticks - len(each)), axis=0)])[:ticks]
         for each in whole
     ]
-    return Drives(
+    return ArmDrives(
         states=np.stack(held),
         largest_m=np.array([score.max_cte_m for score in scores]),
         mean_m=np.array([score.mean_cte_m for score in scores]),

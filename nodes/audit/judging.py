@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from advnerf_core.attack.artifact import face_texture, load_attack
 from advnerf_core.geometry import Array, planar_poses
-from advnerf_core.report.audit_parts import DisturbedDrives, Evidence, JudgedDrives, JudgedStart, RoutePoint
+from advnerf_core.report.audit_parts import AuditedDrives, DisturbedDrives, Evidence, JudgedStart, RoutePoint
 from advnerf_core.report.audit_result import AuditControl, ControlKind
 from advnerf_core.report.clips import ClipTrack, write_clip
 from advnerf_core.scene.surrogate import Surrogate
@@ -32,7 +32,7 @@ from nodes.audit.drives import (
     learned,
     with_starts,
 )
-from nodes.audit.verdict import Control, Drives, Judgement, effect_of, judge
+from nodes.audit.verdict import ArmDrives, Control, EffectJudgement, effect_of, judge
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.images import as_uint8
 from nodes.experiment.show.learned_scene import load_background
@@ -68,8 +68,8 @@ class Judged:
 
     evidence: Evidence
     arms: Mapping[str, Arm]
-    drives: Mapping[str, Drives]
-    judgement: Judgement
+    drives: Mapping[str, ArmDrives]
+    judgement: EffectJudgement
     experiment: Experiment
     limit_m: float
 
@@ -95,11 +95,11 @@ class Judged:
         differences = self.drives[FOUND].largest_m - control.largest_m
         return int(np.argsort(differences, kind="stable")[len(differences) // 2])
 
-    def as_result(self) -> JudgedDrives:
+    def as_result(self) -> AuditedDrives:
         """The same as the audit's result has it."""
         found, control = self.drives[FOUND], self.drives[self.judgement.control]
         dt_s, limit_m, shown = self.experiment.config.dt_s, self.limit_m, self.shown_start
-        return JudgedDrives(
+        return AuditedDrives(
             evidence=self.evidence,
             measure="max_abs_cte",
             control=self.judgement.control,
@@ -179,7 +179,7 @@ def judge_found(
 
 def drive_arms(
     experiment: Experiment, victim: str, arms: Mapping[str, Arm], evidence: Evidence
-) -> dict[str, Drives]:
+) -> dict[str, ArmDrives]:
     """Drives past each of several things, from the measured starts."""
     with open_world(experiment, evidence) as world:
         return {

@@ -13,12 +13,12 @@ from advnerf_core.documents import read_json
 from advnerf_core.driving.metrics import Horizon, drive_metrics
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
-from advnerf_core.report.audit_parts import JudgedDrives
+from advnerf_core.report.audit_parts import AuditedDrives
 from advnerf_core.report.audit_result import AuditResult, read_audit
 from hardware.worlds.paths import ReferencePath
 from nodes.audit.drives import FOUND, FOUND_DISTURBED, PLAIN_DISTURBED
 from nodes.audit.judging import CONTROLS, Judged
-from nodes.audit.verdict import Control, Drives, effect_of, judge
+from nodes.audit.verdict import ArmDrives, Control, effect_of, judge
 from nodes.lab.worlds.expert_drive import as_path
 
 DRIVES, RESULT = "drives.json", "audit.json"
@@ -48,12 +48,12 @@ def _as_data(judged: Judged) -> dict[str, Any]:
     }
 
 
-def read_drives(folder: Path) -> dict[str, dict[str, Drives]]:
+def read_drives(folder: Path) -> dict[str, dict[str, ArmDrives]]:
     """The judged drives by evidence and name of what the car met, measured again."""
     return {evidence: _measured(data) for evidence, data in read_json(folder / DRIVES).items()}
 
 
-def _measured(data: Mapping[str, Any]) -> dict[str, Drives]:
+def _measured(data: Mapping[str, Any]) -> dict[str, ArmDrives]:
     path = as_path(ReferencePath.from_dict(data["path"]))
     horizon = Horizon(off_track_m=data["off_track_m"], **data["limits"])
     found = {}
@@ -63,7 +63,7 @@ def _measured(data: Mapping[str, Any]) -> dict[str, Drives]:
             drive_metrics(path, each[: 1 + driven], horizon)
             for each, driven in zip(states, ticks, strict=True)
         ]
-        found[name] = Drives(
+        found[name] = ArmDrives(
             states=states,
             largest_m=np.array([score.max_cte_m for score in scores]),
             mean_m=np.array([score.mean_cte_m for score in scores]),
@@ -89,10 +89,10 @@ def check_audit(folder: Path) -> list[str]:
     return [_check(folder, result, each, drives[each.evidence]) for each in result.strongest.judgements]
 
 
-def _check(folder: Path, result: AuditResult, said: JudgedDrives, drives: Mapping[str, Drives]) -> str:
+def _check(folder: Path, result: AuditResult, said: AuditedDrives, drives: Mapping[str, ArmDrives]) -> str:
     limit_m = result.place.off_track_m
     assert limit_m is not None, "an object is judged where the scale is known"
-    controls: dict[Control, Drives] = {name: drives[name] for name in CONTROLS}
+    controls: dict[Control, ArmDrives] = {name: drives[name] for name in CONTROLS}
     found = judge(drives[FOUND], controls, limit_m)
     _same(folder, f"{said.evidence}: control", said.control, found.control)
     for name in ("mean_m", "low_m", "high_m"):

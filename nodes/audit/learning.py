@@ -15,7 +15,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.geometry import Array
 from advnerf_core.report.audit_result import AuditFidelity
 from nodes.audit.drives import pictures_along
-from nodes.audit.question import HALF, OTHER_HALF, VICTIM, Question, half_overrides
+from nodes.audit.question import HALF, OTHER_HALF, VICTIM, AuditedQuestion, half_overrides
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.images import as_uint8
 from nodes.experiment.show.learned_scene import FIDELITY
@@ -49,10 +49,10 @@ class Copies:
     file: Path
     searched: Path
     judged: Path
-    question: Question
+    question: AuditedQuestion
 
     @classmethod
-    def of(cls, file: Path, question: Question) -> Copies:
+    def of(cls, file: Path, question: AuditedQuestion) -> Copies:
         """The copies of a place in the folder of the experiment file."""
         names = ("place", "place") if question.place.is_driven else (HALF, OTHER_HALF)
         return cls(file, file.parent / names[0], file.parent / names[1], question)

@@ -19,7 +19,7 @@ from advnerf_core.report.audit_parts import (
     AuditedPolicy,
     AuditedVehicle,
     JudgedObject,
-    ObjectPose,
+    PlacedPose,
 )
 from advnerf_core.report.audit_result import (
     AuditBudget,
@@ -39,9 +39,9 @@ from nodes.audit.drives import PICTURE
 from nodes.audit.judging import Judged, film, texture_of
 from nodes.audit.kept import RESULT, keep_drives
 from nodes.audit.page import write_page
-from nodes.audit.question import JUDGING_SEED, SELECTION_SEED, Question, question_of
+from nodes.audit.question import JUDGING_SEED, SELECTION_SEED, AuditedQuestion, question_of
 from nodes.audit.schedule import NEVER_TRIED
-from nodes.audit.searching import Found, Searches
+from nodes.audit.searching import FoundAttack, Searches
 from nodes.audit.spots import Spot
 from nodes.experiment.plan.object_kinds import footprint_m, name_of
 from nodes.experiment.show.context import Experiment
@@ -59,14 +59,14 @@ _LIBRARIES = ("torch", "numpy", "numba", "opencv-contrib-python-headless")
 class Known:
     """All that is known so far; what is None or empty was not reached."""
 
-    question: Question
+    question: AuditedQuestion
     minutes: float
     file: Path | None = None
     experiment: Experiment | None = None
     fidelity: AuditFidelity | None = None
     spots: Sequence[Spot] = ()
     searches: Searches | None = None
-    best: Found | None = None
+    best: FoundAttack | None = None
     judged: list[Judged] = field(default_factory=list)
     planted: PlantedControl | None = None
     against: AuditComparison | None = None
@@ -215,7 +215,7 @@ def _strongest(known: Known, folder: Path) -> JudgedObject | None:
             name=placed.name,
             kind=name_of(placed.kind),
             size_m=(length, width, width),
-            pose=ObjectPose(x_m=placed.x_m, y_m=placed.y_m, z_m=placed.z_m, yaw_rad=placed.yaw_rad),
+            pose=PlacedPose(x_m=placed.x_m, y_m=placed.y_m, z_m=placed.z_m, yaw_rad=placed.yaw_rad),
             texture=None if texture is None else TEXTURE,
             texture_sha256=None if texture is None else sha256_of(folder / TEXTURE),
         ),

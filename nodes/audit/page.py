@@ -23,7 +23,7 @@ from advnerf_core.report.conditions import style_of
 from advnerf_core.report.palette import LIGHT, look_css
 from advnerf_core.report.text_table import Table, number
 from nodes.audit.judging import CONDITIONS, FOUND, NO_OBJECT, PLAIN_OBJECT, TITLES
-from nodes.audit.verdict import Drives, effect_of
+from nodes.audit.verdict import ArmDrives, effect_of
 
 PAGE = "audit.html"
 _OUTCOMES = {
@@ -40,7 +40,7 @@ _QUALITY = 85
 def write_page(
     folder: FilePath,
     result: AuditResult,
-    drives: Mapping[Evidence, Mapping[str, Drives]],
+    drives: Mapping[Evidence, Mapping[str, ArmDrives]],
     path: Path | None,
     film: FilePath | None,
     pictures: Sequence[tuple[FilePath, str]],
@@ -80,7 +80,9 @@ def write_page(
     return folder / PAGE
 
 
-def _judged(result: AuditResult, drives: Mapping[Evidence, Mapping[str, Drives]]) -> Mapping[str, Drives]:
+def _judged(
+    result: AuditResult, drives: Mapping[Evidence, Mapping[str, ArmDrives]]
+) -> Mapping[str, ArmDrives]:
     """The drives that the verdict rests on, or the last there are."""
     evidence = result.verdict.evidence
     if evidence is not None and evidence in drives:
@@ -88,7 +90,7 @@ def _judged(result: AuditResult, drives: Mapping[Evidence, Mapping[str, Drives]]
     return next(reversed(list(drives.values())), {})
 
 
-def _above(result: AuditResult, judged: Mapping[str, Drives], path: Path) -> Markup:
+def _above(result: AuditResult, judged: Mapping[str, ArmDrives], path: Path) -> Markup:
     """All drives from above, with the lane and the object."""
     limit_m = result.place.off_track_m or 0.0
     with plots.new_axes(5.4, 4.6) as ax:
@@ -125,7 +127,7 @@ def _draw_object(ax: Any, placed: AuditedObject) -> np.ndarray:
     return there
 
 
-def _arms(result: AuditResult, drives: Mapping[Evidence, Mapping[str, Drives]]) -> Table:
+def _arms(result: AuditResult, drives: Mapping[Evidence, Mapping[str, ArmDrives]]) -> Table:
     limit_m, rows = result.place.off_track_m or 0.0, []
     for evidence, judged in drives.items():
         for name, each in judged.items():

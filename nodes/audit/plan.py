@@ -11,7 +11,7 @@ from pydantic import Field
 from advnerf_core.documents import Document, read_json
 from advnerf_core.files import write_json
 from advnerf_core.strict import StrictModel, validate
-from nodes.audit.question import Question, experiment_data, setting_of, write_experiment
+from nodes.audit.question import AuditedQuestion, experiment_data, setting_of, write_experiment
 from nodes.audit.spots import Spot
 from nodes.experiment.engine.artefact import hash_of
 from nodes.experiment.plan.placed import PlacedObject
@@ -37,7 +37,7 @@ class Decided(StrictModel):
 
 
 @dataclass
-class Plan:
+class AuditPlan:
     """The decisions of one audit.
 
     Attributes:
@@ -47,11 +47,11 @@ class Plan:
     """
 
     folder: Path
-    question: Question
+    question: AuditedQuestion
     decided: Decided
 
     @classmethod
-    def of(cls, folder: Path, question: Question) -> Plan:
+    def of(cls, folder: Path, question: AuditedQuestion) -> AuditPlan:
         """The decisions in a folder, or none.
 
         Raises:

@@ -27,7 +27,7 @@ _USUAL = {"colour_space": "RGB", "value_max": 1.0, "output_unit": "normalised", 
 
 
 @dataclass(frozen=True)
-class GivenPolicy:
+class NamedPolicy:
     """The policy as the user named it, and what is known where it will drive.
 
     Attributes:

@@ -61,7 +61,7 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Question:
+class AuditedQuestion:
     """What is asked.
 
     Attributes:
@@ -91,7 +91,7 @@ class Question:
     sections: Mapping[str, Any] = field(default_factory=dict)
 
 
-def experiment_data(question: Question) -> dict[str, Any]:
+def experiment_data(question: AuditedQuestion) -> dict[str, Any]:
     """The experiment without an object, as its file has it."""
     place = question.place
     own = {} if place.is_driven else _of_photographs(question)
@@ -113,7 +113,7 @@ def experiment_data(question: Question) -> dict[str, Any]:
     return _merged(_merged(data, own), question.sections)
 
 
-def _of_photographs(question: Question) -> dict[str, Any]:
+def _of_photographs(question: AuditedQuestion) -> dict[str, Any]:
     assert question.limit_m is not None, "photographs declare no lane"
     return {
         "held_cap_m": 4.0 * question.limit_m,
@@ -133,7 +133,9 @@ def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any
     return merged
 
 
-def write_experiment(folder: Path, question: Question, settings: Mapping[str, Mapping[str, Any]]) -> Path:
+def write_experiment(
+    folder: Path, question: AuditedQuestion, settings: Mapping[str, Mapping[str, Any]]
+) -> Path:
     """Write the experiment file: the place, the victim, and one setting for each search; it can be run again by ``advnerf experiment``."""
     text = dump_yaml(
         {**experiment_data(question), "settings": {"place": {}, **_of_halves(question), **settings}},
@@ -146,7 +148,7 @@ def write_experiment(folder: Path, question: Question, settings: Mapping[str, Ma
     return file
 
 
-def _of_halves(question: Question) -> dict[str, Any]:
+def _of_halves(question: AuditedQuestion) -> dict[str, Any]:
     """Settings that learn a place of photographs from one half of them."""
     if question.place.is_driven:
         return {}
@@ -156,7 +158,9 @@ def _of_halves(question: Question) -> dict[str, Any]:
     }
 
 
-def setting_of(question: Question, objects: Sequence[Mapping[str, Any]], **sections: Any) -> dict[str, Any]:
+def setting_of(
+    question: AuditedQuestion, objects: Sequence[Mapping[str, Any]], **sections: Any
+) -> dict[str, Any]:
     """A setting of the experiment file with an object; where the world has panels of its own it stands in them, in their light."""
     carrier = (
         {"carrier": {"kind": "native"}} if question.place.shows_panels and question.kind == PANEL else {}
@@ -164,7 +168,7 @@ def setting_of(question: Question, objects: Sequence[Mapping[str, Any]], **secti
     return {"objects": [dict(each) for each in objects], **carrier, **sections}
 
 
-def half_overrides(question: Question, setting: str) -> list[str]:
+def half_overrides(question: AuditedQuestion, setting: str) -> list[str]:
     """The texts that lay the setting of one half over another setting."""
     of_half = _of_halves(question).get(setting, {})
     return [

@@ -30,7 +30,7 @@ from nodes.audit.hardening import export_frames
 from nodes.audit.judging import drive_arms, judge_found, seen_on
 from nodes.audit.learning import Copies, fidelity_of
 from nodes.audit.outcome import AFTER, BEFORE, Known, result_of, write_result
-from nodes.audit.plan import Plan, as_listed
+from nodes.audit.plan import AuditPlan, as_listed
 from nodes.audit.planted import policy_code, strength, write_module
 from nodes.audit.question import (
     JUDGING_SEED,
@@ -38,9 +38,9 @@ from nodes.audit.question import (
     PLANTED,
     SELECTION_SEED,
     VICTIM,
-    Question,
+    AuditedQuestion,
 )
-from nodes.audit.searching import Found, Searches, SearchesElsewhere, seconds_of_evaluation
+from nodes.audit.searching import FoundAttack, Searches, SearchesElsewhere, seconds_of_evaluation
 from nodes.audit.spots import Spot, best_spots
 from nodes.experiment.plan.object_kinds import footprint_m
 from nodes.experiment.show.context import Experiment
@@ -70,7 +70,7 @@ class CannotJudgeError(AdvnerfError):
 
 
 @dataclass(frozen=True)
-class Options:
+class AuditOptions:
     """How an audit is run.
 
     Attributes:
@@ -102,9 +102,9 @@ class Audit:
         console: Where progress is shown.
     """
 
-    question: Question
+    question: AuditedQuestion
     folder: Path
-    options: Options
+    options: AuditOptions
     say: Say
     console: Console
     before: Before | None = field(default=None, init=False)
@@ -132,7 +132,7 @@ class Audit:
         return result
 
     def _run(self, known: Known) -> None:
-        plan = Plan.of(self.folder, self.question)
+        plan = AuditPlan.of(self.folder, self.question)
         copies = Copies.of(plan.save(), self.question)
         experiments = copies.learn(self.console)
         experiment = experiments[0]
@@ -185,7 +185,7 @@ class Audit:
                 "(advnerf policy check), the car, the speed and the path"
             )
 
-    def _spots(self, plan: Plan, experiment: Experiment) -> list[Spot]:
+    def _spots(self, plan: AuditPlan, experiment: Experiment) -> list[Spot]:
         """Where the object may stand, decided once."""
         if plan.spots is None:
             kind, width_m = self.question.kind, footprint_m(self.question.kind)[1]
@@ -202,7 +202,7 @@ class Audit:
         return spots
 
     def _searches(
-        self, copies: Copies, plan: Plan, spots: list[Spot], victim: str, limit_m: float
+        self, copies: Copies, plan: AuditPlan, spots: list[Spot], victim: str, limit_m: float
     ) -> Searches:
         declared = given(copies.experiment("place"))[VICTIM].declared
         if plan.decided.evaluations is None:
@@ -232,7 +232,7 @@ class Audit:
         write_image(self.folder / name, seen_on(experiment, arm_of(experiment, arm, found), poses, None)[0])
         self.say(f"picture of the object where it stands: {self.folder / name}")
 
-    def _judge(self, known: Known, copies: Copies, plan: Plan, best: Found) -> None:
+    def _judge(self, known: Known, copies: Copies, plan: AuditPlan, best: FoundAttack) -> None:
         """Judge in the other copy, or in the world, which comes last."""
         question = self.question
         starts = question.judging, JUDGING_SEED, known.limit_m
@@ -246,7 +246,7 @@ class Audit:
         if self.options.harden:
             self.say(f"frames past the object: {export_frames(known.judged[-1], self.folder / HARDEN)}")
 
-    def _compare(self, before: Before, copies: Copies, plan: Plan, limit_m: float) -> AuditComparison:
+    def _compare(self, before: Before, copies: Copies, plan: AuditPlan, limit_m: float) -> AuditComparison:
         """Drive past what an earlier audit found, from its starts."""
         plan.add(_BEFORE, [before.listed(self.question.kind)])
         starts, evidence = before.result.starts.judging, self.question.place.evidence
@@ -257,7 +257,7 @@ class Audit:
         }
         return before.compare(drive_arms(there, VICTIM, arms, evidence), evidence, limit_m)
 
-    def _plant(self, copies: Copies, plan: Plan, spots: list[Spot], limit_m: float) -> PlantedControl:
+    def _plant(self, copies: Copies, plan: AuditPlan, spots: list[Spot], limit_m: float) -> PlantedControl:
         """Look for a planted weakness with the same schedule, until it is found."""
         name, wanted = (
             "it also steers to the left for red, to the right for green",

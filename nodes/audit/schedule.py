@@ -53,7 +53,7 @@ NEVER_TRIED = {
 
 
 @dataclass(frozen=True)
-class Search:
+class PlannedSearch:
     """One search of a round.
 
     Attributes:
@@ -69,7 +69,7 @@ class Search:
     evaluations: int
 
 
-def planned(rounds: Sequence[Round], evaluations: int) -> list[list[Search]]:
+def planned(rounds: Sequence[Round], evaluations: int) -> list[list[PlannedSearch]]:
     """The searches of each round that a budget buys.
 
     Args:
@@ -79,9 +79,9 @@ def planned(rounds: Sequence[Round], evaluations: int) -> list[list[Search]]:
     return [list(_of_round(number, each, evaluations)) for number, each in enumerate(rounds)]
 
 
-def _of_round(number: int, wanted: Round, evaluations: int) -> Iterator[Search]:
+def _of_round(number: int, wanted: Round, evaluations: int) -> Iterator[PlannedSearch]:
     fewest = FEWEST.get(wanted.method, _FEWEST)
     each = int(wanted.share * evaluations / (wanted.spots * wanted.seeds * wanted.starts))
     for spot in range(wanted.spots):
         for seed in range(wanted.seeds):
-            yield Search(number, spot, 100 * number + seed, max(fewest, each))
+            yield PlannedSearch(number, spot, 100 * number + seed, max(fewest, each))

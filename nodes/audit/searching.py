@@ -14,9 +14,9 @@ from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
 from advnerf_core.documents import read_json
 from advnerf_core.driving.metrics import drive_metrics
 from nodes.audit.learning import Copies
-from nodes.audit.plan import Plan, as_listed
+from nodes.audit.plan import AuditPlan, as_listed
 from nodes.audit.question import VICTIM
-from nodes.audit.schedule import BLACK_BOX, LEARNING_RATE, WITH_GRADIENT, Round, Search, planned
+from nodes.audit.schedule import BLACK_BOX, LEARNING_RATE, WITH_GRADIENT, PlannedSearch, Round, planned
 from nodes.audit.spots import Spot
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import search_cell
@@ -31,7 +31,7 @@ Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Found:
+class FoundAttack:
     """A finished search.
 
     Attributes:
@@ -66,7 +66,7 @@ class Found:
 
 
 @dataclass(frozen=True)
-class Wanted:
+class SearchJob:
     """A search to run; plain data, so that it can go to another machine.
 
     Attributes:
@@ -89,7 +89,7 @@ class Wanted:
 class SearchesElsewhere(Protocol):
     """Other machines that run the searches of a round beside each other."""
 
-    def search(self, searches: Sequence[Wanted]) -> None:
+    def search(self, searches: Sequence[SearchJob]) -> None:
         """Run searches until all have left their results in their folders."""
 
 
@@ -110,14 +110,14 @@ class Searches:
     """
 
     copies: Copies
-    plan: Plan
+    plan: AuditPlan
     spots: Sequence[Spot]
     victim: str
     evaluations: int
     differentiable: bool
     limit_m: float
     elsewhere: SearchesElsewhere | None = None
-    found: list[Found] = field(default_factory=list)
+    found: list[FoundAttack] = field(default_factory=list)
 
     @property
     def rounds(self) -> tuple[Round, ...]:
@@ -125,17 +125,17 @@ class Searches:
         return WITH_GRADIENT if self.differentiable else BLACK_BOX
 
     @property
-    def planned(self) -> list[list[Search]]:
+    def planned(self) -> list[list[PlannedSearch]]:
         """The searches of each round; fewer where there are fewer spots."""
         rounds = planned(self.rounds, self.evaluations)
         return [[each for each in row if each.spot < len(self.spots)] for row in rounds]
 
     @property
-    def best(self) -> Found | None:
+    def best(self) -> FoundAttack | None:
         """What moves the policy most on the selection starts."""
         return max(self.found, key=lambda each: each.rank, default=None)
 
-    def run(self, say: Say, enough: Callable[[Found], bool] = lambda found: False) -> None:
+    def run(self, say: Say, enough: Callable[[FoundAttack], bool] = lambda found: False) -> None:
         """Search until the schedule ends, or what was found is enough."""
         for wanted, row in zip(self.rounds, self.planned, strict=True):
             spots = self._spots(wanted.spots)
@@ -159,11 +159,11 @@ class Searches:
         ranked = sorted(best, key=lambda spot: best[spot], reverse=True)
         return [*ranked, *(spot for spot in range(len(self.spots)) if spot not in best)][:count]
 
-    def _search(self, wanted: Round, search: Search, spot: int) -> Found:
+    def _search(self, wanted: Round, search: PlannedSearch, spot: int) -> FoundAttack:
         described = self._wanted(wanted, search, spot)
         experiment, folder = self.copies.experiment(described.setting), Path(described.folder)
         clean = search_cell(experiment, described.cell, folder, lambda *told: None)
-        return Found(
+        return FoundAttack(
             described.setting,
             folder,
             spot,
@@ -173,7 +173,7 @@ class Searches:
             *_effect(experiment, folder, clean, self.limit_m),
         )
 
-    def _wanted(self, wanted: Round, search: Search, spot: int) -> Wanted:
+    def _wanted(self, wanted: Round, search: PlannedSearch, spot: int) -> SearchJob:
         """The search, whose setting is in the experiment file and whose object is built."""
         setting = self._setting(wanted, search)
         self.plan.add(
@@ -187,7 +187,7 @@ class Searches:
             over={"method": [wanted.method], "seed": [search.seed]},
         )
         experiment = self.copies.ready(setting)
-        return Wanted(
+        return SearchJob(
             str(self.copies.file),
             setting,
             tuple(self.copies.overrides(judged=False)),
@@ -196,7 +196,7 @@ class Searches:
             str(self.copies.file.parent / SEARCHES / setting),
         )
 
-    def _setting(self, wanted: Round, search: Search) -> str:
+    def _setting(self, wanted: Round, search: PlannedSearch) -> str:
         victim = "" if self.victim == VICTIM else f"{self.victim}-"
         return f"{victim}{search.round_ + 1}-{wanted.method.replace('_', '-')}-{search.spot + 1}"
 

@@ -24,7 +24,7 @@ Control = Literal["no_object", "plain_object"]
 
 
 @dataclass(frozen=True, eq=False)
-class Drives:
+class ArmDrives:
     """Drives from the same starts.
 
     Attributes:
@@ -47,7 +47,7 @@ class Drives:
 
 
 @dataclass(frozen=True)
-class Judgement:
+class EffectJudgement:
     """What the object does.
 
     Attributes:
@@ -70,13 +70,13 @@ class Judgement:
         return self.p <= 1.0 - LEVEL
 
 
-def judge(attacked: Drives, controls: Mapping[Control, Drives], limit_m: float) -> Judgement:
+def judge(attacked: ArmDrives, controls: Mapping[Control, ArmDrives], limit_m: float) -> EffectJudgement:
     """Judge an object by its drives and those of the controls from the same starts."""
     effects = {name: effect_of(attacked, drives) for name, drives in controls.items()}
     control = min(effects, key=lambda name: effects[name].mean_m)
     by_object = attacked.left(limit_m)
     by_control = {name: each.left(limit_m) for name, each in controls.items()}
-    return Judgement(
+    return EffectJudgement(
         control,
         effects[control],
         {"object": int(by_object.sum()), **{name: int(each.sum()) for name, each in by_control.items()}},
@@ -85,7 +85,7 @@ def judge(attacked: Drives, controls: Mapping[Control, Drives], limit_m: float) 
     )
 
 
-def effect_of(attacked: Drives, control: Drives) -> AuditEffect:
+def effect_of(attacked: ArmDrives, control: ArmDrives) -> AuditEffect:
     """How much larger the largest |CTE| is, in the mean over the starts, with its 95 % interval [m]."""
     return _effect(attacked.largest_m - control.largest_m)
 
@@ -105,7 +105,7 @@ def paired_p(one: NDArray[np.bool_], other: NDArray[np.bool_]) -> float:
     return float(binomtest(only_one, only_one + only_other, 0.5, alternative="greater").pvalue)
 
 
-def change_of(now: Drives, then: Drives, of_several: int = 1) -> AuditEffect:
+def change_of(now: ArmDrives, then: ArmDrives, of_several: int = 1) -> AuditEffect:
     """How much the largest |CTE| grew since then, in the mean over the same starts [m].
 
     Args:

@@ -18,8 +18,8 @@ from nodes.runtime.terminal import Overrides, say_error
 
 if TYPE_CHECKING:
     from nodes.audit.cluster import Cluster
-    from nodes.audit.question import Question
-    from nodes.audit.run import Options
+    from nodes.audit.question import AuditedQuestion
+    from nodes.audit.run import AuditOptions
 
 # Codes below are verdicts: see `advnerf_core.report.audit_result.EXIT_CODES`.
 USAGE_EXIT, FAULT_EXIT, INTERRUPTED_EXIT, CANNOT_JUDGE_EXIT = 64, 70, 130, 2
@@ -278,14 +278,14 @@ def _question(
     search: SearchOptions,
     result: ResultOptions,
     overrides: list[str],
-) -> tuple[Question, Options]:
+) -> tuple[AuditedQuestion, AuditOptions]:
     from nodes.audit.asking import answer
     from nodes.audit.cars import car_of
     from nodes.audit.images import posed
     from nodes.audit.places import Answers, camera_of, describe, place_of_photographs, place_of_world
-    from nodes.audit.policies import GivenPolicy
-    from nodes.audit.question import CI_SECTIONS, Question
-    from nodes.audit.run import CI_EVALUATIONS, Options
+    from nodes.audit.policies import NamedPolicy
+    from nodes.audit.question import CI_SECTIONS, AuditedQuestion
+    from nodes.audit.run import CI_EVALUATIONS, AuditOptions
 
     if search.kind != "panel" and not Path(search.kind).is_file():
         raise _wrong(
@@ -299,7 +299,7 @@ def _question(
         )
         car, there = car_of(named), posed(place.place, folder, metric)
         camera = camera_of(there, place.path)
-        spec, wanted = GivenPolicy(policy, camera, car.car.max_steering_rad, declared, folder, _say).resolve()
+        spec, wanted = NamedPolicy(policy, camera, car.car.max_steering_rad, declared, folder, _say).resolve()
         where, limit_m = place_of_photographs(place.place, there, answers, car, wanted)
     else:
         assert place.world is not None, "one of the two is given"
@@ -307,8 +307,8 @@ def _question(
         described = describe(where)
         seen = None if described is None else described.camera
         largest = None if described is None else described.car.largest_control
-        spec, _ = GivenPolicy(policy, seen, largest, declared, folder, _say).resolve()
-    question = Question(
+        spec, _ = NamedPolicy(policy, seen, largest, declared, folder, _say).resolve()
+    question = AuditedQuestion(
         policy=spec,
         given=policy,
         place=where,
@@ -320,7 +320,7 @@ def _question(
         sections=CI_SECTIONS if result.ci else {},
     )
     evaluations = search.evaluations or (CI_EVALUATIONS if result.ci else None)
-    return question, Options(
+    return question, AuditOptions(
         _minutes(search.budget),
         evaluations,
         result.against,

@@ -16,9 +16,9 @@ from typing import Any
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
 from advnerf_core.report.audit_parts import (
+    AuditedDrives,
     AuditedObject,
     AuditedVehicle,
-    JudgedDrives,
     JudgedStart,
     RoutePoint,
 )
@@ -125,7 +125,7 @@ def _misc_object(placed: AuditedObject) -> Any:
     return element
 
 
-def _storyboard(vehicle: AuditedVehicle, placed: AuditedObject, drives: JudgedDrives) -> Any:
+def _storyboard(vehicle: AuditedVehicle, placed: AuditedObject, drives: AuditedDrives) -> Any:
     from scenariogeneration import xosc
 
     pose, init = placed.pose, xosc.Init()
@@ -145,7 +145,7 @@ def _storyboard(vehicle: AuditedVehicle, placed: AuditedObject, drives: JudgedDr
     return storyboard
 
 
-def _start(drives: JudgedDrives) -> Any:
+def _start(drives: AuditedDrives) -> Any:
     """Position of the vehicle at the beginning: of the stored drive, else of the path, else the first judging start."""
     from scenariogeneration import xosc
 

@@ -12,7 +12,7 @@ from advnerf_core.documents import Document, Key, read_yaml
 from nodes.experiment.plan.over import (
     COORDINATES,
     OVER,
-    Change,
+    AxisChange,
     coordinates_in,
     variants_in,
     with_dotted_axes,
@@ -111,7 +111,7 @@ def _on_its_base(file: Path, above: Sequence[Path]) -> tuple[Document, Any]:
     return Document(under.data, document.source, under.places), name
 
 
-def _variant(file: Path, read: _Read, changes: Sequence[Change], overrides: Sequence[str]) -> Document:
+def _variant(file: Path, read: _Read, changes: Sequence[AxisChange], overrides: Sequence[str]) -> Document:
     """The values of one variant: those of the experiment, or of the variant's own base, with its changes and the overrides."""
     values = {change.key: change.value for change in changes}
     base, setting = values.pop("base", None), values.pop("setting", None)
@@ -131,7 +131,7 @@ def _variant(file: Path, read: _Read, changes: Sequence[Change], overrides: Sequ
     return made
 
 
-def _change(made: Document, change: Change, document: Document) -> None:
+def _change(made: Document, change: AxisChange, document: Document) -> None:
     """Lay one change of a variant over its values."""
     steps, value = tuple(change.key.split(".")), copy.deepcopy(change.value)
     places = {

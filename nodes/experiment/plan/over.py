@@ -70,7 +70,7 @@ COORDINATES = tuple(name for name in OverConfig.model_fields if name != VARIANT)
 
 
 @dataclass(frozen=True)
-class Change:
+class AxisChange:
     """What a variant changes.
 
     Attributes:
@@ -103,7 +103,7 @@ def _leaves(values: Mapping[str, Any], above: tuple[str, ...]) -> Iterator[tuple
             yield (*above, str(name)), value
 
 
-def variants_in(over: Any) -> dict[str, list[Change]]:
+def variants_in(over: Any) -> dict[str, list[AxisChange]]:
     """The variants of a section ``over`` by name, each with its changes: the product of its named variants and its axes.
 
     Args:
@@ -122,7 +122,7 @@ def variants_in(over: Any) -> dict[str, list[Change]]:
         factors.insert(0, [(name, _changes(name, changes)) for name, changes in named.items()])
     if (count := math.prod(map(len, factors))) > _MOST_VARIANTS:
         raise ValueError(f"expected at most {_MOST_VARIANTS} variants, got {count}; make several files")
-    found: dict[str, list[Change]] = {}
+    found: dict[str, list[AxisChange]] = {}
     for combined in itertools.product(*factors) if factors else ():
         name = "_".join(str(each) for each, _ in combined)
         if name in found:
@@ -138,21 +138,21 @@ def coordinates_in(over: Any) -> dict[str, Any]:
     return {name: over[name] for name in COORDINATES if name in over} if isinstance(over, dict) else {}
 
 
-def _changes(name: str, changes: Any) -> list[Change]:
+def _changes(name: str, changes: Any) -> list[AxisChange]:
     """What a named variant changes."""
     items = changes.items() if isinstance(changes, dict) else ()
-    return [Change(str(key), value, (OVER, VARIANT, name, key)) for key, value in items]
+    return [AxisChange(str(key), value, (OVER, VARIANT, name, key)) for key, value in items]
 
 
 def _is_axis(key: str, values: Any) -> bool:
     return isinstance(values, list) and key != VARIANT and key not in COORDINATES
 
 
-def _values(key: str, values: list[Any]) -> list[tuple[str, list[Change]]]:
+def _values(key: str, values: list[Any]) -> list[tuple[str, list[AxisChange]]]:
     """What the values of an axis are called in the names of variants, and what each changes."""
     last = key.rpartition(".")[2]
     return [
-        (f"{last}-{_slug(value, at)}", [Change(key, value, (OVER, key, at))])
+        (f"{last}-{_slug(value, at)}", [AxisChange(key, value, (OVER, key, at))])
         for at, value in enumerate(values)
     ]
 

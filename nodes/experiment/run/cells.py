@@ -24,7 +24,7 @@ from nodes.experiment.steps.films import film_cell, kept_film, with_film
 from nodes.experiment.steps.frozen import check_frozen, freeze
 from nodes.experiment.steps.keys import (
     NEEDED,
-    CellError,
+    NoSuchCellError,
     clean_folder,
     require_known,
 )
@@ -148,7 +148,7 @@ def draw_maps(experiment: Experiment, cell: Cell, number: int, folder: Path, rep
         return []
     count = len(experiment.objects)
     if not 0 <= number < count:
-        raise CellError(f"expected an object of 0 to {count - 1}, got {number}")
+        raise NoSuchCellError(f"expected an object of 0 to {count - 1}, got {number}")
     attack = load_attack(folder / ATTACK)
     assert attack.space == PLACES, "the file was written by a cell of this experiment"
     return pose_maps.draw_maps(experiment, cell, attack, number, folder, report)

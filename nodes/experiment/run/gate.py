@@ -20,7 +20,7 @@ from nodes.lab.policy_data.evaluate import predict
 
 
 @dataclass(frozen=True)
-class CleanDrive:
+class GateDrive:
     """What predictions of all attacks on one drive share.
 
     Attributes:
@@ -98,8 +98,8 @@ def predict_cell(
     cell: Cell,
     folder: Path,
     draws: int = DEFAULT_DRAWS,
-    clean: CleanDrive | None = None,
-) -> tuple[TransferPrediction, CleanDrive]:
+    clean: GateDrive | None = None,
+) -> tuple[TransferPrediction, GateDrive]:
     """Predict the deployed drives of a cell whose search is finished, from pictures and the surrogate alone.
 
     Args:
@@ -120,4 +120,4 @@ def predict_cell(
     problem, images, starts, horizon = fidelity.loop(experiment, cell, folder, at)
     none_m = clean.none_m if clean else None
     found = predict_transfer(problem, images, without, effect, starts, horizon, draws, cell.seed, none_m)
-    return found, CleanDrive(without, found.none_m)
+    return found, GateDrive(without, found.none_m)

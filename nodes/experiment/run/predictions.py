@@ -19,7 +19,7 @@ from nodes.experiment.run.store import Store
 from nodes.experiment.show.context import Experiment
 
 if TYPE_CHECKING:
-    from nodes.experiment.run.gate import CleanDrive
+    from nodes.experiment.run.gate import GateDrive
 
 _KEYS = {"excess_m", "excess_low_m", "excess_high_m", "retained", "clean_drive"}
 
@@ -42,7 +42,7 @@ def predict_cells(
 
     draws = DEFAULT_DRAWS if draws is None else draws
     store, made = Store(experiment.folder), 0
-    clean: dict[tuple[str, str, int], CleanDrive] = {}
+    clean: dict[tuple[str, str, int], GateDrive] = {}
     for cell in cells:
         if not cell.searched:
             continue

@@ -45,7 +45,7 @@ FREE: Mapping[str, Any] = {
 _SEARCHED_WITH = {"evaluations", "horizon", "learning_rate", "population", "time_batch", "robustness"}
 
 
-class CellError(RuntimeFault):
+class NoSuchCellError(RuntimeFault):
     """A cell was asked for that this experiment does not have."""
 
 
@@ -141,20 +141,20 @@ def require_known(experiment: Experiment, cell: Cell) -> None:
     )
     for what, value, choices in known:
         if value not in choices:
-            raise CellError(f"expected a {what} of {', '.join(choices)}, got {value!r}")
+            raise NoSuchCellError(f"expected a {what} of {', '.join(choices)}, got {value!r}")
     if cell.method == EMPTY and has_face(experiment):
-        raise CellError(
+        raise NoSuchCellError(
             "expected the control empty only where objects are attacked; a panel of the room was photographed with its scene"
         )
     if cell.searched:
         if not experiment.config.objects and not has_face(experiment):
-            raise CellError(
+            raise NoSuchCellError(
                 "expected objects, whose colours or places are searched, got none; list some in the section objects"
             )
         try:
             require_method(cell.code)
         except PluginError as error:
-            raise CellError(str(error)) from None
+            raise NoSuchCellError(str(error)) from None
     _require_gradient(experiment, cell)
 
 
@@ -164,7 +164,7 @@ def _require_gradient(experiment: Experiment, cell: Cell) -> None:
     if method is None or not method.needs_gradient or cell.victim not in given_in(experiment.config):
         return
     if not given(experiment)[cell.victim].declared.differentiable:
-        raise CellError(
+        raise NoSuchCellError(
             f"expected methods that need no gradient against victim {cell.victim}, which declares that it has none, got {cell.method}; set "
             f"over.method to some of {', '.join(black_box_methods())}"
         )

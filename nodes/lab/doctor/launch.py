@@ -24,7 +24,7 @@ from nodes.lab.doctor.recording import ImageFormat, bytes_per_s
 from nodes.launching.launch_check import check_nodes
 from nodes.launching.launch_file import Plan
 from nodes.launching.launch_hosts import GATEWAY
-from nodes.monitor import MonitorConfig, ScreenConfig
+from nodes.monitor import MonitorConfig, MonitorOutputConfig
 from nodes.motor import MotorConfig
 from nodes.policy import PolicyNodeConfig
 from nodes.recorder import RecorderConfig
@@ -268,7 +268,7 @@ def _attack(asked: _Asked) -> list[DoctorCheck]:
 
 def _monitor(asked: _Asked) -> list[DoctorCheck]:
     config = asked.config(MonitorConfig)
-    if not isinstance(config.display, ScreenConfig):
+    if not isinstance(config.display, MonitorOutputConfig):
         return (
             []
             if asked.on_twin

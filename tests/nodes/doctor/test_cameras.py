@@ -115,9 +115,9 @@ def test_screens_come_from_a_process_of_their_own(monkeypatch):
     (row,) = graphics.screens()
     assert (row.state, "no window system" in row.found) == (ABSENT, True)
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    from nodes.monitor import ScreenConfig
+    from nodes.monitor import MonitorOutputConfig
 
     assert graphics.screens()[0].state == OK
-    rows = graphics.screens(ScreenConfig(index=9, connector="HDMI-A-7"))
+    rows = graphics.screens(MonitorOutputConfig(index=9, connector="HDMI-A-7"))
     assert rows[1].found == "no screen with index 9"
-    assert "no monitor at HDMI-A-7" in graphics.screens(ScreenConfig(connector="HDMI-A-7"))[1].found
+    assert "no monitor at HDMI-A-7" in graphics.screens(MonitorOutputConfig(connector="HDMI-A-7"))[1].found

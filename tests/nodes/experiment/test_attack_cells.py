@@ -35,7 +35,7 @@ from nodes.experiment.steps import attack, frozen, run
 from nodes.experiment.steps.attack import load_shown, surrogate_part
 from nodes.experiment.steps.deploy import DRIVES, ThroughWorld, cell_data
 from nodes.experiment.steps.films import film_cell
-from nodes.experiment.steps.keys import CellError, cell_settings, clean_folder, settings_hash
+from nodes.experiment.steps.keys import NoSuchCellError, cell_settings, clean_folder, settings_hash
 from nodes.experiment.steps.shared_search import search_key, take_search
 from nodes.runtime.errors import ConfigError
 from tests.support.strangers import spiral_code, spiral_theta, write_spiral
@@ -332,7 +332,7 @@ def test_a_cell_is_filmed_frame_by_frame(fresh: Experiment, wall: Any) -> None:
 
 def test_unknown_cells_are_refused(trained: Experiment, tmp_path: Path) -> None:
     for wrong in (("back", "hardened", "none"), ("left", "nobody", "none"), ("left", "hardened", "luck")):
-        with pytest.raises(CellError, match=r"expected an? (path|victim|attack method) of"):
+        with pytest.raises(NoSuchCellError, match=r"expected an? (path|victim|attack method) of"):
             run_cell(trained, Cell(*wrong, 0), tmp_path, silent)
     assert not list(tmp_path.iterdir())
 

@@ -34,7 +34,7 @@ from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps import attack, films, pose_maps, run
 from nodes.experiment.steps.attack import surrogate_part
 from nodes.experiment.steps.deploy import DRIVES, ThroughWorld, cell_data
-from nodes.experiment.steps.keys import CellError, settings_hash
+from nodes.experiment.steps.keys import NoSuchCellError, settings_hash
 from nodes.experiment.steps.pose_maps import PoseMapSettings
 from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError
@@ -202,7 +202,7 @@ def test_a_cell_depends_on_its_space_and_on_its_victim(trained: Experiment) -> N
         ("right", "retrained", "random", 0),
         ("right", "hardened", "luck", 0),
     ):
-        with pytest.raises(CellError, match="expected a"):
+        with pytest.raises(NoSuchCellError, match="expected a"):
             settings_hash(experiment, Cell(*wrong))
 
 
@@ -223,7 +223,7 @@ def test_a_cell_of_colours_depends_on_the_world_and_not_on_what_else_is_searched
         assert digest(free) == same
     needed = ("world.car.turn_rate_lag_s=0.2", "attack.evaluations=9", "held_cap_m=5", "policy.seed=1")
     assert len({same, digest(victim="naive"), *(digest(change) for change in needed)}) == 6
-    with pytest.raises(CellError, match="expected a victim of hardened, got 'naive'"):
+    with pytest.raises(NoSuchCellError, match="expected a victim of hardened, got 'naive'"):
         digest("policy.naive_steps=0", victim="naive")
 
 
@@ -307,7 +307,7 @@ def test_maps_are_of_what_the_cell_found(
     kept = pictures[0].with_suffix(".json").stat().st_mtime_ns
     cells.draw_maps(*asked, 1, tmp_path, silent)
     assert pictures[0].with_suffix(".json").stat().st_mtime_ns == kept
-    with pytest.raises(CellError, match="expected an object of 0 to 4, got 5"):
+    with pytest.raises(NoSuchCellError, match="expected an object of 0 to 4, got 5"):
         cells.draw_maps(*asked, 5, tmp_path, silent)
     assert cells.draw_maps(experiment, PLACES.clean, 1, tmp_path, silent) == []
 
