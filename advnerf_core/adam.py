@@ -1,4 +1,4 @@
-"""Adam as torch computes it, without torch's class: making one of those imports torch's compiler, two seconds of every new process."""
+"""Adam with torch's results but without torch's class, whose first instance imports torch's compiler, two seconds of every new process."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ import torch
 from torch import Tensor
 from torch.optim.adam import adam
 
-_BETA_1, _BETA_2, _EPSILON = 0.9, 0.999, 1e-8  # Kingma and Ba 2015, and torch's own
+_BETA_1, _BETA_2, _EPSILON = 0.9, 0.999, 1e-8  # Kingma and Ba 2015, as in torch
 
 
 class Adam:
-    """Parameters that move against gradients.
+    """Parameters with their moments of Adam.
 
     Args:
-        parameters: By name; each step changes them in place.
-        moments: Those of each parameter that `moments` gave, by its name and then by torch's, to go on from; copied. A parameter
-            without them begins.
+        parameters: Parameters by name; each step changes them in place.
+        moments: Moments to resume from, as in the attribute, by the parameter's name and then by torch's name; copied. A parameter
+            without them starts fresh.
         weight_decay: Share of a parameter that a step of rate 1 takes away, apart from its gradient (Loshchilov and Hutter 2019).
-        fused: All parameters in one pass, with sums rounded a little differently; as ``fused`` of torch's classes.
+        fused: All parameters in one pass, with sums rounded a little differently, like ``fused`` of torch's classes.
 
     Attributes:
-        moments: ``step``, ``exp_avg`` and ``exp_avg_sq`` of each parameter, as they are.
+        moments: ``step``, ``exp_avg`` and ``exp_avg_sq`` of each parameter, not copied.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class Adam:
 
     @torch.no_grad()
     def step(self, learning_rate: float, gradients: Mapping[str, Tensor] | None = None) -> None:
-        """Move against gradients of the parameters' shapes and types; those in ``grad`` unless told, which are taken away."""
+        """Take a step against gradients of the parameters' shapes and types; by default against those in ``grad``, which are cleared."""
         if gradients is None:
             gradients = {name: each.grad for name, each in self._parameters.items() if each.grad is not None}
         moments = [self.moments[name] for name in gradients]

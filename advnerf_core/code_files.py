@@ -1,7 +1,7 @@
-"""Hashes of code that users bring: of its files, and of the versions of the packages that it imports.
+"""Hashes of users' code: of its files, and of the versions of the packages that it imports.
 
-Two rules. A plug-in ``file.py`` counts with the modules beside it that it imports, directly or through others. A module in a package
-counts with all Python files of that package; a module in no package with those of its folder.
+Two rules. The hash of a plug-in ``file.py`` includes the modules beside it that it imports, directly or through others. The hash of a module
+includes all Python files of its package; without a package, the files of its folder.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from pathlib import Path
 from advnerf_core.files import sha256_of
 
 _CACHE = "__pycache__"
-# This project's own code counts by the versions in keys, also where a plug-in lies beside it.
+# This project's own code counts by the versions in keys, even for a plug-in beside it.
 _OURS = {"advnerf_core", "calibration", "hardware", "nodes"}
 _LARGE_BYTES = 1 << 20
 
 
 def modules_beside(file: Path) -> list[Path]:
-    """Python files beside a file that it imports, directly or through others; of a package all its files. Sorted, without the file."""
+    """Python files beside a file that it imports, directly or through others; for a package all its files. Sorted, without the file."""
     found, waiting = {file}, [file]
     while waiting:
         for name in _imported(waiting.pop()) - _OURS:
@@ -43,7 +43,7 @@ def file_sha256(file: Path) -> str:
 
 
 def entry_point_sha256(entry: EntryPoint) -> str:
-    """Hash of what an entry point names: its package's name and version, and all files of the package."""
+    """Hash of an entry point's code: its package's name and version, and all files of the package."""
     named = f"{entry.dist.name} {entry.dist.version}" if entry.dist is not None else ""
     digest = hashlib.sha256(f"{entry.value} {named}".encode())
     for folder, files in _located(entry.module):
@@ -65,10 +65,10 @@ def module_sha256(module: str) -> str:
 
 
 def _located(module: str) -> Iterator[tuple[Path, list[Path]]]:
-    """Folders with code that belongs to a module, each with its files: of its package, or of its folder if it is in none."""
+    """Folders with a module's code, each with its files: of its package, or of its folder without a package."""
     try:
         spec = importlib.util.find_spec(module.partition(".")[0])
-    except ValueError:  # a module that was made by hand has none
+    except ValueError:  # a module that was created in memory has none
         spec = None
     if spec is None:
         return
@@ -80,7 +80,7 @@ def _located(module: str) -> Iterator[tuple[Path, list[Path]]]:
 
 
 def _flat_files(file: Path) -> list[Path]:
-    """Python files that belong to a module in no package: of its distribution where it is installed, else of its folder."""
+    """Python files of a module without a package: of its distribution if it is installed, else of its folder."""
     brought = _packages_by_module()
     packages = set(brought.get(file.stem, ())) if file.parent.name.endswith("-packages") else set()
     if not packages:
@@ -95,7 +95,7 @@ def _packages_by_module() -> Mapping[str, list[str]]:
 
 
 def _files_of_module(folder: Path, name: str) -> list[Path]:
-    """Python files of a module or package of this name in a folder; none if it is not there."""
+    """Python files of a module or package of this name in a folder; empty if it is not there."""
     package = [file for file in _files_below(folder / name) if file.suffix == ".py"]
     return [*package, file] if (file := folder / f"{name}.py").is_file() else package
 
@@ -120,16 +120,16 @@ def _add_files(digest: hashlib._Hash, folder: Path, files: Iterable[Path]) -> No
 
 @lru_cache(maxsize=256)
 def _known_sha256(file: Path, changed_ns: int, size: int) -> str:
-    del changed_ns, size  # with which the file would be another one
+    del changed_ns, size  # part of the cache's key
     return sha256_of(file)
 
 
 def _imported(file: Path) -> set[str]:
-    """Top-level names of the modules that a Python file imports anywhere; none of a file that Python cannot read."""
+    """Top-level names of the modules that a Python file imports; empty for a file that Python cannot parse."""
     try:
         tree = ast.parse(file.read_bytes())
     except (SyntaxError, ValueError):
-        return set()  # loading it says what is wrong
+        return set()  # loading it reports the error
     names = set[str]()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -140,7 +140,7 @@ def _imported(file: Path) -> set[str]:
 
 
 def _versions(names: Iterable[str]) -> set[str]:
-    """``package version`` of each installed package that brings one of these modules; a build's label, such as ``+cpu``, is left out."""
+    """``package version`` of each installed package that provides one of these modules; a build's label, such as ``+cpu``, is left out."""
     brought = _packages_by_module()
     packages = {package for name in names for package in brought.get(name, ())}
     return {f"{package} {version(package).partition('+')[0]}" for package in packages}

@@ -1,7 +1,7 @@
-"""What a camera sees of a colour that is shown on a monitor, and what to show so that it sees a given colour. Numpy only.
+"""Seen colours of a monitor's shown colours, and the inverse: colours to show for given seen ones. Numpy only.
 
 ``seen = (ambient + cos(angle)^falloff  M curve(shown)) ^ (1 / response)``: each channel of the monitor has its own monotone curve (its gamma), the
-camera mixes the channels' light by ``M``, the room reflects in the glass, the panel dims to the side, and the camera answers with its own
+camera mixes the channels' light by ``M``, the room reflects in the glass, the panel dims to the side, and the camera's response is a
 power. All colours are in 0..1. `advnerf_core.attack.spaces.displayed` is the same in torch, with gradients.
 """
 
@@ -22,7 +22,7 @@ _LEAST_DETERMINANT = 1e-3
 
 
 class DisplayModelError(AdvnerfError, ValueError):
-    """Numbers that are no display."""
+    """The numbers do not describe a display."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ class DisplayModel(PlainData):
 
     @classmethod
     def ideal(cls, levels: int = 2) -> DisplayModel:
-        """A monitor whose colours the camera sees as they are."""
+        """A monitor whose colours the camera sees unchanged."""
         return cls(np.tile(np.linspace(0.0, 1.0, levels), (3, 1)), np.eye(3), np.zeros(3))
 
     def light(self, shown: ArrayLike) -> Array:
@@ -89,25 +89,25 @@ class DisplayModel(PlainData):
         return np.stack([np.interp(colours[..., c], levels, self.curves[c]) for c in range(3)], axis=-1)
 
     def forward(self, shown: ArrayLike, cos_angle: ArrayLike = 1.0) -> Array:
-        """What the camera sees ``[..., 3]`` of shown colours ``[..., 3]``.
+        """Seen colours ``[..., 3]`` of shown colours ``[..., 3]``.
 
         Args:
-            shown: Colours in 0..1; beyond, they are clipped.
-            cos_angle: Cosine of the angle between the panel's normal and the way to the camera ``[...]``.
+            shown: Colours in 0..1; values outside are clipped.
+            cos_angle: Cosine of the angle between the panel's normal and the direction to the camera ``[...]``.
         """
         gain = np.asarray(cos_angle, np.float64)[..., None] ** self.falloff
         light = self.ambient + gain * (self.light(shown) @ self.mixing.T)
         return np.clip(np.maximum(light, DARKEST) ** (1.0 / self.response), 0.0, 1.0)
 
     def inverse(self, wanted: ArrayLike, cos_angle: ArrayLike = 1.0) -> tuple[Array, float]:
-        """What to show so that the camera sees wanted colours.
+        """Colours to show so that the camera sees wanted colours.
 
         Args:
             wanted: Colours ``[..., 3]`` in 0..1.
-            cos_angle: As in :meth:`forward`.
+            cos_angle: Cosine of the viewing angle ``[...]``, see :meth:`forward`.
 
         Returns:
-            Colours ``[..., 3]`` in 0..1, and the share of them that the monitor cannot make and that were clipped, channel by channel.
+            Colours ``[..., 3]`` in 0..1, and the share of them that the monitor cannot show and that were clipped, channel by channel.
         """
         target = np.clip(np.asarray(wanted, np.float64), 0.0, 1.0) ** self.response - self.ambient
         gain = np.asarray(cos_angle, np.float64)[..., None] ** self.falloff

@@ -26,7 +26,7 @@ Key = tuple[str | int, ...]
 
 _EVENTS: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _DEEPEST = 100
-# Aliases repeat what is written once. A file of 1 kB can stand for a billion values.
+# Aliases repeat content. A file of 1 kB can expand to a billion values.
 _MOST_REPEATED = 100_000
 _MOST_PROBLEMS = 20
 _TAG = "tag:yaml.org,2002:"
@@ -93,7 +93,7 @@ def read_text(path: Path) -> str:
     """Text of a UTF-8 file, without its byte order mark.
 
     Raises:
-        MissingFileError: There is no such file. It is also a `FileNotFoundError`.
+        MissingFileError: The file does not exist. It is also a `FileNotFoundError`.
         UnreadableFileError: The file cannot be opened. It is also an `OSError`.
         ConfigError: The file is not UTF-8.
     """

@@ -1,21 +1,21 @@
-"""The base of the exceptions that a user of advnerf is meant to see."""
+"""Base classes of the exceptions for users of advnerf."""
 
 from __future__ import annotations
 
 
 class AdvnerfError(Exception):
-    """Something a person can put right; the message says what was expected, what was found and what to do.
+    """An error that the user can correct; the message says what was expected, what was found and what to do.
 
     The command line prints it as one line, without a traceback. Anything else that escapes is a defect of ours.
     """
 
 
 class DeviceError(AdvnerfError, RuntimeError):
-    """A GPU was asked for, and there is none that can be used, or it cannot do what is asked."""
+    """A GPU was requested, but none is usable, or it does not support the request."""
 
 
 class ConfigError(AdvnerfError, ValueError):
-    """A file that a person wrote, or an override of it, is wrong."""
+    """A file that a user wrote, or an override of it, is wrong."""
 
 
 class MissingFileError(ConfigError, FileNotFoundError):
@@ -23,4 +23,4 @@ class MissingFileError(ConfigError, FileNotFoundError):
 
 
 class UnreadableFileError(ConfigError, OSError):
-    """A file exists, and cannot be read."""
+    """A file exists but cannot be read."""

@@ -1,4 +1,4 @@
-"""Writing files so that a reader, or a crash, never meets half of one, and that the same content is the same bytes."""
+"""Writes files so that readers, and crashes, never leave half of one, and the same content gives the same bytes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from advnerf_core.places import require_utf8
 
 
 def write_atomically(path: Path, data: str | bytes) -> None:
-    """Write a whole file or none: under another name first, synced, then renamed over ``path``."""
+    """Write a whole file or nothing: under a temporary name first, synced, then renamed over ``path``."""
     require_utf8(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(path.name + ".part")
@@ -28,7 +28,7 @@ def write_atomically(path: Path, data: str | bytes) -> None:
 
 
 def write_json(path: Path, data: Any) -> None:
-    """Write a JSON value that people read too, whole or not at all."""
+    """Write an indented JSON value, whole or not at all."""
     write_atomically(path, json.dumps(data, indent=1) + "\n")
 
 

@@ -1,6 +1,6 @@
-"""A file together with the files that it refers to, each read once: what is hashed is what is used.
+"""A file together with the files that it refers to, each read once, so that the hash matches the used content.
 
-An ONNX file may keep its weights in other files, a mesh its textures. Such files are named by strangers, so a name may lead out of the
+An ONNX file may store its weights in other files, a mesh its textures. Users do not control these names, so a name may lead out of the
 folder, or through a link. Both are refused. Content is read into memory once, so that no file can change between its hash and its use.
 """
 
@@ -19,14 +19,14 @@ _FLAGS = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # a named p
 
 
 class InputFileError(AdvnerfError, ValueError):
-    """A file refers to another one that is missing, or lies where it must not."""
+    """A file refers to another one that is missing, or is in a forbidden place."""
 
 
 class InputFiles:
-    """A file and what it refers to, as they were when each was first read.
+    """A file and the files that it refers to, with the content of their first reading.
 
     Args:
-        path: The file itself. If it is a link, the files that it refers to lie beside the link's target.
+        path: The file itself. If it is a link, the other files lie beside the link's target.
 
     Raises:
         OSError: The file cannot be read.
@@ -42,10 +42,10 @@ class InputFiles:
         """Content of a file that this one refers to.
 
         Args:
-            name: As it is written in the file: relative to the file's folder.
+            name: Name in the file, relative to the file's folder.
 
         Raises:
-            InputFileError: No regular file of this name below the folder, or a link on the way to it.
+            InputFileError: The folder has no regular file of this name, or a link leads to it.
         """
         written = PurePosixPath(name.strip().replace("\\", "/"))
         if written.is_absolute() or ".." in written.parts or not written.parts or "\0" in name:
@@ -64,14 +64,14 @@ class InputFiles:
 
     @property
     def others(self) -> Mapping[str, bytes]:
-        """What was read besides the file itself: content by name."""
+        """Content by name of the other files that were read."""
         return MappingProxyType(self._others)
 
     def sha256(self, declared: str = "") -> str:
-        """Hash of all content so far; of a file that refers to no other, the hash of its bytes.
+        """Hash of all content that was read; for a file without others, the hash of its bytes.
 
         Args:
-            declared: Text that belongs to the content, such as a declaration.
+            declared: Further text to hash, such as a declaration.
         """
         digest = hashlib.sha256(self.content + declared.encode())
         for name, content in sorted(self._others.items()):

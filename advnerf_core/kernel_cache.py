@@ -1,7 +1,7 @@
-"""Where compiled kernels are kept: a folder for each state of the kernels' sources.
+"""The folder of compiled kernels: a separate one for each state of the kernels' sources.
 
 Numba keeps a compiled kernel until its own file changes. A kernel that calls one of another file is not compiled again when that file
-changes, so it would go on computing with the old one. Here every change of any file with kernels gives all kernels a new folder.
+changes, so it would keep computing with the old one. Here a change of any file with kernels gives all kernels a new folder.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from advnerf_core.places import PlaceError, is_writable, use_writable_cache
 _PACKAGE = Path(__file__).parent
 _PREFIX = "advnerf-"
 _VARIABLE = "NUMBA_CACHE_DIR"
-_KEPT = 3  # folders of earlier sources that stay, as other checkouts may share the place
+_KEPT = 3  # folders of earlier sources that are kept, as other checkouts may share the place
 
 
 def use_own_folder(package: Path = _PACKAGE) -> Path:
-    """Tell numba, in this process and in those it starts, to keep compiled kernels in the folder of their present sources.
+    """Tell numba, in this process and in child processes, to store compiled kernels in the folder of their current sources.
 
     It lies below ``NUMBA_CACHE_DIR``, or in the package's ``__pycache__``, or in the user's cache where that cannot be written, or in a
     private temporary folder where that cannot either. Call it before a kernel is decorated.
@@ -62,7 +62,7 @@ def sources_digest(package: Path) -> str:
 
 def _base(package: Path) -> Path:
     if chosen := os.environ.get(_VARIABLE):
-        # A process that we started has our folder there already.
+        # A child process inherits our folder.
         return Path(chosen).parent if Path(chosen).name.startswith(_PREFIX) else Path(chosen)
     own = package / "__pycache__"
     return own if is_writable(own if own.is_dir() else package) else use_writable_cache() / "kernels"

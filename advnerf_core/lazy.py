@@ -16,7 +16,7 @@ def lazy_names(
     """The ``__getattr__`` and the ``__dir__`` of a package that has ``__all__``.
 
     Args:
-        package: Its ``__name__``.
+        package: The package's ``__name__``.
         names: Public names, separated by spaces, by the module that defines them.
     """
     module_of = {name: module for module, found in names.items() for name in found.split()}

@@ -1,4 +1,4 @@
-"""The peak of this process's resident memory, as the kernel counts it."""
+"""The peak of this process's resident memory, from the kernel."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ RETURNS_WHAT_IS_FREED = {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHO
 
 
 def restart_peak() -> float:
-    """Set the kernel's peak to the present resident size, where it lets us, and return it [MiB]."""
+    """Reset the kernel's peak to the current resident size, if permitted, and return it [MiB]."""
     try:
         Path("/proc/self/clear_refs").write_text("5")
     except OSError:

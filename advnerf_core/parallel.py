@@ -44,12 +44,12 @@ _scratch = threading.local()
 
 
 def thread_count() -> int:
-    """Number of threads that kernels use: the processors this process may run on, unless set."""
+    """Number of threads for kernels: the processors available to this process, unless set."""
     return _threads or len(os.sched_getaffinity(0))
 
 
 def set_thread_count(threads: int) -> None:
-    """Use so many threads for kernels; 0 goes back to all available processors."""
+    """Set the number of threads for kernels; 0 restores all available processors."""
     if threads < 0:
         raise ValueError(f"expected a number of threads >= 0, got {threads}")
     global _threads
@@ -57,10 +57,10 @@ def set_thread_count(threads: int) -> None:
 
 
 def run_slots(function: Callable[[int], object], slots: int) -> None:
-    """Call ``function(slot)`` for each of ``slots`` slots, on all threads; slots are handed out as threads get free.
+    """Call ``function(slot)`` for each of ``slots`` slots, on all threads; free threads take the next slot.
 
     Args:
-        function: Does the work of one slot; must write only what belongs to that slot, and release the GIL to gain anything.
+        function: Does the work of one slot; must write only data of that slot, and release the GIL to gain anything.
         slots: Number of slots. A few per thread balance the load.
     """
     threads = min(thread_count(), slots)
@@ -85,24 +85,24 @@ def run_slots(function: Callable[[int], object], slots: int) -> None:
 
 @dataclass(frozen=True)
 class Work(Generic[T]):
-    """Something to compute, in parts that do not wait for each other.
+    """A computation in independent parts.
 
     Attributes:
-        parts: Do the work; each obeys the rules of a slot of `run_slots`.
-        result: Gives what was computed, once all parts have run.
+        parts: Callables that do the work; each obeys the rules of a slot of `run_slots`.
+        result: Returns the result, once all parts have run.
     """
 
     parts: Sequence[Callable[[], object]]
     result: Callable[[], T]
 
     def run(self) -> T:
-        """Run the parts on all threads, those that come first in the sequence first."""
+        """Run the parts on all threads, in their order."""
         run_slots(lambda slot: self.parts[slot](), len(self.parts))
         return self.result()
 
 
 def beside(first: Work[T], second: Work[U]) -> Work[tuple[T, U]]:
-    """Both works as one: threads that find no part of the first go on with the second."""
+    """Both works as one: threads without a part of the first continue with the second."""
     return Work([*first.parts, *second.parts], lambda: (first.result(), second.result()))
 
 
@@ -115,7 +115,7 @@ def slot_bounds(count: int, slots: int, multiple: int = 1) -> list[tuple[int, in
 
 
 def scratch(use: str, count: int, dtype: Any) -> NDArray[Any]:
-    """An array ``[>= count]`` of this thread for one use: zeros when it is made, then as the last call for that use left it."""
+    """An array ``[>= count]`` of this thread for one use: zeros at first, then with the content of the last call for that use."""
     kept: dict[tuple[str, str], NDArray[Any]] = _scratch.__dict__.setdefault("arrays", {})
     key = use, np.dtype(dtype).char
     if key not in kept or len(kept[key]) < count:

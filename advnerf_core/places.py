@@ -1,4 +1,4 @@
-"""Places of this user: configuration, data, caches, and private temporary folders; and paths that every library can open."""
+"""Places of this user: configuration, data, caches, and private temporary folders; and paths that all libraries can open."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _OF_HOME = {
 
 
 class PlaceError(AdvnerfError):
-    """A place that is needed does not exist, belongs to somebody else, or has a name that cannot be used."""
+    """A required place does not exist, belongs to another user, or has an unusable name."""
 
 
 def user_place(kind: Literal["cache", "config", "data"]) -> Path:
     """Folder of advnerf among this user's files; it need not exist.
 
     Raises:
-        PlaceError: The user has no home, as a service account or a container's user may.
+        PlaceError: The user has no home, like some service accounts and container users.
     """
     variable, below = _OF_HOME[kind]
     if chosen := os.environ.get(variable):
@@ -35,10 +35,10 @@ def user_place(kind: Literal["cache", "config", "data"]) -> Path:
 
 
 def expanded(path: Path | str, variable: str = "") -> Path:
-    """A path with ``~`` as the home of this user.
+    """A path with ``~`` expanded to this user's home.
 
     Raises:
-        PlaceError: There is no home; the message names ``variable`` as a cure beside HOME.
+        PlaceError: The user has no home; the message suggests setting ``variable`` or HOME.
     """
     try:
         return Path(path).expanduser()
@@ -73,13 +73,13 @@ def temporary_folder() -> Path:
 
 
 def use_writable_cache() -> Path:
-    """Folder for this user's caches of advnerf. Where the home cannot be written, a private temporary one takes its place, and that is said.
+    """Folder for this user's caches of advnerf. If the home is not writable, it falls back to a private temporary folder, with a warning.
 
-    Libraries that keep caches (Matplotlib, Mesa), and the processes started from here, are told of it by the environment, so that they
-    neither fail nor say it again.
+    The environment passes it on to libraries with caches (Matplotlib, Mesa) and to child processes, so that they
+    neither fail nor warn again.
 
     Raises:
-        PlaceError: The temporary folder belongs to somebody else.
+        PlaceError: The temporary folder belongs to another user.
     """
     try:
         folder = user_place("cache")
@@ -98,15 +98,15 @@ def use_writable_cache() -> Path:
 
 
 def is_writable(folder: Path) -> bool:
-    """Whether this user can make files in a folder."""
+    """Whether this user can create files in a folder."""
     return os.access(folder, os.W_OK | os.X_OK)
 
 
 def require_utf8(path: Path | str) -> None:
-    """Refuse a path that is no UTF-8, before work whose results could not be read back from there.
+    """Raise for a path that is not UTF-8, before any work whose results could not be read back from there.
 
     Raises:
-        PlaceError: It is not.
+        PlaceError: The path is not UTF-8.
     """
     try:
         os.fspath(path).encode()
@@ -117,10 +117,10 @@ def require_utf8(path: Path | str) -> None:
 
 
 def open_tensors(path: Path | str, framework: Literal["pt", "numpy"]) -> Any:
-    """``safe_open`` of safetensors, which reads paths in UTF-8 only, and takes others for damaged files.
+    """``safe_open`` of safetensors, which supports UTF-8 paths only, and takes others for damaged files.
 
     Raises:
-        PlaceError: The path is no UTF-8.
+        PlaceError: The path is not UTF-8.
     """
     from safetensors import safe_open
 

@@ -25,13 +25,13 @@ _Data = TypeVar("_Data", bound="PlainData")
 
 
 class PlainData:
-    """A dataclass whose fields are plain data: numbers, texts, `Numbers`, tuples, mappings, and other such dataclasses."""
+    """A dataclass with plain data in its fields: numbers, texts, `Numbers`, tuples, mappings, and other such dataclasses."""
 
     __pydantic_config__ = ConfigDict(extra="forbid")
     _refusal: ClassVar[type[Exception]] = ValueError
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data (JSON types) from which :meth:`from_dict` makes the same."""
+        """Plain data (JSON types) from which :meth:`from_dict` rebuilds it."""
         return {field.name: _plain(getattr(self, field.name)) for field in fields(self)}  # type: ignore[arg-type]
 
     @classmethod
@@ -39,7 +39,7 @@ class PlainData:
         """Rebuild it from :meth:`to_dict`.
 
         Raises:
-            ValueError: The data is something else; the class may name an error of its own.
+            ValueError: The data does not fit; the class may name its own error.
         """
         try:
             found: _Data = _adapter(cls).validate_python(data)  # type: ignore[arg-type]

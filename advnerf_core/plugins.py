@@ -1,4 +1,4 @@
-"""Code that users name: what is built in, an entry point of an installed package, or ``file.py:Name`` of their own.
+"""Finds code by name: a built-in, an entry point of an installed package, or a user's ``file.py:Name``.
 
 Worlds, attack methods and policies are found this way, in experiments, in the worker processes of many cells, and on clusters.
 """
@@ -32,7 +32,7 @@ T = TypeVar("T")
 
 
 class PluginError(AdvnerfError):
-    """A name stands for nothing, or for code that cannot be loaded."""
+    """A name is unknown, or its code cannot be loaded."""
 
 
 def resolve(
@@ -42,13 +42,13 @@ def resolve(
 
     Args:
         name: A built-in name, an entry point's name, or ``file.py:Name``.
-        what: What is being named, for messages: ``attack method``.
-        built_in: Loaders of what this project brings; called only for the name that is asked for.
+        what: Kind of the object, for messages: ``attack method``.
+        built_in: Loaders of the built-in objects; only the requested one is called.
         group: Entry point group, such as ``advnerf.methods``.
         folder: Folder that a relative ``file.py`` is relative to; the working folder if it is not given.
 
     Raises:
-        PluginError: There is no such name, two things have it, or what it names fails to load. Other plug-ins are not loaded, so
+        PluginError: The name is unknown or ambiguous, or its code fails to load. Other plug-ins are not loaded, so
             they cannot fail.
     """
     require_known(name, what, built_in, group, folder)
@@ -63,17 +63,17 @@ def resolve(
 def require_known(
     name: str, what: str, built_in: Collection[str], group: str, folder: Path | None = None
 ) -> None:
-    """Refuse a name that stands for nothing or for two things. No code is loaded: what the name stands for may still be broken.
+    """Raise for an unknown or ambiguous name. No code is loaded, so it may still be broken.
 
     Args:
-        name: As of `resolve`, like the other arguments.
-        what: What is being named, for messages.
-        built_in: Names of what this project brings.
+        name: See `resolve`, also for the other arguments.
+        what: Kind of the object, for messages.
+        built_in: Names of the built-in objects.
         group: Entry point group.
         folder: Folder that a relative ``file.py`` is relative to; the working folder if it is not given.
 
     Raises:
-        PluginError: There is no such name, two things have it, or there is no such file.
+        PluginError: The name is unknown or ambiguous, or its file does not exist.
     """
     if is_file_reference(name):
         _file_of(name, what, folder)
@@ -89,16 +89,16 @@ def require_known(
 
 
 def code_sha256(name: str, built_in: Container[str], group: str, folder: Path | None = None) -> str:
-    """Hash of the code behind a user's name: it changes with the files that the code consists of (`advnerf_core.code_files`).
+    """Hash of the code behind a user's name: it changes with the code's files (`advnerf_core.code_files`).
 
     Args:
-        name: As of `resolve`, like the other arguments.
-        built_in: Names of what this project brings.
+        name: See `resolve`, also for the other arguments.
+        built_in: Names of the built-in objects.
         group: Entry point group.
         folder: Folder that a relative ``file.py`` is relative to; the working folder if it is not given.
 
     Returns:
-        SHA-256, the same on every machine; empty for a built-in name, and for one that stands for nothing.
+        SHA-256, the same on every machine; empty for a built-in or unknown name.
     """
     if name in built_in:
         return ""
@@ -109,7 +109,7 @@ def code_sha256(name: str, built_in: Container[str], group: str, folder: Path | 
 
 
 def known_names(built_in: Iterable[str], group: str) -> tuple[str, ...]:
-    """Built-in names, then those of installed packages, each once; nothing is loaded."""
+    """Built-in names, then names from installed packages, each once; nothing is loaded."""
     own = tuple(built_in)
     return (*own, *sorted({each.name for each in _installed(group)} - set(own)))
 
@@ -119,13 +119,13 @@ def _entries(name: str, group: str) -> list[EntryPoint]:
 
 
 def _installed(group: str) -> tuple[EntryPoint, ...]:
-    """Entry points of a group. Reading those of all packages takes 17 ms, which a file of many variants would spend for each of them."""
+    """Entry points of a group. Reading all packages takes 17 ms, which a file of many variants would spend for each variant."""
     return _read_entries(group, tuple((folder, _changed_ns(folder)) for folder in sys.path))
 
 
 @lru_cache(maxsize=16)
 def _read_entries(group: str, searched: tuple[tuple[str, int], ...]) -> tuple[EntryPoint, ...]:
-    """They are read again when a package comes into a folder of the search path, or goes."""
+    """Read again when a package is added to a folder of the search path, or removed."""
     return tuple(entry_points(group=group))
 
 
@@ -137,7 +137,7 @@ def _changed_ns(folder: str) -> int:
 
 
 def origin_of(entry: EntryPoint) -> str:
-    """The package that brings an entry point, with its version: ``package 1.0``."""
+    """The package of an entry point, with its version: ``package 1.0``."""
     return (
         f"{entry.dist.name} {entry.dist.version}"
         if entry.dist is not None
@@ -152,12 +152,12 @@ def is_file_reference(name: str) -> bool:
 
 
 def name_in_results(reference: str) -> str:
-    """What a thing is called in tables and file names: of ``file.py:Name`` it is ``Name``. Names stay as they are."""
+    """Name in tables and file names: ``Name`` for ``file.py:Name``; other names are unchanged."""
     return reference.rpartition(":")[2] if is_file_reference(reference) else reference
 
 
 def absolute_reference(name: str, folder: Path) -> str:
-    """``file.py:Name`` with the file's absolute path, so that a worker finds it from any working folder; other names as they are."""
+    """``file.py:Name`` with the file's absolute path, so that a worker finds it from any working folder; other names are unchanged."""
     if not is_file_reference(name):
         return name
     file, _, attribute = name.rpartition(":")
@@ -167,11 +167,11 @@ def absolute_reference(name: str, folder: Path) -> str:
 def load_from_file(reference: str, what: str, folder: Path | None = None) -> Any:
     """The attribute that ``file.py:Name`` names.
 
-    A file is loaded once per process and content, under a name of its own: two files of one name do not meet. While it is loaded, it
+    A file is loaded once per process and content, under a unique name, so that two files of one name do not clash. While it is loaded, it
     may import the modules beside it.
 
     Raises:
-        PluginError: There is no such file or attribute, or the file raises an error.
+        PluginError: The file or attribute does not exist, or the file raises an error.
     """
     file, attribute = _file_of(reference, what, folder)
     digest = hashlib.sha256(f"{file}\0{file_sha256(file)}".encode()).hexdigest()[:16]
@@ -182,7 +182,7 @@ def load_from_file(reference: str, what: str, folder: Path | None = None) -> Any
         module = importlib.util.module_from_spec(spec)
         sys.modules[name] = module  # dataclasses look their module up while it is being loaded
         try:
-            # Not by the loader: its byte code is as old as the file to the second, and a file may be saved twice in one.
+            # Not by the loader: its byte code cache compares times to the second, and a file may be saved twice in one.
             with _imports_from(file.parent, modules_beside(file)):
                 exec(compile(file.read_bytes(), file, "exec"), module.__dict__)
         except Exception as error:
@@ -197,7 +197,7 @@ def load_from_file(reference: str, what: str, folder: Path | None = None) -> Any
 
 
 class _Beside(MetaPathFinder):
-    """Finds some modules in a folder, and nothing else: the folder may hold a `hardware.py` that has nothing to do with ours."""
+    """Finds given modules in a folder, and no others: the folder may contain an unrelated `hardware.py`."""
 
     def __init__(self, folder: Path, names: Container[str]) -> None:
         self._folder, self._names = folder, names
@@ -205,7 +205,7 @@ class _Beside(MetaPathFinder):
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """The module, if it is one of these."""
+        """The module's spec, if it is one of these."""
         if path is not None or fullname not in self._names:
             return None
         return PathFinder.find_spec(fullname, [str(self._folder)], target)
@@ -213,7 +213,7 @@ class _Beside(MetaPathFinder):
 
 @contextmanager
 def _imports_from(folder: Path, files: Iterable[Path]) -> Iterator[None]:
-    """Imports find some files of a folder, as they are now, and other modules of their names do not meet them: before and after."""
+    """Imports find the current files of a folder, and these do not clash with other modules of their names, before or after."""
     names = {file.relative_to(folder).parts[0].removesuffix(".py") for file in files}
 
     def loaded() -> dict[str, ModuleType]:
@@ -221,7 +221,7 @@ def _imports_from(folder: Path, files: Iterable[Path]) -> Iterator[None]:
 
     others = loaded()
     for name, each in others.items():
-        # What the user's own program imported from this folder is the same module, also to the plug-in.
+        # A module that the user's own program imported from this folder is the same for the plug-in.
         if not Path(getattr(each, "__file__", None) or "/").is_relative_to(folder):
             del sys.modules[name]
     writes_none, sys.dont_write_bytecode = sys.dont_write_bytecode, True
@@ -262,14 +262,14 @@ def options_of(
     """The options of a plug-in as its own type.
 
     Args:
-        model: Its dataclass or pydantic model; None if it has no options.
+        model: The options' dataclass or pydantic model; None if it has no options.
         written: Keys and values as a user wrote them.
-        what: What one of them is called in messages: ``option of this method``.
-        key: What stands before each key in messages.
+        what: Kind of an option, for messages: ``option of this method``.
+        key: Prefix of each key in messages.
         error: Raised for an unknown key or a wrong value.
 
     Returns:
-        An instance of the model; None if there is none.
+        An instance of the model; None without a model.
     """
     names = _fields_of(model)
     for name in written:
@@ -295,7 +295,7 @@ def _fields_of(model: type[Any] | None) -> tuple[str, ...]:
 
 
 def unknown(name: str, what: str, known: Iterable[str]) -> str:
-    """Message about a name that is not known: the valid ones, and the nearest of them."""
+    """Message about an unknown name: the valid ones, and the nearest of them."""
     names = list(dict.fromkeys(known))
     near = difflib.get_close_matches(name, names, n=1)
     hint = f" (did you mean {near[0]}?)" if near else ""

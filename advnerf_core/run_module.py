@@ -1,8 +1,8 @@
-"""Start Python modules so that a folder's own ``hardware.py`` or ``nodes/`` never stands for ours.
+"""Start Python modules so that a folder's own ``hardware.py`` or ``nodes/`` never replaces ours.
 
 ``python -m`` searches the working folder first, and ``python -P`` does not exist before Python 3.11. This file, run as a script, searches
-what is installed first and the working folder last: ``python run_module.py MODULE ARGUMENTS...``. It imports only what is built in
-before the search path is in order, as its own folder is searched first until then.
+installed packages first and the working folder last: ``python run_module.py MODULE ARGUMENTS...``. It imports only built-in modules
+before the search path is set, as its own folder comes first until then.
 """
 
 from __future__ import annotations
@@ -34,23 +34,23 @@ class _LastOfAll:
 
 
 def module_command(module: str, *arguments: str) -> list[str]:
-    """Command line that runs a module, ours or one in the user's working folder, in a Python of its own."""
+    """Command line that runs a module, ours or one in the user's working folder, in a separate Python."""
     return [sys.executable, __file__, module, *arguments]
 
 
 def search_working_folder_last() -> None:
-    """Let this process find modules in the working folder too, but none that has the name of an installed one."""
+    """Let this process find modules in the working folder too, except for names of installed ones."""
     import os
 
     try:
         here = os.getcwd()
-    except FileNotFoundError:  # it was removed since
+    except FileNotFoundError:  # the folder was removed
         return
     search_folder_last(here)
 
 
 def search_folder_last(folder: str) -> None:
-    """Let this process find modules in a folder too, but none that has the name of one that it finds already."""
+    """Let this process find modules in a folder too, except for names that it finds already."""
     if folder not in _LastOfAll.folders:
         _LastOfAll.folders.append(folder)
     if _LastOfAll not in sys.meta_path:

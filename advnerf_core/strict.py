@@ -1,4 +1,4 @@
-"""The base of all models that are read from files, and the one way from a document to a typed object.
+"""The base of all models that are read from files, and the conversion of a document to a typed object.
 
 pydantic takes ``true`` for 1, ``"12"`` for 12 and ``1`` for ``true``. In a file, each of these is a mistake.
 """
@@ -19,7 +19,7 @@ from pydantic_core import CoreSchema, PydanticKnownError, SchemaValidator, core_
 from advnerf_core.documents import Document, Key, raise_problems
 from advnerf_core.errors import ConfigError
 
-# Type of a pydantic error whose message says what came.
+# Types of pydantic errors whose message includes the input.
 COMPLETE = "complete"
 
 M = TypeVar("M")
@@ -72,7 +72,7 @@ def _wrap(part: Any, check: Callable[[Any], Any]) -> None:
 
 
 def _refuse_equal_type(expected: list[Any], value: Any) -> Any:
-    """Refuse ``true`` where 1 is a choice: they are equal."""
+    """Reject ``true`` where 1 is a choice, since they are equal."""
     if isinstance(value, bool | int | float) and not any(type(value) is type(each) for each in expected):
         raise PydanticKnownError("literal_error", {"expected": " or ".join(map(repr, expected))})
     return value
@@ -102,12 +102,12 @@ class StrictModel(BaseModel):
 
 
 def validate(model: type[M], document: Document, folder: Path | None = None) -> M:
-    """Typed object of a document; everything unknown or invalid in it is one `ConfigError` with a line for each problem.
+    """Typed object of a document; all its unknown and invalid keys are one `ConfigError` with a line for each problem.
 
     Args:
         model: A pydantic model or a dataclass.
-        document: What it is made of.
-        folder: What ``file.py:Name`` in it is relative to; the working folder if it is not given.
+        document: The document to convert.
+        folder: Folder that ``file.py:Name`` in it is relative to; the working folder if it is not given.
     """
     if not isinstance(document.data, dict):
         raise ConfigError(
@@ -125,7 +125,7 @@ def validate(model: type[M], document: Document, folder: Path | None = None) -> 
 
 
 def parse_value(annotation: Any, document: Document) -> Any:
-    """Typed value of a document that is one value of a bigger one, such as a section; errors as in `validate`."""
+    """Typed value of a document that is part of a bigger one, such as a section; errors as in `validate`."""
     try:
         return strict_validator(annotation).validate_python(document.data)
     except ValidationError as error:
@@ -168,7 +168,7 @@ def _models_in(part: Any) -> Iterator[type[BaseModel]]:
 
 
 def _unknown_keys(model: Any, document: Document, key: Key) -> Iterator[str]:
-    """Unknown keys of models that would take them in silence: dataclasses, and pydantic models that say nothing about extra keys."""
+    """Unknown keys of models that would ignore them: dataclasses, and pydantic models without a rule for extra keys."""
     data = document.data
     for step in key:
         data = data[step]
@@ -189,7 +189,7 @@ def _unknown_keys(model: Any, document: Document, key: Key) -> Iterator[str]:
 
 
 def _hints(model: Any) -> dict[str, Any]:
-    """Fields of a model by the name that stands in files; empty if it is none."""
+    """Fields of a model by their name in files; empty if it is not a model."""
     if isinstance(model, type) and issubclass(model, BaseModel):
         return {each.alias or name: each.annotation for name, each in model.model_fields.items()}
     if isinstance(model, type) and dataclasses.is_dataclass(model):
@@ -199,7 +199,7 @@ def _hints(model: Any) -> dict[str, Any]:
 
 
 def _explain(model: Any, document: Document, error: ValidationError) -> list[str]:
-    """One line for each wrong key, in the order in which a person corrects them."""
+    """One line for each wrong key, in the order in which a user corrects them."""
     # A misspelt key is often the reason for a missing one, so it is reported first.
     problems = sorted(
         error.errors(include_url=False), key=lambda problem: problem["type"] != "extra_forbidden"
@@ -221,7 +221,7 @@ def _what(model: Any, key: Key, problem: Any) -> str:
         return f"{name} is missing; add it"
     message = str(problem["msg"]).removeprefix("Value error, ")
     message = message[:1].lower() + message[1:]
-    # A check of several keys together, or of a name, says itself what it got; all of a file would not help.
+    # The error of a check of several keys, or of a name, includes the input; the whole file would not help.
     if not key:
         return message
     if problem["type"] == COMPLETE:
@@ -231,7 +231,7 @@ def _what(model: Any, key: Key, problem: Any) -> str:
 
 
 def _as_written(data: Any, location: Key) -> Key:
-    """Path of a key as the user wrote it, without the ``kind`` or the tag that pydantic inserts for sections with several models.
+    """Path of a key in the user's file, without the ``kind`` or the tag that pydantic inserts for sections with several models.
 
     Tags are words with spaces, which no key is.
     """
@@ -248,7 +248,7 @@ def _as_written(data: Any, location: Key) -> Key:
 
 
 def _valid_keys(annotation: Any, key: Key) -> list[str]:
-    """Keys of the model at a path; empty if there is no model."""
+    """Keys of the model at a path; empty without a model."""
     if typing.get_origin(annotation) is typing.Annotated:
         annotation = typing.get_args(annotation)[0]
     if hints := _hints(annotation):

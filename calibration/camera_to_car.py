@@ -78,7 +78,7 @@ class MountFit:
         view_rms_px: ``[N]`` reprojection error of each view through the whole chain; NaN without a board pose.
         rotation_stddev_rad: Standard deviation of the rotation, its largest axis [rad].
         translation_stddev_m: Standard deviation of the translation, its largest axis [m].
-        method: In words.
+        method: Description of the method.
     """
 
     T_car_from_camera: Array
@@ -124,8 +124,8 @@ def calibrate_mount(
 
     Args:
         views: Moments at which everything stood still; all with a tracked board, or none.
-        camera: Its lens.
-        T_board_from_pattern: Where the print is on the tracked board ``[4, 4]``, probed with a wand; None solves for it.
+        camera: Calibrated lens.
+        T_board_from_pattern: Pose of the print on the tracked board ``[4, 4]``, probed with a wand; None solves for it.
 
     Raises:
         DegenerateDataError: Too few views, or rotations about one axis only with an unknown pattern pose.

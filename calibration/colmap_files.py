@@ -1,7 +1,7 @@
 """Finds COLMAP models in folders, and checks the structure of their binary files.
 
 pycolmap reads a truncated ``cameras.bin`` as zeros and does not return from some damaged ``points3D.bin`` or ``frames.bin``. Therefore the records of binary
-files are counted before pycolmap reads them. The format is that of COLMAP's ``src/colmap/scene/reconstruction_io_binary.cc``.
+files are counted before pycolmap reads them. The format follows COLMAP's ``src/colmap/scene/reconstruction_io_binary.cc``.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def model_folders(path: Path) -> dict[str, Path]:
     """Folders of COLMAP models by name: the folder itself, or those in it or in its ``sparse`` folder.
 
     Raises:
-        ReconstructionError: There is no model.
+        ReconstructionError: The folder has no model.
     """
     for folder in (path, path / "sparse"):
         if model_suffix(folder):

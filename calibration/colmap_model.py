@@ -99,7 +99,7 @@ def _map(
 
     def one_more() -> None:
         nonlocal placed
-        placed = min(placed + 1, total)  # images of a part that is given up are counted again
+        placed = min(placed + 1, total)  # images of an abandoned part are counted again
         report(placed / total, f"{placed} of {total} images placed")
 
     shutil.rmtree(sparse, ignore_errors=True)

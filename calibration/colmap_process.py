@@ -1,7 +1,7 @@
 """The process that COLMAP runs in: ``python -m calibration.colmap_process PARENT_PID``, started by `calibration.structure_from_motion`.
 
 It reads its job from standard input and writes progress, then the model or an error, to standard output
-(`calibration.colmap_messages`). It ends with its parent, whatever it is doing: COLMAP's database and our files stand that.
+(`calibration.colmap_messages`). It ends with its parent at any time, which COLMAP's database and our files withstand.
 """
 
 from __future__ import annotations

@@ -28,8 +28,8 @@ class ColmapModel:
 
     Attributes:
         model: Images, points and cameras. Cameras that no `Lens` describes have the pinhole of their undistorted images.
-        folder: Where the model is.
-        sizes: Number of images with a pose, of every model that was there, by name.
+        folder: Folder of the model.
+        sizes: Number of images with a pose, of every model found, by name.
         undistorted: pycolmap cameras whose images must be undistorted, by image name.
         points_by_id: Points ``[3]`` by COLMAP's number.
     """
@@ -45,11 +45,11 @@ def read_colmap(path: Path, name: str | None = None) -> ColmapModel:
     """Read a COLMAP model: text or binary, with or without rigs and frames.
 
     Args:
-        path: Folder of a model, or of several in folders of their own.
-        name: Which of several; None for the one with the most images.
+        path: Folder of a model, or of several in subfolders.
+        name: Name of the model; None for the one with the most images.
 
     Raises:
-        ReconstructionError: There is no such model, it is damaged, or it has too few images or an impossible camera.
+        ReconstructionError: The model does not exist, is damaged, or has too few images or an impossible camera.
     """
     folders = model_folders(path)
     if name is not None and name not in folders:

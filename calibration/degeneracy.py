@@ -27,7 +27,7 @@ def mean_rotation(rotations: ArrayLike) -> Array:
 def rotation_spread(rotations: ArrayLike) -> Array:
     """Root mean square turn about the three principal axes ``[3]`` [rad], largest first, of rotations ``[N, 3, 3]``.
 
-    Rotations about one axis alone, such as those of a car on a floor, have a second value at their noise.
+    Rotations about one axis alone, as of a car on a floor, have a second value at their noise.
     """
     R = np.asarray(rotations, np.float64)
     turns = Rotation.from_matrix(mean_rotation(R).T @ R).as_rotvec()

@@ -72,7 +72,7 @@ class PositionFit:
         images: Number of images that it was fitted to.
         rms_m: Root mean square distance of the cameras from their positions [m].
         worst_m: Largest such distance [m].
-        worst: Its image.
+        worst: Image with this distance.
         on_line: Whether the positions are on one line, so that up comes from the cameras or the ground.
     """
 
@@ -88,7 +88,7 @@ def fit_known_positions(model: Model, positions_m: Mapping[str, Array], ground: 
     """Place a model by the positions ``[3]`` of cameras by image name, in a world with z up.
 
     Args:
-        ground: Of the model; up, if the positions are on one line.
+        ground: Ground of the model, which gives up if the positions are on one line.
 
     Raises:
         ReconstructionError: The positions do not fit the model.
@@ -152,7 +152,7 @@ def marker_scale(views: Iterable[View], side_m: float, dictionary: str) -> Marke
         corners, numbers, _ = detector.detectMarkers(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
         found = [] if numbers is None else [int(number) for number in numbers.ravel()]
         for pixels, number in zip(corners, found, strict=True):
-            if found.count(number) == 1:  # two markers of one number cannot be told apart
+            if found.count(number) == 1:  # two markers with one number are ambiguous
                 seen[number].append((pixels.reshape(4, 2).astype(np.float64) + 0.5, pinhole, T))
     sides = [_sides(each) for each in seen.values()]
     measured = np.array([side for side in sides if side is not None]).reshape(-1, 4)

@@ -46,8 +46,8 @@ class LensChoice:
 
     Attributes:
         model: COLMAP's name of the model.
-        why: Why this one.
-        focal_error_percent: Standard error of the focal length [%]; None where it is held, or could not be computed.
+        why: Reason for the choice.
+        focal_error_percent: Standard error of the focal length [%]; None if it is held, or could not be computed.
     """
 
     model: str

@@ -25,7 +25,7 @@ _POSITION_TOLERANCE_M = 0.08
 _ROTATION_TOLERANCE_RAD = float(np.radians(3.0))
 # With a smaller share of inliers the set is refused.
 _MIN_SHARE = 0.5
-# The cameras are left out in so many turns, to see how well the others place them.
+# The cameras are left out in this many turns, to see how well the others place them.
 _FOLDS = 4
 # A larger median error of left-out inliers is refused [m].
 _MOST_HELD_OUT_M = 0.05
@@ -37,7 +37,7 @@ class SceneFit:
 
     Attributes:
         alignment: Similarity, inliers and residuals of all cameras.
-        names: Of the cameras, in the order of the residuals.
+        names: Names of the cameras, in the order of the residuals.
         held_out_m: Distance of each inlier from where the similarity of the others puts it ``[I]`` [m].
         held_out_rad: Angle of the same ``[I]`` [rad].
         T_world_from_camera: Motion-capture poses ``[N, 4, 4]``.

@@ -23,7 +23,7 @@ _MOCAP_STDDEV_RAD = 0.001
 
 
 class MountProblem:
-    """The whitened reprojection error of all corners as a function of X, and of Y where it is not known."""
+    """The whitened reprojection error of all corners as a function of X, and of Y if it is unknown."""
 
     def __init__(
         self,
@@ -64,7 +64,7 @@ class MountProblem:
         )
 
     def _factor(self, X: Array, Y: Array, row: int) -> Array:
-        """Lower Cholesky factor of the covariance of a view's corners ``[2n, 2n]``: their own noise and that of both bodies' poses."""
+        """Lower Cholesky factor of the covariance of a view's corners ``[2n, 2n]``: from their own noise and both bodies' poses."""
         A = self._T_base_from_car[row]
         here = self._errors(X, Y, row).ravel()
         covariance = _CORNER_STDDEV_PX**2 * np.eye(len(here))

@@ -65,12 +65,12 @@ def target_size(target: TargetCalibration) -> tuple[float, float]:
 def make_panel(
     size_px: tuple[int, int], target: TargetCalibration, edid_mm: tuple[float, float] | None = None
 ) -> MonitorPanel:
-    """The panel of a monitor; where it says its size and the calibration says another, one of them is of another monitor.
+    """The panel of a monitor; an error if its EDID and the calibration disagree on its size, as one belongs to another monitor.
 
     Args:
         size_px: Native width and height [px].
         target: Measured corners of the whole panel.
-        edid_mm: What the monitor says [mm]; None leaves it to the measured corners.
+        edid_mm: Size in the monitor's EDID [mm]; None uses the measured corners only.
     """
     measured = target_size(target)
     if edid_mm is None:
@@ -85,7 +85,7 @@ def make_panel(
 
 
 def require_fits(attack: AttackFile, panel: MonitorPanel, target: TargetCalibration) -> None:
-    """Refuse an attack that this panel cannot show as it was computed: another carrier, too large, or off the centre."""
+    """Raise for an attack that this panel cannot show exactly: another carrier, too large, or off the centre."""
     face = attack.face
     if face is None or face.subject != target.subject:
         what = f"for {face.subject}" if face is not None else "without a face"

@@ -32,8 +32,8 @@ class PhotoSource:
         camera_id: Name of the camera.
         images: Files, relative to the folder of all images.
         ordered: Whether they follow each other in time, so that neighbours overlap.
-        pinhole: Intrinsics where they are known; they are then held.
-        lens: Distortion where it is known.
+        pinhole: Known intrinsics, which are held; None if unknown.
+        lens: Known distortion; None if unknown.
     """
 
     camera_id: str
@@ -61,8 +61,8 @@ class SfmConfig:
         all_pairs_up_to: Number of images up to which all pairs are matched. With more, neighbours and similar images are matched.
         overlap: Followers of an image in its video that it is matched with.
         look_alikes: Images that look like it that each is matched with.
-        min_registered_share: With fewer images registered than this share the result is refused.
-        seed: Of all randomness.
+        min_registered_share: With fewer registered images than this share the result is rejected.
+        seed: Seed of all randomness.
     """
 
     max_features: int = 4096
@@ -100,13 +100,13 @@ class FoundCamera:
     """A camera of the model.
 
     Attributes:
-        camera_id: Its name: the source's, or the source and the image or image size where a source has several cameras.
-        images: How many of its images have a pose.
+        camera_id: Name of the camera: the source's, or the source and the image or image size if a source has several cameras.
+        images: Number of its images with a pose.
         model: COLMAP's name of the lens model that was chosen.
-        why: Why this model.
+        why: Reason for this model.
         pinhole: Intrinsics.
         lens: Distortion.
-        focal_error_percent: Standard error of the focal length [%]; None where it was held, or could not be computed.
+        focal_error_percent: Standard error of the focal length [%]; None if it was held, or could not be computed.
     """
 
     camera_id: str
@@ -154,10 +154,10 @@ class Model(PlainData):
 
     Attributes:
         images: Images with poses, in the order they were given.
-        left_out: Images without, and why.
+        left_out: Images without a pose, and why.
         points: Points of the scene ``[M, 3]``, seen from three images or more.
         reprojection_error_px: Mean distance of a point's projection from where it was seen [px].
-        parts: How many separate models there were; this is the largest.
+        parts: Number of separate models; this is the largest.
         cameras: The cameras of the images with poses.
     """
 

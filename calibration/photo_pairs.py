@@ -31,14 +31,14 @@ def chosen_pairs(
     look_alikes: int,
     seed: int,
 ) -> list[tuple[int, int]]:
-    """Neighbours in time, at growing distances too, and for every image those that look most like it.
+    """Neighbours in time, at growing distances too, and for every image the most similar ones.
 
     Args:
         descriptors: Local features of each image ``[n_i, 128]`` uint8.
         sequences: Images in the order of each video.
-        overlap: How many followers of an image in its video.
-        look_alikes: How many images that look like it, out of all.
-        seed: Of the vocabulary.
+        overlap: Number of an image's followers in its video.
+        look_alikes: Number of similar images, out of all.
+        seed: Seed of the vocabulary.
     """
     pairs: set[tuple[int, int]] = set()
     for order in sequences:

@@ -1,4 +1,4 @@
-"""Compares the pose of the board or monitor with that of its attack, and says how to move it."""
+"""Compares the pose of the board or monitor with its attack's, and says how to move it."""
 
 from __future__ import annotations
 
@@ -78,15 +78,15 @@ def face_frame(corners_m: Array) -> Array:
 
 
 def misplacement(attack: AttackFile, target: TargetCalibration, T_world_from_subject: Array) -> Misplacement:
-    """Compare where a face is with where its attack was computed.
+    """Compare the pose of a face with the pose of its attack.
 
     Args:
-        attack: The attack; its object's frame is that of the face.
-        target: Corners of what shows it, in the subject's frame; of a monitor the whole panel.
-        T_world_from_subject: Where the subject is now ``[4, 4]``.
+        attack: The attack; its object's frame is the face's.
+        target: Corners of the board or monitor, in the subject's frame; for a monitor the whole panel.
+        T_world_from_subject: Current pose of the subject ``[4, 4]``.
 
     Raises:
-        CalibrationError: The attack is for something else.
+        CalibrationError: The attack belongs to another subject.
     """
     if attack.face is None or attack.face.subject != target.subject:
         subject = "nothing that can be shown" if attack.face is None else attack.face.subject

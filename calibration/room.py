@@ -31,10 +31,10 @@ def fence_from_trace(trace: ArrayLike, margin_m: float) -> tuple[tuple[float, fl
 
     Args:
         trace: Positions in the order of time ``[N, 2]`` [m].
-        margin_m: How far inside the fence lies [m].
+        margin_m: Distance of the fence inside the walk [m].
 
     Raises:
-        DegenerateDataError: The walk encloses nothing, or nothing is left inside the margin.
+        DegenerateDataError: The walk encloses nothing, or less than the margin.
     """
     xy = _finite(trace)
     canvas, origin = _canvas(xy, 0.2)
@@ -71,7 +71,7 @@ def start_before_corner(path: Path, corner: int, before_m: float) -> tuple[float
 
     Args:
         path: The path.
-        corner: Which arc, from 1.
+        corner: Number of the arc, from 1.
         before_m: Distance along the path [m].
     """
     starts = np.concatenate([[0.0], np.cumsum([piece.length_m for piece in path.segments])])
@@ -101,9 +101,9 @@ def target_of_size(
     Args:
         subject: Motion-capture subject.
         size_m: Width and height [m].
-        centre_m: Its middle in the subject's frame [m].
-        normal_yaw_rad: Where it looks, about the subject's z axis [rad]; 0 is along x.
-        method: How it was measured.
+        centre_m: Middle of the rectangle in the subject's frame [m].
+        normal_yaw_rad: Direction of its normal, about the subject's z axis [rad]; 0 is along x.
+        method: Measuring method.
     """
     if min(size_m) <= 0.0:
         raise DegenerateDataError(f"expected a width and a height > 0, got {size_m[0]:g} x {size_m[1]:g} m")
@@ -143,7 +143,7 @@ def find_touches(
         stamps_ns: ``[N]`` [ns].
         T_world_from_wand: ``[N, 4, 4]``.
         T_world_from_subject: ``[N, 4, 4]`` at the same moments.
-        tip_in_wand_m: Where the wand touches, in its own frame ``[3]`` [m].
+        tip_in_wand_m: Position of the tip in the wand's frame ``[3]`` [m].
     """
     tip = np.asarray(tip_in_wand_m, dtype=np.float64)
     tips = np.stack(

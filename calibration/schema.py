@@ -37,12 +37,12 @@ class Calibration(StrictModel):
     """Fields that all calibration files have.
 
     Attributes:
-        kind: What is calibrated.
+        kind: Kind of the calibration.
         date: Day of the measurement.
-        method: How it was measured.
-        notes: Anything a person should know.
-        views: Pictures, segments or samples that the result rests on; None where nothing was fitted.
-        residuals: What the fit left, by name with its unit; empty where nothing was fitted.
+        method: Measuring method.
+        notes: Remarks for people.
+        views: Number of pictures, segments or samples behind the result; None without a fit.
+        residuals: Residuals of the fit, by name with the unit; empty without a fit.
     """
 
     kind: str
@@ -178,8 +178,8 @@ class VehicleCalibration(Calibration):
     Attributes:
         wheelbase_m: Distance between the axles [m].
         gains: From speed and steering to the motor controller.
-        limits: What may be sent.
-        response: Delay and lag; None where they were not measured.
+        limits: Limits of the sent commands.
+        response: Delay and lag; None if they were not measured.
     """
 
     kind: Literal["vehicle"] = "vehicle"
@@ -253,7 +253,7 @@ class RoomCalibration(Calibration):
         path: Reference path as `advnerf_core.driving.path.Path.to_dict` writes it.
         off_track_m: Magnitude of the cross-track error beyond which the car is off the track [m].
         fence_m: Corners of the polygon that the rear axle may not leave [m].
-        start_pose: Where the experiments start: x [m], y [m], yaw [rad].
+        start_pose: Start of the experiments: x [m], y [m], yaw [rad].
     """
 
     kind: Literal["room"] = "room"
@@ -299,7 +299,7 @@ def save_calibration(calibration: Calibration, path: Path | str) -> None:
     """Write a calibration file atomically."""
     path = Path(path)
     values = calibration.model_dump(mode="python")
-    # Files that measured nothing stay as short as they were.
+    # Files without measurements stay as short as before.
     kept = {key: value for key, value in values.items() if key not in _OPTIONAL or value not in (None, {})}
     text = dump_yaml(kept, default_flow_style=None, width=120)
     try:

@@ -1,8 +1,8 @@
 """Poses, intrinsics and points of photographs of one scene by structure from motion (COLMAP, by its Python package).
 
 Any number of cameras, each with its own intrinsics: unknown ones are found with the simplest lens that the photographs support
-(`calibration.lens_choice`), known ones can be held. Work is kept in a folder and goes on where it was stopped. Everything runs on the
-CPU, in a process of its own: COLMAP takes over the process's signals, and one call can take minutes.
+(`calibration.lens_choice`), known ones can be held. Work is stored in a folder and resumed from there. Everything runs on the
+CPU, in a separate process: COLMAP takes over the process's signals, and one call can take minutes.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ def reconstruct(
     Args:
         root: Folder of all images.
         sources: The cameras and their images.
-        work: Folder for what is kept between runs; with other images or another configuration its content is replaced.
-        config: Numbers.
-        report: Progress callback; an exception from it (Ctrl-C, SIGTERM) stops the run at once, and the next run goes on from there.
+        work: Folder for data between runs; with other images or another configuration its content is replaced.
+        config: Settings.
+        report: Progress callback; an exception from it (Ctrl-C, SIGTERM) stops the run at once, and the next run resumes from there.
 
     Raises:
-        ReconstructionError: Too few images, or too few that could be put together.
+        ReconstructionError: Too few images, or too few that fit together.
         AdvnerfError: An image cannot be read.
     """
     config, report = config or SfmConfig(), report or (lambda share, text: None)
@@ -74,7 +74,7 @@ def reconstruct(
 
 
 def _require_colmap() -> None:
-    """Let a missing package be the caller's error, not that of the other process."""
+    """Raise the error of a missing package in the caller, not in the other process."""
     from importlib.util import find_spec
 
     if find_spec("pycolmap") is None:

@@ -61,17 +61,17 @@ class Turns:
 
 @dataclass(frozen=True, eq=False)
 class OffsetFit:
-    """The offset and the curve it was found on.
+    """The offset and its correlation curve.
 
     Attributes:
         camera_minus_mocap_s: Camera stamp less mocap stamp of one instant [s].
-        stddev_s: Its standard deviation by the residuals [s].
-        scale: Image turn per car turn; above 1 where the camera also moves sideways.
+        stddev_s: Standard deviation of the offset from the residuals [s].
+        scale: Image turn per car turn; above 1 if the camera also moves sideways.
         rms_rad: Residual of the turns [rad].
         shifts_s: Shifts of the search ``[K]`` [s].
         correlation: Correlation at each ``[K]``.
-        turns: What the image said.
-        car_yaw_rad: What motion capture says at the offset ``[N]``, times the scale.
+        turns: Turns measured in the image.
+        car_yaw_rad: Turns from motion capture at the offset ``[N]``, times the scale [rad].
     """
 
     camera_minus_mocap_s: float

@@ -23,7 +23,7 @@ from advnerf_core.geometry import Array
 from calibration.degeneracy import DegenerateDataError, PoorFitError, require_count
 from calibration.linear import line_stddev, linear_fit
 
-# After a change of command so much is left out [s].
+# This time after a change of command is left out [s].
 _SETTLE_S = 0.8
 # Shorter segments are left out [s].
 _LEAST_S = 0.5
@@ -71,8 +71,8 @@ class Segment:
     """A stretch with constant commands.
 
     Attributes:
-        start_s: Where its poses begin [s].
-        end_s: Where they end [s].
+        start_s: Time of its first pose [s].
+        end_s: Time of its last pose [s].
         servo: Mean servo value.
         erpm: Mean speed command.
         vx_mps: Velocity of the tracked point along the body's x [m/s].
@@ -95,13 +95,13 @@ class GainsFit:
 
     Attributes:
         segments: The segments.
-        wheelbase_m: As given [m].
+        wheelbase_m: Given wheelbase [m].
         servo_per_rad: Servo per wheel angle [1/rad].
         servo_offset: Servo that drives straight.
         erpm_per_mps: Electrical rpm per speed.
-        erpm_offset: Electrical rpm at standstill; 0 where the speeds do not tell it from the gain.
-        origin_ahead_m: How far ahead of the rear axle the subject's origin is [m].
-        axis_turned_rad: How far the subject's x axis is turned to the left of the direction of travel [rad].
+        erpm_offset: Electrical rpm at standstill; 0 if the speeds cannot separate it from the gain.
+        origin_ahead_m: Distance of the subject's origin ahead of the rear axle [m].
+        axis_turned_rad: Angle of the subject's x axis to the left of the direction of travel [rad].
         speed_mps: Speed of the rear axle in each segment ``[S]``.
         steering_rad: Wheel angle in each segment ``[S]``.
         stddev: Standard deviations by name.
@@ -156,7 +156,7 @@ def fit_gains(drive: RecordedDrive, wheelbase_m: float) -> GainsFit:
     w = np.array([s.yaw_rate_radps for s in segments])
     vx, vy = (np.array([getattr(s, name) for s in segments]) for name in ("vx_mps", "vy_mps"))
     (ahead, turned), _ = linear_fit(np.stack([w, -vx], axis=1), vy)
-    # The tracked point's speed along the way of the rear axle; b is not told from the gain's asymmetry and is taken as 0.
+    # Speed of the tracked point along the rear axle's path; b cannot be separated from the gain's asymmetry and is set to 0.
     speed = vx * np.cos(turned) - (vy - ahead * w) * np.sin(turned)
     steering = np.arctan(wheelbase_m * w / speed)
     servo, erpm = (np.array([getattr(s, name) for s in segments]) for name in ("servo", "erpm"))
@@ -167,7 +167,7 @@ def fit_gains(drive: RecordedDrive, wheelbase_m: float) -> GainsFit:
             "expected the curvature to follow the servo, got none; is the servo output on, the stamp right?"
         )
     gain, offset = 1.0 / slope, -at_zero / slope
-    # Near the middle of the data the line is known best; the offset's error is that of the line at angle zero.
+    # The line is best known near the middle of the data; the offset's error is the line's at angle zero.
     offset_sd = line_stddev(servo, steering, slope, at_zero, offset) * abs(gain)
     speed_gain, speed_offset, speed_sd = _speed_line(speed, erpm)
     stddev = {"servo_per_rad": slope_sd * gain**2, "servo_offset": offset_sd, "erpm_per_mps": speed_sd}

@@ -28,8 +28,8 @@ class Ground:
 
     Attributes:
         up: Unit normal ``[3]``, towards the cameras.
-        height: Of the plane along ``up``.
-        points: Number of points on it.
+        height: Height of the plane along ``up``.
+        points: Number of points on the plane.
     """
 
     up: Array

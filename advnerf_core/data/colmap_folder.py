@@ -8,7 +8,7 @@ _FILES = ("cameras", "images", "points3D")
 
 
 def model_suffix(folder: Path) -> str | None:
-    """``.bin`` or ``.txt`` of a COLMAP model, binary first as in COLMAP; None if the folder holds none."""
+    """``.bin`` or ``.txt`` for a COLMAP model, binary first as in COLMAP; None if the folder has none."""
     for suffix in (".bin", ".txt"):
         if all((folder / f"{name}{suffix}").is_file() for name in _FILES):
             return suffix

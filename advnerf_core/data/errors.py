@@ -1,4 +1,4 @@
-"""What can be wrong with a set of posed images."""
+"""Errors of a set of posed images."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ _MOST_LINES = 20
 
 
 class DatasetError(AdvnerfError):
-    """A set of posed images cannot be used; the message names the file, the frame, the field and what is wrong with it."""
+    """A set of posed images cannot be used; the message names the file, the frame and the field."""
 
 
 def raise_all(errors: Sequence[DatasetError], count: int, what: str) -> None:
-    """Raise what is wrong with some of ``count`` frames or images as one error; return if nothing is."""
+    """Raise the errors of some of ``count`` frames or images as one; return if there are none."""
     if not errors:
         return
     if len(errors) == 1:

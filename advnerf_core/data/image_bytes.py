@@ -1,4 +1,4 @@
-"""What the bytes of a picture say before and beside its pixels: whether they are whole, how to turn it, what its alpha means."""
+"""Checks and metadata of encoded pictures: whether they are whole, their orientation, and the meaning of their alpha."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _FULLY_ZERO = bytes(512)
 
 
 def is_heif(data: bytes) -> bool:
-    """Whether this is a HEIC or HEIF picture, as iPhones take them."""
+    """Whether this is a HEIC or HEIF picture, as from iPhones."""
     return data[4:8] == b"ftyp" and data[8:12] in _HEIF_BRANDS
 
 
@@ -31,7 +31,7 @@ def is_tiff(data: bytes) -> bool:
 
 
 def is_damaged(data: bytes) -> bool:
-    """Whether a JPEG or PNG lacks its end, or a part that decoders would silently fill up; other formats fail in decoding."""
+    """Whether a JPEG or PNG lacks its end, or a part that decoders would silently fill in; other formats fail in decoding."""
     if data.startswith(JPEG):
         scan = _first_scan(data)
         return scan is None or data.find(b"\xff\xd9", scan) < 0 or _has_a_hole(data, scan)
@@ -42,7 +42,7 @@ def is_damaged(data: bytes) -> bool:
 
 
 def orientation(data: bytes) -> int:
-    """How the picture is to be turned to be upright: EXIF's orientation, 1 to 8; 1 where nothing says so."""
+    """EXIF's orientation, 1 to 8, which says how to turn the picture upright; 1 without one."""
     tiff = _exif(data)
     at = _tag(tiff, _ORIENTATION)
     value = _AS_STORED if at is None else _short(tiff, at)
@@ -50,7 +50,7 @@ def orientation(data: bytes) -> int:
 
 
 def turned(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
-    """Turn pixels ``[H, W, ...]`` as EXIF's orientation asks (TIFF 6.0, tag 274)."""
+    """Turn pixels ``[H, W, ...]`` by EXIF's orientation (TIFF 6.0, tag 274)."""
     if orientation in (5, 6, 7, 8):
         pixels = pixels.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):
@@ -61,7 +61,7 @@ def turned(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
 
 
 def upright_exif(data: bytes) -> bytes:
-    """The EXIF segment of a JPEG file for a copy whose pixels were turned upright: the orientation in it is 1; empty without EXIF."""
+    """The EXIF segment of a JPEG file for a copy with upright pixels: its orientation is set to 1; empty without EXIF."""
     return exif_segment(_exif(data)) if data.startswith(JPEG) else b""
 
 
@@ -74,9 +74,9 @@ def exif_segment(tiff: bytes) -> bytes:
 
 
 def plain_tiff(data: bytes) -> tuple[bytes, str]:
-    """A TIFF file whose samples decoders leave as they are, and what its fourth one means.
+    """A TIFF file whose samples decoders do not change, and the meaning of its fourth one.
 
-    OpenCV turns TIFF files by their orientation, whatever it is asked, and multiplies colours by an alpha that is not.
+    OpenCV always turns TIFF files by their orientation, and multiplies colours by an alpha that is not premultiplied.
 
     Returns:
         The file without orientation, and ``"associated"`` (colours are multiplied by alpha), ``"unassociated"`` or ``"none"``.
@@ -131,7 +131,7 @@ def _order(tiff: bytes) -> str:
 
 
 def _tag(tiff: bytes, tag: int) -> int | None:
-    """Where the value of a tag of the first directory is; None without it, or if the directory is damaged: readers ignore it."""
+    """Offset of the value of a tag in the first directory; None without it, or if the directory is damaged, which readers ignore."""
     order = _order(tiff)
     try:
         (directory,) = struct.unpack_from(f"{order}I", tiff, 4)
@@ -156,7 +156,7 @@ def _with_value(tiff: bytes, tag: int, value: int) -> bytes:
 
 
 def _first_scan(data: bytes) -> int | None:
-    """Where the picture's own data begins; a thumbnail with an end of its own may lie before it."""
+    """Offset of the picture's own data; a thumbnail with its own end marker may precede it."""
     at = 2
     while at + 4 <= len(data) and data[at] == 0xFF:
         marker = data[at + 1]
@@ -170,8 +170,8 @@ def _first_scan(data: bytes) -> int | None:
 
 
 def _has_a_hole(data: bytes, scan: int) -> bool:
-    """Whether coded data are missing or overwritten. OpenCV and Pillow fill the rest with grey; FFmpeg says so."""
-    if importlib.util.find_spec("av") is None:  # an installation for a car alone, which learns no scenes
+    """Whether coded data are missing or overwritten. OpenCV and Pillow fill the rest with grey; FFmpeg reports it."""
+    if importlib.util.find_spec("av") is None:  # an installation for a car only, which learns no scenes
         return False
     import av
 
@@ -183,7 +183,7 @@ def _has_a_hole(data: bytes, scan: int) -> bool:
     except av.error.InvalidDataError:
         return True
     except av.error.FFmpegError:
-        return False  # a kind of JPEG that FFmpeg does not read
+        return False  # a kind of JPEG that FFmpeg does not support
     return _progressive(data, scan) and _zeros_in_detail(data, scan)
 
 
@@ -192,9 +192,9 @@ def _progressive(data: bytes, scan: int) -> bool:
 
 
 def _zeros_in_detail(data: bytes, scan: int) -> bool:
-    """Whether a scan of detail has a long run of zeros, as lost blocks of a disk leave: there FFmpeg finds valid codes.
+    """Whether a scan of detail has a long run of zeros, as lost disk blocks leave: FFmpeg decodes them as valid codes.
 
-    A scan of detail writes areas without any in four bytes, however large; only a scan of mean colours may repeat a code for long.
+    A scan of detail encodes an area without detail in four bytes, however large; only a scan of mean colours may repeat a code for long.
     """
     hole = data.find(_FULLY_ZERO, scan)
     while hole >= 0:

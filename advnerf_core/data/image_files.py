@@ -1,4 +1,4 @@
-"""Image files: read whole or not at all, with their transparency; as they are stored, or upright."""
+"""Image files: read whole or not at all, with their transparency; in stored or upright orientation."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def write_image(path: Path, rgb: Rgb) -> None:
 
 
 def encoded(rgb: Rgb, suffix: str, alpha: Grey | None = None) -> bytes:
-    """The file that `write_image` writes for such a name; with opacity ``[H, W]`` where the format has it."""
+    """The content that `write_image` writes for this suffix; with opacity ``[H, W]`` if the format has it."""
     options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if suffix in (".jpg", ".jpeg") else []
     planes = [rgb[..., ::-1]] if alpha is None or suffix in (".jpg", ".jpeg") else [rgb[..., ::-1], alpha]
     done, data = cv2.imencode(suffix, np.ascontiguousarray(np.dstack(planes)), options)
@@ -49,27 +49,27 @@ def encoded(rgb: Rgb, suffix: str, alpha: Grey | None = None) -> bytes:
 
 
 def read_stored(path: Path) -> tuple[Rgb, Grey | None]:
-    """Colours ``[H, W, 3]`` and, if the file has it, opacity ``[H, W]``, of the pixels as the file stores them.
+    """Colours ``[H, W, 3]`` and, if the file has it, opacity ``[H, W]``, of the pixels in stored orientation.
 
-    This is how images with poses, masks, logs and calibration pictures are read: their numbers are about the stored pixels, whatever
-    EXIF says of the way up.
+    Images with poses, masks, logs and calibration pictures are read this way: their numbers refer to the stored pixels, regardless
+    of EXIF's orientation.
 
     Raises:
-        DatasetError: The file cannot be read, is damaged, or is no image.
+        DatasetError: The file cannot be read, is damaged, or is not an image.
     """
     return _decoded(path, read_bytes(path))
 
 
 def read_upright(path: Path) -> tuple[Rgb, Grey | None]:
-    """The same of a picture for people, or one whose pose is still to be found: turned upright as its EXIF data says."""
+    """The same for a picture for people, or one whose pose is still unknown: turned upright by its EXIF data."""
     data = read_bytes(path)
     rgb, alpha = _decoded(path, data)
-    turn = 1 if is_heif(data) else orientation(data)  # the decoder of HEIF has turned it
+    turn = 1 if is_heif(data) else orientation(data)  # the decoder of HEIF has turned it already
     return turned(rgb, turn), None if alpha is None else turned(alpha, turn)
 
 
 def read_mask(path: Path) -> Grey:
-    """A mask ``[H, W]`` of stored pixels; what is not black is kept."""
+    """A mask ``[H, W]`` of stored pixels; pixels that are not black are kept."""
     try:
         rgb, _ = read_stored(path)
     except DatasetError as error:
@@ -78,7 +78,7 @@ def read_mask(path: Path) -> Grey:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height [px] as `read_stored` would return them; of a PNG without decoding it."""
+    """Width and height [px] that `read_stored` would return; for a PNG without decoding it."""
     with _open(path) as stream:
         head = stream.read(24)
     if head.startswith(PNG) and len(head) == 24:
@@ -89,7 +89,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def read_bytes(path: Path) -> bytes:
-    """The file's content; what stands in the way is one error."""
+    """The file's content; failures are raised as one kind of error."""
     with _open(path) as stream:
         return stream.read()
 
@@ -122,7 +122,7 @@ def _decoded(path: Path, data: bytes) -> tuple[Rgb, Grey | None]:
 
 
 def _opencv_pixels(data: bytes) -> NDArray[Any] | None:
-    # Colours of a JPEG may be CMYK, which only the first flag converts; the second reads whatever there is, alpha and 16 bit.
+    # Colours of a JPEG may be CMYK, which only the first flag converts; the second reads all others, alpha and 16 bit.
     flags = (
         cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION if data.startswith(JPEG) else cv2.IMREAD_UNCHANGED
     )
@@ -145,7 +145,7 @@ def heif_reader(path: Path) -> Any:
     """The library that reads HEIC pictures.
 
     Raises:
-        DatasetError: It is not installed.
+        DatasetError: The library is not installed.
     """
     try:
         import pillow_heif
@@ -169,7 +169,7 @@ def _heif_image(path: Path, data: bytes) -> Any:
 
 
 def unpremultiplied(rgb: Rgb, alpha: Grey) -> Rgb:
-    """Colours that were multiplied by opacity, without it."""
+    """Colours without the opacity that they were multiplied by."""
     weight = np.maximum(alpha[..., None], 1) / np.float32(OPAQUE)
     return np.minimum(np.rint(rgb / weight), OPAQUE).astype(np.uint8)
 

@@ -1,8 +1,8 @@
-"""Which frames of a video to keep: sharp ones, and a new one whenever the view has moved on.
+"""Selects the frames of a video to keep: sharp ones, and a new one whenever the view has moved on.
 
 Sharpness is the variance of the Laplacian (Pech-Pacheco et al. 2000) of a small grey copy. Movement is the median displacement of
-corners that optical flow (Lucas and Kanade, with pyramids) follows from the last kept frame; when too few can be followed, the view is
-another one. Among the frames since the movement came near its limit the sharpest is kept, so that a shake costs no place.
+corners tracked by optical flow (Lucas and Kanade, with pyramids) since the last kept frame; when too few can be followed, the view
+counts as changed. Among the frames since the movement came near its limit the sharpest is kept, so that a shake costs no place.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ _LOST_SHARE, _RETURN_PX = 0.35, 1.0
 
 @dataclass(frozen=True)
 class KeyframeConfig:
-    """How frames are chosen.
+    """Criteria for selecting frames.
 
     Attributes:
         movement: Displacement of the picture after which a new frame is due, as a share of its width.
         window: Share of that movement over which the sharpest frame is looked for.
         blur_limit: A frame less sharp than this share of the usual sharpness is passed over until `max_wait_s` is over.
-        max_wait_s: At the latest after so long another frame is kept, if the view has moved at all [s].
+        max_wait_s: Longest time until another frame is kept, if the view has moved at all [s].
     """
 
     movement: float = 0.06
@@ -51,7 +51,7 @@ class Candidate:
     """A frame of a video.
 
     Attributes:
-        number: Place in the video, from 0.
+        number: Number of the frame, from 0.
         time_s: Time in the video [s].
         rgb: ``[H, W, 3]`` uint8.
         sharpness: Variance of the Laplacian.
@@ -64,7 +64,7 @@ class Candidate:
 
 
 class KeyframeSelector:
-    """Takes frames one after another and says which to keep; holds at most two of them."""
+    """Takes frames one after another and selects those to keep; holds at most two of them."""
 
     def __init__(self, config: KeyframeConfig | None = None) -> None:
         self._config = config or KeyframeConfig()
@@ -75,12 +75,12 @@ class KeyframeSelector:
         self._usual = 0.0
 
     def offer(self, number: int, time_s: float, rgb: Rgb) -> Candidate | None:
-        """The next frame ``[H, W, 3]`` uint8; the one to keep, if one has been settled on."""
+        """Take the next frame ``[H, W, 3]`` uint8; returns a frame to keep once one is settled."""
         grey = work_image(rgb)
         new = Candidate(number, time_s, rgb, sharpness(grey))
         self._usual = new.sharpness if self._usual == 0.0 else 0.95 * self._usual + 0.05 * new.sharpness
         if self._kept is None:
-            # What comes close behind and is sharper may still take the first one's place.
+            # A sharper frame soon after may still replace the first one.
             self._best = new
             self._remember(new)
             return None
@@ -94,19 +94,19 @@ class KeyframeSelector:
         return self._keep() if moved >= config.movement or late else None
 
     def last(self) -> Candidate | None:
-        """At the end of the video: the best frame that has moved on and was not kept, if there is one."""
+        """At the end of the video: the best frame that has moved on and was not kept, if any."""
         return None if self._best is None else self._keep()
 
     def movement(self, grey: Grey) -> float:
         """Median displacement since the last kept frame, as a share of the width; 1 when it cannot be followed."""
         if self._kept is None or len(self._corners) < _LEAST_CORNERS:
-            # Nothing to follow on a bare wall: how different the pictures are stands in for it.
+            # On a bare wall there is nothing to follow: the difference of the pictures replaces it.
             return (
                 0.0 if self._kept is None else float(np.asarray(cv2.absdiff(self._kept, grey)).mean() / 255.0)
             )
         found, status = _follow(self._kept, grey, self._corners)
         back, status_back = _follow(grey, self._kept, found)
-        # Flow finds something in any picture; what it finds is the same corner only if the way back ends where it began.
+        # Flow gives a result in any picture; it is the same corner only if tracking back ends where it began.
         same = status & status_back & (np.linalg.norm(back - self._corners, axis=-1).reshape(-1) < _RETURN_PX)
         if same.mean() < _LOST_SHARE:
             return 1.0
@@ -129,7 +129,7 @@ class KeyframeSelector:
 
 
 def work_image(rgb: Rgb) -> Grey:
-    """Small grey copy ``[h, w]`` on which frames are judged."""
+    """Small grey copy ``[h, w]`` for judging a frame."""
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     width = min(_WORK_WIDTH, grey.shape[1])
     size = (width, max(1, round(grey.shape[0] * width / grey.shape[1])))

@@ -1,4 +1,4 @@
-"""Lens distortion and its removal: everything behind the door of a data set is an ideal pinhole.
+"""Lens distortion and its removal: loaded data sets have ideal pinholes only.
 
 Two models, both as OpenCV defines them: ``OPENCV`` (Brown: radial k1, k2, k3 and tangential p1, p2, on the image plane) and
 ``OPENCV_FISHEYE`` (Kannala and Brandt 2006: a polynomial k1..k4 in the angle from the optical axis). COLMAP, nerfstudio and
@@ -18,18 +18,18 @@ from numpy.typing import NDArray
 from advnerf_core.data.errors import DatasetError
 from advnerf_core.geometry import Array, Pinhole
 
-# An ideal pinhole spends nearly all its pixels on the border when it is wider; what a fisheye sees beyond is left out.
+# An ideal pinhole that is wider spends nearly all its pixels on the border; a fisheye's view beyond is left out.
 WIDEST_HALF_ANGLE_RAD = math.radians(70.0)
 _EDGE_SAMPLES = 64
 
 
 @dataclass(frozen=True)
 class Lens:
-    """How a lens departs from a pinhole.
+    """Distortion of a lens relative to a pinhole.
 
     Attributes:
         coefficients: ``k1, k2, p1, p2, k3`` or, for a fisheye, ``k1, k2, k3, k4``.
-        fisheye: Whether the coefficients are those of the fisheye model.
+        fisheye: Whether the coefficients belong to the fisheye model.
     """
 
     coefficients: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
@@ -58,11 +58,11 @@ class Lens:
 
 @dataclass(frozen=True, eq=False)
 class Straightening:
-    """How to undistort images of one camera.
+    """Undistortion of images of one camera.
 
     Attributes:
-        pinhole: Intrinsics afterwards; the size is kept.
-        valid: ``[H, W]`` bool: pixels that the lens saw; None when all are.
+        pinhole: Intrinsics afterwards; the size is unchanged.
+        valid: ``[H, W]`` bool: pixels that the lens saw; None if it saw all.
     """
 
     pinhole: Pinhole
@@ -81,11 +81,11 @@ def straightening(pinhole: Pinhole, lens: Lens, keep_all: bool = False) -> Strai
 
     Args:
         pinhole: Intrinsics of the distorted images.
-        keep_all: Whether to keep every pixel of the image and say which of the new ones are valid; otherwise the largest
+        keep_all: Whether to keep every pixel of the image and mark the valid ones; otherwise the largest
             window without missing pixels is kept.
 
     Raises:
-        DatasetError: The coefficients fold the image over itself, so nothing undoes them.
+        DatasetError: The coefficients fold the image over itself, so that it cannot be undistorted.
     """
     ideal = _ideal_fisheye(pinhole, lens, keep_all) if lens.fisheye else _ideal_brown(pinhole, lens, keep_all)
     if ideal is None:

@@ -1,4 +1,4 @@
-"""One photograph on disk, with the lens and the pose that a data set gives it."""
+"""One photograph on disk, with its lens and pose from a data set."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class PosedImage:
         pinhole: Intrinsics for the listed size.
         lens: Distortion.
         T_world_from_camera: Pose ``[4, 4]``, OpenCV axes.
-        mask: File whose black pixels are to be left out; None if all count.
-        split: ``train``, ``val`` or ``test`` where the data set says so.
+        mask: File whose black pixels are left out; None if all count.
+        split: ``train``, ``val`` or ``test`` if the data set has splits.
     """
 
     path: Path

@@ -1,4 +1,4 @@
-"""A folder of posed images, filled picture by picture from whatever takes them."""
+"""Writes a folder of posed images, picture by picture."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ def write_posed_images(
     keep: bool = False,
     told: Callable[[int], None] = lambda count: None,
 ) -> int:
-    """Write ``images/00000.<suffix>`` and so on and, when all are there, their ``transforms.json``; no poses, no files.
+    """Write ``images/00000.<suffix>`` and so on and, when all exist, their ``transforms.json``; without poses, no files.
 
     Args:
         poses: ``T_world_from_camera [4, 4]`` of each picture, OpenCV axes.
         pinhole: Intrinsics of all, or of each.
         see: Takes the picture ``[h, w, 3]`` of an index.
         suffix: ``png`` where pixels are compared, ``jpg`` where a scene is learned from them.
-        keep: Do not take pictures that are there: for a capture that goes on. The caller sees to it that they belong to these poses.
-        told: Called after each picture with how many are there.
+        keep: Skip existing pictures, to resume a capture. The caller must make sure that they belong to these poses.
+        told: Progress callback, called after each picture with the number of existing ones.
 
     Returns:
-        How many pictures were taken now.
+        Number of pictures taken in this call.
     """
     names = [f"images/{index:05d}.{suffix}" for index in range(len(poses))]
     taken = 0

@@ -1,10 +1,10 @@
-"""The similarity between two worlds that hold the same cameras: scale, rotation and translation, robust against wrong poses.
+"""The similarity between two worlds with the same cameras: scale, rotation and translation, robust against wrong poses.
 
-Structure from motion leaves scale and frame open; motion capture gives both. With camera centres ``p_i`` and rotations ``R_i`` in
+Structure from motion leaves scale and frame open; motion capture determines both. With camera centres ``p_i`` and rotations ``R_i`` in
 the source world and ``q_i``, ``S_i`` in the target, the map ``q = s R p + t`` minimises
 ``sum_i |q_i - s R p_i - t|^2 + l^2 |S_i - R R_i|^2`` (Umeyama 1991, with the rotations as further correspondences: the axes of a
-camera, held at distance ``l``). The rotations settle what positions on a line leave open, and they reveal a wrong correspondence
-that happens to lie in the right place. Outliers are found by consensus among pairs of cameras, each of which fixes a candidate.
+camera, at distance ``l``). The rotations determine what positions on a line leave open, and they reveal a wrong correspondence
+that happens to lie in the right place. Outliers are found by consensus among pairs of cameras, each of which gives a candidate.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _LINE_RATIO = 0.02
 
 
 class SimilarityError(AdvnerfError):
-    """Two sets of camera poses do not fix a similarity."""
+    """Two sets of camera poses do not determine a similarity."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,14 +55,14 @@ class Similarity:
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """A similarity and how well it fits.
+    """A similarity and its residuals.
 
     Attributes:
-        similarity: From the source to the target world.
+        similarity: Map from the source to the target world.
         inliers: ``[N]`` bool: cameras that it was fitted to.
         position_error_m: ``[N]`` distance of each camera from its target [target units].
         rotation_error_rad: ``[N]`` angle of each camera from its target [rad].
-        extent_m: Largest distance between two target cameras that were fitted [target units].
+        extent_m: Largest distance between two inlier target cameras [target units].
     """
 
     similarity: Similarity
@@ -82,7 +82,7 @@ class Alignment:
         return float(np.sqrt(np.mean(self.rotation_error_rad[self.inliers] ** 2)))
 
     def summary(self) -> dict[str, float | int]:
-        """What a report says."""
+        """Values for a report."""
         inside = self.inliers
         return {
             "scale": self.similarity.scale,
@@ -109,10 +109,10 @@ def align_poses(
     Args:
         T_source_from_camera: ``[N, 4, 4]``.
         T_target_from_camera: ``[N, 4, 4]`` of the same cameras.
-        position_tolerance_m: How far an inlier may be from its target [target units]; with both tolerances infinite all count.
-        rotation_tolerance_rad: How far an inlier may be turned from its target [rad].
-        min_inlier_share: With fewer inliers than this share the result is refused.
-        seed: Of the choice of candidate pairs, where there are too many to try all.
+        position_tolerance_m: Largest distance of an inlier from its target [target units]; with both tolerances infinite all count.
+        rotation_tolerance_rad: Largest angle of an inlier from its target [rad].
+        min_inlier_share: With fewer inliers than this share the result is rejected.
+        seed: Seed of the choice of candidate pairs, if there are too many to try all.
 
     Raises:
         SimilarityError: Too few cameras, all at one place or on one line, or too few that agree.
@@ -138,7 +138,7 @@ def align_poses(
     everything = np.isinf(tolerances).all()
     inliers = np.ones(len(source), np.bool_) if everything else _consensus(source, target, tolerances, seed)
     _require_share(inliers, min_inlier_share, tolerances)
-    for _ in range(20):  # to a fixed point; the set settles after two or three rounds
+    for _ in range(20):  # to a fixed point; it settles after two or three rounds
         similarity = _fit(source[inliers], target[inliers])
         again = _inliers(_errors(similarity, source, target), tolerances)
         _require_share(again, min_inlier_share, tolerances)
@@ -154,7 +154,7 @@ def fit_positions(source: ArrayLike, target: ArrayLike, source_up: ArrayLike) ->
     """Least-squares similarity between positions ``[N, 3]`` without rotations, into a world with z up (Umeyama 1991).
 
     Args:
-        source_up: Up ``[3]`` in the source world. It settles the rotation about a line that all positions are on.
+        source_up: Up ``[3]`` in the source world. It determines the rotation about a line that all positions are on.
 
     Returns:
         The similarity, and whether the positions are on a line, so that ``source_up`` was used.
@@ -179,7 +179,7 @@ def fit_positions(source: ArrayLike, target: ArrayLike, source_up: ArrayLike) ->
             raise SimilarityError(
                 "expected known positions that are not above each other; give some elsewhere"
             )
-        # What up says about the turn around the line counts as much as the line itself.
+        # Up determines the turn around the line with the same weight as the line itself.
         up_p, up_q = (_across(up, along) for up, along in ((source_up, along_p), ([0.0, 0.0, 1.0], along_q)))
         places = np.outer(along_q, along_p) + np.outer(up_q, up_p)
     R = _nearest_rotation(places)
@@ -219,7 +219,7 @@ def _fit(source: Array, target: Array) -> Similarity:
     p, q = source[:, :3, 3], target[:, :3, 3]
     p0, q0 = p.mean(axis=0), q.mean(axis=0)
     p, q = p - p0, q - q0
-    # As long as the cameras are spread: then a radian counts as much as the spread it would cause.
+    # Length over which the cameras are spread: then a radian counts as much as the spread it would cause.
     arm = float(np.sqrt((q**2).sum(axis=1).mean()))
     turns = np.einsum("nij,nkj->ik", target[:, :3, :3], source[:, :3, :3])
     places = q.T @ p

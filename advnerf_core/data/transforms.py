@@ -1,6 +1,6 @@
-"""``transforms.json`` as nerfstudio, Instant-NGP and blender write it, turned into our conventions at the door.
+"""``transforms.json`` from nerfstudio, Instant-NGP and blender, converted to our conventions on reading.
 
-Files have OpenGL camera axes (x right, y up, z backward); everything after this module has OpenCV axes. Whatever is wrong with
+Files have OpenGL camera axes (x right, y up, z backward); everything after this module has OpenCV axes. Any error in
 a file is one `DatasetError` that names the file, the frame and the field.
 """
 
@@ -39,19 +39,19 @@ _LENS_KEYS = {
     "is_equirectangular",
     "equirectangular",
 }
-# What other software reads of a lens, in the words of all of them: whoever ignores one of these learns another camera.
+# Lens keys that other software reads; a reader that ignores one of these learns another camera.
 _LENS_LIKE = re.compile(
     r"(k|p|s|b|d|sx|sy|ftheta_p)\d+|.*(distort|fisheye|shutter|skew|lens|latlong|equirect|orthographic|mitsuba).*",
     re.I,
 )
-# Keys with which other software learns something else; the camera is the same without them.
+# Keys that change what other software learns, but not the camera.
 _OTHER_KEYS = (
     "white_transparent", "black_transparent", "mask_color", "fix_premult", "fisheye_crop_radius", "depth_file_path", "depth_path",
     "timestamp", "time",
 )  # fmt: skip
 _SPLITS = (TRAIN, *HELD_OUT_SPLITS)
 _RIGID_TOLERANCE = 0.01
-# Times the spread of the cameras, whatever the unit: single precision resolves a thousandth of the spread there. What is farther has
+# Relative to the spread of the cameras, in any unit: single precision resolves a thousandth of the spread there. Anything farther has
 # a map's origin, not a scene's.
 _FARTHEST = 1e4
 _SPREAD_QUANTILE = 0.9
@@ -59,14 +59,14 @@ _Values = dict[str, Any]
 
 
 class _FieldError(ValueError):
-    """A field of one frame is wrong; says which and how."""
+    """A field of one frame is wrong."""
 
 
 def load_transforms(path: str | Path, require_all: bool = False) -> PosedImages:
-    """Read a ``transforms.json``, or a folder with one or with blender's ``transforms_train.json`` and its like.
+    """Read a ``transforms.json``, or a folder with one or with blender's ``transforms_train.json`` and similar files.
 
     Args:
-        path: The file, or the folder that holds it.
+        path: The file, or its folder.
         require_all: Whether a listed image that is missing is an error; otherwise it is left out and listed in ``missing``.
 
     Raises:
@@ -183,7 +183,7 @@ def _normal(name: str) -> str:
 
 
 def _image_path(folder: Path, name: str) -> Path | None:
-    # Blender's files leave the suffix out.
+    # Blender's files omit the suffix.
     candidates: Iterable[Path] = (folder / name, *(folder / f"{name}{suffix}" for suffix in SUFFIXES))
     return next((c for c in candidates if c.is_file()), None)
 
@@ -234,7 +234,7 @@ def _pose(values: _Values) -> Array:
             f"transform_matrix: expected a rotation and a translation, got {kind} by {', '.join(f'{s:.4g}' for s in stretch)} in "
             "its rotation part; remove the scale of the camera (or of its parent) and export again"
         )
-    # Files in the wild carry rotations rounded to a few digits; the nearest rotation keeps rays of unit length.
+    # Files often have rotations rounded to a few digits; the nearest rotation keeps rays of unit length.
     matrix[:3, :3] = u @ vt
     return np.asarray(matrix @ OPENGL_FROM_OPENCV, np.float64)
 
@@ -321,7 +321,7 @@ def _focal_length(values: _Values, axis: str, size: int) -> float | None:
 def _number(values: _Values, key: str, default: float, positive: bool = False) -> float:
     raw = values.get(key)
     try:
-        if isinstance(raw, bool):  # in Python, a number
+        if isinstance(raw, bool):  # a number in Python
             raise TypeError
         value = default if raw is None else float(raw)
     except (TypeError, ValueError):

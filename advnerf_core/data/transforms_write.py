@@ -1,4 +1,4 @@
-"""Write ``transforms.json`` files that nerfstudio and Instant-NGP read too."""
+"""Writes ``transforms.json`` files that nerfstudio and Instant-NGP can read too."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def write_transforms(
         pinhole: One for all images, or one each.
         aabb_scale: Instant-NGP's box size.
         lens: Distortion of all images, or one each; None for none.
-        camera_ids: Which camera took each image.
-        extra: Anything else to note at the top of the file (JSON types).
+        camera_ids: Id of each image's camera.
+        extra: Further data for the top of the file (JSON types).
     """
     path, poses, count = Path(path), np.asarray(T_world_from_camera, np.float64), len(image_paths)
     if poses.shape != (count, 4, 4):
@@ -71,7 +71,7 @@ def _each(value: Any, kind: type[T], count: int) -> list[T]:
 
 
 def _relative(image: Path, folder: Path) -> str:
-    """Relative to the file's folder even where the image lies outside, so that both can move together."""
+    """Relative to the file's folder even if the image lies outside, so that both can move together."""
     return (
         Path(os.path.relpath(image, folder.absolute())).as_posix()
         if image.is_absolute()

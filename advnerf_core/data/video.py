@@ -1,4 +1,4 @@
-"""Videos: frames in order, upright, with their times; and the pick of them on disk."""
+"""Videos: frames in order, upright, with their times; and selected frames on disk."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ _SQUARE = 1e-3
 
 
 def read_video(path: Path) -> Iterator[tuple[int, float, float, Rgb]]:
-    """Frames of a video: number, time [s], share of the video that is over (0..1), image ``[H, W, 3]`` uint8, upright, of square
+    """Frames of a video: number, time [s], elapsed share of the video (0..1), image ``[H, W, 3]`` uint8, upright, of square
     pixels.
 
     Raises:
-        DatasetError: The file is no video, or not one frame of it can be read. A damaged end only ends the video early.
+        DatasetError: The file is not a video, or not one frame of it can be read. A damaged end only ends the video early.
     """
     import av
 
@@ -43,7 +43,7 @@ def read_video(path: Path) -> Iterator[tuple[int, float, float, Rgb]]:
             for frame in container.decode(stream):
                 time_s = float(frame.time) if frame.time is not None else float(number)
                 share = min(max(time_s / length_s, 0.0), 1.0) if length_s > 0.0 else 0.0
-                # Phones store the sensor's picture and say how to turn it.
+                # Phones store the sensor's picture and a rotation for display.
                 turns = round(getattr(frame, "rotation", 0) / 90.0) % 4
                 rgb = np.ascontiguousarray(np.rot90(_square_pixels(frame, stream), turns))
                 yield number, time_s, share, rgb
@@ -72,21 +72,21 @@ def _square_pixels(frame: Any, stream: Any) -> Rgb:
 def keep_keyframes(
     path: Path, folder: Path, config: KeyframeConfig, most: int, report: Callable[[float, str], None]
 ) -> list[Path]:
-    """Write the frames of a video worth keeping as JPEG files; what an earlier run finished is used again.
+    """Write the selected frames of a video as JPEG files; finished files of an earlier run are reused.
 
     Args:
-        folder: Where the files go, named by their number in the video.
-        most: At most so many, evenly thinned out.
-        report: Told of the finished share and how many are kept.
+        folder: Folder of the files, which are named by their number in the video.
+        most: Largest number of frames, evenly thinned out.
+        report: Progress callback, called with the finished share and the number of frames as text.
 
     Returns:
-        The files in order of time.
+        The files, ordered by time.
     """
     key = _key(path, config, most)
     if (done := _finished(folder, key)) is not None:
         return done
     folder.mkdir(parents=True, exist_ok=True)
-    for old in folder.glob("*.jpg"):  # of another choice, or of a run that was stopped
+    for old in folder.glob("*.jpg"):  # from another choice, or an interrupted run
         old.unlink()
     selector, kept = KeyframeSelector(config), []
     for number, time_s, share, rgb in read_video(path):
@@ -116,7 +116,7 @@ def _thinned(rows: list[dict[str, Any]], most: int) -> list[dict[str, Any]]:
 
 
 def _key(path: Path, config: KeyframeConfig, most: int) -> str:
-    # The content of a video is too long to read twice; its size and the moment it was written stand for it.
+    # The content of a video is too long to read twice; its size and modification time replace it.
     try:
         state = path.stat()
     except OSError as error:

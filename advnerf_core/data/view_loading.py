@@ -1,4 +1,4 @@
-"""One photograph into memory: read, masked, undistorted, brought to size."""
+"""Loads one photograph: read, masked, undistorted, resized."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from advnerf_core.data.lens import straightening
 from advnerf_core.data.posed_image import PosedImage
 from advnerf_core.geometry import Pinhole
 
-# Sizes may differ from the listed ones (half-size copies), their ratio may not: then the image is another one, or turned.
+# Sizes may differ from the listed ones (half-size copies), but not in their ratio: then the image is another one, or turned.
 _ASPECT_TOLERANCE = 0.01
 
 
@@ -24,9 +24,9 @@ class LoadedView:
     """One image in memory, undistorted.
 
     Attributes:
-        rgb: ``[H, W, 3]`` uint8; behind full transparency it means nothing.
+        rgb: ``[H, W, 3]`` uint8; meaningless where it is fully transparent.
         alpha: Opacity ``[H, W]`` uint8; None for a photograph.
-        valid: ``[H, W]`` bool: pixels to learn from; None when all are.
+        valid: ``[H, W]`` bool: pixels to learn from; None if all are valid.
     """
 
     rgb: Rgb
@@ -36,16 +36,16 @@ class LoadedView:
 
 
 def load_image(frame: PosedImage, size: tuple[int, int] | None = None) -> tuple[Rgb, Pinhole]:
-    """Colours and intrinsics of one image, undistorted and brought to ``size`` (width, height); see `load_view`."""
+    """Colours and intrinsics of one image, undistorted and resized to ``size`` (width, height); see `load_view`."""
     view = load_view(frame, size)
     return view.rgb, view.pinhole
 
 
 def load_view(frame: PosedImage, size: tuple[int, int] | None = None, keep_all: bool = False) -> LoadedView:
-    """Read one image, undistort it and bring it to ``size`` (width, height).
+    """Read one image, undistort it and resize it to ``size`` (width, height).
 
     Undistortion keeps the largest window without missing pixels, so intrinsics change a little with it; or with ``keep_all``
-    everything, and ``valid`` says where there is nothing.
+    everything, and ``valid`` marks the existing pixels.
     """
     rgb, alpha = read_stored(frame.path)
     height, width = rgb.shape[:2]
@@ -56,7 +56,7 @@ def load_view(frame: PosedImage, size: tuple[int, int] | None = None, keep_all: 
     if size is not None and size != (width, height):
         rgb, alpha = _resized(rgb, alpha, size)
         if valid is not None:
-            # A pixel that is partly masked is masked.
+            # A partly masked pixel counts as masked.
             valid = _resize(np.where(valid, np.uint8(OPAQUE), np.uint8(0)), size) == OPAQUE
         pinhole = pinhole.resized(*size)
     return LoadedView(rgb, alpha, valid, pinhole)
@@ -126,5 +126,5 @@ def _resize(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8
 
 
 def _premultiplied(rgb: Rgb, alpha: Grey) -> tuple[Rgb, Grey]:
-    """Colours weighted by opacity: only those may be averaged, or what is behind the glass bleeds into the edges."""
+    """Colours weighted by opacity: only these may be averaged, or hidden colours bleed into the edges."""
     return np.rint(rgb * (alpha[..., None] / np.float32(OPAQUE))).astype(np.uint8), alpha

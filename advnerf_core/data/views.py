@@ -1,7 +1,7 @@
-"""Posed images: what a data set lists, and what a trainer gets after undistortion.
+"""Posed images: the list of a data set, and undistorted images in memory for training.
 
 On disk an image has a lens and possibly a mask and transparency; in memory there are ideal pinholes with pixel centres at +0.5
-and, where a set needs them, an opacity and a flag per pixel.
+and, where a set needs them, an opacity and a validity flag per pixel.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ class ImageSet:
     Attributes:
         rgb: ``[N, H, W, 3]`` uint8.
         T_world_from_camera: ``[N, 4, 4]``.
-        alpha: Opacity ``[N, H, W]`` uint8; None when all are opaque.
-        valid: ``[N, H, W]`` bool, pixels to learn from and to compare with; None when all are.
-        camera_ids: Which camera took each; empty when unknown.
+        alpha: Opacity ``[N, H, W]`` uint8; None if all are opaque.
+        valid: ``[N, H, W]`` bool, pixels to learn from and to compare with; None if all are valid.
+        camera_ids: Camera id of each image; empty if unknown.
     """
 
     rgb: Rgb
@@ -66,15 +66,15 @@ class ImageSet:
 
 @dataclass(frozen=True, eq=False)
 class PosedImages:
-    """What a data set lists.
+    """The list of a data set.
 
     Attributes:
         frames: Images that exist, in the file's order.
         missing: Listed files that do not exist.
         aabb_scale: Instant-NGP's box size, if the file has one.
         scale: Instant-NGP's scale from the file's coordinates to its unit cube.
-        offset: Its offset, applied after the scale.
-        file: The file that lists them.
+        offset: Offset to the unit cube, applied after the scale.
+        file: The file of the list.
         ignored: Keys of the file that other software reads and that have no effect here.
     """
 
@@ -88,7 +88,7 @@ class PosedImages:
 
     @property
     def remarks(self) -> list[str]:
-        """What of the file is not used, in lines for its user."""
+        """Unused parts of the file, in lines for its user."""
         lines = [f"skipped, file not found: {path}" for path in self.missing]
         if self.ignored:
             lines.append(f"no effect here: the keys {', '.join(self.ignored)} of {self._name}")
@@ -96,7 +96,7 @@ class PosedImages:
 
     @property
     def splits(self) -> tuple[str, ...]:
-        """Splits that the data set itself makes, e.g. ``("train", "test")``; empty if it makes none."""
+        """Splits defined by the data set itself, e.g. ``("train", "test")``; empty if it has none."""
         return tuple(dict.fromkeys(frame.split for frame in self.frames if frame.split is not None))
 
     @property
@@ -109,7 +109,7 @@ class PosedImages:
         return replace(self, frames=tuple(frames))
 
     def sorted_by_name(self) -> PosedImages:
-        """The same, in the order of file names."""
+        """The same data set, in the order of file names."""
         return self.with_frames(sorted(self.frames, key=lambda f: f.path.name))
 
     def of_camera(self, camera_id: str) -> PosedImages:
@@ -125,7 +125,7 @@ class PosedImages:
         return self.with_frames([frame for frame in self.frames if frame.split in names])
 
     def split(self, every: int) -> tuple[PosedImages, PosedImages]:
-        """Training and held-out images: of the present order, every ``every``-th, from the first, is held out."""
+        """Training and held-out images: in the current order, every ``every``-th, from the first, is held out."""
         if every < 2:
             raise ValueError(f"expected to hold out every 2nd image or fewer, got every {every}")
         if len(self.frames) < 2:
@@ -147,8 +147,8 @@ class PosedImages:
         """Read, undistort and resize all images.
 
         Args:
-            size: ``(width, height)`` [px] to bring all images to by area averaging; None keeps the size on disk.
-            keep_all: Whether undistortion keeps the whole view, with ``valid`` saying where there is none; otherwise it crops.
+            size: ``(width, height)`` [px] to resample all images to by area averaging; None keeps the size on disk.
+            keep_all: Whether undistortion keeps the whole view, with ``valid`` marking existing pixels; otherwise it crops.
         """
         if not self.frames:
             raise DatasetError(f"expected at least one image in {self._name} to load, got none")
@@ -182,7 +182,7 @@ class PosedImages:
         return centre - half, centre + half
 
     def inner_box(self) -> tuple[Array, Array]:
-        """Low and high corner ``[3]`` of what a contracted field sees in full detail: Instant-NGP's unit cube, larger if cameras need it."""
+        """Low and high corner ``[3]`` of the full-detail region of a contracted field: Instant-NGP's unit cube, larger if cameras need it."""
         centre = (0.5 - np.array(self.offset)) / self.scale
         places = np.stack([frame.T_world_from_camera[:3, 3] for frame in self.frames])
         half = max(0.5 / self.scale, float(np.abs(places - centre).max()))

@@ -29,7 +29,7 @@ class ExpertConfig:
         smoothing_m: Path curvature is averaged over this length, so that the steering is continuous in the state [m].
         steering_limits_rad: Rightmost and leftmost output, inside what the policy can express: wheel angle [rad], or turn
             rate [rad/s].
-        output: What the expert commands: the wheel angle of a car with a wheelbase, or the turn rate of a Dubins car.
+        output: Command of the expert: the wheel angle of a car with a wheelbase, or the turn rate of a Dubins car.
     """
 
     wheelbase_m: float = 0.25
@@ -106,7 +106,7 @@ class Expert:
     def to_dict(self) -> dict[str, Any]:
         """Settings and path as plain data, for manifests."""
         settings = asdict(self.config)
-        # Left out where it is the default, so that policies and training folders from before it existed keep their hashes.
+        # Left out if it is the default, so that older policies and training folders keep their hashes.
         if settings["output"] == "wheel_angle":
             del settings["output"]
         return {**settings, "path": self.path.to_dict()}

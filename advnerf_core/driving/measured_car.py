@@ -26,13 +26,13 @@ _POSE, _ACTING, _BEFORE = 3, 3, 4
 
 @dataclass(frozen=True)
 class CarResponse:
-    """How a car answers.
+    """Measured response of a car.
 
     Attributes:
-        speed_mps: Its speed [m/s].
+        speed_mps: Speed of the car [m/s].
         gain: Steering per commanded steering.
         offset: Steering at command zero [rad, or rad/s].
-        delay_s: Until a command acts; at most one tick [s].
+        delay_s: Time until a command acts; at most one tick [s].
         lag_s: Time constant with which the steering follows [s].
     """
 
@@ -46,7 +46,7 @@ class CarResponse:
 class RespondingCar:
     """The surrogate's car with a measured response.
 
-    Its state is that of the surrogate's car, the steering that acts, and the last command: ``[x, y, yaw, u, c']``.
+    Its state is the surrogate car's, the acting steering, and the last command: ``[x, y, yaw, u, c']``.
 
     Args:
         ideal: The surrogate's car; its speed is replaced by the measured one.
@@ -75,11 +75,11 @@ class RespondingCar:
 
 
 def fit_response(poses: Sequence[Array], controls: Sequence[Array], ideal: Dubins | Ackermann) -> CarResponse:
-    """The response of a car from drives.
+    """Fit the response of a car to drives.
 
     Args:
-        poses: Of each drive, poses ``[T + 1, 3]`` at the ticks; headings may wrap.
-        controls: Of each drive, what was commanded ``[T]``.
+        poses: Poses ``[T + 1, 3]`` at the ticks of each drive; headings may wrap.
+        controls: Commands ``[T]`` of each drive.
 
     Raises:
         ValueError: No drive has two ticks.
@@ -93,7 +93,7 @@ def fit_response(poses: Sequence[Array], controls: Sequence[Array], ideal: Dubin
         raise ValueError("expected drives of at least two ticks, got none; drive without attack first")
     steps = np.concatenate([np.hypot(*np.diff(p[:, :2], axis=0).T) for p, _ in pairs])
     turned = [np.diff(np.unwrap(p[:, 2])) for p, _ in pairs]
-    # The first ticks may be those of a car that still speeds up.
+    # In the first ticks the car may still speed up.
     speed_mps = float(np.median(steps)) / ideal.dt_s
     limit = ideal.steering_limits_rad[1] if isinstance(ideal, Ackermann) else max(abs(pairs[0][1]).max(), 0.1)
 

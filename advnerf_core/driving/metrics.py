@@ -40,12 +40,12 @@ def drives(mean_cte_m: float, off_track: bool, off_track_m: float = LAB_OFF_TRAC
 
 @dataclass(frozen=True)
 class Horizon:
-    """What is summed, and the limits.
+    """Horizon of the sums, and the limits.
 
     Attributes:
         ticks: Number of control ticks.
         dt_s: Length of a tick [s].
-        off_track_m: A larger |CTE| is off the track [m]; half a lane elsewhere.
+        off_track_m: A larger |CTE| is off the track [m]; half a lane by default.
         held_cap_m: Greatest |CTE| that a stopped car is charged per tick [m].
     """
 

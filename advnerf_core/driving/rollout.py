@@ -84,7 +84,7 @@ class Remembering:
         return policy if getattr(policy, "stateless", True) else Remembering(policy, batch, keep=False)
 
     def __call__(self, images: Tensor, goals: Tensor | None = None) -> Tensor:
-        """Controls ``[B]`` of images ``[B, 3, H, W]``; the memory goes on."""
+        """Controls ``[B]`` of images ``[B, 3, H, W]``; the memory is carried over."""
         steering: Tensor
         steering, memory = self._policy(images, goals, self.memories[-1])
         if not self._keep:

@@ -15,7 +15,7 @@ class Solids:
     """Rectangles that a car can hit, and the car's body.
 
     Attributes:
-        rectangles: What cannot be driven through; at least one.
+        rectangles: Obstacles; at least one.
         body: The car's body where its state is zero: the x axis points forward.
     """
 

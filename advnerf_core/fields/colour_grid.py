@@ -1,7 +1,7 @@
-"""Where the free colours of an object lie: which cell of a grid each row of its theta stands for.
+"""The grid of an object's free colours: the cell that each row of its theta stands for.
 
-The colours of a face and of a textured mesh are a picture; those of an object made of voxels lie in its box. Random textures with a
-structure in space are defined on these grids.
+The colours of a face and of a textured mesh are a picture; a voxel object's fill its box. Random textures with
+spatial structure are defined on these grids.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from advnerf_core.fields.voxel_grid import VoxelGridObject
 
 
 class ColourGridError(AdvnerfError, ValueError):
-    """The parameters of an object lie on no grid."""
+    """The parameters of an object have no grid."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ def colour_grid(field: ColouredObject) -> ColourGrid:
     """The grid of an object's colours.
 
     Raises:
-        ColourGridError: Its parameters are no colours of cells, as those of summed levels.
+        ColourGridError: Its parameters are not colours of cells, such as those of summed levels.
     """
     if field.mixing is None and len(field.theta_shape) > 2:
         shape = tuple(field.theta_shape[:-1])
@@ -57,9 +57,9 @@ def colour_grid(field: ColouredObject) -> ColourGrid:
 
 
 def _first_voxels(field: VoxelGridObject) -> Tensor:
-    """The first voxel that shows each free row, ``[rows, 3]``; a row that none shows gets the first of all."""
+    """The first voxel that shows each free row, ``[rows, 3]``; a row without voxels gets the first of all."""
     rows = field.slots.reshape(-1)
     voxels = np.flatnonzero(rows < field.free_count)[::-1]
     first = np.zeros(field.free_count, dtype=np.int64)
-    first[rows[voxels]] = voxels  # of several the last assignment stays
+    first[rows[voxels]] = voxels  # of several assignments the last remains
     return torch.from_numpy(np.stack(np.unravel_index(first, field.slots.shape), axis=1))

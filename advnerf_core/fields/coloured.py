@@ -1,6 +1,6 @@
-"""What renderers and attacks need of an object whose colours are free, whatever its geometry is.
+"""The interface of an object with free colours for renderers and attacks, independent of its geometry.
 
-``VoxelGridObject`` is one, and so is a textured mesh (``advnerf_core.objects.mesh.field``).
+``VoxelGridObject`` implements it, and so does a textured mesh (``advnerf_core.objects.mesh.field``).
 """
 
 from __future__ import annotations

@@ -98,7 +98,7 @@ class HashGrid(nn.Module):
         """Encode points.
 
         Args:
-            points: ``[N, 3]`` in [0, 1]; outside, coordinates are clamped.
+            points: ``[N, 3]`` in [0, 1]; coordinates outside are clamped.
 
         Returns:
             Features ``[N, L * F]``, level by level. On the CPU path this is a transposed view of feature-major memory.
@@ -161,7 +161,7 @@ def encode(points: Array32, count: int, table: Array32, levels: NDArray[np.int64
     One level at a time, so that its table (1 MB at 2^17 x 2) stays in the cache while all points pass.
     """
     last = levels.shape[0] - 1
-    # Finest first: those miss the cache most, and a slow level handed out last would leave the other threads waiting.
+    # Finest first: those miss the cache most, and a slow level at the end would leave the other threads waiting.
     run_slots(
         lambda slot: encode_level(points, count, table, last - slot, levels, *chunk_scratch(), out),
         levels.shape[0],
@@ -178,7 +178,7 @@ def scatter(
 ) -> None:
     """``scatter_level`` at all levels, in parallel over levels (no two write the same rows).
 
-    ``from_zero`` overwrites what ``grad_table`` held: a level is cleared while it is in the cache anyway.
+    ``from_zero`` overwrites ``grad_table``: a level is cleared while it is in the cache anyway.
     """
     last = levels.shape[0] - 1
     ends = [*levels[1:, 0].tolist(), len(grad_table)]

@@ -23,7 +23,7 @@ Array64i = NDArray[np.int64]
 PRIME_Y = 2654435761  # the spatial hash of Teschner et al. 2003, as used by Müller et al. 2022, equation 4
 PRIME_Z = 805459861
 
-CHUNK = 128  # points that are placed together
+CHUNK = 128  # points placed together
 _NEXT = np.uint32(1)
 # Products wrap at 32 bits; the mask of a level is shorter.
 _PRIME_Y, _PRIME_Z = np.uint32(PRIME_Y), np.uint32(PRIME_Z)
@@ -33,7 +33,7 @@ _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 
 @njit(**KERNEL_OPTIONS)
 def chunk_scratch() -> tuple[Array32u, Array32]:
-    """What one thread needs to place a chunk: table rows and cells ``[11 * CHUNK]``, weights and fractions ``[11 * CHUNK]``."""
+    """Scratch of one thread for placing a chunk: table rows and cells ``[11 * CHUNK]``, weights and fractions ``[11 * CHUNK]``."""
     return np.empty(11 * CHUNK, np.uint32), np.empty(11 * CHUNK, np.float32)
 
 
@@ -159,11 +159,11 @@ def encode_level(
     """Encode the first ``count`` points at one level; levels may run in parallel.
 
     Args:
-        points: ``[>= count, 3]`` in [0, 1]; outside, coordinates are clamped.
+        points: ``[>= count, 3]`` in [0, 1]; coordinates outside are clamped.
         count: Number of points.
         table: ``[entries, F]``, F even.
         levels: ``[L, 4]``.
-        rows: Of `chunk_scratch`, used by one thread at a time.
+        rows: Scratch from `chunk_scratch`, used by one thread at a time.
         out: Tiles ``[tiles, L * F, T]``; only the rows of this level are written.
     """
     features, tile = table.shape[1], out.shape[2]
@@ -192,7 +192,7 @@ def scatter_level(
         count: Number of points.
         grad_out: Tiles ``[tiles, L * F, T]``.
         levels: ``[L, 4]``.
-        rows: Of `chunk_scratch`, used by one thread at a time.
+        rows: Scratch from `chunk_scratch`, used by one thread at a time.
         grad_table: ``[entries, F]``, accumulated into.
     """
     features, tile = grad_table.shape[1], grad_out.shape[2]

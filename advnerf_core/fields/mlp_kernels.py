@@ -1,7 +1,7 @@
 """CPU kernels of perceptron layers on tiles of samples.
 
 Memory is tiled and feature-major, ``[tiles, features, TILE]``: the innermost loop runs over the samples of a tile with a constant trip
-count, so it vectorises whatever the layer width is. Two outputs by four inputs are taken per pass, which keeps the multiply-add
+count, so it vectorises for any layer width. Two outputs by four inputs are taken per pass, which keeps the multiply-add
 units busy between loads and stores; therefore output widths are even and input widths multiples of four.
 """
 

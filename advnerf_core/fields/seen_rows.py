@@ -1,6 +1,6 @@
-"""The rows of an object's colour vector that a batch of images shows: all that a render and its gradient have to touch.
+"""The visible rows of an object's colour vector in a batch of images, which a render and its gradient are limited to.
 
-A 64^3 object has a quarter of a million voxels, of which a frame shows a few thousand. Squashing, mixing and their derivatives
+A 64^3 object has a quarter of a million voxels, but a frame shows a few thousand. Squashing, mixing and their derivatives
 are taken for these only.
 """
 
@@ -22,7 +22,7 @@ class SeenRows:
     """Rows of an object's colour vector.
 
     Args:
-        rows: Which rows, ascending, ``[V]`` int64.
+        rows: Indices of the rows, ascending, ``[V]`` int64.
     """
 
     def __init__(self, field: ColouredObject, rows: NDArray[np.int64]) -> None:
@@ -47,12 +47,12 @@ class SeenRows:
         return torch.from_numpy(self._mixing.astype(flat.numpy().dtype, copy=False) @ flat.numpy())
 
     def colours(self, values: Tensor) -> Tensor:
-        """Colours ``[V, 3]`` of the rows, of the free rows' ``values``."""
+        """Colours ``[V, 3]`` of the rows, from the free rows' ``values``."""
         fixed = self.field.fixed_colours[self.rows[len(self._free) :] - self.field.free_count]
         return torch.cat([squash(values), torch.as_tensor(fixed, dtype=values.dtype).reshape(-1, 3)])
 
     def gradient(self, values: Tensor, grad_colours: Tensor) -> Tensor:
-        """Gradient with respect to ``theta`` ``[parameter_count, 3]`` of one with respect to the rows' colours ``[V, 3]``."""
+        """Gradient with respect to ``theta`` ``[parameter_count, 3]`` from one with respect to the rows' colours ``[V, 3]``."""
         slopes = grad_colours[: len(self._free)] * squash_derivative(values)
         if self._mixing is not None:
             return torch.from_numpy(self._mixing.T.astype(slopes.numpy().dtype, copy=False) @ slopes.numpy())
@@ -62,7 +62,7 @@ class SeenRows:
 
 
 def compact(weights: SparseRows, field: ColouredObject) -> tuple[SparseRows, SeenRows]:
-    """Weights ``[P, slots]`` with only the columns that are used ``[P, V]``, and what these are."""
+    """Weights ``[P, slots]`` with only the used columns ``[P, V]``, and the rows of these."""
     columns = np.empty_like(weights.columns)
     rows = _pack(weights.columns, scratch("place", weights.width, np.int32), columns)
     return SparseRows(weights.ends, columns, weights.values, len(rows)), SeenRows(field, rows)
@@ -72,15 +72,15 @@ def compact(weights: SparseRows, field: ColouredObject) -> tuple[SparseRows, See
 def _pack(
     indices: NDArray[np.int32], place: NDArray[np.int32], packed: NDArray[np.int32]
 ) -> NDArray[np.int64]:
-    """The different ones of ``indices``, ascending; ``packed`` gets each index's number among them. ``place`` is and stays zeros."""
+    """The distinct ``indices``, ascending; ``packed`` gets each index's number among them. ``place`` is zero before and after."""
     count = 0
     for n in range(indices.shape[0]):
-        index = np.uint64(indices[n])  # numba asks of a signed one whether it counts from the end
+        index = np.uint64(indices[n])  # numba checks a signed one for counting from the end
         count += 1 - place[index]
         place[index] = 1
     rows, found, at = np.empty(count + 1, np.int64), 0, 0
     while found < count:
-        # Without a branch, as no processor can foresee which ones are there.
+        # Without a branch, which would be unpredictable.
         is_there = place[np.uint64(at)]
         rows[np.uint64(found)] = at
         found += is_there

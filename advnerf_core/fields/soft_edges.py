@@ -1,7 +1,7 @@
-"""Objects whose edges are as wide as a few voxels, so that a picture of them changes smoothly as they move.
+"""Objects whose edges are a few voxels wide, so that a picture of them changes smoothly as they move.
 
-A solid's outline, and that of a dense voxel grid, passes from nothing to opaque within a fraction of a millimetre. Few rays of a
-picture lie there, and a derivative with respect to the object's place that is exact for these rays says little about the outline
+The outline of a solid, or of a dense voxel grid, passes from empty to opaque within a fraction of a millimetre. Few rays of a
+picture lie there, and an exact derivative of these rays with respect to the object's place says little about the outline
 between them. Here the opacity ``a`` rises from 0 to 1 over a given width, half of it outside the surface, by the distance to it. With
 extinction ``-log(1 - a) / chord`` a ray that crosses a chord of constant ``a`` has the opacity ``a``.
 """
@@ -18,11 +18,11 @@ from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.geometry import Array
 
 DEFAULT_WIDTH_VOXELS = 2.0
-# What counts as inside of a grid with a density: where a voxel takes more than half of the light.
+# The inside of a grid with a density: voxels that take more than half of the light.
 _HALF_OPAQUE = float(np.log(2.0))
 # Chord of a ray that grazes the outline of a body, in widths of the edge.
 _CHORD_WIDTHS = 3.0
-# What is inside lets through one part in 10^8; layers of a flat solid; ray-marching steps along the width of an edge.
+# Transmission of the inside, one part in 10^8; layers of a flat solid; ray-marching steps along the width of an edge.
 _DEEPEST, _LAYERS, _STEPS = 1e-8, 4, 2
 
 
@@ -31,11 +31,11 @@ def with_soft_edges(field: VoxelGridObject, width: float | None = None) -> Voxel
 
     Args:
         field: An object, solid or with a density. A solid that is seen from its front only becomes a sheet as deep as the width.
-        width: How far the opacity takes from 0 to 1, in object units; two of the widest voxel edges if not given. Parts of a body that are
+        width: Length over which the opacity rises from 0 to 1, in object units; two of the widest voxel edges if not given. Parts of a body that are
             thinner than the width become translucent.
 
     Raises:
-        ValueError: A width that is not positive, or an object without a body.
+        ValueError: The width is not positive, or the object has no body.
     """
     pitch = (np.asarray(field.box_max, np.float64) - field.box_min) / field.slots.shape
     flat = field.density is None and field.one_sided
@@ -47,7 +47,7 @@ def with_soft_edges(field: VoxelGridObject, width: float | None = None) -> Voxel
 
 
 def _sheet(field: VoxelGridObject, width: float, pitch: Array) -> VoxelGridObject:
-    """Opaque by the distance to the outline of the front; what the front shows goes through all layers."""
+    """Opaque by the distance to the outline of the front; the front's colours extend through all layers."""
     pitch = np.array([width / _LAYERS, pitch[1], pitch[2]])
     border = _border(width, pitch)
     around = [(int(n), int(n)) for n in border[1:]]
@@ -94,7 +94,7 @@ def _body(field: VoxelGridObject, width: float, pitch: Array) -> VoxelGridObject
 
 
 def _border(width: float, pitch: Array) -> NDArray[np.int64]:
-    """Voxels around the object, the outermost of which are empty."""
+    """Number of voxels around the object; the outermost are empty."""
     return np.ceil(0.5 * width / pitch).astype(np.int64) + 1
 
 

@@ -1,6 +1,6 @@
-"""Rows of which few entries are not zero: what a cast writes, a frame keeps, and a gradient reads.
+"""Sparse rows for casts, frames and gradients.
 
-The arrays are those of SciPy's CSR matrix. SciPy examines them whenever a matrix is made or cut, which for one object's part of one
+The arrays equal those of SciPy's CSR matrix. SciPy examines them whenever a matrix is made or cut, which for one object's part of one
 frame takes longer than the product itself.
 """
 
@@ -46,11 +46,11 @@ class SparseRows:
         return self.ends.nbytes + self.columns.nbytes + self.values.nbytes
 
     def csr(self) -> sparse.csr_matrix:
-        """The same as a matrix of SciPy, which shares the arrays where it can."""
+        """The same as a matrix of SciPy, which shares the arrays if possible."""
         return sparse.csr_matrix((self.values, self.columns, self.ends), (len(self), self.width))
 
     def take(self, rows: NDArray[np.int64]) -> SparseRows:
-        """The ``rows [R]`` alone, in arrays of their own."""
+        """The ``rows [R]`` alone, in new arrays."""
         return self.scaled(rows, np.ones(len(rows)))
 
     def scaled(self, rows: NDArray[np.int64], factors: NDArray[Any]) -> SparseRows:
@@ -72,7 +72,7 @@ class SparseRows:
         return out
 
 
-# Indices are unsigned here, because numba asks of each signed one whether it counts from the end.
+# Indices are unsigned here, because numba checks each signed one for counting from the end.
 @njit(**_ORDERED)
 def _scaled(ends: Any, columns: Any, values: Any, rows: Any, factors: Any) -> Any:
     begins = np.zeros(len(rows) + 1, np.int32)

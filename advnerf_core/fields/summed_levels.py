@@ -25,7 +25,7 @@ def with_summed_levels(
         field: An object whose free rows are given directly. A row that several voxels show takes their mean.
         levels: Number of grids; each spans the object's box, with ``n^3`` cells at whose centres the values sit.
         coarsest: Cells along an edge of the first grid.
-        finest: Of the last; those between grow geometrically, and equal sizes are kept once.
+        finest: Cells along an edge of the last grid; sizes between grow geometrically, and equal sizes are kept once.
 
     Returns:
         An object with ``theta_shape (parameters, 3)``; its geometry is shared.
@@ -43,7 +43,7 @@ def with_summed_levels(
     shown = np.bincount(rows, minlength=field.free_count)
     mean = sparse.csr_matrix((1.0 / shown[rows], (rows, np.arange(len(rows)))), (field.free_count, len(rows)))
     parameters = int(sum(n**3 for n in sizes))
-    # The plain colours are those of the rows, whatever gives them.
+    # The plain colours belong to the rows, for any mixing.
     plain = field.plain_colours
     changed = replace(
         field, theta_shape=(parameters, 3), mixing=sparse.csr_matrix(mean @ mixing), plain_colours=plain

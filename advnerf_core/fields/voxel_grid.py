@@ -5,7 +5,7 @@ grid values *before* interpolation, so with frozen geometry every pixel is linea
 sparse matrix product and its vector-Jacobian product is the transpose of the same matrix (see ``render/cast_object``).
 
 Voxels share parameters through ``slots``: each voxel names the row of the colour vector ``[squash(theta); fixed]`` it shows.
-That is how a face several voxels deep stays one texture, and how parts that are not deployed stay plain.
+This keeps a face several voxels deep one texture, and parts that are not deployed plain.
 
 Object frame of a face object: origin at the centre of the deployed face, x its outward normal, z up, y = z cross x. A viewer
 in front of the face sees texture row 0 at the top and column 0 at the left, which is at the smallest y.
@@ -26,7 +26,7 @@ from torch import Tensor
 
 from advnerf_core.geometry import Array
 
-# Inverse squash of exactly 0 or 1 is infinite; half an 8-bit step is as far as a display can show.
+# The inverse squash of exactly 0 or 1 is infinite; half an 8-bit step is as far as a display can show.
 _SATURATION = 0.5 / 255.0
 
 
@@ -42,17 +42,17 @@ class VoxelGridObject:
         box_max: Opposite corner, ``[3]``.
         T_world_from_object: Rigid pose ``[4, 4]``.
         scale: World metres per object unit; ``sigma * length`` is taken in object units.
-        density: Extinction at voxel centres per object unit, ``[nx, ny, nz]``; what is negative after interpolation is empty, so that a
+        density: Extinction at voxel centres per object unit, ``[nx, ny, nz]``; negative values after interpolation are empty, so that a
             surface can lie anywhere between voxel centres. None is an opaque solid box (the limit of infinite density: one sample
             where the ray enters).
-        one_sided: Only rays that enter through the ``+x`` face hit. This is what a projected or displayed texture does: it has
+        one_sided: Only rays that enter through the ``+x`` face hit, as for a projected or displayed texture, which has
             a front and no sides.
         step_units: Length of a ray-marching step in object units; used with a density only.
         plain_colours: Colours of the free rows without an attack, ``[free_count, 3]`` in 0..1; None is the mean of the fixed
             ones.
         mixing: Free rows as sums of parameters before the squash, ``[free_count, parameter_count]``; None is the identity. It
             is how summed levels (``fields/summed_levels``) keep a picture linear in the squashed colours.
-        derived: What renderers have worked out from slots and density; shared by moved copies.
+        derived: Data that renderers computed from slots and density; shared by moved copies.
     """
 
     slots: NDArray[np.int32]
@@ -70,7 +70,7 @@ class VoxelGridObject:
     derived: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check shapes and ranges, so that the casting kernel may index without looking."""
+        """Check shapes and ranges, so that the casting kernel may index unchecked."""
         if self.slots.ndim != 3 or self.slots.dtype != np.int32:
             raise ValueError(
                 f"expected slots [nx, ny, nz] of int32, got {self.slots.shape} of {self.slots.dtype}"
@@ -120,7 +120,7 @@ class VoxelGridObject:
 
     @property
     def plain_theta(self) -> Array:
-        """Free parameters without an attack, ``[parameter_count, 3]``; grey if nothing says otherwise."""
+        """Free parameters without an attack, ``[parameter_count, 3]``; grey by default."""
         if self.plain_colours is not None:
             values = inverse_squash(self.plain_colours)
         else:
@@ -135,7 +135,7 @@ class VoxelGridObject:
 
     @property
     def sha256(self) -> str:
-        """Hash of everything about the object but the colours that are searched for."""
+        """Hash of the object except its free colours."""
         digest = hashlib.sha256(
             repr((self.theta_shape, self.scale, self.one_sided, self.step_units)).encode()
         )
@@ -185,7 +185,7 @@ class VoxelGridObject:
         return np.unique(together, axis=0)
 
     def moved(self, T_world_from_object: ArrayLike, scale: float | None = None) -> VoxelGridObject:
-        """The same object at another pose ``[4, 4]``, and with another scale if one is given; what renderers derived from it is shared."""
+        """The same object at another pose ``[4, 4]``, and with another scale if one is given; data that renderers derived from it is shared."""
         pose = np.asarray(T_world_from_object, dtype=np.float64)
         other = replace(self, T_world_from_object=pose, scale=self.scale if scale is None else scale)
         object.__setattr__(other, "derived", self.derived)
@@ -193,7 +193,7 @@ class VoxelGridObject:
 
 
 def _check_pose(T_world_from_object: Array, scale: float) -> None:
-    """Raise ``ValueError`` unless the pose is rigid and finite: lengths are taken from the scale alone."""
+    """Raise ``ValueError`` unless the pose is rigid and finite: only the scale may change lengths."""
     T = np.asarray(T_world_from_object)
     if T.shape != (4, 4) or not (np.isfinite(T).all() and np.isfinite(scale)):
         raise ValueError(
@@ -235,7 +235,7 @@ def cube_face_object(
     depth_m: float = 0.01,
     one_sided: bool = True,
 ) -> VoxelGridObject:
-    """An opaque slab or cube of which one square face is textured and the rest is plain.
+    """An opaque slab or cube with one textured square face; the rest is plain.
 
     The texture reaches two voxels deep (the whole depth of a thin slab), so where a ray enters through the face the colour is
     exactly the bilinear interpolation of the squashed ``[resolution, resolution, 3]`` grid at its cell centres.
@@ -273,6 +273,6 @@ def cube_face_object(
 
 
 def face_corners_in_object(size_m: float) -> Array:
-    """Corners ``[4, 3]`` of the deployed face: top left, top right, bottom right, bottom left as its viewer sees them [m]."""
+    """Corners ``[4, 3]`` of the deployed face: top left, top right, bottom right, bottom left for its viewer [m]."""
     h = 0.5 * size_m
     return np.array([[0.0, -h, h], [0.0, h, h], [0.0, h, -h], [0.0, -h, -h]])

@@ -1,1 +1,1 @@
-"""Attackable objects: made from meshes, photographs or generators, kept in files, placed in scenes."""
+"""Attackable objects: made from meshes, photographs or generators, stored in files, placed in scenes."""

@@ -1,4 +1,4 @@
-"""A network of any origin as the policy that rollouts, attacks and the live node know."""
+"""Wraps a network of any origin as the policy that rollouts, attacks and the live node use."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from advnerf_core.policies.contract import PolicyContract, PolicyContractError
 
 
 class AdaptedPolicy(nn.Module):
-    """A network behind its declaration.
+    """A network with its declaration.
 
-    Its mode is that of the network when it was wrapped: nothing is put into eval mode silently.
+    It takes over the network's mode when it is wrapped: it never puts a network into eval mode silently.
 
     Args:
-        network: Called as `advnerf_core.policies.answer` says; one that is not stateless also has ``initial_memory(batch)``. A network that
-            asks another program has an attribute ``identity``, a text that names that program.
+        network: Called as in `advnerf_core.policies.answer`; a network with memory also has ``initial_memory(batch)``. A network that
+            queries another program has an attribute ``identity``, a text that names that program.
 
     Attributes:
         stateless: Whether the steering depends on the present image and goal only.
-        identity: The program that is asked; empty for a network that runs here. Such a policy is not fixed: the program may change.
+        identity: Name of the queried program; empty for a network that runs here. Such a policy is not fixed: the program may change.
     """
 
     def __init__(self, network: Callable[..., Any], contract: PolicyContract) -> None:
@@ -59,7 +59,7 @@ class AdaptedPolicy(nn.Module):
         return steering if self.stateless else (steering, memory)
 
     def answers_mrad(self) -> list[int]:
-        """Steering for three fixed pictures [mrad, whole]: by which a program that is asked is told from another."""
+        """Steering for three fixed pictures [mrad, whole], which identifies a queried program."""
         generator = torch.Generator().manual_seed(0)
         pictures = torch.rand(3, 3, *self.contract.size, generator=generator)
         pictures[0] = 0.5
@@ -72,7 +72,7 @@ class AdaptedPolicy(nn.Module):
         return [round(1000.0 * float(each)) for each in steering]
 
     def described_tensors(self) -> list[tuple[str, str]]:
-        """Each input and output in words, with its shape and what it is used for: those of the file, else those of the contract."""
+        """Name and use of each input and output with its shape, from the file, else from the contract."""
         contract, tensors = self.contract, getattr(self.network, "tensors", None)
         if tensors is not None:
             rows = [("input", each) for each in tensors.inputs] + [
@@ -94,10 +94,10 @@ class AdaptedPolicy(nn.Module):
 
 
 def adapt(network: Callable[..., Any], contract: PolicyContract) -> AdaptedPolicy:
-    """What a ``package.module:factory`` returns: the network, in eval mode with its weights, and its declaration."""
+    """Wrap a network, in eval mode with its weights, with its declaration; the return value of a ``package.module:factory``."""
     return AdaptedPolicy(network, contract)
 
 
 def adapted(policy: Any, contract: PolicyContract) -> AdaptedPolicy:
-    """The policy itself if it is adapted, else a policy that already speaks the contract, wrapped."""
+    """The policy itself if it is adapted, else a wrapper around a policy that already fulfils the contract."""
     return policy if isinstance(policy, AdaptedPolicy) else AdaptedPolicy(policy, contract)

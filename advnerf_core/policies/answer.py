@@ -1,6 +1,6 @@
-"""What a network behind a declaration answers: images in, its raw output and the next memory out, for numpy and torch alike.
+"""Calls a network behind a declaration: images in, its raw output and the next memory out, for numpy and torch alike.
 
-A network is called as ``network(images)``, with goals as ``network(images, goals)``, and if it is not stateless as
+A network is called as ``network(images)``, with goals as ``network(images, goals)``, and with memory as
 ``network(images, goals, memory) -> (output, memory)``. The memory of a policy that sees several images is one row for each car: the past
 images, then the memory of the network itself.
 """
@@ -16,7 +16,7 @@ from advnerf_core.policies.contract import PolicyContract, PolicyContractError
 
 
 def memory_before(contract: PolicyContract, network: Any, batch: int, images: Any) -> Any:
-    """Memory of a policy before the first image, as an array of the kind of some images; None for one without."""
+    """Memory of a policy before the first image, as an array of the images' kind; None for a policy without memory."""
     own = None if contract.stateless else network.initial_memory(batch)
     if contract.frames is None:
         return own
@@ -32,7 +32,7 @@ def answer(
 
     Args:
         goals: ``[B, goal_size]``; None for a policy without goals.
-        memory: From `memory_before` or the last call; None for a policy without.
+        memory: From `memory_before` or the last call; None for a policy without memory.
     """
     past, own = None, memory
     if contract.frames is not None:
@@ -55,7 +55,7 @@ def _row(memory: Any) -> Any:
 
 
 def one_output(contract: PolicyContract, raw: Any) -> Any:
-    """The output that is declared, of a network that returns several."""
+    """The declared output of a network that returns several."""
     key: Any = contract.output_name if contract.output_name is not None else contract.output_index
     if not isinstance(raw, Mapping | list | tuple):
         return raw

@@ -1,4 +1,4 @@
-"""The architectures of policies that are trained here: one table of the built-in ones, and those that users bring.
+"""The architectures of policies that are trained here: a table of the built-in ones, and the users' own.
 
 An architecture is a class derived from `advnerf_core.policies.network.SteeringNetwork`. A built-in one is a row of `ARCHITECTURES`; a
 user's is an entry point of the group ``advnerf.architectures`` or ``file.py:Class``, see docs/policies.md.
@@ -92,7 +92,7 @@ class VisionTransformerConfiguration(StrictModel):
 
 @dataclass(frozen=True)
 class BuiltIn:
-    """A row of the table.
+    """A row of the table of built-in architectures.
 
     Attributes:
         module: Module of `advnerf_core.policies` that holds the class.
@@ -106,14 +106,14 @@ class BuiltIn:
     Configuration: type[BaseModel]
 
     def is_class(self, other: type[Any]) -> bool:
-        """Whether a class is this one; imports nothing."""
+        """Whether a class is this architecture's; imports nothing."""
         return (other.__module__, other.__qualname__) == (
             f"advnerf_core.policies.{self.module}",
             self.name,
         )
 
     def load(self) -> type[SteeringNetwork]:
-        """The class; imports torch."""
+        """Load the class; imports torch."""
         found: type[SteeringNetwork] = getattr(
             import_module(f"advnerf_core.policies.{self.module}"), self.name
         )
@@ -136,11 +136,11 @@ ARCHITECTURES: Mapping[str, BuiltIn] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Architecture:
-    """An architecture with its settings: what it takes to build a network.
+    """An architecture with its settings, from which a network is built.
 
     Attributes:
         name: A built-in name, an entry point's name, or ``file.py:Class``; a relative file is relative to the working folder.
-        configuration: The architecture's own settings, as a user writes them. Settings that are left out have their defaults.
+        configuration: The architecture's own settings, as the user wrote them; others have their defaults.
     """
 
     name: str = PILOTNET
@@ -150,7 +150,7 @@ class Architecture:
         """A network with random weights, drawn from torch's global generator.
 
         Raises:
-            PluginError: There is no such architecture, or its code cannot be loaded.
+            PluginError: The architecture is unknown, or its code cannot be loaded.
             ArchitectureError: A wrong setting, or a class that cannot be used.
         """
         require_known(self.name, _WHAT, ARCHITECTURES, GROUP)
@@ -171,11 +171,11 @@ class Architecture:
         return network
 
     def check(self) -> None:
-        """Build a user's architecture and ask it once, so that a mistake shows before the work of hours. A built-in one needs no check.
+        """Build a user's architecture and call it once, so that a mistake shows before hours of training. A built-in one needs no check.
 
         Raises:
-            PluginError: There is no such architecture, or its code cannot be loaded.
-            ArchitectureError: A wrong setting, or it fails.
+            PluginError: The architecture is unknown, or its code cannot be loaded.
+            ArchitectureError: A setting is wrong, or the call fails.
         """
         if self.name in ARCHITECTURES:
             return
@@ -192,9 +192,9 @@ class Architecture:
                 ) from error
 
     def described(self) -> dict[str, Any]:
-        """Plain data that identifies the architecture on every machine: of a user's the hash of its code, not the place of its file.
+        """Plain data that identifies the architecture on every machine; for a user's, the hash of its code and not the path of its file.
 
-        PilotNet is described by its settings alone, as it was before there were others.
+        PilotNet is described by its settings alone, as in existing files.
         """
         if self.name == PILOTNET:
             return plain_values(_typed(PilotNetConfiguration, self.name, self.configuration))
@@ -209,13 +209,13 @@ class Architecture:
 
 
 def load_architecture(reference: str) -> type[SteeringNetwork]:
-    """The class that a reference stands for.
+    """The class that a reference names.
 
     Args:
         reference: A built-in name, an entry point's name, or ``file.py:Class``.
 
     Raises:
-        PluginError: There is no such architecture, its code cannot be loaded, or it is none.
+        PluginError: The architecture is unknown, its code cannot be loaded, or it is not a `SteeringNetwork`.
     """
     from advnerf_core.policies.network import SteeringNetwork
 
@@ -239,15 +239,15 @@ def load_architecture(reference: str) -> type[SteeringNetwork]:
 def require_architecture(
     reference: str, folder: Path | None = None, configuration: Mapping[str, Any] | None = None
 ) -> None:
-    """Refuse a reference that stands for no architecture, and wrong settings of a built-in one; nothing is loaded.
+    """Raise unless a reference names an architecture, or for wrong settings of a built-in one; nothing is loaded.
 
     Args:
-        reference: As of `load_architecture`.
+        reference: See `load_architecture`.
         folder: Folder that a relative ``file.py`` is relative to; the working folder if it is not given.
 
     Raises:
-        PluginError: There is no such architecture.
-        ArchitectureError: It has no such setting, or a value is wrong.
+        PluginError: The architecture is unknown.
+        ArchitectureError: A setting is unknown, or its value is wrong.
     """
     require_known(reference, _WHAT, ARCHITECTURES, GROUP, folder)
     if reference in ARCHITECTURES:
@@ -255,12 +255,12 @@ def require_architecture(
 
 
 def short_name(reference: str) -> str:
-    """The name without folders: of ``folder/file.py:Class`` it is ``file.py:Class``."""
+    """The name without folders: ``file.py:Class`` for ``folder/file.py:Class``."""
     return Path(reference).name if is_file_reference(reference) else reference
 
 
 def plain_values(configuration: Any) -> dict[str, Any]:
-    """All settings of a configuration as JSON holds them; empty if the architecture has none."""
+    """All settings of a configuration as JSON values; empty if the architecture has none."""
     if configuration is None:
         return {}
     if isinstance(configuration, BaseModel):
@@ -269,7 +269,7 @@ def plain_values(configuration: Any) -> dict[str, Any]:
 
 
 def _code_files(reference: str) -> dict[str, bytes]:
-    """Python files of ``file.py:Class`` by their path below the file's folder; none of other references."""
+    """Python files of ``file.py:Class`` by their path in the file's folder; empty for other references."""
     if not is_file_reference(reference):
         return {}
     file = Path(absolute_reference(reference, Path.cwd()).rpartition(":")[0])

@@ -1,4 +1,4 @@
-"""Classifiers as steering: an output with a score for each of some steering values."""
+"""Classifiers as steering: an output with a score for each of several steering values."""
 
 from __future__ import annotations
 

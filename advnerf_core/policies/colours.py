@@ -1,4 +1,4 @@
-"""From RGB to the colours that a network was trained on (numpy or torch; differentiable)."""
+"""Converts RGB to the colours that a network was trained on (numpy or torch; differentiable)."""
 
 from __future__ import annotations
 
@@ -30,5 +30,5 @@ def in_colour_space(images: Any, space: ColourSpace) -> Any:
 
 
 def of_channels(images: Any, values: tuple[float, ...]) -> Any:
-    """A value for each channel, or one for all, to be combined with images ``[B, C, H, W]``."""
+    """A value for each channel, or one for all, in a shape that broadcasts with images ``[B, C, H, W]``."""
     return like(images, values).reshape(1, -1, 1, 1)

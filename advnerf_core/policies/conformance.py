@@ -1,4 +1,4 @@
-"""What is wrong with a policy's adapter, each finding in a sentence that says what to change."""
+"""Checks a policy's adapter; each finding is a sentence that says what to change."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ OK: Final = "ok"
 WARNING: Final = "warning"
 FAILURE: Final = "failure"
 
-# No car turns its wheels further [rad].
+# Larger than any car's wheel angle [rad].
 LARGEST_STEERING_RAD = 1.2
 # Outputs that should be equal may differ by this share of their spread: batched kernels round differently.
 _EQUAL_SHARE = 1e-3
@@ -41,7 +41,7 @@ class Finding:
 
     Attributes:
         verdict: ``ok``, ``warning`` or ``failure``.
-        text: What was found, and what to change.
+        text: The finding, and what to change.
     """
 
     name: str
@@ -56,14 +56,14 @@ def check_policy(
     goal: tuple[float, ...] | None = None,
     methods: Sequence[str] = (),
 ) -> list[Finding]:
-    """Everything that can be told of a policy from the outside; what an earlier failure hides is left out.
+    """All checks of a policy from the outside; checks that an earlier failure makes meaningless are left out.
 
     Args:
-        policy: As its author left it.
+        policy: The policy in its author's mode.
         images: Policy images ``[N, H, W, 3]`` uint8 RGB of the policy's own view, at least 4 and not all alike.
-        steering_rad: What an expert would steer on them ``[N]`` [rad], left positive; None leaves the comparison out.
+        steering_rad: The expert's steering on them ``[N]`` [rad], left positive; None skips the comparison.
         goal: Goal vector for a policy that has goals; zeros if not given.
-        methods: Methods of attack that can search against it without a gradient; named where it declares that it has none.
+        methods: Methods of attack that need no gradient; named if the policy declares that it has none.
     """
     if len(images) < _PROBES:
         raise ValueError(f"expected at least {_PROBES} images, got {len(images)}")
@@ -133,7 +133,7 @@ def _runs(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
             examined(batch)
     except PolicyContractError as error:
         return Finding("input", FAILURE, str(error))
-    except Exception as error:  # whatever a stranger's network raises
+    except Exception as error:  # a user's network may raise anything
         reason = " ".join(traceback.format_exception_only(error)[-1].split())
         return Finding(
             "input",
@@ -144,12 +144,12 @@ def _runs(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
 
 
 def _remedy(examined: _Examined, batch: Tensor) -> str:
-    """Which other shape the network would take."""
+    """The other shape that the network would accept."""
     contract = examined.policy.contract
     given = contract.first_input(batch)
     if given.ndim != len(batch.shape):
         return _SIZE_ADVICE
-    # As NCHW it would be given the other layout's axes; then height and width swapped; then the commonest other sizes.
+    # As NCHW it would get the other layout's axes; then height and width swapped; then other common sizes.
     other = given.permute(0, 2, 3, 1) if contract.layout == "NCHW" else given.permute(0, 3, 1, 2)
     attempts: list[tuple[str, Tensor]] = [
         (f"set layout = {'NHWC' if contract.layout == 'NCHW' else 'NCHW'!r}", other),
@@ -179,7 +179,7 @@ def _accepts(examined: _Examined, given: Tensor) -> bool:
         with torch.no_grad():
             raw = policy.network(given.contiguous(), *extra)
             policy.contract.to_steering_rad(raw, len(given))
-    except Exception:  # it does not take this shape either
+    except Exception:  # it does not accept this shape either
         return False
     return True
 
@@ -194,7 +194,7 @@ def _finite(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
 
 
 def _answer(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
-    """What it answers to the first image, in the words of its declaration."""
+    """Its answer to the first image, in the declaration's terms."""
     policy, contract, batch = examined.policy, examined.policy.contract, images_to_tensor(images[:1])
     memory = None if policy.stateless else policy.initial_memory(1)
     with torch.no_grad():
@@ -214,7 +214,7 @@ def _answer(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
 
 
 def _repeatable(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
-    """Tells randomness from memory: with the same seed, only memory still makes a difference."""
+    """Distinguishes randomness from memory: with the same seed, only memory makes a difference."""
     first, other = images[:_PROBES], images[-_PROBES:][::-1]
 
     def seeded(batch: NDArray[np.uint8], seed: int) -> Array:
@@ -284,7 +284,7 @@ def _gradient(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
 
 
 def _slope(examined: _Examined, batch: Tensor, slopes: Tensor, step: float = 2e-3) -> Finding:
-    """The gradient against the difference of two evaluations along it."""
+    """Compare the gradient with the difference of two evaluations along it."""
     direction = slopes.sign()
     with torch.no_grad():
         difference = (examined(batch + step * direction) - examined(batch - step * direction)).double() / (

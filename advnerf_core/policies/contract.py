@@ -1,6 +1,6 @@
-"""What a policy says about itself, and the two conversions that follow from it. No torch here: the car's computer needs none.
+"""The declaration of a policy, and the two conversions that follow from it. No torch here: the car's computer needs none.
 
-Everything downstream sees one contract: images ``[B, 3, H, W]`` RGB in 0..1 in, steering ``[B]`` in radians, positive to the
+All other code uses one contract: images ``[B, 3, H, W]`` RGB in 0..1 in, steering ``[B]`` in radians, positive to the
 left, out. A network that was trained otherwise declares how; the declaration is all that is needed to use it.
 """
 
@@ -36,23 +36,23 @@ _CHOICES: dict[str, tuple[str, ...]] = {
 _SECTIONS: dict[str, Any] = {
     "frames": FrameStack, "trajectory": TrackedTrajectory, "bins": SteeringBins, "states": tuple[NetworkState, ...],
 }  # fmt: skip
-# Keys that came later. Without them, declarations have the text, and policies the hash, that they always had.
+# Keys that came later. Without them, declarations keep their text, and policies their hash.
 _LATER = ("input_name", "output_name", "output_index", "output_column", *_SECTIONS)
 RAD_PER_DEG = pi / 180.0
 
 
 class PolicyContractError(AdvnerfError, ValueError):
-    """A policy is not what its declaration says, or the declaration itself is wrong."""
+    """A policy contradicts its declaration, or the declaration itself is wrong."""
 
 
 @dataclass(frozen=True)
 class PolicyContract:
     """The declaration of a policy.
 
-    The network is given ``(value_max * image - mean) / std``, with the values of the image in ``colour_space`` in 0..1.
+    The network gets ``(value_max * image - mean) / std``, with the values of the image in ``colour_space`` in 0..1.
 
     Attributes:
-        view: What the policy sees of the camera image, and its input size (``view.height``, ``view.width``).
+        view: Window of the camera image that the policy sees, and its input size (``view.height``, ``view.width``).
         colour_space: The network's input channels: ``RGB``, ``BGR``, ``YUV`` (full range, as 8-bit OpenCV makes it: U and V
             about one half and clipped to 0..1) or ``GRAY`` (one channel).
         value_max: White in the network's input before ``mean`` and ``std``: 1 or 255.
@@ -63,16 +63,16 @@ class PolicyContract:
             ``normalised`` by ``full_steering_rad``, or the inverse turning radius of the rear axle in ``1/m``.
         full_steering_rad: Angle of the front wheels at a normalised output of 1 [rad]; with ``normalised`` only.
         wheelbase_m: Wheelbase that turns an inverse radius into an angle, ``atan(wheelbase / radius)`` [m]; with ``1/m`` only.
-        steering_ratio: Turn of the steering wheel over that of the front wheels, for an output that is the steering wheel's.
-        input_name: The file's input that takes the images; None where its shapes allow one reading only.
-        output_name: The output that steers, of a file or of a network that returns a dict; None where there is one output.
-        output_index: The same by its number from 0, of a file or of a network that returns a tuple.
+        steering_ratio: Steering wheel angle over front wheel angle, for an output of the steering wheel's angle.
+        input_name: The file's input for the images; None if its shapes allow one reading only.
+        output_name: The output that steers, of a file or of a network that returns a dict; None if there is one output.
+        output_index: Index of that output from 0, of a file or of a network that returns a tuple.
         output_column: The column of an output ``[B, N]`` that steers; None for ``[B]`` and ``[B, 1]``.
-        frames: Which past images it sees as well. This and the next three are sections, which may be given as their keys and values.
-        trajectory: The output is waypoints, and this is how they are followed; None for an output that steers.
-        bins: The output is a score for each of these steering values; None for an output that steers.
-        states: Inputs and outputs of a file that carry its memory from image to image; they make it not stateless.
-        positive: To which side a positive output steers.
+        frames: Past images in the input. This and the next three are sections, which may be given as their keys and values.
+        trajectory: The tracker of an output of waypoints; None for an output that steers.
+        bins: Steering values of an output of scores; None for an output that steers.
+        states: Inputs and outputs of a file that carry its memory from image to image; with them it is not stateless.
+        positive: Side to which a positive output steers.
         stateless: Whether the network's output depends on its present input only; a stack of ``frames`` is such an input.
         differentiable: Whether gradients reach the image; a black box declares False.
         goal_size: Length of the goal vector; 0 for none.
@@ -115,7 +115,7 @@ class PolicyContract:
             raise PolicyContractError(f"expected a goal size >= 0, got {self.goal_size!r}")
 
     def _read_sections(self) -> None:
-        """Make objects of sections that are given as their keys and values."""
+        """Convert sections that are given as their keys and values to objects."""
         try:
             for name, kind in _SECTIONS.items():
                 if (given := getattr(self, name)) not in (None, ()):
@@ -176,7 +176,7 @@ class PolicyContract:
             )
 
     def _check_meaning(self) -> None:
-        """An output is an angle, waypoints, or scores of bins."""
+        """Check that an output is either an angle, waypoints, or scores of bins."""
         given = [name for name in ("output_column", "trajectory", "bins") if getattr(self, name) is not None]
         if len(given) > 1:
             raise PolicyContractError(
@@ -201,12 +201,12 @@ class PolicyContract:
 
     @property
     def has_memory(self) -> bool:
-        """Whether the steering depends on images before the present one."""
+        """Whether the steering depends on earlier images."""
         return self.frames is not None or not self.stateless
 
     @property
     def meaning(self) -> str:
-        """What the output is, in words."""
+        """Meaning of the output, as text."""
         if self.trajectory is not None:
             return f"{len(self.trajectory.times_s)} waypoints"
         if self.bins is not None:
@@ -222,7 +222,7 @@ class PolicyContract:
         return (*times, channels, *self.size) if self.layout == "NCHW" else (*times, *self.size, channels)
 
     def to_network(self, images: Any) -> Any:
-        """What the network is given for images (numpy or torch; differentiable).
+        """The network's input for images (numpy or torch; differentiable).
 
         Args:
             images: ``[B, 3, H, W]`` RGB 0..1; with ``frames`` the stack ``[B, count, 3, H, W]``.
@@ -247,14 +247,14 @@ class PolicyContract:
         return images if self.layout == "NCHW" else array_module(images).moveaxis(images, -3, -1)
 
     def first_input(self, images: Any) -> Any:
-        """What the network is given for the first images ``[B, 3, H, W]`` of a drive."""
+        """The network's input for the first images ``[B, 3, H, W]`` of a drive."""
         if self.frames is None:
             return self.to_network(images)
         past = like(images, self.frames.initial(len(images), self.size))
         return self.to_network(self.frames.push(images, past)[0])
 
     def to_steering_rad(self, raw: Any, batch: int) -> Any:
-        """Steering ``[B]`` [rad], left positive, of the network's output (numpy or torch; differentiable).
+        """Steering ``[B]`` [rad], left positive, from the network's output (numpy or torch; differentiable).
 
         Args:
             raw: ``[B]``, ``[B, 1]``, or ``[B, N]`` with ``output_column`` or ``bins``; with ``trajectory`` as in `waypoints_m`.
@@ -273,12 +273,12 @@ class PolicyContract:
         return raw if scale == 1.0 else raw * scale
 
     def waypoints_m(self, raw: Any, batch: int) -> Any:
-        """Waypoints ``[B, N, 2]`` [m], x forward and y left, of the network's output ``[B, N, 2 or more]`` or ``[B, 2 N]``."""
+        """Waypoints ``[B, N, 2]`` [m], x forward and y left, from the network's output ``[B, N, 2 or more]`` or ``[B, 2 N]``."""
         assert self.trajectory is not None
         count = len(self.trajectory.times_s)
         shape = tuple(getattr(raw, "shape", ()))
         if len(shape) == 3 and shape[:2] == (batch, count) and shape[2] > 2:
-            raw = raw[:, :, :2]  # what follows x and y, such as a heading, is not used
+            raw = raw[:, :, :2]  # values after x and y, such as a heading, are not used
         elif shape == (batch, 2 * count):
             raw = raw.reshape(batch, count, 2)
         raw = self._checked(raw, (batch, count, 2), "trajectory.times_s")
@@ -304,7 +304,7 @@ class PolicyContract:
         return raw
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data from which `from_dict` makes the same declaration; names that are not declared are left out."""
+        """Plain data from which `from_dict` rebuilds the declaration; undeclared names are left out."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         values = {
             name: _plain(value) if name in _SECTIONS else value
@@ -342,7 +342,7 @@ class PolicyContract:
 
 
 def _plain(value: Any) -> Any:
-    """Sections of a declaration as JSON holds them, without their defaults."""
+    """Sections of a declaration as JSON values, without their defaults."""
     if isinstance(value, tuple):
         return [_plain(each) for each in value]
     return value.model_dump(mode="json", exclude_defaults=True)

@@ -1,4 +1,4 @@
-"""The declaration of a policy file: in a YAML file beside it, or carried in the file itself."""
+"""The declaration of a policy file: in a YAML file beside it, or embedded in the file."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from advnerf_core.errors import ConfigError
 from advnerf_core.policies.contract import PolicyContract, PolicyContractError
 from advnerf_core.policies.tensors import UINT8, TensorInfo
 
-# Where an ONNX file carries its declaration.
+# Metadata key of the declaration in an ONNX file.
 ONNX_METADATA_KEY = "advnerf_policy"
-# What a declaration beside a file adds to the file's name.
+# Suffix of a declaration beside a file.
 DECLARATION_SUFFIX = ".policy.yaml"
 
 
 def declaration_beside(path: Path, embedded: str | None, inputs: Sequence[TensorInfo] = ()) -> PolicyContract:
-    """The declaration of a file, which must have one; see `find_declaration`.
+    """The declaration of a file, which must exist; see `find_declaration`.
 
     Raises:
-        PolicyContractError: There is none, or it is wrong.
+        PolicyContractError: The declaration is missing or wrong.
     """
     if (found := find_declaration(path, embedded, inputs)) is not None:
         return found
@@ -34,14 +34,14 @@ def declaration_beside(path: Path, embedded: str | None, inputs: Sequence[Tensor
 def find_declaration(
     path: Path, embedded: str | None, inputs: Sequence[TensorInfo] = ()
 ) -> PolicyContract | None:
-    """The declaration of a file: the YAML file ``<path>.policy.yaml`` if there is one, else what the file carries; None without one.
+    """The declaration of a file: the YAML file ``<path>.policy.yaml`` if it exists, else the embedded one; None without one.
 
     Args:
-        embedded: JSON that the file carries; None or empty if it carries none.
-        inputs: The file's inputs: elements of eight bits leave one range of values.
+        embedded: Embedded JSON; None or empty without.
+        inputs: The file's inputs: eight-bit elements determine the range of values.
 
     Raises:
-        PolicyContractError: It is wrong.
+        PolicyContractError: The declaration is wrong.
     """
     implied: dict[str, Any] = {"value_max": 255.0} if any(each.kind == UINT8 for each in inputs) else {}
     beside = path.with_name(path.name + DECLARATION_SUFFIX)

@@ -1,4 +1,4 @@
-"""A policy as the live node uses it: one image after the other. No torch here: the car's computer needs none for an ONNX file."""
+"""A policy for the live node: one image after the other. No torch here: the car's computer needs none for an ONNX file."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from advnerf_core.policies.contract import PolicyContract
 
 
 class Driver:
-    """Drives by a network of numpy arrays. The memory of a policy that has one goes on from image to image, until `reset`.
+    """Drives with a network of numpy arrays. A policy's memory is carried from image to image, until `reset`.
 
     Args:
-        network: As `advnerf_core.policies.answer` calls it.
-        contract: Its declaration.
+        network: Called as in `advnerf_core.policies.answer`.
+        contract: Declaration of the network.
         sha256: Hash of the policy.
     """
 
@@ -31,7 +31,7 @@ class Driver:
         return self.command(image, goal)[0]
 
     def command(self, image: NDArray[np.uint8], goal: tuple[float, ...]) -> tuple[float, float | None]:
-        """The same, and the speed that the waypoints imply [m/s]; None for a policy without waypoints."""
+        """Steering as in `steer`, and the speed implied by the waypoints [m/s]; None for a policy without waypoints."""
         raw, trajectory = self.answer(image, goal), self.contract.trajectory
         steering_rad = float(self.contract.to_steering_rad(raw, 1)[0])
         if trajectory is None:
@@ -39,12 +39,12 @@ class Driver:
         return steering_rad, float(trajectory.speed_mps(self.contract.waypoints_m(raw, 1))[0])
 
     def answer(self, image: NDArray[np.uint8], goal: tuple[float, ...]) -> Any:
-        """The network's raw output for one policy image, as the methods of the declaration take it."""
+        """The network's raw output for one policy image, as the declaration's methods expect it."""
         images = np.moveaxis(image, -1, 0)[None].astype(np.float32) / np.float32(255.0)
         return self._after(images, np.array([goal], dtype=np.float32) if goal else None)
 
     def reset(self) -> None:
-        """Forget the images so far."""
+        """Forget earlier images."""
         self._memory = None
 
     def _after(self, images: Any, goals: Any) -> Any:

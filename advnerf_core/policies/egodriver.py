@@ -1,7 +1,7 @@
-"""A driver behind a socket as a policy: the egodriver protocol of alpasim, which users of CARLA speak too (PyPI ``carla-driver-interface``).
+"""A driver behind a socket as a policy: alpasim's egodriver protocol, which CARLA users also have (PyPI ``carla-driver-interface``).
 
-The driver is sent a camera's pictures and where the car is, and answers with a plan: poses ahead. A car of constant speed follows it with the
-tracker of `advnerf_core.policies.tracker`, which looks as far ahead as the car drives in half a second. The car's own poses are those that its steering leads to from where the drive began, as an odometer has them. No route is sent: a policy of this project sees
+The driver receives a camera's pictures and the car's pose, and answers with a plan: poses ahead. A car of constant speed follows it with the
+tracker of `advnerf_core.policies.tracker`, which looks as far ahead as the car drives in half a second. The poses are integrated from the start of the drive by the car's steering, like an odometer's. No route is sent: a policy of this project sees
 pictures.
 
 A drive is a session. The memory of the policy holds, per car: the session, the tick, x [m], y [m], yaw [rad].
@@ -36,14 +36,14 @@ _LOOKAHEAD_S, _ANSWER_S = 0.5, 60.0
 
 @dataclass(frozen=True, eq=False)
 class DrivenRig:
-    """What a driver is told about the car.
+    """The car and camera that a driver is told about.
 
     Attributes:
-        pinhole: Intrinsics of the pictures that it is sent.
-        T_car_from_camera: Where the camera sits on the car ``[4, 4]``.
+        pinhole: Intrinsics of the sent pictures.
+        T_car_from_camera: Pose ``[4, 4]`` of the camera on the car.
         speed_mps: The car's speed [m/s].
         dt_s: Time between two pictures [s].
-        wheelbase_m: Between the axles [m]; None for a car whose control is a turn rate.
+        wheelbase_m: Distance between the axles [m]; None for a car whose control is a turn rate.
     """
 
     pinhole: Pinhole
@@ -54,7 +54,7 @@ class DrivenRig:
 
     @cached_property
     def tracker(self) -> TrackedTrajectory:
-        """What follows the plans, which are as long as the driver likes."""
+        """The tracker of the plans, which may have any length."""
         speed_mps = self.speed_mps if self.wheelbase_m is None else None
         return TrackedTrajectory(
             times_s=(_LOOKAHEAD_S,),
@@ -64,7 +64,7 @@ class DrivenRig:
         )
 
     def turn_rate_radps(self, control: float) -> float:
-        """How fast the car turns under a control."""
+        """Turn rate of the car under a control."""
         return (
             control
             if self.wheelbase_m is None
@@ -73,14 +73,14 @@ class DrivenRig:
 
 
 class EgoDriver:
-    """A network, as `advnerf_core.policies.adapter.adapt` takes it, that asks a driver.
+    """A network for `advnerf_core.policies.adapter.adapt` that queries a driver.
 
     Args:
         address: ``grpc://HOST:PORT`` on this computer, or ``grpcs://HOST:PORT`` by TLS.
-        rig: The car that it drives.
+        rig: Car and camera.
 
     Raises:
-        PolicyContractError: The address is none, its package is not installed, or nobody answers.
+        PolicyContractError: The address is invalid, its package is not installed, or no driver answers.
     """
 
     training = False
@@ -113,7 +113,7 @@ class EgoDriver:
         return f"{version.version_id} {version.git_hash}".strip()
 
     def initial_memory(self, batch: int) -> Tensor:
-        """Begin a session for each car, and end those before."""
+        """Begin a session for each car, and end earlier ones."""
         from carla_driver_interface.protocol import DriveSessionCloseRequest
 
         for session in self._sessions:
@@ -147,7 +147,7 @@ class EgoDriver:
         return images.new_tensor(controls), following
 
     def _control(self, session: str, tick: int, pose: list[float], picture: Array) -> float:
-        """What the plan of one car leads to."""
+        """Control from the plan of one car."""
         from carla_driver_interface.geometry import Pose, Trajectory
         from carla_driver_interface.protocol import (
             DriveRequest,
@@ -201,10 +201,10 @@ class EgoDriver:
 def load_driver_at(
     address: str, view: PolicyView, rig: DrivenRig, expected_sha256: str | None = None
 ) -> LoadedPolicy:
-    """A driver as a policy without a gradient; its hash names its version and its answers to fixed pictures.
+    """A driver as a policy without a gradient; its hash identifies its version and its answers to fixed pictures.
 
     Raises:
-        PolicyContractError: Nobody answers, or another than was expected.
+        PolicyContractError: No driver answers, or another than expected.
     """
     policy = driver_at(address, view, rig)
     digest = hashlib.sha256(

@@ -1,4 +1,4 @@
-"""A network in the form that exporters take: tensors in, the output that steers and the next memory out."""
+"""A network in the form that exporters need: tensors in, the output that steers and the next memory out."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from advnerf_core.policies.memory import NetworkState
 
 @dataclass(frozen=True, eq=False)
 class Exportable:
-    """What is exported.
+    """A network ready for export.
 
     Attributes:
         network: Called with ``examples``.
-        examples: Its inputs for a batch of two.
-        inputs: Their names.
-        outputs: Names of its outputs.
-        contract: The declaration without what the file will name.
-        initial: Memory of one car before the first image; empty for a network without.
+        examples: Inputs for a batch of two.
+        inputs: Names of the inputs.
+        outputs: Names of the outputs.
+        contract: The declaration without names in the file.
+        initial: Memory of one car before the first image; empty for a network without memory.
     """
 
     network: Any
@@ -34,7 +34,7 @@ class Exportable:
     initial: tuple[float, ...] = ()
 
     def declared(self, memory: str, next_memory: str, steering: str | None = None) -> PolicyContract:
-        """The declaration of the file, in which the memory has these names."""
+        """The declaration of the file with these names of the memory."""
         if not self.initial:
             return self.contract
         state = NetworkState(input=memory, output=next_memory, initial=self.initial)
@@ -42,7 +42,7 @@ class Exportable:
 
 
 def exportable(network: Any, contract: PolicyContract) -> Exportable:
-    """The network behind a declaration, in eval mode, as exporters take it."""
+    """The network behind a declaration, in eval mode, in the form that exporters need."""
     images = contract.first_input(
         torch.rand(2, 3, *contract.size, generator=torch.Generator().manual_seed(0))
     )
@@ -73,7 +73,7 @@ class _OfTensors(nn.Module):
         self.eval()
 
     def forward(self, images: Tensor, second: Tensor | None = None, third: Tensor | None = None) -> Any:
-        """Output of images, and of the goals and the memory where there are any, in this order; with a memory also the next one."""
+        """Output for images, then goals and memory if any, in this order; with a memory also the next one."""
         if self.contract.stateless:
             raw = self.network(images) if second is None else self.network(images, second)
             return one_output(self.contract, raw)

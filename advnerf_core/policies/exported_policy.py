@@ -31,8 +31,8 @@ class ProgramNetwork(FileNetwork):
     """An exported program as a function of tensors.
 
     Args:
-        program: What ``torch.export.load`` returned.
-        tensors: Its inputs and outputs, and what each is used for.
+        program: Program from ``torch.export.load``.
+        tensors: Inputs and outputs of the program with their uses.
     """
 
     def __init__(self, program: Any, tensors: Tensors) -> None:
@@ -60,7 +60,7 @@ def load_program(path: Path) -> tuple[ProgramNetwork, PolicyContract, str]:
     """Network, declaration and hash of an exported program.
 
     Raises:
-        PolicyContractError: It is missing, no exported program, carries pickled objects, has no declaration, or one that does not fit.
+        PolicyContractError: The file is missing, not an exported program, has pickled objects, or lacks a fitting declaration.
     """
     program, files, embedded = opened_program(path)
     inputs, outputs = program_tensors(program)
@@ -74,17 +74,17 @@ def load_program(path: Path) -> tuple[ProgramNetwork, PolicyContract, str]:
 
 
 def opened_program(path: Path) -> tuple[Any, InputFiles, str]:
-    """An exported program, the file that it was made of, and the declaration that it carries; empty if it carries none.
+    """An exported program, its source file, and the embedded declaration; empty without one.
 
     Raises:
-        PolicyContractError: It is missing, no exported program, or carries pickled objects.
+        PolicyContractError: The file is missing, not an exported program, or has pickled objects.
     """
     files = _checked_file(path)
     extra = {METADATA_FILE: ""}
     try:
         program = torch.export.load(BytesIO(files.content), extra_files=extra)
         program_tensors(program)
-    except Exception as error:  # a damaged archive ends in any of a dozen exceptions
+    except Exception as error:  # a damaged archive raises any of a dozen exceptions
         reason = " ".join(str(error).split())
         raise PolicyContractError(
             f"expected an exported program in {path}, got {reason:.200}; export it again"
@@ -117,7 +117,7 @@ def export_program(network: Any, contract: PolicyContract, path: Path) -> None:
     try:
         shapes = tuple({0: batch} for _ in given.examples)
         program = torch.export.export(given.network, given.examples, dynamic_shapes=shapes)
-    except Exception as error:  # the exporter and the network raise what they like
+    except Exception as error:  # the exporter and the network may raise anything
         reason = " ".join(str(error).split())
         raise PolicyContractError(
             f"the network cannot be exported ({type(error).__name__}: {reason:.160}); name its factory instead of a file"
@@ -136,7 +136,7 @@ def export_program(network: Any, contract: PolicyContract, path: Path) -> None:
 
 
 def _checked_file(path: Path) -> InputFiles:
-    """The file's content, after a look for pickled objects: torch would unpickle them, which runs what a stranger wrote."""
+    """The file's content, checked for pickled objects: torch would unpickle them, which runs the code of strangers."""
     try:
         files = InputFiles(path)
         with zipfile.ZipFile(BytesIO(files.content)) as archive:
@@ -151,7 +151,7 @@ def _checked_file(path: Path) -> InputFiles:
 
 
 def _unsafe(name: str, content: bytes) -> str:
-    """What in a member of the archive could run code; empty if nothing."""
+    """The part of a member of the archive that could run code; empty if none."""
     if name.endswith(("weights_config.json", "constants_config.json")):
         entries = json.loads(content).get("config", {})
         return next(
@@ -161,7 +161,7 @@ def _unsafe(name: str, content: bytes) -> str:
         return f"the object {name}"
     if name.endswith(".pt"):
         try:
-            # What this accepts, torch.export.load reads the same way; what it refuses would be unpickled there.
+            # Members accepted here are read by torch.export.load in the same way; rejected ones would be unpickled there.
             torch.load(BytesIO(content), weights_only=True)
         except Exception as error:
             return f"{name}, which is more than tensors ({type(error).__name__})"

@@ -1,4 +1,4 @@
-"""A policy file as a network: images, goals and memory go to the inputs that its declaration names, for every kind of file."""
+"""A policy file as a network: images, goals and memory are fed to the inputs that its declaration names, for every kind of file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class FileNetwork:
     """Base of the networks of policy files; a subclass runs the file.
 
     Args:
-        tensors: Its inputs and outputs, and what each is used for.
+        tensors: Inputs and outputs of the file with their uses.
     """
 
     training = False
@@ -24,7 +24,7 @@ class FileNetwork:
         self.tensors = tensors
 
     def run(self, feeds: Mapping[str, Any], outputs: list[str]) -> list[Any]:
-        """Outputs by name of inputs by name, which are floating-point arrays of any type.
+        """Compute outputs by name from inputs by name, which are floating-point arrays of any type.
 
         Raises:
             Exception: The inputs do not fit the file.
@@ -36,7 +36,7 @@ class FileNetwork:
         return initial_memory(self.tensors.states, batch)
 
     def __call__(self, images: Any, goals: Any = None, memory: Any = None) -> Any:
-        """Raw output ``[B, ...]`` of images as the file takes them; of a file with states also the next memory."""
+        """Raw output ``[B, ...]`` for images in the file's layout; for a file with states also the next memory."""
         if self.tensors.one_by_one and len(images) != 1:
             given = [images, goals, memory]
             answers = [
@@ -56,7 +56,7 @@ class FileNetwork:
         names = [self.tensors.steering.name, *(each.declared.output for each in states)]
         try:
             raw, *following = self.run(feeds, names)
-        except Exception as error:  # what the runtimes raise has no base in common
+        except Exception as error:  # the runtimes' exceptions have no common base
             reason = " ".join(str(error).split())
             raise PolicyContractError(
                 f"expected the file to take {[list(each.shape) for each in feeds.values()]}, but it wants "

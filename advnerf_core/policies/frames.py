@@ -1,4 +1,4 @@
-"""Policies that see several images at once: the last ones, so many ticks apart."""
+"""Policies that see several images at once: the latest ones, at a fixed spacing in ticks."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from advnerf_core.strict import StrictModel
 
 
 class FrameStack(StrictModel):
-    """Which images an input holds, and in which order.
+    """Past images in an input, and their order.
 
     Attributes:
         count: Number of images in the input, the present one included.
         spacing: Ticks between two of them; a tick is one image of the drive.
-        first: What stands for the images before the first tick: the first image (``repeat``), or ``black`` ones.
-        axis: ``channels`` for one input of ``count`` times the channels, or ``time`` for an axis of its own before the image's.
+        first: Replacement for images before the first tick: the first image (``repeat``), or ``black`` ones.
+        axis: ``channels`` for one input of ``count`` times the channels, or ``time`` for a separate axis before the image's.
         order: ``oldest_first``, or ``newest_first``.
     """
 
@@ -31,11 +31,11 @@ class FrameStack(StrictModel):
 
     @property
     def past(self) -> int:
-        """Number of past images that are kept."""
+        """Number of stored past images."""
         return (self.count - 1) * self.spacing
 
     def initial(self, batch: int, size: tuple[int, int]) -> NDArray[np.float32]:
-        """Past images ``[B, past, 3, H, W]`` before the first tick. NaN stands for images that the first one will replace."""
+        """Past images ``[B, past, 3, H, W]`` before the first tick. NaN marks images that the first one will replace."""
         value = np.nan if self.first == "repeat" else 0.0
         return np.full((batch, self.past, 3, *size), value, dtype=np.float32)
 
@@ -47,7 +47,7 @@ class FrameStack(StrictModel):
             past: ``[B, past, 3, H, W]``, oldest first.
 
         Returns:
-            The images that are seen ``[B, count, 3, H, W]`` in the stack's order, and the past images of the next tick.
+            The seen images ``[B, count, 3, H, W]`` in the stack's order, and the past images of the next tick.
         """
         module, present = array_module(images), images[:, None]
         if self.first == "repeat":

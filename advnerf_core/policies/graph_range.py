@@ -1,4 +1,4 @@
-"""Which values an ONNX network was made for, where its first layers say so: one that scales its own images, as Keras's ``Rescaling`` does."""
+"""Infers the value range that an ONNX network expects from its first layers, if it scales its own images, like Keras's ``Rescaling``."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 
-# Layers that leave the values as they are.
+# Layers that do not change the values.
 _PASSED = frozenset(
     {"Cast", "Identity", "Transpose", "Reshape", "Squeeze", "Unsqueeze", "Pad", "Slice", "Crop"}
 )
-# Nothing of an image in 0..1 is divided by, or compared with, more than this.
+# A network for images in 0..1 divides by, or compares with, nothing larger than this.
 _LARGEST_OF_ONE = 8.0
 
 
 def value_max_of(path: Path, image: str) -> float | None:
-    """White in the images of an ONNX file, 1 or 255, as its normalisation says; None where it has none.
+    """White in the images of an ONNX file, 1 or 255, by its normalisation; None without one.
 
     Args:
         image: Name of the input.
@@ -41,7 +41,7 @@ def value_max_of(path: Path, image: str) -> float | None:
 
 
 def _scale(node: Any, constants: dict[str, Any]) -> float | None:
-    """What the first layer that changes the values says about them."""
+    """Range implied by the first layer that changes the values."""
     # The running mean of a batch normalisation is its fourth input.
     names = node.input[3:4] if node.op_type == "BatchNormalization" else node.input
     values = [_array(constants[name]) for name in names if name in constants]
@@ -58,7 +58,7 @@ def _scale(node: Any, constants: dict[str, Any]) -> float | None:
 
 
 def _array(tensor: Any) -> Any:
-    """Values of a tensor; None of one that lies in another file."""
+    """Values of a tensor; None if it is stored in another file."""
     import onnx
 
     if onnx.external_data_helper.uses_external_data(tensor):

@@ -1,4 +1,4 @@
-"""What a policy file says about itself without a declaration, and what only its author knows."""
+"""Guesses the declaration of a policy file from its tensors, and asks for the rest, which only its author knows."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from advnerf_core.strict import StrictModel
 _STEERING_WORDS = ("steer", "angle", "curvature")
 _WAYPOINT_WORDS = ("waypoint", "traj", "plan")
 _COLOURS = (3, 1)
-# Inputs and outputs of the same shape are a memory if they are this long; shorter ones may be a goal and the steering.
+# Inputs and outputs of the same shape are a memory if they have this length; shorter ones may be a goal and the steering.
 _LONG = 8
-# Cars that plan waypoints do so half a second apart, more often than otherwise.
+# Planned waypoints of cars are most often half a second apart.
 _WAYPOINTS_S = 0.5
 
 
 @dataclass(frozen=True)
 class Question:
-    """Something that a file does not say about itself.
+    """A fact that a file does not contain.
 
     Attributes:
         key: Key of the declaration, with dots for a section's.
-        text: What is asked, in words.
-        choices: What may be answered; empty for a number or a section.
+        text: The question as text.
+        choices: Possible answers; empty for a number or a section.
     """
 
     key: str
@@ -44,13 +44,13 @@ class Question:
 
 
 def guess_contract(path: str | Path) -> tuple[PolicyContract, list[Question]]:
-    """The declaration of a policy file: its own, else what its inputs and outputs say, with the usual values for the rest.
+    """The declaration of a policy file: its own, else one inferred from its inputs and outputs, with the usual values for the rest.
 
     Returns:
-        The declaration, and what cannot be read from the file; no questions where the file has a declaration.
+        The declaration, and questions about facts that the file lacks; none for a file with a declaration.
 
     Raises:
-        PolicyContractError: It is no policy file, or no input can be an image.
+        PolicyContractError: The file is not a policy, or no input can be an image.
     """
     path = Path(path)
     if path.suffix == ".safetensors":
@@ -64,10 +64,10 @@ def guess_contract(path: str | Path) -> tuple[PolicyContract, list[Question]]:
 
 
 def tensors_of(path: Path) -> tuple[list[TensorInfo], list[TensorInfo], str | None]:
-    """Inputs and outputs of an ``.onnx`` or ``.pt2`` file, and the declaration that it carries; empty if it carries none.
+    """Inputs and outputs of an ``.onnx`` or ``.pt2`` file, and its embedded declaration; empty without one.
 
     Raises:
-        PolicyContractError: It is another file, or cannot be read.
+        PolicyContractError: The file is of another kind, or cannot be read.
     """
     if path.suffix == ".onnx":
         from advnerf_core.policies.onnx_policy import opened_onnx, read_tensors
@@ -126,7 +126,7 @@ def _image(path: Path, inputs: list[TensorInfo]) -> TensorInfo:
 
 
 def _value_max(path: Path, image: TensorInfo) -> float | None:
-    """White in the images, where the file says so; None otherwise."""
+    """White in the images, if the file determines it; else None."""
     if image.kind == UINT8:
         return 255.0
     if path.suffix != ".onnx" or find_spec("onnx") is None:  # ONNX Runtime reads files without it
@@ -137,14 +137,14 @@ def _value_max(path: Path, image: TensorInfo) -> float | None:
 
 
 def _of_image(image: TensorInfo, value_max: float | None) -> tuple[dict[str, Any], list[Question]]:
-    """Keys that the shape, type and range of the image input give, and what they leave open."""
+    """Keys inferred from the shape, type and range of the image input, and open questions."""
     shape, questions = list(image.shape or (None,) * 4)[1:], []
     times = shape.pop(0) if len(shape) == 4 else None
     layout, channels = _layout(shape)
     rows, columns = shape[-2:] if layout == "NCHW" else shape[:2]
     height = rows if isinstance(rows, int) else IMAGE_HEIGHT
     width = columns if isinstance(columns, int) else IMAGE_WIDTH
-    # A guess of a lens that sees a right angle; the camera of the place replaces it.
+    # Guess a lens of 90 degrees; the camera of the place replaces it.
     camera = Pinhole(width, height, 0.5 * width, 0.5 * width, 0.5 * width, 0.5 * height)
     view = PolicyView(camera, crop_top_px=0, crop_height_px=height, width=width, height=height)
     found: dict[str, Any] = {"view": view, "layout": layout}
@@ -188,14 +188,14 @@ def _stack(channels: int, times: Any) -> tuple[int, int | None]:
 
 
 def _states(inputs: list[TensorInfo], outputs: list[TensorInfo]) -> tuple[NetworkState, ...]:
-    """Inputs that an output has the name or, if they are long, the shape of, in the order of the file."""
+    """Inputs that share an output's name or, if they are long, its shape, in the order of the file."""
     states: list[NetworkState] = []
     left = [each for each in outputs if not _steers(each)]
     for given in inputs:
         fitting = [each for each in left if _alike(each, given) and given.kind in FLOATS]
         namesakes = [each for each in fitting if given.name.removesuffix("_in") in each.name]
         chosen = next(iter(namesakes or fitting), None)
-        # One output is left, which steers.
+        # One output remains, which steers.
         if (
             chosen is not None
             and len(outputs) - len(states) > 1
@@ -207,7 +207,7 @@ def _states(inputs: list[TensorInfo], outputs: list[TensorInfo]) -> tuple[Networ
 
 
 def _alike(output: TensorInfo, given: TensorInfo) -> bool:
-    """Whether an output can be given to an input: dimensions that are not fixed fit any."""
+    """Whether an output can feed an input: variable dimensions fit any."""
     if output.shape is None or given.shape is None or len(output.shape) != len(given.shape):
         return False
     pairs = zip(output.shape, given.shape, strict=True)
@@ -215,14 +215,14 @@ def _alike(output: TensorInfo, given: TensorInfo) -> bool:
 
 
 def _batch_axis(tensor: TensorInfo) -> int:
-    """Axis of the batch: the one that is not fixed, else the first of two and the second of three axes, as PyTorch's states have it."""
+    """Axis of the batch: the variable one, else the first of two and the second of three axes, as in PyTorch's states."""
     shape = tensor.shape or ()
     free = [axis for axis, size in enumerate(shape) if not isinstance(size, int)]
     return free[0] if free else min(1, max(0, len(shape) - 2))
 
 
 def _of_output(outputs: list[TensorInfo]) -> tuple[dict[str, Any], list[Question]]:
-    """Keys that the outputs give, and what they leave open."""
+    """Keys inferred from the outputs, and open questions."""
     named = [each for each in outputs if _steers(each)]
     planned = [each for each in outputs if _waypoints(each)]
     chosen = (named or planned or outputs)[0]
@@ -247,7 +247,7 @@ def _of_output(outputs: list[TensorInfo]) -> tuple[dict[str, Any], list[Question
 
 
 def _steers(tensor: TensorInfo) -> bool:
-    """Whether an output is named as one that steers."""
+    """Whether an output's name says that it steers."""
     return any(word in tensor.name.lower() for word in _STEERING_WORDS)
 
 
@@ -268,13 +268,13 @@ def _last(tensor: TensorInfo) -> int | None:
 
 
 def declaration_text(contract: PolicyContract, questions: Sequence[Question]) -> str:
-    """A declaration as YAML to be put beside the file: what is not the default, and what was asked for, with the question above."""
+    """A declaration as YAML for a file beside the policy: non-default values, and answers with their question above."""
     plain, default = contract.to_dict(), PolicyContract(contract.view).to_dict()
     asked = {each.key: each for each in questions}
     lines = []
     for name in dict.fromkeys(("view", *plain)):
         if name not in asked and (name == "stateless" or plain[name] == default.get(name)):
-            continue  # what states say, or what it is without the key
+            continue  # determined by states, or the default
         if question := asked.get(name):
             choices = f" ({' or '.join(question.choices)})" if question.choices else ""
             lines.append(f"# {question.text}{choices}")

@@ -1,8 +1,8 @@
-"""Which wrong declaration would explain what a policy does on images of which the right steering is known.
+"""Searches the wrong declaration that would explain a policy's outputs on images with known steering.
 
-Every hypothesis is a declaration other than the given one: colours the other way round, another range, another unit, the other
-sign. The network is run as each would run it, and the hypothesis whose steering lies nearest to the expert's is believed if it
-explains much more than the declaration does. One error of input and one of output may come together.
+Every hypothesis is a declaration other than the given one: swapped colours, another range, another unit, the other
+sign. The network is run under each, and the hypothesis whose steering lies nearest to the expert's is believed if it
+explains much more than the declaration does. One error of input and one of output may be combined.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ _IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """Another declaration, in words.
+    """An alternative declaration with its explanation.
 
     Attributes:
-        found: What it says is wrong; empty for the declaration itself.
-        advice: What to change; empty for the declaration itself.
+        found: The error that it assumes; empty for the declaration itself.
+        advice: Change to make; empty for the declaration itself.
         contract: The declaration that it proposes.
     """
 
@@ -49,10 +49,10 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class Judgement:
-    """How well the declaration and the best other one explain the expert.
+    """Comparison of the declaration and the best alternative with the expert.
 
     Attributes:
-        declared_error: Mean error over that of always steering the expert's median; below 1 is better than no policy.
+        declared_error: Mean error relative to always steering the expert's median; below 1 is better than no policy.
         deviations: Mean of the frames' differences in error between the two, over its standard error.
     """
 
@@ -63,7 +63,7 @@ class Judgement:
 
     @property
     def believed(self) -> bool:
-        """Whether the declaration is taken to be wrong in the way the hypothesis says."""
+        """Whether the declaration is believed to be wrong in the way of the hypothesis."""
         better = (
             self.best_error < BELIEVED_SHARE * self.declared_error and self.deviations > BELIEVED_DEVIATIONS
         )
@@ -77,8 +77,8 @@ def judge(
 
     Args:
         policy: A policy of stateless steering.
-        images: Its images ``[N, H, W, 3]`` uint8 RGB.
-        steering_rad: What the expert would steer ``[N]`` [rad], left positive; it must vary.
+        images: Policy images ``[N, H, W, 3]`` uint8 RGB.
+        steering_rad: The expert's steering ``[N]`` [rad], left positive; it must vary.
         goal: Goal vector, for a policy that has goals.
     """
     wanted = np.asarray(steering_rad, dtype=np.float64)
@@ -89,7 +89,7 @@ def judge(
     best, best_errors = Hypothesis((), (), policy.contract), declared
     for hypothesis in _hypotheses(policy.contract):
         errors = np.abs(steering_of(policy, hypothesis.contract, images, goal) - wanted)
-        # A second change must earn its place: between nearly equals, the one with fewer changes is meant.
+        # A second change must earn its place: of nearly equal hypotheses, the one with fewer changes wins.
         penalty = 1.1 ** (len(hypothesis.found) - len(best.found))
         if np.isfinite(errors).all() and errors.mean() * max(penalty, 1.0) < best_errors.mean():
             best, best_errors = hypothesis, errors
@@ -103,7 +103,7 @@ def judge(
 def steering_of(
     policy: AdaptedPolicy, contract: PolicyContract, images: NDArray[np.uint8], goal: Array | None = None
 ) -> Array:
-    """Steering ``[N]`` [rad] of a policy's network under some declaration of the same view."""
+    """Steering ``[N]`` [rad] of a policy's network under a given declaration of the same view."""
     assumed = AdaptedPolicy(policy.network, contract)
     steering: list[Any] = []
     for first in range(0, len(images), _BATCH):
@@ -128,7 +128,7 @@ def _input_changes(contract: PolicyContract) -> Iterator[Hypothesis]:
     ranges = list(_range_changes(contract))
     yield from ranges
     for base in [Hypothesis((), (), contract), *ranges]:
-        # A network of one channel takes no other space, nor the other way round.
+        # A network of one channel supports no other space, nor the reverse.
         spaces: tuple[ColourSpace, ...] = () if contract.channels == 1 else ("RGB", "BGR", "YUV")
         for other in spaces:
             if other != contract.colour_space:
@@ -176,7 +176,7 @@ def _output_changes(contract: PolicyContract) -> Iterator[Hypothesis]:
     bases: list[tuple[tuple[tuple[str, str], ...], PolicyContract]] = [((), contract)]
     for unit in units:
         words = f"steers in {_UNIT_WORDS[unit]} for {_UNIT_WORDS[contract.output_unit]}"
-        # Without what belongs to the declared unit only.
+        # Without keys that belong to the declared unit only.
         other = replace(contract, output_unit=unit, full_steering_rad=None, wheelbase_m=None)  # type: ignore[arg-type]
         bases.append((((words, f"set output_unit = {unit!r}"),), other))
     for found, base in bases:

@@ -1,4 +1,4 @@
-"""One door for policies of any origin. Imports torch only for what needs it.
+"""Loads policies of any origin. Imports torch only for policies that need it.
 
 A policy is named by a file (``.safetensors``: a network that was trained here; ``.onnx``; ``.pt2``) or by ``package.module:factory``, a
 function without arguments that returns ``adapt(network, contract)``.
@@ -39,7 +39,7 @@ def is_factory(spec: str | os.PathLike[str]) -> bool:
 
 
 def is_code(spec: str | os.PathLike[str]) -> bool:
-    """Whether a policy is named as something that is executed or asked, and not as a file."""
+    """Whether a policy is named as code or a service, and not as a file."""
     return is_factory(spec) or is_address(spec)
 
 
@@ -52,7 +52,7 @@ def load_any_policy(spec: str | os.PathLike[str], expected_sha256: str | None = 
     """A policy ready for a rollout or an attack: frozen, in eval mode, with its view and hash.
 
     Raises:
-        AdvnerfError: It cannot be loaded, is left in training mode, or is not the one that was expected.
+        AdvnerfError: The policy cannot be loaded, is in training mode, or is not the expected one.
     """
     from advnerf_core.policies.policy_file import LoadedPolicy, load_policy
 
@@ -74,7 +74,7 @@ def load_any_policy(spec: str | os.PathLike[str], expected_sha256: str | None = 
 
 
 def load_adapted(spec: str | os.PathLike[str]) -> tuple[AdaptedPolicy, str]:
-    """The network with its declaration, as its author left it, and its hash: what the conformance test looks at."""
+    """The network with its declaration in its author's mode, and its hash, for the conformance test."""
     from advnerf_core.policies.adapter import AdaptedPolicy
 
     if is_factory(spec):
@@ -107,7 +107,7 @@ def load_adapted(spec: str | os.PathLike[str]) -> tuple[AdaptedPolicy, str]:
 
 
 def described_policy(spec: str | os.PathLike[str]) -> tuple[AdaptedPolicy, str, dict[str, str]]:
-    """Declaration, hash and architecture of a policy, to be read and not to be called: of a ``.safetensors`` file no code is run."""
+    """Declaration, hash and architecture of a policy, without calling it; no code of a ``.safetensors`` file is run."""
     if is_factory(spec) or Path(spec).suffix != ".safetensors":
         return *load_adapted(spec), {}
     from advnerf_core.policies.adapter import AdaptedPolicy
@@ -153,7 +153,7 @@ def _from_factory(spec: str) -> tuple[AdaptedPolicy, str]:
 
 
 def _imported(name: str) -> tuple[ModuleType, str]:
-    """A module, and the hash of its code when it was first imported: a file that is edited later changes nothing in this process."""
+    """A module, and the hash of its code at its first import: a file that is edited later changes nothing in this process."""
     if (module := sys.modules.get(name)) is None or module not in _CODE_OF_MODULES:
         importlib.invalidate_caches()
         code = module_sha256(name)
@@ -163,7 +163,7 @@ def _imported(name: str) -> tuple[ModuleType, str]:
 
 
 def _factory_sha256(spec: str, policy: AdaptedPolicy, code: str) -> str:
-    """Names weights, declaration and code; of a program that is asked also its identity and its answers to fixed pictures."""
+    """Hash of weights, declaration and code; for a queried program also of its identity and its answers to fixed pictures."""
     digest = hashlib.sha256(f"{spec}\0{policy.contract.to_json()}\0{code}".encode())
     for name, tensor in sorted(policy.state_dict().items()):
         array = tensor.detach().cpu().contiguous().numpy()
@@ -175,9 +175,9 @@ def _factory_sha256(spec: str, policy: AdaptedPolicy, code: str) -> str:
 
 
 def source_sha256(spec: str | os.PathLike[str]) -> str:
-    """Hash of what a policy is made from, without loading it: of a file's content, or of a factory's code.
+    """Hash of a policy's source, without loading it: of a file's content, or of a factory's code.
 
-    It changes whenever the hash of `load_any_policy` does, unless a program that a factory asks is another.
+    It changes whenever the hash of `load_any_policy` does, except for changes of a program that a factory queries.
 
     Raises:
         PolicyContractError: A file is missing, or the module of a factory cannot be found.
@@ -196,10 +196,10 @@ def source_sha256(spec: str | os.PathLike[str]) -> str:
 
 
 def policy_file_sha256(path: Path) -> str:
-    """Hash of a policy file as it lies on disk, with the files that it keeps weights in and the declaration beside it; nothing is loaded.
+    """Hash of a policy file on disk, with its external weight files and the declaration beside it; nothing is loaded.
 
     Raises:
-        PolicyContractError: One of them is missing, or lies elsewhere.
+        PolicyContractError: One of them is missing, or is in another folder.
     """
     from advnerf_core.policies.onnx_policy import read_onnx
 

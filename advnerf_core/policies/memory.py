@@ -1,4 +1,4 @@
-"""The memory of policies from files: named inputs and outputs that are carried from image to image, as one array for each car."""
+"""The memory of policies from files: named inputs and outputs carried from image to image, as one array for each car."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from advnerf_core.strict import StrictModel
 
 
 class NetworkState(StrictModel):
-    """One piece of the memory of a file.
+    """One state of a file's memory.
 
     Attributes:
-        input: Name of the input that takes it.
-        output: Name of the output that gives it for the next image.
-        initial: Its value before the first image; one number for all elements, or one for each in the order of the input's own layout.
+        input: Name of the input for the state.
+        output: Name of the output with the next state.
+        initial: Value before the first image; one number for all elements, or one for each in the order of the input's own layout.
         batch_axis: Axis of the batch in the input and the output; 1 for the states of ``torch.nn.LSTM`` and ``GRU``.
     """
 
@@ -36,7 +36,7 @@ class CarriedState:
 
     Attributes:
         shape: Shape of the input without the batch's axis.
-        one_by_one: Whether its batch is fixed to one.
+        one_by_one: Whether its batch size is fixed to one.
     """
 
     declared: NetworkState
@@ -58,7 +58,7 @@ def initial_memory(states: tuple[CarriedState, ...], batch: int) -> NDArray[np.f
 
 
 def split(states: tuple[CarriedState, ...], memory: Any) -> dict[str, Any]:
-    """The inputs by name, in their own shapes, of a memory ``[B, K]`` (numpy or torch; differentiable)."""
+    """The inputs by name, in their own shapes, from a memory ``[B, K]`` (numpy or torch; differentiable)."""
     module, parts, first = array_module(memory), {}, 0
     for state in states:
         piece = memory[:, first : first + state.size].reshape(len(memory), *state.shape)
@@ -68,7 +68,7 @@ def split(states: tuple[CarriedState, ...], memory: Any) -> dict[str, Any]:
 
 
 def joined(states: tuple[CarriedState, ...], outputs: dict[str, Any]) -> Any:
-    """The memory ``[B, K]`` of the outputs by name (numpy or torch; differentiable)."""
+    """The memory ``[B, K]`` from the outputs by name (numpy or torch; differentiable)."""
     rows = []
     for state in states:
         output = outputs[state.declared.output]

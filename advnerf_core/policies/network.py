@@ -1,4 +1,4 @@
-"""What a policy is to the rest of the project, and the base class of the networks that it trains."""
+"""The interface of a policy, and the base class of the networks that this project trains."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from torch import Tensor, nn
 
 from advnerf_core.policies.view import IMAGE_HEIGHT, IMAGE_WIDTH
 
-# A few goal inputs beside a thousand features start with so much larger weights, or a policy learns every view before it learns
-# to be told where to go: only the views ahead of a junction need the goal.
+# Weights of the few goal inputs, beside a thousand features, start larger by this factor; otherwise a policy learns every view before
+# it learns to use the goal, which only the views ahead of a junction need.
 _GOAL_GAIN = 12.0
 
 
 class Policy(Protocol):
-    """What a rollout and an attack need of a policy."""
+    """The interface of a policy for rollouts and attacks."""
 
     stateless: bool
 
@@ -111,7 +111,7 @@ class FeaturesAndHead(SteeringNetwork):
     def raise_goal_weights(self, feature_count: int) -> None:
         """Start with larger weights of the goals, which come after the features in the first layer of ``head``."""
         if self.goal_size:
-            with torch.no_grad():  # no file and no policy without a goal is touched by this
+            with torch.no_grad():  # loaded weights and policies without a goal are not changed by this
                 next(self.head.parameters())[:, feature_count:] *= _GOAL_GAIN
 
 

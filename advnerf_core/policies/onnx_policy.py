@@ -28,8 +28,8 @@ class OnnxNetwork(FileNetwork):
     """An ONNX file as a function of arrays.
 
     Attributes:
-        contract: Its declaration, with ``differentiable`` False whatever it says.
-        sha256: Hash of the file, of files that it keeps weights in, and of the declaration.
+        contract: Declaration of the network, with ``differentiable`` always False.
+        sha256: Hash of the file, of its external weight files, and of the declaration.
     """
 
     def __init__(self, path: Path, threads: int = 1) -> None:
@@ -68,7 +68,7 @@ class TensorNetwork:
         return torch.from_numpy(self._network.initial_memory(batch))
 
     def __call__(self, images: Any, *others: Any) -> Any:
-        """Raw output of the network for tensors, and the next memory of one that has any."""
+        """Raw output of the network for tensors, and the next memory if it has one."""
         given = [
             None if each is None else np.asarray(each.detach().cpu().numpy()) for each in (images, *others)
         ]
@@ -85,10 +85,10 @@ def _tensor(array: NDArray[Any], images: Any) -> Any:
 
 
 def opened_onnx(path: Path, threads: int = 1) -> tuple[Any, InputFiles]:
-    """A session of ONNX Runtime, and the files that it was made of.
+    """A session of ONNX Runtime, and its source files.
 
     Raises:
-        PolicyContractError: They cannot be read, or are no ONNX model.
+        PolicyContractError: They cannot be read, or are not an ONNX model.
     """
     import onnxruntime
 
@@ -98,7 +98,7 @@ def opened_onnx(path: Path, threads: int = 1) -> tuple[Any, InputFiles]:
     options.log_severity_level = 3
     try:
         return _session(files, options), files
-    except Exception as error:  # its exceptions share no base of their own
+    except Exception as error:  # its exceptions have no common base
         reason = " ".join(str(error).split())
         raise PolicyContractError(
             f"expected an ONNX model in {path}, got {reason:.200}; export it again"
@@ -106,7 +106,7 @@ def opened_onnx(path: Path, threads: int = 1) -> tuple[Any, InputFiles]:
 
 
 def read_tensors(session: Any) -> tuple[list[TensorInfo], list[TensorInfo], str | None]:
-    """Inputs and outputs of a session, and the declaration that the file carries; None if it carries none."""
+    """Inputs and outputs of a session, and the embedded declaration; None without one."""
     embedded = session.get_modelmeta().custom_metadata_map.get(ONNX_METADATA_KEY)
     return (
         [_info(each) for each in session.get_inputs()],
@@ -120,7 +120,7 @@ def export_onnx(network: Any, contract: PolicyContract, path: Path) -> None:
 
     Args:
         network: The network behind the declaration, in eval mode.
-        contract: Its declaration; it travels in the file's metadata.
+        contract: Declaration of the network, which is embedded in the file's metadata.
         path: Target.
     """
     import onnx
@@ -130,9 +130,9 @@ def export_onnx(network: Any, contract: PolicyContract, path: Path) -> None:
 
     given = exportable(network, contract)
     names = [*given.inputs, *given.outputs]
-    buffer: Any = BytesIO()  # the exporter's signature knows names of files only
+    buffer: Any = BytesIO()  # the exporter's signature allows file names only
     with warnings.catch_warnings(), torch.no_grad():
-        # It announces its successor, which needs another package, and remarks on every check of a shape.
+        # It announces its successor, which needs another package, and logs every check of a shape.
         warnings.simplefilter("ignore")
         try:
             torch.onnx.export(
@@ -145,7 +145,7 @@ def export_onnx(network: Any, contract: PolicyContract, path: Path) -> None:
                 output_names=given.outputs,
                 dynamic_axes={name: {0: "B"} for name in names},
             )
-        except Exception as error:  # the exporter and the network raise what they like
+        except Exception as error:  # the exporter and the network may raise anything
             reason = " ".join(str(error).split())
             raise PolicyContractError(
                 f"the network cannot be written as ONNX ({type(error).__name__}: {reason:.160}); keep its gradient in a .pt2 file, "
@@ -164,7 +164,7 @@ def _black_box(contract: PolicyContract, path: Path) -> PolicyContract:
 
 
 def require_states(contract: PolicyContract, path: Path) -> None:
-    """Refuse a file that is declared to have a memory, but not which inputs and outputs carry it."""
+    """Raise for a file that is declared to have a memory without naming its inputs and outputs."""
     if not contract.stateless and not contract.states:
         raise PolicyContractError(
             f"{path}: stateless: expected true, or states: the inputs and outputs that carry the memory; got false without states"
@@ -172,10 +172,10 @@ def require_states(contract: PolicyContract, path: Path) -> None:
 
 
 def read_onnx(path: Path) -> InputFiles:
-    """An ONNX file and the files that it keeps weights in, which must lie beside it.
+    """An ONNX file and its external weight files, which must lie beside it.
 
     Raises:
-        PolicyContractError: One of them is missing, or lies elsewhere.
+        PolicyContractError: One of them is missing, or is in another folder.
     """
     try:
         files = InputFiles(path)
@@ -189,14 +189,14 @@ def read_onnx(path: Path) -> InputFiles:
 
 
 def _external_files(content: bytes) -> list[str]:
-    """Names of the files in which tensors of an ONNX model lie."""
-    if b"location" not in content:  # the key that names them; most models need no second reading
+    """Names of the files with external tensors of an ONNX model."""
+    if b"location" not in content:  # the key of their names; most models need no second reading
         return []
     import onnx
 
     try:
         model = onnx.load_model_from_string(content)
-    except Exception:  # protobuf's own; ONNX Runtime says what is wrong with the file
+    except Exception:  # protobuf's own; ONNX Runtime reports the file's problem
         return []
     return sorted(
         {
@@ -209,7 +209,7 @@ def _external_files(content: bytes) -> list[str]:
 
 
 def _tensors(message: Any) -> Iterator[Any]:
-    """All tensors in a model: weights, constants of nodes, and those of subgraphs and functions."""
+    """All tensors in a model: weights, constants of nodes, and tensors of subgraphs and functions."""
     if message.DESCRIPTOR.name == "TensorProto":
         yield message
         return
@@ -220,7 +220,7 @@ def _tensors(message: Any) -> Iterator[Any]:
 
 
 def _session(files: InputFiles, options: Any) -> Any:
-    """An inference session of what was read; the files themselves are not opened again."""
+    """An inference session from the read content; the files themselves are not opened again."""
     import onnxruntime
 
     providers = ["CPUExecutionProvider"]

@@ -1,4 +1,4 @@
-"""The file of a policy: the weights of a network, its architecture, its view, and what its trainer wrote about it."""
+"""The file of a policy: the weights of a network, its architecture, its view, and its trainer's metadata."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ from advnerf_core.policies.network import SteeringNetwork
 from advnerf_core.policies.view import PolicyView
 
 FILE_FORMAT = "advnerf-policy-1"
-# Folder beside the policy file that holds the code of a user's architecture; the first characters of its hash follow.
+# Folder beside the policy file with the code of a user's architecture; the first characters of its hash follow.
 _CODE_FOLDER = "architecture_"
 
 
 class PolicyFileError(AdvnerfError, ValueError):
-    """A policy file cannot be read or is not what was asked for."""
+    """A policy file cannot be read or is not the expected one."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,8 @@ class LoadedPolicy:
     Attributes:
         policy: A `SteeringNetwork` or an ``AdaptedPolicy`` with ``stateless`` and ``goal_size``, in eval mode, without gradients to its
             weights.
-        view: How camera images become policy images.
-        metadata: What the trainer wrote about it.
+        view: Conversion of camera images to policy images.
+        metadata: The trainer's metadata.
         sha256: Hash over weights and metadata; identifies the policy in manifests and attack files.
     """
 
@@ -66,14 +66,14 @@ def save_policy(
 
     Args:
         path: Target, by convention ``*.safetensors``.
-        view: How camera images become its input.
-        metadata: Anything JSON can hold: training settings, data, measured errors.
+        view: Conversion of camera images to the network's input.
+        metadata: JSON values: training settings, data, measured errors.
 
     Raises:
-        PolicyFileError: The network is not one that `Architecture.build` made.
+        PolicyFileError: The network does not come from `Architecture.build`.
     """
     settings = _network_settings(policy)
-    # Copies, because the file holds each tensor of tied weights.
+    # Copies, because the file stores each tensor of tied weights.
     weights = {name: value.detach().cpu().contiguous().clone() for name, value in policy.state_dict().items()}
     header = {
         "format": FILE_FORMAT,
@@ -89,7 +89,7 @@ def save_policy(
 
 
 def copy_policy(source: Path, target: Path) -> None:
-    """Copy a policy file, and the code of its architecture where it has some."""
+    """Copy a policy file, and the code of its architecture if it has some."""
     code = _settings(_checked(source, None)[0]).get("code", "")
     if code and (folder := _code_folder(source, code)).is_dir():
         for file in folder.rglob("*.py"):
@@ -101,7 +101,7 @@ def architecture_of(policy: Any) -> Architecture:
     """Architecture and settings of a network that is trained here.
 
     Raises:
-        PolicyFileError: It is no such network, or its class is a user's and was called directly.
+        PolicyFileError: The network is not trained here, or its user's class was constructed directly.
     """
     made_by = type(policy)
     if isinstance(policy, SteeringNetwork):
@@ -117,7 +117,7 @@ def architecture_of(policy: Any) -> Architecture:
 def load_policy(path: str | os.PathLike[str], expected_sha256: str | None = None) -> LoadedPolicy:
     """Read a policy file and check its hash against its content and, if given, against ``expected_sha256``.
 
-    A file of a user's architecture names its code, which lies beside it. The code runs only if it has the hash in the policy file.
+    A file of a user's architecture names its code, which lies beside it. The code runs only if its hash matches the policy file.
 
     Raises:
         PolicyFileError: The file is missing, damaged or another policy, or its architecture's code is missing or has changed.
@@ -163,7 +163,7 @@ def _checked(path: Path, expected_sha256: str | None) -> tuple[dict[str, str], d
 
 
 def _network_settings(policy: SteeringNetwork) -> dict[str, Any]:
-    """What the file holds of the network. PilotNet's settings stand there as in files that were written before there were others."""
+    """Settings of the network for the file. PilotNet's keep the layout of existing files."""
     architecture = architecture_of(policy)
     common = {"goal_size": policy.goal_size, "max_steering_rad": policy.max_steering_rad}
     if architecture.name == PILOTNET:

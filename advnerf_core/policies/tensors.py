@@ -1,4 +1,4 @@
-"""Which input of a policy file takes the images, which output steers: as declared, or as its shapes allow one reading only."""
+"""Assigns the inputs and outputs of a policy file: as declared, or by their shapes if these allow one reading only."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class TensorInfo:
     """An input or output of a policy file.
 
     Attributes:
-        shape: Its dimensions; a text or None is a dimension that is not fixed. None if the file does not say.
-        kind: Type of its elements, as numpy calls it.
+        shape: Dimensions; a text or None is a variable dimension. None if the file does not say.
+        kind: Type of its elements, by numpy's name.
     """
 
     name: str
@@ -38,15 +38,15 @@ class TensorInfo:
 
 @dataclass(frozen=True)
 class Tensors:
-    """Inputs and outputs of a policy file, and what each is used for.
+    """Inputs and outputs of a policy file with their uses.
 
     Attributes:
-        inputs: In the file's order.
-        outputs: In the file's order.
-        image: The input that takes the images.
-        goal: The input that takes the goals; None for a policy without a goal.
+        inputs: All inputs, in the file's order.
+        outputs: All outputs, in the file's order.
+        image: The input for the images.
+        goal: The input for the goals; None for a policy without a goal.
         steering: The output that steers.
-        states: What is carried from image to image.
+        states: States carried from image to image.
     """
 
     inputs: tuple[TensorInfo, ...]
@@ -58,11 +58,11 @@ class Tensors:
 
     @property
     def one_by_one(self) -> bool:
-        """Whether the file takes one image at a time."""
+        """Whether the file accepts only one image at a time."""
         return (self.image.shape or ())[:1] == (1,) or any(each.one_by_one for each in self.states)
 
     def use_of(self, tensor: TensorInfo, meaning: str) -> str:
-        """What a tensor is used for, in words; the output that is used has the declaration's ``meaning``."""
+        """Use of a tensor as text; the used output has the declaration's ``meaning``."""
         if tensor is self.steering:
             return meaning
         for state in self.states:
@@ -93,7 +93,7 @@ def chosen_tensors(
 def _carried(
     inputs: Sequence[TensorInfo], outputs: Sequence[TensorInfo], state: NetworkState, path: Path
 ) -> CarriedState:
-    """A state with the shape that the file says."""
+    """A state with its shape in the file."""
     given = _named(inputs, state.input, "states.input", path)
     _named(outputs, state.output, "states.output", path)
     shape = list(given.shape or ())

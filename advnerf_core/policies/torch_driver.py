@@ -1,4 +1,4 @@
-"""A torch policy as the live node uses it."""
+"""A torch policy for the live node."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class TorchDriver(Driver):
 
     @torch.inference_mode()
     def answer(self, image: NDArray[np.uint8], goal: tuple[float, ...]) -> Tensor:
-        """The network's raw output for one policy image, as the methods of the declaration take it."""
+        """The network's raw output for one policy image, as the declaration's methods expect it."""
         goals = torch.tensor([goal], dtype=torch.float32) if goal else None
         raw: Tensor = self._after(images_to_tensor(image), goals)
         return raw

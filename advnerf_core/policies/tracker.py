@@ -22,9 +22,9 @@ class TrackedTrajectory(StrictModel):
 
     Attributes:
         times_s: Time of each waypoint after the image [s], increasing.
-        lookahead_m: Distance from the car at which the tracker meets the waypoints [m]; of shorter ones the last is taken.
-        wheelbase_m: Distance between the axles of a car whose control is a wheel angle [m].
-        car_speed_mps: Instead of it, the speed of a car whose control is a turn rate [m/s].
+        lookahead_m: Distance from the car at which the tracker meets the waypoints [m]; the last waypoint if they are nearer.
+        wheelbase_m: Distance between the axles, for a car whose control is a wheel angle [m].
+        car_speed_mps: Speed, for a car whose control is a turn rate [m/s].
     """
 
     times_s: tuple[_Positive, ...] = Field(min_length=1)
@@ -65,7 +65,7 @@ def pursued_curvature_1pm(waypoints: Any, lookahead_m: float) -> Any:
 
     Args:
         waypoints: ``[B, N, 2]`` in metres in the car's frame (numpy or torch; differentiable).
-        lookahead_m: Distance from the car at which the waypoints are met [m]; of shorter ones the last is taken.
+        lookahead_m: Distance from the car at which the waypoints are met [m]; the last waypoint if they are nearer.
     """
     points = _from_the_car(waypoints)
     beyond = np.asarray(((points.detach() if hasattr(points, "detach") else points) ** 2).sum(-1).tolist())
@@ -75,8 +75,8 @@ def pursued_curvature_1pm(waypoints: Any, lookahead_m: float) -> Any:
     rows = list(range(len(points)))
     start, end = points[rows, [each - 1 for each in index]], points[rows, index]
     step = end - start
-    # Where the piece leaves the circle: |start + share step| = lookahead. A short trajectory has none: its end is taken, and the ones
-    # that are added keep the derivative finite.
+    # Where the piece leaves the circle: |start + share step| = lookahead. A short trajectory never does: its end is used, and the added
+    # ones keep the derivative finite.
     short = like(points, 1.0 - found)
     a = (step * step).sum(-1) + short
     b, c = (start * step).sum(-1), (start * start).sum(-1) - lookahead_m**2
@@ -87,5 +87,5 @@ def pursued_curvature_1pm(waypoints: Any, lookahead_m: float) -> Any:
 
 
 def _from_the_car(waypoints: Any) -> Any:
-    """The waypoints with the car's place before them ``[B, N + 1, 2]``."""
+    """The waypoints with the car's position before them ``[B, N + 1, 2]``."""
     return array_module(waypoints).concatenate([0.0 * waypoints[:, :1], waypoints], 1)

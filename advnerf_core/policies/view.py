@@ -1,4 +1,4 @@
-"""From the camera image to what the policy sees: undistort, crop, area resize. One function for every domain."""
+"""Converts camera images to policy images: undistort, crop, area resize. One function for every domain."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from advnerf_core.geometry import Pinhole
 
-# Of the policies that are trained here (Bojarski et al. 2016).
+# Image size of the policies that are trained here (Bojarski et al. 2016).
 IMAGE_HEIGHT, IMAGE_WIDTH = 66, 200
 
 Image = NDArray[np.uint8]
@@ -24,14 +24,14 @@ class PolicyView:
     """The window of the camera image that the policy sees, and its size.
 
     The defaults keep the full width of a 336x188 image and the rows around and under the horizon (row 63 with the camera
-    pitched down 10 degrees) at PilotNet's aspect: of a board on the floor at 2 m, two thirds are seen.
+    pitched down 10 degrees) at PilotNet's aspect: two thirds of a board on the floor at 2 m are visible.
 
     Attributes:
         camera: Intrinsics of the (undistorted) camera image.
-        crop_top_px: First row that is kept [px].
-        crop_height_px: Number of rows that are kept [px].
-        crop_left_px: First column that is kept [px].
-        crop_width_px: Number of columns that are kept [px]; None keeps all to the right edge.
+        crop_top_px: First row of the crop [px].
+        crop_height_px: Number of rows of the crop [px].
+        crop_left_px: First column of the crop [px].
+        crop_width_px: Number of columns of the crop [px]; None extends to the right edge.
         width: Width of the policy's image [px].
         height: Height of the policy's image [px].
         distortion: OpenCV distortion coefficients of the camera; empty for a camera without distortion.
@@ -47,20 +47,20 @@ class PolicyView:
     crop_width_px: int | None = None
 
     def __post_init__(self) -> None:
-        _ = self.pinhole  # fails here if the crop leaves the image
+        _ = self.pinhole  # raises if the crop leaves the image
         if len(self.distortion) not in (0, 4, 5, 8):
             raise ValueError(f"expected 0, 4, 5 or 8 distortion coefficients, got {len(self.distortion)}")
 
     @property
     def window(self) -> tuple[slice, slice]:
-        """Rows and columns of the camera image that are kept: ``image[view.window]``."""
+        """Rows and columns of the crop: ``image[view.window]``."""
         width = self.camera.width - self.crop_left_px if self.crop_width_px is None else self.crop_width_px
         rows = slice(self.crop_top_px, self.crop_top_px + self.crop_height_px)
         return rows, slice(self.crop_left_px, self.crop_left_px + width)
 
     @cached_property
     def window_pinhole(self) -> Pinhole:
-        """Intrinsics of the part of the camera image that is kept, before it is resized."""
+        """Intrinsics of the crop, before it is resized."""
         rows, columns = self.window
         width, height = columns.stop - columns.start, rows.stop - rows.start
         return self.camera.cropped(columns.start, rows.start, width, height)
@@ -85,7 +85,7 @@ class PolicyView:
         return np.asarray(resized, dtype=np.uint8)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data from which :meth:`from_dict` makes the same view."""
+        """Plain data from which :meth:`from_dict` rebuilds the view."""
         return {**asdict(self), "distortion": list(self.distortion)}
 
     @classmethod

@@ -1,7 +1,7 @@
 """A small vision transformer as the policy.
 
 Dosovitskiy et al., "An Image is Worth 16x16 Words: Transformers for Image Recognition at Scale" (2021): an image is a row of patches, one
-token each, and a class token whose last state is read out. The blocks are those of Vaswani et al., "Attention Is All You Need" (2017), with
+token each, and a class token whose last state is read out. The blocks follow Vaswani et al., "Attention Is All You Need" (2017), with
 normalisation before each part. Positions begin as sines and cosines of row and column, which learn faster than random ones (Beyer, Zhai and
 Kolesnikov, "Better plain ViT baselines for ImageNet-1k", 2022). There is no dropout: train and eval mode compute the same.
 """
@@ -16,8 +16,8 @@ from advnerf_core.policies.architecture import VisionTransformerConfiguration
 from advnerf_core.policies.network import SteeringNetwork
 from advnerf_core.policies.view import IMAGE_HEIGHT, IMAGE_WIDTH
 
-_SPREAD = 0.02  # of the class token at the start
-_LONGEST = 100.0  # wavelength of positions over that of the shortest, as in Beyer et al.
+_SPREAD = 0.02  # initial spread of the class token
+_LONGEST = 100.0  # longest over shortest wavelength of positions, as in Beyer et al.
 _EXPANSION = 2
 
 

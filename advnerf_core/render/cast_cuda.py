@@ -38,10 +38,10 @@ _SUM_BITS = 62
 
 
 def check_drawable(objects: Sequence[ColouredObject]) -> list[VoxelGridObject]:
-    """The objects, all of which a GPU can draw.
+    """The objects, if a GPU can draw all of them.
 
     Raises:
-        DeviceError: One is no voxel grid, or there are too many.
+        DeviceError: An object is not a voxel grid, or there are too many.
     """
     grids = [field for field in objects if isinstance(field, VoxelGridObject)]
     if len(grids) != len(objects):
@@ -135,9 +135,9 @@ class CudaObjects:
 
         Args:
             places: From `placed`.
-            colours: Of each texture, all objects' colour vectors in their order ``[N, V, 3]``.
-            texture_of: Which texture an image shows ``[B]`` int32.
-            behind_m: [m].
+            colours: All objects' colour vectors in their order, for each texture ``[N, V, 3]``.
+            texture_of: Index of each image's texture ``[B]`` int32.
+            behind_m: Planar depth of the background ``[B, H, W]`` [m].
             image: Drawn into.
         """
         shares = torch.empty((len(self.objects), *behind_m.shape), dtype=self.dtype, device=self.device)

@@ -138,7 +138,7 @@ def draw_objects(frames: Any, windows: Any, intrinsics: Any, supersample: int, w
     """Draw all objects of a batch of images before its background, one thread for each pixel.
 
     Args:
-        frames: Of each object in each image: directions of unit planar depth in the camera to voxel coordinates, row by row, then the camera's
+        frames: For each object in each image: directions of unit planar depth in the camera to voxel coordinates, row by row, then the camera's
             centre there ``[K, B, 12]`` float64.
         windows: First row, end row, first column, end column ``[K, B, 4]``.
         intrinsics: ``fx, fy, cx, cy`` ``[4]`` float64.
@@ -146,14 +146,14 @@ def draw_objects(frames: Any, windows: Any, intrinsics: Any, supersample: int, w
         whole: Whole numbers of each object ``[K, 9]`` int64, see above.
         lengths: Lengths of each object ``[K, 4]`` float64, see above.
         slots: Colour of each voxel of all objects, flat, int32.
-        density: Of the voxels, flat; those of solid objects are not read.
+        density: Density of the voxels, flat; not read for solid objects.
         clear: Cells around each cell that are empty, flat, uint8.
-        colours: Of each texture ``[N, V, 3]``.
-        texture_of: Texture that an image shows ``[B]`` int32.
+        colours: Colours for each texture ``[N, V, 3]``.
+        texture_of: Index of each image's texture ``[B]`` int32.
         behind_m: Planar depth of the background ``[B, H, W]`` [m]; NaN is infinitely far.
-        tolerance_m: By how much an object may be behind the background and still be seen [m].
+        tolerance_m: Distance behind the background at which an object is still visible [m].
         image: Background ``[B, 3, H, W]``, which objects are drawn into.
-        shares: What is kept of the light of each object ``[K, B, H, W]``, written.
+        shares: Share of the light that each object keeps ``[K, B, H, W]``, written.
         nothing: An empty gradient ``[0, 3]`` int64.
     """
     n: int = cuda.grid(1)  # type: ignore[call-arg]
@@ -205,12 +205,12 @@ def draw_objects(frames: Any, windows: Any, intrinsics: Any, supersample: int, w
 @cuda.jit
 def pull_objects(frames: Any, windows: Any, intrinsics: Any, supersample: int, whole: Any, lengths: Any, slots: Any, density: Any, clear: Any,
                  colours: Any, texture_of: Any, shares: Any, slopes: Any, scale: Any, gradient: Any) -> None:  # fmt: skip
-    """Pull slopes of images back to the colours that they show; arguments as of `draw_objects`, and:
+    """Propagate slopes of images back to their colours; arguments as in `draw_objects`, and:
 
     Args:
         shares: From `draw_objects`.
         slopes: With respect to the images ``[B, 3, H, W]``.
-        scale: What one is in the whole numbers of the gradient ``[1]`` float64.
+        scale: Value of one in the gradient's whole numbers ``[1]`` float64.
         gradient: With respect to the colours ``[N, V, 3]`` int64, added to.
     """
     n: int = cuda.grid(1)  # type: ignore[call-arg]

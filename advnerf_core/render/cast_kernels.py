@@ -77,8 +77,8 @@ def box_windows(T: Any, box: Any, intrinsics: Any, width: int, height: int) -> A
         T: Box to camera ``[B, 4, 4]``; one that is not finite sees nothing.
         box: Lowest and highest corner ``[2, 3]`` [m].
         intrinsics: ``fx, fy, cx, cy`` ``[4]``.
-        width: Of the image [pixels].
-        height: Of the image [pixels].
+        width: Width of the image [pixels].
+        height: Height of the image [pixels].
     """
     out = np.zeros((len(T), 4), np.int64)
     for b in range(len(T)):
@@ -150,7 +150,7 @@ def _set_out(R: Any, o: Any, edges: Any, sizes: Any, aims: Any, count: int, soli
     """Where rays sample, in vector instructions: `span_in_box` without branches, and the samples between.
 
     Args:
-        R: As in `cast_window`, like the following.
+        R: Rotation as in `cast_window`, as are the following.
         o: ``[3]``.
         edges: ``[3]``.
         sizes: Voxels along each axis.
@@ -222,7 +222,7 @@ def _leap(rays: Any, n: int, i: int, clear: Any) -> int:
 def _leap_all(rays: Any, spans: Any, count: int, going: Any, clear: Any) -> None:
     """Take ``count`` rays to their first samples in cells that are not empty, or to their ends.
 
-    One leap of every ray after the other: a leap waits for the one before, but not for those of other rays.
+    All rays advance in turn by one leap each: a leap waits for the ray's last one, but not for those of other rays.
     """
     under_way = 0
     for n in range(count):
@@ -326,7 +326,7 @@ def cast_window(R: Any, o: Any, edges: Any, window: Any, intrinsics: Any, neares
         pixels: Flat indices ``[P]``, written.
         alphas: ``[P]``, written.
         depths: ``[P]``, written.
-        ends: Where each pixel's weights end ``[P]``, written.
+        ends: End of each pixel's weights ``[P]``, written.
         indices: Slots of the weights, written.
 
     Returns:

@@ -108,7 +108,7 @@ def cast_work(
     supersample: int = 2,
     dtype: Any = np.float32,
 ) -> Work[list[ObjectCast]]:
-    """:func:`cast_objects`, not begun yet: its parts may run beside those of other work."""
+    """:func:`cast_objects` as work that has not begun: its parts may run beside other work's."""
     poses = np.asarray(T_world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
     if supersample < 1:
         raise ValueError(f"expected at least 1 ray along a pixel's side, got {supersample}")
@@ -343,7 +343,7 @@ def _joined(parts: Sequence[_ObjectCast], field: VoxelGridObject, dtype: Any) ->
 
 
 def _bands(window: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
-    """A window cut into so many bands of rows."""
+    """A window cut into ``count`` bands of rows."""
     if count == 1:
         return [window]
     edges = np.linspace(window[0], max(window[1], window[0]), count + 1).astype(np.int64)

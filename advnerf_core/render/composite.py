@@ -79,7 +79,7 @@ def sparse_shares(
     """:func:`visible_shares` of layers that cover few pixels each, before an opaque background that covers all.
 
     Args:
-        pixels: Of each layer, the pixels that it covers ``[P]``, each at most once.
+        pixels: Pixels that each layer covers ``[P]``, each at most once.
         alphas: ``[P]`` each, in 0..1.
         depths_m: ``[P]`` each [m]. At equal depth a layer is before the background, and before later layers.
         background_depth_m: ``[N]`` [m]; NaN is infinitely far.
@@ -109,7 +109,7 @@ def sparse_shares(
 def _layer_shares(
     where: Any, alpha: Any, depth: Any, behind: Any, ends: Any, order: Any, background: Any, shares: Any
 ) -> None:
-    """Sort the entries into pixels, and those of a pixel by depth; ``ends`` is used up."""
+    """Sort the entries by pixel, and within a pixel by depth; ``ends`` is used up."""
     for n in range(
         len(where) - 1, -1, -1
     ):  # backwards, so that entries of a pixel keep the order of the layers

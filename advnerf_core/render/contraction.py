@@ -55,7 +55,7 @@ def uncontract(cube: ArrayLike) -> NDArray[np.float64]:
 
 
 def radial_stretch(shape: tuple[int, int, int]) -> Array32:
-    """How much longer than an inner cell the cells of a grid over the cube are, outwards: ``r^2``, at most that of ``FAR``.
+    """Radial length of a grid's cells over the cube, relative to an inner cell: ``r^2``, at most the value at ``FAR``.
 
     Args:
         shape: Cells along each axis, multiples of 4, so that no cell lies in two regions.
@@ -159,8 +159,8 @@ def next_sample_contracted(
 
     Args:
         ray: Origin and direction ``[6]`` in box coordinates.
-        t: Where to start [m].
-        end: Where the ray ends [m].
+        t: Ray parameter to start from [m].
+        end: End of the ray [m].
         distance: ``[X, Y, Z]``.
         cells: Cells per unit of the cube along each axis ``[3]``.
     """

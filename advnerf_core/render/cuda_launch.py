@@ -43,8 +43,8 @@ def launch(kernel: Any, threads: int, *arguments: Any) -> None:
     """Run a kernel after what torch has queued.
 
     Args:
-        kernel: Of ``numba.cuda.jit``; it returns at once where ``cuda.grid(1)`` is not below ``threads``.
-        threads: How many are wanted; none runs nothing.
+        kernel: Kernel of ``numba.cuda.jit``; it returns at once if ``cuda.grid(1)`` is not below ``threads``.
+        threads: Number of threads; 0 runs nothing.
         arguments: Tensors on `cuda_device` without history, and numbers.
     """
     blocks = -(-threads // _THREADS)

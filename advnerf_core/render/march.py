@@ -89,9 +89,9 @@ class Marcher:
     """Packs the samples of a batch of rays; keeps its memory between batches.
 
     Args:
-        capacity: Samples of a batch that fit. Rays that begin after so many are left out.
+        capacity: Samples of a batch that fit. Later rays are left out.
         box_high: High corner of the box in box coordinates ``[3]``.
-        contracted: Whether the field is contracted: rays then go on outside the box.
+        contracted: Whether the field is contracted: rays then continue outside the box.
     """
 
     def __init__(

@@ -1,9 +1,9 @@
-"""CPU kernels that walk rays through a box, leap over empty space and place samples where something may be.
+"""CPU kernels that walk rays through a box, leap over empty space and place samples in occupied space.
 
 Rays live in box coordinates: positions are metres divided by the longest side of the box, measured from its low corner, so the box
 is ``[0, high]`` with ``max(high) = 1``; the ray parameter stays in metres. ``distance`` tells per cell how many cells one may go in any
 direction: 0 is occupied, d > 0 means that all cells at Chebyshev distance below d are empty. With a contracted field the box is only the
-inner region: rays go on outside it, and cells and sample positions are those of the unit cube that ``contraction`` maps all space to.
+inner region: rays continue outside it, and cells and sample positions refer to the unit cube that ``contraction`` maps all space to.
 """
 
 from __future__ import annotations
@@ -54,12 +54,12 @@ def _leap(position, direction, index, cells, reach):  # type: ignore[no-untyped-
 
 @njit(**KERNEL_OPTIONS)
 def next_sample(ray: Array32, t: np.float32, end: np.float32, distance: Array8, cells: Array32) -> np.float32:
-    """Ray parameter of the first occupied place at or after ``t``, or ``end`` or more if there is none.
+    """Ray parameter of the first occupied place at or after ``t``, or ``end`` or more without one.
 
     Args:
         ray: Origin and direction ``[6]`` in box coordinates.
-        t: Where to start [m].
-        end: Where the ray leaves the box [m].
+        t: Ray parameter to start from [m].
+        end: End of the ray in the box [m].
         distance: ``[X, Y, Z]``.
         cells: Cells per unit of box coordinates along each axis ``[3]``.
     """
@@ -96,7 +96,7 @@ def march(
 
     Args:
         rays: ``[R, 6]`` origins and unit directions in box coordinates.
-        jitter: Where in its interval a sample lies, ``[R]`` in [0, 1).
+        jitter: Position of a sample in its interval, ``[R]`` in [0, 1).
         first: First ray.
         stop: One past the last ray.
         high: High corner of the box ``[3]``.
@@ -112,7 +112,7 @@ def march(
         contracted: Whether the field is contracted.
 
     Returns:
-        How many rays fit.
+        Number of rays that fit.
     """
     capacity, at = points.shape[0], 0
     for r in range(first, stop):

@@ -67,9 +67,9 @@ class OccupancyGrid:
         """Probe cells at random places inside them and keep ``max(decay * old, probed)``.
 
         Args:
-            step: Training step; with the seed it fixes the random numbers, so that a resumed run goes on alike.
+            step: Training step; with the seed it determines the random numbers, so that a resumed run continues identically.
             share: Share of the cells to probe, 1 for all; chosen at random.
-            decay: Factor on the old estimates, of all cells: one that is not probed for long is given up.
+            decay: Factor on the old estimates of all cells: one without probes for long becomes empty.
         """
         rng = np.random.Generator(np.random.Philox(key=[self.seed, 2 * step + 1]))
         total = self.density.size

@@ -7,7 +7,7 @@ depths ``tau_i = sigma(p_i) step |d| / scale`` and colours ``c_i``, a ray shows 
     dL/dtau_i = T_i exp(-tau_i) e_i - sum_{j>i} w_j e_j,    dL/dc_i = w_i g,
 
 and the chain through ``p_i`` needs only the sums of ``dL/dp_i``, ``p_i x dL/dp_i``, ``p_i . dL/dp_i`` and ``tau_i dL/dtau_i``. Nothing of a sample
-outlives its ray: the backward pass walks each ray again, so memory is that of the covered pixels.
+outlives its ray: the backward pass walks each ray again, so memory is limited to the covered pixels.
 """
 
 from __future__ import annotations
@@ -189,7 +189,7 @@ def pull_pixels(first: int, last: int, pixels: Any, R: Any, o: Any, intrinsics: 
     """The backward pass of `shade_pixels`, which has the arguments up to ``taus``.
 
     Args:
-        slopes: Of red, green, blue and alpha of each pixel, ``[P, 4]``.
+        slopes: Slopes of red, green, blue and alpha of each pixel, ``[P, 4]``.
         low: Corner of the box in object units ``[3]``.
         edges: Object units per voxel ``[3]``.
         rows: Derivative with respect to the colour vector ``[rows, 3]``, added to; of no rows if it is not wanted.

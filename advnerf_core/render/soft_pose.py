@@ -75,7 +75,7 @@ class SoftLayer:
 
     @property
     def nbytes(self) -> int:
-        """Memory held by the arrays [bytes], that of the object's grids and colours not counted."""
+        """Memory held by the arrays [bytes], without the object's grids and colours."""
         return int(sum(part.nbytes for part in (self.pixels, self.colour, self.alpha, self.depth_m)))
 
     def pull(self, slopes: Array, with_colours: bool = True) -> tuple[Array, Array]:

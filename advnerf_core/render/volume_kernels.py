@@ -123,7 +123,7 @@ def accumulate_backward(
     field: Array32, widths: Array32, begins: Array64i, first: int, stop: int, weights: Array32, grad_out: Array32,
     grad_alpha: Array32, grad_weights: Array32,
 ) -> None:  # fmt: skip
-    """Replace ``field`` by its gradient, that of features before squashing, for rays ``first..stop``.
+    """Replace ``field`` by its gradient, with respect to features before squashing, for rays ``first..stop``.
 
     Args:
         field: ``[tiles, 1 + C, TILE]``, overwritten.
@@ -134,7 +134,7 @@ def accumulate_backward(
         weights: ``[N]`` from ``accumulate``.
         grad_out: ``[ray tiles, >= C, TILE]``.
         grad_alpha: ``[R]``.
-        grad_weights: What the loss adds directly to the gradient of each weight ``[N]``; overwritten with the whole of it.
+        grad_weights: Direct gradient of the loss with respect to each weight ``[N]``; overwritten with the full one.
     """
     channels = field.shape[1] - 1
     for r in range(first, stop):
@@ -177,11 +177,11 @@ def add_distortion_gradient(
     """Gradient of the distortion loss, which pulls the weights of a ray together into one surface.
 
     ``L = sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 d_i`` per ray (Barron et al. 2022, "Mip-NeRF 360", equation 15), in linear
-    time since samples are sorted. Differentiated to weights only: samples are where they are.
+    time since samples are sorted. Differentiated with respect to weights only: samples are fixed.
 
     Args:
         weights: ``[N]``.
-        middles: Where samples lie along their rays, any unit ``[N]``.
+        middles: Positions of samples along their rays, any unit ``[N]``.
         widths: Their intervals in the same unit ``[N]``.
         begins: First sample of each ray ``[R + 1]``.
         first: First ray.

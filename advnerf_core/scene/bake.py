@@ -14,11 +14,11 @@ from advnerf_core.scene.baked_kernels import bake_points
 from advnerf_core.scene.colour import IDENTITY
 from advnerf_core.scene.render_field import FieldRenderer
 
-# Length of a brick's part in pixels, seen from nearest. Shorter ones look a little better and take much more memory.
+# Length of a brick's part in pixels at the nearest view. Shorter ones look a little better and take much more memory.
 PART_PX = 1.4
-_MOST_HALVINGS = 3  # of a cell's side
+_MOST_HALVINGS = 3  # per side of a cell
 _SLOTS = 16
-_CHUNK = 1 << 20  # points that are baked at a time
+_CHUNK = 1 << 20  # points baked at a time
 _CONSTANT = np.float32(0.28209479177387814)  # the spherical harmonic of degree 0
 
 
@@ -29,17 +29,17 @@ class NotBakedError(AdvnerfError):
 def bake(
     source: FieldRenderer, T_world_from_camera: ArrayLike, pinhole: Pinhole, part_px: float = PART_PX
 ) -> BakedScene:
-    """Bake a field, its colour map included.
+    """Bake a field, including its colour map.
 
-    Every occupied cell gets values at its corners. A cell that is seen from near by also gets a brick of finer ones.
+    Every occupied cell gets values at its corners. A cell seen from near by also gets a brick of finer ones.
 
     Args:
-        T_world_from_camera: Poses ``[N, 4, 4]`` like those that will be rendered: bricks are made where these look.
-        pinhole: The camera that will be rendered.
-        part_px: Length of a brick's part in pixels, where it is seen from nearest.
+        T_world_from_camera: Poses ``[N, 4, 4]`` like the later ones: bricks are made where these look.
+        pinhole: Intrinsics of the later renders.
+        part_px: Length of a brick's part in pixels, at the nearest view.
 
     Raises:
-        NotBakedError: Colours of the field depend on the direction, it reaches beyond its box, or it is transparent.
+        NotBakedError: The field's colours depend on the direction, it reaches beyond its box, or it is transparent.
     """
     config = source.config
     if (
@@ -65,10 +65,10 @@ def bake(
 
 
 def _corner_values(source: FieldRenderer) -> NDArray[np.uint8]:
-    """Values at the corners of all cells; nothing where no sample of an occupied cell can lie."""
+    """Values at the corners of all cells; empty where no sample of an occupied cell can lie."""
     shape = np.array(source.leaps.distance.shape)
     cell_m = source.config.extent_m / float(source.leaps.cells.max())
-    # A sample lies half an interval behind the place at which its ray met an occupied cell.
+    # A sample lies half an interval behind the point where its ray met an occupied cell.
     reach = 1 + int(np.ceil(0.5 * source.march.largest_step_m / cell_m))
     near = ndimage.maximum_filter(np.pad(source.leaps.distance == 0, (0, 1)), size=2 * reach + 1)
     corners = np.flatnonzero(near)
@@ -80,7 +80,7 @@ def _corner_values(source: FieldRenderer) -> NDArray[np.uint8]:
 
 
 def _with_bricks(source: FieldRenderer, coarse: Voxels, parts: NDArray[np.float32]) -> Voxels:
-    """The voxels with bricks of at least ``parts [X, Y, Z]`` along the sides of cells, as far as there are so many."""
+    """The voxels with bricks of at least ``parts [X, Y, Z]`` along the sides of cells, up to the limit."""
     logs = np.ceil(np.log2(np.maximum(parts.reshape(-1), 1.0))).astype(np.int64)
     cells = np.flatnonzero(logs > 0)
     logs = np.minimum(logs[cells], _MOST_HALVINGS)

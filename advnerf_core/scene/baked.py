@@ -27,7 +27,7 @@ from advnerf_core.scene.field import SceneFieldConfig, SceneFileError
 
 FORMAT = "advnerf-baked-1"
 _SLOTS = 16
-_NOTING = 4  # threads that note what is seen: an array of all cells is tens of MiB
+_NOTING = 4  # threads that record seen cells: an array of all cells is tens of MiB
 _NOTHING_NOTED = np.zeros((0, 0, 0), np.float32)
 
 
@@ -36,8 +36,8 @@ class Voxels:
     """Values of a field at voxel corners.
 
     Attributes:
-        values: Logarithm of density and colour of each corner ``[V, 4]`` uint8; first those of all cells, then those of bricks.
-        brick_of: First value of the brick of each cell ``[X, Y, Z]`` int32; negative where it has none.
+        values: Logarithm of density and colour of each corner ``[V, 4]`` uint8; first the cells', then the bricks'.
+        brick_of: First value of the brick of each cell ``[X, Y, Z]`` int32; negative without a brick.
         log_sides: Logarithm to base 2 of the parts along each side of the bricks ``[X, Y, Z]`` uint8.
         behind: Colour ``[3]`` behind everything.
     """
@@ -61,11 +61,11 @@ class Voxels:
 class BakedScene:
     """Renders voxels as `FieldRenderer` renders the field that they were baked from; same inputs, same bits.
 
-    Samples lie where the field's renderer has them. Colours are mixed along a ray; the field mixes features, and decodes them once.
+    Samples have the same places as in the field's renderer. Colours are mixed along a ray; the field mixes features, and decodes them once.
 
     Args:
-        least_transmittance: A ray stops when so little light would still come through.
-        voxels: From `bake`.
+        least_transmittance: A ray stops when less light than this would still come through.
+        voxels: Voxels from `bake`.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class BakedScene:
     def render(
         self, T_world_from_camera: ArrayLike | Tensor, pinhole: Pinhole
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Render a batch of views; arguments and results are those of `FieldRenderer.render`."""
+        """Render a batch of views; arguments and results as in `FieldRenderer.render`."""
         return self.work(T_world_from_camera, pinhole).run()
 
     __call__ = render
@@ -90,7 +90,7 @@ class BakedScene:
     def work(
         self, T_world_from_camera: ArrayLike | Tensor, pinhole: Pinhole
     ) -> Work[tuple[Tensor, Tensor, Tensor]]:
-        """`render`, not begun yet: its parts may run beside those of other work."""
+        """`render` as work that has not begun: its parts may run beside other work's."""
         if isinstance(T_world_from_camera, Tensor):
             T_world_from_camera = T_world_from_camera.detach().cpu().numpy()
         poses = np.asarray(T_world_from_camera, np.float64)
@@ -99,8 +99,8 @@ class BakedScene:
         return self._work(poses, pinhole, _NOTHING_NOTED)
 
     def nearest_seen_m(self, T_world_from_camera: Array, pinhole: Pinhole) -> NDArray[np.float32]:
-        """From how near each cell ``[X, Y, Z]`` is seen in views ``[N, 4, 4]`` [m]; infinite where it is not."""
-        # Each thread notes in an array of its own, as two would write the same cells.
+        """Distance [m] from which each cell ``[X, Y, Z]`` is seen in views ``[N, 4, 4]``, the smallest; infinite for unseen ones."""
+        # Each thread records in its own array, as two would write the same cells.
         shape = (min(thread_count(), _NOTING), *self.leaps.distance.shape)
         nearest_m = np.full(shape, np.inf, np.float32)
 
@@ -174,7 +174,7 @@ class BakedScene:
         """Read a file of `save`.
 
         Raises:
-            SceneFileError: The file is missing, damaged, or something else.
+            SceneFileError: The file is missing, damaged, or of another kind.
         """
         try:
             with open_tensors(path, "numpy") as file:

@@ -1,4 +1,4 @@
-"""A baked scene drawn on a GPU: one thread for each pixel, with samples and values as ``baked_kernels`` has them."""
+"""A baked scene drawn on a GPU: one thread for each pixel, with samples and values as in ``baked_kernels``."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _to_edge(place: Any, step: Any, cell: Any, reach: Any) -> Any:
 @cuda.jit
 def render_baked_cuda(poses: Any, intrinsics: Any, high: Any, near: Any, steps: Any, distance: Any, cells: Any, brick_of: Any, log_sides: Any,
                       words: Any, behind: Any, least_through: Any, max_samples: int, rgb: Any, depth_m: Any) -> None:  # fmt: skip
-    """Render a batch of images; arguments are those of ``render_baked``, but for the image ``rgb [B, 3, H, W]``."""
+    """Render a batch of images; arguments as for ``render_baked``, except the image ``rgb [B, 3, H, W]``."""
     n: int = cuda.grid(1)  # type: ignore[call-arg]
     height, width = depth_m.shape[1], depth_m.shape[2]
     if n >= depth_m.shape[0] * height * width:
@@ -104,10 +104,10 @@ class CudaBaked:
     """A `BakedScene` in the memory of the GPU.
 
     Args:
-        scene: Copied there once.
+        scene: The scene, copied to the GPU once.
 
     Raises:
-        DeviceError: No device.
+        DeviceError: No device is available.
     """
 
     def __init__(self, scene: BakedScene) -> None:

@@ -1,7 +1,7 @@
-"""The CPU kernels of a baked scene: values of the field at voxel corners, and rays that look them up between corners.
+"""The CPU kernels of a baked scene: values of the field at voxel corners, and rays that interpolate between corners.
 
 A value is four bytes: the logarithm of density, and the colour. Space is a grid of cells; every cell has its eight corners in one coarse
-grid, and cells that are seen from near by have a brick of more corners instead.
+grid, and cells seen from near by have a brick of more corners instead.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ Array32 = NDArray[np.float32]
 Array8 = NDArray[np.uint8]
 Array64i = NDArray[np.int64]
 
-# Logarithms of density per box side that a byte tells apart; what is thinner is not seen.
+# Logarithms of density per box side in a byte; anything thinner is invisible.
 LOWEST_LOG = -4.0
 LOG_STEP = (MAX_LOG_DENSITY - LOWEST_LOG) / 255.0
-# Pixels of a tile, samples that are taken together, and those of one ray among them.
+# Pixels of a tile, samples of a wave, and samples of one ray among them.
 WIDE, HIGH, WAVE, AHEAD = 16, 16, 512, 2
 INTO_CELL = np.float32(1e-4)  # m beyond an edge, so that rounding cannot trap a ray on it
-TINY = np.float32(1e-9)  # cells a metre, of a ray along the other axes
-_SEEN = np.float32(0.2)  # of a pixel's light, for a cell to count as seen
+TINY = np.float32(1e-9)  # cells a metre, for a ray along the other axes
+_SEEN = np.float32(0.2)  # share of a pixel's light for a cell to count as seen
 _f, _i = np.float32, np.int32  # in 64 bits, the words would fill twice as many vectors
 _ONE = np.float32(1.0)
 _ZERO = np.float32(0.0)
@@ -45,21 +45,21 @@ def bake_points(
     """Values of the field at points ``first..stop``.
 
     Args:
-        points: ``[N, 3]`` where the field is asked.
+        points: ``[N, 3]`` points of the field.
         first: First point.
         stop: One past the last point.
-        table: As of ``render_tiles``, like the following.
+        table: Hash table as in ``render_tiles``, as are the following.
         levels: ``[L, 4]``.
         w1: ``[H, L * F]``.
         b1: ``[H]``.
         w2: ``[1 + C, H]``.
         b2: ``[1 + C]``.
-        c1: ``[H, K]``; inputs beyond the features are those of a field whose colours do not depend on the direction.
+        c1: ``[H, K]``; inputs beyond the features are constant, as colours do not depend on the direction.
         d1: ``[H]``.
         c2: ``[4, H]``.
         d2: ``[4]``.
-        matrix: Of the colour map ``[3, 3]``.
-        offset: Of the colour map ``[3]``.
+        matrix: Matrix of the colour map ``[3, 3]``.
+        offset: Offset of the colour map ``[3]``.
         values: ``[N, 4]``, written.
     """
     channels = w2.shape[0] - 1
@@ -94,10 +94,10 @@ def bake_points(
                 values[begin + n, 1 + c] = np.uint8(min(max(mapped, _ZERO), _ONE) * _f(255.0) + _f(0.5))
 
 
-# Loops that call a function are not turned into vector instructions, unless numba itself puts the function in its place.
+# Loops that call a function are not vectorised, unless numba itself inlines the function.
 @njit(**_IN_ORDER, inline="always")
 def between(p000, p001, p010, p011, p100, p101, p110, p111, fx, fy, fz):  # type: ignore[no-untyped-def]
-    """The four parts of the value between corners, each a word of four bytes, at fractions of the way along x, y and z."""
+    """The four parts of the value between corners, each a word of four bytes, at fractions along x, y and z."""
     gx, gy, gz = _ONE - fx, _ONE - fy, _ONE - fz
     a, b, c, d = gx * gy * gz, gx * gy * fz, gx * fy * gz, gx * fy * fz
     e, f, g, h = fx * gy * gz, fx * gy * fz, fx * fy * gz, fx * fy * fz
@@ -116,7 +116,7 @@ def between(p000, p001, p010, p011, p100, p101, p110, p111, fx, fy, fz):  # type
 def _gather(words, base, strides, used, corners):  # type: ignore[no-untyped-def]
     """Read the corners of samples ``[:used]`` into ``corners [8, WAVE]``: many reads wait for memory at once."""
     for m in range(used):
-        # Unsigned, because numba asks of each signed index whether it counts from the end.
+        # Unsigned, because numba checks each signed index for counting from the end.
         at, line, plane = np.uint64(base[m]), np.uint64(strides[1, m]), np.uint64(strides[0, m])
         one = np.uint64(1)
         corners[0, m], corners[1, m] = words[at], words[at + one]
@@ -140,7 +140,7 @@ def _interpolate(corners, places, used, mixed):  # type: ignore[no-untyped-def]
 def _leap_all(grids, t, end, distance, rays, count):  # type: ignore[no-untyped-def]
     """Take the rays ``rays[:count]``, in cells ``grids [N, 9]``, to the first occupied place at or after ``t``, or to their end.
 
-    One leap of every ray after the other: a leap waits for the one before, but not for those of other rays. ``rays`` is used up.
+    All rays advance in turn by one leap each: a leap waits for the ray's last one, but not for those of other rays. ``rays`` is used up.
     """
     nx, ny, nz = distance.shape
     while count > 0:
@@ -172,7 +172,7 @@ def render_baked(
 ) -> None:  # fmt: skip
     """Render pixel tiles ``first..stop`` of a batch of images.
 
-    Rays of a tile advance together, and what a wave will read is touched before: a sample waits for memory, not for arithmetic, and many
+    Rays of a tile advance together, and values for the next wave are prefetched: a sample waits for memory, not for arithmetic, and many
     can wait at once.
 
     Args:
@@ -185,7 +185,7 @@ def render_baked(
         steps: Smallest and largest interval [m] and growth per metre ``[3]``.
         distance: Leap distances ``[X, Y, Z]``.
         cells: Cells per unit ``[3]``.
-        brick_of: First value of the brick of each cell ``[X * Y * Z]``; negative where it has none, and the corners of cells serve,
+        brick_of: First value of the brick of each cell ``[X * Y * Z]``; negative without a brick, for which the corners of cells are used,
             which come first among the values.
         log_sides: Logarithm to base 2 of the parts along each side of the bricks ``[X * Y * Z]``.
         words: The values ``[V]``, four bytes each.
@@ -193,9 +193,9 @@ def render_baked(
         least_through: Transmittance at which a ray stops.
         max_samples: Most samples on one ray.
         rgb: ``[B, H, W, 3]``, written.
-        depth_m: Planar depth ``[B, H, W]`` [m], written; infinite where nothing is.
+        depth_m: Planar depth ``[B, H, W]`` [m], written; infinite for empty pixels.
         alpha: ``[B, H, W]``, written.
-        nearest_m: Per cell ``[X, Y, Z]``, the nearest distance from which it was seen, kept up; empty if nobody asks.
+        nearest_m: Per cell ``[X, Y, Z]``, the smallest distance from which it was seen, updated; empty to skip this.
     """
     nx, ny, nz = distance.shape
     height, width = alpha.shape[1], alpha.shape[2]
@@ -225,7 +225,7 @@ def render_baked(
     for tile in range(first, stop):
         image, rest = tile // (across_image * down), tile % (across_image * down)
         top, left = HIGH * (rest // across_image), WIDE * (rest % across_image)
-        count = np.int64(0)  # for literals, what they are handed to would be compiled twice
+        count = np.int64(0)  # with literals, the called functions would be compiled twice
         for n in range(WIDE * HIGH):
             row, column = top + n // WIDE, left + n % WIDE
             if row >= height or column >= width:

@@ -1,4 +1,4 @@
-"""Colour maps between cameras: the camera that learned a scene is not the one that drives through it.
+"""Colour maps between cameras: the camera that learned a scene differs from the one that drives through it.
 
 The map goes from learned colours ``a`` to driving colours ``b`` in two steps: each channel is straightened by a power, because phones
 store tone-mapped values, then mixed by an affine map: ``b = M a^g + offset``. Powers are found by search, the rest by least
@@ -22,7 +22,7 @@ _MOST_PAIRS = 50_000
 
 @dataclass(frozen=True)
 class ColourMap(PlainData):
-    """Colours of one camera to those of another.
+    """Map from the colours of one camera to those of another.
 
     Attributes:
         matrix: ``M``, row by row ``[3][3]``.
@@ -38,7 +38,7 @@ class ColourMap(PlainData):
         """Map colours ``[..., 3]`` in 0..1; results are clipped to 0..1."""
         matrix, offset = np.array(self.matrix, np.float32), np.array(self.offset, np.float32)
         straight = np.maximum(rgb, np.float32(0.0)) ** np.float32(self.power)
-        # Contiguous 2-d product: the sum of products then has one order whatever the image size.
+        # Contiguous 2-d product: the order of summation then does not depend on the image size.
         mapped = straight.reshape(-1, 3) @ matrix.T + offset
         return np.clip(mapped, np.float32(0.0), np.float32(1.0)).reshape(rgb.shape)
 
@@ -59,7 +59,7 @@ def fit_colour_map(learned: ArrayLike, driving: ArrayLike, trim: float = 0.1) ->
     if a.shape != b.shape or len(a) < 16:
         raise ValueError(f"expected at least 16 paired colours, got {a.shape} and {b.shape}")
     if len(a) > _MOST_PAIRS:
-        # A fixed choice at random: a regular one would meet the rows of the images in step.
+        # A fixed random choice: a regular one would be in step with the rows of the images.
         chosen = np.random.default_rng(0).choice(len(a), _MOST_PAIRS, replace=False)
         a, b = a[chosen], b[chosen]
     finite = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)

@@ -1,7 +1,7 @@
 """The surrogate on a GPU: background, objects, images and gradients are computed and stay there.
 
-A drop-in for `Surrogate`, and for `ManyTextures`, as the sensor of an attack. The processor keeps the car's states and theta; what crosses
-between the two in a tick are camera poses, and what the policy makes of the images.
+A drop-in for `Surrogate`, and for `ManyTextures`, as the sensor of an attack. The CPU keeps the car's states and theta; per tick only
+camera poses and the policy's outputs cross between the two.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from advnerf_core.scene.surrogate import Rendered, Surrogate, split_theta
 
 @dataclass(frozen=True, eq=False)
 class _Textures:
-    """Theta as it was given, and the colours that it means.
+    """Theta in its original form, and its colours.
 
     Attributes:
-        given: As given, which keeps its memory from being used by another theta.
+        given: The original tensor; the reference keeps its memory from being reused for another theta.
         version: Torch's count of changes of ``given``.
-        leaf: The same on the device.
+        leaf: The same values on the device.
         colours: All objects' colour vectors ``[N, V, 3]``, with history to ``leaf``.
     """
 
@@ -43,20 +43,20 @@ class _Textures:
     shown: Tensor
 
     def is_of(self, theta: Tensor) -> bool:
-        """Whether ``theta`` is what these were made of, unchanged."""
+        """Whether these were computed from ``theta``, unchanged since."""
         same = theta.data_ptr() == self.given.data_ptr() and theta.shape == self.given.shape
         return same and theta.dtype == self.given.dtype and theta._version == self.version
 
 
 @dataclass(frozen=True, eq=False)
 class CudaFrames:
-    """A batch of camera poses with what does not depend on ``theta``.
+    """A batch of camera poses with everything that does not depend on ``theta``.
 
     Attributes:
-        surrogate: That renders them.
-        background: ``[B, 3, H, W]`` on the device.
-        depth_m: Its planar depth ``[B, H, W]`` [m].
-        places: Where the objects are, from `CudaObjects.placed`; None without objects.
+        surrogate: The surrogate that renders them.
+        background: Background ``[B, 3, H, W]`` on the device.
+        depth_m: Planar depth of the background ``[B, H, W]`` [m].
+        places: Places of the objects, from `CudaObjects.placed`; None without objects.
     """
 
     surrogate: CudaSurrogate
@@ -71,7 +71,7 @@ class CudaFrames:
 
     @torch.no_grad()
     def render(self, theta: Tensor | None) -> Rendered:
-        """Images for ``theta``, on the device, with their vjp, which takes slopes there and gives the gradient where ``theta`` is."""
+        """Images for ``theta``, on the device, with their vjp, which takes slopes there and returns the gradient on theta's device."""
         image, objects, places = self.background.clone(), self.surrogate.drawn, self.places
         if objects is None or places is None:
             return Rendered(image, lambda _: torch.zeros(0, 3), image.nbytes)
@@ -94,13 +94,13 @@ class CudaFrames:
 class CudaSurrogate:
     """A surrogate on a GPU; the images of its renders are tensors there, theta may be anywhere.
 
-    A baked scene is copied to the device. Another background is rendered on the processor as before, and then copied.
+    A baked scene is copied to the device. Another background is rendered on the CPU as before, and then copied.
 
     Args:
         surrogate: The scene with its objects, all voxel grids.
 
     Raises:
-        DeviceError: No device; or the objects are not all voxel grids, too many, or composed opaque.
+        DeviceError: No device is available; or the objects are not all voxel grids, too many, or composed opaque.
     """
 
     def __init__(self, surrogate: Surrogate) -> None:
@@ -110,7 +110,7 @@ class CudaSurrogate:
             )
         self.surrogate = surrogate
         self.count: int | None = (
-            None  # of textures at once; None is one, with theta of the surrogate's own shape
+            None  # number of textures at once; None is one, with theta of the surrogate's own shape
         )
         self.starts = 1
         self.device = cuda_device()
@@ -128,7 +128,7 @@ class CudaSurrogate:
         self._textures: _Textures | None = None
 
     def many(self, count: int, starts: int) -> CudaSurrogate:
-        """The same for several textures at once, sharing what is on the device; frames and theta as of `ManyTextures`."""
+        """The same for several textures at once, sharing data on the device; frames and theta as in `ManyTextures`."""
         if count < 1 or starts < 1:
             raise ValueError(f"expected at least one texture and one start, got {count} and {starts}")
         other = copy.copy(self)
@@ -137,21 +137,21 @@ class CudaSurrogate:
 
     @property
     def objects(self) -> tuple[ColouredObject, ...]:
-        """Of the surrogate."""
+        """Objects of the surrogate."""
         return self.surrogate.objects
 
     @property
     def theta_shape(self) -> tuple[int, ...]:
-        """Of the surrogate; of several textures ``(count, *surrogate.theta_shape)``."""
+        """Theta's shape in the surrogate; for several textures ``(count, *surrogate.theta_shape)``."""
         own = self.surrogate.theta_shape
         return own if self.count is None else (self.count, *own)
 
     def plain_theta(self) -> Tensor:
-        """Of the surrogate."""
+        """Plain theta of the surrogate."""
         return self.surrogate.plain_theta()
 
     def initial_theta(self, generator: torch.Generator) -> Tensor:
-        """Of the surrogate; of several textures one after the other from one generator."""
+        """Initial theta of the surrogate; several textures are drawn in order from one generator."""
         drawn = [self.surrogate.initial_theta(generator) for _ in range(self.count or 1)]
         return drawn[0] if self.count is None else torch.stack(drawn)
 
@@ -160,7 +160,7 @@ class CudaSurrogate:
         return self.surrogate.camera_poses(states)
 
     def sense(self, states: Tensor, theta: Tensor | None) -> Rendered:
-        """What the car's camera sees from states ``[B, n]``; poses are detached."""
+        """Images of the car's camera from states ``[B, n]``; poses are detached."""
         return self.render(self.camera_poses(states), theta)
 
     def render(self, T_world_from_camera: ArrayLike, theta: Tensor | None) -> Rendered:
@@ -169,7 +169,7 @@ class CudaSurrogate:
 
     @torch.no_grad()
     def prepare(self, T_world_from_camera: ArrayLike) -> CudaFrames:
-        """Render the background for camera poses ``[B, 4, 4]``, and find out where the objects are."""
+        """Render the background for camera poses ``[B, 4, 4]``, and compute the places of the objects."""
         poses = np.asarray(T_world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
         if self.count is not None and len(poses) % (self.count * self.starts):
             raise ValueError(f"expected poses in multiples of {self.count * self.starts}, got {len(poses)}")
@@ -178,11 +178,11 @@ class CudaSurrogate:
         return CudaFrames(self, background.contiguous(), depth_m.contiguous(), places)
 
     def texture_of(self, images: int) -> Tensor:
-        """Which texture each of a batch of images shows ``[B]`` int32."""
+        """Index of the texture that each of a batch of images shows ``[B]`` int32."""
         return (torch.arange(images, device=self.device) // self.starts % (self.count or 1)).to(torch.int32)
 
     def textures(self, theta: Tensor) -> _Textures:
-        """The colours of a theta; those of the last one are kept, as all ticks of a drive show the same."""
+        """The colours of a theta; cached for the last one, as all ticks of a drive share it."""
         if self._textures is None or not self._textures.is_of(theta):
             if theta.shape != self.theta_shape:
                 raise ValueError(f"expected theta {list(self.theta_shape)}, got {list(theta.shape)}")
@@ -216,7 +216,7 @@ def on_cuda(sensor: Any) -> CudaSurrogate:
     """A sensor on a GPU.
 
     Raises:
-        DeviceError: No device; or the sensor is no surrogate, or has objects that a GPU cannot draw.
+        DeviceError: No device is available; or the sensor is not a surrogate, or has objects that a GPU cannot draw.
     """
     if not isinstance(sensor, Surrogate):
         raise DeviceError(

@@ -1,10 +1,10 @@
-"""Exposure of each training photograph, learned with the scene: a gain per channel on the colours that the field shows.
+"""Exposure of each training photograph, learned with the scene: a gain per channel on the field's colours.
 
-Phones choose exposure and white balance anew for each picture. A field without gains explains the differences with fog in front of
+Phones choose exposure and white balance for each picture. A field without gains explains the differences by fog in front of
 the cameras. Gains multiply stored values, not light: the power law of stored pictures turns a factor on light into a factor on values.
 
-The mean of the logarithms over the photographs stays zero, so the scene keeps the average exposure, which all later views are
-rendered with.
+The mean of the logarithms over the photographs stays zero, so the scene keeps the average exposure, with which all later views are
+rendered.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from advnerf_core.scene.field_kernels import adam
 
 Array32 = NDArray[np.float32]
 
-# Weight of the mean square of the logarithms in the loss: keeps a gain from explaining errors of a field that is not learned yet.
+# Weight of the mean square of the logarithms in the loss: keeps a gain from explaining errors of a field at the start of training.
 _PULL = 0.01
 
 
@@ -63,7 +63,7 @@ class Exposures:
 
         Args:
             rays: The batch, with its gradient.
-            step: Counts from 0.
+            step: Step number from 0.
             rate: Learning rate of the field.
         """
         pull = np.float32(_PULL / (3.0 * max(len(rays.photographs), 1)))

@@ -1,9 +1,9 @@
-"""The fidelity gate: is a surrogate good enough that attacks found in it mean something where they are deployed?
+"""The fidelity gate: is a surrogate good enough for attacks found in it to carry over to the deployment?
 
-Two questions are asked of pictures alone, before anything is deployed. Do learned and real pictures of one place look alike (PSNR, SSIM),
+It asks two questions of pictures alone, before any deployment. Do learned and real pictures of one place look alike (PSNR, SSIM),
 and does the policy steer alike on them? And, with an attack: does the object move the steering in the real picture as it does in the
-learned one (the *effect*: steering with the attack minus steering without, on the same view)? From the second follows a prediction of
-transfer, see `advnerf_core/attack/transfer.py`. Nothing here has seen a deployed drive with the attack.
+learned one (the *effect*: steering with the attack minus steering without, on the same view)? The second gives a prediction of
+transfer, see `advnerf_core/attack/transfer.py`. No deployed drive with the attack is used here.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class SceneAgreement:
-    """Learned against real pictures of the same places, as the policy sees them.
+    """Comparison of learned and real pictures of the same places at the policy's size.
 
     Attributes:
         psnr_db: PSNR of each view [dB].
@@ -46,12 +46,12 @@ class SceneAgreement:
 
     @property
     def difference(self) -> Floats:
-        """Steering on the learned picture minus that on the real one, per view."""
+        """Steering on the learned picture minus steering on the real one, per view."""
         return self.learned - self.real
 
     @property
     def correlation(self) -> float:
-        """Pearson's correlation of the steering; 1 where both are constant and equal, 0 where one is constant."""
+        """Pearson's correlation of the steering; 1 if both are constant and equal, 0 if one is constant."""
         if np.ptp(self.real) == 0.0 or np.ptp(self.learned) == 0.0:
             return 1.0 if np.array_equal(self.real, self.learned) else 0.0
         return float(np.corrcoef(self.real, self.learned)[0, 1])
@@ -95,11 +95,11 @@ def agreement(
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the gate says of one set of pictures.
+    """The gate's decision on one set of pictures.
 
     Attributes:
-        passed: Whether attacks may go on.
-        reasons: What was not reached, in words; empty if all was.
+        passed: Whether attacks may proceed.
+        reasons: Missed limits as text; empty if all are kept.
     """
 
     passed: bool
@@ -112,10 +112,10 @@ class Verdict:
 
 
 def judge(found: SceneAgreement, limits: GateLimits, of: str = "held-out views") -> Verdict:
-    """Hold what was measured against the limits.
+    """Compare the measured values with the limits.
 
     Args:
-        of: What was compared, for the reasons.
+        of: Name of the comparison, for the reasons.
     """
     numbers = found.summary()
     reasons = reasons_against(numbers, limits, of)
@@ -123,7 +123,7 @@ def judge(found: SceneAgreement, limits: GateLimits, of: str = "held-out views")
 
 
 def reasons_against(n: Mapping[str, float | int], limits: GateLimits, of: str) -> tuple[str, ...]:
-    """What a comparison's numbers, as `SceneAgreement.summary` gives them, do not reach, in words."""
+    """Limits that a comparison's numbers, from `SceneAgreement.summary`, miss, as text."""
     checks = (
         (n["views"] >= limits.views, f"{n['views']} pictures, at least {limits.views} needed"),
         (
@@ -145,7 +145,7 @@ def reasons_against(n: Mapping[str, float | int], limits: GateLimits, of: str) -
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """What an attack does to the steering on single views, learned and real.
+    """Effect of an attack on the steering on single views, learned and real.
 
     Attributes:
         learned: Steering with minus without the attack, on the learned picture of each view.
@@ -171,18 +171,18 @@ class Effect:
 
     @property
     def residual(self) -> Floats:
-        """What the share does not explain, per view."""
+        """Part of the effect that the share does not explain, per view."""
         return self.real - self.retained * self.learned
 
 
 @dataclass(frozen=True, eq=False)
 class PicturePairs:
-    """Real and learned pictures of the same places, as the policy sees them, in the order of the path where there is one.
+    """Real and learned pictures of the same places at the policy's size, in the order of the path if there is one.
 
     Attributes:
-        of: What they are of, in words.
-        real: ``[N, H, W, 3]`` uint8 from where attacks are deployed.
-        learned: The same from the surrogate.
+        of: Title of the pictures.
+        real: ``[N, H, W, 3]`` uint8 from the deployment.
+        learned: ``[N, H, W, 3]`` uint8 from the surrogate.
     """
 
     of: str

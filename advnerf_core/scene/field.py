@@ -32,7 +32,7 @@ FORMAT = "advnerf-scene-2"
 
 
 class SceneFileError(AdvnerfError):
-    """A scene file cannot be used; the message says why."""
+    """A scene file cannot be used."""
 
 
 _PLACES_M = (0.25, 1000.0)
@@ -43,16 +43,16 @@ class SceneFieldConfig:
     """Sizes of a scene field.
 
     Attributes:
-        box_low_m: Low corner of the box that holds the scene, in the world [m].
+        box_low_m: Low corner of the scene's box, in the world [m].
         box_high_m: High corner [m].
         grid: Hash grid over a cube with the box's longest side.
         hidden: Width of the hidden layer of both networks.
-        features: Features per sample that are accumulated and decoded to a colour.
+        features: Features per sample, which are accumulated and decoded to a colour.
         direction_bands: Bands of spherical harmonics of the viewing direction; 1 means colours do not depend on it, as
-            in a matte room: fog that looks different from every side then explains nothing, and geometry is found sooner.
-        contraction: Whether the field goes on outside the box, with detail that fades with distance; the cube around the box is
+            in a matte room: fog that looks different from every side then explains nothing, and geometry is learned sooner.
+        contraction: Whether the field extends outside the box, with detail that fades with distance; the cube around the box is
             then the inner region of ``render.contraction``.
-        learned_background: Whether what lies behind everything is one learned colour. Without, the field is transparent there,
+        learned_background: Whether everything behind the field is one learned colour. Otherwise the field is transparent there,
             as in images with alpha.
     """
 
@@ -78,9 +78,9 @@ class SceneFieldConfig:
 
     @property
     def ray_unit_m(self) -> float:
-        """Unit of ray parameters [m]: the metre, but for boxes of a size that no place has in metres, a quarter of their longest side.
+        """Unit of ray parameters [m]: the metre; for boxes of a size that no place has in metres, a quarter of their longest side.
 
-        Kernels step 0.1 mm beyond the edge of a cell, which must be less than a cell and more than rounding, whatever a file's unit.
+        Kernels step 0.1 mm beyond the edge of a cell, which must be less than a cell and more than rounding, in any file's unit.
         """
         return 1.0 if _PLACES_M[0] <= self.extent_m <= _PLACES_M[1] else 0.25 * self.extent_m
 
@@ -91,7 +91,7 @@ class SceneFieldConfig:
 
     @property
     def origin_m(self) -> tuple[float, float, float]:
-        """Where box coordinates are zero, in the world [m]: the low corner of the box, or of the cube around it if contracted."""
+        """Origin of box coordinates in the world [m]: the low corner of the box, or of the cube around it if contracted."""
         if not self.contraction:
             return self.box_low_m
         half = 0.5 * self.extent_m
@@ -102,7 +102,7 @@ class SceneFieldConfig:
 
     @property
     def box_high(self) -> NDArray[np.float32]:
-        """High corner of what the grids cover ``[3]``: of the box in box coordinates, or of the contracted cube."""
+        """High corner ``[3]`` of the grids' range: of the box in box coordinates, or of the contracted cube."""
         if self.contraction:
             return np.ones(3, np.float32)
         return ((np.array(self.box_high_m) - np.array(self.box_low_m)) / self.extent_m).astype(np.float32)
@@ -126,7 +126,7 @@ class SceneFieldConfig:
 
 
 class SceneField(nn.Module):
-    """Density and colour everywhere in a box, or with a contraction everywhere; all points are those of ``to_box``."""
+    """Density and colour everywhere in a box, or with a contraction everywhere; all points are in the coordinates of ``to_box``."""
 
     def __init__(self, config: SceneFieldConfig, seed: int = 0) -> None:
         super().__init__()
@@ -138,12 +138,12 @@ class SceneField(nn.Module):
         self.colour_1 = _linear(config.colour_inputs, config.hidden, generator)
         self.colour_2 = _linear(
             config.hidden, 4, generator
-        )  # red, green, blue, unused: kernels take outputs in fours
+        )  # red, green, blue, unused: kernels need multiples of four
         self.background = nn.Parameter(torch.zeros(config.features), requires_grad=config.learned_background)
 
     def to_box(self, points_in_world: Tensor) -> Tensor:
-        """World points ``[..., 3]`` [m] where the field is asked: box coordinates, from the low corner in units of the longest side,
-        or in the cube that they are contracted to.
+        """Coordinates of world points ``[..., 3]`` [m] in the field: box coordinates, from the low corner in units of the longest side,
+        or in the contracted cube.
         """
         low = torch.tensor(self.config.origin_m, dtype=points_in_world.dtype, device=points_in_world.device)
         in_box = (points_in_world - low) / self.config.extent_m
@@ -182,7 +182,7 @@ def _linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
 
 
 def scene_hash(scene: SceneField, occupancy: NDArray[np.bool_]) -> str:
-    """Content hash of a trained scene as its file has it: its configuration, weights and occupancy; 16 hexadecimal digits."""
+    """Content hash of a trained scene in its file's form: its configuration, weights and occupancy; 16 hexadecimal digits."""
     digest = hashlib.sha256(json.dumps(scene.config.to_dict(), sort_keys=True).encode())
     for name, value in sorted(scene.named_parameters()):
         digest.update(name.encode() + _as_kept(name, value).float().numpy().tobytes())
@@ -191,7 +191,7 @@ def scene_hash(scene: SceneField, occupancy: NDArray[np.bool_]) -> str:
 
 
 def _as_kept(name: str, value: Tensor) -> Tensor:
-    """A parameter as the file has it: tables of the grid in half precision, where no feature is too large for it."""
+    """A parameter in the file's form: tables of the grid in half precision, unless a feature is too large for it."""
     kept = value.detach().cpu().contiguous()
     if not name.startswith("grid.") or float(kept.abs().max()) > torch.finfo(torch.float16).max:
         return kept
@@ -203,12 +203,12 @@ def save_scene(
 ) -> str:
     """Write a trained scene to one ``.safetensors`` file, atomically.
 
-    The grid's tables, nearly all of it, are kept in half precision, as Instant-NGP trains them: what is read back differs by at most
+    The grid's tables, nearly all of it, are stored in half precision, as Instant-NGP trains them: a loaded scene differs by at most
     one part in 2048 in each feature.
 
     Args:
-        occupancy: Cells where something is ``[X, Y, Z]``.
-        metadata: Anything JSON can hold: how it was trained, figures.
+        occupancy: Occupied cells ``[X, Y, Z]``.
+        metadata: JSON values: how it was trained, figures.
 
     Returns:
         The scene's hash.
@@ -231,7 +231,7 @@ def load_scene(path: str | Path) -> tuple[SceneField, NDArray[np.bool_], dict[st
     """Read a scene file: field, occupancy ``[X, Y, Z]``, metadata (with ``scene_hash``).
 
     Raises:
-        SceneFileError: The file is missing, damaged, or something else.
+        SceneFileError: The file is missing, damaged, or of another kind.
     """
     path = Path(path)
     try:

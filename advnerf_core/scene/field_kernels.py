@@ -64,7 +64,7 @@ def two_layers_backward(
 def complete_colour_inputs(
     inputs: Array32, rays: Array32, alpha: Array32, background: Array32, bands: int, first: int, stop: int
 ) -> None:
-    """Fill up accumulated features to colour network inputs: background behind what let light through, then directions.
+    """Complete accumulated features to colour network inputs: background where light comes through, then directions.
 
     Args:
         inputs: ``[ray tiles, K, TILE]``; rows ``0..C`` hold accumulated features, the rest is written.
@@ -98,7 +98,7 @@ def colour_loss(
         targets: Pixels ``[R, 3]``.
         first: First ray.
         stop: One past the last ray.
-        huber: Where the loss turns from square to linear.
+        huber: Error at which the loss changes from square to linear.
         scale: Factor on the gradient: 1 / number of values.
 
     Returns:
@@ -124,17 +124,17 @@ def matte_loss(
     raw: Array32, targets: NDArray[np.uint8], opacities: NDArray[np.uint8], behind: Array32, alpha: Array32,
     first: int, stop: int, huber: np.float32, scale: np.float32, grad_alpha: Array32,
 ) -> tuple[float, float]:  # fmt: skip
-    """``colour_loss`` of rays that let light through: field and pixel are compared before the same colour.
+    """``colour_loss`` for transparent rays: field and pixel are compared before the same colour.
 
     Args:
         raw: Network outputs ``[ray tiles, 4, TILE]``, overwritten by the gradient; the fourth row is unused.
         targets: Pixels ``[R, 3]``, not premultiplied.
-        opacities: Of the pixels ``[R]``.
+        opacities: Opacities of the pixels ``[R]``.
         behind: Colour behind both ``[R, 3]`` in 0..1.
         alpha: Opacity of the field ``[R]``.
         first: First ray.
         stop: One past the last ray.
-        huber: Where the loss turns from square to linear.
+        huber: Error at which the loss changes from square to linear.
         scale: Factor on the gradient: 1 / number of values.
         grad_alpha: ``[R]``, written: gradient to ``alpha`` where it mixes the two colours.
 
@@ -168,18 +168,18 @@ def exposed_loss(
 ) -> tuple[float, float]:  # fmt: skip
     """``matte_loss`` where the field's colours are first multiplied by the gain of each ray's photograph.
 
-    A pixel at 255 says only that the light was at least so bright: a brighter colour has no error there.
+    A pixel at 255 only gives a lower bound of the light: a brighter colour has no error there.
 
     Args:
         raw: Network outputs ``[ray tiles, 4, TILE]``, overwritten by the gradient; the fourth row is unused.
         targets: Pixels ``[R, 3]``, not premultiplied.
-        opacities: Of the pixels ``[R]``; 255 for photographs without alpha.
+        opacities: Opacities of the pixels ``[R]``; 255 for photographs without alpha.
         behind: Colour behind both ``[R, 3]`` in 0..1.
         alpha: Opacity of the field ``[R]``; 1 for a field with a learned background, whose colours include it.
         gains: Factors on the colours ``[R, 3]``.
         first: First ray.
         stop: One past the last ray.
-        huber: Where the loss turns from square to linear.
+        huber: Error at which the loss changes from square to linear.
         scale: Factor on the gradient: 1 / number of values.
         grad_alpha: ``[R]``, written: gradient to ``alpha`` where it mixes the two colours.
         grad_log_gains: ``[R, 3]``, written: gradient to the logarithms of the gains.
@@ -243,7 +243,7 @@ def adam(
         rate: Learning rate.
         mean_scale: Bias correction of the first moment.
         square_scale: Bias correction of the second moment.
-        skip_zero: Leave entries with gradient zero alone, moments included: a hash entry that no sample touched has not
+        skip_zero: Leave entries with gradient zero unchanged, including moments: a hash entry without samples has not
             been measured (Müller et al. 2022, section 4).
     """
     tiny = _f(1e-15)

@@ -1,4 +1,4 @@
-"""What a training depends on, as one hash: a checkpoint goes on only where it was begun."""
+"""Hash of a training's inputs and settings; a checkpoint can only be resumed with the same."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.field import SceneFieldConfig
 from advnerf_core.scene.train_config import TrainConfig
 
-# Settings that older checkpoints do not know, and the value at which they change nothing.
+# Settings that older checkpoints do not have, with their neutral values.
 _LATER = {"exposure": False, "decay": "exponential"}
 
 
@@ -25,7 +25,7 @@ def training_fingerprint(
     Args:
         images: Training images.
         field: Sizes of the field.
-        march: The intervals as they were chosen: they also depend on the cameras and on the rule.
+        march: The chosen intervals, which also depend on the cameras and on the rule.
     """
     training = {**asdict(config), "march": asdict(march)}
     for name, usual in _LATER.items():

@@ -1,4 +1,4 @@
-"""The limits of the fidelity gate; apart from it, as configuration files need them and not what it computes with."""
+"""The limits of the fidelity gate, in a separate module because configuration files need them without its computations."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 
 class GateLimits(StrictModel):
-    """What a surrogate must reach; the first two follow the targets of the room's experiment."""
+    """Required fidelity of a surrogate; the first two follow the targets of the room's experiment."""
 
     psnr_db: Positive = Field(default=25.0, description="Least mean PSNR at the policy's size [dB].")
     ssim: Annotated[float, Field(ge=0.0, le=1.0)] = Field(

@@ -1,4 +1,4 @@
-"""Whether a training learns anything: after some steps it must be better than one colour for all pixels."""
+"""Checks that a training learns: after some steps it must be better than one colour for all pixels."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from advnerf_core.scene.train_config import TrainingReport
 
 AFTER_STEPS = 100
 _BETTER_DB = 1.0
-# Pictures that are nearly of one colour say nothing.
+# Pictures that are nearly of one colour are no test.
 _PLAIN_DB = 35.0
 _MOST_PIXELS = 1 << 20
 
 
 class LearningCheck:
-    """Says once if a training does not learn."""
+    """Reports once if a training does not learn."""
 
     def __init__(self, images: ImageSet) -> None:
         self._one_colour_db = one_colour_db(images)
         self._done = images.alpha is not None or self._one_colour_db > _PLAIN_DB
 
     def __call__(self, at: TrainingReport) -> str | None:
-        """What is wrong, in a sentence, at the first report after 100 steps; else None."""
+        """A sentence about the problem, at the first report after 100 steps; None if there is no problem."""
         if self._done or at.step < AFTER_STEPS:
             return None
         self._done = True
@@ -36,7 +36,7 @@ class LearningCheck:
 
 
 def one_colour_db(images: ImageSet) -> float:
-    """PSNR of all pixels against their mean colour [dB]: what a scene without any content reaches."""
+    """PSNR of all pixels against their mean colour [dB], which a scene without content reaches."""
     step = max(1, images.rgb[..., 0].size // _MOST_PIXELS)
     pixels = images.rgb.reshape(-1, 3)[::step].astype(np.float64) / OPAQUE
     return float(-10.0 * np.log10(max(pixels.var(axis=0).mean(), 1e-12)))

@@ -1,6 +1,6 @@
-"""Several textures of the same objects rendered in one batch: what lets the searches of several seeds run together.
+"""Several textures of the same objects rendered in one batch, so that the searches of several seeds run together.
 
-The background, the geometry and the policy do not care which texture an object wears, so the frames of K searches are one batch: the
+The background, the geometry and the policy do not depend on the texture, so the frames of K searches are one batch: the
 scene is rendered and the objects are cast for all of them at once, and only the last step, weights times colours, is done by texture.
 """
 
@@ -21,7 +21,7 @@ from advnerf_core.scene.surrogate import PoseBatch, Rendered, Surrogate, split_t
 
 @dataclass(frozen=True, eq=False)
 class _Share:
-    """What one texture is shown by: rows of one object's weights, and the pixels they belong to."""
+    """The part of a batch for one texture: rows of one object's weights, and their pixels."""
 
     rows: NDArray[np.int64]
     pixels: Tensor
@@ -29,10 +29,10 @@ class _Share:
 
 @runtime_checkable
 class ShowsMany(Protocol):
-    """A sensor that can show several textures at once by itself."""
+    """A sensor with its own support for several textures at once."""
 
     def many(self, count: int, starts: int) -> Any:
-        """The sensor for ``count`` textures at once, each from so many ``starts``; frames and theta as of `ManyTextures`."""
+        """The sensor for ``count`` textures at once, each from ``starts`` starts; frames and theta as in `ManyTextures`."""
 
 
 class ManyTextures:
@@ -43,7 +43,7 @@ class ManyTextures:
 
     Args:
         surrogate: The scene with its objects.
-        starts: Start poses of each.
+        starts: Number of start poses of each.
     """
 
     def __init__(self, surrogate: Surrogate, count: int, starts: int) -> None:
@@ -65,7 +65,7 @@ class ManyTextures:
         return self._surrogate.camera_poses(states)
 
     def sense(self, states: Tensor, theta: Tensor) -> Rendered:
-        """What the cameras see from states ``[ticks * count * starts, n]``."""
+        """Images of the cameras from states ``[ticks * count * starts, n]``."""
         return self.render(self.camera_poses(states), theta)
 
     def render(self, T_world_from_camera: ArrayLike, theta: Tensor) -> Rendered:
@@ -102,7 +102,7 @@ class ManyTextures:
         return Rendered(images, _vjp(frames, shares, values, theta), nbytes)
 
     def _shares(self, pixels: Tensor, shape: Sequence[int]) -> list[_Share]:
-        """Which of an object's pixels show which texture."""
+        """Assign an object's pixels to textures."""
         flat = pixels.numpy()
         texture = (flat // (shape[1] * shape[2]) // self.starts) % self.count
         rows = [np.flatnonzero(texture == k) for k in range(self.count)]

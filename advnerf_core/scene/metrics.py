@@ -1,4 +1,4 @@
-"""Image fidelity: PSNR, SSIM, and the gain that fits best before either."""
+"""Image fidelity: PSNR, SSIM, and the best fitting gain before either."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ def psnr(image: ArrayLike, reference: ArrayLike) -> float:
 def gain_fitted(image: ArrayLike, reference: ArrayLike, background: ArrayLike = 0.0) -> np.ndarray:
     """The image times the gain per channel that brings it closest to the reference, by least squares; clipped to 0..1.
 
-    A photograph whose exposure the scene cannot know is compared so. The figure is no substitute for the PSNR as rendered: it does not
+    For comparing a photograph whose exposure the scene cannot know. The figure is no substitute for the plain PSNR: it does not
     count wrong brightness or tint.
 
     Args:
         image: Colours ``[..., 3]`` in 0..1 (uint8 is divided by 255).
-        reference: What they should be, same shape.
-        background: Part of both that the gain does not change, e.g. white behind transparent pixels; broadcast to ``image``.
+        reference: Expected colours, same shape.
+        background: Part of both that is exempt from the gain, e.g. white behind transparent pixels; broadcast to ``image``.
     """
     a, b = _unit(image), _unit(reference)
     _same_shape(a.shape, b.shape)

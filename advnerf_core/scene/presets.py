@@ -1,4 +1,4 @@
-"""Named settings for scenes from photographs: sizes of the field, and how it is trained in minutes on a CPU.
+"""Named settings for scenes from photographs: sizes of the field, and a training of minutes on a CPU.
 
 Measured on one set of photographs only, Instant-NGP's fox.
 """
@@ -13,7 +13,7 @@ from advnerf_core.scene.train_config import TrainConfig
 
 
 class PresetError(AdvnerfError, ValueError):
-    """A preset that does not exist; the message lists those that do."""
+    """A preset does not exist; the message lists the valid ones."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class ScenePreset:
     Attributes:
         minutes: The training time that the settings suit [min].
         grid: Sizes of the hash grid over a bounded box.
-        training: How to train; the time limit is that of ``minutes``.
+        training: Settings of the training; the time limit comes from ``minutes``.
     """
 
     minutes: float
@@ -31,7 +31,7 @@ class ScenePreset:
     training: TrainConfig
 
     def train_config(self, minutes: float | None = None, steps: int | None = None) -> TrainConfig:
-        """Settings that train for so many minutes or steps; for the preset's own time if neither is given."""
+        """Settings for a training of this many minutes or steps; for the preset's own time if neither is given."""
         if minutes is None and steps is not None:
             return replace(self.training, steps=steps)
         seconds = 60.0 * (self.minutes if minutes is None else minutes)
@@ -42,11 +42,11 @@ class ScenePreset:
         return replace(self.grid, finest=2 * self.grid.finest) if contraction else self.grid
 
 
-# Bands of spherical harmonics: photographs show gloss.
+# Bands of spherical harmonics, for the gloss in photographs.
 PHOTOGRAPH_BANDS = 3
-# Found by `python -m benchmarks.learning_rates` on photographs, a room, a road and a town. Experiments train like this too.
+# Found by `python -m benchmarks.learning_rates` on photographs, a room, a road and a town. Experiments use the same.
 FAST = TrainConfig(learning_rate=0.02, decay="cosine")
-# Ends by time: no training takes so many steps in minutes.
+# Ends by time: no training takes this many steps in minutes.
 _NO_LIMIT_STEPS = 1_000_000
 _COMMON = replace(FAST, steps=_NO_LIMIT_STEPS, refine_depth=0.005, distortion=2e-3)
 _GRID = HashGridConfig(levels=8, features=4, log2_entries=18)
@@ -59,10 +59,10 @@ PRESETS = {
 
 
 def scene_preset(name: str) -> ScenePreset:
-    """The preset of a name.
+    """The preset of this name.
 
     Raises:
-        PresetError: There is none of that name.
+        PresetError: No preset has this name.
     """
     if name not in PRESETS:
         raise PresetError(f"expected a preset of {', '.join(PRESETS)}, got {name!r}")

@@ -1,4 +1,4 @@
-"""Frames of a scene that are asked for again: a drive's on the way, and the same ones for its gradient."""
+"""Caches frames of a scene that are requested again: on a drive, and for its gradient."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from advnerf_core.geometry import Pinhole
 
 
 def frame_bytes(pinhole: Pinhole) -> int:
-    """What one kept frame takes: colours and depth in float32."""
+    """Size of one cached frame: colours and depth in float32."""
     return 4 * 4 * pinhole.height * pinhole.width
 
 
 class RememberedBackground:
-    """A background renderer that keeps the frames it gave last, each by its pose to the bit.
+    """A background renderer that caches its last frames, each by its pose to the bit.
 
     Args:
         background: ``(T_world_from_camera [B, 4, 4], pinhole) -> (rgb [B, H, W, 3], planar depth [B, H, W], ...)``, whose frames do not
-            depend on which others they are asked for with. The first two parts are kept.
-        budget_bytes: Memory that kept frames may take; the oldest go first.
+            depend on the rest of the batch. The first two parts are kept.
+        budget_bytes: Memory for cached frames [bytes]; the oldest are dropped first.
     """
 
     def __init__(self, background: Any, budget_bytes: int) -> None:
@@ -35,7 +35,7 @@ class RememberedBackground:
         self.nbytes = 0
 
     def __call__(self, T_world_from_camera: ArrayLike, pinhole: Pinhole) -> tuple[Tensor, Tensor]:
-        """Colours and planar depth of a batch of views; only those that are not kept are rendered."""
+        """Colours and planar depth of a batch of views; only those that are not cached are rendered."""
         poses = np.ascontiguousarray(T_world_from_camera, np.float64).reshape(-1, 4, 4)
         keys = [(pose.tobytes(), pinhole) for pose in poses]
         with self._lock:

@@ -1,4 +1,4 @@
-"""Rendering a trained scene field without gradients, fast: what the attack and the data for policies are made from."""
+"""Fast rendering of a trained scene field without gradients, for attacks and for training data of policies."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class FieldRenderer:
     """Renders images, planar depth and opacity of a trained field on the CPU; same inputs, same bits.
 
     Args:
-        scene: The field; a copy of its weights is taken.
-        occupied: Cells where something is ``[X, Y, Z]``.
-        march: How samples are placed, from training.
-        colour_map: Applied to all colours: from the camera that learned the scene to the one that is rendered.
-        least_transmittance: A ray stops when so little light would still come through.
-        behind: Colour ``[3]`` behind a scene that was learned from images with alpha; black leaves colours times opacity.
+        scene: The field; its weights are copied.
+        occupied: Occupied cells ``[X, Y, Z]``.
+        march: Placement of samples, from training.
+        colour_map: Applied to all colours: from the camera that learned the scene to the rendered one.
+        least_transmittance: A ray stops when less light than this would still come through.
+        behind: Colour ``[3]`` behind a scene that was learned from images with alpha; black gives colours times opacity.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class FieldRenderer:
     ) -> None:
         self.config, self.march, self.colour_map = scene.config, march or MarchConfig(), colour_map
         self.least_transmittance, self.behind = least_transmittance, behind
-        self.samples = 0  # evaluated by the last call, for benchmarks
+        self.samples = 0  # samples of the last call, for benchmarks
         self.weights = {name: value.detach().cpu().numpy().copy() for name, value in scene.named_parameters()}
         self.levels = scene.grid.levels
         cells = (np.array(occupied.shape) / self.config.box_high).astype(np.float32)
@@ -69,9 +69,9 @@ class FieldRenderer:
         """Renderer of a scene file.
 
         Args:
-            colour_map: Instead of the one in the file, if any.
+            colour_map: Replaces the file's map, if any.
             behind: Colour behind a scene that was learned from images with alpha.
-            interval_scale: Sample intervals in those of the training, which a field looks best with. Longer ones are quicker.
+            interval_scale: Sample intervals relative to the training's, which suit the field best. Longer ones are quicker.
         """
         scene, occupied, metadata = load_scene(Path(path))
         march = MarchConfig(**metadata["march"]) if "march" in metadata else None
@@ -89,7 +89,7 @@ class FieldRenderer:
             T_world_from_camera: Poses ``[B, 4, 4]``.
 
         Returns:
-            Colours ``[B, H, W, 3]`` in 0..1, planar depth ``[B, H, W]`` [m] (infinite where nothing is) and opacity
+            Colours ``[B, H, W, 3]`` in 0..1, planar depth ``[B, H, W]`` [m] (infinite for empty pixels) and opacity
             ``[B, H, W]``, all float32 without history.
         """
         if isinstance(T_world_from_camera, Tensor):

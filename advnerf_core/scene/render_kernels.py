@@ -1,6 +1,6 @@
 """The CPU kernel that renders a trained scene field: rays of a pixel tile advance together, so networks see full tiles of samples.
 
-A wave takes one or more samples from every ray of the tile that is still under way, evaluates them together and composites
+A wave takes one or more samples from every ray of the tile that has not ended, evaluates them together and composites
 them; rays whose transmittance is used up drop out. Nothing leaves the cache in between. Same inputs, same bits.
 """
 
@@ -64,7 +64,7 @@ def render_tiles(
         least_through: Transmittance at which a ray stops.
         max_samples: Most samples on one ray.
         rgb: ``[B, H, W, 3]``, written.
-        depth_m: Planar depth ``[B, H, W]`` [m], written; infinite where nothing is.
+        depth_m: Planar depth ``[B, H, W]`` [m], written; infinite for empty pixels.
         alpha: ``[B, H, W]``, written.
         contracted: Whether the field is contracted.
 

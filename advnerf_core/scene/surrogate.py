@@ -2,7 +2,7 @@
 
 ``render(poses, theta)`` gives images and their vector-Jacobian product with respect to ``theta``, the squash-inverse colours of
 the objects. Scene, geometry and camera poses are frozen, so the images are linear in the squashed colours and the background
-never needs a gradient: what the forward pass computed is all that the backward pass of the same frames reads.
+never needs a gradient: the backward pass reads only values that the forward pass of the same frames computed.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ BackgroundRenderer = Callable[[Array, Pinhole], Sequence[Any]]
 
 @runtime_checkable
 class RendersInParts(Protocol):
-    """A `BackgroundRenderer` whose work can be done beside the casting of objects: no thread waits for the end of either."""
+    """A `BackgroundRenderer` whose work can run beside the casting of objects: no thread waits for the end of either."""
 
     def work(self, T_world_from_camera: Array, pinhole: Pinhole) -> Work[tuple[Tensor, Tensor, Tensor]]:
-        """What calling it does and returns, not begun yet."""
+        """The computation of a call, not begun yet."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +46,8 @@ class Rendered:
 
     Attributes:
         images: ``[B, 3, H, W]`` RGB in 0..1, without autograd history.
-        vjp: Takes the gradient of a scalar with respect to ``images``, on their device, to its gradient with respect to ``theta``, on theta's.
-        nbytes: Memory that keeping this object holds [bytes].
+        vjp: Maps the gradient of a scalar with respect to ``images``, on their device, to its gradient with respect to ``theta``, on theta's.
+        nbytes: Memory that this object holds [bytes].
     """
 
     images: Tensor
@@ -57,13 +57,13 @@ class Rendered:
 
 @dataclass(frozen=True, eq=False)
 class PoseBatch:
-    """A batch of camera poses with everything that does not depend on ``theta``; render it with as many as you like.
+    """A batch of camera poses with everything that does not depend on ``theta``, for rendering any number of thetas.
 
     Attributes:
-        background: What is seen where no object is, already dimmed by the objects in front, ``[B, H, W, 3]``.
-        weights: Per object, rendering weights ``[P, V]`` after occlusion, of the pixels and colours that are seen.
+        background: Background colours, already dimmed by the objects in front, ``[B, H, W, 3]``.
+        weights: Per object, rendering weights ``[P, V]`` after occlusion, of the visible pixels and colours.
         pixels: Per object, flat indices ``[P]`` into ``[B, H, W]``.
-        seen: Per object, which colours these are; the objects are in the order of ``weights``.
+        seen: Per object, the rows of these colours; the objects are in the order of ``weights``.
     """
 
     background: Tensor
@@ -120,8 +120,8 @@ class Surrogate:
             scene's depth is not exact, and a face a centimetre in front of its board must win.
         supersample: Rays along each side of a pixel for the objects; 2 imitates the area filter of the policy's view.
         dtype: Type of images and weights.
-        opaque: Compose as a deployment does that cannot blend: each pixel is wholly the object's or wholly the scene's, whichever
-            is nearer; an object that covers less than half of a pixel is not there.
+        opaque: Compose without blending, as some deployments do: each pixel is wholly the nearer of the object and the scene;
+            an object that covers less than half of a pixel is not shown.
     """
 
     def __init__(
@@ -146,19 +146,19 @@ class Surrogate:
         self.opaque = opaque
 
     def in_type(self, dtype: torch.dtype) -> Surrogate:
-        """The same surrogate with images and weights of another type; geometry is float64 in any case."""
+        """The same surrogate with images and weights of another type; geometry is always float64."""
         other = copy.copy(self)
         other.dtype = dtype
         return other
 
     def with_background(self, background: BackgroundRenderer) -> Surrogate:
-        """The same surrogate before another renderer of the scene."""
+        """The same surrogate with another renderer of the scene."""
         other = copy.copy(self)
         other.background = background
         return other
 
     def with_objects(self, objects: Sequence[ColouredObject], opaque: bool | None = None) -> Surrogate:
-        """The same surrogate with other objects, for example the same ones elsewhere; composed as before unless ``opaque`` says."""
+        """The same surrogate with other objects, for example moved ones; ``opaque`` is unchanged if None."""
         other = copy.copy(self)
         other.objects = tuple(objects)
         other.opaque = self.opaque if opaque is None else opaque
@@ -178,7 +178,7 @@ class Surrogate:
         return torch.cat(rows).reshape(self.theta_shape).to(dtype or self.dtype)
 
     def initial_theta(self, generator: torch.Generator, dtype: torch.dtype | None = None) -> Tensor:
-        """Where an attack starts: white noise of N(0, 1), so that each seed is another search; ``theta_shape``."""
+        """Initial theta of an attack: white noise of N(0, 1), so that each seed is another search; ``theta_shape``."""
         noise = torch.randn(self.theta_shape, generator=generator, dtype=torch.float64)
         return noise.to(dtype or self.dtype)
 
@@ -187,7 +187,7 @@ class Surrogate:
         return planar_poses(states.detach().cpu().numpy()) @ self.T_car_from_camera
 
     def remembering(self, budget_bytes: int) -> Surrogate:
-        """The same surrogate, which keeps as many of the last background frames as fit into a budget of memory."""
+        """The same surrogate, which caches as many of the last background frames as fit into a budget of memory [bytes]."""
         return self.with_background(RememberedBackground(self.background, budget_bytes))
 
     @torch.no_grad()
@@ -198,7 +198,7 @@ class Surrogate:
         return self._composed(casts, *self._checked(frames, len(poses)))
 
     def _casts_and_scene(self, poses: Array) -> tuple[list[ObjectCast], Sequence[Any]]:
-        # In a method of its own, so that the parts of the cast are gone before frames are composed.
+        # In a separate method, so that the parts of the cast are freed before frames are composed.
         casting = self._cast_work(poses)
         if isinstance(self.background, RendersInParts):
             return beside(casting, self.background.work(poses, self.camera)).run()
@@ -208,11 +208,11 @@ class Surrogate:
     def overlay(
         self, rgb: ArrayLike, depth_m: ArrayLike, T_world_from_camera: ArrayLike, theta: Tensor | None
     ) -> Tensor:
-        """Put the objects into given images, by the same composition.
+        """Compose the objects over given images.
 
         Args:
             rgb: Images ``[B, H, W, 3]`` in 0..1.
-            depth_m: Their planar depth ``[B, H, W]`` [m]; infinite or NaN where nothing is known.
+            depth_m: Their planar depth ``[B, H, W]`` [m]; infinite or NaN if unknown.
             T_world_from_camera: Poses they were taken from ``[B, 4, 4]``.
             theta: See :meth:`render`.
 
@@ -258,11 +258,11 @@ class Surrogate:
         return self.prepare(T_world_from_camera).render(None if theta is None else theta.detach())
 
     def render_placed(self, T_world_from_camera: ArrayLike, theta: Tensor, placements: Tensor) -> Tensor:
-        """Images of the objects standing elsewhere, differentiable by autograd with respect to where, and to ``theta``.
+        """Images of the objects at other placements, differentiable by autograd with respect to these, and to ``theta``.
 
         Args:
             T_world_from_camera: Camera poses ``[B, 4, 4]``.
-            theta: Of ``theta_shape``.
+            theta: Parameters of the objects, of ``theta_shape``.
             placements: ``(x_m, y_m, yaw_rad, scale)`` of each object, ``[K, 4]``; see ``render/soft_pose``.
 
         Returns:
@@ -288,7 +288,7 @@ class Surrogate:
         return composite(colours, alphas, depths)[0].permute(0, 3, 1, 2)
 
     def sense(self, states: Tensor, theta: Tensor | None) -> Rendered:
-        """What the car's camera sees from states ``[B, n]``; poses are detached."""
+        """Images of the car's camera from states ``[B, n]``; poses are detached."""
         return self.render(self.camera_poses(states), theta)
 
     def observe(self, theta: Tensor | None) -> Callable[[Tensor], Tensor]:
@@ -314,7 +314,7 @@ class Surrogate:
 
 
 def _seen(cast: ObjectCast, share: Array, field: ColouredObject) -> tuple[Tensor, SparseRows, SeenRows]:
-    """Pixels, weights and colours of what is seen of a cast whose pixels keep ``share [P]`` of their light."""
+    """Visible pixels, weights and colours of a cast whose pixels keep ``share [P]`` of their light."""
     kept = np.flatnonzero(share > 0.0)
     return torch.from_numpy(cast.pixels[kept]), *compact(cast.rows.scaled(kept, share[kept]), field)
 

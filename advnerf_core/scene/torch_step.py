@@ -1,6 +1,6 @@
-"""One training step in plain torch, on any device: what an accelerator runs, and the second implementation of ``CpuStep``.
+"""One training step in plain torch, on any device: for accelerators, and as the second implementation of ``CpuStep``.
 
-Same samples, same loss, same optimiser, differentiated by torch; tests hold the two against each other.
+Same samples, same loss, same optimiser, differentiated by torch; tests compare the two.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ _MEAN_DECAY, _SQUARE_DECAY, _TINY = 0.9, 0.99, 1e-15
 
 
 class TorchStep:
-    """Gradients and Adam for a scene field on the device it lies on; a drop-in for ``CpuStep``.
+    """Gradients and Adam for a scene field on its device; a drop-in for ``CpuStep``.
 
     Args:
         scene: The field; its parameters are changed in place.
-        huber: Where the loss turns from square to linear.
+        huber: Error at which the loss changes from square to linear.
         distortion: Weight of the distortion loss, with the distances of ``distortion_distances``.
         opacity: Weight of the mean transmittance of rays in the loss.
     """
@@ -42,7 +42,7 @@ class TorchStep:
 
     @property
     def grads(self) -> dict[str, Tensor]:
-        """Gradients gathered since the last update, by the parameter's name."""
+        """Gradients accumulated since the last update, by the parameter's name."""
         return {n: torch.zeros_like(v) if v.grad is None else v.grad for n, v in self.values.items()}
 
     def step(
@@ -53,11 +53,11 @@ class TorchStep:
         matte: Matte | None = None,
         exposure: RayGains | None = None,
     ) -> StepResult:
-        """Add the gradient of a batch, of the samples that show; arguments as in ``gradients``."""
+        """Add the gradient of a batch over its visible samples; arguments as in ``gradients``."""
         return self.gradients(rays, targets, self.visible(samples), matte, exposure)
 
     def visible(self, samples: Samples, least_weight: float = 5e-4) -> Samples:
-        """Samples that show in the image."""
+        """Samples that are visible in the image."""
         with torch.no_grad():
             density = torch.exp(self._log_density(self._tensor(samples.points)))
             weights, _, through = _weights(density * self._tensor(samples.widths), samples)
@@ -81,7 +81,7 @@ class TorchStep:
             rays: ``[R, 6]`` in box coordinates.
             targets: Pixels ``[R, 3]``.
             samples: Samples of those rays.
-            matte: Opacities of the pixels and what is behind them; for a field without a learned background.
+            matte: Opacities of the pixels and the colours behind them; for a field without a learned background.
             exposure: Gains on the field's colours, whose gradient is written.
         """
         with torch.enable_grad():
@@ -108,9 +108,9 @@ class TorchStep:
 
     @torch.no_grad()
     def update(self, step: int, rate: float) -> None:
-        """Adam with the gradients gathered since the last update; ``step`` counts from 0.
+        """Adam with the gradients accumulated since the last update; ``step`` counts from 0.
 
-        As in the kernel, table entries that no sample touched stay as they are, moments included.
+        As in the kernel, table entries without samples are unchanged, including moments.
         """
         mean_scale = 1.0 / (1.0 - _MEAN_DECAY ** (step + 1))
         square_scale = 1.0 / (1.0 - _SQUARE_DECAY ** (step + 1))
@@ -118,7 +118,7 @@ class TorchStep:
             if value.grad is None:
                 continue
             g, mean, square = value.grad, self.means[name], self.squares[name]
-            # Where nothing was measured, interpolate with weight zero: branches cost more than arithmetic on a GPU.
+            # Entries without samples interpolate with weight zero: branches cost more than arithmetic on a GPU.
             measured = (g != 0.0).to(g.dtype) if name == "grid.table" else torch.ones((), device=g.device)
             mean.lerp_(g, (1.0 - _MEAN_DECAY) * measured.expand_as(g))
             square.lerp_(g * g, (1.0 - _SQUARE_DECAY) * measured.expand_as(g))
@@ -126,12 +126,12 @@ class TorchStep:
             value.grad = None
 
     def state(self) -> dict[str, Array32]:
-        """Parameters and moments by kind and name, as ``CpuStep`` gives them: a checkpoint of one resumes in the other."""
+        """Parameters and moments by kind and name, as in ``CpuStep``: a checkpoint of one resumes in the other."""
         return {name: tensor.detach().cpu().numpy() for name, tensor in self._state().items()}
 
     @torch.no_grad()
     def load_state(self, state: dict[str, Array32]) -> None:
-        """Take over what ``state`` gave."""
+        """Restore a ``state``."""
         for name, tensor in self._state().items():
             tensor.copy_(torch.from_numpy(np.ascontiguousarray(state[name])))
 
@@ -161,7 +161,7 @@ class TorchStep:
 
 
 def stepper_for(scene: SceneField, config: TrainConfig) -> CpuStep | TorchStep:
-    """The training step of a configuration; one in torch runs on an accelerator, if there is one."""
+    """The training step of a configuration; the torch one runs on an accelerator, if there is one."""
     device = "cuda" if torch.cuda.is_available() else "cpu"
     opacity = config.opacity if scene.config.learned_background else 0.0
     if config.backend == "torch" or (config.backend == "auto" and device != "cpu"):
@@ -190,7 +190,7 @@ def render_rays(scene: SceneField, rays: Tensor, samples: Samples) -> tuple[Tens
 
 
 def exposed(colours: Tensor, log_gains: Tensor, targets: Tensor) -> Tensor:
-    """Colours ``[R, 3]`` times gains; no brighter than 1 where the pixel ``[R, 3]`` is 255, which only says that it is no darker."""
+    """Colours ``[R, 3]`` times gains; at most 1 where the pixel ``[R, 3]`` is 255, which is only a lower bound."""
     shown = colours * torch.exp(log_gains)
     return torch.where(targets == 255.0, shown.clamp(max=1.0), shown)
 
@@ -198,10 +198,10 @@ def exposed(colours: Tensor, log_gains: Tensor, targets: Tensor) -> Tensor:
 def distortion_loss(weights: Tensor, middles: Tensor, widths: Tensor, samples: Samples) -> Tensor:
     """``sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 d_i``, summed over rays (Barron et al. 2022, equation 15).
 
-    Linear in the number of samples: those of a ray are sorted, so ``sum_ij`` is twice a sum of prefix sums.
+    Linear in the number of samples: a ray's samples are sorted, so ``sum_ij`` is twice a sum of prefix sums.
     """
     ray_of, first = _ray_of(samples, weights.device)
-    # Whole-batch prefix sums in double precision: differences of them must stay exact to single.
+    # Whole-batch prefix sums in double precision: their differences must stay exact to single.
     w, m = weights.double(), middles.double()
     before = _since(torch.cumsum(w, 0) - w, first, ray_of)
     moment = _since(torch.cumsum(w * m, 0) - w * m, first, ray_of)
@@ -212,7 +212,7 @@ def distortion_loss(weights: Tensor, middles: Tensor, widths: Tensor, samples: S
 def _weights(depth: Tensor, samples: Samples) -> tuple[Tensor, Tensor, Tensor]:
     """Rendering weights ``[N]`` of optical depths, the ray of each sample ``[N]``, and the light that reaches it ``[N]``."""
     ray_of, first = _ray_of(samples, depth.device)
-    # One running sum over the whole batch grows large where rays are opaque: in single precision it would eat thin air.
+    # One running sum over the whole batch grows large where rays are opaque: in single precision it would lose thin air.
     running = torch.cumsum(depth.double(), 0) - depth.double()
     through = torch.exp(-_since(running, first, ray_of)).to(depth.dtype)
     through = torch.where(through < MIN_TRANSMITTANCE, torch.zeros_like(through), through)

@@ -34,11 +34,11 @@ Array32 = NDArray[np.float32]
 
 
 class CheckpointError(AdvnerfError):
-    """A checkpoint cannot be resumed from; the message says why and what to do."""
+    """A checkpoint cannot be resumed."""
 
 
 class Trainer:
-    """Holds the state of a training; ``run`` goes on until it is done.
+    """State of a training; ``run`` continues until it is done.
 
     Args:
         images: Training images. Their alpha counts if the field has no learned background: each ray is then compared before a
@@ -46,7 +46,7 @@ class Trainer:
         field_config: Sizes of the field, and its box.
 
     Attributes:
-        march: How samples are placed, in training and for rendering.
+        march: Placement of samples, in training and for rendering.
         exposures: Gains of the photographs; None if they are not learned.
     """
 
@@ -86,7 +86,7 @@ class Trainer:
         self._marcher = Marcher(
             capacity, self.march.in_unit(unit_m), field_config.box_high, field_config.contraction
         )
-        # Pixels to learn from, where a mask or an undistortion leaves some out.
+        # Pixels to learn from, if a mask or an undistortion leaves some out.
         self._usable = None if images.valid is None else np.flatnonzero(images.valid)
         if self._usable is not None and not len(self._usable):
             raise AdvnerfError(
@@ -98,7 +98,7 @@ class Trainer:
 
     @property
     def fraction(self) -> float:
-        """Share of the training that is done."""
+        """Finished share of the training."""
         by_steps = self.step / self.config.steps
         by_time = 0.0 if self.config.max_seconds is None else self.elapsed_s / self.config.max_seconds
         return min(1.0, max(by_steps, by_time))
@@ -113,7 +113,7 @@ class Trainer:
 
         Args:
             progress: Called every ``report_every`` steps.
-            checkpoint: File to save to now and then, and to resume from if it exists.
+            checkpoint: File to save to regularly, and to resume from if it exists.
             report_every: Steps between reports.
 
         Raises:
@@ -168,8 +168,8 @@ class Trainer:
         return result
 
     def occupied(self) -> NDArray[np.bool_]:
-        """Cells where something is, now ``[X, Y, Z]``."""
-        # A cell counts if its density would show in the shortest interval: 1 % opacity.
+        """Currently occupied cells ``[X, Y, Z]``."""
+        # A cell counts if its density would be visible in the shortest interval: 1 % opacity.
         smallest = self.march.smallest_step_m / self.scene.config.extent_m
         return self.occupancy.occupied(0.01 / smallest)
 
@@ -186,10 +186,10 @@ class Trainer:
         write_atomically(path, save_arrays(tensors, {"state": json.dumps(state)}))
 
     def restore(self, path: Path) -> None:
-        """Go on from a checkpoint of the same training.
+        """Resume from a checkpoint of the same training.
 
         Raises:
-            CheckpointError: It cannot be read, or belongs to other images or settings.
+            CheckpointError: The file cannot be read, or belongs to other images or settings.
         """
         try:
             with open_tensors(path, "numpy") as file:
@@ -210,7 +210,7 @@ class Trainer:
         self.step, self.elapsed_s = int(state["step"]), float(state["elapsed_s"])
         self.rays_per_step = int(state["rays_per_step"])
         self.history = [(int(a), float(b), float(c)) for a, b, c in state["history"]]
-        # The grid in use is the one of the last update, which the saved densities are.
+        # The grid in use dates from the last update, like the saved densities.
         self._leaps = leap_distances(self.occupied(), self.occupancy.cells) if self.step else None
 
     def _exposure(self, pixels: NDArray[np.int64]) -> RayGains | None:
@@ -224,7 +224,7 @@ class Trainer:
     def _matte(
         self, pixels: NDArray[np.int64], kept: NDArray[np.int64], rng: np.random.Generator
     ) -> Matte | None:
-        """Opacities of pixels, and a random colour behind each; None where the background is learned."""
+        """Opacities of pixels, and a random colour behind each; None if the background is learned."""
         if self.images.alpha is None or self.scene.config.learned_background:
             return None
         behind = rng.random((len(pixels), 3), dtype=np.float32)
@@ -238,7 +238,7 @@ class Trainer:
         matte: Matte | None,
         exposure: RayGains | None,
     ) -> StepResult:
-        # Only once geometry is found: earlier, pulling weights together freezes surfaces at wrong depths.
+        # Only once geometry is learned: earlier, pulling weights together freezes surfaces at wrong depths.
         self.stepper.distortion = self.config.distortion * min(1.0, max(0.0, 4.0 * self.fraction - 2.0))
         result = self.stepper.step(rays, colours, samples, matte, exposure)
         if not math.isfinite(result.loss):

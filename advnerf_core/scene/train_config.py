@@ -1,4 +1,4 @@
-"""How a scene field is trained, what a running training reports, and what it ends with."""
+"""Settings, progress reports and result of training a scene field."""
 
 from __future__ import annotations
 
@@ -17,36 +17,36 @@ DECAYS = ("exponential", "cosine")
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """How a scene is trained.
+    """Settings of the training.
 
     Attributes:
         steps: Number of optimisation steps.
         max_seconds: Stop after this much training time, if sooner [s]; the learning rate then decays with time. Results with a
             time limit depend on the machine's speed; without one they are the same to the bit.
-        samples_per_step: Samples that a step aims at; the number of rays follows from it.
+        samples_per_step: Intended samples per step, which determine the number of rays.
         max_rays: Most rays in a step.
         learning_rate: Adam's rate at the start.
         final_rate: Factor on the rate at the end.
-        decay: How the rate falls to it: ``exponential`` or ``cosine``, which stays high for longer.
-        huber: Where the loss turns from square to linear, in colour units 0..1.
+        decay: Decay of the rate: ``exponential``, or ``cosine``, which stays high for longer.
+        huber: Error at which the loss changes from square to linear, in colour units 0..1.
         distortion: Weight of the distortion loss, which turns fog into surfaces.
-        occupancy_resolution: Cells along the longest side of the box, or of the cube that a contracted field lies in.
+        occupancy_resolution: Cells along the longest side of the box, or of a contracted field's cube.
         occupancy_every: Steps between updates of the occupancy grid.
         warmup_steps: Steps during which sample intervals shrink to their final length and all cells are probed.
-        march: How samples are placed, in training and rendering; None: by `pixel_intervals`, of the training images.
-        near_m: Nothing nearer to a camera than this is learned [m]; None: a share of the box, see `pixel_intervals`; not used if
+        march: Placement of samples, in training and rendering; None: by `pixel_intervals`, of the training images.
+        near_m: Smallest learned distance from a camera [m]; None: a share of the box, see `pixel_intervals`; not used if
             ``march`` is given.
         interval_px: Sample intervals in pixels of the training images [px], instead of the rule's; not used if ``march`` is given.
-        opacity: Weight of the rays' mean transmittance in the loss. A constant background is learned for what is left; without
+        opacity: Weight of the rays' mean transmittance in the loss. A constant background is learned for the rest; without
             this pull it explains walls that all cameras see from one side, and is wrong from any other. Not used for images with
             alpha, which tell what is transparent.
-        refine_depth: Optical depth of crossing a fine cell from which rendering looks into it. Surfaces of a finished room are
-            dense; where they may still be haze, as in large boxes or after short trainings, 0.005 keeps them whole.
+        refine_depth: Optical depth of a fine cell above which rendering samples it. Surfaces of a finished room are
+            dense; if they may still be haze, as in large boxes or after short trainings, 0.005 keeps them whole.
         exposure: Whether a gain per channel is learned for each photograph, for cameras that choose exposure and white balance
             themselves. The scene gets the mean exposure.
-        seed: Seed of everything random.
+        seed: Seed of all randomness.
         checkpoint_every_s: Time between checkpoints [s].
-        backend: ``numba`` (CPU kernels), ``torch`` (any device), or ``auto``: torch where it sees an accelerator, else numba.
+        backend: ``numba`` (CPU kernels), ``torch`` (any device), or ``auto``: torch if it finds an accelerator, else numba.
     """
 
     steps: int = 1000
@@ -82,7 +82,7 @@ class TrainConfig:
             raise ValueError(f"expected a decay of {', '.join(DECAYS)}, got {self.decay!r}")
 
     def rate(self, fraction: float) -> float:
-        """Adam's rate when so much of the training is done, 0..1."""
+        """Adam's rate at a finished share of the training, 0..1."""
         if self.decay == "exponential":
             return self.learning_rate * self.final_rate**fraction
         high = 0.5 * (1.0 + math.cos(math.pi * fraction))
@@ -91,14 +91,14 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class TrainingReport:
-    """What a running training reports.
+    """Progress report of a training.
 
     Attributes:
-        step: Steps done.
-        fraction: Share of the training that is done, by steps or time, whichever is ahead.
+        step: Number of finished steps.
+        fraction: Finished share of the training, by steps or time, whichever is ahead.
         loss: Huber loss, averaged over recent steps.
         psnr_db: PSNR of recent batches [dB].
-        eta_s: Estimated time left [s].
+        eta_s: Estimated remaining time [s].
         rays: Rays in the last step.
         samples_per_ray: Mean samples on a ray.
     """
@@ -114,11 +114,11 @@ class TrainingReport:
 
 @dataclass(frozen=True, eq=False)
 class TrainedScene:
-    """A trained field with what a renderer needs.
+    """A trained field with the inputs of a renderer.
 
     Attributes:
-        occupied: Cells where something is ``[X, Y, Z]``, finer than in training.
-        march: How samples were placed, and are for rendering.
+        occupied: Occupied cells ``[X, Y, Z]``, finer than in training.
+        march: Placement of samples, in training and for rendering.
         history: One row per report: step, elapsed [s], PSNR [dB].
         gains: Factors on the colours for each photograph ``[P, 3]``, whose logarithms have mean zero; None if not learned.
     """

@@ -43,13 +43,13 @@ Array32 = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class StepResult:
-    """What a training step reports.
+    """Result of a training step.
 
     Attributes:
         loss: Mean Huber loss.
         mse: Mean squared error.
-        rays: Rays used.
-        samples: Samples used.
+        rays: Number of rays.
+        samples: Number of samples.
     """
 
     loss: float
@@ -60,10 +60,10 @@ class StepResult:
 
 @dataclass(frozen=True, eq=False)
 class Matte:
-    """What makes transparency measurable: with a random colour behind field and pixel, only the true opacity fits always.
+    """Makes transparency measurable: with a random colour behind field and pixel, only the true opacity always fits.
 
     Attributes:
-        opacities: Of the pixels ``[R]`` uint8.
+        opacities: Opacities of the pixels ``[R]`` uint8.
         behind: Colour behind each ray ``[R, 3]`` in 0..1.
     """
 
@@ -81,7 +81,7 @@ class CpuStep:
 
     Args:
         scene: The field; its parameters are changed in place.
-        huber: Where the loss turns from square to linear.
+        huber: Error at which the loss changes from square to linear.
         distortion: Weight of the distortion loss, with the distances of ``distortion_distances``.
         opacity: Weight of the mean transmittance of rays in the loss.
     """
@@ -105,11 +105,11 @@ class CpuStep:
         matte: Matte | None = None,
         exposure: RayGains | None = None,
     ) -> StepResult:
-        """Add the gradient of a batch, of the samples that show; arguments as in ``gradients``."""
+        """Add the gradient of a batch over its visible samples; arguments as in ``gradients``."""
         return self.gradients(rays, targets, *self.visible(samples), matte, exposure)
 
     def visible(self, samples: Samples, least_weight: float = 5e-4) -> tuple[Samples, Array32]:
-        """Samples that show in the image, and their encodings in tiles ``[tiles, K, TILE]``.
+        """Samples that are visible in the image, and their encodings in tiles ``[tiles, K, TILE]``.
 
         Behind a surface, and in air that the occupancy grid is too coarse to leave out, weights and therefore gradients vanish;
         everything after the density is spared there.
@@ -158,7 +158,7 @@ class CpuStep:
             targets: Pixels ``[R, 3]``.
             samples: Samples of those rays.
             encoded: Their encodings ``[tiles, K, TILE]``, overwritten.
-            matte: Opacities of the pixels and what is behind them; for a field without a learned background.
+            matte: Opacities of the pixels and the colours behind them; for a field without a learned background.
             exposure: Gains on the field's colours, whose gradient is written.
         """
         v, n_rays, n = self.values, len(rays), len(samples.points)
@@ -217,7 +217,7 @@ class CpuStep:
     def _density_backward(
         self, samples: Samples, encoded: Array32, grad_field: Array32, slot_grads: list[dict[str, Array32]]
     ) -> None:
-        """Take the gradient at the density network's outputs on to its weights and the hash table, and sum over slots."""
+        """Propagate the gradient at the density network's outputs to its weights and the hash table, and sum over slots."""
         v, n = self.values, len(samples.points)
         bounds = slot_bounds(len(encoded), SLOTS)
         _clear_tail(grad_field, n)

@@ -34,7 +34,7 @@ def restore_definitions(found: Scan) -> None:
 
 
 def contradiction(found: Scan, known: Summary) -> str:
-    """Contradiction between summary and data; empty if there is none. A summary may be incomplete."""
+    """Contradiction between summary and data; empty without one. A summary may be incomplete."""
     statistics = known.statistics
     counts = {channel_id: n for channel_id, n in found.counts.items() if n}
     if statistics is not None:

@@ -19,7 +19,7 @@ _MARK = b"advnjrn1"
 # CRC-32 of the following bytes, log time, publish time, sequence, length of the topic, length of the message.
 _ENTRY = struct.Struct("<IQQIHI")
 _CRC_BYTES = 4
-# Reserved space for the summaries when the disk is full: those of two parts of 1 GiB take 3 MB.
+# Reserved space for the summaries when the disk is full: the summaries of two parts of 1 GiB take 3 MB.
 RESERVE_BYTES, RESERVE_NAME = 8 * 1024 * 1024, ".reserve"
 
 

@@ -24,7 +24,7 @@ class MergeSource(Generic[T]):
 
 
 def merge_by_time(sources: Sequence[MergeSource[T]], time_ns: Callable[[T], int]) -> Iterator[T]:
-    """Yield all messages in order of time. Of two with the same time, that of the earlier source comes first.
+    """Yield all messages in order of time. Of two with the same time, the earlier source's comes first.
 
     Args:
         sources: The files, in the order of their recording.

@@ -92,7 +92,7 @@ class Definition:
 
         Args:
             data: Bytes of the message: CDR with its encapsulation, or the ROS 1 format.
-            ros1: Whether the format is that of ROS 1.
+            ros1: Whether the bytes have the ROS 1 format.
 
         Raises:
             MessageError: The bytes do not decode.

@@ -37,7 +37,7 @@ class PartWriter:
         compressed: Whether chunks are compressed with zstd.
 
     Attributes:
-        contents: Contents written so far.
+        contents: Contents that were written.
         first_log_ns: Log time of the message that was written first [ns since 1970]; None before it.
     """
 
@@ -72,7 +72,7 @@ class PartWriter:
 
     @property
     def size_bytes(self) -> int:
-        """Length of the file so far, without the unfinished chunk."""
+        """Current length of the file, without the unfinished chunk."""
         return self._stream.tell()
 
     def write(

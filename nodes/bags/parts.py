@@ -41,7 +41,7 @@ def bag_parts(bag: Path) -> tuple[Path, ...]:
             or the folder has the name of the bag. Otherwise it is a separate bag.
 
     Raises:
-        BagError: There is no bag, a part is missing, or the files of the folder are not parts of one bag.
+        BagError: The bag does not exist, a part is missing, or the files of the folder are not parts of one bag.
     """
     bag = Path(bag)
     if bag.name == METADATA_FILE and bag.is_file():

@@ -46,18 +46,18 @@ class TopicInfo:
 
 @dataclass(frozen=True)
 class BagInfo:
-    """What a bag holds; times are log times.
+    """Contents of a bag; times are log times.
 
     Attributes:
-        path: Its file, or its folder if it was split.
-        parts: Its files in order.
+        path: The bag's file, or its folder if it was split.
+        parts: The bag's files in order.
         size_bytes: Size of all files [bytes].
         start_ns: Time of the first message [ns since 1970].
         end_ns: Time of the last message [ns since 1970].
-        topics: Its topics by name.
-        attachments: Names of the files that ride along, in whichever part.
-        metadata: Facts that the recorder noted: versions, git hash.
-        unchecked: Why its messages may have changed without a sign of it; empty where checksums cover them. Every figure made from
+        topics: Topics by name.
+        attachments: Names of the attached files in all parts.
+        metadata: Facts noted by the recorder: versions, git hash.
+        unchecked: Why its messages may have changed unnoticed; empty if checksums cover them. Every figure made from
             such a bag says so.
     """
 
@@ -87,11 +87,11 @@ class BagMessage:
     """One message of a bag.
 
     Attributes:
-        topic: Its topic.
-        cdr: Its CDR bytes; on a topic of the topic table they are converted to our type if the bag has another definition.
-        log_ns: When the recorder received it [ns since 1970].
-        publish_ns: When it was published [ns since 1970].
-        sequence: Its number in the order of its publisher.
+        topic: Name of the topic.
+        cdr: CDR bytes; on a topic of the topic table they are converted to our type if the bag has another definition.
+        log_ns: Time at which the recorder received it [ns since 1970].
+        publish_ns: Time at which it was published [ns since 1970].
+        sequence: Sequence number from its publisher.
     """
 
     topic: str
@@ -223,7 +223,7 @@ def read_messages(
         bag: Bag folder or file.
         topics: Topics to read, which must be in the bag; None means all.
         start_offset_s: Time to skip at the beginning [s].
-        types: Wanted types by topic. None uses those of the topic table and does not convert other topics.
+        types: Wanted types by topic. None uses the topic table's and does not convert other topics.
         as_recorded: Do not convert any message.
 
     Raises:

@@ -69,7 +69,7 @@ def record_at(buffer: Any, at: int, limit: int) -> tuple[int, int, int]:
 
 
 def chunk_head(buffer: Any, body: int, length: int | None) -> ChunkHead:
-    """Parse the head of a chunk record. The length of its data must agree with that of the record.
+    """Parse the head of a chunk record. The length of its data must agree with the record's length.
 
     Args:
         buffer: Bytes that include at least the head.

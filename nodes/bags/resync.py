@@ -41,7 +41,7 @@ def only_zeros(buffer: Any, at: int) -> bool:
 
 
 def next_record(buffer: Any, at: int, limit: int, channels: Collection[int], messages: bool) -> int | None:
-    """Return the next offset after ``at`` from which valid records follow; None if there is none.
+    """Return the next offset after ``at`` from which valid records follow; None without one.
 
     Args:
         at: Offset of the damage.
@@ -142,7 +142,7 @@ def is_cut(buffer: Any, at: int, limit: int) -> bool:
 
 
 def _attachment_agrees(buffer: Any, body: int, length: int) -> bool:
-    """Whether the length inside an attachment agrees with that of its record. The end of the attachment may be missing."""
+    """Whether the length inside an attachment agrees with its record's. The end of the attachment may be missing."""
     at = body + 16
     for _ in range(2):
         if at + 4 > len(buffer):

@@ -37,7 +37,7 @@ def good_records(
     """Find the good records of a damaged chunk.
 
     Args:
-        data: Its data, compressed or not.
+        data: Data of the chunk, compressed or not.
         indexed: Channel and log time [ns] of its messages by offset, from its message indexes; empty without them.
         channels: Ids of the channels that the file had before it.
     """

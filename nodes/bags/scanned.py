@@ -74,7 +74,7 @@ class Scan:
         size: Size of the file [bytes].
         ending: The footer; None if it is missing.
         known: The summary; None if it is missing or damaged.
-        summary_damage: Damage of the summary; empty if there is none.
+        summary_damage: Damage of the summary; empty if undamaged.
         data_end: Offset of the record that ends the data; None if it is missing.
         data_crc: Checksum of all data; 0 means none.
         data_crc_wrong: Whether this checksum is wrong.

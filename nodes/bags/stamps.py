@@ -28,7 +28,7 @@ class Delays:
         publish_worst_ms: Longest delay from capture to publication.
         receive_ms: Median from publication to reception by the recorder.
         receive_worst_ms: Longest delay from publication to reception.
-        backwards: Number of messages whose stamp is older than that of the message before.
+        backwards: Number of messages whose stamp is older than the previous message's.
         future: Number of messages with a capture time after their reception, which means a wrong clock.
     """
 

@@ -18,7 +18,7 @@ class Ending(NamedTuple):
     """Contents of the footer.
 
     Attributes:
-        summary_start: Offset of the summary; 0 if there is none.
+        summary_start: Offset of the summary; 0 without one.
         summary_crc: Checksum of summary and footer; 0 means none.
         footer_at: Offset of the footer.
     """
@@ -53,7 +53,7 @@ def read_summary_section(buffer: Any, ending: Ending) -> Summary:
     """Read the records of the summary.
 
     Raises:
-        Damaged: Its checksum is wrong, or it is invalid.
+        Damaged: The checksum is wrong, or the summary is invalid.
     """
     end = ending.footer_at + FOOTER_BYTES - _CRC_BYTES
     content = bytes(buffer[ending.summary_start : end])

@@ -51,7 +51,7 @@ def _run_to_arm(given: Path | None) -> Path:
         return run_dir
     launches = active_launches()
     if not launches:
-        return find_run_dir(None)  # says that there is none
+        return find_run_dir(None)  # raises the error about a missing one
     for number, launch in enumerate(launches, start=1):
         folder = Path(launch["run_dir"])
         mark = f"{number}: " if len(launches) > 1 else ""

@@ -155,7 +155,7 @@ def carla_drive(
 
 @app.command("release")
 def carla_release(host: Host = None, port: Port = None) -> None:
-    """Free a server whose client was killed: its world waits for ticks that nobody sends."""
+    """Free a server whose client was killed: its world waits for ticks that never come."""
     from hardware.worlds.carla.release import release
 
     freed = release(_config(None, None, host, port).server)

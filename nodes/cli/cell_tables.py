@@ -118,7 +118,7 @@ def _show_published(experiment: Experiment, cells: Sequence[Cell], output: Path 
     from nodes.experiment.run.published import published_table
 
     full = published_table(folder, experiment, list(cells))
-    # Films are not published; those of the own cells may be of other drives.
+    # Films are not published; films of the user's own cells may show other drives.
     _say_where(full, cells, _write_and_print(experiment, full, folder, folder, output))
 
 

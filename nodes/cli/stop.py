@@ -21,7 +21,7 @@ def stop(run_dir: Path | None, reason: str) -> int:
     promise_first_word()
     try:
         return 0 if _stop(run_dir, reason) else _FAILURE_EXIT
-    except Exception as error:  # whatever went wrong, the car may be driving
+    except Exception as error:  # after any error, the car may still be driving
         spoken()
         _say_error(f"NOT CONFIRMED: {error or type(error).__name__}. The car may be driving. Use the e-stop")
         return _ERROR_EXIT

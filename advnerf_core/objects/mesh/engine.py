@@ -25,12 +25,12 @@ _WHAT_TO_DO = f"install it (Debian, Ubuntu: sudo apt-get install libllvm19), or 
 
 
 class MeshEngineError(AdvnerfError, RuntimeError):
-    """Mitsuba, or the LLVM that it compiles with, is not there."""
+    """Mitsuba, or the LLVM that it compiles with, is missing."""
 
 
 @dataclass(frozen=True)
 class Engine:
-    """The modules of Mitsuba and of its compiler; ``mi`` has its variant set."""
+    """The modules of Mitsuba and of its compiler; the variant of ``mi`` is set."""
 
     mi: Any
     dr: Any
@@ -40,10 +40,10 @@ def engine(in_order: bool = False) -> Engine:
     """Mitsuba, ready for use.
 
     Args:
-        in_order: On one thread, for sums that shall have the same bits each time; else on all that may be used.
+        in_order: Run on one thread, so that sums have the same bits each time; else on all available ones.
 
     Raises:
-        MeshEngineError: The package or LLVM is missing; says which, and what to do.
+        MeshEngineError: The package or LLVM is missing.
     """
     loaded = _load()
     threads = 1 if in_order else _threads()
@@ -53,7 +53,7 @@ def engine(in_order: bool = False) -> Engine:
 
 
 def newest_llvm(folders: Iterable[str] = _FOLDERS) -> Path | None:
-    """The newest LLVM library in some folders (patterns); None if there is none that is new enough."""
+    """The newest LLVM library in some folders (patterns); None if none is new enough."""
     found: list[tuple[tuple[int, int], str]] = []
     for folder in folders:
         for parent in sorted(Path("/").glob(folder.lstrip("/"))):
@@ -65,7 +65,7 @@ def newest_llvm(folders: Iterable[str] = _FOLDERS) -> Path | None:
 
 
 def _threads() -> int:
-    """As many as the machine and OMP_NUM_THREADS allow."""
+    """As many threads as the machine and OMP_NUM_THREADS allow."""
     asked = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
     return min(int(asked), thread_count()) if asked.isdigit() and int(asked) else thread_count()
 

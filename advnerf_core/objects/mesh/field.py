@@ -32,7 +32,7 @@ class MeshField:
         mesh: Surface, texture coordinates and colours without an attack.
         T_world_from_object: Rigid pose ``[4, 4]``.
         scale: World metres per metre of the mesh.
-        derived: What is worked out from the surface once; shared by moved copies.
+        derived: Data computed once from the surface; shared by moved copies.
     """
 
     mesh: TexturedMesh
@@ -54,7 +54,7 @@ class MeshField:
 
     @property
     def theta_shape(self) -> tuple[int, ...]:
-        """That of the texture."""
+        """Shape of the texture."""
         return tuple(self.mesh.texture.shape)
 
     @property
@@ -89,7 +89,7 @@ class MeshField:
         return squash(theta.reshape(-1, 3))
 
     def texture(self, theta: Tensor) -> NDArray[np.float32]:
-        """The texture ``[H, W, 3]`` that ``theta`` means; texels of no chart keep their plain colour."""
+        """The texture ``[H, W, 3]`` of ``theta``; texels outside all charts keep their plain colour."""
         colours = self.colours(theta.detach()).numpy().reshape(self.theta_shape)
         return np.where(self.mesh.charts[..., None] >= 0, colours, self.mesh.texture).astype(np.float32)
 
@@ -103,7 +103,7 @@ class MeshField:
         return np.concatenate(pairs).astype(np.int64)
 
     def moved(self, T_world_from_object: ArrayLike, scale: float | None = None) -> MeshField:
-        """The same object elsewhere, and with another scale if one is given."""
+        """The same object at another pose, and with another scale if one is given."""
         pose = np.asarray(T_world_from_object, dtype=np.float64)
         other = replace(self, T_world_from_object=pose, scale=self.scale if scale is None else scale)
         object.__setattr__(other, "derived", self.derived)
@@ -111,7 +111,7 @@ class MeshField:
 
     @property
     def sha256(self) -> str:
-        """Hash of geometry, texture coordinates and pose, and of nothing that is searched for in a texture attack."""
+        """Hash of geometry, texture coordinates and pose, and of no colours, which a texture attack searches."""
         digest = hashlib.sha256(repr((self.theta_shape, self.scale)).encode())
         for part in (self.mesh.vertices, self.mesh.faces, self.mesh.texels, self.T_world_from_object):
             digest.update(np.ascontiguousarray(part).tobytes())
@@ -146,7 +146,7 @@ class MeshField:
         return pixels[top:bottom, left:right].reshape(-1), origin, seen @ (T[:3, :3].T / self.scale)
 
     def window(self, T_world_from_camera: Array, pinhole: Pinhole) -> tuple[int, int, int, int] | None:
-        """Rows and columns that surely hold the mesh; None if it is out of sight, or the pose is not finite."""
+        """Rows and columns that surely contain the mesh; None if it is out of sight, or the pose is not finite."""
         if not np.isfinite(T_world_from_camera).all():
             return None
         low, high = self.mesh.box
@@ -167,7 +167,7 @@ class MeshField:
         return (top, bottom, left, right) if bottom > top and right > left else None
 
     def _gathered(self, pixel: NDArray[np.int64], hits: Hits, rays_per_pixel: int, dtype: Any) -> ObjectCast:
-        """One row per pixel of what its rays hit; rays of a pixel follow one another."""
+        """One row per pixel with the hits of its rays; rays of a pixel are consecutive."""
         pixels, first, counts = np.unique(pixel, return_index=True, return_counts=True)
         texel, weight = self._bilinear(hits)
         ends = np.concatenate([[0], np.cumsum(4 * counts)]).astype(np.int32)

@@ -1,7 +1,7 @@
-"""Attacked meshes as GLB files: geometry, texture coordinates and the found texture, for any viewer, printer or simulator.
+"""Attacked meshes as GLB files: geometry, texture coordinates and the attacked texture, for any viewer, printer or simulator.
 
-glTF has y up; the file is written so, and turned back when it is read here. The texture is 8 bits a channel, which is what a re-read mesh
-differs by. Viewers light it; it was attacked unlit.
+glTF has y up; axes are converted when writing and reading. The texture is 8 bits a channel, which is how a re-read mesh
+differs. Viewers light it; it was attacked unlit.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def glb_bytes(mesh: TexturedMesh) -> bytes:
     from PIL import Image
 
     height, width = mesh.texture.shape[:2]
-    # A vertex has one place in the texture: those on the seams of charts are written once for each chart.
+    # A vertex has one place in the texture: vertices on the seams of charts are written once for each chart.
     texels = np.ascontiguousarray(mesh.texels.reshape(-1, 2))
     keys = np.concatenate([mesh.faces.reshape(-1, 1).astype(np.float64), texels], axis=1)
     _, first, place = np.unique(keys, axis=0, return_index=True, return_inverse=True)
@@ -50,10 +50,10 @@ def glb_bytes(mesh: TexturedMesh) -> bytes:
 
 
 def read_glb(path: Path) -> TexturedMesh:
-    """Read what :func:`write_glb` wrote; texture coordinates are kept. Other files: ``objects.mesh.load_mesh`` and ``unwrapped``.
+    """Read a file of :func:`write_glb`; texture coordinates are kept. For other files use ``objects.mesh.load_mesh`` and ``unwrapped``.
 
     Raises:
-        MeshError: No file, or not a single mesh with a texture.
+        MeshError: The file is missing, or is not a single mesh with a texture.
     """
     if not path.is_file():
         raise MeshError(f"expected a GLB file at {path}, found none")
@@ -61,7 +61,7 @@ def read_glb(path: Path) -> TexturedMesh:
 
 
 def mesh_from_glb(content: bytes, source: str) -> TexturedMesh:
-    """The mesh of a GLB file's content; see `read_glb`. Errors call it ``source``."""
+    """The mesh of a GLB file's content; see `read_glb`. ``source`` names it in errors."""
     import trimesh
 
     try:
@@ -72,7 +72,7 @@ def mesh_from_glb(content: bytes, source: str) -> TexturedMesh:
         uv = np.asarray(part.visual.uv, dtype=np.float64)
         pixels = np.asarray(part.visual.material.baseColorTexture.convert("RGB"))
         faces = np.asarray(part.faces, dtype=np.int64)
-    except Exception as error:  # trimesh's readers raise whatever they stumble over
+    except Exception as error:  # trimesh's readers raise any exception
         raise MeshError(
             f"expected {source} to be one mesh with one texture, as 'advnerf attack run' writes it ({type(error).__name__}: {error})"
         ) from error
@@ -84,6 +84,6 @@ def mesh_from_glb(content: bytes, source: str) -> TexturedMesh:
 
 
 def _welded(vertices: Array, faces: NDArray[np.int64]) -> tuple[Array, NDArray[np.int32]]:
-    """One vertex for each place: those on seams were written more than once, with the same bits."""
+    """Merge vertices with equal bits: vertices on seams were written more than once."""
     unique, place = np.unique(vertices, axis=0, return_inverse=True)
     return unique, place.reshape(-1)[faces].astype(np.int32)

@@ -1,8 +1,8 @@
 """The preconditioner of shape attacks: Nicolet, Jacobson and Jakob 2021, "Large Steps in Inverse Rendering of Geometry".
 
-Vertices are moved by ``d = (I + lambda L)^-1 u`` with the mesh's combinatorial Laplacian ``L``; ``u`` is what is optimised. The inverse
-spreads a gradient, which is there only where silhouettes and texture move, over the surface around. Mitsuba's ``mi.ad.LargeSteps`` is
-the same matrix, but needs a solver that Mitsuba does not bring; scipy's serves as well, in float64.
+Vertices are moved by ``d = (I + lambda L)^-1 u`` with the mesh's combinatorial Laplacian ``L``; ``u`` is optimised. The inverse
+spreads a gradient, which exists only where silhouettes and texture move, over the surface around. Mitsuba's ``mi.ad.LargeSteps`` is
+the same matrix, but needs a solver that Mitsuba does not include; scipy's serves as well, in float64.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ class LargeSteps:
     """The symmetric matrix ``(I + lambda L)^-1`` of a mesh, factorised once.
 
     Args:
-        vertex_count: Number of vertices; they are welded, so that nothing opens.
+        vertex_count: Number of vertices, welded so that the surface stays closed.
         faces: Corners ``[F, 3]``.
-        smoothness: Lambda; 0 moves each vertex by itself. It should grow with the number of triangles.
+        smoothness: Lambda; 0 moves each vertex independently. It should grow with the number of triangles.
     """
 
     def __init__(self, vertex_count: int, faces: NDArray[np.int32], smoothness: float = 19.0) -> None:

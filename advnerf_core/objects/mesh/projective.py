@@ -1,10 +1,10 @@
-"""Derivatives of a picture of a mesh with respect to its vertices; imported where it is needed only, as it loads Mitsuba.
+"""Derivatives of a picture of a mesh with respect to its vertices; imported only where needed, as it loads Mitsuba.
 
-A picture is the mesh's texture where the mesh is nearest, and a background picture elsewhere. Its derivative has two parts: inside the
+A picture is the mesh's texture where the mesh is nearest, and a background picture otherwise. Its derivative has two parts: inside the
 silhouettes the texture moves with the surface (found by automatic differentiation of the ray's hit), and the silhouettes
 themselves move (Zhang, Roussel and Jakob 2023, "Projective Sampling for Differentiable Rendering of Geometry"; the machinery is Mitsuba's
-``PSIntegrator``). Both are Monte Carlo estimates. All is in the camera's frame: the camera never changes, so no frame compiles a
-kernel anew.
+``PSIntegrator``). Both are Monte Carlo estimates. Everything is in the camera's frame: the camera never changes, so no frame compiles a
+new kernel.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ class OverBackground(PSIntegrator):
         self.sample_border_warning = False  # the film is exactly the picture, and its pixels are boxes
 
     def look_through(self, pinhole: Pinhole) -> None:
-        """Set the camera; ``fy`` is that of square pixels."""
+        """Set the camera; ``fy`` assumes square pixels."""
         self._size = (pinhole.width, pinhole.height)
         self._lens = [_opaque(value) for value in (pinhole.fx, pinhole.cx, pinhole.cy)]
 
     def show(self, corner_texels: Array, texture: NDArray[np.float32]) -> None:
-        """Set texture ``[H, W, 3]`` and where the faces' corners lie in it ``[F, 3, 2]``."""
+        """Set texture ``[H, W, 3]`` and the positions of the faces' corners in it ``[F, 3, 2]``."""
         uv = np.asarray(corner_texels, np.float32) / np.array(texture.shape[1::-1], np.float32)
         self._corners = [floats(mi, uv[:, k]) for k in range(3)]
         self._texture = mi.Texture2f(
@@ -48,7 +48,7 @@ class OverBackground(PSIntegrator):
         )
 
     def stand_before(self, rgb: NDArray[np.float32], depth_m: NDArray[np.float32]) -> None:
-        """Set what is behind ``[H, W, 3]``, and the depth ``[H, W]`` [m] beyond which it hides the mesh."""
+        """Set the background ``[H, W, 3]``, and the depth ``[H, W]`` [m] beyond which it hides the mesh."""
         self._rgb = floats(mi, rgb)
         self._depth = floats(mi, np.where(np.isnan(depth_m), np.inf, depth_m))
 
@@ -84,7 +84,7 @@ class OverBackground(PSIntegrator):
         return difference, active & (dr.max(dr.abs(difference)) > 0)
 
     def _seen(self, si: Any, direction: Any, active: Any) -> Any:
-        """What is seen along a direction from the camera that meets the mesh at ``si``."""
+        """Colour along a direction from the camera that meets the mesh at ``si``."""
         f, cx, cy = self._lens
         width, height = self._size
         column = mi.UInt32(dr.clip(dr.detach(f * direction.x / direction.z + cx), 0, width - 1))
@@ -101,9 +101,9 @@ class ProjectiveRenderer:
     """Pictures of a mesh over a background, and their derivatives.
 
     Args:
-        vertex_count: Number of vertices, which are given with each picture.
+        vertex_count: Number of vertices; their positions are given with each picture.
         faces: Corners ``[F, 3]``.
-        corner_texels: Where they lie in the texture ``[F, 3, 2]``.
+        corner_texels: Positions of the corners in the texture ``[F, 3, 2]``.
         texture: Colours ``[H, W, 3]`` in 0..1.
         pinhole: Camera.
         samples: Rays a pixel inside the silhouettes.
@@ -140,7 +140,7 @@ class ProjectiveRenderer:
         samples: int,
         seed: int = 0,
     ) -> NDArray[np.float32]:
-        """The picture ``[H, W, 3]`` itself, with random rays; arguments as for :meth:`gradient`."""
+        """The picture ``[H, W, 3]`` itself, with random rays; arguments as in :meth:`gradient`."""
         self._place(vertices, rgb, depth_m)
         self._parameters.update()
         return np.array(mi.render(self._scene, integrator=self._integrator, spp=samples, seed=_seed(seed)))
@@ -156,11 +156,11 @@ class ProjectiveRenderer:
         """Gradient with respect to the vertices ``[V, 3]`` of a scalar with gradient ``grad_image`` with respect to the picture.
 
         Args:
-            vertices: In the camera's frame ``[V, 3]`` [m].
-            rgb: What is behind ``[H, W, 3]`` in 0..1.
+            vertices: Vertices in the camera's frame ``[V, 3]`` [m].
+            rgb: Background ``[H, W, 3]`` in 0..1.
             depth_m: Planar depth beyond which the mesh is hidden ``[H, W]`` [m]; NaN hides nothing.
-            grad_image: ``[H, W, 3]``.
-            seed: Of the samples; the same seed gives the same estimate, to the bit.
+            grad_image: Gradient with respect to the picture, ``[H, W, 3]``.
+            seed: Seed of the samples; the same seed gives the same estimate, to the bit.
         """
         engine(in_order=True)  # many samples add to one vertex
         positions = self._place(vertices, rgb, depth_m, attached=True)
@@ -182,7 +182,7 @@ class ProjectiveRenderer:
 
 
 def _sensor(pinhole: Pinhole) -> dict[str, Any]:
-    """A camera in the origin that looks along z, y down."""
+    """A camera at the origin that looks along z, y down."""
     up_is_up = mi.ScalarTransform4f().look_at(origin=[0, 0, 0], target=[0, 0, 1], up=[0, -1, 0])
     film = {
         "type": "hdrfilm",
@@ -212,7 +212,7 @@ def _opaque(value: float) -> Any:
 
 
 def _seed(seed: int) -> Any:
-    # Not a literal: each would compile a kernel of its own.
+    # Not a literal: each value would compile another kernel.
     return dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
 
 

@@ -1,4 +1,4 @@
-"""Where rays meet a mesh: Mitsuba's tracer, with plain arrays on both sides."""
+"""Intersections of rays and a mesh: Mitsuba's tracer, with plain arrays on both sides."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _ALIGNMENT = 16  # floats
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Where rays met the surface.
+    """Intersections of rays with the surface.
 
     Attributes:
-        rays: Which rays hit it ``[N]``, ascending.
+        rays: Indices of the rays that hit it ``[N]``, ascending.
         t: Distance in lengths of the ray's direction ``[N]``.
-        faces: Triangles ``[N]``.
+        faces: Indices of the triangles ``[N]``.
         weights: Barycentric weights of their corners ``[N, 3]``.
     """
 
@@ -34,19 +34,19 @@ class Hits:
 
 
 class RayCaster:
-    """A mesh that rays can be cast at; both sides of a triangle are hit."""
+    """A mesh for ray casting; both sides of a triangle are hit."""
 
     def __init__(self, mesh: TexturedMesh) -> None:
         mi = engine().mi
         self._scene = mi.load_dict({"type": "scene", "mesh": mitsuba_mesh(mi, mesh.vertices, mesh.faces)})
 
     def cast(self, origins: Array, directions: Array) -> Hits:
-        """Cast rays ``[N, 3]``; directions of any length, what is nearer than a thousandth of it is not seen."""
+        """Cast rays ``[N, 3]``; directions may have any length, and hits nearer than a thousandth of it are ignored."""
         used = engine()
         mi, dr = used.mi, used.dr
         if not len(origins):
             return Hits(np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.int64), np.zeros((0, 3)))
-        # Axis by axis: a matrix would be taken apart by a kernel that knows the number of rays.
+        # Axis by axis: splitting a matrix would compile a kernel for each number of rays.
         o, d = ([floats(mi, axis) for axis in part.T] for part in (origins, directions))
         ray = mi.Ray3f(mi.Point3f(*o), mi.Vector3f(*d))
         ray.o += _NEAR * ray.d
@@ -70,10 +70,10 @@ class RayCaster:
 
 
 def floats(mi: Any, values: ArrayLike) -> Any:
-    """Numbers as an array of Mitsuba, flat.
+    """Numbers as a flat array of Mitsuba.
 
-    Mitsuba reads an array of numpy where it is, by a kernel that depends on its alignment; numpy's varies, and each new frame might
-    compile a kernel anew. So it is copied to where the alignment is always the same.
+    Mitsuba reads an array of numpy in place, by a kernel that depends on its alignment; numpy's varies, and each frame might
+    compile a new kernel. So it is copied to memory with a fixed alignment.
     """
     flat = np.asarray(values, dtype=np.float32).ravel()
     room = np.empty(len(flat) + _ALIGNMENT, np.float32)
@@ -83,7 +83,7 @@ def floats(mi: Any, values: ArrayLike) -> Any:
 
 
 def mitsuba_mesh(mi: Any, vertices: Array, faces: NDArray[np.int32]) -> object:
-    """A mesh of Mitsuba without normals and texture coordinates; its vertices are its parameter ``vertex_positions``."""
+    """A mesh of Mitsuba without normals and texture coordinates; ``vertex_positions`` is its parameter."""
     mesh = mi.Mesh("mesh", len(vertices), len(faces))
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = floats(mi, vertices)

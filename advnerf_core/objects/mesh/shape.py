@@ -1,12 +1,12 @@
-"""An attack on shapes: the vertices of meshes are free, their colours are not.
+"""An attack on shapes: the vertices of meshes are free, their colours are fixed.
 
-``ShapeSensor`` stands where a ``Surrogate`` stands in an attack: the adjoint and every search take it as they are. What a search changes,
-``theta``, is preconditioned (``large_steps``) and bounded::
+``ShapeSensor`` replaces a ``Surrogate`` in an attack: the adjoint and every search accept it unchanged. The searched parameters,
+``theta``, are preconditioned (``large_steps``) and bounded::
 
     d = (I + lambda L)^-1 theta,    vertices = plain vertices + d / sqrt(1 + |d|^2 / bound^2),    z >= 0
 
-Pictures are those of a surrogate with the moved meshes; their gradient is the projective estimate (``projective``), whose seed depends
-on camera poses and ``theta`` only: a search that is resumed meets the same numbers.
+Pictures come from a surrogate with the moved meshes; their gradient is the projective estimate (``projective``), whose seed depends
+on camera poses and ``theta`` only, so that a resumed search gets the same numbers.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from advnerf_core.scene.surrogate import Rendered, Surrogate, split_theta
 
 @dataclass(frozen=True)
 class ShapeLimits:
-    """How shapes may change.
+    """Limits of shape changes.
 
     Attributes:
-        bound_m: No vertex moves farther, in the world [m].
+        bound_m: Largest displacement of a vertex, in the world [m].
         smoothness: Lambda of the preconditioner.
         samples: Rays a pixel for the gradient inside the silhouettes.
-        boundary_samples: Points a pixel for that of the silhouettes.
+        boundary_samples: Points a pixel for the gradient of the silhouettes.
     """
 
     bound_m: float = 0.2
@@ -61,15 +61,15 @@ class ShapeLimits:
         return 0.05 * self.bound_m
 
 
-# Of vertices, in units of theta: noise of N(0, 1) would fold the surface.
+# Noise of vertices, in units of theta: N(0, 1) would fold the surface.
 _INITIAL_NOISE = 1e-4
 
 
 class ShapeSensor:
-    """Meshes of free shape in a scene.
+    """Meshes with free shapes in a scene.
 
     Args:
-        surrogate: Scene and camera, with the meshes in their plain shape; nothing but meshes (`MeshField`).
+        surrogate: Scene and camera, with the meshes in their plain shape; all objects must be meshes (`MeshField`).
         colours: Colours of the meshes, of ``surrogate.theta_shape``; their plain ones if not given.
     """
 
@@ -96,7 +96,7 @@ class ShapeSensor:
         return (sum(self._counts), 3)
 
     def initial_theta(self, generator: torch.Generator) -> Tensor:
-        """The plain shapes, with a noise that tells seeds apart."""
+        """The plain shapes, with noise that depends on the seed."""
         return _INITIAL_NOISE * torch.randn(self.theta_shape, generator=generator)
 
     @property
@@ -106,7 +106,7 @@ class ShapeSensor:
 
     @cached_property
     def random_sigma(self) -> float:
-        """Spread of a random ``theta`` whose displacements are in the mean as large as the bound, before they are bounded [m]."""
+        """Spread of a random ``theta`` whose mean displacement equals the bound, before it is bounded [m]."""
         noise = torch.randn(self.theta_shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
         moved = [
             self._displaced(k, part) * field.scale
@@ -137,7 +137,7 @@ class ShapeSensor:
         return self._shaped[1]
 
     def sense(self, states: Tensor, theta: Tensor) -> Rendered:
-        """What the car's camera sees from states ``[B, n]``."""
+        """Images of the car's camera from states ``[B, n]``."""
         return self.render(self.camera_poses(states), theta)
 
     @torch.no_grad()
@@ -167,7 +167,7 @@ class ShapeSensor:
     def overlay(
         self, rgb: ArrayLike, depth_m: ArrayLike, T_world_from_camera: ArrayLike, theta: Tensor
     ) -> Tensor:
-        """Put the shaped meshes into given images; see ``Surrogate.overlay``."""
+        """Render the shaped meshes over given images; see ``Surrogate.overlay``."""
         return self.surrogate.with_objects(self.shaped(theta)).overlay(
             rgb, depth_m, T_world_from_camera, self.colours
         )
@@ -183,7 +183,7 @@ class ShapeSensor:
         return torch.cat([moved[:, :2], moved[:, 2:].clamp_min(0.0)], dim=1)
 
     def _pulled_back(self, theta: Tensor, slopes: Tensor) -> Tensor:
-        """From gradients with respect to vertices to the gradient with respect to ``theta``."""
+        """Gradient with respect to ``theta``, from gradients with respect to vertices."""
         parts = zip(theta.double().split(self._counts), slopes.split(self._counts), strict=True)
         out = []
         for k, (part, slope) in enumerate(parts):
@@ -202,7 +202,7 @@ class ShapeSensor:
         slopes: NDArray[Any],
         seed: int,
     ) -> Tensor:
-        """Gradient ``[sum V, 3]`` with respect to the vertices in the meshes' frames, of one picture."""
+        """Gradient ``[sum V, 3]`` of one picture with respect to the vertices in the meshes' frames."""
         T = [invert_transform(pose) @ field.T_world_from_object for field in self.meshes]
         seen = [
             field.scale * part.numpy() @ t[:3, :3].T + t[:3, 3]
@@ -217,7 +217,7 @@ class ShapeSensor:
         return torch.from_numpy(np.concatenate(turned))
 
     def _projective(self) -> Any:
-        """The renderer of gradients, with all meshes in one and their textures below one another."""
+        """The renderer of gradients, with all meshes joined and their textures stacked."""
         if self._renderer is None:
             from advnerf_core.objects.mesh.projective import ProjectiveRenderer
 

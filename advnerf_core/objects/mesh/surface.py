@@ -1,6 +1,6 @@
-"""Meshes to attack: welded vertices, and one texture whose texels are the free colours.
+"""Attackable meshes: welded vertices, and one texture whose texels are the free colours.
 
-A texture that is attacked wants texels of one size on the whole surface, coarse ones (high frequencies do not transfer), and no
+An attacked texture needs texels of one size on the whole surface, coarse ones (high frequencies do not transfer), and no
 repeats. So the mesh gets new texture coordinates: each triangle is seen along the axis that it faces most, and the six views
 (from front, back, left, right, above and below) lie side by side in the texture. Layers that face the same way behind one another
 share their texels. Inside a chart colours are continuous; no sample of a chart reads another chart's texels.
@@ -17,10 +17,10 @@ from scipy import ndimage
 from advnerf_core.geometry import Array
 from advnerf_core.objects.voxel.mesh import MeshError, SurfaceMesh, part_from_colours, texture_colours
 
-_WELD = 1e-6  # of the size: nearer vertices are one
+_WELD = 1e-6  # relative to the size: nearer vertices are merged
 _SAMPLES_PER_TEXEL = 16.0
-_OUTER = 0.1  # texels: what lies deeper below the outermost layer does not give its colour
-# In-plane axes of the six views (column, row) with their signs, so that each is upright to who looks at it from outside.
+_OUTER = 0.1  # texels: anything deeper below the outermost layer does not contribute its colour
+# In-plane axes of the six views (column, row) with their signs, so that each is upright for a viewer outside.
 _VIEWS = (
     ((1, 1), (2, -1)), ((1, -1), (2, -1)),  # from +x and -x
     ((0, -1), (2, -1)), ((0, 1), (2, -1)),  # from +y and -y
@@ -35,9 +35,9 @@ class TexturedMesh:
     Attributes:
         vertices: ``[V, 3]`` in the object's frame [m].
         faces: Indices of the corners ``[F, 3]`` int32.
-        texels: Where the corners lie in the texture, column and row ``[F, 3, 2]``; texel centres are at +0.5.
+        texels: Positions of the corners in the texture, column and row ``[F, 3, 2]``; texel centres are at +0.5.
         texture: Colours without an attack, ``[H, W, 3]`` float32 in 0..1, row 0 on top.
-        charts: Which texels belong together ``[H, W]`` int16; -1 belongs to none.
+        charts: Chart of each texel ``[H, W]`` int16; -1 for none.
     """
 
     vertices: Array
@@ -85,7 +85,7 @@ def unwrapped(mesh: SurfaceMesh, resolution: int = 32) -> TexturedMesh:
         resolution: Texels along its longest side.
 
     Raises:
-        MeshError: Nothing but triangles without area, or a resolution out of 2..512.
+        MeshError: All triangles are without area, or the resolution is not in 2..512.
     """
     if not 2 <= resolution <= 512:
         raise MeshError(f"expected 2 to 512 texels along the longest side, got {resolution}")
@@ -108,7 +108,7 @@ def unwrapped(mesh: SurfaceMesh, resolution: int = 32) -> TexturedMesh:
 
 
 def sphere(radius_m: float, rgb: tuple[float, float, float], subdivisions: int = 3) -> SurfaceMesh:
-    """A ball of one colour that stands on z = 0: an icosahedron, subdivided; what a shape attack can begin with."""
+    """A ball of one colour that stands on z = 0: a subdivided icosahedron, as the start of a shape attack."""
     import trimesh
 
     if not (np.isfinite(radius_m) and radius_m > 0 and 0 <= subdivisions <= 6):
@@ -129,14 +129,14 @@ def _welded(triangles: Array, tolerance: float) -> tuple[Array, NDArray[np.int32
 
 
 def _facing(normals: Array) -> NDArray[np.int64]:
-    """Which of the six views sees a triangle best, ``[F]``."""
+    """Index of the view that sees a triangle best, ``[F]``."""
     axis = np.abs(normals).argmax(axis=1)
     away = np.take_along_axis(normals, axis[:, None], axis=1)[:, 0] < 0
     return np.asarray(2 * axis + away)
 
 
 def _layout(corners: Array, view: NDArray[np.int64], texel: float) -> tuple[Array, NDArray[np.int16]]:
-    """Coordinates ``[F, 3, 2]`` of the corners in the texture, and which view each texel is of."""
+    """Coordinates ``[F, 3, 2]`` of the corners in the texture, and the view of each texel."""
     texels = np.zeros((len(corners), 3, 2))
     rectangles, width = [], 0
     for number, ((across, flip), (down, turn)) in enumerate(_VIEWS):

@@ -1,4 +1,4 @@
-"""From a mesh or from cut-out photographs to an object model."""
+"""Builds an object model from a mesh or from cut-out photographs."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ FIT_VIEWS, FIT_PIXELS = 60, 160
 HELD_OUT_VIEWS = 12
 # Limits of a good fit to pictures; see `advice`.
 POOR_DB, UNFINISHED_DB, GAP_DB = 20.0, 0.3, 6.0
-# Shares of a mesh that its voxels may lose: without a warning, and at all.
+# Shares of a mesh that its voxels may lose: without a warning, and at most.
 THIN, LOST = 0.05, 0.5
-# Rows that are drawn at once for a comparison: a whole picture of 800 x 800 takes as much memory as the pictures of a set.
+# Rows drawn at once for a comparison: a whole picture of 800 x 800 takes as much memory as the pictures of a set.
 _STRIP_ROWS = 64
-# The held-out poses lie between those of the fit.
+# The held-out poses lie between the poses of the fit.
 _HELD_OUT_PHASE = 0.37
 
 
@@ -46,11 +46,11 @@ def build_from_mesh(
 
     Args:
         mesh: The mesh [m].
-        name: What the object is called.
+        name: Name of the object.
         resolution: Voxels along its longest side, 8 to 128.
         steps: Steps of the refinement; 0 leaves the geometry as voxelised.
-        source: Where the mesh comes from, kept in the model.
-        progress: Told the finished fraction and what is being done.
+        source: Origin of the mesh, stored in the model.
+        progress: Called with the finished fraction and the current step.
     """
     told = progress or (lambda fraction, text: None)
     told(0.0, "voxelising")
@@ -101,16 +101,16 @@ def build_from_images(
 
     ``about`` gets the agreement with the pictures: ``train_psnr_db`` and ``held_out_psnr_db`` over whole pictures,
     ``train_object_psnr_db`` and ``held_out_object_psnr_db`` over the pixels of the object, and ``gain_db``, by which the error
-    still fell at the end. Keys of held-out pictures are missing if there are none.
+    fell at the end. Keys of held-out pictures are missing if there are none.
 
     Args:
         views: Pictures to learn from.
-        name: What the object is called.
+        name: Name of the object.
         resolution: Voxels along the longest side.
         steps: Steps of the fit.
-        source: Where the pictures come from, kept in the model.
-        progress: Called with the finished fraction and what is being done.
-        held_out: Pictures that nothing is learned from. The agreement is taken on at most 12 of each set.
+        source: Origin of the pictures, stored in the model.
+        progress: Called with the finished fraction and the current step.
+        held_out: Pictures that are not learned from. The agreement is measured on at most 12 of each set.
         max_seconds: Time limit of the fit [s].
         coarse_to_fine: Whether to fit smaller grids first, see `stages`.
     """
@@ -140,10 +140,10 @@ def build_from_images(
 
 
 def advice(about: Mapping[str, Any]) -> list[str]:
-    """Say what is wrong with an object that was built, and what to do; empty if it is good.
+    """Problems of a built object with their remedies; empty if it is good.
 
-    A mesh loses parts that are thinner than a voxel: more than ``THIN`` of it is told. The rest is about pictures.
-    The figures are those of the object's own pixels. ``POOR_DB`` is an error of a tenth of the colour range: colours that an
+    A mesh loses parts that are thinner than a voxel: a loss above ``THIN`` is reported. The other problems concern pictures.
+    The figures refer to the object's own pixels. ``POOR_DB`` is an error of a tenth of the colour range: colours that an
     attack changes must be known better than that. A fit is unfinished if the error fell by more than ``UNFINISHED_DB`` over the
     last fifth of its steps, and overfitted if held-out pictures are worse by more than ``GAP_DB``, twice the error.
     """
@@ -176,7 +176,7 @@ def advice(about: Mapping[str, Any]) -> list[str]:
 
 
 def _spread(views: PosedRgba, most: int) -> PosedRgba:
-    """At most so many pictures, evenly spread over the set."""
+    """At most ``most`` pictures, evenly spread over the set."""
     count = len(views.images)
     return views.chosen(np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int)))
 
@@ -205,11 +205,11 @@ def draw_object(
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well an object explains pictures, both before white.
+    """Agreement of an object with pictures, both before white.
 
     Attributes:
-        psnr_db: Over all pixels of the pictures [dB].
-        object_psnr_db: Over the pixels that the object covers, drawn or pictured [dB]. It does not depend on how much of a
+        psnr_db: PSNR over all pixels of the pictures [dB].
+        object_psnr_db: PSNR over the pixels that the object covers, drawn or pictured [dB]. It does not depend on how much of a
             picture is empty.
         missing: Share of the pictured object that is not drawn, 0..1.
     """
@@ -229,7 +229,7 @@ class Agreement:
                 strip = pinhole.cropped(0, top, pinhole.width, len(part))
                 drawn = draw_object(model, views.T_object_from_camera[index], strip)[0]
                 error = drawn[..., :3] - drawn[..., 3:] - (part[..., :3] - part[..., 3:])
-                # Outside both silhouettes the error is zero: the sum is that of the covered pixels.
+                # Outside both silhouettes the error is zero: the sum is over the covered pixels.
                 squares += float(np.square(error).sum())
                 covered += int(((drawn[..., 3] > 0.0) | (part[..., 3] > 0.0)).sum())
                 missing += float(np.maximum(part[..., 3] - drawn[..., 3], 0.0).sum())

@@ -1,7 +1,7 @@
 """Fits voxel grids to pictures with transparency, by volume rendering.
 
-The pictures are drawn from a mesh (to repair what voxelising loses at thin and slanted parts) or are photographs that were cut out.
-Density and colours are fitted together by Adam over random rays, each with a background of its own, so that transparency cannot
+The pictures are drawn from a mesh (to repair losses of voxelising at thin and slanted parts) or are cut-out photographs.
+Density and colours are fitted together by Adam over random rays, each with a different background, so that transparency cannot
 be faked by a colour. Density may be negative at voxels and is cut off after interpolation (Karnewar et al. 2022, "ReLU Fields"): edges
 are then sharp, and lie anywhere between voxel centres.
 """
@@ -31,12 +31,12 @@ _FAINT = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What a fit ended with.
+    """Result of a fit.
 
     Attributes:
         grids: Density and colours.
-        steps: Optimiser steps that were taken.
-        gain_db: How much the training error fell from the last but one to the last fifth of the steps [dB].
+        steps: Number of optimiser steps.
+        gain_db: Decrease of the training error from the last but one to the last fifth of the steps [dB].
     """
 
     grids: ObjectGrids
@@ -54,22 +54,22 @@ def fit_grids(
     max_seconds: float | None = None,
     learning_rate: float = LEARNING_RATE,
 ) -> Fit:
-    """Density and colours that explain the pictures.
+    """Fit density and colours to the pictures.
 
     Memory does not grow with the pictures: each step makes only its own rays.
 
     Args:
-        start: Where to begin; voxels further than two from any with density stay empty.
-        steps: Optimiser steps; 0 leaves the start as it is.
+        start: Initial grids; voxels further than two from any with density stay empty.
+        steps: Optimiser steps; 0 returns the start unchanged.
         rays: Rays per step.
-        seed: Of the rays and backgrounds.
+        seed: Seed of the rays and backgrounds.
         progress: Called after each step with the finished fraction and a text.
         max_seconds: Stop after this much time, if sooner [s]. The learning rate falls with the finished fraction, so that a fit
             that is stopped by time ends as smoothly as one that is stopped by steps.
-        learning_rate: Of Adam, at the start.
+        learning_rate: Adam's rate at the start.
 
     Raises:
-        FitError: Too few pictures, none shows the object, or none looks at the box.
+        FitError: Too few pictures, or none shows the object or looks at the box.
     """
     views.refuse_useless()
     batches = RayBatches(views, start.box_min, start.box_max, seed)
@@ -168,7 +168,7 @@ class _Field:
     def grids(self) -> ObjectGrids:
         with torch.no_grad():
             share = self._share().numpy()
-            # What lets through more than nearly everything is empty: it costs time in every picture.
+            # A voxel that lets nearly everything through is made empty: it costs time in every picture.
             filled = share >= _FAINT
             share = np.where(filled, share, np.minimum(share, 0.0))
             # Further out, negative values change nothing.

@@ -1,4 +1,4 @@
-"""Objects that need no file: a fire hydrant and a small car, built from turned and extruded outlines."""
+"""Objects without a file: a fire hydrant and a small car, built from turned and extruded outlines."""
 
 from __future__ import annotations
 

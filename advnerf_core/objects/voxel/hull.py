@@ -1,4 +1,4 @@
-"""Where an object may be, from its silhouettes: the visual hull, which is where a fit to photographs starts."""
+"""The visual hull of an object from its silhouettes, where a fit to photographs starts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _SEEN_THROUGH = 0.1
 _COARSE, _FINE = 48, 96
 _MARGIN_VOXELS = 1
 _ROUNDING = 1e-6
-# The hull is never smaller than the object, so its border starts half transparent and may go.
+# The hull is never smaller than the object, so its border starts half transparent and may vanish.
 _START_SHARE = 0.5
 
 
@@ -21,7 +21,7 @@ def visual_hull(views: PosedRgba, resolution: int = 64) -> ObjectGrids:
     """Grids over the box around the hull, half dense inside it, in the mean colour of the pictures.
 
     Args:
-        views: Pictures from around the object; where one shows nothing, nothing is.
+        views: Pictures from around the object; space that one of them shows empty is empty.
         resolution: Voxels along the longest side of the box.
 
     Raises:
@@ -35,10 +35,10 @@ def visual_hull(views: PosedRgba, resolution: int = 64) -> ObjectGrids:
             "expected silhouettes that agree on an object, they have no point in common: are the poses right?"
         )
     low, high = _box_of(coarse, centre - radius, 2 * radius / _COARSE)
-    # Once more in finer cells: voxels beside the object are wasted.
+    # Repeat with finer cells: voxels beside the object are wasted.
     step = float((high - low).max()) / _FINE
     fine = _carve(views, low, step, tuple(np.ceil((high - low) / step).astype(int)))
-    if fine.any():  # a thread may lie between the cells' centres
+    if fine.any():  # a thin thread may lie between the cells' centres
         low, high = _box_of(fine, low, step)
     voxel = float((high - low).max()) / (resolution - 2 * _MARGIN_VOXELS)
     counts = np.ceil((high - low) / voxel - _ROUNDING).astype(int) + 2 * _MARGIN_VOXELS

@@ -1,8 +1,8 @@
-"""Textured triangle meshes as plain arrays: what a GLB file, or a generator, says about the surface of an object.
+"""Textured triangle meshes as plain arrays: the surface of an object from a GLB file or a generator.
 
-What is kept is what voxelising and drawing need: triangles, a UV coordinate for each of their corners, and one texture for each
-part. Vertex colours and plain materials become textures of a part as well (one texel per colour), so that there is one way to ask
-for the colour of a surface point. `mesh_files` reads files.
+It keeps the data that voxelising and drawing need: triangles, a UV coordinate for each of their corners, and one texture for each
+part. Vertex colours and plain materials become textures of a part as well (one texel per colour), so that there is one way to look up
+the colour of a surface point. `mesh_files` reads files.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from numpy.typing import NDArray
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Array
 
-# glTF says y up; what robots drive among has z up.
+# glTF has y up; robot worlds have z up.
 _Z_UP_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 _SANE_SIZE = (1e-6, 1e6)
 
 
 class MeshError(AdvnerfError, ValueError):
-    """A mesh cannot be read or has no surface that an object could be made of."""
+    """A mesh cannot be read or has no surface to make an object of."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeshPart:
-    """Triangles that share one texture.
+    """Triangles with a common texture.
 
     Attributes:
         triangles: Corners ``[F, 3, 3]``, in the mesh's unit.
@@ -44,9 +44,9 @@ class SurfaceMesh:
     """The surface of an object, z up, its base in the plane z = 0, its axis at the origin.
 
     Attributes:
-        parts: Its parts [m].
-        notes: What of its file it does not show, in sentences.
-        sha256: Hash of its file and of all files that this names; empty for a mesh that was made.
+        parts: Parts with their textures [m].
+        notes: Sentences about content of its file that is left out.
+        sha256: Hash of its file and of all files that this names; empty for a generated mesh.
     """
 
     parts: tuple[MeshPart, ...]
@@ -66,7 +66,7 @@ class SurfaceMesh:
         return np.asarray(high - low)
 
     def scaled(self, factor: float) -> SurfaceMesh:
-        """The same, larger by a factor."""
+        """The same mesh, larger by a factor."""
         if factor == 1.0:
             return self
         parts = (MeshPart(part.triangles * factor, part.uv, part.texture) for part in self.parts)

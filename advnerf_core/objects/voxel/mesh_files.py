@@ -1,6 +1,6 @@
-"""Mesh files: what trimesh reads, with what each format means by up, by length and by colour, and with all files that it names.
+"""Mesh files: read by trimesh, with each format's up axis, unit and colour space, and with all files that they name.
 
-Formats differ in what they say. glTF fixes metres, y up and linear colour factors; OBJ, PLY and STL say none of it.
+glTF fixes metres, y up and linear colour factors; OBJ, PLY and STL fix none of these.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from advnerf_core.objects.voxel.mesh import MeshError, MeshPart, SurfaceMesh, pa
 UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
 _GLTF = (".glb", ".gltf")
 _GREY = (0.6, 0.6, 0.6)
-# What is put into a scene is larger than a nail and smaller than a stadium; other sizes come from another unit.
+# An object of a scene is larger than a nail and smaller than a stadium; other sizes come from another unit.
 _SANE_SIDE_M = (0.01, 100.0)
 # Extensions that change neither shape nor base colour, or that trimesh reads.
 _KNOWN_EXTENSIONS = ("KHR_materials_", "KHR_lights_", "EXT_texture_webp", "KHR_xmp")
@@ -34,17 +34,17 @@ _TRANSPARENT = 250
 def load_mesh(
     path: Path, up: str | None = None, height_m: float | None = None, unit: str | None = None
 ) -> SurfaceMesh:
-    """Read a mesh file (GLB, OBJ, PLY, STL, ... whatever trimesh reads).
+    """Read a mesh file (GLB, OBJ, PLY, STL, ... all formats of trimesh).
 
     Args:
-        path: The file; textures and the scene graph's transforms are taken over.
-        up: Which axis of the file points up, ``"z"`` or ``"y"``; None: y for glTF, which says so, z for the others.
-        height_m: Scale to this height [m], whatever the unit.
-        unit: The file's unit of length: ``mm``, ``cm``, ``m`` or ``in``; None: the metre for glTF, whose unit it is.
+        path: The file; its textures and the scene graph's transforms are applied.
+        up: Up axis of the file, ``"z"`` or ``"y"``; None: y for glTF, z for the others.
+        height_m: Scale to this height [m], regardless of the unit.
+        unit: The file's unit of length: ``mm``, ``cm``, ``m`` or ``in``; None: the metre for glTF.
 
     Raises:
-        MeshError: No file, not a mesh, no triangles, an image that it names is missing or broken, coordinates that are not finite, a
-            unit that neither format nor caller say, or a size no object has.
+        MeshError: The file is missing, not a mesh or without triangles; an image that it names is missing or broken; coordinates are not
+            finite; the unit is unknown; or the size is impossible for an object.
     """
     if unit is not None and unit not in UNITS_M:
         raise MeshError(f"expected a unit of {', '.join(UNITS_M)}, got {unit!r}")
@@ -66,13 +66,13 @@ def load_mesh(
 
 
 def read_mesh_files(path: Path) -> tuple[InputFiles, dict[str, bytes]]:
-    """A mesh file with all files that it names: materials, buffers and images. Each is read once; links and other folders are refused.
+    """A mesh file with all files that it names: materials, buffers and images. Each is read once; links and other folders are rejected.
 
     Returns:
-        The files, and the content of those that are named, under the names that the mesh file uses.
+        The files, and the content of the named ones, under the names in the mesh file.
 
     Raises:
-        MeshError: Some of them cannot be read; all are named.
+        MeshError: Some of them cannot be read; the message names all of these.
     """
     if not path.is_file():
         raise MeshError(f"expected a mesh file at {path}, found none")
@@ -156,7 +156,7 @@ def _read_named_by_gltf(path: Path, content: bytes, read: _Read) -> None:
 
 
 def _refuse_broken_images(files: InputFiles) -> None:
-    """Refuse images that cannot be decoded: trimesh leaves them out, and shows white."""
+    """Reject images that cannot be decoded: trimesh would leave them out, and show white."""
     from PIL import Image
 
     path = files.path
@@ -203,7 +203,7 @@ def _gltf_header(path: Path, data: bytes) -> dict[str, Any]:
 
 
 def _geometries(files: InputFiles, named: dict[str, bytes]) -> list[Any]:
-    """Geometries of what was read; trimesh opens no file itself."""
+    """Geometries of the files; trimesh opens no file itself."""
     import trimesh
 
     path = files.path
@@ -211,7 +211,7 @@ def _geometries(files: InputFiles, named: dict[str, bytes]) -> list[Any]:
         kind = path.suffix.lower().removeprefix(".")
         scene = trimesh.load_scene(io.BytesIO(files.content), file_type=kind, resolver=named)
         dumped = scene.dump(concatenate=False)
-    except Exception as error:  # trimesh's readers raise whatever they stumble over
+    except Exception as error:  # trimesh's readers raise any exception
         raise MeshError(
             f"cannot read {path} as a mesh ({type(error).__name__}: {error}); export it again"
         ) from error
@@ -244,7 +244,7 @@ def _names_an_image(material: Any) -> bool:
 
 
 def _plain_colour(material: Any, linear: bool) -> Array:
-    """A material's colour without an image, in display values; grey where there is no material."""
+    """A material's colour without an image, in display values; grey without a material."""
     if material is not None and linear:
         factor = getattr(material, "baseColorFactor", None)
         return np.ones(3) if factor is None else _displayed(np.asarray(factor)[:3] / 255.0, True)

@@ -1,6 +1,6 @@
-"""An object in its own frame, as it is kept in an object file and placed in scenes.
+"""An object in its own frame, for object files and scenes.
 
-The frame: origin in the middle of the base, z up, x forward for what has a front; metres, unless placed with a scale.
+The frame: origin in the middle of the base, z up, x forward if it has a front; metres, unless placed with a scale.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _HIDDEN_RGB = (0.5, 0.5, 0.5)
 
 
 class ObjectFileError(AdvnerfError, ValueError):
-    """An object file cannot be read, or is not one."""
+    """An object file cannot be read or is invalid."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class ObjectModel:
     """An object that can be placed.
 
     Attributes:
-        about: Where it comes from: source, resolution, fit, software version (JSON types).
+        about: Origin: source, resolution, fit, software version (JSON types).
     """
 
     name: str
@@ -49,13 +49,13 @@ class ObjectModel:
 
     @property
     def size_m(self) -> Array:
-        """Extent of the part that is not empty, along x, y, z [m]."""
+        """Extent of the non-empty part along x, y, z [m]."""
         low, high = self.solid_box
         return np.asarray(high - low)
 
     @property
     def solid_box(self) -> tuple[Array, Array]:
-        """Corners of the box around everything that is not empty [m]."""
+        """Corners of the box around the non-empty part [m]."""
         filled = np.argwhere(self.grids.density > 0)
         return (
             self.grids.box_min + self.grids.voxel * filled.min(axis=0),
@@ -64,7 +64,7 @@ class ObjectModel:
 
     @cached_property
     def slots(self) -> NDArray[np.int32]:
-        """Row of theta for each voxel that can be seen; all others share the last, fixed row. ``[nx, ny, nz]``."""
+        """Row of theta for each visible voxel; all others share the last, fixed row. ``[nx, ny, nz]``."""
         near = ndimage.binary_dilation(self.grids.density > 0, np.ones((3, 3, 3)))
         full = self.grids.density >= 0.9 * OPAQUE_PER_VOXEL / self.grids.voxel
         seen = near & ~ndimage.binary_erosion(full, iterations=_DEEP_VOXELS)
@@ -73,7 +73,7 @@ class ObjectModel:
         return slots
 
     def placed(self, T_world_from_object: ArrayLike, scale: float = 1.0) -> VoxelGridObject:
-        """The object at a pose ``[4, 4]``, with ``scale`` world metres per metre of its own."""
+        """The object at a pose ``[4, 4]``, with ``scale`` world metres per metre of the object."""
         pose = np.asarray(T_world_from_object, dtype=np.float64)
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
             raise ObjectFileError(
@@ -117,7 +117,7 @@ def load_object(path: Path) -> ObjectModel:
     """Read an object file.
 
     Raises:
-        ObjectFileError: No file, not an object file, or values that no object has.
+        ObjectFileError: The file is missing, not an object file, or has invalid values.
     """
     if not path.is_file():
         raise ObjectFileError(

@@ -1,6 +1,6 @@
 """Pictures of an object with transparency, and batches of their rays.
 
-Pictures stay in 8 bits: 100 of 800 x 800 are 256 MB. Rays are made for a batch of pixels at a time and are never all in memory.
+Pictures stay in 8 bits: 100 of 800 x 800 are 256 MB. Rays are made for one batch of pixels at a time, never all at once.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Array, Pinhole, invert_transform, transform_points
 
 _FEWEST = 3
-# A picture's window holds the box's corners; less than one ray in so many meets the box only if the box is all but invisible.
+# A picture's window contains the box's corners; less than one ray in this many meets the box only if the box is all but invisible.
 _MOST_DRAWS = 200
 
 
 class FitError(AdvnerfError, ValueError):
-    """Pictures that no object can be fitted to."""
+    """No object can be fitted to the pictures."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,10 +72,10 @@ class PosedRgba:
         return PosedRgba(images, poses, tuple(self.pinholes[i] for i in at))
 
     def refuse_useless(self) -> None:
-        """Refuse what no object can be fitted to.
+        """Raise for pictures that no object can be fitted to.
 
         Raises:
-            FitError: Too few pictures, or nothing in them.
+            FitError: Too few pictures, or all are empty.
         """
         if len(self.images) < _FEWEST:
             raise FitError(f"expected at least {_FEWEST} pictures around the object, got {len(self.images)}")
@@ -87,10 +87,10 @@ def load_pictures(listed: PosedImages, size: tuple[int, int] | None = None) -> P
     """Read cut-out pictures of a data set into one array of bytes.
 
     Args:
-        size: ``(width, height)`` [px] to bring all pictures to by area averaging; None keeps the size on disk.
+        size: ``(width, height)`` [px] to resample all pictures to by area averaging; None keeps the size on disk.
 
     Raises:
-        FitError: The pictures have no transparency, or are not of one size.
+        FitError: The pictures have no transparency, or differ in size.
         DatasetError: A picture cannot be read.
     """
     frames = listed.frames
@@ -132,7 +132,7 @@ def _write_premultiplied(view: LoadedView, out: NDArray[np.uint8]) -> None:
 
 
 class RayBatches:
-    """Draws random rays that meet a box, with the pixels that they belong to.
+    """Draws random rays that meet a box, with their pixels.
 
     All rays that meet the box are equally likely. Pixels are drawn from the rectangle that the box's corners span in each picture;
     rays that miss the box are dropped.

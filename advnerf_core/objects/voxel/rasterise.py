@@ -1,6 +1,6 @@
-"""Pictures of a mesh by a depth buffer: what a voxel object made from the mesh is fitted to and judged by.
+"""Pictures of a mesh by a depth buffer: targets for fitting and judging a voxel object made from the mesh.
 
-Unlit, as the objects of an attack are: a pixel shows the texture. Several rays a pixel are averaged, over colour and coverage.
+Unlit, like the objects of an attack: a pixel shows the texture. Several rays a pixel are averaged, over colour and coverage.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from advnerf_core.objects.voxel.mesh import SurfaceMesh
 from advnerf_core.parallel import run_slots, slot_bounds
 
 _NEAR_M = 1e-3
-_BANDS = 16  # of rows, each drawn by one thread
+_BANDS = 16  # bands of rows, each drawn by one thread
 
 
 def draw_mesh(
@@ -66,7 +66,7 @@ def _draw(
 
 
 def _atlas(mesh: SurfaceMesh) -> tuple[Any, Any, Any]:
-    """All textures in one list of texels, with the shape and the first texel of each."""
+    """All textures as one list of texels, with the shape and the first texel of each."""
     shapes = np.array([part.texture.shape[:2] for part in mesh.parts], dtype=np.int64)
     firsts = np.concatenate([[0], np.cumsum(shapes.prod(axis=1))[:-1]]).astype(np.int64)
     return np.concatenate([part.texture.reshape(-1, 3) for part in mesh.parts]), shapes, firsts
@@ -91,7 +91,7 @@ def _draw_band(
     top: int,
     bottom: int,
 ) -> None:
-    """Rows from ``top`` to before ``bottom``."""
+    """Draw rows from ``top`` to before ``bottom``."""
     width = depth.shape[1]
     p = np.empty((3, 2))
     for f in range(len(corners)):

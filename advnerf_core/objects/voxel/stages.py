@@ -15,7 +15,7 @@ from advnerf_core.objects.voxel.pictures import PosedRgba
 from advnerf_core.objects.voxel.voxelise import OPAQUE_PER_VOXEL, ObjectGrids
 
 _COARSEST = 32
-# The last stage, which is the one that counts, gets this share of the steps or of the time.
+# Share of the steps or of the time of the last stage, which matters most.
 _LAST_SHARE = 0.6
 # A grid that starts from a fit needs no large steps: they tear thin voxels open, which no ray closes again.
 _REFINING = 0.15
@@ -40,7 +40,7 @@ def stage_shares(count: int) -> list[float]:
 def resampled(grids: ObjectGrids, onto: ObjectGrids) -> ObjectGrids:
     """Interpolate density and colours at the voxel centres of another grid.
 
-    Density is taken as a share of what makes a voxel opaque, so that it does not depend on the size of the voxels. Voxels stay empty
+    Density is interpolated relative to an opaque voxel's, so that it does not depend on the size of the voxels. Voxels stay empty
     where the other grid has no density within two voxels.
     """
     axes = [
@@ -75,7 +75,7 @@ def fit_in_stages(
         steps: Optimiser steps over all stages.
         progress: Called with the finished fraction and a text.
         max_seconds: Stop after this much time, if sooner [s]. Time that a stage does not use goes to the later ones.
-        sizes: Resolutions of the stages, the last of which is ``resolution``; None: `resolutions`.
+        sizes: Resolutions of the stages, ending with ``resolution``; None: `resolutions`.
     """
     sizes = list(sizes or resolutions(resolution))
     shares = stage_shares(len(sizes))
@@ -103,7 +103,7 @@ def fit_in_stages(
 def _part(
     progress: Callable[[float, str], None] | None, done: float, share: float
 ) -> Callable[[float, str], None] | None:
-    """The progress of one stage as that of the whole fit."""
+    """Converts the progress of one stage to the progress of the whole fit."""
     if progress is None:
         return None
     return lambda fraction, text: progress(min(1.0, done + share * fraction), text)

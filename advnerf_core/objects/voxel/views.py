@@ -1,4 +1,4 @@
-"""Cameras around an object: for fitting it, judging it, and showing it."""
+"""Cameras around an object, for fitting, judging and showing it."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ def look_at(eye: Array, target: Array) -> Array:
 
 
 def viewing_lens(pixels: int) -> Pinhole:
-    """A square picture of 35 degrees."""
+    """Lens of a square picture of 35 degrees."""
     f = 0.5 * pixels / np.tan(FIELD_OF_VIEW_RAD / 2)
     return Pinhole(pixels, pixels, f, f, pixels / 2, pixels / 2)
 
 
 def ring(box: tuple[Array, Array], count: int) -> Array:
-    """Poses ``[count, 4, 4]`` on a circle around a box that they hold in view."""
+    """Poses ``[count, 4, 4]`` on a circle around a box, with the box in view."""
     azimuth = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
     return _poses(box, azimuth, np.full(count, _RING_RAD, dtype=np.float64))
 
 
 def dome(box: tuple[Array, Array], count: int, phase: float = 0.0) -> Array:
-    """Poses ``[count, 4, 4]`` spread evenly over the part of a sphere that a car's camera and a person's see (a golden spiral)."""
+    """Poses ``[count, 4, 4]`` spread evenly over the part of a sphere visible to a car's camera and a person (a golden spiral)."""
     k = (np.arange(count) + 0.5) / count
     sine = np.sin(_LOWEST_RAD) + k * (np.sin(_HIGHEST_RAD) - np.sin(_LOWEST_RAD))
     azimuth = 2.0 * np.pi * ((np.arange(count) + phase) * 0.6180339887498949 % 1.0)

@@ -1,7 +1,7 @@
-"""Voxel grids from a mesh: how dense each voxel is, and which colour it has.
+"""Voxel grids from a mesh: density and colour of each voxel.
 
-Meshes in the wild have holes, doubled walls and inner parts, so inside and outside are not asked of the triangles. The surface is
-drawn into a finer grid; inside is what cannot be reached from outside without crossing it, or what is shut in on five of its six
+Meshes in the wild have holes, doubled walls and inner parts, so inside and outside are not derived from the triangles. The surface is
+drawn into a finer grid; inside is any cell that cannot be reached from outside without crossing it, or that is enclosed on five of its six
 sides (a hydrant that is open below); the signed distance to that body gives the density of the coarse voxels.
 """
 
@@ -19,10 +19,10 @@ from advnerf_core.geometry import Array
 from advnerf_core.objects.voxel.mesh import MeshError, SurfaceMesh
 
 MAX_RESOLUTION = 128
-# Extinction inside, per voxel: what is behind one voxel of it shows through by less than 1e-8.
+# Extinction inside, per voxel: anything behind one voxel of it shows through by less than 1e-8.
 OPAQUE_PER_VOXEL = 20.0
 _PADDING = 2
-# An open shell counts as filled where so many of the six axis directions meet its surface.
+# An open shell counts as filled if this many of the six axis directions meet its surface.
 _SHUT_IN = 5
 
 
@@ -53,11 +53,11 @@ def voxelise(mesh: SurfaceMesh, resolution: int = 64) -> ObjectGrids:
     """Density and colour grids of a mesh.
 
     Args:
-        mesh: The mesh, in metres, which become the object's units.
+        mesh: The mesh [m]; metres become the object's units.
         resolution: Voxels along the longest side of the box, padding included, 8 to 128.
 
     Raises:
-        MeshError: A resolution out of range, or a mesh without any surface.
+        MeshError: A resolution out of range, or a mesh without a surface.
     """
     if not 8 <= resolution <= MAX_RESOLUTION:
         raise MeshError(f"expected 8 to {MAX_RESOLUTION} voxels along the longest side, got {resolution}")
@@ -72,7 +72,7 @@ def voxelise(mesh: SurfaceMesh, resolution: int = 64) -> ObjectGrids:
         raise MeshError("expected a mesh with a surface, all its triangles are degenerate")
     # The body ends in the middle of its outermost fine cells, the surface at their border, half a fine cell further out.
     ramp = np.clip((0.5 - _coarse(_signed_distance(surface), fine)) / fine, -1.0, 1.0)
-    # Where nothing is near, it is plainly empty: such cells are leapt over.
+    # Cells far from the surface are plainly empty, and rays skip them.
     ramp[~ndimage.binary_dilation(ramp > 0.0, np.ones((3, 3, 3)))] = 0.0
     density = (OPAQUE_PER_VOXEL / voxel * ramp).astype(np.float32)
     return ObjectGrids(density, _spread_colours(sums, hits), box_min, box_min + voxel * counts)
@@ -98,7 +98,7 @@ def _signed_distance(surface: NDArray[np.bool_]) -> Array:
 
 
 def _blocked_sides(surface: NDArray[np.bool_]) -> NDArray[np.int8]:
-    """In how many of the six axis directions each cell meets the surface."""
+    """Number of axis directions, of six, in which each cell meets the surface."""
     count = np.zeros(surface.shape, dtype=np.int8)
     for axis in range(3):
         count += np.logical_or.accumulate(surface, axis=axis)
@@ -116,7 +116,7 @@ def _coarse(values: Array, fine: int) -> Array:
 
 
 def _spread_colours(sums: Array, hits: Array) -> NDArray[np.float32]:
-    """Mean colours where there are any, the nearest of these elsewhere, so that interpolation never mixes in black."""
+    """Mean colours where they exist, else the nearest one, so that interpolation never mixes in black."""
     nearest = ndimage.distance_transform_edt(hits == 0, return_distances=False, return_indices=True)
     mean = sums / np.maximum(hits, 1)[..., None]
     return np.asarray(mean[tuple(nearest)], dtype=np.float32)
@@ -143,7 +143,7 @@ def _draw(
         for k in range(3):
             lengths[k] = np.sqrt(((c[(k + 1) % 3] - c[k]) ** 2).sum())
         longest = int(np.argmax(lengths))
-        # The corner across from the longest edge has the two shorter ones.
+        # The corner opposite the longest edge joins the two shorter ones.
         i0, i1, i2 = (longest + 2) % 3, longest, (longest + 1) % 3
         n1 = int(2.5 * lengths[(longest + 2) % 3] / cell) + 1
         n2 = int(2.5 * lengths[(longest + 1) % 3] / cell) + 1
