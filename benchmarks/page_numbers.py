@@ -26,12 +26,13 @@ _HEAD_LINES = 8
 _GENERATED = ("results.md", "api.md")
 # How-to and reference pages: their other numbers are settings, limits, formats and sizes of devices.
 SETTINGS = frozenset(
-    """attacks.md bag_format.md bags.md calibration.md cameras.md carla.md cars.md driving.md faults.md first_day.md foreign_worlds.md
-    intersection.md methods.md objects.md operator_page.md performance.md policies.md policy_contract.md poses.md room.md ros2.md
-    scene_files.md trials.md troubleshooting.md two_hosts.md victims.md was_not_run.md wiring.md worlds.md""".split()  # noqa: SIM905
+    """attacks.md audit.md bag_format.md bags.md calibration.md cameras.md carla.md cars.md driving.md evidence.md experiments.md
+    faults.md first_day.md foreign_worlds.md intersection.md methods.md objects.md operator_page.md performance.md policies.md
+    policy_contract.md poses.md room.md ros2.md scaling.md scene_files.md scenes.md trials.md troubleshooting.md two_hosts.md
+    victims.md was_not_run.md wiring.md worlds.md""".split()  # noqa: SIM905
 )
 # Settings on pages that lead to results.
-_SETTINGS_ON = {"README.md": {("250", "ms")}, "evidence.md": {("2", "kB")}}
+_SETTINGS_ON = {"README.md": {("250", "ms")}}
 _UNIT = r"%|dB|ms|us|s|min|h|x|×|mm|cm|m|MB|GB|kB|MiB|GiB|rad|degrees|Hz"  # noqa: RUF001
 _NUMBER = re.compile(rf"(?<![\w.#/=-])(-?\d[\d,]*(?:\.\d+)?) ?({_UNIT})(?![\w/])")
 _CODE = re.compile(r"^(?: {4}.*|```[\s\S]*?```)$|`[^`]*`|\]\([^)]*\)", re.MULTILINE)

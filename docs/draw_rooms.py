@@ -1,7 +1,7 @@
 """Draws the rooms of the house from the code: ``make rooms`` (or ``python docs/draw_rooms.py``).
 
 A room is a sub-package, or a module that stands beside them; an arrow is an import, wherever in the file it stands, those for type
-checkers left out. Arrows that follow from others are not drawn. Writes ``docs/rooms_PACKAGE.svg`` and the tables of ``docs/architecture.md``.
+checkers left out. Arrows that follow from others are not drawn. Writes ``docs/rooms_PACKAGE.svg`` and the lists of ``docs/architecture.md``.
 """
 
 from __future__ import annotations
@@ -34,33 +34,32 @@ class House:
     """Rooms of a package.
 
     Attributes:
-        about: What each room holds, by name.
-        files: How many modules each room has.
+        about: What each room holds, by name; single modules are left out.
         arrows: Which rooms each one imports from.
     """
 
     about: dict[str, str]
-    files: dict[str, int]
     arrows: dict[str, frozenset[str]]
 
 
 def survey(package: str, graph: grimp.ImportGraph) -> House:
     """Read the rooms of a package from its imports."""
     about: dict[str, str] = {}
-    files: dict[str, int] = {}
     arrows: dict[str, set[str]] = {}
     for module in sorted(graph.modules):
         name = _room(package, module)
         if name is None:
             continue
-        files[name] = files.get(name, 0) + (not (ROOT / module.replace(".", "/")).is_dir())
         arrows.setdefault(name, set())
-        about.setdefault(name, "One process per file." if name == PROCESSES else _first_line(package, name))
+        if name == PROCESSES:
+            about[name] = "One process per file."
+        elif (ROOT / package / name).is_dir():
+            about.setdefault(name, _first_line(package, name))
         for imported in graph.find_modules_directly_imported_by(module):
             other = _room(package, imported)
             if other is not None and other != name:
                 arrows[name].add(other)
-    return House(about, files, {name: frozenset(found) for name, found in arrows.items()})
+    return House(about, {name: frozenset(found) for name, found in arrows.items()})
 
 
 def _room(package: str, module: str) -> str | None:
@@ -73,10 +72,10 @@ def _room(package: str, module: str) -> str | None:
 
 
 def _first_line(package: str, name: str) -> str:
-    folder = ROOT / package / name
-    file = folder / "__init__.py" if folder.is_dir() else folder.with_suffix(".py")
+    file = ROOT / package / name / "__init__.py"
     docstring = ast.get_docstring(ast.parse(file.read_text(encoding="utf-8"))) or ""
-    return docstring.split("\n\n")[0].replace("\n", " ").replace("``", "`")
+    sentence, stop, _ = docstring.split("\n\n")[0].replace("\n", " ").replace("``", "`").partition(". ")
+    return sentence + stop.strip()
 
 
 def reduced(arrows: Mapping[str, frozenset[str]]) -> dict[str, set[str]]:
@@ -188,14 +187,10 @@ def _mean(values: Sequence[float], otherwise: float) -> float:
     return sum(values) / len(values) if values else otherwise
 
 
-def table(house: House) -> str:
-    """The rooms as a Markdown table, the roof first."""
-    lines = ["| room | files | what it holds | imports from |", "|---|---|---|---|"]
-    for row in floors(house.arrows):
-        for name in row:
-            imports = ", ".join(f"`{other}`" for other in sorted(house.arrows[name])) or "-"
-            lines.append(f"| `{name}` | {house.files[name]} | {house.about[name]} | {imports} |")
-    return "\n".join(lines)
+def listed(house: House) -> str:
+    """What the rooms hold as a Markdown list, the roof first."""
+    names = [name for row in floors(house.arrows) for name in row if name in house.about]
+    return "\n".join(f"- `{name}`: {house.about[name]}" for name in names)
 
 
 def written() -> dict[Path, str]:
@@ -207,12 +202,12 @@ def written() -> dict[Path, str]:
         texts[ROOT / "docs" / f"rooms_{package}.svg"] = draw(house)
         begin, end = f"<!-- rooms of {package} -->", f"<!-- end of rooms of {package} -->"
         head, _, rest = page.partition(begin)
-        page = f"{head}{begin}\n{table(house)}\n{end}{rest.partition(end)[2]}"
+        page = f"{head}{begin}\n{listed(house)}\n{end}{rest.partition(end)[2]}"
     return {**texts, PAGE: page}
 
 
 def main() -> None:
-    """Write the pictures and the tables."""
+    """Write the pictures and the lists."""
     for file, text in written().items():
         write_atomically(file, text)
         print(f"wrote {file.relative_to(ROOT)}")
