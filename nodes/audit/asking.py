@@ -14,17 +14,17 @@ T = TypeVar("T", str, float)
 
 
 class UnansweredError(AdvnerfError):
-    """A question without a default, and nobody to ask."""
+    """A question has no default, and no user can be asked."""
 
 
 def answer(given: T | None, option: str, question: str, kind: Callable[[str], T]) -> T:
-    """What an option says, or else a person at the terminal.
+    """The value of an option, or else the answer of a user at the terminal.
 
     Args:
         given: Value of the option; None if it was left out.
-        option: Its name.
-        question: What is asked, with the unit.
-        kind: Type of the answer.
+        option: Name of the option.
+        question: Question for the user, with the unit.
+        kind: Converts the answer.
 
     Raises:
         UnansweredError: The option was left out, and there is no terminal.

@@ -1,4 +1,4 @@
-"""Cars that an audit knows by name, and where their driving camera usually sits; a car of one's own is a file."""
+"""Cars that an audit knows by name, with the usual place of their driving camera; a user's own car is a file."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ class AuditedCar(StrictModel):
     """A car and its camera.
 
     Attributes:
-        car: How it moves.
-        camera_ahead_m: Camera ahead of the rear axle [m].
-        camera_left_m: Camera left of the car's middle [m].
-        camera_height_m: Camera above the ground [m]; None is asked for.
+        car: Kinematics of the car.
+        camera_ahead_m: Position of the camera ahead of the rear axle [m].
+        camera_left_m: Position of the camera left of the car's middle [m].
+        camera_height_m: Height of the camera above the ground [m]; None asks the user.
     """
 
     car: DrivenCarConfig
@@ -34,7 +34,7 @@ def _car(speed_mps: float, wheelbase_m: float | None, largest_rad: float, ahead_
     return AuditedCar(car=car, camera_ahead_m=ahead_m)
 
 
-# Nominal values, for cars that nobody has measured.
+# Nominal values, not measured ones.
 CARS: dict[str, AuditedCar] = {
     "racecarj": _car(0.8, 0.25, 0.26, 0.3),  # RacecarJ/racecar, branch VESC6: racecar-v2/vesc.yaml
     "roboracer": _car(1.5, 0.33, 0.42, 0.27),  # f1tenth_gym's default vehicle: lf + lr, s_max
@@ -45,10 +45,10 @@ CARS: dict[str, AuditedCar] = {
 
 
 def car_of(text: str) -> AuditedCar:
-    """A car by its name, or of a YAML file with the keys of `AuditedCar`.
+    """A car by its name, or from a YAML file with the keys of `AuditedCar`.
 
     Raises:
-        ConfigError: There is no such car.
+        ConfigError: The car is unknown, or its file is invalid.
     """
     if text in CARS:
         return CARS[text]

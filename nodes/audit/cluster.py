@@ -19,19 +19,19 @@ HERE = "here"
 
 @dataclass(frozen=True)
 class Cluster:
-    """Where the searches of a round run beside each other.
+    """The cluster that runs the searches of a round in parallel.
 
     Attributes:
-        address: ``HOST:PORT`` of the head, ``auto`` for the one of this machine, or ``here`` to start one.
+        address: ``HOST:PORT`` of the head, ``auto`` for this machine's, or ``here`` to start one.
     """
 
     address: str
 
     def search(self, searches: Sequence[SearchJob]) -> None:
-        """Run searches until all have left their results in their folders.
+        """Run searches until all have written their results to their folders.
 
         Raises:
-            ConfigError: There is no cluster, or a machine of it cannot run a search.
+            ConfigError: The cluster does not answer, or a machine in it cannot run a search.
         """
         with ray_session("" if self.address == HERE else self.address, os.cpu_count() or 1):
             import ray

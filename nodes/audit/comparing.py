@@ -1,4 +1,4 @@
-"""Compares a policy with an earlier audit: it is driven from the same starts past nothing, the plain object, and what was found then."""
+"""Compares a policy with an earlier audit: it drives from the same starts past nothing, the plain object, and the object found then."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ _ARMS = (NO_OBJECT, PLAIN_OBJECT, FOUND)
 
 
 class Before:
-    """An earlier audit, with its drives and the object that it found.
+    """An earlier audit, with its drives and its object.
 
     Args:
         file: Its ``audit.json``.
 
     Raises:
-        ConfigError: It judged nothing, or its folder lacks the drives or the attack.
+        ConfigError: It judged no object, or its folder lacks the drives or the attack.
     """
 
     def __init__(self, file: Path) -> None:
@@ -48,18 +48,18 @@ class Before:
 
     @property
     def object(self) -> AuditedObject:
-        """What was found."""
+        """The object that was found."""
         assert self.result.strongest is not None
         return self.result.strongest.object
 
     def listed(self, kind: str) -> dict[str, Any]:
-        """The object as experiment files list it.
+        """The object in the form of experiment files.
 
         Args:
-            kind: The kind that is asked about now, with the path of a file.
+            kind: The current kind of object, with the path of a file.
 
         Raises:
-            ConfigError: It is another kind.
+            ConfigError: The object is of another kind.
         """
         then = self.object
         if name_of(kind) != then.kind:
@@ -75,11 +75,11 @@ class Before:
         }
 
     def compare(self, now: Mapping[str, ArmDrives], evidence: Evidence, limit_m: float) -> AuditComparison:
-        """What changed, of the arm that got worst.
+        """The change of the arm that got worst.
 
         Args:
-            now: Drives past no object, the plain one and the one that was found then, from the starts of then.
-            evidence: Where they were driven.
+            now: Drives past no object, the plain one and the one found then, from the earlier starts.
+            evidence: Kind of the drives.
             limit_m: |CTE| beyond which the car has left its lane [m].
         """
         then = read_drives(self.folder).get(evidence)
@@ -98,5 +98,5 @@ class Before:
 
 
 def is_worse(comparison: AuditComparison) -> bool:
-    """Whether the policy leaves its path by more than then, beyond the margin."""
+    """Whether the policy leaves its path by more than before, beyond the margin."""
     return comparison.effect.low_m > comparison.margin_m

@@ -1,4 +1,4 @@
-"""Drives of an audit: past nothing, a plain object, a picture, or what a search found; in a learned scene, or in a world by its own car."""
+"""Drives of an audit: past nothing, a plain object, a picture, or an attack; in a learned scene, or in a world by its own car."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from nodes.experiment.steps.attack import attack_problem, from_measured_starts
 NO_OBJECT, PLAIN_OBJECT, PICTURE, FOUND = "no_object", "plain_object", "natural_picture", "object"
 # The same two under `camera_effects`.
 PLAIN_DISTURBED, FOUND_DISTURBED = "plain_object_disturbed", "object_disturbed"
-# Whether what was found survives another camera: as far as cheap cameras and their mounts differ from day to day.
+# Whether an attack survives another camera: variations like those of cheap cameras and their mounts from day to day.
 NOISE, GAIN, BRIGHTNESS, JITTER_RAD = 0.02, 0.1, 0.02, 0.01
-_JITTER = 0.04  # of the lane's half width
+_JITTER = 0.04  # relative to the lane's half width
 
 
 def with_starts(experiment: Experiment, count: int, seed: int) -> Experiment:
@@ -43,7 +43,7 @@ def with_starts(experiment: Experiment, count: int, seed: int) -> Experiment:
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """What the car meets.
+    """The objects of a group of drives.
 
     Attributes:
         shown: The objects.
@@ -55,12 +55,12 @@ class Arm:
 
 
 def arm_of(experiment: Experiment, name: str, found: Path | None = None) -> Arm:
-    """What one arm of an audit meets.
+    """One arm of an audit.
 
     Args:
-        experiment: With the object where it stands.
+        experiment: Experiment with the object at its place.
         name: ``no_object``, ``plain_object``, ``natural_picture`` or ``object``.
-        found: The attack file; of ``object`` alone.
+        found: The attack file, for ``object`` only.
     """
     if name == NO_OBJECT:
         return Arm(Shown((), torch.zeros(0, 3)))
@@ -74,14 +74,14 @@ def arm_of(experiment: Experiment, name: str, found: Path | None = None) -> Arm:
 
 
 def red_all_over(experiment: Experiment) -> Shown:
-    """The object in the reddest colour there is."""
+    """The object in the reddest possible colour."""
     plain = colour_space(experiment).plain
     red = torch.from_numpy(inverse_squash([1.0, 0.0, 0.0])).to(plain.colours.dtype)
     return replace(plain, colours=red.expand(plain.colours.shape).clone())
 
 
 def _picture(experiment: Experiment, space: ColourSpace) -> Tensor:
-    """Colours of the object that show a photograph of the place, of the middle of the first held-out view."""
+    """Colours of the object that show a photograph of the place, the middle of the first held-out view."""
     plain = space.plain.colours
     views = load_transforms(experiment.stage_folder("capture") / HELD_OUT, require_all=True).load()
     rgb = np.asarray(views.rgb[0])
@@ -91,7 +91,7 @@ def _picture(experiment: Experiment, space: ColourSpace) -> Tensor:
     if plain.ndim == 3:
         size = plain.shape[1], plain.shape[0]
         small = cv2.resize(square, size, interpolation=cv2.INTER_AREA)
-    else:  # of solid objects the voxels have no two directions: they take its colours in their order
+    else:  # the voxels of solid objects have no two directions: they take its colours in order
         index = np.linspace(0, square.shape[0] * square.shape[1] - 1, plain.shape[0]).astype(int)
         small = square.reshape(-1, 3)[index]
     return torch.from_numpy(inverse_squash(small / 255.0)).to(plain.dtype).reshape(plain.shape)
@@ -105,7 +105,7 @@ def camera_effects(limit_m: float, seed: int) -> Disturbances:
 def learned(
     experiment: Experiment, victim: str, arm: Arm, disturbances: Disturbances | None = None
 ) -> ArmDrives:
-    """Drives in the learned scene, as fast as searches see it, from the measured starts."""
+    """Drives in the learned scene, as searches render it, from the measured starts."""
     scenario = experiment.config.paths[0]
     policy = load_victim(experiment, victim)
     space = colour_space(experiment)
@@ -148,7 +148,7 @@ def _drives(experiment: Experiment, states: Sequence[Array], scores: Sequence[Dr
 
 
 def pictures_along(experiment: Experiment, states: Array, shown: Shown) -> Tensor:
-    """What the policy sees in the learned scene from car states ``[N, 3]``: ``[N, 3, H, W]`` in 0..1."""
+    """Policy images in the learned scene from car states ``[N, 3]``: ``[N, 3, H, W]`` in 0..1."""
     surrogate = shown.seen_by(colour_space(experiment).surrogate)
     poses = surrogate.camera_poses(torch.from_numpy(np.asarray(states, dtype=np.float64)))
     return surrogate.render(poses, shown.colours if shown.objects else None).images

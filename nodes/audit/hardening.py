@@ -1,4 +1,4 @@
-"""Frames that would help a policy that was driven off: what its camera saw past the object, and the steering that keeps the path."""
+"""Frames for hardening a policy that was driven off: its images past the object, labelled with the steering that keeps the path."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from nodes.audit.judging import Judged, open_world, seen_on
 
 FOLDER, LABELS = "harden", "labels.csv"
 _COLUMNS = ("image", "steering", "unit", "x_m", "y_m", "yaw_rad", "cte_m")
-# Drives whose frames are exported, those that were moved most.
+# Number of drives whose frames are exported, those with the largest effect.
 _DRIVES = 5
 
 
 def export_frames(judged: Judged, folder: Path) -> Path:
-    """Write the frames and their labels; nothing of the user's is trained.
+    """Write the frames and their labels; the user's policy is not trained.
 
     Args:
-        judged: With the drives past the object.
-        folder: Gets ``images`` and ``labels.csv``: left is positive, in the unit of the car's control.
+        judged: Result with the drives past the object.
+        folder: Folder for ``images`` and ``labels.csv``: left is positive, in the unit of the car's control.
 
     Returns:
         The file of labels.

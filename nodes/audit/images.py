@@ -1,4 +1,4 @@
-"""The posed photographs of a place, from what a user has: ``transforms.json``, a COLMAP model beside its images, photographs, or videos."""
+"""The posed photographs of a place, from the user's input: ``transforms.json``, a COLMAP model beside its images, photographs, or videos."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
 
 POSES, IMPORTED, REPORT = "transforms.json", "photos", "import.json"
-_EXTENT_M = 1.0  # of a set whose metre nobody knows; it is refused then
-_MOVEMENT, _MOST = 0.06, 300  # as of ``advnerf scene from-video``
+_EXTENT_M = 1.0  # of a set without a known metre, which is then rejected
+_MOVEMENT, _MOST = 0.06, 300  # as in ``advnerf scene from-video``
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,9 @@ class PosedPlace:
     """Photographs with poses.
 
     Attributes:
-        poses: Their ``transforms.json``.
-        kind: What the user gave.
-        scale: What the metre comes from.
+        poses: Path of their ``transforms.json``.
+        kind: Kind of the user's input.
+        scale: Source of the metre.
         ground_at_zero: Whether the ground is known to be at z = 0.
     """
 
@@ -39,17 +39,17 @@ class PosedPlace:
 
 
 def posed(given: Path, folder: Path, metric: MetricOptions) -> PosedPlace:
-    """The posed photographs of a place; what has none yet is imported into the audit's folder, once.
+    """The posed photographs of a place; input without poses is imported into the audit's folder, once.
 
     Args:
-        given: What the user gave.
-        folder: The audit's.
-        metric: What is known of lengths in the place.
+        given: The user's input.
+        folder: Folder of the audit.
+        metric: Known lengths in the place.
 
     Raises:
-        ConfigError: It is nothing of what is known.
-        UnansweredError: Nothing says how long a metre is.
-        AdvnerfError: It cannot be read, or poses cannot be estimated.
+        ConfigError: The input is of no known kind.
+        UnansweredError: The length of a metre is unknown.
+        AdvnerfError: The input cannot be read, or poses cannot be estimated.
     """
     poses = given / POSES if given.is_dir() else given
     if poses.is_file() and poses.suffix == ".json":
@@ -75,7 +75,7 @@ def _known(poses: Path, kind: PlaceKind) -> PosedPlace:
 
 
 def _importer(given: Path) -> Callable[[Path, MetricOptions, Any], object]:
-    """What imports the poses of something."""
+    """The function that estimates the poses of some input."""
     models = next(
         (each for each in (given, given / "sparse", given / "colmap" / "sparse") if _holds_model(each)), None
     )

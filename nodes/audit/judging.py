@@ -1,4 +1,4 @@
-"""The last part of an audit: what was chosen is driven from starts that nothing has used, beside the controls, and filmed."""
+"""The last part of an audit: the chosen attack is driven from unused starts, beside the controls, and filmed."""
 
 from __future__ import annotations
 
@@ -49,20 +49,20 @@ TITLES = {
     PLAIN_DISTURBED: "plain object, a worse camera",
     FOUND_DISTURBED: "the object that was found, a worse camera",
 }
-# Colours of films and plots are those of conditions.
+# Films and plots use the colours of conditions.
 CONDITIONS = {NO_OBJECT: "empty", PLAIN_OBJECT: "none", PICTURE: "random", FOUND: "gradient"}
 
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """What was judged.
+    """Result of judging one attack.
 
     Attributes:
-        evidence: Where it was driven.
-        arms: What the car met.
-        drives: The drives of each, by name of the arm.
-        judgement: What they say.
-        experiment: With the judging starts.
+        evidence: Kind of the drives.
+        arms: Objects of each arm.
+        drives: Drives of each arm, by name.
+        judgement: Judgement of the drives.
+        experiment: Experiment with the judging starts.
         limit_m: |CTE| beyond which the car has left its lane [m].
     """
 
@@ -74,7 +74,7 @@ class Judged:
     limit_m: float
 
     def controls(self) -> list[AuditControl]:
-        """What was driven without an attack."""
+        """The drives without an attack."""
         return [
             AuditControl(
                 kind=kind,
@@ -90,13 +90,13 @@ class Judged:
 
     @property
     def shown_start(self) -> int:
-        """The start that pictures and films are of: whose effect is the median."""
+        """The start for pictures and films: the one with the median effect."""
         control = self.drives[self.judgement.control]
         differences = self.drives[FOUND].largest_m - control.largest_m
         return int(np.argsort(differences, kind="stable")[len(differences) // 2])
 
     def as_result(self) -> AuditedDrives:
-        """The same as the audit's result has it."""
+        """The same in the form of the audit's result."""
         found, control = self.drives[FOUND], self.drives[self.judgement.control]
         dt_s, limit_m, shown = self.experiment.config.dt_s, self.limit_m, self.shown_start
         return AuditedDrives(
@@ -157,11 +157,11 @@ def judge_found(
     """Drive from the judging starts.
 
     Args:
-        experiment: With the object where the search had it; of the copy that is judged in.
-        victim: Which policy.
+        experiment: Experiment with the attacked object, in the copy for judging.
+        victim: Name of the victim.
         found: The attack file.
-        count: Judging starts.
-        seed: Of these.
+        count: Number of judging starts.
+        seed: Seed of these starts.
         limit_m: |CTE| beyond which the car has left its lane [m].
         evidence: ``surrogate``, or ``world``.
     """
@@ -180,7 +180,7 @@ def judge_found(
 def drive_arms(
     experiment: Experiment, victim: str, arms: Mapping[str, Arm], evidence: Evidence
 ) -> dict[str, ArmDrives]:
-    """Drives past each of several things, from the measured starts."""
+    """Drives of each arm from the measured starts."""
     with open_world(experiment, evidence) as world:
         return {
             name: learned(experiment, victim, arm)
@@ -192,7 +192,7 @@ def drive_arms(
 
 @contextmanager
 def open_world(experiment: Experiment, evidence: Evidence) -> Iterator[World | None]:
-    """The world that is driven in, open; None where drives are in the learned scene."""
+    """The open world of the drives; None for drives in the learned scene."""
     if evidence == "surrogate":
         yield None
         return
@@ -201,7 +201,7 @@ def open_world(experiment: Experiment, evidence: Evidence) -> Iterator[World | N
 
 
 def film(judged: Judged, file: Path) -> Path:
-    """The drives past no object, a plain one and the one that was found, side by side, from the shown start."""
+    """The drives past no object, the plain one and the attacked one, side by side, from the shown start."""
     experiment, tracks = judged.experiment, []
     every, rate_hz = filmed(experiment.config.dt_s)
     path = experiment.paths[experiment.config.paths[0]]
@@ -215,7 +215,7 @@ def film(judged: Judged, file: Path) -> Path:
 
 
 def seen_on(experiment: Experiment, arm: Arm, states: Array, world: World | None) -> list[NDArray[np.uint8]]:
-    """The driving camera's pictures ``[H, W, 3]`` from car states ``[N, 3]``; in the learned scene where there is no world."""
+    """The driving camera's pictures ``[H, W, 3]`` from car states ``[N, 3]``; from the learned scene without a world."""
     if world is None:
         whole = Surrogate(load_background(experiment), experiment.camera, experiment.mount, arm.shown.objects)
         colours = arm.shown.colours if arm.shown.objects else None
@@ -228,6 +228,6 @@ def seen_on(experiment: Experiment, arm: Arm, states: Array, world: World | None
 
 
 def texture_of(found: Path) -> NDArray[np.uint8] | None:
-    """The picture ``[H, W, 3]`` that a panel shows; None of an object that is none."""
+    """The picture ``[H, W, 3]`` of an attacked panel; None for other objects."""
     theta = load_attack(found).objects[0].theta
     return face_texture(theta) if theta.ndim == 3 else None

@@ -1,4 +1,4 @@
-"""The drives that an audit has judged, as it keeps them: from them its numbers can be computed again, by anybody."""
+"""Stored drives of an audit, from which its numbers can be recomputed."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from nodes.audit.verdict import ArmDrives, Control, effect_of, judge
 from nodes.lab.worlds.expert_drive import as_path
 
 DRIVES, RESULT = "drives.json", "audit.json"
-# Numbers are compared to this [m]: they come from the same states.
+# Numbers must agree to this [m]: they come from the same states.
 _SAME_M = 1e-6
 
 
 class AuditDiffersError(AdvnerfError):
-    """What an audit says is not what its drives say."""
+    """An audit's numbers differ from those of its drives."""
 
 
 def keep_drives(folder: Path, judged: Sequence[Judged]) -> None:
-    """Write the states of all judged drives, and what they are measured by."""
+    """Write the states of all judged drives, with their path and horizon."""
     data = {each.evidence: _as_data(each) for each in judged}
     write_atomically(folder / DRIVES, json.dumps(data) + "\n")
 
@@ -49,7 +49,7 @@ def _as_data(judged: Judged) -> dict[str, Any]:
 
 
 def read_drives(folder: Path) -> dict[str, dict[str, ArmDrives]]:
-    """The judged drives by evidence and name of what the car met, measured again."""
+    """The judged drives by evidence and arm, measured again."""
     return {evidence: _measured(data) for evidence, data in read_json(folder / DRIVES).items()}
 
 
@@ -74,13 +74,13 @@ def _measured(data: Mapping[str, Any]) -> dict[str, ArmDrives]:
 
 
 def check_audit(folder: Path) -> list[str]:
-    """Compute an audit's numbers again from the drives in its folder.
+    """Recompute an audit's numbers from the drives in its folder.
 
     Returns:
-        What was checked, a line each.
+        The checks, a line each.
 
     Raises:
-        AuditDiffersError: A number is another.
+        AuditDiffersError: A number differs.
     """
     result = read_audit(folder / RESULT)
     if result.strongest is None:

@@ -1,4 +1,4 @@
-"""The learned copies of a place, and how far they can be trusted: by views that nothing learned from, and by each other."""
+"""The learned copies of a place, and their fidelity: by held-out views, and by each other."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ from nodes.experiment.steps.steering_gate import (
 )
 from nodes.lab.policy_data.evaluate import predict
 
-# Of the largest control: such a difference drives no car elsewhere, however little the policy steers in all.
+# Share of the largest control: a smaller difference does not divert a car, even if the policy steers little overall.
 _NEGLIGIBLE = 0.02
 _EMPTY = Shown((), torch.zeros(0, 3))
 
 
 @dataclass(frozen=True)
 class Copies:
-    """Where an audit searches, and where it judges.
+    """The copies that an audit searches and judges in.
 
     Attributes:
         file: The experiment file.
-        searched: Run folder of the copy that is searched in.
-        judged: Run folder of the copy that is judged in; the same where there is a world to judge in.
-        question: What is asked.
+        searched: Run folder of the copy for searching.
+        judged: Run folder of the copy for judging; the same if the audit judges in a world.
+        question: The audit's question.
     """
 
     file: Path
@@ -58,22 +58,22 @@ class Copies:
         return cls(file, file.parent / names[0], file.parent / names[1], question)
 
     def experiment(self, setting: str, judged: bool = False) -> Experiment:
-        """The experiment of a setting, in the copy that is searched or judged in."""
+        """The experiment of a setting, in the copy for searching or judging."""
         folder = self.judged if judged else self.searched
         return load_experiment(self.file, setting, self.overrides(judged), folder)
 
     def overrides(self, judged: bool) -> list[str]:
-        """Changes of the experiment file in the copy that is searched or judged in."""
+        """Changes of the experiment file in the copy for searching or judging."""
         folder = self.judged if judged else self.searched
         return [*half_overrides(self.question, folder.name), *self.question.overrides]
 
     def ready(self, setting: str, judged: bool = False) -> Experiment:
-        """The same with the object of the setting built."""
+        """The same experiment, after the setting's object was built."""
         make_ready(self.experiment(setting, judged), until="object", console=Console(quiet=True))
-        return self.experiment(setting, judged)  # which knows now what its stages wrote
+        return self.experiment(setting, judged)  # read again, with the outputs of its stages
 
     def learn(self, console: Console) -> list[Experiment]:
-        """Learn the copies that are not there yet; each once."""
+        """Learn the missing copies, each once."""
         found = []
         for judged in (False, True)[: 1 + (self.judged != self.searched)]:
             make_ready(self.experiment("place", judged), until="bake", console=console)
@@ -82,9 +82,9 @@ class Copies:
 
 
 def fidelity_of(copies: list[Experiment]) -> AuditFidelity:
-    """How much the learned copies are to be trusted.
+    """Fidelity of the learned copies.
 
-    The policy must steer in each as on real pictures that it did not learn from, and in one as in the other along the path.
+    In each copy the policy must steer as on held-out real pictures, and along the path it must steer the same in both.
     """
     why, differences = [], []
     for experiment in copies:
@@ -113,7 +113,7 @@ def fidelity_of(copies: list[Experiment]) -> AuditFidelity:
 
 
 def _apart(one: Experiment, other: Experiment) -> str:
-    """How the steering in two copies differs along the path, in a sentence; empty if it does not by more than the gate allows."""
+    """Difference of the steering in two copies along the path, as a sentence; empty if the gate allows it."""
     scenario = one.config.paths[0]
     poses = clean_poses(one, scenario)
     first, second = (_steering_along(each, poses) for each in (one, other))

@@ -1,4 +1,4 @@
-"""What an audit has come to know, as its result: the sentence, the numbers behind it, and the files of its folder."""
+"""The result of an audit from its findings: the sentence, the numbers behind it, and the files of its folder."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ _LIBRARIES = ("torch", "numpy", "numba", "opencv-contrib-python-headless")
 
 @dataclass
 class Known:
-    """All that is known so far; what is None or empty was not reached."""
+    """All findings of a running audit; None or empty for steps that were not reached."""
 
     question: AuditedQuestion
     minutes: float
@@ -83,7 +83,7 @@ class Known:
 
 
 def result_of(known: Known, folder: Path) -> AuditResult:
-    """The result of an audit; pictures that it names are written into its folder."""
+    """The result of an audit; the pictures that it names are written into its folder."""
     assert known.file is not None, "the experiment file is written first"
     question = known.question
     return AuditResult(
@@ -121,7 +121,7 @@ def result_of(known: Known, folder: Path) -> AuditResult:
 
 
 def write_result(known: Known, result: AuditResult, folder: Path) -> str:
-    """Write the result, and what is made from it: the drives, the film, the page; returns what could not be written, and why."""
+    """Write the result and its derived files: the drives, the film, the page; returns failed files, and why."""
     keep_drives(folder, known.judged)
     if known.best is not None:
         write_atomically(folder / ATTACK_KEPT, known.best.attack.read_bytes())
@@ -135,14 +135,14 @@ def write_result(known: Known, result: AuditResult, folder: Path) -> str:
     write_audit(folder / RESULT, result)
     try:
         from advnerf_core.report.exports.write import write_exports
-    except ImportError:  # the extra is for those who hand results to other programs
+    except ImportError:  # the extra is for users who pass results to other programs
         return "for SARIF, JUnit and OpenSCENARIO files: pip install 'advnerf[audit]', then the same command again"
     write_exports(folder, result)
     return ""
 
 
 def verdict_of(known: Known) -> AuditVerdict:
-    """What the audit concludes."""
+    """The conclusion of the audit."""
     if known.against is not None and is_worse(known.against):
         evidence = known.question.place.evidence
         return AuditVerdict(outcome="worse", evidence=evidence, sentence=_worse(known.against))

@@ -1,4 +1,4 @@
-"""The page of an audit: the verdict, the film and the drives from above on the first screen; then what stands behind them."""
+"""The page of an audit: the verdict, the film and the drives from above on the first screen; then the details."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _OUTCOMES = {
     "worse": "worse than before",
 }
 _DRIVEN_IN = {"surrogate": "learned copy", "world": "world", "live": "live car"}
-_SPACING = 0.1  # of points along the path, in half lanes
+_SPACING = 0.1  # between points along the path, in half lanes
 _QUALITY = 85
 
 
@@ -48,11 +48,11 @@ def write_page(
     """Write the page of an audit into its folder.
 
     Args:
-        folder: The audit's.
-        result: What it says.
-        drives: The judged drives by evidence and name of what the car met.
-        path: The reference path; None where nothing was judged.
-        film: The film; None where there is none.
+        folder: Folder of the audit.
+        result: Result of the audit.
+        drives: The judged drives by evidence and arm.
+        path: The reference path; None without judged drives.
+        film: File of the film; None without one.
         pictures: Pictures of the object, each with its caption.
     """
     judged = _judged(result, drives)
@@ -83,7 +83,7 @@ def write_page(
 def _judged(
     result: AuditResult, drives: Mapping[Evidence, Mapping[str, ArmDrives]]
 ) -> Mapping[str, ArmDrives]:
-    """The drives that the verdict rests on, or the last there are."""
+    """The drives behind the verdict, or else the last ones."""
     evidence = result.verdict.evidence
     if evidence is not None and evidence in drives:
         return drives[evidence]

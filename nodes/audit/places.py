@@ -1,4 +1,4 @@
-"""The place of an audit, from what a user has: photographs with poses, or a world that can be driven."""
+"""The place of an audit, from the user's input: photographs with poses, or a world that can be driven."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from nodes.lab.worlds.photographs.world import PATH, Photographs
 from nodes.runtime.paths import shipped
 
 _DRIVEN_POSES = "transforms_car.json"
-# A path goes round if its ends are no farther apart than this many usual steps.
+# A path is closed if its ends are no farther apart than this many usual steps.
 _ROUND = 3.0
-# Of the extent of the cameras: farther away nothing is learned. A place whose walls are farther is refused by its held-out views.
+# Relative to the extent of the cameras: nothing is learned beyond. A place with more distant walls fails on its held-out views.
 _REACH = 1.5
 
 
 @dataclass(frozen=True)
 class Answers:
-    """What the options say of a place; None is asked for, or found out.
+    """Options about a place; None asks the user, or is derived.
 
     Attributes:
         limit_m: Half the width of the lane [m].
@@ -53,11 +53,11 @@ def place_of_photographs(
     """A place of posed photographs, and half the width of its lane [m].
 
     Args:
-        given: What the user gave.
-        there: Its posed photographs.
-        answers: What the options say.
+        given: The user's input.
+        there: The posed photographs.
+        answers: Values of the options.
         car: The car.
-        camera: The camera that the policy was made for; None for that of the photographs.
+        camera: Intrinsics of the policy's camera; None uses the photographs'.
 
     Raises:
         ConfigError: The photographs show no path.
@@ -99,7 +99,7 @@ def _height_m(poses: Path) -> float:
 
 
 def camera_of(there: PosedPlace, path: str | None) -> Pinhole:
-    """Intrinsics of the driving camera, undistorted: of the photographs that were taken while driving."""
+    """Intrinsics of the driving camera, undistorted: from the photographs that were taken while driving."""
     driven = there.poses.parent / _DRIVEN_POSES
     named = Path(path) if path is not None and path.endswith(".json") else driven
     poses = named if named.exists() else there.poses
@@ -107,7 +107,7 @@ def camera_of(there: PosedPlace, path: str | None) -> Pinhole:
 
 
 def _found_out(world: dict[str, Any]) -> dict[str, Any]:
-    """What the photographs themselves say: whether the driven path ends where it begins, and how far the place reaches at most."""
+    """Settings derived from the photographs: whether the driven path is closed, and the largest extent of the place."""
     settings = {key: value for key, value in world.items() if key != "kind"}
     document = Document({**settings, "closed": False}, "--place")
     there = Photographs(validate(Photographs.Config, document, Path.cwd()))
@@ -121,7 +121,7 @@ def place_of_world(name: str, answers: Answers) -> Place:
     """A world that can be driven: by its kind, or ``file.py:Class``.
 
     Raises:
-        ConfigError: There is no such world, or it has no such path.
+        ConfigError: The world or its path is unknown.
     """
     base = _known_settings(name)
     section = read_yaml(base).data["world"] if base is not None else {"kind": name}
@@ -132,7 +132,7 @@ def place_of_world(name: str, answers: Answers) -> Place:
 
 
 def describe(place: Place) -> WorldDescription | None:
-    """What a world says of itself; None where it must be open for that."""
+    """A world's description; None if it must be open for that."""
     try:
         return read_world(Document(dict(place.world), f"--world {place.source}"), Path.cwd()).describe()
     except NotOpenError:
@@ -140,7 +140,7 @@ def describe(place: Place) -> WorldDescription | None:
 
 
 def _known_settings(name: str) -> Path | None:
-    """An experiment file that comes with advnerf and is of this world: what is photographed and learned there was chosen for it."""
+    """An experiment file of advnerf with this world: its settings for photographs and learning suit it."""
     for file in sorted(shipped("launch").glob("*.experiment.yaml")):
         data = read_yaml(file).data
         if "base" not in data and data.get("world", {}).get("kind") == name:

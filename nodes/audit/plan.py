@@ -1,4 +1,4 @@
-"""What an audit has decided so far, in its folder: a run that is started again decides nothing anew."""
+"""Decisions of an audit, stored in its folder, so that a resumed run does not decide again."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ FILE = "plan.json"
 
 
 class Decided(StrictModel):
-    """The file.
+    """Content of the decisions' file.
 
     Attributes:
-        question: Hash of what is asked.
-        evaluations: What the budget buys; None before it was counted.
-        spots: Where the object may stand; None before they were chosen.
-        settings: Of the experiment file, by name.
+        question: Hash of the question.
+        evaluations: Evaluations that the budget buys; None before they were counted.
+        spots: Possible places of the object; None before they were chosen.
+        settings: Settings of the experiment file, by name.
     """
 
     question: str
@@ -41,9 +41,9 @@ class AuditPlan:
     """The decisions of one audit.
 
     Attributes:
-        folder: The audit's.
-        question: What is asked; a planted victim may be added to it.
-        decided: What is decided.
+        folder: Folder of the audit.
+        question: The audit's question; a planted victim may be added to it.
+        decided: The decisions.
     """
 
     folder: Path
@@ -52,10 +52,10 @@ class AuditPlan:
 
     @classmethod
     def of(cls, folder: Path, question: AuditedQuestion) -> AuditPlan:
-        """The decisions in a folder, or none.
+        """The decisions in a folder, or empty ones.
 
         Raises:
-            ConfigError: The folder is of another audit.
+            ConfigError: The folder belongs to another audit.
         """
         key, file = (
             hash_of([experiment_data(question), list(question.overrides), question.kind, question.size_m]),
@@ -73,7 +73,7 @@ class AuditPlan:
 
     @property
     def spots(self) -> list[Spot] | None:
-        """Where the object may stand; None before that was chosen."""
+        """Possible places of the object; None before they were chosen."""
         if self.decided.spots is None:
             return None
         return [
@@ -82,11 +82,11 @@ class AuditPlan:
         ]
 
     def choose(self, spots: list[Spot]) -> None:
-        """Fix where the object may stand."""
+        """Store the possible places of the object."""
         self._decide(spots=[{**vars(each), "placed": as_listed(each)} for each in spots])
 
     def set_evaluations(self, evaluations: int) -> None:
-        """Fix what the budget buys."""
+        """Store the evaluations that the budget buys."""
         self._decide(evaluations=evaluations)
 
     def add(self, setting: str, objects: list[dict[str, Any]], **sections: Any) -> None:
@@ -105,5 +105,5 @@ class AuditPlan:
 
 
 def as_listed(spot: Spot) -> dict[str, Any]:
-    """An object at a spot as experiment files list it; a file with its whole path."""
+    """An object at a spot in the form of experiment files; a file with its absolute path."""
     return {**spot.placed.model_dump(mode="json", exclude_defaults=True), "kind": spot.placed.kind}

@@ -1,8 +1,8 @@
 """A control for the search itself: the audited policy with a planted weakness, which an audit that works must find.
 
-The planted policy steers as the audited one, plus a term for how much redder than green the picture is, to the left, and for how much
-greener, to the right. Within what pictures of the place differ by on their own, both steer almost alike: a tenth of the slope is left
-there, so that a gradient finds the way. An audit that does not find this, in the same place with the same budget, says nothing about
+The planted policy steers like the audited one, plus a term for how much redder than green the picture is, to the left, and for how much
+greener, to the right. Within the natural variation of pictures of the place, both steer almost alike: a tenth of the slope remains
+there, so that a gradient finds the way. An audit that misses this weakness, in the same place with the same budget, has no conclusion about
 the policy.
 """
 
@@ -26,7 +26,7 @@ from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.run import load_experiment
 
-# Of the slope, within what pictures of the place differ by.
+# Remaining share of the slope within the natural variation.
 _SLOPE = 0.1
 
 
@@ -34,7 +34,7 @@ class Planted(nn.Module):
     """A policy with a planted weakness.
 
     Args:
-        policy: Called as `Policy`.
+        policy: The audited policy, called as `Policy`.
         gain_rad: Steering for each unit of `redness` [rad].
         middle: Redness of pictures of the place, in their middle.
         reach: Largest difference from it.
@@ -57,15 +57,15 @@ class Planted(nn.Module):
 
 
 class PlantedWithMemory(Planted):
-    """The same of a policy that is not stateless."""
+    """The same for a policy with memory."""
 
     def forward(self, images: Tensor, goals: Tensor | None = None, memory: Tensor | None = None) -> Any:
-        """As of `Planted`, and the next memory."""
+        """Output of `Planted`, and the next memory."""
         steering, after = self.policy(images, goals, memory)
         return steering + self._added(images), after
 
     def initial_memory(self, batch: int) -> Tensor:
-        """As of the policy."""
+        """Initial memory of the policy."""
         memory: Tensor = self.policy.initial_memory(batch)
         return memory
 
@@ -89,7 +89,7 @@ def plant(loaded: LoadedPolicy, gain_rad: float, middle: float, reach: float) ->
 
 
 def audited_driver(file: str, folder: str, setting: str) -> LoadedPolicy:
-    """The driver behind a socket that an audit asks: it must be told of the experiment's car and camera."""
+    """The driver behind a socket that an audit queries, with the experiment's car and camera."""
     return load_victim(load_experiment(Path(file), setting, (), Path(folder)), VICTIM)
 
 
@@ -99,7 +99,7 @@ def strength(plain: Sequence[Tensor], red: Tensor, wanted_rad: float) -> tuple[f
     Args:
         plain: Pictures ``[N, 3, H, W]`` of the place without a red object.
         red: Pictures along a drive past an object that is red all over.
-        wanted_rad: What it shall steer in the mean of the pictures that show it [rad].
+        wanted_rad: Mean planted steering on the pictures that show it [rad].
 
     Raises:
         ValueError: The object makes no picture redder than the place.
@@ -120,7 +120,7 @@ def policy_code(spec: str, experiment: Experiment) -> str:
 
 
 def write_module(folder: Path, loads: str, gain_rad: float, middle: float, reach: float) -> str:
-    """Write the module of the planted policy; returns how a policy of it is named. Two of them never have one name in one process."""
+    """Write the module of the planted policy; returns the policy's name, which is unique within a process."""
     text = (
         '"""The audited policy with a planted weakness, as advnerf audit made it."""\n\n'
         "from advnerf_core.policies.load import load_any_policy\n"

@@ -1,4 +1,4 @@
-"""The policy of an audit, as experiments take it; a file without a declaration gets one, of what it says itself and what is asked."""
+"""The policy of an audit in the form of experiments; a file without a declaration gets one, from its content and the user's answers."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from nodes.runtime.errors import ConfigError
 
 FOLDER = "policy"
 Say = Callable[[str], None]
-# What files that say nothing mean more often than not; said aloud, so that a wrong one is seen.
+# Most common meanings of files without a declaration; printed, so that a wrong one is noticed.
 _USUAL = {"colour_space": "RGB", "value_max": 1.0, "output_unit": "normalised", "positive": "left"}
 
 
 @dataclass(frozen=True)
 class NamedPolicy:
-    """The policy as the user named it, and what is known where it will drive.
+    """The policy by the user's name, and what is known about its place.
 
     Attributes:
         given: File, ``package.module:factory`` or address.
-        camera: The driving camera of the place, for a policy that names none; None where only the world knows.
-        largest_rad: Largest wheel angle of the car, which a normalised output of 1 means [rad].
+        camera: The driving camera of the place, for a policy that names none; None if only the world knows it.
+        largest_rad: Largest wheel angle of the car, which equals a normalised output of 1 [rad].
         declared: ``key=value`` texts of a declaration.
-        folder: Of the audit; gets a copy of the file with its declaration, if it has none.
-        say: Called with what is assumed.
+        folder: Folder of the audit, for a copy of the file with its declaration, if it has none.
+        say: Called with each assumption.
     """
 
     given: str
@@ -47,11 +47,11 @@ class NamedPolicy:
     say: Say
 
     def resolve(self) -> tuple[str, Pinhole | None]:
-        """The name that experiments use, and the camera that the policy was made for; None for a driver behind a socket.
+        """The name for experiments, and the policy's camera; None for a driver behind a socket.
 
         Raises:
-            ConfigError: The file is not there.
-            AdvnerfError: It cannot be loaded.
+            ConfigError: The file does not exist.
+            AdvnerfError: The policy cannot be loaded.
         """
         if is_address(self.given):
             return self.given, None
@@ -68,7 +68,7 @@ class NamedPolicy:
         return self._with_declaration(file, self._contract(contract, questions))
 
     def _contract(self, guessed: PolicyContract, questions: Sequence[Question]) -> PolicyContract:
-        """The contract with what was declared, answered or is usual."""
+        """The contract with declared, answered and usual values."""
         values, answers = guessed.to_dict(), _read(self.declared)
         for question in questions:
             if question.key == "view":
@@ -104,7 +104,7 @@ def _read(declared: Sequence[str]) -> dict[str, Any]:
 
 
 def _whole_picture(view: Mapping[str, Any], camera: Pinhole | None) -> dict[str, Any]:
-    """The view of a policy that sees the whole picture of the place's camera in its own size."""
+    """The view of a policy that sees the whole picture of the place's camera in the policy's image size."""
     if camera is None:
         return dict(view)
     whole = {"camera": asdict(camera), "crop_top_px": 0, "crop_height_px": camera.height}
@@ -112,7 +112,7 @@ def _whole_picture(view: Mapping[str, Any], camera: Pinhole | None) -> dict[str,
 
 
 def _answered(question: Question, usual: Any, say: Say) -> Any:
-    """What a person at the terminal says; without one, what is usual, said aloud."""
+    """The answer of a user at the terminal; without one, the usual value, which is printed."""
     if sys.stdin.isatty():
         text = typer.prompt(
             f"{question.text} ({' or '.join(question.choices)})" if question.choices else question.text,

@@ -1,4 +1,4 @@
-"""What an audit asks, resolved: which policy, at which place, with which object; and the experiment file that says so."""
+"""The resolved question of an audit: the policy, the place and the object; and its experiment file."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from nodes.experiment.plan.object_kinds import PANEL
 
 VICTIM, PLANTED, OBJECT = "policy", "planted", "object"
 FILE = "audit.experiment.yaml"
-# Searches draw their starts from their own seeds, counted from 0; nothing that is selected or judged by is among them.
+# Searches draw their starts from their own seeds, counted from 0; selection and judging use none of these.
 SELECTION_SEED, JUDGING_SEED = 10_000, 20_000
 HALF, OTHER_HALF = "half", "other-half"
-# The teacher whose steering is exported returns to the path within about so many half lanes.
+# The teacher of the exported steering returns to the path within about this many half lanes.
 _RETURNS_IN = 5.0
-# A small audit: fewer pictures to learn from would not be trusted, so that searches are what is short.
+# A small audit: fewer pictures would fail the fidelity gate, so the searches are shortened instead.
 CI_SECTIONS: Mapping[str, Any] = {"scene": {"steps": 600}, "horizon": 40}
 Scale = Literal["world", "poses", "length", "positions", "fiducials"]
 PlaceKind = Literal["images", "video", "scene", "splat", "world"]
@@ -27,16 +27,16 @@ PlaceKind = Literal["images", "video", "scene", "splat", "world"]
 
 @dataclass(frozen=True)
 class Place:
-    """Where the policy is audited.
+    """The place of the audit.
 
     Attributes:
-        name: As sentences name it.
-        kind: What the user gave.
+        name: Name in sentences.
+        kind: Kind of the user's input.
         source: The folder, file or name that the user gave.
-        scale: What the metre comes from.
+        scale: Source of the metre.
         world: The section ``world`` of the experiment.
         base: Experiment file whose settings fit the place; None for the defaults.
-        path: Which of the world's paths is driven; empty for its first.
+        path: Name of the driven path of the world; empty for its first.
         shows_panels: Whether the world's own renderer shows panels.
     """
 
@@ -51,31 +51,31 @@ class Place:
 
     @property
     def is_driven(self) -> bool:
-        """Whether there is a world that can be driven; else there are photographs alone, of which two scenes are learned."""
+        """Whether the place is a world that can be driven; else it is known by photographs alone, from which two scenes are learned."""
         return self.kind == "world"
 
     @property
     def evidence(self) -> Evidence:
-        """The strongest evidence that there can be."""
+        """The strongest possible evidence."""
         return "world" if self.is_driven else "surrogate"
 
 
 @dataclass(frozen=True)
 class AuditedQuestion:
-    """What is asked.
+    """The question of an audit.
 
     Attributes:
-        policy: The policy as experiments name it.
-        given: The same as the user named it.
-        place: Where.
-        limit_m: |CTE| beyond which the car has left its lane [m]; None for what the world declares.
+        policy: Name of the policy for experiments.
+        given: The user's name for it.
+        place: The place.
+        limit_m: |CTE| beyond which the car has left its lane [m]; None uses the world's.
         kind: Kind of the object: ``panel``, or a file.
         size_m: Width of the object [m]; None for a share of the lane.
         overrides: ``key=value`` texts over the experiment file.
-        seed: Of everything that is drawn, beside starts.
-        selection: Starts that searches are compared from.
-        judging: Starts that the verdict is from.
-        sections: What the experiment file says beside place and victim.
+        seed: Seed of all draws except starts.
+        selection: Number of starts for comparing searches.
+        judging: Number of starts for the verdict.
+        sections: Sections of the experiment file besides place and victim.
     """
 
     policy: str
@@ -92,7 +92,7 @@ class AuditedQuestion:
 
 
 def experiment_data(question: AuditedQuestion) -> dict[str, Any]:
-    """The experiment without an object, as its file has it."""
+    """The experiment without an object, in the form of its file."""
     place = question.place
     own = {} if place.is_driven else _of_photographs(question)
     data: dict[str, Any] = {} if place.base is None else {"base": str(place.base)}
@@ -108,7 +108,7 @@ def experiment_data(question: AuditedQuestion) -> dict[str, Any]:
         "measure": {"starts": question.selection, "seed": SELECTION_SEED},
         "retrain": None,
         "reference": None,
-        "gate": None,  # the audit judges the scene itself, and says what it found
+        "gate": None,  # the audit judges the scene itself, and reports the result
     }
     return _merged(_merged(data, own), question.sections)
 
@@ -136,7 +136,7 @@ def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any
 def write_experiment(
     folder: Path, question: AuditedQuestion, settings: Mapping[str, Mapping[str, Any]]
 ) -> Path:
-    """Write the experiment file: the place, the victim, and one setting for each search; it can be run again by ``advnerf experiment``."""
+    """Write the experiment file: the place, the victim, and one setting for each search; ``advnerf experiment`` can run it again."""
     text = dump_yaml(
         {**experiment_data(question), "settings": {"place": {}, **_of_halves(question), **settings}},
         default_flow_style=None,
@@ -161,7 +161,7 @@ def _of_halves(question: AuditedQuestion) -> dict[str, Any]:
 def setting_of(
     question: AuditedQuestion, objects: Sequence[Mapping[str, Any]], **sections: Any
 ) -> dict[str, Any]:
-    """A setting of the experiment file with an object; where the world has panels of its own it stands in them, in their light."""
+    """A setting of the experiment file with an object; a world with native panels shows it in them, in its own light."""
     carrier = (
         {"carrier": {"kind": "native"}} if question.place.shows_panels and question.kind == PANEL else {}
     )
@@ -169,7 +169,7 @@ def setting_of(
 
 
 def half_overrides(question: AuditedQuestion, setting: str) -> list[str]:
-    """The texts that lay the setting of one half over another setting."""
+    """The overrides that apply the setting of one half to another setting."""
     of_half = _of_halves(question).get(setting, {})
     return [
         f"{section}.{key}={value}" for section, values in of_half.items() for key, value in values.items()

@@ -1,4 +1,4 @@
-"""Runs an audit: learn the place, look whether the policy drives there, search under the schedule, judge, and say it."""
+"""Runs an audit: learn the place, check that the policy drives there, search under the schedule, judge, and report."""
 
 from __future__ import annotations
 
@@ -48,21 +48,21 @@ from nodes.experiment.show.given import given
 from nodes.experiment.show.placing import clean_poses
 from nodes.experiment.show.victims import look_at_given
 
-# Of half a lane: width of an object that nobody gave one.
+# In half lanes: width of an object without a given one.
 _WIDTH = 0.8
 _SPOTS = 3
 # A policy that leaves its lane from more of the starts, without any object, does not drive.
 _LEAVES_AT_MOST = 0.25
-# What the planted weakness steers past an object that is red all over, of the largest control.
+# Steering of the planted weakness past an object that is red all over, relative to the largest control.
 _PLANTED_SHARE = 1.0
-# Settings with the plain object at the first spot, and where it stood in an earlier audit; and what an audit in continuous integration may spend.
+# Settings with the plain object at the first spot, and at its place in an earlier audit; and the budget of an audit in continuous integration.
 _FIRST, _BEFORE = "first", "before"
 CI_EVALUATIONS = 40
 Say = Callable[[str], None]
 
 
 class CannotJudgeError(AdvnerfError):
-    """The audit ends without a verdict, for reasons that it says."""
+    """The audit ends without a verdict; the message gives the reasons."""
 
     def __init__(self, *reasons: str) -> None:
         super().__init__("; ".join(reasons))
@@ -71,15 +71,15 @@ class CannotJudgeError(AdvnerfError):
 
 @dataclass(frozen=True)
 class AuditOptions:
-    """How an audit is run.
+    """Options of an audit.
 
     Attributes:
         minutes: Time for the searches; converted once into evaluations.
-        evaluations: The number of evaluations itself, instead.
-        against: The result of an earlier audit, which this policy is compared with.
-        harden: Whether frames that would help are exported.
+        evaluations: Number of evaluations, instead of the time.
+        against: Result of an earlier audit to compare this policy with.
+        harden: Whether to export frames for hardening.
         timed: Whether the result says when it ended and how long it took.
-        cluster: Machines that search; None for this process.
+        cluster: Machines for the searches; None for this process.
     """
 
     minutes: float
@@ -92,14 +92,14 @@ class AuditOptions:
 
 @dataclass
 class Audit:
-    """One audit in its folder; what is there already is not made again.
+    """One audit in its folder; existing parts are not repeated.
 
     Attributes:
-        question: What is asked.
-        folder: Gets everything.
-        options: How it is run.
-        say: Told what happens.
-        console: Where progress is shown.
+        question: The question.
+        folder: Folder for all files.
+        options: Options of the audit.
+        say: Callback for messages.
+        console: Console for progress.
     """
 
     question: AuditedQuestion
@@ -110,7 +110,7 @@ class Audit:
     before: Before | None = field(default=None, init=False)
 
     def run(self) -> AuditResult:
-        """Run it, or go on with it, and write its result; Ctrl-C ends the searches, and judges what they found.
+        """Run or resume the audit, and write its result; Ctrl-C ends the searches, and judges their best attack.
 
         Raises:
             AdvnerfError: The question is wrong, or a file cannot be read.
@@ -172,7 +172,7 @@ class Audit:
             )
 
     def _require_drives(self, experiment: Experiment, limit_m: float) -> None:
-        """Refuse a policy that leaves its lane in the learned place without any object."""
+        """Raise for a policy that leaves its lane in the learned place without any object."""
         nothing = arm_of(experiment, NO_OBJECT)
         there = learned(with_starts(experiment, self.question.selection, SELECTION_SEED), VICTIM, nothing)
         left = there.left(limit_m)
@@ -186,7 +186,7 @@ class Audit:
             )
 
     def _spots(self, plan: AuditPlan, experiment: Experiment) -> list[Spot]:
-        """Where the object may stand, decided once."""
+        """Possible places of the object, decided once."""
         if plan.spots is None:
             kind, width_m = self.question.kind, footprint_m(self.question.kind)[1]
             wanted_m = self.question.size_m or _WIDTH * experiment.world.off_track_m
@@ -227,7 +227,7 @@ class Audit:
     def _show(
         self, experiment: Experiment, spot: Spot, arm: str, name: str, found: Path | None = None
     ) -> None:
-        """Write a picture of the object from where it is largest on the way past it."""
+        """Write a picture of the object from the pose on the path at which it is largest."""
         poses = clean_poses(experiment, experiment.config.paths[0])[[spot.largest_tick]]
         write_image(self.folder / name, seen_on(experiment, arm_of(experiment, arm, found), poses, None)[0])
         self.say(f"picture of the object where it stands: {self.folder / name}")
@@ -247,7 +247,7 @@ class Audit:
             self.say(f"frames past the object: {export_frames(known.judged[-1], self.folder / HARDEN)}")
 
     def _compare(self, before: Before, copies: Copies, plan: AuditPlan, limit_m: float) -> AuditComparison:
-        """Drive past what an earlier audit found, from its starts."""
+        """Drive past the object of an earlier audit, from its starts."""
         plan.add(_BEFORE, [before.listed(self.question.kind)])
         starts, evidence = before.result.starts.judging, self.question.place.evidence
         there = with_starts(copies.ready(_BEFORE, judged=True), starts.count, starts.seed)
@@ -258,7 +258,7 @@ class Audit:
         return before.compare(drive_arms(there, VICTIM, arms, evidence), evidence, limit_m)
 
     def _plant(self, copies: Copies, plan: AuditPlan, spots: list[Spot], limit_m: float) -> PlantedControl:
-        """Look for a planted weakness with the same schedule, until it is found."""
+        """Search a planted weakness with the same schedule, until it is found."""
         name, wanted = (
             "it also steers to the left for red, to the right for green",
             self.question.selection // 2 + 1,
@@ -285,7 +285,7 @@ class Audit:
         )
 
     def _planted_victim(self, experiment: Experiment) -> str:
-        """Write the planted policy, as strong as an object at the first spot lets it be."""
+        """Write the planted policy, with the strength that an object at the first spot allows."""
         states = clean_poses(experiment, experiment.config.paths[0])
         controls = [arm_of(experiment, name).shown for name in (NO_OBJECT, PLAIN_OBJECT)]
         plain = [pictures_along(experiment, states, shown) for shown in controls]

@@ -1,7 +1,7 @@
-"""In which order an audit searches, and how it shares its budget: cheap and strong first, and what works gets more.
+"""The order of an audit's searches and the shares of its budget: cheap and strong first, and successful methods get more.
 
-A round searches at the spots that were best in the rounds before it. Shares are of the evaluations that the budget buys, which are
-counted once, before the first search, so that a run that is started again does the same.
+A round searches at the best spots of the earlier rounds. Shares refer to the evaluations that the budget buys, which are
+counted once, before the first search, so that a resumed run does the same.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ class Round:
 
     Attributes:
         method: Name of the method.
-        spots: At so many spots, the best of those that were searched at; in the first round, those that are seen best.
-        seeds: Searches at each.
-        starts: Starts that each search drives from.
+        spots: Number of spots, the best of those searched before; in the first round, the most visible ones.
+        seeds: Number of searches at each.
+        starts: Number of starts of each search.
         share: Share of the budget.
     """
 
@@ -40,11 +40,11 @@ BLACK_BOX = (
     Round("cem", spots=2, seeds=1, starts=1, share=0.4),
     Round("guided", spots=1, seeds=1, starts=1, share=0.4),
 )
-# Of Adam: searches of an audit are short, so that they take larger steps than those of an experiment.
+# Adam's rates: searches of an audit are short, so that they take larger steps than those of an experiment.
 LEARNING_RATE = 0.5
 FEWEST = {"cem": 20, "guided": 20}  # evaluations below which a method cannot begin
 _FEWEST = 4
-# What no schedule has; with the reason, so that a report can say it.
+# Methods that no schedule has; with the reason, for the report.
 NEVER_TRIED = {
     "where the object stands, as part of a search": "the schedule searches colours at spots that a rule chose (space.kind places)",
     "the shape of the object": "shapes are searched over a world's own pictures only (space.kind mesh_shape)",
@@ -58,8 +58,8 @@ class PlannedSearch:
 
     Attributes:
         round_: Number of the round.
-        spot: Rank of the spot among those of the round.
-        seed: Of the search.
+        spot: Rank of the spot in the round.
+        seed: Seed of the search.
         evaluations: Closed-loop evaluations.
     """
 
@@ -70,7 +70,7 @@ class PlannedSearch:
 
 
 def planned(rounds: Sequence[Round], evaluations: int) -> list[list[PlannedSearch]]:
-    """The searches of each round that a budget buys.
+    """The searches of each round for a budget.
 
     Args:
         rounds: The schedule.

@@ -1,4 +1,4 @@
-"""The searches of an audit, round by round: what was found at a spot decides where the next round goes on."""
+"""The searches of an audit, round by round: results at a spot decide where the next round searches."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ class FoundAttack:
     """A finished search.
 
     Attributes:
-        setting: Its setting in the experiment file.
-        folder: Where its attack is.
+        setting: Name of its setting in the experiment file.
+        folder: Folder of its attack.
         spot: Number of the spot where the object stands.
-        method: Which method.
-        seed: Of the search.
-        evaluations: What it spent.
-        effect_m: How much larger the largest |CTE| is than without the attack, in the mean of the selection starts [m].
+        method: Name of the method.
+        seed: Seed of the search.
+        evaluations: Number of evaluations.
+        effect_m: Increase of the largest |CTE| over the drive without the attack, mean over the selection starts [m].
         left: Selection starts from which the car left its lane.
     """
 
@@ -61,7 +61,7 @@ class FoundAttack:
 
     @property
     def rank(self) -> tuple[int, float]:
-        """By which the best is chosen."""
+        """Sort key for the best attack."""
         return self.left, self.effect_m
 
 
@@ -71,11 +71,11 @@ class SearchJob:
 
     Attributes:
         file: Experiment file.
-        setting: Its setting.
-        overrides: Changes of it.
-        run_folder: Of the copy that is searched in.
-        cell: Which cell.
-        folder: Gets the search.
+        setting: Name of its setting.
+        overrides: Changes of the setting.
+        run_folder: Run folder of the copy for searching.
+        cell: The cell.
+        folder: Folder for the search.
     """
 
     file: str
@@ -87,10 +87,10 @@ class SearchJob:
 
 
 class SearchesElsewhere(Protocol):
-    """Other machines that run the searches of a round beside each other."""
+    """Other machines that run the searches of a round in parallel."""
 
     def search(self, searches: Sequence[SearchJob]) -> None:
-        """Run searches until all have left their results in their folders."""
+        """Run searches until all have written their results to their folders."""
 
 
 @dataclass
@@ -98,15 +98,15 @@ class Searches:
     """All searches of one victim at one place.
 
     Attributes:
-        copies: Where is searched.
-        plan: Gets a setting for each search.
-        spots: Where the object may stand, seen best first.
-        victim: Which policy of the experiment.
-        evaluations: What the budget buys, of one start.
+        copies: Learned copies of the place.
+        plan: Plan, to which a setting is added for each search.
+        spots: Possible places of the object, the most visible first.
+        victim: Name of the experiment's victim.
+        evaluations: Evaluations that the budget buys, from one start.
         differentiable: Whether the policy has a gradient.
         limit_m: |CTE| beyond which the car has left its lane [m].
-        elsewhere: Machines that search; None for this process.
-        found: What is finished.
+        elsewhere: Machines for the searches; None for this process.
+        found: Finished searches.
     """
 
     copies: Copies
@@ -126,20 +126,20 @@ class Searches:
 
     @property
     def planned(self) -> list[list[PlannedSearch]]:
-        """The searches of each round; fewer where there are fewer spots."""
+        """The searches of each round; fewer if there are fewer spots."""
         rounds = planned(self.rounds, self.evaluations)
         return [[each for each in row if each.spot < len(self.spots)] for row in rounds]
 
     @property
     def best(self) -> FoundAttack | None:
-        """What moves the policy most on the selection starts."""
+        """The attack with the largest effect on the selection starts."""
         return max(self.found, key=lambda each: each.rank, default=None)
 
     def run(self, say: Say, enough: Callable[[FoundAttack], bool] = lambda found: False) -> None:
-        """Search until the schedule ends, or what was found is enough."""
+        """Search until the schedule ends, or a result is enough."""
         for wanted, row in zip(self.rounds, self.planned, strict=True):
             spots = self._spots(wanted.spots)
-            if self.elsewhere is not None:  # what it leaves in the folders is then only read here
+            if self.elsewhere is not None:  # its results in the folders are then only read here
                 self.elsewhere.search([self._wanted(wanted, search, spots[search.spot]) for search in row])
             for search in row:
                 found = self._search(wanted, search, spots[search.spot])
@@ -152,7 +152,7 @@ class Searches:
                     return
 
     def _spots(self, count: int) -> list[int]:
-        """The best spots so far; those that were not searched at come last, as they were seen."""
+        """The best spots yet; unsearched ones come last, by visibility."""
         best: dict[int, tuple[int, float]] = {}
         for each in self.found:
             best[each.spot] = max(each.rank, best.get(each.spot, each.rank))
@@ -174,7 +174,7 @@ class Searches:
         )
 
     def _wanted(self, wanted: Round, search: PlannedSearch, spot: int) -> SearchJob:
-        """The search, whose setting is in the experiment file and whose object is built."""
+        """The search, after its setting was written and its object built."""
         setting = self._setting(wanted, search)
         self.plan.add(
             setting,
@@ -202,7 +202,7 @@ class Searches:
 
 
 def _effect(experiment: Experiment, folder: Path, clean: Path, limit_m: float) -> tuple[float, int]:
-    """Effect and starts off the lane, of the drives from the selection starts."""
+    """Effect and number of starts off the lane, over the drives from the selection starts."""
     path = experiment.paths[experiment.config.paths[0]]
     attacked, without = (
         np.array(
@@ -217,7 +217,7 @@ def _effect(experiment: Experiment, folder: Path, clean: Path, limit_m: float) -
 
 
 def seconds_of_evaluation(experiment: Experiment, victim: str, differentiable: bool) -> float:
-    """How long an evaluation from one start takes here, with the gradient where there is one [s]."""
+    """Duration of an evaluation from one start here, with the gradient if there is one [s]."""
     space, policy = colour_space(experiment), load_victim(experiment, victim)
     one = experiment.config.attack.model_copy(update={"starts": 1})
     alone = _with_attack(experiment, one)

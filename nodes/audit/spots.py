@@ -1,6 +1,6 @@
-"""Where an object may stand in a learned place: beside the lane, in front of what was learned, and large in the driver's view.
+"""Possible places of an object in a learned place: beside the lane, in front of the learned surfaces, and large in the driver's view.
 
-The rule knows the path and the learned scene's depth, and no policy: nothing of a search is known to it.
+The rule uses the path and the learned scene's depth, but neither the policy nor any search.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.learned_scene import load_background
 from nodes.experiment.show.placing import SeenFrom, clean_poses, is_seen
 
-# Of half a lane: steps along the path and away from it, and how far away is looked.
+# In half lanes: steps along the path and away from it, and the largest distance.
 _ALONG, _AWAY, _FARTHEST = 0.5, 0.25, 4.0
-# It looks at where the car is so long before it passes.
+# The object faces the car's position this long before it passes.
 _LOOKS_AHEAD_S = 1.5
 _LEAST_PX = 6.0
-# Two spots are at least so many sides of the object apart.
+# Two spots are at least this many sides of the object apart.
 _APART = 1.0
 
 
@@ -32,9 +32,9 @@ class Spot:
     """One place for the object.
 
     Attributes:
-        placed: The object there.
+        placed: The object at this place.
         seen_px: Pixels of the policy's picture that it covers, summed over the ticks of a drive without an error [px].
-        seen_ticks: Ticks at which nearly all of it is seen.
+        seen_ticks: Ticks at which nearly all of it is visible.
         largest_tick: The tick at which it is largest in the picture.
     """
 
@@ -47,14 +47,14 @@ class Spot:
 def best_spots(
     experiment: Experiment, kind: str, scale: float, count: int, name: str = "object"
 ) -> list[Spot]:
-    """The spots where an object covers most of a drive's pictures, best first.
+    """The spots at which an object covers most of a drive's pictures, best first.
 
     Args:
-        experiment: Its scene must be learned.
+        experiment: Experiment whose scene is learned.
         kind: Kind of object.
-        scale: Its size.
-        count: At most so many.
-        name: What the object is called.
+        scale: Size of the object.
+        count: Largest number of spots.
+        name: Name of the object.
     """
     scenario = experiment.config.paths[0]
     views = _views(experiment, scenario)
@@ -73,7 +73,7 @@ def best_spots(
 
 
 def _views(experiment: Experiment, scenario: str) -> list[SeenFrom]:
-    """What the learned scene shows along a drive without an error."""
+    """Views of the learned scene along a drive without an error."""
     render, views = load_background(experiment), []
     for x_m, y_m, yaw_rad in clean_poses(experiment, scenario).tolist():
         T_world_from_camera = planar_pose(x_m, y_m, yaw_rad) @ experiment.mount
@@ -117,7 +117,7 @@ def _seen(experiment: Experiment, placed: PlacedObject, views: Sequence[SeenFrom
 
 
 def _pixels(experiment: Experiment, placed: PlacedObject, view: SeenFrom) -> float:
-    """Pixels of the policy's picture that the object covers, 0 where not nearly all of it is seen."""
+    """Pixels of the policy's picture that the object covers; 0 unless nearly all of it is visible."""
     if not is_seen(experiment, placed, view, _LEAST_PX):
         return 0.0
     ahead_m = float((view.T_camera_from_world @ placed.T_world_from_face)[2, 3])

@@ -1,7 +1,7 @@
-"""What drives from the judging starts say: the effect with its interval, and whether the object drives the policy out of its lane.
+"""The judgement of drives from the judging starts: the effect with its interval, and whether the object drives the policy out of its lane.
 
 The judging starts were used by no search and for no choice, so that the number of candidates does not widen the interval. The effect
-is paired by start, against the control that makes it smaller. The interval is that of `mean_estimate.one_sample`. That the object,
+is paired by start, against the control with the smaller difference. The interval is `mean_estimate.one_sample`'s. That the object,
 and nothing else, drives the car off is tested exactly on the starts where only one of the two leaves the lane (McNemar 1947).
 """
 
@@ -32,7 +32,7 @@ class ArmDrives:
         largest_m: Largest |CTE| of each ``[S]`` [m].
         mean_m: Mean |CTE| of each ``[S]`` [m].
         ctes_m: Signed CTE ``[S, T]`` [m].
-        driven_ticks: Ticks until each car stopped ``[S]``; its states after that are those of the last.
+        driven_ticks: Ticks until each car stopped ``[S]``; later states repeat the last one.
     """
 
     states: Floats
@@ -42,20 +42,20 @@ class ArmDrives:
     driven_ticks: NDArray[np.int64]
 
     def left(self, limit_m: float) -> NDArray[np.bool_]:
-        """Which left the lane ``[S]``."""
+        """Whether each drive left the lane ``[S]``."""
         return np.asarray(self.largest_m > limit_m)
 
 
 @dataclass(frozen=True)
 class EffectJudgement:
-    """What the object does.
+    """Effect of the object.
 
     Attributes:
         control: The control with the smaller effect.
-        effect: How much farther from the path it brings the car at most, than with that control.
+        effect: Increase of the car's largest distance from the path over that control.
         left: Starts from which the car left its lane with the object, and with each control.
-        starts: How many there are.
-        p: Of the exact test that the object drives the car off no more often than the worse of the controls.
+        starts: Number of starts.
+        p: p of the exact test that the object drives the car off no more often than the worse of the controls.
     """
 
     control: Control
@@ -71,7 +71,7 @@ class EffectJudgement:
 
 
 def judge(attacked: ArmDrives, controls: Mapping[Control, ArmDrives], limit_m: float) -> EffectJudgement:
-    """Judge an object by its drives and those of the controls from the same starts."""
+    """Judge an object by its drives and the controls' from the same starts."""
     effects = {name: effect_of(attacked, drives) for name, drives in controls.items()}
     control = min(effects, key=lambda name: effects[name].mean_m)
     by_object = attacked.left(limit_m)
@@ -86,7 +86,7 @@ def judge(attacked: ArmDrives, controls: Mapping[Control, ArmDrives], limit_m: f
 
 
 def effect_of(attacked: ArmDrives, control: ArmDrives) -> AuditEffect:
-    """How much larger the largest |CTE| is, in the mean over the starts, with its 95 % interval [m]."""
+    """Increase of the largest |CTE|, mean over the starts, with its 95 % interval [m]."""
     return _effect(attacked.largest_m - control.largest_m)
 
 
@@ -106,11 +106,11 @@ def paired_p(one: NDArray[np.bool_], other: NDArray[np.bool_]) -> float:
 
 
 def change_of(now: ArmDrives, then: ArmDrives, of_several: int = 1) -> AuditEffect:
-    """How much the largest |CTE| grew since then, in the mean over the same starts [m].
+    """Increase of the largest |CTE| since then, mean over the same starts [m].
 
     Args:
         now: Drives now.
         then: Drives then, from the same starts.
-        of_several: So many changes are looked at, of which the largest counts (Bonferroni).
+        of_several: Number of compared changes, of which the largest counts (Bonferroni).
     """
     return _effect(now.largest_m - then.largest_m, 1.0 - (1.0 - LEVEL) / of_several)

@@ -1,4 +1,4 @@
-"""Does a camera keep its contract (`hardware.cameras.interface`)? One finding for each part of it."""
+"""Checks that a camera keeps its contract (`hardware.cameras.interface`), with one finding for each part of it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _FRAMES = 4
 _FRAME_S = 10.0
 _READ_S = 0.2
 _POLLS = 50
-# A reader with a timeout of 30 ms must be back by then, also on a busy computer.
+# A reader with a timeout of 30 ms must return within this time, even on a busy computer.
 _LATE_S = 2.0
 _OLDEST_NS, _CLOCKS_NS = 1_000_000_000, 20_000_000
 COLOURS = ("red", "green", "blue")
@@ -30,7 +30,7 @@ Read = Callable[[float], Frame | None]
 
 
 def _nothing() -> None:
-    """A device exposes frames by itself."""
+    """Default of `produce`: a real device exposes frames by itself."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ class CameraBench:
 
     Attributes:
         produce: Makes an emulated device expose a frame.
-        shows: Colour of what stands before the camera, of `COLOURS`; empty if that is not known.
-        seen: Frames that the checks took; the last one is for a person to look at.
+        shows: Colour of the object before the camera, from `COLOURS`; empty if unknown.
+        seen: Frames that the checks took; the last one is for a person to inspect.
     """
 
     camera: Camera
@@ -61,10 +61,10 @@ class CameraBench:
         """The next frame.
 
         Args:
-            read: Reads it; the camera's own `read` if None.
+            read: Read function; the camera's own `read` if None.
 
         Raises:
-            NotMet: None comes.
+            NotMet: No frame comes.
         """
         deadline = time.monotonic() + _FRAME_S
         while time.monotonic() < deadline:
@@ -149,7 +149,7 @@ def stamps_rise(bench: CameraBench) -> str:
 
 
 def opens_twice(bench: CameraBench) -> str:
-    """`open` on an open camera, and after `close`, begins again; stamps go on rising and no file stays open."""
+    """`open` on an open camera, and after `close`, starts again; stamps keep rising and no file stays open."""
     with bench.opened():
         stamps = [bench.frame().stamp_mono_ns]
         bench.camera.open()
@@ -191,7 +191,7 @@ def gives_up_in_time(bench: CameraBench) -> str:
 
 
 class _Clock:
-    """A clock that is moved by hand."""
+    """A clock that tests move by hand."""
 
     def __init__(self) -> None:
         self.now_s = 100.0
@@ -257,7 +257,7 @@ def one_thread_reads(bench: CameraBench) -> str:
 
 
 def counters_are_numbers(bench: CameraBench) -> str:
-    """`counters` are numbers by name, and intrinsics, if there are any, are those of the delivered images."""
+    """`counters` are numbers by name, and intrinsics, if any, match the delivered images."""
     with bench.opened() as camera:
         frame = bench.frame()
         counters, pinhole = camera.counters(), camera.pinhole
@@ -276,7 +276,7 @@ def counters_are_numbers(bench: CameraBench) -> str:
 
 
 def colours_are_in_order(bench: CameraBench) -> str:
-    """What is red is in the first channel."""
+    """The first channel is red."""
     if not bench.shows:
         return "not checked: hold something red before the camera, and say --shows red"
     with bench.opened():
@@ -308,7 +308,7 @@ def check_camera(bench: CameraBench) -> list[ContractFinding]:
     """A finding for each part of the contract; the first one alone if there are no frames of the right form.
 
     Raises:
-        DeviceNotFound: There is no such device.
+        DeviceNotFound: The device does not exist.
         DeviceBusy: Another program has it.
     """
     findings: list[ContractFinding] = []

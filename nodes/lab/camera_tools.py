@@ -110,7 +110,7 @@ def source_document(text: str, overrides: Sequence[str] = ()) -> Document:
 
 
 def parse_source(text: str, overrides: Sequence[str] = ()) -> Any:
-    """The settings of a camera source; arguments as of `source_document`."""
+    """The settings of a camera source; arguments as in `source_document`."""
     return parse_value(CameraSource, source_document(text, overrides))
 
 
@@ -118,7 +118,7 @@ def save_picture(rgb: NDArray[np.uint8], file: Path) -> None:
     """Write an image ``[H, W, 3]``.
 
     Raises:
-        CameraToolError: The file name does not end as one of an image does.
+        CameraToolError: The file name does not have the suffix of an image format.
     """
     try:
         done, data = cv2.imencode(file.suffix, rgb[:, :, ::-1])

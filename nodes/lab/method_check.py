@@ -1,4 +1,4 @@
-"""Does a method of attack keep its contract (docs/methods.md)? One finding for each part of it, on an attack of a second."""
+"""Checks that a method of attack keeps its contract (docs/methods.md), with one finding for each part of it, on an attack of a second."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class _Stopped(Exception):
 
 
 class _Brighter:
-    """A policy that steers towards the brighter half of the image; it counts the images that it was asked about."""
+    """A policy that steers towards the brighter half of the image and counts the images that it gets."""
 
     stateless, training, goal_size = True, False, 0
 
@@ -82,7 +82,7 @@ class MethodBench:
 
     Attributes:
         settings: Budget and the method's own options.
-        folder: An empty folder, where states are kept.
+        folder: An empty folder for states.
     """
 
     method: Method
@@ -97,13 +97,13 @@ class MethodBench:
         settings_hash: str = "",
         problem: AttackProblem | None = None,
     ) -> tuple[SearchResult, list[Evaluation]]:
-        """Result of a search, and the evaluations that it called back with.
+        """Result of a search, and the evaluations passed to its callback.
 
         Args:
             state: Name of its state file; empty for none.
             stop_after: Evaluations after which it is killed; 0 for never.
-            settings_hash: Of what must stay the same.
-            problem: What is attacked; a fresh one if None.
+            settings_hash: Hash of the settings that must stay the same.
+            problem: The attack problem; a fresh one if None.
         """
         told: list[Evaluation] = []
 
@@ -117,7 +117,7 @@ class MethodBench:
 
 
 def keeps_to_its_budget(bench: MethodBench) -> str:
-    """The history has as many evaluations as the method announces, at most those of the budget, each called back once."""
+    """The history has as many evaluations as the method announces, at most the budget's, each called back once."""
     problem = _problem()
     planned = bench.method.evaluations(problem, bench.settings)
     result, told = bench.search(problem=problem)
@@ -164,7 +164,7 @@ def depends_on_the_seed(bench: MethodBench) -> str:
 
 
 def resumes_to_the_bit(bench: MethodBench) -> str:
-    """A search that is killed and resumed from its state file ends with the same bytes as one that is left alone."""
+    """A search that is killed and resumed from its state file ends with the same bytes as an uninterrupted one."""
     whole, _ = bench.search()
     stops = [each for each in (1, _STOPPED_AFTER) if each < len(whole.history)]
     for stop_after in stops:
@@ -191,7 +191,7 @@ def resumes_to_the_bit(bench: MethodBench) -> str:
 
 
 def refuses_another_state(bench: MethodBench) -> str:
-    """A state file of another seed or other settings is refused."""
+    """A state file of another seed or other settings is rejected."""
     bench.search(state="other.state", settings_hash="one")
     for changed, values in (("seed", (_OTHER_SEED, "one")), ("settings_hash", (_SEED, "two"))):
         try:
@@ -205,7 +205,7 @@ def refuses_another_state(bench: MethodBench) -> str:
 
 
 def says_what_it_needs(bench: MethodBench) -> str:
-    """A method that says that it needs no gradient searches against a policy without one."""
+    """A method that declares that it needs no gradient searches against a policy without one."""
     if bench.method.needs_gradient:
         return "needs a gradient, and says so"
     try:
@@ -216,10 +216,10 @@ def says_what_it_needs(bench: MethodBench) -> str:
 
 
 def writes_only_its_state(bench: MethodBench) -> str:
-    """It opens no file for writing but its state."""
+    """It writes no file but its state."""
     with _watched() as written:
         bench.search(state="written.state")
-    # Compiled kernels and byte code are no results.
+    # Compiled kernels and byte code are not results.
     outside = [path for path in written if not path.is_relative_to(bench.folder) and not _is_cache(path)]
     if outside:
         raise NotMet(
@@ -247,8 +247,8 @@ def check_method(reference: str, options: Mapping[str, Any] | None = None) -> li
         reference: A built-in name, an entry point's name, or ``file.py:Name``.
 
     Raises:
-        PluginError: There is no such method, or it cannot be loaded.
-        MethodError: It has no such options.
+        PluginError: The method is unknown, or cannot be loaded.
+        MethodError: The method has no such options.
     """
     method = load_method(reference)
     settings = replace(_SETTINGS, options=method.options(options or {}))
@@ -285,7 +285,7 @@ def _on_audit(event: str, arguments: tuple[Any, ...]) -> None:
 
 @contextmanager
 def _watched() -> Iterator[list[Path]]:
-    """Files that Python code of this process opens for writing, makes, renames or removes meanwhile."""
+    """Files that Python code of this process writes, creates, renames or removes in this context."""
     global _watching, _hooked
     if not _hooked:
         sys.addaudithook(_on_audit)  # hooks cannot be removed

@@ -1,4 +1,4 @@
-"""What users can name and bring: one row of `TABLES` for each kind of thing, and the code that a file's names execute."""
+"""Named plug-ins: one row of `TABLES` for each kind, and the code that a file's names execute."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ _DIGITS = 12
 
 @dataclass(frozen=True)
 class PluginTable:
-    """One kind of thing that users can name.
+    """One kind of named plug-in.
 
     Attributes:
-        built_in: Lines about what this project brings, by name.
-        group: Entry point group of what installed packages bring; empty if there is none.
-        keys: Keys of files that name such a thing.
+        built_in: Lines about the built-in ones, by name.
+        group: Entry point group of installed packages; empty if there is no group.
+        keys: Keys of files whose value is such a name.
     """
 
     built_in: Callable[[], Mapping[str, str]]
@@ -37,10 +37,10 @@ class PluginTable:
 
 @dataclass(frozen=True)
 class PluginRow:
-    """One thing that can be named.
+    """One named plug-in.
 
     Attributes:
-        line: What it is, in one sentence.
+        line: Description in one sentence.
         origin: ``built in``, or package and version.
     """
 
@@ -103,14 +103,14 @@ TABLES: Mapping[str, PluginTable] = MappingProxyType(
 
 
 def rows_of(table: PluginTable) -> list[PluginRow]:
-    """What a table has: built-in things, then those of installed packages, which are loaded for their title."""
+    """The rows of a table: built-in ones, then those of installed packages, which are loaded for their title."""
     own = [PluginRow(name, line, BUILT_IN) for name, line in table.built_in().items()]
     found = sorted(entry_points(group=table.group), key=lambda each: each.name) if table.group else []
     return [*own, *(PluginRow(entry.name, _line_of_entry(entry), origin_of(entry)) for entry in found)]
 
 
 def names_twice(rows: list[PluginRow]) -> list[str]:
-    """A sentence for each name that two things have; neither can be used."""
+    """A sentence for each name that occurs twice; neither plug-in can be used."""
     origins: dict[str, list[str]] = {}
     for row in rows:
         origins.setdefault(row.name, []).append(row.origin)
@@ -141,18 +141,18 @@ def _line_of_entry(entry: Any) -> str:
 
 
 def named_code(data: Any, folder: Path) -> list[str]:
-    """The code that is not this project's and that a file names, each with the start of its SHA-256. Nothing is loaded.
+    """Users' code that a file names, each with the start of its SHA-256. Nothing is loaded.
 
     Args:
         data: Plain data of an experiment, a request, a launch file or one of their sections.
-        folder: What a relative ``file.py`` is relative to.
+        folder: Folder that a relative ``file.py`` is relative to.
     """
     lines = [line for key, text in _texts(data, "") if (line := _line_of_code(key, text, folder))]
     return list(dict.fromkeys(lines))
 
 
 def say_code(data: Any, folder: Path) -> None:
-    """Print what a file is about to execute, see `named_code`."""
+    """Print the code that a file is about to execute, see `named_code`."""
     for line in named_code(data, folder):
         print(f"executes {line}", file=sys.stderr, flush=True)
 

@@ -120,7 +120,7 @@ def from_bag(bag: Path, room: Path, view: PolicyView, count: int = 96) -> Refere
 
 
 def from_picture(file: Path, view: PolicyView) -> ReferenceFrames:
-    """A picture of the policy's camera, its mirror image, and both at half the brightness; what is right on them is not known."""
+    """A picture of the policy's camera, its mirror image, and both at half the brightness; the right steering is unknown."""
     rgb, _ = read_stored(file)
     both = np.stack([_seen(view, each, str(file)) for each in (rgb, np.ascontiguousarray(rgb[:, ::-1]))])
     return ReferenceFrames(np.concatenate([both, both // 2]), None, f"{file}, mirrored and darker")
@@ -224,7 +224,7 @@ def judged_by_drives(
     findings: list[Finding],
     goal: tuple[float, ...] | None = None,
 ) -> list[Finding]:
-    """Add the finding of test drives to those of a policy's adapter. The adapter must be right before it is driven.
+    """Add the finding of test drives to the findings on a policy's adapter. The adapter must be right before it is driven.
 
     A policy that does not drive in the place that the user named fails. For a place that cannot be driven, such as a bag, the
     comparison with the expert decides.

@@ -1,7 +1,7 @@
-"""A policy offered to others as a driver behind gRPC: the egodriver protocol of alpasim, Autoware and CARLA users.
+"""Serves a policy to others as a driver behind gRPC: the egodriver protocol of alpasim, Autoware and CARLA users.
 
-Each session has a memory of its own. A policy that answers with waypoints is passed on with its times. One that steers is answered with the
-arc of its curvature, at the speed that the car has.
+Each session has its own memory. A policy of waypoints answers with its plan and times. A policy that steers answers with the
+arc of its curvature, at the car's speed.
 
 Needs ``pip install 'advnerf[egodriver]'``.
 """
@@ -42,11 +42,11 @@ _WORKERS, _GRACE_S = 8, 1.0
 
 @dataclass(frozen=True)
 class ServedCar:
-    """What a policy that steers does not know about the car.
+    """The car's data that a policy that steers lacks.
 
     Attributes:
-        wheelbase_m: Distance between the axles, which makes an arc of a wheel angle [m]; None for a policy that needs none.
-        speed_mps: Speed of the plans [m/s]; None for the speed that the car has.
+        wheelbase_m: Distance between the axles, which converts a wheel angle to an arc [m]; None for a policy without need of it.
+        speed_mps: Speed of the plans [m/s]; None for the car's current speed.
         goal: Goal vector of a goal-conditioned policy.
     """
 
@@ -60,11 +60,11 @@ class ServedPolicy(BaseDriver):
 
     Args:
         driver: The policy.
-        name: What it is called; the start of its hash follows.
-        car: What it is told about the car.
+        name: Name of the driver; the start of the policy's hash follows.
+        car: Data of the car.
 
     Raises:
-        ConfigError: The policy steers and there is no wheelbase, or its goal has another length.
+        ConfigError: The policy steers and the wheelbase is missing, or its goal has another length.
     """
 
     def __init__(self, driver: Driver, name: str, car: ServedCar) -> None:
@@ -83,10 +83,10 @@ class ServedPolicy(BaseDriver):
         self._sessions: dict[str, tuple[str, Driver]] = {}
 
     def on_session_start(self, session: SessionState) -> None:
-        """Find the policy's camera among those of the session, and forget what was seen before.
+        """Find the policy's camera among the session's, and reset its memory.
 
         Raises:
-            ValueError: No camera of the session has the size and lens that the policy was made for.
+            ValueError: No camera of the session has the size and lens of the policy's.
         """
         wanted = self._driver.view.camera
         fitting = [name for name, camera in session.cameras.items() if _fits(camera, wanted)]
@@ -165,21 +165,21 @@ def _described(camera: Any) -> str:
 
 @contextmanager
 def serving(policy: BaseDriver, listen: str, mode: ServiceMode = "carla") -> Iterator[str]:
-    """Serve a policy while the block runs; yields the address that others name.
+    """Serve a policy while the block runs; yields the address for clients.
 
     Args:
-        policy: What answers.
+        policy: The policy as a driver.
         listen: ``HOST:PORT``; port 0 takes a free one. On an address that other computers reach, TLS with this user's certificate.
         mode: ``alpasim`` for a runtime of alpasim itself, whose opaque fields differ.
 
     Raises:
-        ConfigError: The address is none, or taken.
+        ConfigError: The address is invalid, or taken.
     """
     found = _ADDRESS.fullmatch(listen)
     if found is None:
         raise ConfigError(f"expected HOST:PORT to listen on, got {listen}")
     host, port = found.groups()
-    # Two servers would share a port in silence, and each answer some of the questions.
+    # Two servers would silently share a port, and each answer some of the requests.
     options = [*channel_options(), ("grpc.so_reuseport", 0)]
     server = grpc.server(ThreadPoolExecutor(max_workers=_WORKERS), options=options)
     servicer = EgodriverServicer(policy, mode)

@@ -1,4 +1,4 @@
-"""A policy that runs in ROS 2, asked over DDS: for attacks on a black box, ``advnerf policy check``, and drives in a world.
+"""A policy that runs in ROS 2, queried over DDS: for black-box attacks, ``advnerf policy check``, and drives in a world.
 
 The ROS program gets whole camera images, as it does on the car, and answers each with a command that carries the image's stamp.
 """
@@ -30,7 +30,7 @@ _FIND_S, _ANSWER_S, _AGAIN_S, _POLL_S = 30.0, 10.0, 0.5, 0.0005
 
 
 class Ros2Network(nn.Module):
-    """Asks a ROS 2 program for the steering of images, one after the other.
+    """Queries a ROS 2 program for the steering of images, one after the other.
 
     Args:
         domain_id: DDS domain, ``ROS_DOMAIN_ID`` of the program.
@@ -38,7 +38,7 @@ class Ros2Network(nn.Module):
         commands: ROS name of its commands.
         command_type: ``geometry_msgs/msg/TwistStamped`` or ``ackermann_msgs/msg/AckermannDriveStamped``.
         wheelbase_m: Distance of the axles, which turns yaw rates into wheel angles [m].
-        interface: A loopback interface: a search asks thousands of times and needs no network.
+        interface: A loopback interface: a search sends thousands of queries and needs no network.
     """
 
     def __init__(
@@ -128,7 +128,7 @@ def ros2_policy(
         images: ROS name of the images.
         commands: ROS name of its commands.
         command_type: Type of its commands.
-        view: What the program is sent; none sends whole camera images. A program that takes its network's own input size is asked faster,
+        view: View of the sent images; None sends whole camera images. A program that takes its network's own input size answers faster,
             because the scene is rendered at that size.
     """
     found = load_calibration(CameraCalibration, Path(camera)).pinhole

@@ -1,4 +1,4 @@
-"""Settings of a scene training: what ``advnerf scene train`` takes as options."""
+"""Settings of a scene training: the options of ``advnerf scene train``."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ class TrainingRequest:
 
     @property
     def length(self) -> tuple[int | None, float | None]:
-        """Steps and minutes of the training: as given, else the preset's minutes, else 1000 steps."""
+        """Steps and minutes of the training: the given ones, else the preset's minutes, else 1000 steps."""
         from advnerf_core.scene.presets import PRESETS as SCENE_PRESETS
 
         if self.steps is not None or self.minutes is not None:

@@ -1,1 +1,1 @@
-"""What the commands ``advnerf carla ...`` do: look at a server, photograph a junction, drive it with the expert."""
+"""Implementation of ``advnerf carla ...``: check a server, photograph a junction, drive it with the expert."""

@@ -1,4 +1,4 @@
-"""Photograph a junction: posed images for learning, and views of the driving camera that nothing learns from."""
+"""Photographs a junction: posed images for learning, and held-out views of the driving camera."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ PHOTOS, HELD_OUT, DRIVES, REQUEST = "photos", "held_out", "drives.json", "reques
 
 @dataclass(frozen=True)
 class CaptureRequest:
-    """What to photograph.
+    """Amount of pictures to take.
 
     Attributes:
-        photos: Photographs that the scene is learned from; the paper has 1800.
+        photos: Photographs for learning the scene; the paper has 1800.
         held_out: Views of the driving camera along the drives.
     """
 
@@ -42,19 +42,19 @@ def capture(
 ) -> tuple[int, int]:
     """Write ``photos`` and ``held_out`` (images and ``transforms.json``) and ``drives.json`` (frame and reference paths).
 
-    A capture that was stopped goes on: pictures that are there are kept. They are in the scene's frame: right-handed, metres, z up.
+    An interrupted capture resumes: existing pictures are kept. They are in the scene's frame: right-handed, metres, z up.
 
     Args:
-        folder: Where to; one that holds another capture is refused.
-        report: Gets the share done and what is being done.
+        folder: Output folder; an error if it holds another capture.
+        report: Called with the finished share and the current step.
         library: The ``carla`` module; None imports it.
 
     Returns:
-        How many pictures were taken now, and how many were there.
+        Number of pictures taken in this call, and of pictures that existed.
 
     Raises:
-        ConfigError: The folder holds a capture of something else.
-        CarlaError: Something is wrong with the server.
+        ConfigError: The folder holds another capture.
+        CarlaError: The server failed.
     """
     with CarlaScene(config, library) as scene:
         drives = scene.drives.to_dict()
@@ -87,7 +87,7 @@ def capture(
 
 
 def _claim(folder: Path, config: CarlaConfig, request: CaptureRequest, drives: dict[str, Any]) -> None:
-    """Note what is captured into a folder, or see that it is the same as before; the server's address does not count."""
+    """Note the capture's settings in a folder, or check that they are the same as before; the server's address does not count."""
     about = config.model_dump(mode="json", exclude={"server", "car", "body"}) | {"town": config.server.town}
     text = json.dumps({"config": about, "request": vars(request), "drives": drives}, sort_keys=True)
     digest, file = hashlib.sha256(text.encode()).hexdigest(), folder / REQUEST

@@ -1,4 +1,4 @@
-"""Is this CARLA server fit for an experiment? One line per thing, in the order in which they can be wrong."""
+"""Checks whether a CARLA server is fit for an experiment: one line per check, in the order of dependence."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from hardware.worlds.world import require_depth
 State = Literal["ok", "warning", "failure"]
 _STEPS = 10
 _GROUND_TOLERANCE = 0.03
-_GROUND_SHARE = 0.5  # at least so much of the picture's lower middle must be road
+_GROUND_SHARE = 0.5  # at least this share of the picture's lower middle must be road
 
 
 @dataclass(frozen=True)
 class CarlaCheck:
-    """One thing that was looked at.
+    """Result of one check.
 
     Attributes:
-        state: Whether it is as it must be.
-        text: What was found, and if it is wrong what to do.
+        state: Whether it passed.
+        text: The finding, and what to do if it failed.
     """
 
     name: str
@@ -43,18 +43,18 @@ class CarlaCheck:
 
 
 def check_server(config: CarlaConfig, library: Any = None, pictures: Path | None = None) -> list[CarlaCheck]:
-    """Look at a server; ends at the first thing without which the rest cannot be looked at.
+    """Check a server; stops at the first failure that prevents the rest.
 
-    The map is not changed. If everything else is right a scene is opened for a few ticks and put back.
+    The map is not changed. If all checks pass a scene is opened for a few ticks and restored.
 
     Args:
         library: The ``carla`` module; None imports it.
-        pictures: Folder for what the driving camera sees, to be looked at by a person.
+        pictures: Folder for the driving camera's pictures, for a person to inspect.
     """
     checks: list[CarlaCheck] = []
 
     def look(name: str, what: Callable[[], Any]) -> Any:
-        """The result of a look, or None if it failed, which is written down."""
+        """The result of a check, or None if it failed, which is recorded."""
         try:
             with server_answers(name):
                 found = what()
@@ -86,7 +86,7 @@ def check_server(config: CarlaConfig, library: Any = None, pictures: Path | None
 
 
 def _look_at_map(config: CarlaConfig, client: Any, world: Any, checks: list[CarlaCheck]) -> bool:
-    """Whether the wanted map is the one that is loaded."""
+    """Whether the requested map is loaded."""
     loaded, wanted = map_name(world.get_map().name), config.server.town
     if wanted in (None, loaded):
         checks.append(CarlaCheck("map", "ok", loaded))
@@ -164,7 +164,7 @@ def _look_at_pictures(
 def _ground(
     pinhole: Pinhole, T_car_from_camera: Any, rgb: NDArray[np.uint8], depth: NDArray[np.float32]
 ) -> CarlaCheck:
-    """Is the road where depth says, for a camera mounted as ours is? Wrong units, a wrong angle or a bonnet in view show here."""
+    """Check that the road is where depth says, for a camera mounted as ours. Wrong units, a wrong angle or a bonnet in view show here."""
     rows, columns = slice(int(0.75 * pinhole.height), None), slice(pinhole.width // 3, 2 * pinhole.width // 3)
     down = -(pinhole.directions()[rows, columns] @ T_car_from_camera[:3, :3].T)[..., 2]
     expected = T_car_from_camera[2, 3] / down

@@ -28,7 +28,7 @@ class CheckResult:
         check: Name of the check.
         state: ``ok``; ``absent`` (missing, but only some users need it); ``warning`` (something will not work as it should);
             ``failure`` (the requested function cannot work).
-        do: What to do about it; empty if no action is needed.
+        do: Action to take; empty if none is needed.
     """
 
     check: str
@@ -49,7 +49,7 @@ class DoctorCheck:
         name: Name of the check.
         run: Runs the check; may hang.
         deadline_s: Time after which the check counts as hung [s].
-        cure: What to do if it hangs.
+        cure: Action to take if it hangs.
     """
 
     name: str
@@ -66,8 +66,8 @@ class ProbeResult:
 
     Attributes:
         data: The result; None if the probe failed.
-        trouble: Why the probe failed.
-        late: Whether it gave no answer in time, which says nothing about what is installed.
+        trouble: Reason for a failed probe.
+        late: Whether it gave no answer in time, which does not show what is installed.
     """
 
     data: Any
@@ -75,7 +75,7 @@ class ProbeResult:
     late: bool = False
 
     def cure(self, of_failure: str) -> str:
-        """What to do: that of a failure, or wait where the computer is only slow."""
+        """Action to take: the failure's, or to wait if the computer is only slow."""
         return "run advnerf doctor again when this computer has less to do" if self.late else of_failure
 
 

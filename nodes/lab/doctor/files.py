@@ -89,7 +89,7 @@ def _paths(value: Any) -> Iterator[str]:
 def _attack(name: str, data: dict[str, Any]) -> list[CheckResult]:
     file = Path(data["attack"])
     if not file.exists():
-        return []  # said already
+        return []  # reported already
     try:
         attack = load_attack(file)
     except AdvnerfError as error:
@@ -99,7 +99,7 @@ def _attack(name: str, data: dict[str, Any]) -> list[CheckResult]:
             camera = load_calibration(CameraCalibration, data["camera"])
             show(attack, camera, load_calibration(TargetCalibration, data["target"]))
     except CalibrationError:
-        pass  # said under "calibration"
+        pass  # reported under "calibration"
     except AdvnerfError as error:
         return [CheckResult("attack", FAILURE, f"{name}: {error}", "give the target that it was made for")]
     subject = "no subject" if attack.face is None else attack.face.subject

@@ -147,7 +147,7 @@ def _calibration(file: Path) -> CameraCalibration | None:
     try:
         return load_calibration(CameraCalibration, file)
     except AdvnerfError:
-        return None  # said under "calibration"
+        return None  # reported under "calibration"
 
 
 def _nobody(name: str, where: str) -> list[CheckResult]:
@@ -190,7 +190,7 @@ def _safety(asked: _Asked) -> list[DoctorCheck]:
 def _policy(asked: _Asked) -> list[DoctorCheck]:
     config = asked.config(PolicyNodeConfig)
     if _missing_policy(config) is not None:
-        return []  # said under "files"
+        return []  # reported under "files"
     return [
         DoctorCheck("policy", partial(_policy_findings, config, _image_size(asked.plan)), _CHILD_DEADLINE_S)
     ]

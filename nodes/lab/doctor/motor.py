@@ -71,7 +71,7 @@ def _port(port: Any) -> CheckResult:
 
 
 def stable_names(device: Path, folders: Iterable[Path] = (BY_ID,), fixed: Path = FIXED_NAME) -> list[Path]:
-    """Names of a device that stay the same when it is plugged in again."""
+    """Names of a device that survive replugging."""
     candidates = [
         fixed,
         *(link for folder in folders if folder.is_dir() for link in sorted(folder.iterdir())),
@@ -87,7 +87,7 @@ def permission_cure(group: str) -> str:
         return f"this system has no group {group}; ls -l shows who may open the device"
     try:
         user = pwd.getpwuid(os.getuid()).pw_name
-    except KeyError:  # as the user of a container
+    except KeyError:  # for the user of a container
         return f"start the container with --group-add {entry.gr_gid}, or give user {os.getuid()} a name and the group {group}"
     if entry.gr_gid in os.getgroups():
         return f"you are in the group {group}: ls -l shows who may open it; its udev rule sets GROUP and MODE"
@@ -97,7 +97,7 @@ def permission_cure(group: str) -> str:
 
 
 def find_vesc() -> str | None:
-    """Port of the device that looks like a VESC; None if there is none."""
+    """Port of the device that looks like a VESC; None without one."""
     if FIXED_NAME.exists():
         return str(FIXED_NAME)
     return next((str(port.device) for port in ports() if (port.vid, port.pid) == VESC_USB), None)
@@ -200,7 +200,7 @@ def _running(name: str) -> int | None:
                 if (folder / "comm").read_text().strip() == name:
                     return int(folder.name)
             except OSError:
-                continue  # it ended while we looked
+                continue  # it ended in the meantime
     return None
 
 

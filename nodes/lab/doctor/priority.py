@@ -24,7 +24,7 @@ def shares() -> list[CheckResult]:
         "import dataclasses, json; from nodes.runtime.priority import *; "
         "print(json.dumps(dataclasses.astuple(take_share(FIRST))))"
     )
-    # A session of its own, as each node of a launch has.
+    # A separate session, as each node of a launch has.
     done = subprocess.run(
         [sys.executable, "-c", program],
         capture_output=True,

@@ -36,7 +36,7 @@ def from_colmap(
         images: Folder of the images that the model was made from.
         output: Folder of the data set, with copies of the images.
         number: Name of the model's folder, if there are several; None for the one with the most images.
-        metric: What is known of the world.
+        metric: Known facts about the world.
     """
 
     def build(folder: Path) -> Imported:
@@ -70,7 +70,7 @@ def _with_reading(share: float) -> float:
 
 
 def _copy_images(found: ColmapModel, images: Path, folder: Path, output: Path, report: Report) -> Model:
-    """The model of those images that are there, under the names that they have in the data set."""
+    """The model of the existing images, with their names in the data set."""
     made = {folder.resolve(), output.resolve()}
     model, kept, left_out = found.model, list[Registered](), list(found.model.left_out)
     files = {each.name: _file_of(images, each.name) for each in model.images}
@@ -94,7 +94,7 @@ def _copy_images(found: ColmapModel, images: Path, folder: Path, output: Path, r
 
 
 def _file_of(images: Path, name: str) -> Path | None:
-    """The image in the folder; None if it is not there."""
+    """The image in the folder; None if it does not exist."""
     for written in (PurePosixPath(name), PurePosixPath(name.replace("\\", "/"))):
         if written.is_absolute() or ".." in written.parts:
             raise ImportRecordingError(
@@ -119,7 +119,7 @@ def _require_some(files: dict[str, Path | None], images: Path) -> None:
 
 
 def _others(images: Path, known: set[str], made: Set[Path]) -> list[str]:
-    """Images in the folder that the model does not know; not those of data sets that are made inside it."""
+    """Images in the folder that the model does not contain, except for data sets inside the folder."""
     names = (
         file.relative_to(images).as_posix()
         for file in images.rglob("*")
@@ -145,7 +145,7 @@ def _copied(image: Registered, file: Path, folder: Path, camera: Any) -> Registe
 
 
 def _same_size(image: Registered, file: Path, pinhole: Pinhole, exactly: bool = False) -> Pinhole:
-    """Intrinsics for the image as it is: it may be smaller than the one that the model was made from.
+    """Intrinsics for the image in its current size, which may be smaller than the model's.
 
     Raises:
         ImportRecordingError: The image has another shape.

@@ -1,4 +1,4 @@
-"""Fits the map from the colours of a learned scene to those of the driving camera."""
+"""Fits the map from the colours of a learned scene to the driving camera's."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class ColourMatch:
     """A fitted colour map.
 
     Attributes:
-        map: Map from learned colours to those of the driving camera.
+        map: Map from learned colours to the driving camera's.
         frames: Number of frames used for the fit.
         before_db: PSNR against the frames without the map [dB].
         after_db: PSNR against the frames with the map [dB].

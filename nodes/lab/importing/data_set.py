@@ -70,7 +70,7 @@ def from_media(
         media_config: Selection of frames.
         sfm: Settings of structure from motion.
         extent_m: Assumed largest distance between two camera positions [m]; not used if ``metric`` gives the scale.
-        metric: What is known of the world.
+        metric: Known facts about the world.
     """
 
     def build(folder: Path) -> Imported:
@@ -132,7 +132,7 @@ def from_phone_and_car(
 ) -> Imported:
     """Combine phone media and frames of a bag in one model, metric and in the motion-capture world.
 
-    ``transforms.json`` has all registered images with the model's poses, ``transforms_phone.json`` only those of the phone (for
+    ``transforms.json`` has all registered images with the model's poses, ``transforms_phone.json`` only the phone's (for
     training), ``transforms_car.json`` all frames of the car with their motion-capture poses (to fit colours and to compare).
     """
 
@@ -192,7 +192,7 @@ def write_model_set(
         output: Folder that the names of the images are relative to.
         poses: ``T_world_from_camera [N, 4, 4]`` of the images.
         points: Points of the scene ``[M, 3]``.
-        facts: What the report says.
+        facts: Content of the report.
     """
     path = output / TRANSFORMS
     _write_model(path, output, model, poses, range(len(model.images)), _box_of(points, poses))

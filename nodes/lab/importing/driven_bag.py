@@ -83,7 +83,7 @@ def take_frames(
 
     Raises:
         BagError: The bag is unfinished or lacks the topics.
-        ImportRecordingError: There is no calibration, the image size differs from it, or the frames have no poses.
+        ImportRecordingError: The calibration is missing, the image size differs from it, or the frames have no poses.
     """
     camera = _camera(bag, calibration)
     poses = _car_poses(bag, config)

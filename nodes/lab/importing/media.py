@@ -85,7 +85,7 @@ def _part_of(report: Report, index: int, parts: int) -> Report:
 
 
 def photographs_in(folder: Path) -> list[Path]:
-    """Image files of a folder, sorted by name. Numbers in names are sorted by value. Files of other kinds are told."""
+    """Image files of a folder, sorted by name. Numbers in names are sorted by value. Files of other kinds are reported."""
     files, others = list[Path](), Counter[str]()
     for path in folder.iterdir():
         if path.is_file() and _is_photograph(path):
@@ -127,7 +127,7 @@ def _thinned(files: list[Path], most: int) -> list[Path]:
 
 
 def _copy_photographs(files: Sequence[Path], folder: Path, report: Report) -> list[Path]:
-    """Copy what can be read; what cannot is left out, and told."""
+    """Copy all readable photographs; the others are left out and reported."""
     folder.mkdir(parents=True, exist_ok=True)
     copies, names, damaged = [], set[str](), []
     for file in files:

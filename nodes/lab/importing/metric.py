@@ -1,4 +1,4 @@
-"""Puts a model of photographs into an upright, metric world, by what the user knows of it."""
+"""Puts a model of photographs into an upright, metric world, by facts that the user knows about it."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from nodes.lab.importing.metric_options import MetricOptions
 
 @dataclass(frozen=True)
 class Unscaled:
-    """What a model has without a known length.
+    """Scale of a model without a known length.
 
     Attributes:
         scale: Factor of its lengths.
-        why: What the report says of them.
+        why: The report's explanation.
     """
 
     scale: float
@@ -42,11 +42,11 @@ def place(
     options: MetricOptions,
     otherwise: Unscaled,
 ) -> tuple[Similarity, dict[str, Any]]:
-    """Similarity from a model into an upright world, and what the report says of it.
+    """Similarity from a model into an upright world, and the report's description of it.
 
     Args:
-        points_by_id: Points ``[3]`` of the model by the number that COLMAP shows.
-        views: Gives the undistorted images, for markers.
+        points_by_id: Points ``[3]`` of the model by COLMAP's number.
+        views: Returns the undistorted images, for markers.
         otherwise: The scale if no option gives it.
     """
     ground = _ground(model, options)

@@ -1,4 +1,4 @@
-"""What a user knows of the world of photographs: options of the commands ``advnerf scene from-...``."""
+"""Facts that a user knows about the world of photographs: options of the commands ``advnerf scene from-...``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from nodes.lab.importing.errors import ImportRecordingError
 
 @dataclass(frozen=True)
 class MetricOptions:
-    """What is known of the world; the help of each option describes it. At most one of the first three gives the metre."""
+    """Known facts about the world; the help of each option describes it. At most one of the first three gives the metre."""
 
     length: Annotated[
         tuple[str, str, float] | None,

@@ -68,7 +68,7 @@ def compare(predicted_rad: NDArray[np.floating[Any]], true_rad: NDArray[np.float
 def predict(policy: Any, images: NDArray[np.uint8], goal: tuple[float, ...] = ()) -> NDArray[np.float64]:
     """Compute the steering ``[N]`` [rad] of a loaded policy for policy images ``[N, H, W, 3]`` uint8."""
     parts, batch = [], _BATCH
-    if not getattr(policy, "stateless", True):  # one after the other, as they were driven
+    if not getattr(policy, "stateless", True):  # in driving order, one by one
         policy, batch = Remembering.afresh(policy, 1), 1
     with torch.no_grad():
         for start in range(0, len(images), batch):

@@ -202,7 +202,7 @@ def _read_track(bag: Path, topics: list[str]) -> _Track:
         elif message.topic == _EXPERT:
             track.disturbed.append((stamp_ns, decoded.disturbance_rad != 0.0))
         elif not decoded.braking:
-            # In a drive of a policy, the stamp is that of the image. In a drive of the expert, it is that of a pose just after it.
+            # A policy's drive has the image's stamp. An expert's drive has the stamp of a pose just after it.
             track.sent.append((stamp_ns, float(decoded.steering_rad)))
     for stream in (track.armed, track.sent, track.disturbed):
         stream.sort()

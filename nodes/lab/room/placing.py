@@ -35,7 +35,7 @@ def guide(
         target: Corners of the target that shows it.
         limits: Tolerated distance [m] and angle [rad].
         once: Whether to measure only once.
-        timeout_s: Time after which it gives up [s].
+        timeout_s: Time limit [s].
 
     Returns:
         The last displacement and the subject's pose ``[4, 4]``; None if the subject was never seen.

@@ -61,7 +61,7 @@ def find_drives(bag: Path) -> list[DriveSpan]:
         moved = np.flatnonzero(np.linalg.norm(xy[first:] - origin, axis=1) > MOVED_M)
         start_ns = int(stamps[first + moved[0]]) if moved.size else None
         end_ns = int(stamps[-1]) if disarmed_ns is None else disarmed_ns
-        for gap in gaps:  # a drive ends where the clock was set: what follows is at another time
+        for gap in gaps:  # a drive ends where the clock was set, as later times are not comparable
             if armed_ns <= gap.before_ns < end_ns:
                 end_ns, reason = gap.before_ns, str(gap)
         if start_ns is not None and start_ns < end_ns:

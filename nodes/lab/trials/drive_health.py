@@ -24,13 +24,13 @@ _SENT = "/motor/sent"
 _TICK_SHARE = 0.1
 # Time from the capture of an image to its command beyond which the command is late [s]. It is two control periods.
 _LATE_S = 0.2
-# Share of its own ticks that the loop of a node may miss.
+# Share of its own ticks that a node's loop may miss.
 _LOOP_SHARE = 0.25
 
 
 @dataclass(frozen=True)
 class DriveHealth:
-    """How the node graph ran during one drive.
+    """Health of the node graph during one drive.
 
     Attributes:
         stopped: Why the safety node disarmed; empty for a complete drive.

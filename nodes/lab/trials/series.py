@@ -75,7 +75,7 @@ def prepare_series(
     Args:
         launch_file: Node graph with a safety node, whose room is used, and a recorder.
         overrides: ``node.key=value`` and ``params.name=value``.
-        folder: New folder, or that of the same series.
+        folder: New folder, or the same series' folder.
         attacks: Attack files of each condition besides ``none``.
         repeats: Number of runs of each condition.
         seed: Random seed of the order.
@@ -164,7 +164,7 @@ def summarise(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Summarise the results in one row per condition: runs, mean and standard deviation of the total CTE [m], ratio to no attack,
     number of runs off the track, spoiled tries before these runs, number of runs without checksums.
 
-    The standard deviation is that of a sample (n - 1), and None for a single run. The ratio is that of the means.
+    The standard deviation is a sample's (n - 1), and None for a single run. The ratio compares the means.
     """
     groups: dict[str, list[dict[str, Any]]] = {}
     for result in results:

@@ -1,4 +1,4 @@
-"""Tries of one drive: it is driven until it counts, at most three times. The reasons of the tries that were spoiled are kept.
+"""Tries of one drive: it is repeated until it counts, at most three times. The reasons of spoiled tries are kept.
 
 `nodes.lab.trials.drive_health` decides what spoils a drive, before any result of it is computed.
 """
@@ -39,11 +39,11 @@ def drive_with_tries(
     Args:
         drive: Drives once into the folder named like the file without its suffix, and returns the result as JSON data. Raises
             `SpoiledError` before it computes anything, if the drive does not count.
-        file: Gets the result. A result that is there is returned.
-        tell: Told of spoiled tries.
+        file: File for the result. An existing result is returned.
+        tell: Called with a message for each spoiled try.
 
     Raises:
-        NotDrivenError: All tries were spoiled, now or when this drive was tried before.
+        NotDrivenError: All tries were spoiled, now or in an earlier call.
     """
     if file.exists():
         found: dict[str, Any] = read_json(file)
@@ -66,7 +66,7 @@ def drive_with_tries(
 
 
 def allow_more_tries(folder: Path) -> None:
-    """Allow three more tries of each drive in a folder that was given up. The reasons of the earlier tries are kept."""
+    """Allow three more tries of each drive in a folder whose tries were all spoiled. Earlier reasons are kept."""
     for kept in folder.glob(f"*{_TRIES}"):
         rounds = _read(kept)
         if len(rounds[-1]) >= MOST_TRIES:

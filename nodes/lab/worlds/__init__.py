@@ -1,1 +1,1 @@
-"""Worlds that are driven: found by name, driven by the expert, and held against their contract."""
+"""Worlds: found by name, driven by the expert, and checked against their contract."""

@@ -1,4 +1,4 @@
-"""What all checks of a world share: the open world, what it says about itself, and places from which it is looked at."""
+"""Common parts of all checks of a world: the open world, its description, and poses to look from."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hardware.worlds.world import World, WorldDescription
 from nodes.lab.worlds.named import NamedWorld
 
 TICK_S = 0.1
-# Stretch of a path that is driven and looked at [s].
+# Stretch of a path that is driven and inspected [s].
 DRIVEN_S = 6.0
 
 
@@ -23,8 +23,8 @@ class WorldBench:
     """An open world under test.
 
     Attributes:
-        description: What it said about itself when it was opened.
-        step_s: Whole multiples of this may pass in a step [s]; None for any duration.
+        description: Description of the open world.
+        step_s: A step's duration must be a multiple of this [s]; None for any duration.
     """
 
     named: NamedWorld
@@ -34,17 +34,17 @@ class WorldBench:
 
     @cached_property
     def tick_s(self) -> float:
-        """A control tick that the world can make, near 0.1 s [s]."""
+        """A control tick that the world supports, near 0.1 s [s]."""
         return TICK_S if self.step_s is None else max(round(TICK_S / self.step_s), 1) * self.step_s
 
     def driven_m(self, path: ReferencePath) -> float:
-        """How far a path is driven in a check [m]."""
+        """Length of a path that a check drives [m]."""
         length_m = path.length_m
         return min(self.description.car.speed_mps * DRIVEN_S, length_m if path.closed else 0.95 * length_m)
 
     @cached_property
     def places(self) -> list[Pose]:
-        """Poses of the car on the paths: where each is begun, a third and two thirds of the way that is driven."""
+        """Poses of the car on the paths: at each start, and after a third and two thirds of the driven length."""
         return [
             path.pose_at(share * self.driven_m(path))
             for path in self.description.paths.values()

@@ -1,4 +1,4 @@
-"""Does a world keep its contract? One line for each part of it, met or not, and why."""
+"""Checks that a world keeps its contract: one line for each part of it, met or not, and why."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from nodes.runtime.errors import ConfigError
 from nodes.runtime.findings import ContractFinding, NotMet, look
 
 _DESCRIPTION = "description"
-# Without the first of these nothing else can be looked at.
+# Without the first of these the others cannot run.
 _FIRST: tuple[tuple[str, Check], ...] = (("pictures", form),)
 _CHECKS: tuple[tuple[str, Check], ...] = (
     ("repeatable", repeats),
@@ -52,27 +52,27 @@ _CHECKS: tuple[tuple[str, Check], ...] = (
     ("paths", paths_are_drivable),
     ("expert", expert_keeps_its_lane),
 )
-# What a world says itself, such as that its server is gone.
+# Errors that a world raises itself, such as that its server is gone.
 _OF_THE_WORLD = (AdvnerfError,)
-# Of worlds that take panels into their own scene.
+# For worlds that take panels into their own scene.
 _PANELS: tuple[str, Check] = ("panels", panels_are_native)
 
 
 def check_world(
     named: NamedWorld, pictures: Path | None = None, only: Collection[str] = ()
 ) -> list[ContractFinding]:
-    """Look at everything that can be told of a world from the outside.
+    """Run all checks of a world from the outside.
 
     Args:
-        pictures: Folder for what the driving camera and a photograph show, for a person to look at.
-        only: Parts of the contract to look at, beside the first ones; all of them if empty.
+        pictures: Folder for a picture of the driving camera and a photograph, for a person to inspect.
+        only: Parts of the contract to check, beside the first ones; all of them if empty.
 
     Returns:
-        A line for each part of the contract; fewer if a first one fails without which the others cannot be looked at.
+        A line for each part of the contract; fewer if a first check fails without which the others cannot run.
 
     Raises:
         AdvnerfError: The world cannot be made or opened; its own message.
-        ConfigError: There is no part of such a name.
+        ConfigError: No part has this name.
     """
     names = (_DESCRIPTION, *(name for name, _ in (*_FIRST, *_CHECKS, _PANELS)))
     for name in only:
@@ -105,7 +105,7 @@ def check_world(
 
 
 def _described(world: World) -> WorldDescription | None:
-    """What a world says about itself before it is opened; None if it must be asked."""
+    """A world's description before it is opened; None if it must be open for that."""
     try:
         return world.describe()
     except NotOpenError:
@@ -113,7 +113,7 @@ def _described(world: World) -> WorldDescription | None:
 
 
 def _is_consistent(bench: WorldBench, closed: WorldDescription | None) -> str:
-    """The description says the same every time and through JSON, and has the camera that the world has; settings are JSON."""
+    """The description is the same every time and through JSON, and has the world's camera; settings are JSON."""
     world, described = bench.world, bench.description
     text = json.dumps(described.to_dict())
     for when, other in (("when it is asked again", world.describe()), ("before it is opened", closed)):
@@ -146,7 +146,7 @@ def _has(settings: dict[str, object], key: str) -> bool:
 
 
 def _write_pictures(bench: WorldBench, folder: Path) -> None:
-    """What the driving camera sees where each path begins, its depth (near is bright), and a photograph from there."""
+    """Write the driving camera's picture at the start of each path, its depth (near is bright), and a photograph from there."""
     for name, path in bench.description.paths.items():
         rgb, depth = require_depth(bench.world.observe_at(*path.start_pose))
         near = 255.0 * np.clip(1.0 - np.log1p(np.minimum(depth, 1e4)) / 5.0, 0.0, 1.0)

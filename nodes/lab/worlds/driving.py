@@ -1,4 +1,4 @@
-"""Checks of a world's car and paths: it is put where it is asked, moves as the description says, and can drive the paths."""
+"""Checks of a world's car and paths: it starts at the requested pose, moves as described, and can drive the paths."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from nodes.lab.worlds.expert_drive import as_path, drive_expert, lane_expert
 from nodes.runtime.findings import NotMet
 
 _RESET_TOLERANCE = 1e-4
-# A drive that is measured [s]: its second half, when lags have died away.
+# A drive for measurement [s]: its second half, when lags have died away.
 _MEASURED_S = 1.2
 _TURN_TOLERANCE, _SPEED_TOLERANCE, _SLIP_RAD = 0.25, 0.2, 0.06
 # Firmness of the expert [1/m] times half a lane [m], and how far beside a path it starts, of half a lane.
@@ -23,7 +23,7 @@ _STIFFNESS_HALF_LANES, _START_ASIDE = 0.35, 0.3
 
 
 def is_put_down(bench: WorldBench) -> str:
-    """The car is where ``reset`` puts it, at rest, and has forgotten what was commanded."""
+    """The car is at rest at the pose of ``reset``, and has forgotten earlier commands."""
     world, car = bench.world, bench.description.car
     for x, y, yaw in [*bench.places, (*bench.places[0][:2], bench.places[0][2] + 4.0 * math.pi)]:
         world.step(car.control_limits[1], car.speed_mps, bench.tick_s)
@@ -50,7 +50,7 @@ def is_put_down(bench: WorldBench) -> str:
 
 
 def moves_as_described(bench: WorldBench) -> str:
-    """The car goes as fast, and turns as fast and to the side, as kind, speed and wheelbase say; a small lag and error are its own."""
+    """The car's speed and turn rate agree with kind, speed and wheelbase, up to a small lag and error."""
     car, told = bench.description.car, []
     for name, path in bench.description.paths.items():
         ratio, speed_ratio, slip_rad = _measured(bench, path)
@@ -77,7 +77,7 @@ def moves_as_described(bench: WorldBench) -> str:
 
 
 def paths_are_drivable(bench: WorldBench) -> str:
-    """Paths are continuous, no tighter than the car can turn, free of obstacles, and in a lane; those that begin together have different goals."""
+    """Paths are continuous, no tighter than the car can turn, free of obstacles, and in a lane; paths with the same start have different goals."""
     paths, car, told = bench.description.paths, bench.description.car, []
     lanes = np.concatenate(
         [_along(lane, 0.2 * bench.description.off_track_m)[:, :2] for lane in bench.description.lanes]
@@ -126,7 +126,7 @@ def paths_are_drivable(bench: WorldBench) -> str:
 
 
 def expert_keeps_its_lane(bench: WorldBench) -> str:
-    """The project's expert, told the true state, stays in its lane on every path, from a start beside it."""
+    """The project's expert, given the true state, stays in its lane on every path, from a start beside it."""
     told, car, half_lane_m = [], bench.description.car, bench.description.off_track_m
     for name, path in bench.description.paths.items():
         expert = lane_expert(as_path(path), car, bench.tick_s, _STIFFNESS_HALF_LANES / half_lane_m)
@@ -157,12 +157,12 @@ def _turned_after_reset(bench: WorldBench, control: float) -> float:
 
 
 def _measured(bench: WorldBench, path: ReferencePath) -> tuple[float, float, float]:
-    """Turn rate and speed over what the description says, and the largest angle between heading and motion [rad], in drives along a path."""
+    """Turn rate and speed relative to the description, and the largest angle between heading and motion [rad], in drives along a path."""
     car, ticks = bench.description.car, max(round(_MEASURED_S / bench.tick_s), 4)
     way_m = ticks * bench.tick_s * car.speed_mps
     x, y, yaw = path.pose_at(0.0)
     bend_1pm = float(wrap_angle(path.pose_at(0.5 * way_m)[2] - yaw)) / (0.5 * way_m)
-    # So much more curvature that the drive ends half a lane aside.
+    # Additional curvature that ends the drive half a lane aside.
     more_1pm = min(bench.description.off_track_m / way_m**2, 0.3 * _largest_curvature(car))
     rates, speeds, slips = [], [], []
     for sign in (1.0, -1.0):
@@ -193,7 +193,7 @@ def _steady(poses: Array, tick_s: float) -> tuple[float, float, float]:
 
 
 def _control(car: CarDescription, curvature_1pm: float) -> float:
-    """What turns the described car along a curvature."""
+    """Control that turns the described car along a curvature."""
     wanted = (
         car.speed_mps * curvature_1pm
         if car.wheelbase_m is None
@@ -203,7 +203,7 @@ def _control(car: CarDescription, curvature_1pm: float) -> float:
 
 
 def _largest_curvature(car: CarDescription) -> float:
-    """Of the tighter side [1/m]."""
+    """Largest curvature of the tighter side [1/m]."""
     limit = min(-car.control_limits[0], car.control_limits[1])
     return limit / car.speed_mps if car.wheelbase_m is None else math.tan(limit) / car.wheelbase_m
 

@@ -12,7 +12,7 @@ from advnerf_core.geometry import Array
 from hardware.worlds.paths import ReferencePath
 from hardware.worlds.world import CarDescription, World
 
-# How firmly the expert returns to the lane, a little more than the teacher of the experiment, and how far it looks ahead.
+# Stiffness of the expert's return to the lane, a little above the experiment's teacher, and its look-ahead.
 _STIFFNESS_1PM, _DELAY_S = 0.25, 0.1
 
 
@@ -24,7 +24,7 @@ class ExpertDrive:
         states: x [m], y [m], yaw [rad] at the ticks ``[T + 1, 3]``.
         controls: Turn rates [rad/s], or wheel angles [rad] ``[T]``.
         cte_m: Signed cross-track error at the ticks ``[T + 1]``, left positive.
-        blocked_tick: When the car ran into something; None if it did not.
+        blocked_tick: Tick of a collision; None without one.
     """
 
     states: Array
@@ -34,10 +34,10 @@ class ExpertDrive:
 
 
 def as_path(reference: ReferencePath) -> Path:
-    """The path that lines and arcs describe.
+    """The path of given lines and arcs.
 
     Raises:
-        ValueError: They are none, as those of a closed path that do not close.
+        ValueError: They are invalid, such as a closed path that does not close.
     """
     pieces = [
         Line(piece[1]) if piece[0] == "line" else Arc(piece[1], piece[2]) for piece in reference.segments
@@ -68,9 +68,9 @@ def drive_expert(
     """Drive from a start pose; the expert knows the true state, no picture is taken.
 
     Args:
-        expert: Who, and on which path.
+        expert: The expert, with its path.
         start: x [m], y [m], yaw [rad].
-        dt_s: How long each [s].
+        dt_s: Length of a tick [s].
     """
     scene.reset(*start)
     states, controls, blocked = [_now(scene)], [], None

@@ -1,7 +1,7 @@
-"""Checks of where a world's camera is: depth of one view predicts depth of another, the ground is at z = 0, photographs and the box cover the paths.
+"""Checks of a world's camera pose: depth of one view predicts depth of another, the ground is at z = 0, photographs and the box cover the paths.
 
-Points are taken from depth to the world by the declared intrinsics, mount and pose of the car, and from there into another view. Where that fails, the
-same is tried with what is commonly wrong (depth along the ray, millimetres, a mirrored picture, ...), so that the report can name it.
+Points are taken from depth to the world by the declared intrinsics, mount and pose of the car, and from there into another view. If that fails, the
+same is tried with common mistakes (depth along the ray, millimetres, a mirrored picture, ...), so that the report can name the mistake.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from hardware.worlds.world import Depth, require_depth
 from nodes.lab.worlds.bench import WorldBench
 from nodes.runtime.findings import NotMet
 
-# Predicted depth may be off by this share, and colour by so much [grey levels, and of the picture's spread]; points on edges and behind others are.
+# Predicted depth may be off by this share, and colour by this much [grey levels, and of the picture's spread]; points on edges and behind others are.
 _SAME_DEPTH, _LEAST_AGREEMENT, _BETTER_BY = 0.02, 0.75, 0.1
 _SAME_COLOUR, _SAME_COLOUR_SHARE = 4.0, 0.2
 _EVERY_PX = 3
-# The second view of a pair: ahead by so many seconds of driving, aside by a share of half a lane, turned [rad].
+# The second view of a pair: ahead by this many seconds of driving, aside by a share of half a lane, turned [rad].
 _PAIRS = ((0.25, 0.0, 0.0), (0.1, 0.3, 0.35), (0.1, -0.3, -0.35))
 # Ground under the lane ahead: height [m] as a share of the camera's, and of the distance.
 _GROUND_SHARE, _HEIGHT_SHARE, _RANGE_SHARE, _LEAST_GROUND = 0.7, 0.03, 0.01, 200
@@ -41,14 +41,14 @@ _INSIDE_SHARE = 0.99
 
 @dataclass(frozen=True)
 class Reading:
-    """One way to read a world's depth and camera.
+    """One interpretation of a world's depth and camera.
 
     Attributes:
-        advice: What is wrong if the world fits this reading, and what to change; empty for the contract's own.
-        mount: Where the camera sits on the car ``[4, 4]``.
-        planar: From what the world gives to planar depth ``[H, W]`` [m], with the directions ``[H, W, 3]`` of its pixels.
-        seen: From the world's pictures to upright ones.
-        pose: From the pose that was asked for to the pose it was taken from.
+        advice: The mistake if the world fits this reading, and what to change; empty for the contract's own.
+        mount: Pose of the camera on the car ``[4, 4]``.
+        planar: Converts the world's depth to planar depth ``[H, W]`` [m], with the directions ``[H, W, 3]`` of its pixels.
+        seen: Converts the world's pictures to upright ones.
+        pose: Converts the requested pose to the pose of the picture.
     """
 
     advice: str
@@ -60,7 +60,7 @@ class Reading:
 
 @dataclass(frozen=True, eq=False)
 class CameraView:
-    """What the driving camera gives from a pose of the car: depth ``[H, W]``, and colours ``[H, W, 3]`` a little blurred [grey levels]."""
+    """Output of the driving camera at a pose of the car: depth ``[H, W]``, and colours ``[H, W, 3]`` a little blurred [grey levels]."""
 
     pose: Pose
     depth: Depth
@@ -68,7 +68,7 @@ class CameraView:
 
 
 def views_agree(bench: WorldBench) -> str:
-    """Points that depth puts into the world from one pose of the car are there, in the same colour, from another pose."""
+    """Points from depth at one pose of the car have the same place and colour from another pose."""
     pairs = _pairs_of_views(bench)
     readings = _readings(bench)
     shares = [_agreement(reading, pairs, bench.world.camera_pinhole) for reading in readings]
@@ -87,7 +87,7 @@ def views_agree(bench: WorldBench) -> str:
 
 
 def ground_is_flat(bench: WorldBench) -> str:
-    """What lies in the lane ahead is at z = 0: the camera is as high as declared, and nothing stands in a lane."""
+    """The lane ahead is at z = 0: the camera is as high as declared, and no object stands in a lane."""
     middles = np.array(
         [
             path.pose_at(float(s))[:2]
@@ -128,7 +128,7 @@ def ground_is_flat(bench: WorldBench) -> str:
 
 
 def box_holds_what_is_seen(bench: WorldBench) -> str:
-    """The box holds what the driving camera sees, or at least what is driven if the rest is contracted."""
+    """The box holds everything that the driving camera sees, or at least the driven paths if the rest is contracted."""
     box = bench.description.box
     if box.contraction:
         points = np.array(
@@ -153,7 +153,7 @@ def box_holds_what_is_seen(bench: WorldBench) -> str:
 
 
 def photographs_cover(bench: WorldBench) -> str:
-    """Photographs for learning are upright, above the ground, and see the stretch of each path that is driven."""
+    """Photographs for learning are upright, above the ground, and see the driven stretch of each path."""
     world, count = bench.world, _PHOTOS
     poses = np.asarray(world.photo_poses(count, np.random.default_rng(0)), dtype=np.float64)
     if poses.shape != (count, 4, 4) or not np.isfinite(poses).all():
@@ -211,7 +211,7 @@ def _view(bench: WorldBench, pose: Pose) -> CameraView:
 
 
 def _readings(bench: WorldBench) -> list[Reading]:
-    """The contract's reading first, then what is commonly wrong."""
+    """The contract's reading first, then common mistakes."""
     T = np.asarray(bench.world.T_car_from_camera, dtype=np.float64)
     level = camera_mount(*map(float, T[:3, 3]))
     return [
@@ -256,7 +256,7 @@ def _readings(bench: WorldBench) -> list[Reading]:
 
 
 def _agreement(reading: Reading, pairs: list[list[tuple[CameraView, CameraView]]], pinhole: Pinhole) -> float:
-    """Share of points that are in one place from both poses, for the kind of move where it is lowest."""
+    """Share of points with the same place from both poses, for the kind of move with the lowest share."""
     shares = []
     for kind in pairs:
         found = np.array([_in_one_place(reading, one, other, pinhole) for one, other in kind])
@@ -266,12 +266,12 @@ def _agreement(reading: Reading, pairs: list[list[tuple[CameraView, CameraView]]
 
 
 def _in_one_place(reading: Reading, one: CameraView, other: CameraView, pinhole: Pinhole) -> tuple[int, int]:
-    """How many points of a view's lower part are where the other view has them, in depth and colour, and how many are in the other view at all."""
+    """Number of points of a view's lower part whose depth and colour agree with the other view, and number of points within the other view."""
     directions = pinhole.directions()
     below = (
         slice(pinhole.height // 2, None, _EVERY_PX),
         slice(None, None, _EVERY_PX),
-    )  # the ground and what stands on it
+    )  # the ground and objects on it
     z_m = np.asarray(reading.seen(reading.planar(one.depth, directions)), dtype=np.float64)[below]
     known = np.isfinite(z_m) & (z_m > 0.0)
     colour = reading.seen(one.rgb)[below][known]
@@ -300,7 +300,7 @@ def _in_one_place(reading: Reading, one: CameraView, other: CameraView, pinhole:
 
 
 def _sampled(image: NDArray[np.float32], xy: NDArray[np.float32]) -> Array:
-    """Values ``[N, ...]`` between pixels; in one column, as OpenCV takes no longer rows than 32 767."""
+    """Values ``[N, ...]`` interpolated between pixels; in one column, as OpenCV limits rows to 32 767."""
     parts = np.array_split(xy, 1 + len(xy) // 30_000)
     values = [
         cv2.remap(image, part[:, :1], part[:, 1:], interpolation=cv2.INTER_LINEAR)[:, 0] for part in parts
@@ -309,7 +309,7 @@ def _sampled(image: NDArray[np.float32], xy: NDArray[np.float32]) -> Array:
 
 
 def _points(bench: WorldBench, place: Pose) -> tuple[Array, Array]:
-    """What the driving camera sees from a pose of the car, in the world ``[N, 3]`` [m], and its depth ``[N]`` [m]."""
+    """Points that the driving camera sees from a pose of the car, in the world ``[N, 3]`` [m], and their depth ``[N]`` [m]."""
     depth = np.asarray(bench.world.observe_at(*place)[1], dtype=np.float64)
     kept = slice(None, None, _EVERY_PX), slice(None, None, _EVERY_PX)
     z_m = depth[kept]

@@ -1,4 +1,4 @@
-"""Makes the environment of a foreign world from its lock file: ``advnerf world install NAME``."""
+"""Installs the environment of a third-party world from its lock file: ``advnerf world install NAME``."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ _VERSION = "import sys; print('%d.%d' % sys.version_info[:2])"
 
 
 class InstallError(RuntimeFault):
-    """An environment cannot be made."""
+    """An environment cannot be installed."""
 
 
 def install(environment: Environment, say: Callable[[str], None], python: Path | None = None) -> bool:
-    """Make the environment of a foreign world, unless it is there and fits its lock file.
+    """Install the environment of a third-party world, unless it exists and matches its lock file.
 
-    The environment counts only once the last step has written its marker, so that one that was interrupted is made again.
+    The last step writes the environment's marker, so that an interrupted installation is repeated.
 
     Args:
-        say: Told of each step.
-        python: Interpreter that it is made with; None looks for one of a version that it runs on.
+        say: Called with a message for each step.
+        python: Interpreter to install with; None searches for one of a supported version.
 
     Returns:
-        Whether it was made; False if it was there.
+        Whether it was installed; False if it existed.
 
     Raises:
-        InstallError: There is no such interpreter, a package cannot be installed, or another process installs it.
+        InstallError: No interpreter fits, a package cannot be installed, or another process installs it.
     """
     folder = environment.folder
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -64,17 +64,17 @@ def install(environment: Environment, say: Callable[[str], None], python: Path |
             "--disable-pip-version-check",
             "--no-input",
         ]
-        # Nothing is resolved: what belongs together was tested together, and some of it declares otherwise.
+        # No dependency resolution: these versions were tested together, and some of them declare otherwise.
         _run([*pip, "--no-deps", "-r", str(environment.lock)], "install its packages")
         write_atomically(folder / MADE, json.dumps({"lock_sha256": sha256_of(environment.lock)}) + "\n")
     return True
 
 
 def find_python(environment: Environment, python: Path | None = None) -> Path:
-    """An interpreter of a version that the environment runs on.
+    """An interpreter of a version that the environment supports.
 
     Raises:
-        InstallError: There is none, or the one that was named has another version.
+        InstallError: None was found, or the given one has another version.
     """
     named = [python] if python is not None else [Path(sys.executable)]
     if python is None:

@@ -1,4 +1,4 @@
-"""Worlds by name: the class that a name stands for, its configuration checked, and what of it results depend on."""
+"""Worlds by name: the class, its checked configuration, and the settings that results depend on."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ WORLDS: Mapping[str, Callable[[], WorldClass]] = {**DRIVEN, "photographs": _phot
 
 @dataclass(frozen=True)
 class NamedWorld:
-    """A world that a file or a person has named. It is not open, and may be made often.
+    """A world named by a file or a user. It is not open, and can be constructed repeatedly.
 
     Attributes:
-        kind: Its name: built in, an entry point, or ``file.py:Class`` with the file's name alone.
-        world_class: What the name stands for.
+        kind: Name of the world: built in, an entry point, or ``file.py:Class`` with the file's name alone.
+        world_class: The world's class.
         source_sha256: Hash of the code of a ``file.py:Class`` or an entry point; empty for a built-in name.
     """
 
@@ -48,13 +48,13 @@ class NamedWorld:
     source_sha256: str
 
     def make(self) -> World:
-        """The world, not open yet.
+        """Construct the world, without opening it.
 
         Raises:
-            ConfigError: The class lacks something that a world must have.
+            ConfigError: The class lacks a member that every world must have.
         """
         world = self.world_class(self.config)
-        # Of a property only the class is asked: a world that is not open may not know its value.
+        # For a property only the class is checked: a world that is not open may not know its value.
         known = (set(dir(type(world))), set(vars(world)) if hasattr(world, "__dict__") else set())
         missing = [name for name in members_of_a_world() if not any(name in names for names in known)]
         if missing:
@@ -65,20 +65,20 @@ class NamedWorld:
 
     @property
     def traits(self) -> Traits:
-        """What is known of it before it is opened."""
+        """Properties that are known before it is opened."""
         return traits_of(self.make())
 
     def describe(self) -> WorldDescription:
-        """What it says about itself before it is opened.
+        """The description before it is opened.
 
         Raises:
-            NotOpenError: It must be open for it.
+            NotOpenError: It must be open for that.
         """
         return self.make().describe()
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What results depend on, as JSON data: the configuration without fields that are excluded, and a hash of a user's code."""
+        """Settings that results depend on, as JSON data: the configuration without excluded fields, and a hash of a user's code."""
         dumped = (
             self.config.model_dump(mode="json")
             if isinstance(self.config, BaseModel)
@@ -89,14 +89,14 @@ class NamedWorld:
 
 
 def read_world(document: Document, folder: Path) -> NamedWorld:
-    """The world that a section ``{kind: ..., key: value, ...}`` names.
+    """The world of a section ``{kind: ..., key: value, ...}``.
 
     Args:
         document: The section: ``kind``, and changes of the configuration of that world's class.
-        folder: What a relative ``file.py:Class`` is relative to.
+        folder: Folder that a relative ``file.py:Class`` is relative to.
 
     Raises:
-        ConfigError: No such world, or something is wrong with its configuration; with file, line and the valid keys.
+        ConfigError: The world is unknown, or its configuration is wrong; with file, line and the valid keys.
     """
     if not isinstance(document.data, dict) or not isinstance(document.data.get("kind"), str):
         raise ConfigError(
@@ -116,10 +116,10 @@ def read_world(document: Document, folder: Path) -> NamedWorld:
 
 
 def find_world(name: str, folder: Path) -> WorldClass:
-    """The class that a world's name stands for.
+    """The class behind a world's name.
 
     Raises:
-        PluginError: There is none, it cannot be loaded, or it is no class with a ``Config``.
+        PluginError: The world is unknown, cannot be loaded, or is not a class with a ``Config``.
     """
     found: Any = resolve(name, "world", WORLDS, ENTRY_POINTS, folder)
     config = getattr(found, "Config", None)
@@ -135,7 +135,7 @@ def find_world(name: str, folder: Path) -> WorldClass:
 
 
 def without(settings: Mapping[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
-    """Settings without some keys, which are written with dots: ``car.turn_rate_lag_s``."""
+    """Settings without the given dotted keys, such as ``car.turn_rate_lag_s``."""
     left = dict(settings)
     for key in keys:
         head, _, rest = key.partition(".")

@@ -1,4 +1,4 @@
-"""Checks of a world that takes textured panels into its own scene: where they appear, how large, which way round, and what hides them."""
+"""Checks of a world that takes textured panels into its own scene: their place, size, orientation, and occlusion."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hardware.worlds.world import NativePanels, Panel, Rgb, require_depth
 from nodes.lab.worlds.bench import WorldBench
 from nodes.runtime.findings import NotMet
 
-# The panel stands so far ahead of the car, and is so wide and high, in half lanes.
+# Distance of the panel ahead of the car, and its width and height, in half lanes.
 _AHEAD, _WIDE, _HIGH = 4.0, 1.6, 1.0
 # The second view: nearer by this share of the distance, and turned [rad].
 _NEARER, _TURNED_RAD = 0.3, 0.12
@@ -30,7 +30,7 @@ _WRONG_WAYS = {
 
 
 def panels_are_native(bench: WorldBench) -> str:
-    """A panel appears where it should, in its true size, the right way up and not mirrored, in depth too; the ground hides it; it can be taken out."""
+    """A panel appears at its place, in its true size, the right way up and not mirrored, in depth too; the ground hides it; it can be removed."""
     world = bench.world
     assert isinstance(world, NativePanels), "only asked where the world takes panels"
     place, half_lane_m = bench.places[0], bench.description.off_track_m
@@ -69,7 +69,7 @@ def _drives_on(bench: WorldBench, place: Pose) -> None:
 
 
 def _panel(bench: WorldBench, place: Pose, height_m: float) -> Panel:
-    """A panel ahead of the car that faces it, its middle at a height."""
+    """A panel ahead of the car that faces it, with its middle at a height."""
     half_lane_m = bench.description.off_track_m
     x, y, yaw = bench.beside(place, _AHEAD * half_lane_m, 0.0, 0.0)
     pose = make_transform(rotation_z(yaw + math.pi), [x, y, height_m])
@@ -77,14 +77,14 @@ def _panel(bench: WorldBench, place: Pose, height_m: float) -> Panel:
 
 
 def _texture() -> Rgb:
-    """Four quarters, each of a colour of its own ``[64, 64, 3]``."""
+    """Four quarters of different colours ``[64, 64, 3]``."""
     return np.ascontiguousarray(
         _QUARTERS.reshape(2, 2, 3).repeat(_TEXELS // 2, axis=0).repeat(_TEXELS // 2, axis=1)
     )
 
 
 def _stands_there(bench: WorldBench, panel: Panel, view: Pose, before: Rgb) -> float:
-    """Outline, colours and depth of the panel in one view; the share of the outline that is where it should be."""
+    """Check outline, colours and depth of the panel in one view; returns the share of the outline at its place."""
     rgb, depth_m = require_depth(bench.world.observe_at(*view))
     on_it, u, v, z_m = _seen(bench, panel, view)
     if on_it.sum() < _LEAST_PX:
@@ -109,7 +109,7 @@ def _stands_there(bench: WorldBench, panel: Panel, view: Pose, before: Rgb) -> f
 
 
 def _is_hidden_by_the_ground(bench: WorldBench, panel: Panel, view: Pose, before: Rgb) -> float:
-    """Of a panel whose middle is on the ground the upper half is seen."""
+    """Check that only the upper half of a panel whose middle is on the ground is visible; returns the outline's share."""
     rgb, _ = bench.world.observe_at(*view)
     on_it, _, v, _ = _seen(bench, panel, view)
     upper = _overlap(rgb, before, on_it & (v > 0.0))
@@ -122,7 +122,7 @@ def _is_hidden_by_the_ground(bench: WorldBench, panel: Panel, view: Pose, before
 
 
 def _seen(bench: WorldBench, panel: Panel, view: Pose) -> tuple[NDArray[np.bool_], Array, Array, Array]:
-    """Which pixels ``[H, W]`` look at a panel that nothing hides; where on it, as shares of its size, right and up; and at which depth [m]."""
+    """Pixels ``[H, W]`` that would see an unoccluded panel; their position on it, as shares of its size, right and up; and their depth [m]."""
     lens = bench.world.camera_pinhole
     T = invert_transform(panel.T_world_from_face) @ planar_pose(*view) @ bench.world.T_car_from_camera
     rays = lens.directions() @ T[:3, :3].T
@@ -138,13 +138,13 @@ def _changed(rgb: Rgb, before: Rgb) -> NDArray[np.bool_]:
 
 
 def _overlap(rgb: Rgb, before: Rgb, expected: NDArray[np.bool_]) -> float:
-    """What changed and should have, over what changed or should have."""
+    """Overlap of the changed pixels with the expected ones: intersection over union."""
     changed = _changed(rgb, before)
     return float((changed & expected).sum() / max(int((changed | expected).sum()), 1))
 
 
 def _where(rgb: Rgb, before: Rgb, expected: NDArray[np.bool_]) -> str:
-    """How far what changed is from what should have, for messages."""
+    """Distance of the changed pixels from the expected ones, for messages."""
     changed = _changed(rgb, before)
     if not changed.any():
         return "nothing in the picture changed"
@@ -159,7 +159,7 @@ def _where(rgb: Rgb, before: Rgb, expected: NDArray[np.bool_]) -> str:
 
 
 def _require_the_right_way_round(rgb: Rgb, inner: NDArray[np.bool_], u: Array, v: Array, edge: float) -> None:
-    """The quarters' colours, whatever the light, are those of the texture."""
+    """Check that the quarters have the texture's colours in any light."""
     found = []
     for up, right in ((True, False), (True, True), (False, False), (False, True)):
         quarter = inner & ((v > edge) if up else (v < -edge)) & ((u > edge) if right else (u < -edge))
@@ -183,7 +183,7 @@ def _require_the_right_way_round(rgb: Rgb, inner: NDArray[np.bool_], u: Array, v
 
 
 def _hue_apart(colour: Array) -> Array:
-    """How far a colour is from each quarter's, whatever its brightness ``[4]``."""
+    """Distance of a colour's hue from each quarter's, for any brightness ``[4]``."""
 
     def hue(rgb: Array) -> Array:
         shifted = rgb - rgb.min(axis=-1, keepdims=True)

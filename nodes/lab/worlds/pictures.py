@@ -1,4 +1,4 @@
-"""Checks of a world's pictures: their form, that they repeat themselves, that looking takes no time, and that photographs match what the car sees."""
+"""Checks of a world's pictures: their form and repeatability, that observing takes no time, and that photographs match the car's view."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from hardware.worlds.world import Rgb, require_depth, traits_of
 from nodes.lab.worlds.bench import WorldBench, pose_of
 from nodes.runtime.findings import NotMet
 
-# A picture of one colour is no picture [grey levels].
+# Below this spread a picture counts as one colour [grey levels].
 _LEAST_SPREAD = 1.0
 _LEAST_DEPTH_SHARE = 0.3
-# A photograph and what the driving camera sees from the same place: correlation of their grey values, and mean difference [grey levels].
+# A photograph and the driving camera's view from the same pose: correlation of their grey values, and mean difference [grey levels].
 _LEAST_CORRELATION, _LARGEST_DIFFERENCE = 0.85, 16.0
 _COLOURLESS = 3.0
 _LEAST_OVERLAP = 0.2
-# A picture of a step may differ by this share of what one step changes, as the car's own body may be in it.
+# A picture after a step may differ by this share of the step's change, as the car's own body may be in it.
 _LATE_SHARE = 0.25
 _AHEAD_S = 0.3
 
 
 def form(bench: WorldBench) -> str:
-    """Sizes, types and ranges of colours, depth and photographs, and that each call gives an array of its own."""
+    """Sizes, types and ranges of colours, depth and photographs; each call returns a new array."""
     world, camera, photo = bench.world, bench.world.camera_pinhole, bench.world.photo_pinhole
     finite = []
     for place in bench.places:
@@ -65,7 +65,7 @@ def form(bench: WorldBench) -> str:
 
 
 def repeats(bench: WorldBench) -> str:
-    """The same calls give the same bytes, whatever was asked in between."""
+    """The same calls give the same bytes, with any calls in between."""
     first = _script(bench)
     bench.world.reset(*bench.places[-1])
     bench.world.step(
@@ -84,7 +84,7 @@ def repeats(bench: WorldBench) -> str:
 
 
 def takes_no_time(bench: WorldBench) -> str:
-    """The car and what it sees stay as they are while the world is looked at, photographed and described."""
+    """The car and its view do not change while the world is observed, photographed and described."""
     world, car = bench.world, bench.description.car
     world.reset(*bench.places[0])
     world.step(0.3 * car.control_limits[1], car.speed_mps, 3 * bench.tick_s)
@@ -110,7 +110,7 @@ def takes_no_time(bench: WorldBench) -> str:
 
 
 def is_not_late(bench: WorldBench) -> str:
-    """What the car sees after a step is what is to be seen from where it is then, not from where it was."""
+    """The view after a step is the view from the new pose, not from the last one."""
     world, car = bench.world, bench.description.car
     worst, compared = 0.0, 0
     for place in bench.places[::3]:
@@ -127,7 +127,7 @@ def is_not_late(bench: WorldBench) -> str:
             )
             change, late = _difference(here, there), _difference(seen, here)
             if change < 0.5:
-                continue  # where nothing changes nothing is late
+                continue  # without a change there is no delay to see
             compared += 1
             worst = max(worst, late / change)
     if not compared:
@@ -143,7 +143,7 @@ def is_not_late(bench: WorldBench) -> str:
 
 
 def photographs_match(bench: WorldBench) -> str:
-    """A photograph from the driving camera's place shows what the driving camera sees: the pose is taken as it is meant, and colours are in one order."""
+    """A photograph from the driving camera's pose shows the driving camera's view: the same meaning of poses, the same order of colours."""
     world, correlations, plain, swapped, colour = bench.world, [], [], [], []
     for place in bench.places:
         T = planar_pose(*place) @ world.T_car_from_camera
@@ -219,9 +219,9 @@ def _difference(one: Rgb, other: Rgb) -> float:
 
 
 def _seen_by_both(view: Rgb, photo: Rgb, bench: WorldBench) -> tuple[tuple[Rgb, Rgb], NDArray[np.bool_]]:
-    """The driving camera's picture and the photograph as that camera would have it, both a little blurred; and where there is a photograph.
+    """The driving camera's picture and the photograph resampled to that camera, both a little blurred; and a mask of the photograph.
 
-    Both look from one point, so that a pixel's direction alone says where it is in the other picture.
+    Both look from one point, so that a pixel's direction alone gives its position in the other picture.
     """
     lens, camera = bench.world.photo_pinhole, bench.world.camera_pinhole
     pixels: Array = lens.project(camera.directions())

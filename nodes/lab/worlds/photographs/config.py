@@ -1,4 +1,4 @@
-"""What must be said of a place that is known by photographs: the pictures, the path, the car and its camera."""
+"""Configuration of a place that is known by photographs: the pictures, the path, the car and its camera."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Located = Annotated[str, AfterValidator(_located)]
 
 
 class DrivenCarConfig(StrictModel):
-    """The car that is to drive there.
+    """The car for the drives.
 
     Attributes:
         speed_mps: Speed of all drives [m/s].
@@ -59,7 +59,7 @@ class DrivenCarConfig(StrictModel):
 
     @property
     def described(self) -> CarDescription:
-        """The same as worlds describe their cars."""
+        """The description that worlds give of their cars."""
         kind: Literal["dubins", "ackermann"] = "dubins" if self.wheelbase_m is None else "ackermann"
         limits = (-self.max_steering_rad, self.max_steering_rad)
         return CarDescription(kind, self.speed_mps, limits, self.wheelbase_m)
@@ -69,11 +69,11 @@ class MountedCameraConfig(StrictModel):
     """The driving camera on that car.
 
     Attributes:
-        x_m: Ahead of the rear axle [m].
-        y_m: Left of the car's middle [m].
-        z_m: Above the ground [m].
-        pitch_down_rad: Optical axis below the horizon [rad]; None: as the driven photographs were taken.
-        pinhole: Its intrinsics; None: those of the photographs, undistorted.
+        x_m: Position ahead of the rear axle [m].
+        y_m: Position left of the car's middle [m].
+        z_m: Height above the ground [m].
+        pitch_down_rad: Angle of the optical axis below the horizon [rad]; None: the driven photographs'.
+        pinhole: Intrinsics of the camera; None: the photographs', undistorted.
     """
 
     x_m: float = 0.0
@@ -88,17 +88,17 @@ class PhotographsConfig(StrictModel):
 
     Attributes:
         images: ``transforms.json`` of posed images, or its folder, in metres with z up; ``advnerf scene from-...`` makes one.
-        path: ``driven``: the photographs were taken while driving, in the order in which they are listed; or the ``.json`` file of those
-            that were, as ``transforms_car.json``; or a CSV file with columns x_m, y_m in driving order, in the frame of the photographs.
-        closed: Whether the path goes round.
+        path: ``driven``: the photographs were taken while driving, in the listed order; or the ``.json`` file of those
+            taken while driving, such as ``transforms_car.json``; or a CSV file with columns x_m, y_m in driving order, in the frame of the photographs.
+        closed: Whether the path is a loop.
         off_track_m: Half the width of the lane [m].
         ground_z_m: Height of the ground in the frame of the photographs [m]; None: below the driven ones, by the camera's height.
         car: The car.
-        camera: Its camera.
-        reach_m: Nothing that matters is farther from the cameras [m]: what is learned is then a box, which is drawn ten times as fast; None:
+        camera: The driving camera.
+        reach_m: Largest relevant distance from the cameras [m]: the learned region is then a box, which renders ten times as fast; None:
             everything to the horizon is learned.
-        half: Every second photograph alone is learned from; None: all of them. Two scenes of a place, one from each half, show how much of
-            an attack is the place's and how much is one scene's.
+        half: Learn from every second photograph only; None: from all. Two scenes of a place, one from each half, show how much of
+            an attack is due to the place and how much to one scene.
     """
 
     images: Located = Field(exclude=True)
@@ -121,18 +121,18 @@ class PhotographsConfig(StrictModel):
 
     @property
     def shows_path(self) -> bool:
-        """Whether photographs show the path, and not a file of points."""
+        """Whether photographs show the path, instead of a file of points."""
         return self.path == DRIVEN or self.path.endswith(".json")
 
     @property
     def driven(self) -> PosedImages:
-        """The photographs that were taken while driving, in their order; where nobody drove, all of them."""
+        """The photographs that were taken while driving, in their order; without any, all of them."""
         return read_images(self.path if self.path.endswith(".json") else self.images)
 
     @computed_field  # type: ignore[prop-decorator]
     @property
     def content_sha256(self) -> str:
-        """Hash of the photographs, their poses and the path, wherever they lie."""
+        """Hash of the photographs, their poses and the path, independent of their folders."""
         listed = read_images(self.images)
         files = {each.path for each in listed.frames} | {each.mask for each in listed.frames if each.mask}
         files |= {listed.file} if listed.file else set()
@@ -143,7 +143,7 @@ class PhotographsConfig(StrictModel):
 
 
 def read_images(images: str) -> PosedImages:
-    """The posed images that a path names, all of which must be there.
+    """The posed images at a path, all of which must exist.
 
     Raises:
         DatasetError: They cannot be read.

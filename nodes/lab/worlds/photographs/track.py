@@ -12,14 +12,14 @@ from hardware.worlds.fitting import path_through
 from hardware.worlds.paths import ReferencePath
 from hardware.worlds.world import WorldError
 
-# Between two photographs of one drive the way is at most so many times the usual one, and leads so far forward (cosine).
+# Between two photographs of one drive the distance is at most this many times the usual one, and leads forward at least this much (cosine).
 _LONGEST_STEPS, _FORWARD = 5.0, 0.5
-# Of half a lane: distance of the points that the path passes, and by how much it may miss them.
+# In half lanes: distance of the points that the path passes, and its largest error there.
 _SPACING, _MISS = 0.5, 0.04
 
 
 def driven_track(cars: Array) -> Array:
-    """The longest part of a drive that leads on without a leap.
+    """The longest continuous part of a drive.
 
     Args:
         cars: ``T_world_from_car [N, 4, 4]`` in the order of the photographs.
@@ -51,22 +51,22 @@ def points_of(file: Path) -> Array:
     """x [m], y [m] ``[N, 2]`` of a CSV file with the columns ``x_m`` and ``y_m``.
 
     Raises:
-        ConfigError: It holds something else.
+        ConfigError: The file does not contain such points.
     """
     rows = [(row.number("x_m"), row.number("y_m")) for row in read_csv(file, ("x_m", "y_m"))]
     return np.array(rows, dtype=np.float64).reshape(-1, 2)
 
 
 def path_along(points: Array, off_track_m: float, closed: bool) -> ReferencePath:
-    """A path along measured points: these are averaged, as poses from pictures are off by millimetres to centimetres.
+    """A path along measured points, which are averaged, as poses from pictures are off by millimetres to centimetres.
 
     Args:
         points: x [m], y [m] ``[N, 2]`` in driving order.
         off_track_m: Half the width of the lane [m].
-        closed: Whether it goes on from the last point to the first.
+        closed: Whether it continues from the last point to the first.
 
     Raises:
-        WorldError: They are on no smooth way.
+        WorldError: The points do not form a smooth route.
     """
     try:
         averaged = _averaged(points, _SPACING * off_track_m, closed)
@@ -78,9 +78,9 @@ def path_along(points: Array, off_track_m: float, closed: bool) -> ReferencePath
 
 
 def _averaged(points: Array, spacing_m: float, closed: bool) -> Array:
-    """Points at equal distances, each on the parabola through its neighbours that a Gaussian weighs.
+    """Points at equal distances, each on the parabola fitted to its neighbours with Gaussian weights.
 
-    Its width is half the distance, or that of the measured points if they are farther apart; a parabola does not cut corners.
+    The width is half the distance, or the measured points' distance if they are farther apart; a parabola does not cut corners.
     """
     lengths_m = np.linalg.norm(np.diff(points, axis=0, append=points[:1]), axis=1)
     along_m = np.concatenate([[0.0], np.cumsum(lengths_m[:-1])])

@@ -1,4 +1,4 @@
-"""A place that is known by posed photographs alone: attacks are searched in what is learned from them, and nothing is driven there."""
+"""A place that is known by posed photographs alone: attacks are searched in the scene learned from them, and nothing is driven there."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from nodes.lab.worlds.photographs.config import PhotographsConfig, read_images
 from nodes.lab.worlds.photographs.track import driven_track, path_along, points_of
 
 PATH = "track"
-# The learned box reaches beyond cameras and path by this share of their extent; what lies outside is learned with less detail.
+# The learned box reaches beyond cameras and path by this share of their extent; anything outside is learned with less detail.
 _BESIDE, _BELOW_M = 0.5, 0.1
 _HALF_PX = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
 
 
 class Photographs:
-    """A place of photographs. Its frame is that of the photographs, moved up or down so that the ground is at z = 0.
+    """A place of photographs. Its frame is the photographs', moved up or down so that the ground is at z = 0.
 
     Args:
         config: The photographs, the path, the car and its camera.
@@ -36,7 +36,7 @@ class Photographs:
 
     @cached_property
     def T_car_from_camera(self) -> Array:
-        """Where the driving camera sits on the car ``[4, 4]``."""
+        """Pose ``[4, 4]`` of the driving camera on the car."""
         camera = self.config.camera
         pitch = camera.pitch_down_rad
         if pitch is None:
@@ -83,7 +83,7 @@ class Photographs:
         return make_transform(np.eye(3), [0.0, 0.0, -ground_m])
 
     def describe(self) -> WorldDescription:
-        """What an experiment must know: the path is that of the photographs that were taken while driving, or of the file."""
+        """The description for an experiment: the path comes from the photographs taken while driving, or from the file."""
         config, points = self.config, self.path_points()
         path = path_along(points, config.off_track_m, config.closed)
         return WorldDescription(
@@ -97,7 +97,7 @@ class Photographs:
         )
 
     def path_points(self) -> Array:
-        """Points ``[N, 2]`` of the path as they were measured [m]."""
+        """Measured points ``[N, 2]`` of the path [m]."""
         if self.config.shows_path:
             return driven_track(self._cars)
         return points_of(Path(self.config.path))
@@ -115,18 +115,18 @@ class Photographs:
 
     @property
     def extent_m(self) -> float:
-        """The longest side of the box around the cameras [m]."""
+        """Longest side of the box around the cameras [m]."""
         places = np.stack([each.T_world_from_camera[:3, 3] for each in self._all])
         return float(np.ptp(places, axis=0).max())
 
     def photographs(self, held_out: int) -> tuple[list[Photograph], list[Photograph]]:
-        """Photographs to learn from, and views of the driving camera that nothing learns from.
+        """Photographs to learn from, and held-out views of the driving camera.
 
         Args:
-            held_out: So many of those that were taken while driving, or nearest to the path, equally spaced.
+            held_out: Number of photographs to hold out, equally spaced among those taken while driving, or nearest to the path.
 
         Raises:
-            WorldError: There are too few.
+            WorldError: Too few photographs.
         """
         along = self._driven if self.config.shows_path else self._nearest()
         if not 3 <= held_out <= len(along) // 3:
@@ -151,7 +151,7 @@ class Photographs:
         return [self._all[index] for index in near]
 
     def _photograph(self, image: PosedImage, pinhole: Pinhole | None) -> Photograph:
-        """One, undistorted; in the driving camera's intrinsics if they are given."""
+        """One photograph, undistorted; in the driving camera's intrinsics if they are given."""
         pose = self._T_world_from_images @ image.T_world_from_camera
 
         def look() -> tuple[Rgb, Pinhole]:
@@ -162,41 +162,41 @@ class Photographs:
 
     @property
     def state(self) -> VehicleState:
-        """There is no car."""
+        """Always an error, as the place has no car."""
         self._refuse()
 
     @property
     def blocked(self) -> bool:
-        """There is no car."""
+        """Always an error, as the place has no car."""
         self._refuse()
 
     def photo_poses(self, count: int, rng: np.random.Generator) -> list[Array]:
-        """Where the photographs were taken, however many are asked for."""
+        """Poses of the photographs, for any ``count``."""
         del count, rng
         return [self._T_world_from_images @ each.T_world_from_camera for each in self._all]
 
     def reset(self, x_m: float, y_m: float, yaw_rad: float) -> VehicleState:
-        """Nothing is driven here."""
+        """Always an error, as nothing is driven here."""
         del x_m, y_m, yaw_rad
         self._refuse()
 
     def step(self, control: float, speed_mps: float, duration_s: float) -> VehicleState:
-        """Nothing is driven here."""
+        """Always an error, as nothing is driven here."""
         del control, speed_mps, duration_s
         self._refuse()
 
     def observe(self, depth: bool = True) -> Any:
-        """Nothing is driven here."""
+        """Always an error, as nothing is driven here."""
         del depth
         self._refuse()
 
     def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True) -> Any:
-        """No other pictures can be taken."""
+        """Always an error, as no other pictures can be taken."""
         del x_m, y_m, yaw_rad, depth
         self._refuse()
 
     def photograph(self, T_world_from_camera: Array) -> Rgb:
-        """No other pictures can be taken."""
+        """Always an error, as no other pictures can be taken."""
         del T_world_from_camera
         self._refuse()
 
@@ -217,7 +217,7 @@ def _through(pinhole: Pinhole, rgb: Rgb, own: Pinhole, file: Path) -> Rgb:
     """A photograph as a camera with other intrinsics would have taken it from the same pose.
 
     Raises:
-        WorldError: It does not show all that that camera sees.
+        WorldError: It does not show the whole view of that camera.
     """
     if pinhole == own:
         return rgb
