@@ -80,7 +80,7 @@ class Detection:
 
     Attributes:
         board_m: Corners in the board's frame ``[n, 3]`` [m].
-        pixels: Where they are seen ``[n, 2]``, pixel centres at +0.5 [px].
+        pixels: Positions in the image ``[n, 2]``, pixel centres at +0.5 [px].
     """
 
     board_m: Array

@@ -15,7 +15,7 @@ from calibration.photo_model import Model, PhotoSource, ReconstructionError, Sfm
 
 @dataclass(frozen=True)
 class Job(PlainData):
-    """What the process is asked to do; arguments as of `calibration.structure_from_motion.reconstruct`."""
+    """Job of the process; arguments as in `calibration.structure_from_motion.reconstruct`."""
 
     root: str
     sources: tuple[PhotoSource, ...]

@@ -41,7 +41,7 @@ class DisplayCalibration(Calibration):
     """A monitor in front of a camera.
 
     Attributes:
-        model: As `DisplayModel.to_dict` writes it.
+        model: Output of `DisplayModel.to_dict`.
         conditions: Conditions that must not change: light, exposure, monitor settings.
     """
 

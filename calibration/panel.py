@@ -52,7 +52,7 @@ class MonitorPanel:
 
 
 def _nearest(pixels: int, cells: int) -> NDArray[np.intp]:
-    """Which cell each pixel's centre lies in."""
+    """Index of the cell that each pixel's centre lies in."""
     return ((np.arange(pixels) + 0.5) * cells / pixels).astype(np.intp)
 
 

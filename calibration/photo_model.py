@@ -80,7 +80,7 @@ class Registered:
 
     Attributes:
         name: File, relative to the folder of all images.
-        camera_id: Its camera, as in `Model.cameras`.
+        camera_id: Id of its camera, as in `Model.cameras`.
         T_world_from_camera: Pose ``[4, 4]`` in the model's own world and scale, OpenCV axes.
         pinhole: Intrinsics.
         lens: Distortion.

@@ -53,7 +53,7 @@ def chosen_pairs(
 
 
 def looks(descriptors: Sequence[Descriptors], seed: int) -> NDArray[np.float64]:
-    """How alike images look, ``[N, N]`` in -1..1: the cosine between their VLAD vectors."""
+    """Similarity of images, ``[N, N]`` in -1..1: the cosine between their VLAD vectors."""
     rng = np.random.default_rng(seed)
     stacked = np.concatenate([_rooted(d) for d in descriptors])
     if len(stacked) < _WORDS:

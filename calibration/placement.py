@@ -106,7 +106,7 @@ def misplacement(attack: AttackFile, target: TargetCalibration, T_world_from_sub
 
 
 def measured_pose(target: TargetCalibration, T_world_from_subject: Array) -> dict[str, float]:
-    """Where the face is now, as an attack request says it: x, y, z [m] and yaw [rad]."""
+    """Current pose of the face, in an attack request's form: x, y, z [m] and yaw [rad]."""
     now = T_world_from_subject @ face_frame(target.corners)
     x, y, z = (round(float(value), 4) for value in now[:3, 3])
     return {"x_m": x, "y_m": y, "z_m": z, "yaw_rad": round(float(yaw_of(now)), 4)}

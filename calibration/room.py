@@ -120,7 +120,7 @@ def target_of_size(
 
 @dataclass(frozen=True, eq=False)
 class Touches:
-    """Where a wand's tip was held still.
+    """Points at which a wand's tip was held still.
 
     Attributes:
         points_in_subject_m: ``[K, 3]`` in the order of time [m].

@@ -160,7 +160,7 @@ class ResponseSection(StrictModel):
     speed_lag_s: float = Field(ge=0.0)
 
     def attack_dynamics(self) -> dict[str, float]:
-        """What an attack request puts under ``dynamics``: delay from image to wheels, lag and, where known, slew."""
+        """The section ``dynamics`` of an attack request: delay from image to wheels, lag and, if known, slew."""
         found = {
             "delay_s": round(self.pipeline_delay_s + self.steering_delay_s, 4),
             "lag_s": round(self.steering_lag_s, 4),

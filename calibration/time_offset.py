@@ -46,7 +46,7 @@ _MOST_STDDEV_S = 0.003
 
 @dataclass(frozen=True, eq=False)
 class Turns:
-    """How far the camera turned between neighbouring frames.
+    """Turns of the camera between neighbouring frames.
 
     Attributes:
         start_s: Stamps of the first frames ``[N]`` [s].

@@ -282,7 +282,7 @@ def _fit(
 
 
 def _slew_start(residuals: Callable[[Array], Array], plain: Array) -> Array:
-    """Where to begin with a limited rate: one that nothing reaches has no slope, and passes for a longer delay and lag."""
+    """Starting point for a limited rate: a limit that is never reached has no slope, and passes for a longer delay and lag."""
     candidates = [
         np.array([delay, lag, np.log(slew)])
         for slew in (0.6, 1.2, 2.4, 4.8)

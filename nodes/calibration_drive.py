@@ -1,7 +1,7 @@
 """The calibration drive for ``advnerf calibrate vehicle``. It replaces the policy: ``--set policy.module=nodes.calibration_drive``.
 
 The car drives circles to both sides, straight runs and wide curves at two speeds, then steps of steering and speed. This takes about
-45 s and 6 x 5.5 m, of which 3.5 m lie behind the start and 3.2 m to its right. The car drives only while the safety node has armed it,
+45 s and 6 x 5.5 m, with 3.5 m behind the start and 3.2 m to its right. The car drives only while the safety node has armed it,
 within fence and limits like any policy. After a stop, the interrupted part starts again; the operator may carry the car back first.
 """
 

@@ -54,7 +54,7 @@ class MotorConfig(StrictModel):
         brake_current_a: Brake current of a stop [A].
         brake_ramp_s: Time over which the brake current rises from a third to its full value [s].
         brake_hold_s: Duration of braking, after which the motor is released [s].
-        current_max_a: Largest commanded current [A]; None for that of the calibration. It can only lower the calibration's.
+        current_max_a: Largest commanded current [A]; None uses the calibration's. It can only lower the calibration's.
         link_timeout_s: Time without an answer of the controller after which the link is faulty [s].
         controller_timeout_ms: Longest accepted command time-out of the controller [ms].
         controller_brake_current_a: Smallest accepted brake current of the controller after its time-out [A].
@@ -229,7 +229,7 @@ class MotorNode(Node):
             return
         self._link_error, self._linked_once = "", True
         self._watch.connected(firmware, self._on_twins_port())
-        # After a connection, the car is stopped first, whatever it did before.
+        # After a connection, the car is stopped first, in any case.
         self._gate.brake_again(now.mono_ns)
 
     def _lose(self, error: Exception, now: Now) -> None:
@@ -331,7 +331,7 @@ class MotorNode(Node):
 
 
 def drive_limits(car: VehicleCalibration, current_max_a: float | None) -> DriveLimits:
-    """Limits of the driver: those of the calibration, with a lower current if the node's configuration asks for one [A]."""
+    """Limits of the driver, from the calibration, with a lower current if the node's configuration asks for one [A]."""
     limits = car.drive_limits
     if current_max_a is None:
         return limits

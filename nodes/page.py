@@ -258,7 +258,7 @@ class PageNode(Node):
         }
 
     def _welcome(self) -> dict[str, Any]:
-        """What a new browser is told. Called by the server's thread, and reads only what that thread may."""
+        """First message for a new browser. Called by the server's thread, and reads only data that this thread may read."""
         return {
             "operates": self._operates,
             "stops": self._stops,
@@ -280,7 +280,7 @@ class PageNode(Node):
         return None if entry is None else entry.png
 
     def _write_door(self, now: Now) -> None:
-        """Write address and code to a file that only this user can read. Nothing secret goes on the bus, which is recorded.
+        """Write address and code to a file that only this user can read. No secret goes on the bus, which is recorded.
 
         Nothing changes while the button is held, so that the operator's phone keeps the code that it shows.
         """

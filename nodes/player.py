@@ -1,6 +1,6 @@
 """The player node: publishes the messages of a bag on the bus, at the recorded speed or another.
 
-Bytes and capture stamps are those of the recording. Publish times are new, so that receivers see fresh messages. Topics that the topic
+Bytes and capture stamps are the recorded ones. Publish times are new, so that receivers see fresh messages. Topics that the topic
 table marks ``replay: never`` are not played, under no name: a recording must not move or arm a car.
 
 The player can pause, resume, step message by message, change its speed and stop, controlled by keys in a terminal and by requests on

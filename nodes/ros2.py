@@ -287,7 +287,7 @@ class Ros2Node(Node):
             self._counts["stops"] += 1
 
     def _meta(self, taken: Taken, heard: Heard) -> Meta:
-        # Another publisher counts as a restart: whoever armed the car meant the earlier one. Many together count as one.
+        # Another publisher counts as a restart: the operator armed the car with the earlier one. Many together count as one.
         writer = "" if taken.writer.shared else heard.writer
         instance_id = int.from_bytes(
             hashlib.sha256(f"{self._instance} {writer}".encode()).digest()[:8], "big"

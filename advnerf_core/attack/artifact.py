@@ -44,7 +44,7 @@ class AttackedObject:
 
     Attributes:
         name: Name of the object, e.g. ``hydrant.object`` or ``face``.
-        theta: Its attacked parameters, ``[..., 3]`` float32: colours before squashing; for an attack on shapes the search's parameters of
+        theta: Attacked parameters, ``[..., 3]`` float32: colours before squashing; for an attack on shapes the search's parameters of
             each vertex ``[V, 3]``.
         T_world_from_object: Pose of the object, ``[4, 4]``.
         scale: World metres per object unit.

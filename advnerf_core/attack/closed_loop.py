@@ -1,4 +1,4 @@
-"""How near the adjoint's gradient is to the gradient of the true closed loop, with an interval, if it can be measured.
+"""Cosine between the adjoint's gradient and the true closed loop's, with an interval, if it can be measured.
 
 The true closed loop, in which images follow the states, jumps wherever an edge crosses a pixel. Its finite differences therefore
 depend on their step: a cosine from one step says nothing. Here the loop is differenced over a sweep of steps, along the gradient

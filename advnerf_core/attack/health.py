@@ -180,7 +180,7 @@ def saturated_shares(problem: AttackProblem, controls: Tensor) -> tuple[float, .
 
 @dataclass(frozen=True)
 class TimeSplit:
-    """Where the time of one loss with its gradient goes [s].
+    """Time of one loss with its gradient, by part [s].
 
     Attributes:
         render_s: Rendering, including frames that were not kept.

@@ -81,7 +81,7 @@ class JudgedDrives:
 
 
 class Objective:
-    """What an attack maximises. Derive from it, and define at least ``value``; see docs/methods.md.
+    """The goal of an attack. Derive from it, and define at least ``value``; see docs/methods.md.
 
     Attributes:
         title: Description in one line for lists.

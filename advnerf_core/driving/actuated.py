@@ -120,7 +120,7 @@ class ActuatedAckermann:
         return int(ticks), ticks - int(ticks)
 
     def _parts(self) -> list[tuple[int, float]]:
-        """What rules in a tick, in order: the age of the command in ticks, and for how long [s]."""
+        """Commands that act in a tick, in order: the age of each in ticks, and its duration [s]."""
         whole, fraction = self._delay()
         if fraction == 0.0:
             return [(whole, self.dt_s)]

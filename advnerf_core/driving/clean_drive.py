@@ -13,7 +13,7 @@ from advnerf_core.plain import PlainData
 
 @dataclass(frozen=True)
 class CleanDrive(PlainData):
-    """How a policy drives where an attack is searched for, without the attack: one entry for each start pose.
+    """Drives of a policy without an attack, in the scene of the search: one entry for each start pose.
 
     Attributes:
         total_cte_m: Total CTE of each drive [m].
@@ -96,5 +96,5 @@ class CleanDrive(PlainData):
 
     @property
     def lines(self) -> list[str]:
-        """What is printed beside a result: the drive, and the warning if it is none."""
+        """Lines to print beside a result: the drive, and a warning if it fails."""
         return [self.in_words, *([self.warning] if self.warning else [])]

@@ -70,7 +70,7 @@ class RespondingCar:
         return torch.cat([poses, acting[:, None], command[:, None]], dim=1)
 
     def jacobians(self, states: Tensor, controls: Tensor) -> tuple[Tensor, Tensor]:
-        """It has none: nothing is searched through it."""
+        """Always an error: no search uses this car."""
         raise NotImplementedError("a measured car predicts drives; search through the surrogate's car")
 
 

@@ -1,4 +1,4 @@
-"""How far a drive left its path: total cross-track error over a fixed horizon, the same in every domain.
+"""Distance of a drive from its path: total cross-track error over a fixed horizon, the same in every domain.
 
 Total CTE is the sum of |CTE| [m] at the control ticks 1..T after the start. If the car stops before the horizon ends, its
 last |CTE| holds for the remaining ticks, capped, so that hitting a wall or the fence is not rewarded.

@@ -1,4 +1,4 @@
-"""How near a car comes to what it cannot drive through, as a differentiable torch function."""
+"""Clearance between a car and obstacles, as a differentiable torch function."""
 
 from __future__ import annotations
 

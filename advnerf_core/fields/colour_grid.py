@@ -43,7 +43,7 @@ def colour_grid(field: ColouredObject) -> ColourGrid:
     """The grid of an object's colours.
 
     Raises:
-        ColourGridError: Its parameters are not colours of cells, such as those of summed levels.
+        ColourGridError: The object's parameters are not colours of cells, such as summed levels.
     """
     if field.mixing is None and len(field.theta_shape) > 2:
         shape = tuple(field.theta_shape[:-1])

@@ -1,1 +1,1 @@
-"""How a driving policy is trained: frames, augmentation, imitation, retraining."""
+"""Training of a driving policy: frames, augmentation, imitation, retraining."""

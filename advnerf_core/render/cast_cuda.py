@@ -111,7 +111,7 @@ class CudaObjects:
         self._intrinsics = self._there(np.array([pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy]))
 
     def placed(self, T_world_from_camera: Array) -> tuple[Tensor, Tensor]:
-        """Where the objects are for cameras ``[B, 4, 4]``: ``frames`` and ``windows`` of `draw_objects`."""
+        """Places of the objects for cameras ``[B, 4, 4]``: ``frames`` and ``windows`` of `draw_objects`."""
         T_camera_from_world = invert_transform(T_world_from_camera)
         frames = np.empty((len(self.objects), len(T_world_from_camera), 12))
         seen = np.empty((*frames.shape[:2], 4), np.int32)

@@ -147,7 +147,7 @@ def reach_of_bricks(
 @njit(**KERNEL_OPTIONS)
 def _set_out(R: Any, o: Any, edges: Any, sizes: Any, aims: Any, count: int, solid: bool, one_sided: bool, step: float,
              rays: Any, spans: Any) -> None:  # fmt: skip
-    """Where rays sample, in vector instructions: `span_in_box` without branches, and the samples between.
+    """Sample ranges of rays, in vector instructions: `span_in_box` without branches, and the samples between.
 
     Args:
         R: Rotation as in `cast_window`, as are the following.

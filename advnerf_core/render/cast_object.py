@@ -36,7 +36,7 @@ _BRICK_CELLS = 4
 
 @dataclass(frozen=True, eq=False)
 class ObjectCast:
-    """What one object contributes to a batch of images.
+    """Contribution of one object to a batch of images.
 
     Attributes:
         pixels: Flat indices into ``[B, H, W]`` of the pixels that the object covers at least in part, ``[P]`` int64, ascending.
@@ -221,7 +221,7 @@ def prepared(field: VoxelGridObject, dtype: Any) -> KernelGrids:
 
 
 def cells_with_density(density: NDArray[Any]) -> NDArray[np.bool_]:
-    """Which cells between voxel centres have density at a corner, ``[max(nx - 1, 1), ...]``."""
+    """Whether cells between voxel centres have density at a corner, ``[max(nx - 1, 1), ...]``."""
     near = ndimage.maximum_filter(
         density > 0, size=[min(n, 2) for n in density.shape], origin=[-(n > 1) for n in density.shape]
     )

@@ -21,7 +21,7 @@ from advnerf_core.parallel import KERNEL_OPTIONS
 
 
 def visible_shares(alphas: Tensor, depths_m: Tensor) -> Tensor:
-    """What each layer keeps of its light: the product of ``1 - alpha`` over all layers in front of it.
+    """Share of its light that each layer keeps: the product of ``1 - alpha`` over all layers in front of it.
 
     Args:
         alphas: ``[L, ...]`` in 0..1.

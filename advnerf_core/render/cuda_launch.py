@@ -23,7 +23,7 @@ def is_simulated() -> bool:
 
 
 def cuda_device() -> torch.device:
-    """Where tensors must lie for the kernels to read them.
+    """Device of tensors that the kernels can read.
 
     Raises:
         DeviceError: No device.

@@ -16,7 +16,7 @@ Array32 = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class MarchConfig:
-    """How samples are placed on rays.
+    """Placement of samples on rays.
 
     Attributes:
         near_m: Nothing is sampled closer to the camera [m].

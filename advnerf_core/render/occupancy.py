@@ -1,4 +1,4 @@
-"""Where in the box something may be: a grid of density bounds, kept up while the field learns, and leap distances over it."""
+"""Occupied space in the box: a grid of density bounds, updated while the field learns, and leap distances over it."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ _SLOTS = 4
 
 
 def placement_of(field: VoxelGridObject) -> Tensor:
-    """Where an object stands: ``(x_m, y_m, yaw_rad, scale)``, float64."""
+    """Placement of an object: ``(x_m, y_m, yaw_rad, scale)``, float64."""
     T = field.T_world_from_object
     return torch.tensor([T[0, 3], T[1, 3], yaw_of(T), field.scale], dtype=torch.float64)
 
@@ -58,7 +58,7 @@ def placed_at(field: VoxelGridObject, placement: Tensor) -> VoxelGridObject:
 
 @dataclass(frozen=True, eq=False)
 class SoftLayer:
-    """What one object shows in a batch of images, with its derivative; made by `soft_layer`.
+    """Image layer of one object in a batch of images, with its derivative; made by `soft_layer`.
 
     Attributes:
         pixels: Flat indices into ``[B, H, W]`` of the pixels that the object covers at least in part, ``[P]`` int64, ascending.
@@ -106,7 +106,7 @@ def soft_layer(
     Args:
         field: The object; must have a density.
         placement: ``(x_m, y_m, yaw_rad, scale)``, finite, with a positive scale.
-        colours: Its colour vector ``[rows, 3]`` (``VoxelGridObject.colours``).
+        colours: Colour vector of the object ``[rows, 3]`` (``VoxelGridObject.colours``).
         T_world_from_camera: ``[B, 4, 4]``.
         supersample: Rays along each side of a pixel.
         least_transmittance: A ray is followed until so little light is left.
@@ -206,7 +206,7 @@ class _RenderSoft(torch.autograd.Function):
 
 @dataclass(frozen=True, eq=False)
 class _Walk:
-    """How the rays of a batch of images meet one object."""
+    """Intersections of one object with the rays of a batch of images."""
 
     grids: KernelGrids
     field: VoxelGridObject

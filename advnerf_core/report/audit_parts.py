@@ -102,7 +102,7 @@ class RoutePoint(StrictModel):
 
 
 class AuditEffect(StrictModel):
-    """How much further from its path the object moves the vehicle: mean over the judging starts, and its interval [m]."""
+    """Increase of the vehicle's distance from its path by the object: mean over the judging starts, and its interval [m]."""
 
     mean_m: float
     low_m: float

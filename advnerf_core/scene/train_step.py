@@ -356,7 +356,7 @@ class CpuStep:
 
 
 def distortion_distances(samples: Samples, config: SceneFieldConfig) -> tuple[Array32, Array32]:
-    """Where samples lie along their rays, and their intervals, as the distortion loss takes them ``[N]``.
+    """Positions of samples along their rays, and their intervals, for the distortion loss ``[N]``.
 
     In box sides; in a contracted field bounded.
     """

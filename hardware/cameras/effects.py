@@ -1,4 +1,4 @@
-"""What a real camera adds to an ideal picture: lens, moving exposure, noise, compression, lost frames.
+"""Imperfections of a real camera: lens, moving exposure, noise, compression, lost frames.
 
 A picture is put together from ideal ones that are drawn along the way the camera moved while its rows were exposed. Light adds up
 linearly, so blur, gain and noise act on linear values; sRGB's curve (IEC 61966-2-1) leads there and back.
@@ -206,7 +206,7 @@ def _row_weights(rows: int, effects: CameraEffects) -> Array:
 
 
 def _distortion(pinhole: Pinhole, k1: float, k2: float) -> tuple[_Linear, _Linear]:
-    """Where each pixel of the distorted picture lies in the ideal one [px]."""
+    """Position of each pixel of the distorted picture in the ideal one [px]."""
     K = np.array([[pinhole.fx, 0.0, pinhole.cx], [0.0, pinhole.fy, pinhole.cy], [0.0, 0.0, 1.0]])
     # OpenCV's pixel centres are at whole numbers, a pinhole's at halves.
     K[:2, 2] -= 0.5

@@ -1,4 +1,4 @@
-"""What cameras share that play a recording at a constant rate."""
+"""Common base of cameras that play a recording at a constant rate."""
 
 from __future__ import annotations
 

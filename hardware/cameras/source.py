@@ -1,4 +1,4 @@
-"""What the settings of all cameras have in common."""
+"""Common settings of all cameras."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ class FrameServer:
 
     @property
     def clients(self) -> int:
-        """How many are connected."""
+        """Number of connected clients."""
         with self._condition:
             return len(self._clients)
 

@@ -59,7 +59,7 @@ class LiveLabConfig(StrictModel):
 
 
 class PoseHistory:
-    """Where the car was, by monotonic time; asked by VICON and camera for the instant they measure."""
+    """Pose of the car by monotonic time; VICON and camera query it for the time of their measurement."""
 
     def __init__(self, rate_hz: float) -> None:
         self._states: deque[tuple[int, VehicleState]] = deque(maxlen=math.ceil(_HISTORY_S * rate_hz))

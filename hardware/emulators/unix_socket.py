@@ -13,7 +13,7 @@ def listen(path: Path, who: str, backlog: int = 8) -> socket.socket:
 
     Args:
         path: Path of the socket; its length is limited by the system (108 bytes on Linux).
-        who: What answers there, for messages, e.g. ``"a frame server"``.
+        who: Name of the server, for messages, e.g. ``"a frame server"``.
         backlog: Connections that may wait.
 
     Raises:

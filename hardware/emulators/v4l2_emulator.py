@@ -81,7 +81,7 @@ class VideoPortEmulator:
 
     @property
     def open_files(self) -> int:
-        """How many descriptors are open."""
+        """Number of open descriptors."""
         return len(self._open)
 
 

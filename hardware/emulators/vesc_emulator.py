@@ -71,7 +71,7 @@ class VescEmulator:
 
     @property
     def state(self) -> VehicleState:
-        """Where the car is."""
+        """Current state of the car."""
         with self._lock:
             return self.vehicle.state
 
@@ -93,7 +93,7 @@ class VescEmulator:
         return self._firmware.timed_out
 
     def events(self, since_mono_ns: int = 0) -> list[WireEvent]:
-        """What happened on the wire, oldest first."""
+        """Events on the wire, oldest first."""
         with self._lock:
             return [event for event in self._events if event.mono_ns >= since_mono_ns]
 
@@ -220,7 +220,7 @@ def read_wire_log(path: Path, offset: int = 0) -> list[tuple[WireEvent, float, f
     """Events of a log file, each with the car's speed [m/s] and odometer [m] at that moment.
 
     Args:
-        offset: Where to begin [bytes]; what a size of the file was earlier gives what came since. Lines cut short are left out.
+        offset: Start in the file [bytes]; an earlier size of the file gives the newer part. Lines cut short are left out.
     """
     with path.open("rb") as log:
         log.seek(offset)

@@ -1,4 +1,4 @@
-"""What a VESC does with the bytes it gets: the firmware of the twin's motor controller, without I/O and without a clock.
+"""Firmware of the twin's motor controller: how a VESC reacts to received bytes, without I/O and without a clock.
 
 It keeps the habits of the stock firmware that matter for safety: the command time-out (checked every 10 ms, not fed by telemetry
 requests, braking with a configured current that is 0 A as delivered), the servo that no time-out touches, the servo output that

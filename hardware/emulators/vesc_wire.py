@@ -1,4 +1,4 @@
-"""How a serial line misbehaves: what becomes of the bytes that a controller sends. Pure; the randomness is the caller's."""
+"""Faults of a serial line that change the bytes from a controller. Pure; the randomness is the caller's."""
 
 from __future__ import annotations
 

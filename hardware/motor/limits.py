@@ -15,7 +15,7 @@ MAX_SLEW_STEP_S = 0.1
 
 @dataclass(frozen=True)
 class DriveLimits:
-    """What the car may be asked to do.
+    """Limits of the car's commands.
 
     Attributes:
         speed_min_mps: Fastest reverse speed, <= 0 [m/s].
@@ -104,7 +104,7 @@ class Setpoint:
 
 @dataclass(frozen=True)
 class Sent:
-    """What really went down the wire, after limits and the rounding of the protocol.
+    """Commands really sent, after limits and the rounding of the protocol.
 
     Attributes:
         speed_mps: Speed that the sent rpm means [m/s]; 0 when braking or coasting.

@@ -17,7 +17,7 @@ POSITION_VARIANCE, YAW_VARIANCE = 0.2, 0.4
 
 @dataclass(frozen=True)
 class OdometryState:
-    """Where dead reckoning believes the car to be.
+    """Pose and speed of the car by dead reckoning.
 
     Attributes:
         x_m: Position of the rear axle since the start [m].

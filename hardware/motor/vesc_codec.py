@@ -173,7 +173,7 @@ def _to_lsb(value: float, scale: float) -> int:
 
 
 def decode_command(payload: bytes) -> Command | None:
-    """What a VESC understands from a payload; None when a known command has too few bytes. Surplus bytes are ignored."""
+    """Meaning of a payload for a VESC; None when a known command has too few bytes. Surplus bytes are ignored."""
     if not payload:
         return None
     identity = payload[0]

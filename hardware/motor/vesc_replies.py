@@ -130,7 +130,7 @@ def encode_values(values: Values) -> bytes:
 
 @dataclass(frozen=True)
 class FirmwareVersion:
-    """What a VESC says it is. Old firmware says less.
+    """Identity reported by a VESC. Old firmware reports less.
 
     Attributes:
         major: First number of the firmware version.

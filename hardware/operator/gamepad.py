@@ -158,7 +158,7 @@ class Gamepad:
         return low, high
 
     def _ask(self) -> None:
-        """What is held now, from the kernel: no events tell of buttons pressed before, or of events that were lost."""
+        """Buttons that are held now, read from the kernel: events do not show earlier presses, or lost events."""
         keys = bytearray(_KEY_BYTES)
         self._ioctl(self._fd, _EVIOCGKEY, keys)
         self._state.held = {code for code in range(8 * _KEY_BYTES) if keys[code // 8] >> (code % 8) & 1}

@@ -169,7 +169,7 @@ class RemoteWorld(ABC):
         return state
 
     def observe(self, depth: bool = True) -> View:
-        """What the driving camera sees; see `World.observe`."""
+        """View of the driving camera; see `World.observe`."""
         T = self.state.T_world_from_car @ self._mount
         rgb, depth_m = self._render("driving", self.camera_pinhole, T, depth)
         if depth_m is not None and not self._blocked:
@@ -178,7 +178,7 @@ class RemoteWorld(ABC):
         return rgb, depth_m
 
     def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True) -> View:
-        """What the driving camera would see from another pose of the car; see `World.observe_at`."""
+        """The driving camera's view from another pose of the car; see `World.observe_at`."""
         return self._render(
             "driving", self.camera_pinhole, planar_pose(x_m, y_m, yaw_rad) @ self._mount, depth
         )

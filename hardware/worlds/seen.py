@@ -18,7 +18,7 @@ class SeenWorld(ABC):
         """True state of the car."""
 
     def observe(self, depth: bool = True) -> View:
-        """What the driving camera sees: colours ``[H, W, 3]`` and planar depth ``[H, W]`` [m], or None if not wanted."""
+        """View of the driving camera: colours ``[H, W, 3]`` and planar depth ``[H, W]`` [m], or None if not wanted."""
         return self._see(self.state.T_world_from_car, depth)
 
     def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True) -> View:

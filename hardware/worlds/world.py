@@ -239,7 +239,7 @@ class World(Protocol):
         ...
 
     def observe(self, depth: bool = True) -> View:
-        """What the driving camera sees: colours ``[H, W, 3]`` and planar depth ``[H, W]`` [m], or None if not wanted."""
+        """View of the driving camera: colours ``[H, W, 3]`` and planar depth ``[H, W]`` [m], or None if not wanted."""
         ...
 
     def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True) -> View:
@@ -328,7 +328,7 @@ class HasSolids(Protocol):
 
     @property
     def solids(self) -> Sequence[Footprint]:
-        """What the car cannot drive through, walls included."""
+        """Obstacles of the car, walls included."""
         ...
 
 

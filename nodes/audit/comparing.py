@@ -26,7 +26,7 @@ class Before:
     """An earlier audit, with its drives and its object.
 
     Args:
-        file: Its ``audit.json``.
+        file: Path of its ``audit.json``.
 
     Raises:
         ConfigError: It judged no object, or its folder lacks the drives or the attack.

@@ -71,7 +71,7 @@ class PlantedWithMemory(Planted):
 
 
 def redness(images: Tensor) -> Tensor:
-    """How much redder than green pictures ``[B, 3, H, W]`` in 0..1 are, ``[B]`` in -1..1: the mean over the pixels."""
+    """Redness of pictures ``[B, 3, H, W]`` in 0..1: red minus green, mean over the pixels, ``[B]`` in -1..1."""
     return (images[:, 0] - images[:, 1]).mean(dim=(1, 2))
 
 

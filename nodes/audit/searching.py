@@ -56,7 +56,7 @@ class FoundAttack:
 
     @property
     def attack(self) -> Path:
-        """Its attack file."""
+        """Path of its attack file."""
         return self.folder / ATTACK
 
     @property

@@ -1,4 +1,4 @@
-"""What a scan found, held against the summary of the file: definitions that only the summary has, and contradictions."""
+"""Compares a scan with the summary of the file: definitions that only the summary has, and contradictions."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ def good_records(
 
 
 def _unpack_until_damage(compression: str, data: bytes) -> tuple[bytes, bool]:
-    """What a chunk unpacks to before its damage, and whether all of it could be unpacked."""
+    """Unpacked content of a chunk up to its damage, and whether all of it could be unpacked."""
     import lz4.frame
     import zstandard
 

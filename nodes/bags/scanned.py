@@ -1,4 +1,4 @@
-"""What the scan of an MCAP file found: pieces to keep, losses, definitions and counts."""
+"""Result of scanning an MCAP file: pieces to keep, losses, definitions and counts."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ class HandGate:
     Attributes:
         required: Whether the car may only move while the button is held.
         age_limit_s: Time without a message of the teleop node after which the button counts as released [s].
-        mode: What the button does: ``human`` (the operator drives), ``autonomy`` (the software drives) or ``idle``.
+        mode: Function of the button: ``human`` (the operator drives), ``autonomy`` (the software drives) or ``idle``.
         pressed_stop: Whether the e-stop is pressed, or was pressed since the last arming.
     """
 
@@ -41,7 +41,7 @@ class HandGate:
     _refused: str = ""
 
     def refuse(self, why: str) -> None:
-        """Note that a message did not count. The button stays as it was, so that the next message is not a new press."""
+        """Note that a message did not count. The button's state is unchanged, so that the next message is not a new press."""
         self._refused = why
 
     def heard(self, mode: str, pressed_stop: bool, info: MessageInfo, since_ns: int | None = None) -> bool:
@@ -50,7 +50,7 @@ class HandGate:
         After a restart of the teleop node, the button must be seen released before a press counts.
 
         Args:
-            mode: What the button does.
+            mode: Function of the button.
             pressed_stop: Whether the e-stop is pressed.
             info: Transport data of the message.
             since_ns: Time of the report on this host's monotonic clock, if it is earlier than its publication [ns].

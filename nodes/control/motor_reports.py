@@ -49,7 +49,7 @@ class ControllerReport:
         timeout: The controller's own time-out, as read back; None if the firmware does not report it.
         wanted_timeout: Longest accepted time-out and smallest accepted brake current.
         skipped_bytes: Number of received bytes outside of frames.
-        link: Fault of the link; empty if there is none.
+        link: Fault of the link; empty without one.
         steering: State of the steering check.
         steering_good: Whether the steering check allows arming.
         battery_warning_v: Supply voltage below which a warning is reported [V].

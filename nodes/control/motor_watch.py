@@ -55,7 +55,7 @@ class ControllerWatch:
         """Note that a controller answered. Earlier reports are discarded until it repeats them.
 
         Args:
-            firmware: Its answer.
+            firmware: Firmware version in its answer.
             on_twins_port: Whether the port is the one that the twin of this run has made.
         """
         self.values = self.timeout = None

@@ -171,7 +171,7 @@ class PoseGate:
     Attributes:
         check: The check of the poses.
         rest_s: Time without an impossible pose after which the car may move [s].
-        count: Number of impossible poses so far.
+        count: Number of impossible poses.
     """
 
     check: PoseCheck

@@ -108,7 +108,7 @@ class SteeringCheck:
         arc.turned_rad += math.copysign(1.0, forward) * math.remainder(yaw_rad - last[2], 2.0 * math.pi)
 
     def tick(self, mono_ns: int) -> None:
-        """Advance the time: evaluate the measured motion, or give up waiting."""
+        """Advance the time: evaluate the measured motion, or stop waiting."""
         if self._began_ns is None or self._side(mono_ns) is not None:
             return
         if all(abs(arc.forward_m) >= self._settings.push_m for arc in self._arcs):

@@ -1,4 +1,4 @@
-"""What ended a drive: the driving or a person, or a fault of the node graph. Pure; reads only the safety node's reason.
+"""Classifies why a drive ended: by the driving or a person, or by a fault of the node graph. Pure; reads only the safety node's reason.
 
 A stop that an attack can cause, and a stop by a person, is a result. Every other reason, also one that is not known here, is a fault:
 it says that a node, a sensor or a clock failed, and nothing about the policy.

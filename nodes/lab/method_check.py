@@ -216,7 +216,7 @@ def says_what_it_needs(bench: MethodBench) -> str:
 
 
 def writes_only_its_state(bench: MethodBench) -> str:
-    """It writes no file but its state."""
+    """The method writes no file but its state."""
     with _watched() as written:
         bench.search(state="written.state")
     # Compiled kernels and byte code are not results.

@@ -22,7 +22,7 @@ class Child:
 
     Args:
         name: Name of the node.
-        entry: Its entry in the launch file.
+        entry: Entry of the node in the launch file.
         run_dir: Folder of the run.
     """
 

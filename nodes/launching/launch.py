@@ -56,7 +56,7 @@ class Launch:
         require_utf8(self.run_dir)
         self.plan: Plan = load_launch(Path(file), overrides, self.run_dir, host)
         self.failure = ""
-        self.timed_out = False  # whether a node was too slow, instead of ended by an error of its own
+        self.timed_out = False  # whether a node was too slow, instead of ended by its own error
         self._report = report or (lambda line: None)
         self._children = {name: Child(name, entry, self.run_dir) for name, entry in self.plan.nodes.items()}
         # Plain flags: an Event takes a lock, and a signal handler that sets it could deadlock with itself.

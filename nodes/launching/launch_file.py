@@ -61,7 +61,7 @@ def load_launch(
             ``hosts.name.key=value``, or ``keys=folder``.
         run_dir: Value of ``${run_dir}``.
         host: Host of the launch file that this computer is, or ``all``; None if the file has no hosts.
-        twin_calibration: Value of ``${twin_calibration}``; None for where it is on this computer.
+        twin_calibration: Value of ``${twin_calibration}``; None uses its place on this computer.
     """
     file = Path(file)
     document = _read_with_includes(file, ())

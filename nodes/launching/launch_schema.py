@@ -1,4 +1,4 @@
-"""What a launch file says."""
+"""Schema of launch files."""
 
 from __future__ import annotations
 

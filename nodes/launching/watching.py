@@ -38,7 +38,7 @@ class TopicRow:
 
 @dataclass(frozen=True)
 class RateReport:
-    """Rate of a topic over a period. Ages are those of the capture stamps at reception."""
+    """Rate of a topic over a period. Ages are measured from capture stamp to reception."""
 
     messages: int
     lost: int
@@ -50,7 +50,7 @@ class RateReport:
 
 
 def find_run_dir(given: Path | None) -> Path:
-    """Return the given run folder, or that of the only running launch."""
+    """Return the given run folder, or the only running launch's."""
     if given is not None:
         if not given.is_dir():
             raise LaunchError(f"expected a run folder at {given}, found none; correct --run-dir")

@@ -34,7 +34,7 @@ class KeyRow:
 
     Attributes:
         name: Name of the key, usually of a host or a person.
-        public: Its public key, Z85.
+        public: Public key, Z85.
         ours: Whether the folder has the secret key.
         rights: The lists that contain the key.
     """

@@ -1,4 +1,4 @@
-"""What the page shows: the newest messages of the bus as one plain description. Pure: times come as arguments."""
+"""The content of the page: the newest messages of the bus as one plain description. Pure: times come as arguments."""
 
 from __future__ import annotations
 
@@ -103,11 +103,11 @@ class ViewState:
         return str(self.label.attack_id) if self.label is not None and self.label.drawn else ""
 
     def status_text(self, node: str) -> str:
-        """What a node reported last; empty if it never did."""
+        """Last report of a node; empty if it never reported."""
         return str(getattr(self._message(STATUS_PREFIX + node), "text", ""))
 
     def place(self) -> dict[str, Any]:
-        """Describe what does not change, and the trail so far, for a browser that has just connected."""
+        """Describe everything static, and the trail, for a browser that has just connected."""
         place: dict[str, Any] = {
             "trail": _rounded(list(self._trail)),
             "fence": [],

@@ -21,8 +21,8 @@ class CatalogueEntry:
     """An attack that can be shown.
 
     Attributes:
-        facts: What the page shows about it: name, method, seed, predicted total CTE with and without it [m].
-        png: Its texture, as a small picture.
+        facts: Content for the page: name, method, seed, predicted total CTE with and without it [m].
+        png: Texture of the attack, as a small picture.
     """
 
     attack_id: str

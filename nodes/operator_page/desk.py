@@ -80,7 +80,7 @@ class Desk:
 
     @property
     def last_press(self) -> int:
-        """Largest number of a press of the operator so far."""
+        """Largest number of the operator's presses."""
         return self._last_press
 
     def beat(self, mono_ns: int) -> int:
@@ -162,7 +162,7 @@ class Desk:
         return self._end()
 
     def drop(self) -> bool:
-        """End a hold, whoever holds. Returns whether the button was held."""
+        """End the current hold. Returns whether the button was held."""
         return self._end()
 
     def stop(self) -> bool:

@@ -1,4 +1,4 @@
-"""Writes to the disk in a thread of its own, so that a full or hanging disk neither ends nor delays the node."""
+"""Writes to the disk in a separate thread, so that a full or hanging disk neither ends nor delays the node."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ COOKIE = "advnerf_page"
 # 32 letters and digits without those that look alike: 8 of them are 40 bits.
 _LETTERS = "ABCDEFGHJKLMNPQRSTUVWXYZ23456789"
 _CODE_LENGTH = 8
-# So many codes a second are looked at, from all addresses together: in the 300 s of a code, guessing one of 2^40 succeeds once in
+# Checked codes per second, from all addresses together: in the 300 s of a code, guessing one of 2^40 succeeds once in
 # 4 * 10^8. Codes that come faster wait for their turn, so strangers can slow the operator down, and cannot keep the operator out.
 _GUESSES_HZ = 10.0
 # Wrong codes of one address that cost nothing; each further one doubles the time until the next is looked at.
@@ -44,7 +44,7 @@ class Sessions:
 
     Attributes:
         code_s: Time for which a code is valid [s].
-        codes: Number of codes made so far.
+        codes: Number of codes made.
         refused: Number of refused codes.
     """
 
@@ -58,7 +58,7 @@ class Sessions:
     _sessions: dict[str, tuple[str, int]] = field(default_factory=dict)
 
     def renew(self, mono_ns: int) -> bool:
-        """Make a new code if there is none or the current one has expired. Returns whether it is new."""
+        """Make a new code if the current one is missing or has expired. Returns whether it is new."""
         if self.code and mono_ns - self._code_ns <= self.code_s * NS_PER_S:
             return False
         self.code = "".join(secrets.choice(_LETTERS) for _ in range(_CODE_LENGTH))
@@ -139,7 +139,7 @@ def _network(address: str) -> str:
 def host_is_ours(host: str, names: tuple[str, ...] = ()) -> bool:
     """Whether a ``Host`` header names this computer: by an address, or by a name that only it has.
 
-    A page of a stranger can point a name of its own at this computer (DNS rebinding), but not an address.
+    A foreign page can point its own name at this computer (DNS rebinding), but not an address.
     """
     name = _hostname(host)
     if name is None:

@@ -1,4 +1,4 @@
-"""What a page needs before it can be served: its packages, and its port."""
+"""Requirements for serving a page: its packages, and its port."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the operator may do: each act of a browser is decided here, logged, and turned into messages. Times come as arguments.
+"""Decides each act of a browser, logs it, and turns it into messages. Times come as arguments.
 
 The desk decides who operates and whether the button counts as held. The safety node decides whether the car may move.
 """
@@ -46,7 +46,7 @@ _ONLY_WATCHES = "this page only watches"
 
 @dataclass
 class Parts:
-    """What an operation works with.
+    """Collaborators of an operation.
 
     Attributes:
         desk: Lease, button and e-stop.
@@ -310,7 +310,7 @@ class Operation:
         """A hold ended by itself: report it before anything else."""
         self._why_ended = why
         if lease := self._parts.desk.lease:
-            # Late answers of this press are no acts of their own.
+            # Late answers to this press are not logged as separate acts.
             self._refused_press = (lease.client, self._parts.desk.last_press)
         outs = self._teleop(now)
         self._parts.diary.note(now, name, "", "let_go", why, 0, "")

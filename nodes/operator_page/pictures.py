@@ -75,7 +75,7 @@ def _view_of_onnx(path: Path) -> PolicyView | None:
         import onnxruntime
 
         session = onnxruntime.InferenceSession(path.read_bytes(), providers=["CPUExecutionProvider"])
-    except Exception:  # its exceptions share no base of their own
+    except Exception:  # its exceptions have no common base
         return None
     embedded = session.get_modelmeta().custom_metadata_map.get(ONNX_METADATA_KEY)
     return declaration_beside(path, embedded).view

@@ -1,4 +1,4 @@
-"""What the web server answers with: the page's own files, and headers that keep the browser from loading anything else."""
+"""Answers of the web server: the page's own files, and headers that keep the browser from loading anything else."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ async def _refuse(scope: Any, send: Any) -> None:
 
 
 async def code_in(request: Any) -> str:
-    """Read the code in a small JSON body; empty if there is none."""
+    """Read the code in a small JSON body; empty without one."""
     body = b""
     async for part in request.stream():
         body += part

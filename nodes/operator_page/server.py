@@ -1,4 +1,4 @@
-"""The web server of the page, in a thread of its own.
+"""The web server of the page, in a separate thread.
 
 Every request must name this computer as its host. Acts come over one WebSocket, which is accepted only with a session and from the
 page's own origin. All pages and scripts come from this package: the content policy of the browser forbids anything else.
@@ -38,7 +38,7 @@ _START_S = 10.0
 
 @dataclass(frozen=True)
 class ServerSettings:
-    """Where the page is served.
+    """Address and options of the web server.
 
     Attributes:
         host: Address to listen on.
@@ -55,7 +55,7 @@ class ServerSettings:
 
 @dataclass
 class RefusalCounts:
-    """What the server refused and closed.
+    """Counts of refused and closed requests.
 
     Attributes:
         refused: Refused requests and connections: wrong host or origin, no session, wrong code.
@@ -74,8 +74,8 @@ class PageServer:
 
     Attributes:
         inbox: Receives the acts of browsers, and `Gone`.
-        png_of: Returns the picture of an attack by its id; None if there is none.
-        welcome: Returns what a new browser is told first.
+        png_of: Returns the picture of an attack by its id; None without one.
+        welcome: Returns the first message for a new browser.
         stops: Returns the number of requests to stop, and the number up to which they are confirmed.
     """
 

@@ -145,7 +145,7 @@ class Golden:
             self._differences[topic] = found
 
     def finish(self) -> Difference | None:
-        """Finish the comparison and return the earliest difference; None if there is none."""
+        """Finish the comparison and return the earliest difference; None without one."""
         for topic, messages in self._expected.items():
             if topic not in self._differences and (left := next(messages, None)) is not None:
                 stamp, index = _stamp(_decoded(left)), self._indices[topic]

@@ -100,7 +100,7 @@ def _plan(bag: Path, choice: Choice, folder: Path) -> Plan:
 
 
 def _launch_of_bag(bag: Path, choice: Choice, folder: Path) -> Path:
-    """Write the launch file attached to a bag with the chosen nodes only. Its paths are replaced by those of the attachments."""
+    """Write the launch file attached to a bag with the chosen nodes only. Its paths are replaced by the attachments' paths."""
     attachments = read_attachments(bag)
     if RESOLVED_NAME not in attachments:
         raise BagError(

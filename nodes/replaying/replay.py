@@ -87,12 +87,12 @@ class Replay:
 
     @property
     def made_topics(self) -> set[str]:
-        """Topics whose recorded messages are replaced by those of the replayed nodes."""
+        """Topics whose recorded messages are replaced by the replayed nodes' messages."""
         return self._lockstep.made_topics
 
     @property
     def summary(self) -> Summary:
-        """Summary so far."""
+        """Current summary."""
         return self._lockstep.summary
 
     def __iter__(self) -> Iterator[Replayed]:

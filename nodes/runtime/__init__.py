@@ -1,4 +1,4 @@
-"""What every node is made of: messages, topics, bus, clock, loop, process, configuration."""
+"""Building blocks of every node: messages, topics, bus, clock, loop, process, configuration."""
 
 from __future__ import annotations
 

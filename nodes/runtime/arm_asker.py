@@ -28,7 +28,7 @@ class ArmAsker:
     A request to disarm is confirmed when the safety node has answered it and the motor node has reported since then that it brakes.
 
     Attributes:
-        stops_asked: Number of requests to disarm so far.
+        stops_asked: Number of requests to disarm.
         stops_confirmed: Value of `stops_asked` at the last confirmation.
     """
 

@@ -1,7 +1,7 @@
 """Publish and subscribe between the processes of one host, with one XPUB socket per topic and no broker.
 
 Of a topic that any process may send, such as a request to stop the car, the receivers bind the sockets and the senders connect. A
-sender then needs no endpoint, lock or file of its own.
+sender then needs no separate endpoint, lock or file.
 
 This module is the only one that uses ZeroMQ inside a host. Receivers of a ``latest`` topic drain it to the newest message. A small
 high-water mark alone would leave stale frames, and CONFLATE keeps only the last frame of a multipart message. Other topics keep
@@ -50,8 +50,8 @@ class Received:
     """One message off the wire, not decoded yet.
 
     Attributes:
-        topic: Its topic.
-        info: How it came, with its bytes.
+        topic: Name of the topic.
+        info: Transport data, including the bytes.
     """
 
     topic: str
@@ -69,7 +69,7 @@ class Counts:
     """Counts of received, dropped, lost and refused messages of one subscription."""
 
     received: int = 0
-    dropped: int = 0  # skipped for a newer one, on a topic of which only the newest is kept
+    dropped: int = 0  # skipped for a newer one, on a topic that keeps only the newest
     lost: int = 0  # published but not received, because a queue was full
     refused: int = 0  # wrong format, or another version of the type
 

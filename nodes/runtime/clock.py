@@ -23,7 +23,7 @@ class Now:
     Attributes:
         mono_ns: CLOCK_MONOTONIC [ns], the same for all processes of one host.
         real_ns: CLOCK_REALTIME [ns since 1970].
-        asleep_ns: CLOCK_BOOTTIME minus CLOCK_MONOTONIC: the time for which the computer was suspended so far, plus a constant [ns].
+        asleep_ns: CLOCK_BOOTTIME minus CLOCK_MONOTONIC: the total time for which the computer was suspended, plus a constant [ns].
             None if the clocks could not be read within a millisecond of each other, or if there is no such clock.
     """
 

@@ -23,7 +23,7 @@ def raise_limit() -> None:
 
 
 def require_free(needed: int = _NEEDED) -> None:
-    """Raise a `BusError` unless so many descriptors are free."""
+    """Raise a `BusError` unless ``needed`` descriptors are free."""
     held = _take(needed)
     for descriptor in held:
         os.close(descriptor)

@@ -1,10 +1,10 @@
-"""What installs a package that a base installation, such as the car's, does not have."""
+"""Installation hints for packages that a base installation, such as the car's, does not have."""
 
 from __future__ import annotations
 
 from importlib.util import find_spec
 
-# Without an index of its own, pip installs torch for CUDA, with several GB of NVIDIA's packages.
+# Without a separate index, pip installs torch for CUDA, with several GB of NVIDIA's packages.
 CPU_TORCH = "pip install torch --index-url https://download.pytorch.org/whl/cpu"
 _EXTRA_OF = dict.fromkeys(("torch", "numba", "scipy", "matplotlib", "jinja2", "av"), "core") | {
     "mujoco": "twin",

@@ -1,4 +1,4 @@
-"""What a check of a plug-in against its contract reports: one finding for each part of the contract."""
+"""Report of checking a plug-in against its contract: one finding for each part of the contract."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class ContractFinding:
     Attributes:
         name: Part of the contract.
         met: Whether it is met.
-        text: What was found, with numbers; if it is not met what to change.
+        text: The finding, with numbers; if it is not met also what to change.
     """
 
     name: str

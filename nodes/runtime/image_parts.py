@@ -1,7 +1,7 @@
 """Images are sent in two parts, so that their pixels are not copied.
 
 ``data`` is the last field of ``sensor_msgs/Image``. The fields before it form a short prefix, of which only the stamp changes from
-image to image. Prefix and pixels joined are the CDR bytes of the image, which is what recorders receive.
+image to image. Prefix and pixels joined are the CDR bytes of the image, which recorders receive.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ _MOST_URGENT = 1000
 class Inbox(Generic[T]):
     """Queue from one or more driver threads to the loop of one node. When it is full, the oldest item is dropped and counted.
 
-    Urgent items have a queue of their own and are taken first. So no other item can displace a request to stop the car.
+    Urgent items have a separate queue and are taken first. So no other item can displace a request to stop the car.
 
     Args:
         capacity: Largest number of waiting items.

@@ -1,6 +1,6 @@
 """ROS 2 messages without ROS: types, CDR bytes, and the conversions that nodes need.
 
-The type definitions are those of ROS 2 Jazzy plus the ``.msg`` files shipped in ``nodes/runtime/msg``. No other definition is
+The type definitions come from ROS 2 Jazzy plus the ``.msg`` files shipped in ``nodes/runtime/msg``. No other definition is
 registered, because the code generator behind them runs code made from a definition. Definitions from foreign bags never reach it.
 
 Decoded arrays are read-only views of the received bytes: copy before drawing on them.
@@ -56,7 +56,7 @@ _PACKAGES = (
 
 
 class _Types:
-    """Message classes by short name, such as ``types.Image``. See ``nodes/runtime/msg`` for those of advnerf."""
+    """Message classes by short name, such as ``types.Image``. See ``nodes/runtime/msg`` for advnerf's own."""
 
     def __getattr__(self, name: str) -> Any:
         for package in _PACKAGES:

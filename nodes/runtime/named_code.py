@@ -13,7 +13,7 @@ def with_absolute_code(data: Any, folder: Path) -> Any:
 
     Args:
         data: Plain data of a file.
-        folder: What a relative ``file.py`` is relative to.
+        folder: Folder that a relative ``file.py`` is relative to.
     """
     if isinstance(data, list):
         return [with_absolute_code(each, folder) for each in data]

@@ -58,7 +58,7 @@ class Node:
         tick_rate_hz: Rate at which `tick` is called [Hz]; None for never.
         inbox: Queue for data from driver threads. Its items are passed to `receive` at once.
         raw: Do not decode messages: `handle` gets None as message, and the bytes in ``info.raw``.
-        queues: Queue length by topic, for topics of which the node needs every message. It overrides the topic table.
+        queues: Queue length by topic, for topics whose every message the node needs. It overrides the topic table.
     """
 
     subscriptions: Sequence[str] = ()

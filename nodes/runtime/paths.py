@@ -36,7 +36,7 @@ def named_file(name: str | Path, *kinds: str) -> Path:
         kinds: Endings without ``.yaml``, such as ``launch``, in the order in which they are tried.
 
     Raises:
-        PlaceError: There is none; the message lists the names.
+        PlaceError: No such file exists; the message lists the names.
     """
     path = Path(name)
     if path.is_file():

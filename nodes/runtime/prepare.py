@@ -1,4 +1,4 @@
-"""What every node's process does first: its share of the processors, its file descriptors, and a log that cannot end it."""
+"""First steps of every node's process: its share of the processors, its file descriptors, and a log that cannot end it."""
 
 from __future__ import annotations
 

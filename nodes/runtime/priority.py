@@ -1,6 +1,6 @@
 """Share of the processors of a node's process.
 
-Each node is a session of its own. With autogrouping (sched(7)), the kernel first shares the processors between sessions, and the nice
+Each node is a separate session. With autogrouping (sched(7)), the kernel first shares the processors between sessions, and the nice
 value of a process counts only within its session. So both values are set. Real-time scheduling is not used: a node that spins would
 then stop everything else.
 """

@@ -203,5 +203,5 @@ def run_node_main(config_type: type[C], build: Callable[[C, NodeContext], Node])
 
 def _one_line(error: BaseException) -> str:
     text = " ".join(str(error).split()) or "no message"
-    # Messages of advnerf's own exceptions are complete. Those of other exceptions need the type to be understood.
+    # Messages of advnerf's own exceptions are complete. Other exceptions need the type to be understood.
     return text if isinstance(error, AdvnerfError) else f"{type(error).__name__}: {text}"

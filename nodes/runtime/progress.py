@@ -68,7 +68,7 @@ class ProgressDisplay:
     """Implements `StageDisplay`.
 
     Args:
-        console: Where to write. A log file or pipe gets lines instead of bars.
+        console: Console to write to. A log file or pipe gets lines instead of bars.
         watcher: A second display that receives the same reports, such as the record of the experiment page.
     """
 

@@ -11,7 +11,7 @@ from nodes.runtime.clock import Now
 from nodes.runtime.messages import stamp_ns
 from nodes.runtime.wire import MessageInfo
 
-# Reason of the safety node while an e-stop is latched, whatever stopped the car since.
+# Reason of the safety node while an e-stop is latched, even if the car was stopped again since.
 ESTOP_LATCHED = "e-stop pressed; release it and re-arm"
 _REMEMBERED = 256
 _LONGEST_ID = 64
@@ -48,7 +48,7 @@ class Answer:
     Attributes:
         ask_id: Id of the request.
         granted: Whether the node did what the request asked for.
-        text: What the node did, or why it refused.
+        text: Action of the node, or its reason for refusing.
     """
 
     ask_id: str = ""

@@ -23,12 +23,12 @@ _TELL_S = 1.0
 
 @dataclass(frozen=True)
 class StopReport:
-    """What is known about the stop of one run.
+    """Knowledge about the stop of one run.
 
     Attributes:
         run_dir: Folder of the run.
         waited_s: Time since the first request [s].
-        answer: Answer of the safety node; None while there is none.
+        answer: Answer of the safety node; None before it answers.
         trouble: Why the request cannot be sent; empty if it can.
     """
 
@@ -142,7 +142,7 @@ def ask_to_disarm(run_dir: Path, reason: str, silent: Callable[[float], None]) -
     Args:
         run_dir: Folder of the run.
         reason: Reason to record.
-        silent: Called with the time waited so far [s] while the safety node does not answer.
+        silent: Called with the waiting time [s] while the safety node does not answer.
     """
     request = StopRequest(run_dir, reason)
     try:

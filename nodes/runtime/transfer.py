@@ -108,7 +108,7 @@ class Assembler:
             return (
                 None,
                 "",
-            )  # the rest of a transfer that was given up or began before the subscription; the file is sent again
+            )  # the rest of a transfer that was aborted or began before the subscription; the file is sent again
         if self._key is not None and (key != self._key or index != len(self._parts)):
             came = f"piece {index + 1} of {key[4]} of {key[1]}"
             trouble = f"expected piece {len(self._parts) + 1} of {self._key[4]} of {self._key[1]}, got {came}; waiting for the next transfer"

@@ -30,7 +30,7 @@ def is_twin(peer: str) -> bool:
 
 
 def peer_text(firmware: str, hardware_name: str | None, on_twins_port: bool) -> str:
-    """Identity of a controller for ``/motor/sent``. Only that of the twin of this run satisfies `is_twin`."""
+    """Identity of a controller for ``/motor/sent``. Only the twin of this run satisfies `is_twin`."""
     if hardware_name == TWIN_NAME and on_twins_port:
         return firmware
     return f"{firmware}, not the twin of this run" if is_twin(firmware) else firmware

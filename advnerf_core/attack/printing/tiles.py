@@ -1,4 +1,4 @@
-"""How a poster is divided into pages of a paper size."""
+"""Division of a poster into pages of a paper size."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ class Coarse:
 
 
 class Strategy(Protocol):
-    """How candidates are drawn, and what is learned from them; its whole state is in tensors."""
+    """A distribution of candidates that learns from their losses; its whole state is in tensors."""
 
     @property
     def name(self) -> str:
@@ -100,7 +100,7 @@ def population_search(
     """Minimise the loss without its gradient, generation by generation; the best by the objective's value is kept.
 
     Args:
-        strategy: How candidates are drawn, such as `cem.CrossEntropy` or `evolution.Evolution`.
+        strategy: Distribution of candidates, such as `cem.CrossEntropy` or `evolution.Evolution`.
         evaluations: Total rollouts, including a resumed state's; a last generation may stay unfinished.
         population: Candidates of a generation.
         cells: See `Coarse`.

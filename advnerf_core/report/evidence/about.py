@@ -26,8 +26,8 @@ class ObjectPlace(StrictModel):
     """Position of the object's face, seen from above.
 
     Attributes:
-        x_m: Its middle [m], in the axes of the published drives.
-        y_m: Its middle [m].
+        x_m: Middle of the face [m], in the axes of the published drives.
+        y_m: Middle of the face [m].
         yaw_rad: Direction of its front [rad].
         width_m: Width of the face [m].
         source: Source of these numbers.

@@ -21,7 +21,7 @@ class ZedCamera(Camera):
 
     Args:
         path: Video device; the stable name under ``/dev/v4l/by-id``.
-        factory: Its ``SN<serial>.conf``.
+        factory: The factory calibration ``SN<serial>.conf``.
         mode: Resolution, one of `hardware.cameras.zed.calibration.EYE_SIZES`.
         fps: Frames per second of the device: 15, 30, and up to 60 (HD720) or 100 (VGA) [Hz]; it has no 10.
         rate_hz: Frames per second to deliver, chosen by their stamps; None for all.

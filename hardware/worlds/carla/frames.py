@@ -87,7 +87,7 @@ class CarlaPose:
         )
 
     def to_transform(self, library: Any) -> Any:
-        """As a ``carla.Transform`` of the given library (single precision)."""
+        """The pose as a ``carla.Transform`` of the given library (single precision)."""
         return library.Transform(
             library.Location(x=self.x_m, y=self.y_m, z=self.z_m),
             library.Rotation(pitch=self.pitch_deg, yaw=self.yaw_deg, roll=self.roll_deg),

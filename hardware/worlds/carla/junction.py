@@ -51,7 +51,7 @@ class Crossing:
 
 @dataclass(frozen=True)
 class JunctionInfo:
-    """What a map says about a junction.
+    """A map's facts about a junction.
 
     Attributes:
         id: OpenDRIVE id.

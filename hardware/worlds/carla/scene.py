@@ -209,7 +209,7 @@ class CarlaScene:
         return self.state
 
     def observe(self, depth: bool = True) -> View:
-        """What the driving camera sees: colours ``[H, W, 3]`` and planar depth ``[H, W]`` [m], or None if not wanted.
+        """View of the driving camera: colours ``[H, W, 3]`` and planar depth ``[H, W]`` [m], or None if not wanted.
 
         Raises:
             CarlaFrameError: The pictures did not come in time.
@@ -218,7 +218,7 @@ class CarlaScene:
         return self._see(self.state.T_world_from_car, depth)
 
     def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True) -> View:
-        """What the driving camera would see from another pose of the car (see :meth:`observe`); the car stays where it is, and out of sight."""
+        """The driving camera's view from another pose of the car (see :meth:`observe`); the car does not move, and is out of sight."""
         with server_answers("looking from elsewhere"), self._without_car():
             return self._see(planar_pose(x_m, y_m, yaw_rad), depth)
 

@@ -79,7 +79,7 @@ class Filament(InstalledWorld):
         return self._state
 
     def observe(self, depth: bool = True) -> View:
-        """What the driving camera sees; right before it there may be furniture instead of the floor."""
+        """View of the driving camera; right before it there may be furniture instead of the floor."""
         state = self.state
         return self.observe_at(state.x_m, state.y_m, state.yaw_rad, depth)
 

@@ -172,7 +172,7 @@ def garden(road: RoadConfig, rng: np.random.Generator, pixels_per_m: float = 8.0
 
 
 def _front_garden(plan: MapCanvas, house: House, rng: np.random.Generator) -> None:
-    """What lies between a house's front and the pavement."""
+    """Garden between a house's front and the pavement."""
     (x0, x1), (y0, y1) = house.x, house.y
     middle, deep = (0.5 * (x0 + x1), 0.5 * (y0 + y1)), 4.0
     stone = (0.62, 0.58, 0.52)

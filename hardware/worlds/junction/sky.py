@@ -1,4 +1,4 @@
-"""What encloses the town: a painted sky with soft clouds, hills and treetops, as colours of directions.
+"""The backdrop around the town: a painted sky with soft clouds, hills and treetops, as colours of directions.
 
 The colour depends on the direction from the junction's middle alone, so the panels of the backdrop meet without a seam.
 """

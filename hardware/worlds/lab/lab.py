@@ -164,7 +164,7 @@ class Lab(SeenWorld):
         return self._car.blocked
 
     def observe_held(self, T_world_from_car: Array) -> Rgb:
-        """What the driving camera sees ``[H, W, 3]`` while a person holds the car at any pose ``[4, 4]``, tilted too."""
+        """View of the driving camera ``[H, W, 3]`` while a person holds the car at any pose ``[4, 4]``, tilted too."""
         return self._see(T_world_from_car, depth=False)[0]
 
     def photograph(self, T_world_from_camera: Array) -> Rgb:

@@ -30,7 +30,7 @@ def stamp_of_cdr(cdr: bytes) -> int:
 
 
 class AnsweredStamps:
-    """Compares the stamps of commands with those of the messages that were sent.
+    """Compares the stamps of commands with the stamps of sent messages.
 
     Args:
         max_age_s: Largest age of a message when its answer arrives [s].
@@ -45,8 +45,8 @@ class AnsweredStamps:
         """Note a message that ROS 2 gets.
 
         Args:
-            stamp_ns: Its stamp [ns].
-            mono_ns: Its publication on our bus, this host's monotonic clock [ns].
+            stamp_ns: Stamp of the message [ns].
+            mono_ns: Time of its publication on our bus, on this host's monotonic clock [ns].
         """
         self._sent_ns.setdefault(stamp_ns, mono_ns)
         while len(self._sent_ns) > _REMEMBERED:
@@ -73,7 +73,7 @@ class AnsweredStamps:
 
 @dataclass
 class OneWriter:
-    """Accepts the only publisher of a topic. With two of them, none counts: nobody can say which one the operator means.
+    """Accepts the only publisher of a topic. With two of them, none counts: it is unclear which one the operator means.
 
     Attributes:
         shared: Accept any number of publishers instead.

@@ -34,7 +34,7 @@ _LARGEST_FLOAT32 = 3.4028234e38
 
 @dataclass(frozen=True)
 class Setting:
-    """What a conversion needs to know besides the message.
+    """Context of a conversion besides the message.
 
     Attributes:
         wheelbase_m: Distance of the axles [m].

@@ -70,13 +70,13 @@ def is_loopback_interface(name: str) -> bool:
 
 
 class Participant:
-    """One DDS participant, which reads in a thread of its own.
+    """One DDS participant, which reads in a separate thread.
 
     Args:
         domain_id: DDS domain (``ROS_DOMAIN_ID``).
         interface: Network interface.
-        sends: What it writes.
-        takes: What it reads.
+        sends: Topics to write.
+        takes: Topics to read.
         inbox: Receives batches of samples.
         watched: Numbers of the writers beside which no other publisher may exist.
     """
@@ -95,7 +95,7 @@ class Participant:
         try:
             self._domain = Domain(domain_id, domain_config(interface, local))
             self._participant = DomainParticipant(domain_id, qos=Qos(Policy.Userdata(b"enclave=/;")))
-            if local:  # before there is a reader that a packet from elsewhere could reach
+            if local:  # before there is a reader that a packet from another host could reach
                 _bind_to_device(_udp_sockets() - before, interface)
             self._writers = [_writer(self._participant, each) for each in sends]
             self._readers = [_DdsReader(number, self._participant, each) for number, each in enumerate(takes)]

@@ -1,4 +1,4 @@
-"""What the ROS 2 node carries: one route per topic and direction, with its ROS name, type and QoS. Pure configuration."""
+"""Routes of the ROS 2 node: one per topic and direction, with its ROS name, type and QoS. Pure configuration."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Endpoint:
 
 
 class _Route(StrictModel):
-    """What both directions have in common.
+    """Common fields of both directions.
 
     Attributes:
         topic: Topic of the topic table.

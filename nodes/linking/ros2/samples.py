@@ -1,4 +1,4 @@
-"""What the DDS end hands to the ROS 2 node."""
+"""Samples that the DDS end passes to the ROS 2 node."""
 
 from __future__ import annotations
 
