@@ -1,1 +1,1 @@
-"""Steps are kept, resumed, and their progress told."""
+"""Stages of long jobs: stored, resumed, and reported."""

@@ -1,10 +1,10 @@
-"""An artefact: files that are kept with the key under which they were made, and with their digest.
+"""An artefact: files stored with the key under which they were made, and with their digest.
 
-A stage, a search, a cell, a verdict and a prediction are artefacts: one whose key is that of now is not made again. A key is a hash over
-the settings that differ from their defaults, the version of what makes it, and the digests of its inputs. All settings are stored beside it.
+A stage, a search, a cell, a verdict and a prediction are artefacts: one with the current key is not made again. A key is a hash over
+the settings that differ from their defaults, the code's version, and the digests of its inputs. All settings are stored beside it.
 
-A reference build keeps finished stages with the code. With it a machine that has only the repository goes on where another stopped: it
-has the very scene, victims and objects that the published cells were run with.
+A reference build stores finished stages with the code. With it a machine that has only the repository can continue: it
+has the scene, victims and objects that the published cells were run with.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from advnerf_core.report.evidence import kept_build
 from nodes.runtime.paths import shipped
 
 RECORD = kept_build.RECORD
-# Where cells and stages are kept with the code.
+# Folders of cells and stages that are stored with the code.
 PUBLISHED = Path("docs/results")
 BUILD = kept_build.BUILD
 _KEY_DIGITS = 16
@@ -38,12 +38,12 @@ class ReferenceBuildError(AdvnerfError):
 
 @dataclass(frozen=True)
 class Settings:
-    """What an artefact is made with, as JSON data.
+    """Settings of an artefact, as JSON data.
 
     Attributes:
         resolved: All settings and inputs; they are stored beside the key.
-        keyed: What the key is made of: settings that differ from their defaults, and all inputs. A new setting changes no key, and a changed
-            default needs a new version of what reads it. Tags of unions have no default, so that they stay.
+        keyed: Content of the key: settings that differ from their defaults, and all inputs. A new setting changes no key, and a changed
+            default needs a new version of the code that reads it. Tags of unions have no default, so that they stay.
     """
 
     resolved: Mapping[str, Any]
@@ -51,20 +51,20 @@ class Settings:
 
     @property
     def key(self) -> str:
-        """The key of what these settings make."""
+        """The key for these settings."""
         return hash_of(self.keyed)
 
     @classmethod
     def of(
         cls, model: BaseModel | None = None, include: Any = None, exclude: Any = None, **inputs: Any
     ) -> Settings:
-        """Settings of a model, or of a part of it, and inputs.
+        """Settings of a model, or of a part of it, with inputs.
 
         Args:
             model: The configuration; None for inputs alone.
-            include: Its fields that count, as `BaseModel.model_dump` takes them; None for all.
+            include: Fields that count, as for `BaseModel.model_dump`; None for all.
             exclude: Fields that do not count.
-            **inputs: Plain data that has no defaults, such as digests.
+            **inputs: Plain data without defaults, such as digests.
         """
 
         resolved, keyed = (
@@ -73,7 +73,7 @@ class Settings:
             else model.model_dump(mode="json", include=include, exclude=exclude, exclude_defaults=short)
             for short in (False, True)
         )
-        # A section of which only other fields differ from their defaults.
+        # A section in which only other fields differ from their defaults.
         for name in [name for name, each in keyed.items() if each == {} and _has_section(model, name)]:
             del keyed[name]
         # Through JSON, so that tuples and lists cannot change a key between processes.
@@ -81,21 +81,21 @@ class Settings:
 
 
 def _has_section(model: Any, name: str) -> bool:
-    """Whether a field is a section that is there without being asked for."""
+    """Whether a field is a section that exists by default."""
     return isinstance(type(model).model_fields[name].get_default(call_default_factory=True), BaseModel)
 
 
 @dataclass(frozen=True)
 class Artefact:
-    """What is remembered of a folder of files.
+    """The record of a folder of files.
 
     Attributes:
-        key: Hash of all that it depends on.
-        digest: Of its files, once it is finished.
-        seconds: How long it took.
-        settings: All that it was made with, those that are left at their defaults too.
-        kept: Of a stage from a reference build, which has no bulk: digest of the files that it does have.
-        files_in: Of a stage in a reference build: folder beside it that has the same files, which are kept once; empty where its own folder has them.
+        key: Hash of everything that the files depend on.
+        digest: Digest of the files, once they are finished.
+        seconds: Time that making them took [s].
+        settings: All settings, including defaults.
+        kept: For a stage from a reference build, without intermediate files: digest of the files that it has.
+        files_in: For a stage in a reference build: folder beside it with the same files, which are stored once; empty if its own folder has them.
     """
 
     key: str
@@ -112,7 +112,7 @@ def hash_of(value: Any) -> str:
 
 
 def digest_of(folder: Path) -> str:
-    """SHA-256 over the names and contents of all files below a folder, its own record excepted."""
+    """SHA-256 over the names and contents of all files in a folder, except its own record."""
     digest = hashlib.sha256()
     for path in sorted(p for p in folder.rglob("*") if p.is_file() and p != folder / RECORD):
         digest.update(path.relative_to(folder).as_posix().encode() + b"\0")
@@ -123,7 +123,7 @@ def digest_of(folder: Path) -> str:
 
 
 def read_artefact(folder: Path) -> Artefact | None:
-    """The record in a folder; None if there is none that can be read, as then its contents are unknown."""
+    """The record in a folder; None if it is missing or unreadable, as the contents are then unknown."""
     try:
         return Artefact(**read_json(folder / RECORD))
     except (FileNotFoundError, ValueError, TypeError):
@@ -140,13 +140,13 @@ def write_artefact(folder: Path, artefact: Artefact) -> None:
 
 
 def digests_in(folder: Path, names: Sequence[str]) -> dict[str, str]:
-    """Digests of the finished artefacts of some names below a folder."""
+    """Digests of the finished artefacts of these names in a folder."""
     found = {name: read_artefact(folder / name) for name in names}
     return {name: each.digest for name, each in found.items() if each is not None and each.digest}
 
 
 def read_current(file: Path, **key: str) -> dict[str, Any] | None:
-    """A JSON object, if its entries ``key`` are these; None if there is none that can be read, or it was made under another key."""
+    """A JSON object whose ``key`` entries are these; None if it is missing, unreadable, or was made under another key."""
     try:
         found = read_json(file)
     except (OSError, ValueError):
@@ -161,43 +161,43 @@ def has_key(file: Path, key: str) -> bool:
 
 
 def write_key(file: Path, key: str, settings: Settings) -> None:
-    """Note under which key, and with which settings, the files beside a file are made."""
+    """Note the key and the settings of the files beside a file."""
     write_json(file, {"key": key, "settings": settings.resolved})
 
 
 @dataclass(frozen=True)
 class ReferenceBuild:
-    """A folder of stages that are kept with the code, one folder each, named by stage and key.
+    """A folder of stages stored with the code, one folder each, named by stage and key.
 
-    Bulk is left out, as photographs and training frames are, which only the making of another stage reads.
+    Intermediate files, such as photographs and training frames, are left out, as only the making of another stage reads them.
 
     Attributes:
-        folder: Holds one folder for each; need not exist.
-        shipped: Where stages are read that are not in ``folder``.
+        folder: Folder with one folder per stage; need not exist.
+        shipped: Folder to read stages from that are not in ``folder``.
     """
 
     folder: Path
     shipped: Path | None = None
 
     def find(self, name: str, key: str) -> Artefact | None:
-        """What is known of the stage of a name with a key; None if it is not here."""
+        """The record of a stage by name and key; None if it is not here."""
         found = read_artefact(self._source(name, key))
         return found if found is not None and found.key == key else None
 
     def take(self, name: str, key: str, folder: Path) -> Artefact | None:
-        """Copy a stage from here into its folder in a run folder, replacing what is there.
+        """Copy a stage from here into its folder in a run folder, replacing the content.
 
         Returns:
-            Its record; None if it is not here.
+            The stage's record; None if it is not here.
 
         Raises:
-            ReferenceBuildError: Its files are not those that were kept.
+            ReferenceBuildError: The files differ from the stored ones.
         """
         found = self.find(name, key)
         return None if found is None else self._take(self._source(name, key), found, folder)
 
     def take_digest(self, name: str, digest: str, key: str, folder: Path) -> Artefact | None:
-        """The same of the stage with a digest, whatever it was keyed by when it was kept; its record gets another key."""
+        """The same for the stage with a digest, regardless of its stored key; its record gets ``key``."""
         for build in filter(None, (self.folder, self.shipped)):
             for file in sorted(build.glob(f"{name}_*/{RECORD}")):
                 found = read_artefact(file.parent)
@@ -218,10 +218,10 @@ class ReferenceBuild:
         return found
 
     def keep(self, name: str, key: str, folder: Path, bulk: Sequence[str] = ()) -> Path | None:
-        """Copy a finished stage from its folder in a run folder to here, without the files that fit a pattern of ``bulk``.
+        """Copy a finished stage from its folder in a run folder to here, without the files that match a pattern of ``bulk``.
 
         Returns:
-            Where it is now; None if it was here, or the folder has no finished stage of this key.
+            The stage's new folder; None if it was here, or the run folder has no finished stage with this key.
         """
         found, target = read_artefact(folder), self._at(name, key)
         if found is None or found.key != key or found.digest is None or self.find(name, key) is not None:
@@ -231,7 +231,7 @@ class ReferenceBuild:
         return target
 
     def _share(self, target: Path) -> None:
-        """Keep the files of a stage once, where another folder of the same stage has the same ones."""
+        """Store the files of a stage once if another folder of the same stage has the same ones."""
         ours = read_artefact(target)
         assert ours is not None, "it was kept"
         for file in sorted(self.folder.glob(f"{target.name.rpartition('_')[0]}_*/{RECORD}")):
@@ -257,7 +257,7 @@ REFERENCE = ReferenceBuild(PUBLISHED / BUILD, shipped(str(PUBLISHED / BUILD)))
 
 
 def _copy(source: Path, target: Path, without: Sequence[str], artefact: Artefact) -> None:
-    """Copy files, all or none, with a record that says which they are."""
+    """Copy files, all or none, with a record that lists them."""
     partial = target.with_name(f".{target.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     left_out = {path for pattern in without for path in source.glob(pattern)} | {source / RECORD}

@@ -1,7 +1,7 @@
-"""What a running experiment reports, kept in ``progress.json`` of its run folder for the experiment page.
+"""Progress of a running experiment, stored in ``progress.json`` of its run folder for the experiment page.
 
-The file is replaced as a whole, so that a reader always finds a complete one, and at most twice a second. It is no part of any
-stage: no key depends on it. An error while writing ends the record and not the experiment.
+The file is replaced as a whole, so that a reader always finds a complete one, and at most twice a second. It belongs to no
+stage: no key depends on it. An error while writing ends the record but not the experiment.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from advnerf_core.documents import read_json
 from nodes.runtime.progress import MeasuringReport, Point
 
-if TYPE_CHECKING:  # the page's server reads records without what searches need
+if TYPE_CHECKING:  # the page's server reads records without importing the searches
     from nodes.experiment.plan.cell import Cell
 
 FILE, FORMAT = "progress.json", "advnerf-progress-1"
@@ -33,12 +33,12 @@ class Part:
 
     Attributes:
         name: Name of the stage or of the cell.
-        state: Where it is.
+        state: State of the part.
         text: The current step, or why it failed.
-        fraction: Share that is done, 0..1.
-        first_fraction: Share that was done when it was begun, as of one that goes on.
-        began_s: When it was begun [s since 1970]; 0 before.
-        seconds: How long it took [s]; 0 until it is finished.
+        fraction: Finished share, 0..1.
+        first_fraction: Share that was finished at the start, if it was resumed.
+        began_s: Time of the start [s since 1970]; 0 before.
+        seconds: Duration [s]; 0 until it is finished.
     """
 
     name: str
@@ -54,8 +54,8 @@ class ProgressRecord:
     """Implements `nodes.runtime.progress.StageDisplay`.
 
     Args:
-        folder: The run folder. Curves of an earlier run there are gone on with.
-        about: What the page says of the experiment, as JSON data.
+        folder: The run folder. Curves of an earlier run there are continued.
+        about: Description of the experiment for the page, as JSON data.
     """
 
     def __init__(self, folder: Path, about: Mapping[str, Any]) -> None:
@@ -70,7 +70,7 @@ class ProgressRecord:
         self._written_s, self._broken = 0.0, False
 
     def plan(self, stages: Sequence[str], cells: Sequence[Cell]) -> None:
-        """Set what will be run, in its order."""
+        """Set the parts to run, in order."""
         with self._lock:
             self._stages, self._cells = list(stages), list(cells)
             names = [*stages, *(cell.name for cell in cells)]
@@ -111,7 +111,7 @@ class ProgressRecord:
         self._write(now=True)
 
     def end(self, failure: str = "") -> None:
-        """Note that the experiment has ended, and by which error, which is that of the part that was running."""
+        """Note that the experiment has ended, with its error if any, which belongs to the running part."""
         running = [part.name for part in self._parts.values() if part.state == "running"]
         for name in running if failure else ():
             self.fail(name, failure)
@@ -133,7 +133,7 @@ class ProgressRecord:
         if not isfinite(point.value):
             return
         curve = self._curves.setdefault(stage, {}).setdefault(point.curve, [])
-        # A stage that starts again, or goes on from a checkpoint, repeats steps.
+        # A stage that restarts, or resumes from a checkpoint, repeats steps.
         while curve and curve[-1][0] >= point.step:
             curve.pop()
         curve.append([round(point.step, 3), round(point.value, 4)])
@@ -165,7 +165,7 @@ class ProgressRecord:
                 self._broken = True
 
     def _replace(self, text: str) -> None:
-        """Replace the file without waiting for the disk: the record may be lost with the power, and must not slow the experiment."""
+        """Replace the file without waiting for the disk: the record may be lost in a power cut, and must not slow the experiment."""
         self._file.parent.mkdir(parents=True, exist_ok=True)
         temporary = self._file.with_name(self._file.name + ".part")
         temporary.write_text(text, encoding="utf-8")
@@ -173,7 +173,7 @@ class ProgressRecord:
 
 
 def read_progress(folder: Path) -> dict[str, Any]:
-    """The record in a run folder; empty if there is none that can be read."""
+    """The record in a run folder; empty if it is missing or unreadable."""
     try:
         data = read_json(folder / FILE)
     except (OSError, ValueError):

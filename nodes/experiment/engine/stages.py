@@ -1,10 +1,10 @@
-"""Stages of a long job: run once, cached by their inputs, resumed where they were stopped.
+"""Stages of a long job: run once, cached by their inputs, resumed after an interruption.
 
 A run folder holds one sub-folder per stage. A stage is finished when its ``stage.json`` says so *and* the key in it equals the
-key of what would be run now. The key is a hash over the stage's configuration, its code version and the digests of what the
-stages before it wrote, so a changed setting runs exactly what depends on it. An interrupted stage keeps its folder: with an
+current key. The key is a hash over the stage's configuration, its code version and the digests of the outputs of
+the stages before it, so a changed setting reruns exactly the stages that depend on it. An interrupted stage keeps its folder: with an
 unchanged key it finds its own partial work there, otherwise the folder is emptied first. A stage whose key a reference build has is
-copied from there. What a stage *does* is not known here.
+copied from there. The content of a stage is unknown here.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from nodes.runtime.progress import MeasuringReport, StageDisplay
 
 
 class StageError(AdvnerfError):
-    """A stage was asked for that does not exist, or whose inputs are not there."""
+    """A requested stage does not exist, or its inputs are missing."""
 
 
 @dataclass(frozen=True)
@@ -41,13 +41,13 @@ class Stage:
 
     Attributes:
         name: Name of the stage and of its folder.
-        run: Does the work, writing only below the given folder.
-        settings: The part of the configuration that the result depends on, and inputs that no stage makes.
+        run: Does the work, writing only to the given folder.
+        settings: The part of the configuration that the result depends on, and further inputs that do not come from stages.
         after: Stages whose outputs this one reads.
         version: Raised when the meaning of the stage's output changes.
-        resumes_from: Other settings whose result is a part of this one, as fewer rounds are: their folder is resumed, not wiped.
-        bulk: Patterns of files that only the making of other stages reads, or of this one: a reference build leaves them out.
-        reads_bulk_of: Stages whose bulk this one reads.
+        resumes_from: Other settings whose result is a part of this one, such as fewer rounds: their folder is resumed, not wiped.
+        bulk: Patterns of intermediate files, which only the making of other stages, or of this one, reads: a reference build leaves them out.
+        reads_bulk_of: Stages whose intermediate files this one reads.
     """
 
     name: str
@@ -61,7 +61,7 @@ class Stage:
 
 
 def key_of(stage: Stage, records: Mapping[str, Artefact]) -> str:
-    """Hash over a stage's settings and version, and the digests of what the stages before it wrote."""
+    """Hash over a stage's settings and version, and the digests of the earlier stages' outputs."""
     inputs = {name: records[name].digest for name in stage.after}
     return hash_of(
         {"name": stage.name, "version": stage.version, "settings": stage.settings.keyed, "inputs": inputs}
@@ -69,7 +69,7 @@ def key_of(stage: Stage, records: Mapping[str, Artefact]) -> str:
 
 
 def stage_digests(stages: Sequence[Stage], folder: Path, reference: ReferenceBuild) -> dict[str, str]:
-    """Digests of what stages wrote, as far as a run folder has them, or else a reference build.
+    """Digests of the stages' outputs that a run folder has, or else a reference build.
 
     Args:
         stages: The stages, each after those it names in ``after``.
@@ -93,17 +93,17 @@ def run_stages(
     until: str | None = None,
     reference: ReferenceBuild | None = None,
 ) -> dict[str, Artefact]:
-    """Run the stages in order, skipping those whose result is there and still fits.
+    """Run the stages in order, skipping those with a current result.
 
     Args:
         stages: The stages, each after those it names in ``after``.
         folder: The run folder.
-        display: Told of starts, progress and ends.
-        until: Name of the last stage wanted; None runs all.
-        reference: Where results may be besides.
+        display: Progress display for starts, progress and ends.
+        until: Name of the last stage to run; None runs all.
+        reference: Reference build that may have results.
 
     Returns:
-        The record of every stage that was considered, by name.
+        The record of every stage up to ``until``, by name.
 
     Raises:
         StageError: ``until`` or an ``after`` names no stage before it.
@@ -119,9 +119,9 @@ def run_stages(
 
 
 def _read_whole(stages: Sequence[Stage], folder: Path, reference: ReferenceBuild | None) -> set[str]:
-    """Stages whose bulk will be read, as one that reads it has to be run."""
+    """Stages whose intermediate files will be read, because a stage that reads them has to run."""
     there, whole = _current(stages, folder, reference), set()
-    # From the last to the first: a stage that is run for its bulk reads that of others.
+    # From the last to the first: a stage that runs to restore its intermediate files reads those of earlier ones.
     for stage in reversed(stages):
         if stage.name not in there or (stage.name in whole and there[stage.name].kept is not None):
             whole |= set(stage.reads_bulk_of)
@@ -129,7 +129,7 @@ def _read_whole(stages: Sequence[Stage], folder: Path, reference: ReferenceBuild
 
 
 def check_until(stages: Sequence[Stage], until: str | None) -> None:
-    """Refuse a last stage that does not exist, before anything is written."""
+    """Raise for a last stage that does not exist, before anything is written."""
     if until is not None and until not in [stage.name for stage in stages]:
         raise StageError(f"expected one of the stages {', '.join(s.name for s in stages)}; got '{until}'")
 
@@ -137,7 +137,7 @@ def check_until(stages: Sequence[Stage], until: str | None) -> None:
 def _current(
     stages: Sequence[Stage], folder: Path, reference: ReferenceBuild | None = None
 ) -> dict[str, Artefact]:
-    """Stages that are finished, as are all that they build on, and are what would be run now."""
+    """Stages that are finished and current, as are all stages that they build on."""
     records: dict[str, Artefact] = {}
     for stage in stages:
         if any(earlier not in records for earlier in stage.after):
@@ -151,7 +151,7 @@ def _current(
 
 
 def begun_with(stages: Sequence[Stage], folder: Path, name: str) -> Settings | None:
-    """The settings that a stage's folder was begun with, if running the stage now would go on from there; None if it would not."""
+    """The settings of a stage's begun folder, if running the stage now would resume it; else None."""
     records = _current(stages, folder)
     stage = next(each for each in stages if each.name == name)
     record = read_artefact(folder / name)
@@ -164,7 +164,7 @@ def begun_with(stages: Sequence[Stage], folder: Path, name: str) -> Settings | N
 
 
 def keep_stages(stages: Sequence[Stage], folder: Path, reference: ReferenceBuild) -> list[Path]:
-    """Copy stages that are finished and current from a run folder into a reference build; returns what is new there."""
+    """Copy finished and current stages from a run folder into a reference build; returns the new folders there."""
     records = _current(stages, folder)
     found = [
         reference.keep(stage.name, records[stage.name].key, folder / stage.name, stage.bulk)
@@ -176,7 +176,7 @@ def keep_stages(stages: Sequence[Stage], folder: Path, reference: ReferenceBuild
 
 @dataclass(frozen=True)
 class _Place:
-    """Where a stage writes, where its result may be besides, and whether its bulk is wanted too."""
+    """Folder of a stage, a further place of its result, and whether its intermediate files are needed too."""
 
     folder: Path
     reference: ReferenceBuild | None
@@ -193,7 +193,7 @@ def _run_or_reuse(
     if (old := _finished(at, key, display)) is not None:
         return old
     with _alone(at.folder):
-        # Whoever held it may have made just this.
+        # The process that held the lock may have made exactly this.
         if (old := _finished(at, key, display)) is not None:
             return old
         return _go_on_or_begin(stage, at, key, records, display)
@@ -211,7 +211,7 @@ def _finished(at: _Place, key: str, display: StageDisplay) -> Artefact | None:
 
 @contextmanager
 def _alone(folder: Path) -> Iterator[None]:
-    """Two processes in one stage's folder would write each other's files."""
+    """Lock a stage's folder, as two processes in it would write each other's files."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     try:
         lock = hold(folder.parent / f".{folder.name}.lock")
@@ -242,7 +242,7 @@ def _go_on_or_begin(
 
 
 def _require_ours(folder: Path) -> None:
-    """Refuse to replace files that no stage wrote."""
+    """Raise instead of replacing files that no stage wrote."""
     if folder.exists() and not (folder / RECORD).exists() and any(folder.iterdir()):
         raise StageError(
             f"expected {folder} to be a stage's folder, got files that no stage wrote; move them, or name another run folder"

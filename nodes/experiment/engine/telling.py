@@ -1,4 +1,4 @@
-"""What a search tells while it runs."""
+"""Progress reports of a running search."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ def telling(
     clean: CleanDrive | None = None,
     objective: Objective | None = None,
 ) -> OnEvaluation:
-    """A callback that reports evaluations as progress: the fraction done; in words the last and the best total, and that without attack.
+    """A callback that reports evaluations as progress: the finished fraction, and as text the last and the best total, and the total without attack.
 
     Args:
-        evaluations: How many there will be.
-        report: Gets the fraction and the words.
-        clean: The drive without attack, if its total shall stand beside the others.
-        objective: What is maximised; the last and the best value are reported too, unless it is ``cte``.
+        evaluations: Total number of evaluations.
+        report: Called with the fraction and the text.
+        clean: The drive without attack, to show its total beside the others.
+        objective: Objective of the search; its last and best value are reported too, unless it is ``cte``.
     """
     best: Evaluation | None = None
     beside = "" if clean is None else f", {clean.short}"

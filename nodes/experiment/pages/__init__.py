@@ -1,1 +1,1 @@
-"""What a finished or running experiment shows."""
+"""Reports of finished experiments."""

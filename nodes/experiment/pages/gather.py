@@ -1,4 +1,4 @@
-"""Reads what the sections of the report are made of from the run folder: drives, searches, fidelity, and what live drives measured."""
+"""Collects the data of the report's sections from the run folder: drives, searches, fidelity, and measurements of live drives."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ def gather(
     overview: NDArray[np.uint8] | None = None,
     memory: tuple[rd.MemoryRow, ...] = (),
 ) -> rd.ReportData:
-    """Everything that the page is made of.
+    """All data of the page.
 
     Args:
-        experiment: With all stages and cells before finished.
-        films: By scenario, where something was deployed.
-        seen: By scenario and method, what the camera saw of the objects.
+        experiment: Experiment with all earlier stages and cells finished.
+        films: Films by scenario, for deployed drives.
+        seen: Camera images of the objects, by scenario and method.
         overview: The world from above.
-        memory: Of the adjoint, where it was measured.
+        memory: Memory of the adjoint, if it was measured.
     """
     live = experiment.config.deploy.live
     return rd.ReportData(
@@ -103,7 +103,7 @@ def _drives(
 def _runs(experiment: Experiment, cell: Cell, domain: Domain) -> Iterator[rd.Run]:
     file = driven_folder(experiment, cell) / (SEARCHED if domain == "surrogate" else DRIVES)
     if domain == "deployed" and read_cell(experiment.cell_result(cell)).deployed is None:
-        return  # also of an arm that was driven live, when the one that it is compared with was not
+        return  # also if a live arm was driven but the one to compare with was not
     found = read_json(file)
     notes = [_note(each) for each in found.get("live", ())] or [""] * len(found["states"])
     for start, (states, total_m, note) in enumerate(
@@ -121,7 +121,7 @@ def _note(live: Mapping[str, Any]) -> str:
 
 
 def _extra(experiment: Experiment, name: str) -> dict[str, Any] | None:
-    """A live drive beside those of the cells; None where it was not asked for, or every try was spoiled."""
+    """A live drive besides the cells' drives; None if it was not requested, or every try was spoiled."""
     run = extra_runs(experiment).get(name) if experiment.config.deploy.live else None
     file = experiment.stage_folder("live") / f"{name}.json"
     found: dict[str, Any] | None = read_json(file) if run is not None and file.exists() else None
@@ -129,7 +129,7 @@ def _extra(experiment: Experiment, name: str) -> dict[str, Any] | None:
 
 
 def _live_parts(experiment: Experiment) -> dict[str, Any]:
-    """Latency and laps of live drives, and why they are missing."""
+    """Latency and laps of live drives, and reasons for missing ones."""
     driven = {name: extra for name in ("laps", EMPTY) if (extra := _extra(experiment, name)) is not None}
     measured = [
         *driven.values(),
@@ -154,7 +154,7 @@ def _live_parts(experiment: Experiment) -> dict[str, Any]:
 def _not_measured(
     experiment: Experiment, driven: dict[str, dict[str, Any]], measured: list[dict[str, Any]]
 ) -> dict[str, str]:
-    """Why parts of the report are missing."""
+    """Reasons for missing parts of the report."""
     found = {}
     if "laps" not in driven:
         wanted = experiment.config.deploy.laps
@@ -222,7 +222,7 @@ def _searched(experiment: Experiment, cell: Cell) -> dict[str, Any]:
 def _live_results(experiment: Experiment, cell: Cell) -> list[dict[str, Any]]:
     file = driven_folder(experiment, cell) / DRIVES
     if read_cell(experiment.cell_result(cell)).not_driven_live:
-        return []  # of an arm that was driven, when the one that it is compared with was not
+        return []  # an arm was driven, but the one to compare with was not
     found: list[dict[str, Any]] = read_json(file)["live"]
     return found
 

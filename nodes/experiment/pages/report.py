@@ -1,4 +1,4 @@
-"""Stage report: the table of results, what every drive did from above and from the driver's seat, and the textures as they were seen."""
+"""Stage report: the table of results, every drive from above and from the driver's seat, and the textures as seen."""
 
 from __future__ import annotations
 
@@ -39,20 +39,20 @@ from nodes.runtime.progress import Report
 
 PAGE = "report.html"
 _TABLE_WIDTH = 160
-# Where along a drive its objects are shown [m, at 6 m/s]: most of them are in view, some close.
+# Points of a drive at which its objects are shown [m, at 6 m/s]: most of them are in view, some close.
 _SEEN_AT_M = (9.0, 14.0)
-# In the learned scene, of so many places of a drive those are shown where most of the objects is seen.
+# In the learned scene, of this many points of a drive those are shown where most of the objects is visible.
 _LOOKED_AT, _SHOWN = 12, 2
 
 
 def run(experiment: Experiment, folder: Path, report: Report, notes: Sequence[str] = ()) -> None:
-    """Write ``report.html``, ``table.json``, ``table.csv``, ``table.md`` and a film of each drive; of live drives also what their bags tell.
+    """Write ``report.html``, ``table.json``, ``table.csv``, ``table.md`` and a film of each drive; for live drives also measurements from their bags.
 
     Args:
-        experiment: With all stages before finished, and all cells of its methods.
-        folder: Where to write.
+        experiment: Experiment with all earlier stages finished, and all cells of its methods.
+        folder: Output folder.
         report: Progress callback.
-        notes: Paragraphs at the top of the page, such as what is left out.
+        notes: Paragraphs at the top of the page, such as missing methods.
     """
     from advnerf_core.report.sections import page_sections, what_it_did  # matplotlib
 
@@ -66,7 +66,7 @@ def run(experiment: Experiment, folder: Path, report: Report, notes: Sequence[st
 
 
 def _measure(experiment: Experiment, folder: Path, report: Report) -> ReportData:
-    """Cut films, and see the objects where the deployed world can be opened; of live drives measure memory."""
+    """Cut films, and render the objects if the deployed world can be opened; for live drives measure memory."""
     names = experiment.config.cell_paths
     if experiment.config.deploy.live:
         rows = memory.measure(experiment, folder, lambda part, text="": report(0.6 * part, text))
@@ -89,7 +89,7 @@ def _measure(experiment: Experiment, folder: Path, report: Report) -> ReportData
 
 
 def opening(experiment: Experiment) -> str:
-    """What was done, in one paragraph."""
+    """What the experiment did, in one paragraph."""
     config, attack = experiment.config, experiment.config.attack
     methods = ", ".join(style_of(name).title for name in config.method_names)
     kinds = Counter(thing.kind.replace("_", " ") for thing in experiment.objects)
@@ -110,7 +110,7 @@ def _then(experiment: Experiment) -> str:
 
 
 def print_summary(experiment: Experiment, console: Console) -> None:
-    """The table, its targets, and where the page is."""
+    """Print the table, its targets, and the path of the page."""
     wide = Console(
         file=console.file, width=max(console.width, _TABLE_WIDTH), force_terminal=console.is_terminal
     )
@@ -156,7 +156,7 @@ def textures_seen(
 
 
 def seen_where_learned(experiment: Experiment, space: Space, scenario: str) -> dict[str, NDArray[np.uint8]]:
-    """What the policy sees in the learned scene past the plain, random and attacked objects of the first seed, where most of them is in view."""
+    """Policy images in the learned scene past the plain, random and attacked objects of the first seed, where most of them is in view."""
     victim, seed = experiment.config.main_victim, experiment.config.seeds[0]
     driven = films.drives_of(experiment, "surrogate", Cell(scenario, victim, NONE, 0))[0]
     states = driven[np.linspace(0, len(driven) - 1, min(_LOOKED_AT, len(driven))).astype(int)]

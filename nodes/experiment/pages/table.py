@@ -17,7 +17,7 @@ from nodes.experiment.plan.cell import Cell
 
 
 def wanted_rows(cells: Sequence[Cell], deployed: bool = True) -> list[Wanted]:
-    """The lines that cells fill, in the order in which their paths and variants appear; in the learned scene alone where nothing is deployed."""
+    """The lines of the cells, in the order in which their paths and variants appear; in the learned scene alone if nothing is deployed."""
     seeds: dict[tuple[str, str, str, str], list[int]] = {}
     for cell in cells:
         seeds.setdefault((cell.scenario, "", cell.victim, cell.method), []).append(cell.seed)
@@ -44,12 +44,12 @@ def write_table(
 
     Args:
         table: The table.
-        cells_folder: Where the cells' clips are.
-        folder: Where to write.
+        cells_folder: Folder of the cells' clips.
+        folder: Output folder.
         sections: Further parts of the page.
         lead: Paragraphs before the table.
         page: Name of the page.
-        targets: What it is held to.
+        targets: Targets of the results.
 
     Returns:
         The page.

@@ -1,1 +1,1 @@
-"""Cells: running them, registering, publishing."""
+"""Cells: running, registering and publishing them."""

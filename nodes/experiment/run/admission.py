@@ -1,4 +1,4 @@
-"""Which cells of an experiment the fidelity gate lets run."""
+"""Selects the cells of an experiment that the fidelity gate admits."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from nodes.runtime.errors import RuntimeFault
 def past_the_gate(
     experiment: Experiment, cells: Sequence[Cell], leave_out: bool, say: Callable[[str], None]
 ) -> list[Cell]:
-    """The cells whose surrogate is good enough; judged once per variant, path and victim, and kept.
+    """The cells whose surrogate is good enough; judged once per variant, path and victim, and stored.
 
     Args:
         experiment: The experiment.
-        cells: Which of its cells.
-        leave_out: Whether cells of a refused surrogate are left out; else it is only told.
-        say: Told of every refusal.
+        cells: The cells to judge.
+        leave_out: Whether cells of a rejected surrogate are left out; else there is only a warning.
+        say: Called with a message for every rejection.
     """
     passed: dict[str, bool] = {}
     for cell in cells:
@@ -34,9 +34,9 @@ def past_the_gate(
 
 
 def _judge(experiment: Experiment, cell: Cell, leave_out: bool, say: Callable[[str], None]) -> bool:
-    """Whether the cells of this one's place and victim may be run: by held-out views, and by a drive without attack where there is one."""
+    """Whether the cells of this one's place and victim may be run: by held-out views, and by a drive without attack if there is one."""
     of, key = experiment.of(cell), gate_key(cell)
-    limits = of.config.gate  # where it is the default, the experiment itself judges, see `steering_gate`
+    limits = of.config.gate  # by default the experiment itself judges, see `steering_gate`
     if not isinstance(limits, GateLimits) or not has_learned_scene(of):
         return True
     from nodes.experiment.run.gate import cached_verdict  # loads torch
@@ -61,10 +61,10 @@ def _judge(experiment: Experiment, cell: Cell, leave_out: bool, say: Callable[[s
 
 
 def gate_file(folder: Path, key: str, drive: bool = False) -> Path:
-    """Where an experiment, or what is published of it, keeps the verdict on held-out views, or on a drive without attack."""
+    """File of the verdict on held-out views, or on a drive without attack, in an experiment's folder or a published set."""
     return folder / "gate" / f"{key}{'.drive' * drive}.json"
 
 
 def gate_key(cell: Cell | CellResult) -> str:
-    """Name of what the fidelity gate judges for a cell."""
+    """Name of the verdict that applies to a cell."""
     return f"{cell.scenario}_{cell.victim}"

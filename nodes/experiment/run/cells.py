@@ -1,4 +1,4 @@
-"""One entry of the transfer table, from the search to the deployed drive and its film; a finished part is not done again."""
+"""One entry of the transfer table, from the search to the deployed drive and its film; finished parts are not repeated."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ _SEARCHED = 0.9  # share of a cell's work
 
 
 class Bench:
-    """What cells of one experiment share while several are run one after the other: the open world, the space, the deployer.
+    """Common resources of an experiment's cells while several are run one after the other: the open world, the space, the deployer.
 
     Args:
-        experiment: Its scene, objects and policies must be there (``advnerf experiment FILE --until policy``).
+        experiment: Experiment with finished scene, objects and policies (``advnerf experiment FILE --until policy``).
     """
 
     def __init__(self, experiment: Experiment) -> None:
@@ -55,7 +55,7 @@ class Bench:
 
     @cached_property
     def scene(self) -> World | None:
-        """The open world; None where neither a search nor a drive looks at it."""
+        """The open world; None if neither a search nor a drive uses it."""
         experiment = self.experiment
         if over_the_world(experiment):
             return self._stack.enter_context(experiment.open_world())
@@ -65,12 +65,12 @@ class Bench:
 
     @cached_property
     def space(self) -> Space:
-        """What is searched."""
+        """The search space."""
         return make_space(self.experiment, self.scene if over_the_world(self.experiment) else None)
 
     @cached_property
     def deployer(self) -> Deployer | None:
-        """What drives; None where nothing is deployed."""
+        """The deployer; None if nothing is deployed."""
         if self.experiment.config.deploy.live:
             return ThroughNodes(self.experiment)
         if self.experiment.config.deploy.through == "nothing":
@@ -82,20 +82,20 @@ class Bench:
 def run_cell(
     experiment: Experiment, cell: Cell, folder: Path, report: Report, bench: Bench | None = None
 ) -> dict[str, Any]:
-    """Search, drive in both domains, and film; goes on from what is in ``folder``.
+    """Search, drive in both domains, and film; resumes from the content of ``folder``.
 
     Args:
-        experiment: Its scene, objects and policies must be there (``advnerf experiment FILE --until policy``).
-        cell: Which.
-        folder: Of this cell: search state, attack file, drives and film are kept here.
-        report: Told the finished fraction.
-        bench: What cells share; None makes one.
+        experiment: Experiment with finished scene, objects and policies (``advnerf experiment FILE --until policy``).
+        cell: The cell to run.
+        folder: Folder of this cell, for search state, attack file, drives and film.
+        report: Called with the finished fraction.
+        bench: Common resources of cells; None makes them.
 
     Returns:
         The cell as JSON data: see `deploy.cell_data`.
 
     Raises:
-        CellError: No such drive, victim or method.
+        CellError: The experiment has no such drive, victim or method.
         FrozenChangedError: The scene, a victim or a place changed since the search.
     """
     require_known(experiment, cell)
@@ -117,13 +117,13 @@ def run_cell(
 def search_cell(
     experiment: Experiment, cell: Cell, folder: Path, report: Report, bench: Bench | None = None
 ) -> Path:
-    """The part of `run_cell` that deploys nothing: search and drive in the surrogate.
+    """The part of `run_cell` without deployment: search and drive in the surrogate.
 
     Returns:
         The folder of the same drive without attack.
 
     Raises:
-        CellError: No such drive, victim or method.
+        CellError: The experiment has no such drive, victim or method.
     """
     require_known(experiment, cell)
     clean = clean_folder(experiment, cell, folder)
@@ -139,10 +139,10 @@ def search_cell(
 
 
 def draw_maps(experiment: Experiment, cell: Cell, number: int, folder: Path, report: Report) -> list[Path]:
-    """Loss landscape and robustness map of a finished cell of places; none of a cell that moved nothing.
+    """Loss landscape and robustness map of a finished cell of places; empty for a cell that moved no object.
 
     Raises:
-        CellError: There is no object of this number.
+        CellError: The cell has no object of this number.
     """
     if not cell.searched or not isinstance(experiment.config.space, PlacesConfig):
         return []
@@ -155,7 +155,7 @@ def draw_maps(experiment: Experiment, cell: Cell, number: int, folder: Path, rep
 
 
 def keep_build(experiment: Experiment, reference: ReferenceBuild) -> list[Path]:
-    """Copy scene, objects and policies into a reference build, without what only their training read; returns the folders that are new there."""
+    """Copy scene, objects and policies into a reference build, without files that only their training reads; returns the new folders there."""
     needed = [stage for stage in stages_of(experiment) if stage.name in NEEDED]
     return keep_stages(needed, experiment.folder, reference)
 
@@ -166,7 +166,7 @@ def needed_settings(experiment: Experiment) -> dict[str, Any]:
 
 
 def runs_alone(experiment: Experiment) -> bool:
-    """Whether a cell needs the machine for itself, as live nodes measure time, or a server that steps one world at a time."""
+    """Whether a cell needs the machine for itself: live nodes measure time, and a server steps one world at a time."""
     exclusive = experiment.deployed_traits.exclusive or experiment.traits.exclusive
     return exclusive or experiment.config.deploy.live
 
@@ -177,5 +177,5 @@ def has_learned_scene(experiment: Experiment) -> bool:
 
 
 def is_predictable(experiment: Experiment) -> bool:
-    """Whether transfer can be predicted: a prediction composes objects into pictures where they were placed by hand."""
+    """Whether transfer can be predicted: a prediction composes objects at given places into pictures."""
     return has_learned_scene(experiment) and not isinstance(experiment.config.space, PlacesConfig)

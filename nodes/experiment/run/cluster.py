@@ -18,14 +18,14 @@ _CONNECT_S = 5.0
 
 @contextmanager
 def ray_session(address: str, cores: int) -> Iterator[int]:
-    """Join a Ray cluster, or start one on this machine; gives the number of its cores.
+    """Join a Ray cluster, or start one on this machine; yields the number of its cores.
 
     Args:
         address: ``host:port`` or ``auto``; empty takes the one in RAY_ADDRESS, or else starts one here.
-        cores: Of a cluster that is started here.
+        cores: Number of cores of a cluster that is started here.
 
     Raises:
-        ConfigError: Ray is not installed, or there is no cluster at the address.
+        ConfigError: Ray is not installed, or no cluster answers at the address.
     """
     try:
         import ray
@@ -53,7 +53,7 @@ def ray_session(address: str, cores: int) -> Iterator[int]:
 
 
 def _require_reachable(address: str) -> None:
-    """Ray itself tries for minutes before it says that nobody is there."""
+    """Raise at once if no cluster answers: Ray itself tries for minutes."""
     host, separator, port = address.removeprefix("ray://").rpartition(":")
     if not separator or not port.isdigit():
         return
@@ -66,17 +66,17 @@ def _require_reachable(address: str) -> None:
 
 
 def run_on_ray(jobs: Sequence[Job], at_a_time: int) -> Iterator[tuple[Job, Ended | None]]:
-    """Run jobs on the cluster in force.
+    """Run jobs on the current cluster.
 
     Args:
         jobs: The cells to run.
         at_a_time: Largest number of cells that run at once.
 
     Yields:
-        Each job as it ends, with how it ended; None if its machine was lost.
+        Each finished job, with how it ended; None if its machine was lost.
 
     Raises:
-        ConfigError: A machine cannot run a job at all, as one without this package.
+        ConfigError: A machine cannot run a job at all, for example without this package.
     """
     import ray
     from ray.exceptions import NodeDiedError, ObjectLostError, RayError, WorkerCrashedError

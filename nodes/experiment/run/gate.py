@@ -21,10 +21,10 @@ from nodes.lab.policy_data.evaluate import predict
 
 @dataclass(frozen=True)
 class GateDrive:
-    """What predictions of all attacks on one drive share.
+    """Common data of the predictions of all attacks on one drive.
 
     Attributes:
-        agreement: How alike real and learned pictures are along the deployed drive without attack.
+        agreement: Agreement of real and learned pictures along the deployed drive without attack.
         none_m: Total CTE of each draw without attack [m].
     """
 
@@ -33,7 +33,7 @@ class GateDrive:
 
 
 def agreement_on(policy: Any, goal: tuple[float, ...], pictures: PicturePairs) -> SceneAgreement:
-    """How alike pictures look, and how alike the policy steers on them."""
+    """Agreement of pictures, and of the policy's steering on them."""
     steering = [predict(policy, images, goal) for images in (pictures.real, pictures.learned)]
     return agreement(list(pictures.real), list(pictures.learned), *steering)
 
@@ -56,13 +56,13 @@ def cached_verdict(
 
     Args:
         experiment: The experiment of the cell.
-        cell: The cell without attack whose drive is looked at, as the experiment names it.
-        limits: What must be reached.
-        file: Where the verdict is kept.
+        cell: The cell without attack that has the drive, with its name in the experiment.
+        limits: Required fidelity.
+        file: File of the verdict.
         drive: Folder of the cell, if its drive is to be judged.
 
     Raises:
-        RuntimeFault: There is no such drive yet.
+        RuntimeFault: The drive does not exist yet.
     """
     policy, goal = fidelity.policy_of(experiment, cell)
     which = [cell.scenario, cell.victim, *(["drive", cell.seed] if drive else [])]
@@ -81,7 +81,7 @@ def cached_verdict(
 
 
 def _weights_sha256(policy: Any) -> str:
-    """Hash of a network's weights; a retrained one is of no stage that all cells need."""
+    """Hash of a network's weights; a retrained one belongs to no stage that all cells need."""
     digest = hashlib.sha256()
     for name, weight in sorted(getattr(policy, "state_dict", dict)().items()):
         digest.update(name.encode() + weight.detach().cpu().numpy().tobytes())
@@ -89,7 +89,7 @@ def _weights_sha256(policy: Any) -> str:
 
 
 def lacks(experiment: Experiment, cell: Cell, folder: Path) -> str:
-    """What a prediction still needs, in words; empty if all is there."""
+    """Missing inputs of a prediction, as text; empty if complete."""
     return fidelity.lacks(experiment, cell, folder, clean_folder(experiment, cell, folder))
 
 
@@ -104,13 +104,13 @@ def predict_cell(
 
     Args:
         experiment: The experiment of the cell.
-        cell: Which, as the experiment names it.
+        cell: The cell, with its name in the experiment.
         folder: The cell's folder.
         draws: Drives per prediction.
-        clean: What an earlier prediction of the same scenario, victim, seed and draws returned of the drive without attack.
+        clean: The second result of an earlier prediction of the same scenario, victim, seed and draws.
 
     Returns:
-        The prediction, and what it says of the drive without attack.
+        The prediction, and its data about the drive without attack.
     """
     policy, goal = fidelity.policy_of(experiment, cell)
     at = clean_folder(experiment, cell, folder)

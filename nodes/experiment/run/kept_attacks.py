@@ -1,4 +1,4 @@
-"""Attacks that are published with their cells: what each search found, once each, as it was driven past."""
+"""Attacks that are published with their cells: each search's attack, once, as it was driven past."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ FOLDER = "attacks"
 
 
 def attack_file(folder: Path, attack_id: str) -> Path:
-    """Where a published set keeps an attack.
+    """File of an attack in a published set.
 
     Args:
-        folder: Of the set.
+        folder: Folder of the set.
         attack_id: Short hash of the attack.
     """
     return folder / FOLDER / f"{attack_id}.safetensors"
 
 
 def publish_attacks(experiment: Experiment, found: Sequence[CellStatus], folder: Path) -> list[Path]:
-    """Copy the attacks of done cells, as far as this machine has them.
+    """Copy the attacks of finished cells that this machine has.
 
     Args:
         experiment: The experiment.
-        found: Where its cells are.
-        folder: Of the published set.
+        found: States of its cells.
+        folder: Folder of the published set.
 
     Returns:
-        Files that are new there.
+        The new files there.
     """
     written = []
     for each in found:
@@ -51,9 +51,9 @@ def publish_attacks(experiment: Experiment, found: Sequence[CellStatus], folder:
 
 
 def attack_problems(folder: Path) -> Iterator[str]:
-    """What is wrong with the attacks of a published set, in words.
+    """Problems of a published set's attacks, as text.
 
-    Cells of before attacks were published have none.
+    Cells from before attacks were published have none.
     """
     used = set()
     for file in sorted(folder.glob("*.json")):
@@ -67,8 +67,8 @@ def attack_problems(folder: Path) -> Iterator[str]:
 
 
 def with_attacks(verified: Verified, folder: Path) -> Verified:
-    """What verifying a set found, with what is wrong with its attacks."""
-    if verified.problems:  # cells that cannot be read say nothing about attacks
+    """The result of verifying a set, with the problems of its attacks."""
+    if verified.problems:  # cells that cannot be read show nothing about attacks
         return verified
     return replace(verified, problems=tuple(attack_problems(folder)))
 
@@ -85,7 +85,7 @@ def _problems_of(cell: CellResult, file: Path) -> Iterator[str]:
 
 
 def _sources(experiment: Experiment, found: CellStatus) -> list[Path]:
-    """Files where a cell's attack may be: beside the cell's result, or in the run folder of its variant."""
+    """Possible files of a cell's attack: beside the cell's result, or in the run folder of its variant."""
     own = [Store(experiment.folder).work(found.cell.name)]
     if found.file is not None:
         own.append(found.file.with_suffix(""))

@@ -1,4 +1,4 @@
-"""What there is to run: every cell with its settings as they are, and where its result may be."""
+"""Plans the cells to run: each with its current settings, and the possible places of its result."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from nodes.runtime.errors import ConfigError, RuntimeFault
 
 @dataclass(frozen=True)
 class Planned:
-    """A cell with its settings, as they are now.
+    """A cell with its current settings.
 
     Attributes:
-        cell: Which.
-        job: How it is run; without threads and phase.
+        cell: The cell.
+        job: Job that runs it; without threads and phase.
         live: Whether it drives a live graph.
     """
 
@@ -34,11 +34,11 @@ class Planned:
 
 
 def plan_cells(experiment: Experiment, cells: Sequence[Cell]) -> list[Planned]:
-    """Settings of every cell as they are; reads variants and digests of their stages, prepares nothing.
+    """Current settings of every cell; reads variants and digests of their stages, and runs nothing.
 
     Args:
         experiment: The experiment.
-        cells: Which of its cells.
+        cells: The cells to plan.
     """
     registration = read_registration(PUBLISHED / experiment.config.name)
     planned = []
@@ -59,12 +59,12 @@ def plan_cells(experiment: Experiment, cells: Sequence[Cell]) -> list[Planned]:
 
 
 def registered_under(registration: Registration | None, cell: Cell, settings: Settings) -> str:
-    """Digest of the registration that a cell is run under; empty if it, with these settings, is not registered.
+    """Digest of the registration of a cell; empty if it is not registered with these settings.
 
     Args:
-        registration: Of the experiment; None if there is none.
-        cell: Which.
-        settings: What `registered_settings` says of its variant.
+        registration: Registration of the experiment; None without one.
+        cell: The cell.
+        settings: Settings of its variant from `registered_settings`.
     """
     if registration is None or registered_cell(cell) not in registration.cells:
         return ""
@@ -74,28 +74,28 @@ def registered_under(registration: Registration | None, cell: Cell, settings: Se
 
 
 def registered_cell(cell: Cell) -> RegisteredCell:
-    """The cell as a registration names it."""
+    """The cell in the form of a registration."""
     return RegisteredCell(scenario=cell.scenario, victim=cell.victim, method=cell.method, seed=cell.seed)
 
 
 def statuses(experiment: Experiment, cells: Sequence[Cell]) -> list[CellStatus]:
-    """Where every cell is; one whose variant cannot be read, as it is not made yet, is missing."""
+    """State of every cell; a cell whose variant cannot be read yet counts as missing."""
     store = Store(experiment.folder)
     return [store.status(cell, current_key(experiment, cell), elsewhere(experiment, cell)) for cell in cells]
 
 
 def elsewhere(experiment: Experiment, cell: Cell) -> list[Path]:
-    """Files where a cell may be besides the experiment's own folder: where its variant's run folder has it, and where cells are kept with the code."""
+    """Further files that may have a cell's result: in its variant's run folder, and in the folder of cells stored with the code."""
     own = experiment.folder_of(cell) / CELLS / f"{cell.inside.name}.json"
     kept = PUBLISHED / experiment.config.name / f"{cell.name}.json"
     return [kept] if own == Store(experiment.folder).result_file(cell.name) else [own, kept]
 
 
 def current_key(experiment: Experiment, cell: Cell) -> str | None:
-    """Hash of everything that a cell depends on; None if it cannot be known yet, as what the cell needs is not made.
+    """Hash of everything that a cell depends on; None if it is unknown yet, because the cell's inputs do not exist.
 
     Raises:
-        ConfigError: Its variant is wrong.
+        ConfigError: The cell's variant is wrong.
     """
     try:
         return plan_cells(experiment, [cell])[0].job.settings_hash

@@ -1,4 +1,4 @@
-"""Predicted against measured transfer: one prediction per attacked cell, made without its deployed drives, and how good they were."""
+"""Predicted and measured transfer: one prediction per attacked cell, made without its deployed drives, and its accuracy."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ _KEYS = {"excess_m", "excess_low_m", "excess_high_m", "retained", "clean_drive"}
 def predict_cells(
     experiment: Experiment, cells: Sequence[Cell], say: Callable[[str], None], draws: int | None = None
 ) -> int:
-    """Predict every attacked cell that has been searched and is not predicted yet; returns how many were.
+    """Predict every attacked cell with a search and without a prediction; returns their number.
 
-    A prediction needs the finished search (``advnerf experiment --search-only`` makes no more than that) and the drive without attack. It reads
+    A prediction needs the finished search (``advnerf experiment --search-only`` does only that) and the drive without attack. It reads
     no drive with the attack, so it is the same before and after that drive.
 
     Args:
         experiment: The experiment.
-        cells: Of it.
-        say: Told what was predicted, and what was not and why.
-        draws: Drives per prediction, `DEFAULT_DRAWS` unless told.
+        cells: Cells of the experiment.
+        say: Called with a message for each prediction, and for each that was not possible.
+        draws: Drives per prediction; None uses `DEFAULT_DRAWS`.
     """
     from nodes.experiment.run.gate import DEFAULT_DRAWS, lacks, predict_cell  # loads torch
 
@@ -47,7 +47,7 @@ def predict_cells(
         if not cell.searched:
             continue
         planned = plan_cells(experiment, [cell])[0]
-        # Work of other settings may hold a search too, of another attack.
+        # Work with other settings may have a search too, of another attack.
         if not is_predictable(experiment.of(cell)):
             continue
         file = prediction_file(experiment.folder, cell.name)
@@ -75,10 +75,10 @@ def predict_cells(
 
 
 def predicted(folder: Path, results: Sequence[CellResult]) -> list[Predicted]:
-    """Predictions of finished cells, each with what was measured.
+    """Predictions of finished cells, each with the measured values.
 
     Args:
-        folder: Of the experiment, or of what was published of it.
+        folder: Folder of the experiment, or of its published set.
         results: Its finished cells.
     """
     pairs, drives = [], CellDrives(results)
@@ -104,11 +104,11 @@ def predicted(folder: Path, results: Sequence[CellResult]) -> list[Predicted]:
 
 
 def prediction_file(folder: Path, name: str) -> Path:
-    """Where the prediction of a cell is kept, in the folder of an experiment or of what was published of it."""
+    """File of a cell's prediction, in the folder of an experiment or of its published set."""
     return folder / "predictions" / f"{name}.json"
 
 
 def kept_prediction(file: Path, settings_hash: str) -> dict[str, Any] | None:
-    """A prediction that was made of a cell with these settings; None where there is none."""
+    """The stored prediction of a cell with these settings; None without one."""
     kept = read_current(file, settings_hash=settings_hash)
     return kept if kept is not None and kept.keys() >= _KEYS else None

@@ -1,4 +1,4 @@
-"""Cells that are kept with the code: a cell there whose key matches is done on every machine."""
+"""Cells that are stored with the code: one whose key matches counts as finished on every machine."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from nodes.runtime.errors import ConfigError
 
 @dataclass(frozen=True)
 class Published:
-    """What became of the cells that were published, by name.
+    """Result of publishing cells, by name.
 
     Attributes:
-        written: New or changed there.
-        same: There already.
-        stale: There, but of other settings than those of now, as is what the run folder has.
+        written: Cells that are new or changed there.
+        same: Cells that were there already.
+        stale: Cells that are there with other settings than the current ones, also in the run folder.
     """
 
     written: tuple[str, ...]
@@ -44,15 +44,15 @@ class Published:
 def publish(
     experiment: Experiment, found: Sequence[CellStatus], folder: Path, prune: bool = False
 ) -> Published:
-    """Copy finished cells to where they are kept with the code, with the fidelity gate's verdicts and the predictions of these cells.
+    """Copy finished cells to the folder stored with the code, with the fidelity gate's verdicts and the predictions of these cells.
 
-    What lies there of cells that are not finished here stays: they may have been run elsewhere.
+    Cells there that are not finished here stay: they may have been run on another machine.
 
     Args:
         experiment: The experiment.
-        found: Where its cells are.
-        folder: Gets one folder per experiment.
-        prune: Remove what lies there of cells whose results here are of other settings too.
+        found: States of its cells.
+        folder: Folder for one folder per experiment.
+        prune: Remove cells there whose results here have other settings too.
     """
     written, same, stale = [], [], []
     for each in found:
@@ -79,7 +79,7 @@ def publish(
 
 
 def _as_published(found: CellStatus) -> str:
-    """A done cell's file, under the name that it has here: the variant's own run folder has it under the name of its path."""
+    """Content of a finished cell's file, under its name here: the variant's own run folder uses the name of its path."""
     assert found.file is not None, "a done cell is somewhere"
     cell, text = found.cell, found.file.read_text(encoding="utf-8")
     data = json.loads(text)
@@ -93,10 +93,10 @@ class PublishedBuild:
     """The reference build after its publication.
 
     Attributes:
-        folder: Where it is.
-        written: Folders of stages that are new there.
+        folder: Folder of the reference build.
+        written: New folders of stages there.
         removed: Folders of stages that no published cell was run with.
-        size_bytes: Of all its files.
+        size_bytes: Size of all its files.
     """
 
     folder: Path
@@ -112,8 +112,8 @@ def publish_build(
 
     Args:
         experiment: The experiment.
-        cells: Whose.
-        folder: Of what is published.
+        cells: Cells whose stages are copied.
+        folder: Folder of the published set.
         prune: Remove stages there that no cell published in ``folder`` was run with.
     """
     reference = ReferenceBuild(folder / BUILD)
@@ -141,7 +141,7 @@ def _prune_build(reference: ReferenceBuild, published: Path) -> list[Path]:
 
 
 def _is_of(published: Path, result: CellResult | None) -> bool:
-    """Whether a published cell is that result, and not one of newer settings from elsewhere."""
+    """Whether a published cell equals that result, and is not one with newer settings from another machine."""
     return (
         result is not None
         and published.exists()
@@ -172,15 +172,15 @@ def _publish_hardness(experiment: Experiment, folder: Path) -> None:
 
 
 def published_table(folder: Path, experiment: Experiment, cells: Sequence[Cell] | None = None) -> ResultTable:
-    """The table of published cells, with all lines and seeds that are asked for.
+    """The table of published cells, with all requested lines and seeds.
 
     Args:
-        folder: Of the published cells.
-        experiment: Whose they are.
-        cells: Which of them the table is of; None for all.
+        folder: Folder of the published cells.
+        experiment: Experiment of the cells.
+        cells: Cells of the table; None for all.
 
     Raises:
-        ConfigError: There are none.
+        ConfigError: The folder has no cells.
     """
     found = read_cells(folder)
     if not found:
@@ -193,11 +193,11 @@ def published_table(folder: Path, experiment: Experiment, cells: Sequence[Cell] 
 
 
 def table_of(experiment: Experiment, found: Sequence[CellStatus]) -> ResultTable:
-    """The table of the cells that are there.
+    """The table of existing cells.
 
     Args:
         experiment: The experiment.
-        found: Where the cells are that the table is of; only results of the settings as they are now are taken.
+        found: States of the table's cells; only results with the current settings are used.
     """
     cells = [each.result for each in found if each.result is not None and each.state in FINISHED]
     return make_table(wanted_rows([each.cell for each in found]), cells, experiment.config.name)

@@ -1,7 +1,7 @@
-"""Driving published cells again: drives in the surrogate past a published attack must come out as they were published.
+"""Repeats published drives: drives in the surrogate past a published attack must give the published result.
 
-A set keeps the keys that it was published with. Its stages are found by their digests, which its cells name, so that it does not matter
-what this version would key them by; what it would drive otherwise than was registered is left to the version that published it.
+A set keeps the keys that it was published with. Its stages are found by their digests, which its cells name, so that the keys of
+this version do not matter; if this version would drive differently, the set must be repeated with the version that published it.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from nodes.runtime.errors import RuntimeFault
 
 # Of positions, between machines: sums are taken in another order, and a search takes many steps.
 TOLERANCE_M = 0.05
-# What a registration says of drives: this version must read the experiment file like this to drive them again.
+# Fields of a registration that determine drives: this version must derive the same from the experiment file to repeat them.
 _DRIVEN = ("path", "ticks", "dt_s", "off_track_m", "held_cap_m", "starts")
 
 
@@ -49,7 +49,7 @@ class Redriven:
     """A cell that was driven again.
 
     Attributes:
-        name: Of the cell.
+        name: Name of the cell.
         off_m: Largest distance of a pose from the published one [m].
         same: Whether that is within `TOLERANCE_M`.
     """
@@ -62,17 +62,17 @@ class Redriven:
 def redrive(
     experiment: Experiment, published: Path, count: int, seed: int, tell: Callable[[str], None]
 ) -> list[Redriven]:
-    """Drive some cells of a set again, in the surrogate, with the scene, the victim and the attacks that are kept.
+    """Drive some cells of a set again, in the surrogate, with the published scene, victim and attacks.
 
     Args:
-        experiment: The registered one, with a run folder that may be empty.
+        experiment: The registered experiment, with a run folder that may be empty.
         published: Folder of the set.
-        count: How many cells, drawn at random.
-        seed: Of the draw.
-        tell: Told which cell is driven.
+        count: Number of cells, drawn at random.
+        seed: Seed of the draw.
+        tell: Called with a message for each cell.
 
     Raises:
-        RedriveError: The set's scene and victim were not kept, or this version would drive otherwise.
+        RedriveError: The set's scene and victim are not published, or this version would drive differently.
     """
     if not is_kept(published):
         raise RedriveError(f"{published.name} {LOST}")
@@ -92,11 +92,11 @@ def redrive(
 
 
 def unreadable(published: Path, why: str) -> RedriveError:
-    """The error for a set that this version reads otherwise than the one that published it.
+    """The error for a set that this version reads differently from the one that published it.
 
     Args:
         published: Folder of the set.
-        why: What differs.
+        why: The difference.
     """
     commit = last_commit(published)
     of = f", git checkout {commit[:12]}" if commit else ""
@@ -104,7 +104,7 @@ def unreadable(published: Path, why: str) -> RedriveError:
 
 
 def _require_same_drives(variant: Experiment, cell: Cell, published: Path) -> None:
-    """Refuse to compare with drives that were registered otherwise than this version would drive them."""
+    """Raise if this version would drive differently from the registered drives."""
     registration = read_registration(published)
     then = None if registration is None else registration.scenario(cell.scenario)
     now = registered_scenario(variant, cell.path)
@@ -113,7 +113,7 @@ def _require_same_drives(variant: Experiment, cell: Cell, published: Path) -> No
 
 
 def _take_stages(experiment: Experiment, said: CellResult, build: ReferenceBuild) -> None:
-    """Put the stages that a published cell was run with into the run folder, as if this version had made them."""
+    """Put the stages of a published cell into the run folder, as if this version had made them."""
     records: dict[str, Artefact] = {}
     for stage in stages_of(experiment):
         if stage.name in said.stages:
@@ -125,7 +125,7 @@ def _take_stages(experiment: Experiment, said: CellResult, build: ReferenceBuild
 
 
 def _again(experiment: Experiment, cell: Cell, attack: Path) -> list[KeptDrive]:
-    """Drives in the surrogate past the published attack; of a set without attacks, past what its search finds again."""
+    """Drives in the surrogate past the published attack; for a set without attacks, past the result of a repeated search."""
     prepare_victims(experiment)
     with TemporaryDirectory() as work, Bench(experiment) as bench:
         folder = Path(work)

@@ -1,4 +1,4 @@
-"""Registering an experiment: what will be run is written down before it is run."""
+"""Registers an experiment: its cells and tests are written down before anything is run."""
 
 from __future__ import annotations
 
@@ -40,15 +40,15 @@ from nodes.experiment.steps.verdicts import TRAINED_ON, VALIDATED_ON, unseen
 
 
 def register(experiment: Experiment, cells: Sequence[Cell], published: Path) -> Registration:
-    """Write down what an experiment will run.
+    """Write the registration of an experiment.
 
     Args:
         experiment: The experiment.
-        cells: Which of its cells.
-        published: Folder of all published sets; the file goes into a folder of the experiment's name.
+        cells: The cells to register.
+        published: Folder of all published sets; the file is written to a folder with the experiment's name.
 
     Raises:
-        RegistrationError: Other things are registered under this name, cells of these settings were run already, or a test lacks baselines.
+        RegistrationError: Another registration has this name, cells with these settings were run already, or a test lacks baselines.
     """
     found = Registration(
         name=experiment.config.name,
@@ -81,18 +81,18 @@ def _scenarios(experiment: Experiment, cells: Sequence[Cell]) -> dict[str, Regis
     for cell in cells:
         if cell.scenario not in found:
             variant = experiment.of(cell)
-            look_at_given(variant)  # they are fixed by their hashes before anything is run
+            look_at_given(variant)  # their hashes are fixed before anything is run
             variant.ask_world()
             found[cell.scenario] = registered_scenario(variant, cell.path)
     return found
 
 
 def registered_scenario(experiment: Experiment, name: str) -> RegisteredScenario:
-    """What a registration says of one path of an experiment.
+    """The registration of one path of an experiment.
 
     Args:
-        experiment: Its world and victims must be known.
-        name: The path, as the experiment names it.
+        experiment: Experiment with known world and victims.
+        name: Name of the path in the experiment.
     """
     config, limits, found = experiment.config, experiment.limits, given(experiment)
     settings = registered_settings(experiment)
@@ -119,12 +119,12 @@ def registered_scenario(experiment: Experiment, name: str) -> RegisteredScenario
 
 
 def primary_tests(experiment: Experiment, cells: Sequence[Cell]) -> list[PrimaryTest]:
-    """The tests on the main victim, per variant and path: the gradient against all baselines, and that in coarse cells against coarse ones.
+    """The tests on the main victim, per variant and path: the gradient against all baselines, and the coarse gradient against coarse ones.
 
-    Baselines are the methods whose textures neither trained nor judged the victim. A place without any has no test.
+    Baselines are the methods whose textures neither trained nor judged the victim. A place without baselines has no test.
 
     Raises:
-        RegistrationError: A place with a baseline lacks some of those that a test needs.
+        RegistrationError: A place with a baseline lacks others that a test needs.
     """
     tests = []
     for scenario in dict.fromkeys(cell.scenario for cell in cells):
@@ -156,7 +156,7 @@ def _lacking(methods: Sequence[str], config: ExperimentConfig) -> list[str]:
 
 
 def _coarse_cells_differ(config: ExperimentConfig) -> bool:
-    """Whether coarse textures have other cells than the gradient's, where the gradient can have theirs: on a face, or on one panel."""
+    """Whether coarse textures have another number of cells than the gradient's, if this can be known: on a face, or on one panel."""
     space, carrier = config.space, config.carrier
     if not isinstance(space, ColoursConfig):
         return False

@@ -1,4 +1,4 @@
-"""Runs cells: prepares what they need, then runs them, over cores or over a cluster; what is there and fits is not run again."""
+"""Runs cells: prepares their inputs, then runs them, over cores or over a cluster; current results are not repeated."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ from nodes.runtime.progress import ProgressDisplay, StageDisplay
 
 Backend = Literal["local", "ray"]
 Say = Callable[[str], None]
-# How often cells are handed out again after a whole machine of a cluster was lost.
+# How often cells are resubmitted after a whole machine of a cluster was lost.
 _ROUNDS = 3
 
 
 @dataclass(frozen=True)
 class Options:
-    """How cells are run.
+    """Options for running cells.
 
     Attributes:
-        jobs: Cells at a time; 0 takes one per core, or the cores of the cluster.
+        jobs: Number of parallel cells; 0 uses one per core, or the cores of the cluster.
         threads: Threads per cell; 0 shares the cores among the jobs.
         backend: ``local`` or ``ray``.
-        address: Of a running Ray cluster; empty takes the one in RAY_ADDRESS, or starts one here.
+        address: Address of a running Ray cluster; empty uses RAY_ADDRESS, or starts one here.
         retry: Also run cells that failed before.
-        gate: Whether cells whose surrogate the fidelity gate refuses are left out; else it is only told.
-        search_only: Search, and deploy nothing: for predictions before the drives, or to choose what is worth one.
-        here: One cell after another in this process, which starts none and shares what cells of one experiment have in common.
-        ready: What cells need is there already.
+        gate: Whether cells whose surrogate fails the fidelity gate are left out; else there is only a warning.
+        search_only: Search without deployment: for predictions before the drives, or to choose what to deploy.
+        here: Run one cell after another in this process, which starts no others and shares resources among cells of one experiment.
+        ready: Whether the inputs of the cells exist already.
     """
 
     jobs: int = 0
@@ -66,15 +66,15 @@ def run_cells(
     console: Console | None = None,
     watcher: StageDisplay | None = None,
 ) -> list[Ended]:
-    """Run the cells that are not there yet.
+    """Run the cells that are not finished yet.
 
     Args:
         experiment: The experiment.
-        cells: Those of its cells that are wanted.
-        options: Over what, and how many at a time.
-        say: Told of every start and end.
-        console: Where the progress of cells in this process is shown.
-        watcher: Receives the progress of cells in this process too.
+        cells: The cells to run.
+        options: Backend, number of parallel cells and further options.
+        say: Called with a message for every start and end.
+        console: Console for the progress of cells in this process.
+        watcher: Also receives the progress of cells in this process.
 
     Returns:
         How every cell that was run ended, in the order of their ends.
@@ -85,7 +85,7 @@ def run_cells(
     store = Store(experiment.folder)
     if not options.ready:
         _prepare(experiment, cells, options, say)
-    # Before the gate, so that a cell that there cannot be is told first.
+    # Before the gate, so that an impossible cell is reported first.
     plan = plan_cells(experiment, cells)
     judged = past_the_gate(experiment, cells, options.gate, say)
     wanted = [
@@ -122,7 +122,7 @@ def run_cells(
     for each in wanted:
         if each.live and each.cell.name not in lost:
             ended.append(_tell(run_in_process(replace(each.job, threads=_cores())), say))
-    # Their drives without attack are there now.
+    # Their drives without attack exist now.
     past_the_gate(experiment, [each.cell for each in wanted if each.live], options.gate, say)
     return ended
 
@@ -135,7 +135,7 @@ def _run_here(
     say: Say,
     display: ProgressDisplay,
 ) -> list[Ended]:
-    """One cell after another in this process; those of one variant share what it opens."""
+    """Run one cell after another in this process; cells of one variant share its resources."""
     ended = []
     for _, group in groupby(wanted, lambda each: each.cell.variant):
         cells = list(group)
@@ -165,7 +165,7 @@ def _prepare(experiment: Experiment, cells: Sequence[Cell], options: Options, sa
 
 
 def _refuse_two_in_one_folder(experiment: Experiment, cells: Sequence[Cell]) -> None:
-    """Variants of one run folder must need the same scene and policies, or each would run on, or remake, those of the other."""
+    """Variants in one run folder must need the same scene and policies, or each would use, or remake, the others'."""
     folders = {experiment.folder_of(cell) for cell in cells}
     first: dict[Path, tuple[str, dict[str, Any]]] = {}
     for cell in {each.variant: each for each in experiment.cells}.values():
@@ -198,7 +198,7 @@ def _is_wanted(store: Store, each: Planned, elsewhere: Sequence[Path], options: 
 
 
 def _allow_more_tries(store: Store, name: str) -> None:
-    """Allow three more tries of a cell's drives, and of those without attack that it is compared with."""
+    """Allow three more tries of a cell's drives, and of the drives without attack for comparison."""
     work = store.work(name)
     for folder in (work, *(work.parent / "shared").glob("*")):
         allow_more_tries(folder)
@@ -240,7 +240,7 @@ def _run_on_ray(jobs: list[Job], at_a_time: int, options: Options, say: Say) -> 
 
 
 def _is_finished(job: Job) -> bool:
-    """Whether a result of these settings is there, whoever was to tell of it; a search has none of its own and goes on from its state."""
+    """Whether a result with these settings exists, even without its message; a search has no result and resumes from its state."""
     result = Store(Path(job.folder)).result(job.name)
     return result is not None and result.settings_hash == job.settings_hash
 
@@ -262,7 +262,7 @@ def _require_positive(options: Options) -> None:
 
 
 def _shares(options: Options) -> tuple[int, int]:
-    """Cells at a time, 0 for as many as a cluster has cores for, which only the cluster can tell; and threads of each."""
+    """Number of parallel cells, 0 for the cores of a cluster, which only the cluster knows; and threads of each."""
     if options.backend == "ray":
         return options.jobs, options.threads or 1
     jobs = options.jobs or (_cores() // options.threads if options.threads else _cores()) or 1

@@ -23,11 +23,11 @@ from nodes.experiment.show.context import Experiment
 
 MOST_BYTES = 250_000
 _WIDTH_PX, _FRAME_MS, _QUALITIES = 760, 200, (70, 50, 35, 20, 10)
-_EVERY = 2  # of ten frames a second
+_EVERY = 2  # frames, at ten frames a second
 
 
 def write_film(experiment: Experiment, published: Path) -> Path | None:
-    """Write the film of the first primary test beside the page; None if there is none, or a clip is not on this machine."""
+    """Write the film of the first primary test beside the page; None without a test, or if a clip is not on this machine."""
     primary = read_json(published / SET)["primary"]
     clips = _clips(experiment, published, primary[0]) if primary else []
     if not clips or not all(clip.exists() for clip in clips):
@@ -54,7 +54,7 @@ def _clips(experiment: Experiment, published: Path, test: dict[str, Any]) -> lis
 
 
 def _side_by_side(clips: Sequence[NDArray[np.uint8]]) -> list[Image.Image]:
-    """Frames with all clips; one that is over shows its last frame."""
+    """Frames with all clips; a finished one holds its last frame."""
     count = max(len(clip) for clip in clips)
     rows = [np.concatenate([clip[min(at, len(clip) - 1)] for clip in clips], axis=1) for at in range(count)]
     height = round(rows[0].shape[0] * _WIDTH_PX / rows[0].shape[1])

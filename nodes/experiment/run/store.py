@@ -1,4 +1,4 @@
-"""The cells in a run folder: one JSON per finished cell, one folder of work per cell, locks, and errors of what failed."""
+"""The cells in a run folder: one JSON per finished cell, one work folder per cell, locks, and errors of failed cells."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ LOG = "log.txt"
 
 @dataclass(frozen=True)
 class CellStatus:
-    """Where one cell is.
+    """State of one cell.
 
     Attributes:
-        cell: Which.
-        state: ``not driven live``: searched, but all its live tries were spoiled; ``changed``: there is a result, but of other settings;
-            ``begun``: stopped on the way, goes on when run.
+        cell: The cell.
+        state: ``not driven live``: searched, but all its live tries were spoiled; ``changed``: a result exists, but with other settings;
+            ``begun``: interrupted, and resumed by the next run.
         text: Error, or the last line of its log.
-        result: The result, of any settings; None where there is none.
-        file: Where the result of a done cell is, or of one that was not driven live.
+        result: The result, with any settings; None without one.
+        file: File of the result of a finished cell, or of one that was not driven live.
     """
 
     cell: Cell
@@ -49,31 +49,31 @@ class Store:
     folder: Path
 
     def result_file(self, name: str) -> Path:
-        """A cell's result."""
+        """File of a cell's result."""
         return self.folder / "cells" / f"{name}.json"
 
     def work(self, name: str) -> Path:
-        """A cell's folder of work."""
+        """Work folder of a cell."""
         return self.folder / "cells" / name
 
     def lock_file(self, name: str) -> Path:
-        """Held by the process that runs the cell."""
+        """Lock file that the process of the cell holds."""
         return self.folder / "locks" / name
 
     def result(self, name: str) -> CellResult | None:
-        """A cell's result; None where there is none."""
+        """A cell's result; None without one."""
         file = self.result_file(name)
         return read_cell(file) if file.exists() else None
 
     def keep_result(self, name: str, data: dict[str, Any]) -> CellResult:
-        """Check a cell's result and write it; the error of an earlier attempt goes."""
+        """Check a cell's result and write it; the error of an earlier attempt is removed."""
         result = cell_from(data, f"the result of {name}")
         write_json(self.result_file(name), data)
         (self.work(name) / _ERROR).unlink(missing_ok=True)
         return result
 
     def error(self, name: str, settings_hash: str) -> str:
-        """Why the cell failed with these settings; empty if it did not."""
+        """Error of the cell with these settings; empty if it did not fail."""
         kept = read_current(self.work(name) / _ERROR, settings_hash=settings_hash)
         return "" if kept is None else str(kept.get("error", ""))
 
@@ -84,7 +84,7 @@ class Store:
         write_json(self.work(name) / _ERROR, data)
 
     def begin(self, name: str, settings_hash: str, settings: Settings) -> Path:
-        """The cell's folder, empty unless work on the same settings was begun there."""
+        """The cell's folder, emptied unless work with the same settings was begun there."""
         work = self.work(name)
         if not self.has_begun(name, settings_hash):
             shutil.rmtree(work, ignore_errors=True)
@@ -93,16 +93,16 @@ class Store:
         return work
 
     def has_begun(self, name: str, settings_hash: str) -> bool:
-        """Whether what is in the cell's folder is of these settings."""
+        """Whether the content of the cell's folder belongs to these settings."""
         return has_key(self.work(name) / _KEY, settings_hash)
 
     def status(self, cell: Cell, settings_hash: str | None, elsewhere: Sequence[Path] = ()) -> CellStatus:
-        """Where a cell is.
+        """State of a cell.
 
         Args:
-            cell: Which.
-            settings_hash: Of the settings as they are; None if they cannot be known yet, as what the cell needs is not made.
-            elsewhere: Files where this cell may be too: one whose key matches is done, wherever it was run.
+            cell: The cell.
+            settings_hash: Hash of the current settings; None if it is unknown yet, because the cell's inputs do not exist.
+            elsewhere: Further files that may have this cell's result: one with the same key counts as finished.
         """
         name = cell.name
         if self._is_held(name):
@@ -146,7 +146,7 @@ class Store:
 
 
 def _first_of(files: Sequence[Path], settings_hash: str) -> tuple[Path, CellResult] | None:
-    """The first readable result of these settings."""
+    """The first readable result with these settings."""
     for file in files:
         try:
             result = read_cell(file)
@@ -158,5 +158,5 @@ def _first_of(files: Sequence[Path], settings_hash: str) -> tuple[Path, CellResu
 
 
 def _named(result: CellResult, cell: Cell) -> CellResult:
-    """A result under the name that it has here: the variant's own run folder has it under the name of its path."""
+    """A result under its name here: the variant's own run folder uses the name of its path."""
     return result.model_copy(update={"scenario": cell.scenario})

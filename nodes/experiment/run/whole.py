@@ -41,23 +41,23 @@ def run_experiment(
     anew: bool = False,
     record: ProgressRecord | None = None,
 ) -> list[Ended]:
-    """Run the stages and the cells that are not there yet, and the report; it leaves out methods of which a cell failed.
+    """Run the unfinished stages and cells, and the report, which leaves out methods with a failed cell.
 
     Args:
         experiment: The experiment.
         until: Last stage to run; None for all, and the cells.
-        options: How cells are run; None runs one after another in this process.
-        only: Which cells; see `select`.
-        console: Where to print.
-        anew: Whether stages are made here that are kept with the code.
-        record: Keeps the progress for the experiment page.
+        options: Options for running cells; None runs one after another in this process.
+        only: Selection of cells, see `select`.
+        console: Console to print to.
+        anew: Whether to make stages here that are stored with the code.
+        record: Progress record for the experiment page.
 
     Returns:
         How every cell that was run ended.
 
     Raises:
         StageError: ``until`` names no stage.
-        ConfigError: The folder has the stages of another experiment, or ``only`` fits no cell.
+        ConfigError: The folder has the stages of another experiment, or ``only`` matches no cell.
     """
     console, began = console or Console(), time.monotonic()
     require_own_folder(experiment)
@@ -103,7 +103,7 @@ def _say(console: Console, record: ProgressRecord | None, text: str) -> None:
 def _record_cells_there(
     experiment: Experiment, chosen: Sequence[Cell], options: Options, record: ProgressRecord
 ) -> None:
-    """Cells that will not be run again: done, or failed before."""
+    """Record the cells that will not be run again: finished, or failed before."""
     for each in statuses(experiment, chosen):
         if each.state in FINISHED and not (each.state == NOT_DRIVEN and options.retry):
             record.finish(each.cell.name, 0.0, cached=True)
@@ -112,9 +112,9 @@ def _record_cells_there(
 
 
 def _write_report(experiment: Experiment, console: Console, record: ProgressRecord | None) -> None:
-    """The report of the methods whose cells are all here and deployed, once no cell is left to run.
+    """The report of the methods whose cells are all finished and deployed, once no cell is left to run.
 
-    A method of which a cell failed is left out and named. What the report was made of is part of its key.
+    A method with a failed cell is left out and named. The report's inputs are part of its key.
     """
     found = statuses(experiment, experiment.cells)
     failed = {each.cell.method: f"{each.cell.name}: {each.text}" for each in found if each.state == "failed"}

@@ -1,7 +1,7 @@
-"""The process of one cell: whatever happens to it, other cells do not notice. ``python -m nodes.experiment.run.worker`` reads its job from stdin.
+"""The process of one cell, isolated from other cells. ``python -m nodes.experiment.run.worker`` reads its job from stdin.
 
-The result, or the error, is left in the run folder; the exit code says which. A killed worker leaves neither, and its folder as it
-was: the next run of the experiment goes on there.
+It writes the result, or the error, to the run folder; the exit code says which. A killed worker writes neither, and leaves its folder:
+the next run of the experiment resumes there.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS
 
 
 class ChangedError(RuntimeFault):
-    """What a cell depends on changed between the plan and the run."""
+    """An input of a cell changed between the plan and the run."""
 
 
 @dataclass(frozen=True)
@@ -54,15 +54,15 @@ class Job:
     """One cell to run; plain data, so that it can go to another machine.
 
     Attributes:
-        folder: The run folder, where results go; the same folder on every machine.
+        folder: The run folder for results; the same folder on every machine.
         file: Experiment file.
-        setting: Which of its settings.
-        overrides: Changes of it.
-        cell: Which of its cells.
-        settings_hash: Of what the result depends on, when it was planned.
-        threads: Threads that it may use.
-        phase: ``search``: only what may run beside others; ``whole``: all of it.
-        registration: Digest of the registration that it is run under; empty if there is none.
+        setting: Name of its setting.
+        overrides: Changes of the setting.
+        cell: The cell.
+        settings_hash: Hash of everything that the result depends on, at planning time.
+        threads: Number of threads for it.
+        phase: ``search``: only the part that may run beside others; ``whole``: all of it.
+        registration: Digest of the registration that it is run under; empty without one.
     """
 
     folder: str
@@ -82,7 +82,7 @@ class Job:
 
     @classmethod
     def from_json(cls, text: str) -> Job:
-        """The job of `json.dumps` of its values."""
+        """The job from the `json.dumps` of its values."""
         data = json.loads(text)
         return cls(**{**data, "overrides": tuple(data["overrides"]), "cell": Cell(**data["cell"])})
 
@@ -93,8 +93,8 @@ class Ended:
 
     Attributes:
         name: Name of the cell.
-        how: ``done``, ``failed`` (the error is kept), ``elsewhere`` (another process has it), or ``lost`` (killed: it goes on when run again).
-        text: What to tell.
+        how: ``done``, ``failed`` (the error is stored), ``elsewhere`` (another process runs it), or ``lost`` (killed: the next run resumes it).
+        text: Message about the end.
         seconds: Wall time [s].
     """
 
@@ -105,7 +105,7 @@ class Ended:
 
 
 def run_in_process(job: Job) -> Ended:
-    """Run a cell in a process of its own and wait for it; called in a thread here, or in a worker of a cluster."""
+    """Run a cell in a separate process and wait for it; called in a thread here, or in a worker of a cluster."""
     began = time.monotonic()
     store = Store(Path(job.folder))
     environment = {
@@ -124,7 +124,7 @@ def run_in_process(job: Job) -> Ended:
     try:
         _, errors = process.communicate(json.dumps(asdict(job)).encode())
     except BaseException:
-        # Asked first: a cell may have a world to put back, as a CARLA server's.
+        # Asked to end before it is killed: a cell may have a world to restore, such as a CARLA server's.
         process.terminate()
         try:
             process.wait(_ENDING_S)
@@ -138,7 +138,7 @@ def run_in_process(job: Job) -> Ended:
         return Ended(job.name, "done", _not_driven(job, store), seconds)
     if code == _ELSEWHERE:
         return Ended(job.name, "elsewhere", said, seconds)
-    # One that was asked to end closed what it had open, and says so by the shell's exit code.
+    # A process that was asked to end closed its resources, and reports it by the shell's exit code.
     if code < 0 or code == _ASKED_TO_END:
         by = signal.Signals(-code) if code < 0 else signal.SIGTERM
         return Ended(
@@ -147,13 +147,13 @@ def run_in_process(job: Job) -> Ended:
     error = store.error(job.name, job.settings_hash)
     if error:
         return Ended(job.name, "failed", error, seconds)
-    # Not even the worker's own error handling was reached, as when a library cannot be loaded.
+    # The worker's own error handling was not reached, for example because a library cannot be loaded.
     store.keep_error(job.name, job.settings_hash, said or f"the worker ended with exit code {code}")
     return Ended(job.name, "failed", said, seconds)
 
 
 def run_here(job: Job, store: Store, experiment: Experiment, bench: Bench, display: StageDisplay) -> Ended:
-    """Run a cell in this process; what ends it by an error is kept, and other cells go on."""
+    """Run a cell in this process; an error is stored, and other cells continue."""
     began = time.monotonic()
     store.lock_file(job.name).parent.mkdir(parents=True, exist_ok=True)
     try:
@@ -179,7 +179,7 @@ def _begin(job: Job, store: Store, experiment: Experiment) -> Path:
 
 
 def _not_driven(job: Job, store: Store) -> str:
-    """What to tell of a finished cell that was not driven live; empty for any other."""
+    """Message about a finished cell that was not driven live; empty for any other."""
     result = store.result(job.name) if job.phase == "whole" else None
     return (
         f"not driven live: {result.not_driven_live}" if result is not None and result.not_driven_live else ""
@@ -215,7 +215,7 @@ def _in_one_line(error: Exception) -> str:
 
 
 def take_cell(store: Store, name: str) -> TextIO:
-    """The cell for this process alone. Who only looks at its state holds it for an instant, which is waited for."""
+    """Lock a cell for this process. A process that only reads its state holds it for an instant, which is waited for."""
     end_s = time.monotonic() + _LOOKED_AT_S
     while True:
         try:
@@ -228,7 +228,7 @@ def take_cell(store: Store, name: str) -> TextIO:
 
 
 def _checked(job: Job, store: Store) -> Experiment:
-    """The experiment as it is now, before anything of the cell is touched."""
+    """The current experiment, checked before the cell is touched."""
     try:
         _use_threads(job.threads)
         whole = load_experiment(Path(job.file), job.setting, job.overrides, Path(job.folder))
@@ -271,7 +271,7 @@ def _run(
 
 
 def _wait_for_live() -> TextIO:
-    """A live graph measures time: of all experiments on this machine only one cell at a time drives one."""
+    """A live graph measures time: over all experiments on this machine only one cell at a time drives one."""
     path = Path(tempfile.gettempdir()) / _LIVE_LOCK
     while True:
         try:
@@ -281,7 +281,7 @@ def _wait_for_live() -> TextIO:
 
 
 def _add_seconds(work: Path, seconds: float) -> float:
-    """Computing time of a cell over all the times it was run and stopped properly [s]."""
+    """Computing time of a cell over all runs that stopped properly [s]."""
     file = work / "seconds"
     total = seconds + (float(file.read_text()) if file.exists() else 0.0)
     write_atomically(file, f"{total:.3f}\n")
@@ -309,7 +309,7 @@ def _use_threads(threads: int) -> None:
 
 
 def _die_with(parent: int) -> None:
-    """End when whoever waits for us ends, on Linux; elsewhere an orphan finishes its cell, which is a result all the same."""
+    """End with the waiting process, on Linux; on other systems an orphan finishes its cell, which is a valid result."""
     if sys.platform == "linux":
         import ctypes
 

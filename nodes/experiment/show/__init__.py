@@ -1,1 +1,1 @@
-"""What shows a texture in a drive, and how an object gets into pictures."""
+"""Presentation of attacks in drives, and of objects in pictures."""

@@ -1,4 +1,4 @@
-"""The deployment side: what the car's camera sees when opaque objects stand in a scene that gives colours and depth.
+"""The deployment: the car's camera images when opaque objects stand in a scene that gives colours and depth.
 
 Works with any `World`: per pixel the nearer of scene and object wins (the paper, section 4), in the camera's own pixels, and
 only then is the image cropped and resized for the policy.
@@ -30,37 +30,37 @@ from hardware.cameras.effects import ImperfectCamera
 from hardware.worlds.world import Depth, Rgb, World, collided_with, require_depth
 from nodes.experiment.show.images import as_uint8
 
-# At a camera's own resolution one ray per pixel is what a rasteriser takes; the policy's resize averages three of them.
+# At a camera's own resolution a rasteriser takes one ray per pixel; the policy's resize averages three of them.
 _SUPERSAMPLE = 1
 
 
 class Dressed(Protocol):
-    """A deployment scene that shows an attack, as the policy sees it."""
+    """An attacked deployment scene, as the policy sees it."""
 
     scene: World
     view: PolicyView
 
     def plain_theta(self) -> Tensor | None:
-        """What stands for the objects without an attack."""
+        """Parameters of the objects without an attack."""
 
     def prepare(self, states: Array, /) -> Any:
-        """What does not depend on the attack, of the policy's view from car states ``[B, 3]``; time does not pass."""
+        """Prepare everything of the policy's view from car states ``[B, 3]`` that does not depend on the attack; time does not pass."""
 
     def policy_images(self, frames: Any, theta: Tensor | None, /) -> NDArray[np.uint8]:
-        """Policy images ``[B, 66, 200, 3]`` of what was prepared."""
+        """Policy images ``[B, 66, 200, 3]`` of prepared views."""
 
     def seen_now(self, theta: Tensor | None, /) -> NDArray[np.uint8]:
-        """Policy image ``[66, 200, 3]`` of the car where it is now."""
+        """Policy image ``[66, 200, 3]`` at the car's current pose."""
 
     def camera_image(self, state: Array, theta: Tensor | None, /) -> NDArray[np.uint8]:
         """The whole camera image ``[H, W, 3]`` from a car state ``[3]``."""
 
     def paint(self, rgb: Rgb, state: Array, theta: Tensor, /) -> NDArray[np.uint8]:
-        """A camera image ``[H, W, 3]`` with the attack, from one without it that was seen from the same state ``[3]``."""
+        """A camera image ``[H, W, 3]`` with the attack, from one without it from the same state ``[3]``."""
 
 
 def seen_in(scene: Dressed) -> Callable[[Array], Show]:
-    """Takes car states ``[B, 3]``, does what does not depend on the attack, and gives what the policy sees of an attack from them."""
+    """A function that prepares the views from car states ``[B, 3]``, and returns a function from an attack to policy images."""
 
     def seen(states: Array) -> Show:
         frames = scene.prepare(states)
@@ -74,9 +74,9 @@ class DressedScene:
 
     Args:
         scene: The scene without objects.
-        view: What the policy sees of its camera.
-        objects: The objects, opaque; none for the empty scene. As in the learned scene, only what is nearer than they are by
-            `Surrogate.depth_tolerance_m` hides them: 0.15 m, so that where they touch the ground they do not flicker.
+        view: The policy's view of its camera.
+        objects: The objects, opaque; none for the empty scene. As in the learned scene, only surfaces nearer than they are by
+            `Surrogate.depth_tolerance_m` hide them: 0.15 m, so that they do not flicker where they touch the ground.
     """
 
     def __init__(self, scene: World, view: PolicyView, objects: Sequence[ColouredObject]) -> None:
@@ -108,7 +108,7 @@ class DressedScene:
         return self._window.plain_theta()
 
     def prepare(self, states: Array) -> PoseBatch:
-        """What does not depend on colours, of the policy's window from car states ``[B, 3]``; time does not pass."""
+        """Prepare everything of the policy's window from car states ``[B, 3]`` that does not depend on colours; time does not pass."""
         return self._window.prepare(
             self._window.camera_poses(torch.from_numpy(np.asarray(states, dtype=np.float64)))
         )
@@ -119,7 +119,7 @@ class DressedScene:
         return np.stack([self._resized(as_uint8(image)) for image in frames.render(shown).images])
 
     def seen_now(self, theta: Tensor | None) -> NDArray[np.uint8]:
-        """Policy image ``[66, 200, 3]`` of the car where it is now."""
+        """Policy image ``[66, 200, 3]`` at the car's current pose."""
         rgb, depth_m = require_depth(self.scene.observe())
         window = self.view.window
         state = self.scene.state
@@ -136,7 +136,7 @@ class DressedScene:
 
     def paint(self, rgb: Rgb, state: Array, theta: Tensor) -> NDArray[np.uint8]:
         """The whole camera image with the objects in these colours; see `Dressed.paint`."""
-        del rgb  # it says nothing of depth
+        del rgb  # it has no depth
         return self.camera_image(state, theta)
 
     def _resized(self, window: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -144,7 +144,7 @@ class DressedScene:
         return np.asarray(resized, dtype=np.uint8)
 
     def _observed(self, poses: Array, pinhole: Pinhole) -> tuple[Tensor, Tensor]:
-        """The scene as a background renderer: the part of the camera image that the pinhole keeps."""
+        """The scene as a background renderer: the part of the camera image within the pinhole."""
         T_camera_from_car = np.linalg.inv(self.scene.T_car_from_camera)
         top, left = round(self.view.camera.cy - pinhole.cy), round(self.view.camera.cx - pinhole.cx)
         kept = slice(top, top + pinhole.height), slice(left, left + pinhole.width)
@@ -174,7 +174,7 @@ class SelfDriving:
         self.blocked_tick, self._tick = None, 0
 
     def step(self, states: Tensor, controls: Tensor) -> Tensor:
-        """Drive on for one tick; the state ``[1, 3]`` that is given is the one that was returned before."""
+        """Drive for one tick; the given state ``[1, 3]`` must be the last returned one."""
         moved = self.scene.step(float(controls[0]), self.speed_mps, self.dt_s)
         self._tick += 1
         if self.scene.blocked and self.blocked_tick is None:
@@ -182,18 +182,18 @@ class SelfDriving:
         return states.new_tensor([[moved.x_m, moved.y_m, moved.yaw_rad]])
 
     def jacobians(self, states: Tensor, controls: Tensor) -> tuple[Tensor, Tensor]:
-        """A scene has none."""
+        """Always an error: a scene has no Jacobians."""
         raise NotImplementedError(
             "a deployment scene has no Jacobians: attacks are searched in the surrogate"
         )
 
 
 class IdealDriving:
-    """The surrogate's car in a scene that is only looked at: it does what it is told, and nothing but the fence stops it.
+    """The surrogate's car in a scene that is only rendered: it follows its commands exactly, and only the fence stops it.
 
     Args:
         dynamics: The surrogate's car.
-        fence_m: Where abs(x) or abs(y) exceeds this the car counts as blocked [m]; None without a fence.
+        fence_m: Beyond this abs(x) or abs(y) the car counts as blocked [m]; None without a fence.
     """
 
     def __init__(self, dynamics: Dynamics, fence_m: float | None) -> None:
@@ -206,7 +206,7 @@ class IdealDriving:
         self.blocked_tick, self._tick = None, 0
 
     def step(self, states: Tensor, controls: Tensor) -> Tensor:
-        """Drive on for one tick from states ``[1, n]``."""
+        """Drive for one tick from states ``[1, n]``."""
         moved = self._dynamics.step(states, controls)
         self._tick += 1
         outside = self._fence_m is not None and bool((moved[0, :2].abs() > self._fence_m).any())
@@ -215,7 +215,7 @@ class IdealDriving:
         return moved
 
     def jacobians(self, states: Tensor, controls: Tensor) -> tuple[Tensor, Tensor]:
-        """Those of the surrogate's car."""
+        """Jacobians of the surrogate's car."""
         return self._dynamics.jacobians(states, controls)
 
 
@@ -225,10 +225,10 @@ class DeployedDrive:
 
     Attributes:
         states: True states ``[T + 1, 3]``.
-        controls: What the policy commanded ``[T]``.
-        metrics: Total CTE and what belongs to it.
-        blocked_tick: When the car ran into something; None if it did not.
-        collided_with: Name of what it ran into; None if it did not.
+        controls: Commands of the policy ``[T]``.
+        metrics: Total CTE and related metrics.
+        blocked_tick: Tick of a collision; None without one.
+        collided_with: Name of the obstacle; None without a collision.
     """
 
     states: Array
@@ -243,14 +243,14 @@ Seen = Callable[[Array], NDArray[np.uint8]]
 
 
 def _ideally(dressed: Dressed, theta: Tensor | None, car: SelfDriving | IdealDriving) -> Seen:
-    """What the policy sees of an ideal camera; the world is asked where its own car is, not where that should be."""
+    """Policy images of an ideal camera; the world renders from its own car's pose, not from where that should be."""
     if isinstance(car, SelfDriving):
         return lambda state: dressed.seen_now(theta)
     return lambda state: dressed.policy_images(dressed.prepare(state[None]), theta)[0]
 
 
 def _through(camera: ImperfectCamera, dressed: Dressed, theta: Tensor | None, dt_s: float) -> Seen:
-    """What the policy sees through a camera, tick by tick; of a lost frame the one before."""
+    """Policy images through a camera, tick by tick; a lost frame repeats the one before."""
     last: list[NDArray[np.uint8]] = []
 
     def seen(state: Array) -> NDArray[np.uint8]:
@@ -273,18 +273,18 @@ def drive_deployed(
     theta: Tensor | None,
     camera: ImperfectCamera | None = None,
 ) -> DeployedDrive:
-    """Drive once through the dressed scene, tick by tick.
+    """Drive once through the attacked scene, tick by tick.
 
     Args:
         dressed: The scene with its objects.
         policy: The victim.
-        goal: What it is told; empty if it is told nothing.
+        goal: Goal vector; empty without a goal.
         start: Pose ``[3]``.
-        path: What it should follow.
+        path: Reference path.
         limits: Ticks and limits.
-        car: What drives.
+        car: Dynamics of the drive.
         theta: The objects' colours; None for no objects.
-        camera: What takes the pictures; None for an ideal camera.
+        camera: Imperfect camera; None for an ideal one.
     """
     car.start(np.asarray(start))
     goals = torch.tensor([tuple(goal)], dtype=torch.float32) if goal else None

@@ -1,4 +1,4 @@
-"""Drives past objects, in the learned scene and where they are deployed."""
+"""Drives past objects, in the learned scene and in the deployment."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def learned_drives(
 
 
 def _fenced_tick(experiment: Experiment, states: Array) -> int | None:
-    """The tick at which the car is outside of the world's fence, where it is stopped; None if it never is."""
+    """The tick at which the car leaves the world's fence and is stopped; None if it never does."""
     if experiment.world.fence_m is None:
         return None
     outside = np.flatnonzero((np.abs(states[:, :2]) > experiment.world.fence_m).any(axis=1))
@@ -47,7 +47,7 @@ def deployed_drives(
     starts: Tensor,
     theta: Tensor | None,
 ) -> list[DeployedDrive]:
-    """Drives through the deployment scene from starts ``[B, 3]``, of its own car or of an ideal one."""
+    """Drives through the deployment scene from starts ``[B, 3]``, with its own car or an ideal one."""
     effects, car = experiment.config.deploy.camera, _car(experiment, dressed)
     return [
         drive_deployed(

@@ -1,4 +1,4 @@
-"""The frames of a deployment scene as the background of an attack: differentiable rendering over pictures that nothing had to learn."""
+"""The frames of a deployment scene as the background of an attack: differentiable rendering over pictures without a learned scene."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from hardware.worlds.world import World, require_depth
 
 
 class DeployedFrames:
-    """A background renderer (`advnerf_core.scene.surrogate.BackgroundRenderer`): what the policy sees of a scene without objects.
+    """A background renderer (`advnerf_core.scene.surrogate.BackgroundRenderer`): the policy's view of a scene without objects.
 
-    Time does not pass. Colours are resized as the policy's view does it; of the depths under a pixel the middle one is taken,
-    as a mean of near and far is nowhere.
+    Time does not pass. Colours are resized as in the policy's view; of the depths under a pixel the middle one is taken,
+    as a mean of near and far belongs to no surface.
 
     Args:
-        scene: Where the car is seen from any pose.
-        view: What the policy sees of its camera.
+        scene: Scene that renders from any pose of the car.
+        view: The policy's view of its camera.
     """
 
     def __init__(self, scene: World, view: PolicyView) -> None:

@@ -1,4 +1,4 @@
-"""What a run folder keeps of the policies that exist already: their hashes and declarations. Nothing of them is executed here."""
+"""Stored facts about existing policies in a run folder: their hashes and declarations. Nothing of them is executed here."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ KEPT = "victims.json"
 
 
 class VictimUnknownError(RuntimeFault):
-    """A policy that exists was not looked at yet, or is another since."""
+    """An existing policy was not loaded yet, or has changed since."""
 
 
 class GivenPolicy(StrictModel):
-    """What is known of a policy that exists.
+    """Stored facts about an existing policy.
 
     Attributes:
-        policy: How it is named.
-        source_sha256: Of its file or its code, by which it is known that it has not changed.
-        sha256: Content hash as `load_any_policy` tells it.
-        contract: Its declaration, as `PolicyContract.to_dict` writes it.
-        not_fixed: The program that it asks, which may change; empty for a policy that runs here.
+        policy: Name of the policy.
+        source_sha256: Hash of its file or code, which shows whether it has changed.
+        sha256: Content hash from `load_any_policy`.
+        contract: Declaration, from `PolicyContract.to_dict`.
+        not_fixed: The program that it queries, which may change; empty for a policy that runs here.
     """
 
     policy: str = Field(min_length=1)
@@ -44,17 +44,17 @@ class GivenPolicy(StrictModel):
 
     @property
     def declared(self) -> PolicyContract:
-        """Its declaration."""
+        """Declaration of the policy."""
         return PolicyContract.from_dict(self.contract, self.policy)
 
 
 def given_in(config: ExperimentConfig) -> dict[str, str]:
-    """The victims that exist already, by name, and how each policy is named."""
+    """The existing victims by name, each with the name of its policy."""
     return {name: each.policy for name, each in config.attacked.items() if isinstance(each, GivenVictim)}
 
 
 def read_kept(folder: Path) -> dict[str, GivenPolicy]:
-    """What a run folder keeps, by name of the victim."""
+    """Content of a run folder, by name of the victim."""
     file = folder / KEPT
     if not file.exists():
         return {}
@@ -62,10 +62,10 @@ def read_kept(folder: Path) -> dict[str, GivenPolicy]:
 
 
 def given(experiment: RunFolder[ExperimentConfig]) -> Mapping[str, GivenPolicy]:
-    """What is kept of the victims that exist, by name; nothing of them is executed.
+    """Stored facts about the existing victims, by name; nothing of them is executed.
 
     Raises:
-        VictimUnknownError: One was not looked at yet, or its file or code is another since.
+        VictimUnknownError: A victim was not loaded yet, or its file or code has changed since.
     """
     wanted = given_in(experiment.config)
     if not wanted:
@@ -82,7 +82,7 @@ def given(experiment: RunFolder[ExperimentConfig]) -> Mapping[str, GivenPolicy]:
 
 
 def victim_spec(experiment: RunFolder[ExperimentConfig], victim: str) -> str:
-    """How a victim is named, as `load_any_policy` and the policy node take it; the retrained one is that of the first round, as in the paper."""
+    """Name of a victim for `load_any_policy` and the policy node; the retrained one is the first round's, as in the paper."""
     if victim == RETRAINED:
         return str(experiment.stage_folder("retrain") / "round0" / "policy.safetensors")
     wanted = experiment.config.attacked[victim]

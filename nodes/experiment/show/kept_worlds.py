@@ -1,4 +1,4 @@
-"""What worlds of a user's code said of themselves when an experiment was run: states and tables of a run folder execute none of it."""
+"""Stored facts about users' worlds from the last run of an experiment, so that states and tables of a run folder execute no code."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ KEPT = "worlds.json"
 
 
 class WorldUnknownError(RuntimeFault):
-    """The experiment was not run yet with a world, or its code is another since."""
+    """The experiment was not run yet with a world, or the world's code has changed since."""
 
 
 @dataclass(frozen=True)
 class KeptWorld(PlainData):
-    """What is known of a world without its code.
+    """Stored facts about a world.
 
     Attributes:
         section: The section of the experiment file that names it.
         source_sha256: Hash of its code.
-        settings: As `NamedWorld.settings` says.
-        traits: As `NamedWorld.traits` says.
-        description: What it says about itself; None where it must be open for it.
+        settings: Output of `NamedWorld.settings`.
+        traits: Output of `NamedWorld.traits`.
+        description: Description of the world; None if it must be open for that.
     """
 
     section: dict[str, Any]
@@ -42,10 +42,10 @@ class KeptWorld(PlainData):
     description: WorldDescription | None
 
     def describe(self) -> WorldDescription:
-        """What it says about itself.
+        """Description of the world.
 
         Raises:
-            NotOpenError: It must be open for it.
+            NotOpenError: The world must be open for that.
         """
         if self.description is None:
             raise NotOpenError(f"the world {self.settings['kind']} must be open to say this")
@@ -58,7 +58,7 @@ def is_users(section: Mapping[str, Any]) -> bool:
 
 
 def keep_worlds(folder: Path, worlds: Iterable[tuple[dict[str, Any], NamedWorld]]) -> None:
-    """Write down what worlds of a user's code say, in a run folder.
+    """Store the facts about users' worlds in a run folder.
 
     Args:
         folder: The run folder.
@@ -88,15 +88,15 @@ def _description(world: NamedWorld) -> WorldDescription | None:
 
 
 def kept_world(folder: Path, section: Mapping[str, Any], beside: Path) -> KeptWorld:
-    """What is kept in a run folder of the world that a section names; nothing of it is executed.
+    """Stored facts about the world of a section; nothing of it is executed.
 
     Args:
         folder: The run folder.
         section: The section of the experiment file.
-        beside: What a relative ``file.py:Class`` is relative to.
+        beside: Folder that a relative ``file.py:Class`` is relative to.
 
     Raises:
-        WorldUnknownError: Nothing is kept of this section with this code.
+        WorldUnknownError: No facts are stored for this section with this code.
     """
     code = code_sha256(section["kind"], WORLDS, ENTRY_POINTS, beside)
     for each in _read(folder):

@@ -1,6 +1,6 @@
-"""The light of a place on a panel: what the driving camera sees of a colour that is painted on it, measured with plain colours alone.
+"""The light on a panel: the response from painted colours to the driving camera's, measured with plain colours alone.
 
-The model is that of a monitor (`advnerf_core.display`): a curve for each channel, a mixing matrix, ambient light, and the camera's power.
+The model equals a monitor's (`advnerf_core.display`): a curve for each channel, a mixing matrix, ambient light, and the camera's power.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from nodes.experiment.show.placing import seen_from
 from nodes.runtime.errors import ConfigError
 
 LIGHT = "panel_light.yaml"
-# Of a panel's side: what is looked at, without its edge. From so many poses, and with so many pixels at least.
+# Share of a panel's side that is measured, without its edge; number of poses, and least number of pixels.
 _INSIDE, _POSES, _LEAST_PX = 0.8, 3, 20
 _NAME = "light"
 # Without a room's glare on glass, black is black: primaries leave two channels dark.
@@ -35,23 +35,23 @@ _LEAST_FREE = 0.4
 
 
 def light_on_panels(experiment: Experiment) -> DisplayModel | None:
-    """The light on the panel, as the capture stage measured it; None where colours are taken to be seen as they are painted."""
+    """The light on the panel, measured in the capture stage; None for the identity."""
     if experiment.config.carrier.response == "identity":
         return None
     return load_calibration(DisplayCalibration, experiment.calibration_folder / LIGHT).display
 
 
 def measure_light(experiment: Experiment, world: World) -> DisplayFit:
-    """Show plain colours on the panel, look at them along the drive, and fit what is seen.
+    """Show plain colours on the panel, look at them along the drive, and fit the response.
 
     Args:
-        experiment: With one panel, which is placed.
-        world: Open; it has no panel afterwards.
+        experiment: Experiment with one placed panel.
+        world: The open world; it has no panel afterwards.
 
     Raises:
         ConfigError: The world takes no panels, or no drive sees this one large enough.
-        DegenerateDataError: The colours do not tell the light, as where they are all too bright.
-        PoorFitError: The light is none that this model has.
+        DegenerateDataError: The colours do not determine the light, for example because all are too bright.
+        PoorFitError: The model does not fit the light.
     """
     if not isinstance(world, NativePanels):
         raise ConfigError(
@@ -72,12 +72,12 @@ def measure_light(experiment: Experiment, world: World) -> DisplayFit:
             ]
     finally:
         world.add_panel(_NAME, panel, None)
-    # Paint has no falloff: where it is seen from does not matter.
+    # Paint has no falloff: the viewing angle does not matter.
     return fit_display(np.repeat(colours / 255.0, len(poses), axis=0), np.array(seen), least_free=_LEAST_FREE)
 
 
 def _poses(experiment: Experiment, world: World, thing: PlacedObject) -> list[Pose]:
-    """First, middle and last of the poses that see the panel large enough."""
+    """First, middle and last of the poses with a large enough view of the panel."""
     found = [
         pose
         for pose in seen_from(experiment, world, thing, 1.0)

@@ -1,4 +1,4 @@
-"""Panels in a world's own scene: its renderer lights, shades and hides them, and nothing is composed into a picture."""
+"""Panels in a world's own scene: its renderer lights, shades and occludes them, and no picture is composed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from nodes.runtime.errors import ConfigError
 
 # Name, pose and texture of each panel.
 _Shown = tuple[tuple[str, bytes, bytes], ...]
-# What stands in each open world, whoever put it there: several `NativeScene` share one.
+# Current panels of each open world, which several `NativeScene` may share.
 _STANDING: WeakKeyDictionary[Any, _Shown] = WeakKeyDictionary()
 
 
@@ -40,11 +40,11 @@ class NativeScene:
 
     Args:
         scene: The open scene.
-        view: What the policy sees of its camera.
-        panels: Faces as `cube_face_object` makes them, at their places; none takes all out.
+        view: The policy's view of its camera.
+        panels: Faces from `cube_face_object`, at their places; none removes all.
 
     Raises:
-        ConfigError: The world takes no panels, or an object is no panel.
+        ConfigError: The world takes no panels, or an object is not a panel.
     """
 
     def __init__(self, scene: World, view: PolicyView, panels: Sequence[ColouredObject]) -> None:
@@ -65,7 +65,7 @@ class NativeScene:
         return self._plain
 
     def prepare(self, states: Array) -> Array:
-        """The states ``[B, 3]`` themselves: the world is asked for every picture."""
+        """The states ``[B, 3]`` themselves: the world renders each picture on request."""
         return np.asarray(states, dtype=np.float64)
 
     def policy_images(self, frames: Any, theta: Tensor | None) -> Rgb:
@@ -73,7 +73,7 @@ class NativeScene:
         return np.stack([self.view.image(self.camera_image(state, theta)) for state in frames])
 
     def seen_now(self, theta: Tensor | None) -> Rgb:
-        """Policy image ``[66, 200, 3]`` of the car where it is now."""
+        """Policy image ``[66, 200, 3]`` at the car's current pose."""
         self._show(theta)
         return self.view.image(self.scene.observe(depth=False)[0])
 
@@ -84,12 +84,12 @@ class NativeScene:
         return self.scene.observe_at(x_m, y_m, yaw_rad, depth=False)[0]
 
     def paint(self, rgb: Rgb, state: Array, theta: Tensor) -> Rgb:
-        """The whole camera image with the panels in these colours; it is seen again, as only the world knows its light."""
+        """The whole camera image with the panels in these colours; it is rendered again, as only the world models its light."""
         del rgb
         return self.camera_image(state, theta)
 
     def _show(self, theta: Tensor | None) -> None:
-        """Have the world show the panels in these colours, in plain ones for None, unless it does already."""
+        """Make the world show the panels in these colours, in plain ones for None, unless it does already."""
         colours = self._plain if theta is None else theta.detach()
         standing = _STANDING.get(self.scene, ())
         # Every tick of a drive asks for the same colours; their textures are painted once.

@@ -36,13 +36,13 @@ def from_above(experiment: Experiment, world: World) -> Image:
 
 
 def _photographed(world: Overview) -> tuple[Image, Project]:
-    """The world's own view from above, and where a point ``[..., 3]`` is in it [px]."""
+    """The world's own view from above, and the projection of points ``[..., 3]`` into it [px]."""
     picture, pinhole, T = world.overview()
     return picture.copy(), lambda points: pinhole.project(transform_points(invert_transform(T), points))
 
 
 def _plan(experiment: Experiment) -> tuple[Image, Project]:
-    """White paper with the edges of the roads, and where a point ``[..., 3]`` lies on it [px]."""
+    """White paper with the edges of the roads, and the projection of points ``[..., 3]`` onto it [px]."""
     edges = experiment.world.road_edge
     seen = [
         np.array([lane.pose_at(float(s))[:2] for s in np.linspace(0.0, lane.length_m, 50)])

@@ -1,4 +1,4 @@
-"""A screen among the panels of a world: pictures of the face on it, and its colours as the driving camera sees them, measured."""
+"""A screen among the panels of a world: pictures of the face on it, and its measured colours for the driving camera."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hardware.worlds.world import Panel, Screens, World
 from nodes.runtime.errors import ConfigError
 
 Rgb = NDArray[np.uint8]
-# Where the car stands while the colours are shown: distance [m], and angles to the panel's normal [rad] for the falloff.
+# Poses of the car for measuring the colours: distance [m], and angles to the panel's normal [rad] for the falloff.
 _DISTANCE_M, _ANGLES_RAD = 1.1, (0.0, 0.5, -0.85)
 
 
@@ -32,10 +32,10 @@ def plain_picture(panel: Panel, rgb: Sequence[float]) -> Rgb:
 
 
 def screens_of(world: World) -> Screens:
-    """The world as one that has screens.
+    """The world, which must have screens.
 
     Raises:
-        ConfigError: It has no way to show a picture.
+        ConfigError: The world cannot show a picture.
     """
     if not isinstance(world, Screens):
         raise ConfigError(
@@ -45,7 +45,7 @@ def screens_of(world: World) -> Screens:
 
 
 def cos_angle(panel: Panel, points: Array) -> Array:
-    """Cosine ``[...]`` of the angle between a panel's normal and the way to points ``[..., 3]``."""
+    """Cosine ``[...]`` of the angle between a panel's normal and the direction to points ``[..., 3]``."""
     seen = transform_points(invert_transform(panel.T_world_from_face), points)
     return np.asarray(seen[..., 0] / np.linalg.norm(seen, axis=-1), dtype=np.float64)
 
@@ -57,14 +57,14 @@ def measure_display(
     seed: int = 0,
     frames_of: Callable[[Rgb], Sequence[Rgb]] | None = None,
 ) -> DisplayFit:
-    """Show the calibration's colours on a screen, look at them from three places, fit the display model.
+    """Show the calibration's colours on a screen, look at them from three poses, and fit the display model.
 
     Args:
-        world: Open; its screen shows the last colour afterwards.
-        name: Of the screen.
+        world: The open world; its screen shows the last colour afterwards.
+        name: Name of the screen.
         panel: The screen.
-        seed: Of the mixed colours.
-        frames_of: What a camera makes of a rendered picture, such as several noisy frames; None takes the picture as it is.
+        seed: Seed of the mixed colours.
+        frames_of: Converts a rendered picture to camera frames, such as several noisy ones; None uses the picture itself.
     """
     colours, screens = colours_to_show(seed=seed), screens_of(world)
     shown, seen, cosines = [], [], []

@@ -1,4 +1,4 @@
-"""An experiment as its file says it: its variants, its cells and where they are run; nothing of its world. Needs no torch."""
+"""An experiment's file content: its variants, its cells and their folders; nothing of its world. Needs no torch."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class Variants(RunFolder[ExperimentConfig]):
     """One resolved experiment with its variants, or one of these.
 
     Attributes:
-        executes: Whether worlds of a user's code may be executed; else what the run folder keeps of them is read.
-        overrides: ``key=value`` texts with which it was read.
-        variants: Its variants by name; an experiment without variants has none and runs its cells itself.
-        load_variant: Reads a variant with its world and its victims; the same name gives the same object.
+        executes: Whether users' worlds may be executed; else the facts stored in the run folder are used.
+        overrides: ``key=value`` texts of the command line.
+        variants: Variants by name; an experiment without variants has none and runs its cells itself.
+        load_variant: Loads a variant with its world and its victims; the same name gives the same object.
     """
 
     executes: bool = True
@@ -50,10 +50,10 @@ class Variants(RunFolder[ExperimentConfig]):
         return tuple(cell for name, config in self.variants.items() for cell in cells_of(config, name))
 
     def require_one(self) -> None:
-        """Refuse an experiment with variants.
+        """Raise for an experiment with variants.
 
         Raises:
-            ConfigError: It has some.
+            ConfigError: The experiment has variants.
         """
         if self.variants:
             raise ConfigError(
@@ -79,10 +79,10 @@ class Variants(RunFolder[ExperimentConfig]):
 
     @cached_property
     def held_to(self) -> Reference:
-        """What the report is held to.
+        """The limits that the report is compared with.
 
         Raises:
-            ConfigError: The file is not there, or is none of limits.
+            ConfigError: The file does not exist, or is not a file of limits.
         """
         file = self.config.reference
         return Reference() if file is None else load_config(Reference, self.file.parent / file)
@@ -103,16 +103,16 @@ def resolve(
     """Resolve an experiment file and its variants.
 
     Args:
-        kind: What is made.
+        kind: Class of the result.
         file: A ``*.experiment.yaml`` file.
-        setting: Which of its settings to lay over its values; None takes demo where it has settings.
+        setting: Name of the setting to lay over its values; None uses demo if it has settings.
         overrides: ``section.key=value`` texts, applied last.
-        folder: The run folder; None takes the file's ``run_folder``, or else one under ``runs``.
-        executes: As of `Variants`.
+        folder: The run folder; None uses the file's ``run_folder``, or else one under ``runs``.
+        executes: See `Variants`.
         load: Reads the world and the victims of an experiment without variants, or of one variant, given its values.
 
     Raises:
-        ConfigError: With file, line and the valid keys.
+        ConfigError: The file is wrong; with file, line and the valid keys.
     """
     read = read_experiment_file(file, setting, overrides)
     config = validate(ExperimentConfig, read.document, file.parent)
@@ -136,7 +136,7 @@ def resolve(
 
 
 def _check_cells(made: Variants, document: Document) -> None:
-    """Cells must have different names, and contrasts must name what cells are called."""
+    """Check that cells have different names, and that contrasts name existing cells."""
     (name, count), *_ = Counter(cell.name for cell in made.cells).most_common(1)
     if count > 1:
         raise ConfigError(

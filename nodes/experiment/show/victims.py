@@ -1,4 +1,4 @@
-"""The victims of an experiment, ready to drive; policies that exist are looked at once, before any stage is run, see `given`."""
+"""The victims of an experiment, ready to drive; existing policies are loaded once, before any stage is run, see `given`."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from nodes.runtime.errors import ConfigError
 
 
 def look_at_given(experiment: Experiment) -> None:
-    """Load the policies that exist and keep what they say about themselves; those that have not changed since are not loaded.
+    """Load the existing policies and store their declarations; unchanged ones are not loaded again.
 
     Raises:
-        AdvnerfError: One cannot be loaded.
-        ConfigError: They see different pictures.
+        AdvnerfError: A policy cannot be loaded.
+        ConfigError: The policies have different views.
     """
     wanted, known = given_in(experiment.config), read_kept(experiment.folder)
     if not wanted:
@@ -45,7 +45,7 @@ def _look_at(experiment: Experiment, spec: str, known: GivenPolicy | None) -> Gi
     if known is not None and (known.policy, known.source_sha256) == (spec, source) and not known.not_fixed:
         return known
     loaded = _driver_at(experiment, spec) if is_address(spec) else load_any_policy(spec)
-    # A network that was trained here declares nothing else.
+    # A network that was trained here has no other declaration.
     plain = PolicyContract(loaded.view, goal_size=loaded.policy.goal_size)
     contract = adapted(loaded.policy, plain).contract
     return GivenPolicy(
@@ -61,7 +61,7 @@ def _driver_at(experiment: Experiment, address: str, expected_sha256: str | None
     """A driver behind a socket; it sees the whole picture of the driving camera.
 
     Raises:
-        ConfigError: Live nodes are to drive, or the world must be asked for its camera and was not yet.
+        ConfigError: Live nodes would drive, or the world must be open for its camera and was not yet.
     """
     from advnerf_core.policies.egodriver import DrivenRig, load_driver_at
 
@@ -80,7 +80,7 @@ def load_victim(experiment: Experiment, victim: str) -> LoadedPolicy:
     """A victim, ready for a drive or an attack.
 
     Raises:
-        AdvnerfError: It cannot be loaded, or is not the one that was looked at.
+        AdvnerfError: The victim cannot be loaded, or differs from the stored facts.
     """
     spec = victim_spec(experiment, victim)
     if victim not in given_in(experiment.config):
@@ -92,10 +92,10 @@ def load_victim(experiment: Experiment, victim: str) -> LoadedPolicy:
 
 
 def told(experiment: Experiment, policy: Any, scenario: str) -> tuple[float, ...]:
-    """What a policy is told on a path; empty for one that takes no goal.
+    """Goal vector of a policy on a path; empty for a policy without goals.
 
     Raises:
-        ConfigError: It takes goals of another length.
+        ConfigError: The policy takes goals of another length.
     """
     goal, size = experiment.goal(scenario), int(policy.goal_size)
     if size not in (0, len(goal)):
@@ -108,5 +108,5 @@ def told(experiment: Experiment, policy: Any, scenario: str) -> tuple[float, ...
 
 @lru_cache(maxsize=4)
 def _loaded(spec: str, changed_ns: int, sha256: str | None = None) -> LoadedPolicy:
-    del changed_ns  # a file that was written again is another entry
+    del changed_ns  # part of the cache's key
     return load_any_policy(spec, sha256)

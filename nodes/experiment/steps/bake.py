@@ -1,4 +1,4 @@
-"""Stage bake: make the learned scene quick to render, and compare it with what was learned on views that nothing learned from."""
+"""Stage bake: bake the learned scene for fast rendering, and compare it with the field on held-out views."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from nodes.experiment.show.learned_scene import FIDELITY, HELD_OUT, baked_file, 
 from nodes.experiment.steps.capture import states_about
 from nodes.runtime.progress import Report
 
-# As of a stage (`pipeline.VERSIONS`). It is part of the keys of what is made through baked scenes; the digest of this stage is not, as what it
-# writes follows from the scene, and machines differ in the last bits.
+# Like a stage's version (`pipeline.VERSIONS`). It is part of the keys of results through baked scenes; this stage's digest is not, as its
+# output follows from the scene, and machines differ in the last bits.
 VERSION = 1
 COMPARED = "baked.json"
-# What baking may cost on held-out views [dB]; a scene that loses more is rendered from its field.
+# Largest loss by baking on held-out views [dB]; a scene that loses more is rendered from its field.
 _MOST_LOST_DB = 0.3
-# Views that bricks are made for: as far from a path as an attack may throw a car [m, of half a lane of 1.75 m], and as turned [rad].
+# Views for which bricks are made: as far from a path as an attack may divert a car [m, for half a lane of 1.75 m], and as turned [rad].
 _VIEWS, _LATERAL_M, _HEADING_RAD, _SEED = 320, 3.0, 0.5, 0
 
 
 def run(experiment: Experiment, folder: Path, report: Report) -> None:
-    """Write ``baked.safetensors``, unless the scene cannot be baked or loses by it, and ``baked.json``, which says which."""
+    """Write ``baked.safetensors``, unless the scene cannot be baked or loses quality, and ``baked.json``, which says which."""
     report(0.0, "baking")
     try:
         baked = bake(load_field(experiment), views_of(experiment), experiment.view.pinhole)
@@ -53,7 +53,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
 
 
 def views_of(experiment: Experiment) -> Array:
-    """Poses ``[N, 4, 4]`` of the driving camera about all paths, equally many about each."""
+    """Poses ``[N, 4, 4]`` of the driving camera around all paths, equally many around each."""
     count = len(experiment.paths) * (_VIEWS // len(experiment.paths))
     driven_m = experiment.config.horizon * experiment.config.dt_s * experiment.car.speed_mps
     rng = np.random.default_rng(_SEED)
@@ -62,7 +62,7 @@ def views_of(experiment: Experiment) -> Array:
 
 
 def _held_out_psnr_db(experiment: Experiment, baked: BakedScene) -> float:
-    """Mean over the held-out views as the policy sees them."""
+    """Mean over the held-out views in the policy's view."""
     views = load_transforms(experiment.stage_folder("capture") / HELD_OUT, require_all=True).load()
     view = experiment.view
     pairs = zip(views.rgb, views.T_world_from_camera, strict=True)

@@ -1,4 +1,4 @@
-"""Stage capture: photograph the world, and keep what it says about itself and views of the driving camera that nothing learns from."""
+"""Stage capture: photograph the world, and store its description and held-out views of the driving camera."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from nodes.experiment.show.screen import measure_display, screens_of
 from nodes.runtime.progress import Report, counted
 
 PHOTOS, COLOUR_PAIRS = "photos", "colour_pairs"
-# Held-out views lie as far from a path as a fooled car drives [m, of half a lane of 1.75 m], and as turned [rad].
+# Held-out views lie as far from a path as a fooled car drives [m, for half a lane of 1.75 m], and as turned [rad].
 _LATERAL_M, _HEADING_RAD = 1.0, 0.2
 
 
 def run(experiment: Experiment, folder: Path, report: Report) -> None:
-    """Write ``world.json``, the places of objects with a rule, and posed image sets: ``photos`` (learned from), ``held_out`` and ``colour_pairs`` (driving camera, without objects)."""
+    """Write ``world.json``, the places of objects with a rule, and posed image sets: ``photos`` (for learning), ``held_out`` and ``colour_pairs`` (driving camera, without objects)."""
     config = experiment.config.capture
     rng = np.random.default_rng(config.seed)
     with experiment.open_world() as scene:
@@ -66,7 +66,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
 
 
 def _take_over(place: Photographed, held_out: int, folder: Path, report: Report) -> None:
-    """Both sets of a place that was photographed before."""
+    """Import both sets of a place that is known by photographs."""
     learned, views = place.photographs(held_out)
     total = len(learned) + len(views)
     _write(folder / PHOTOS, learned, counted(report, PHOTOS, len(learned), 0, total))
@@ -81,7 +81,7 @@ def _write(folder: Path, photographs: Sequence[Photograph], told: Callable[[int]
         pinholes.append(pinhole)
         return rgb
 
-    # What is written is learned from and compared with, so that nothing is lost again.
+    # The images are learned from and compared with, so they are stored without further loss.
     write_posed_images(
         folder, [each.T_world_from_camera for each in photographs], pinholes, look, "png", told=told
     )
@@ -97,7 +97,7 @@ def _driving_views(
     folder: Path,
     report: Report,
 ) -> None:
-    """A set of views of the driving camera about the paths."""
+    """A set of views of the driving camera around the paths."""
     config, states = (
         experiment.config.capture,
         states_about(experiment, count, rng, experiment.config.capture.driven_m),
@@ -119,7 +119,7 @@ def _driving_views(
 
 
 def _calibrate(experiment: Experiment, scene: World, folder: Path, report: Report) -> None:
-    """Files that live nodes read, and the colours of a screen that carries the attack, which then shows the plain face."""
+    """Write files for live nodes, and the colours of a screen that carries the attack, which then shows the plain face."""
     if isinstance(scene, Lab):
         write_twin_calibrations(scene.config, folder)
     if on_screen(experiment):
@@ -139,7 +139,7 @@ def states_about(
     lateral_m: float = _LATERAL_M,
     heading_rad: float = _HEADING_RAD,
 ) -> Array:
-    """Car states ``[count, 3]`` about all paths, or their first ``driven_m`` [m], so far from the path (of half a lane of 1.75 m) and so turned."""
+    """Car states ``[count, 3]`` around all paths, or their first ``driven_m`` [m], up to this far from the path (for half a lane of 1.75 m) and this much turned."""
     names = list(experiment.paths)
     parts = []
     for index, name in enumerate(names):

@@ -1,4 +1,4 @@
-"""The part of a cell where it is deployed: drives past what its search found, by the world's own car or through the live nodes."""
+"""The deployed part of a cell: drives past its attack, by the world's own car or through the live nodes."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ DRIVES = "drives.json"
 
 
 class Deployer(Protocol):
-    """Drives past what a search found."""
+    """Drives past attacks in the deployment."""
 
     @property
     def scene(self) -> World | None:
         """The world, if it is open."""
 
     def drive(self, space: Space, cell: Cell, folder: Path, tell: Callable[[str], None], /) -> Deployed:
-        """Drive a searched cell from the starts that are deployed; its attack file is in ``folder``, where bags go too."""
+        """Drive a searched cell from its deployed starts; its attack file is in ``folder``, which also gets the bags."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +46,8 @@ class Deployed:
     """Deployed drives of one cell.
 
     Attributes:
-        drives: One per start.
-        live: Of live drives what was measured in each bag, and in which folder it is.
+        drives: One drive per start.
+        live: Measurements of each live drive's bag, with the bag's folder.
     """
 
     drives: list[DeployedDrive]
@@ -100,7 +100,7 @@ def live_name(start: int) -> str:
 
 
 def deployed_starts(experiment: Experiment, cell: Cell) -> torch.Tensor:
-    """The starts ``[B, 3]`` of a cell that are deployed."""
+    """The deployed starts ``[B, 3]`` of a cell."""
     return experiment.measured_starts(cell.scenario)[: experiment.config.deploy.starts]
 
 
@@ -113,20 +113,20 @@ def cell_data(
     clean: Path,
     tell: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Drive a searched cell, and without attack, where they are deployed, and put together what was found.
+    """Drive a searched cell, and without attack, in the deployment, and assemble the result.
 
     Args:
         experiment: The experiment.
-        space: What was searched.
-        deployer: What drives; None deploys nothing.
-        cell: Which.
+        space: The search space.
+        deployer: The deployer; None deploys nothing.
+        cell: The cell.
         folder: The cell's folder, with the surrogate's part.
         clean: The folder of the same drive without attack, with the surrogate's part.
-        tell: Told of drives that do not count.
+        tell: Called with a message for each drive that does not count.
 
     Returns:
         Attack id, seconds; for ``surrogate`` and ``deployed`` the total CTE [m] and whether the car left the track, per start, and the total
-        CTE without attack; see `advnerf_core.report.cells`. A cell that was not driven live has no ``deployed``, and says why.
+        CTE without attack; see `advnerf_core.report.cells`. A cell that was not driven live has no ``deployed``, but the reason.
     """
     learned, undisturbed = (read_json(at / SEARCHED) for at in (folder, clean))
     data = {
@@ -177,7 +177,7 @@ def _drives_of(found: Mapping[str, Any], clean: Mapping[str, Any]) -> dict[str, 
 
 
 def _live_extra(live: list[dict[str, Any]]) -> dict[str, Any]:
-    """What only live drives can tell, per start."""
+    """Values that only live drives have, per start."""
     if not live:
         return {}
     return {
@@ -191,7 +191,7 @@ def _live_extra(live: list[dict[str, Any]]) -> dict[str, Any]:
 def deployed_part(
     space: Space, deployer: Deployer, cell: Cell, folder: Path, tell: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Deployed drives of a searched cell from its starts, kept in ``drives.json``; what is there already is read."""
+    """Deployed drives of a searched cell from its starts, stored in ``drives.json``; existing ones are read."""
     kept = folder / DRIVES
     if kept.exists():
         found: dict[str, Any] = read_json(kept)

@@ -1,7 +1,7 @@
-"""Where a victim learns that is not where it is attacked: other worlds of the same kind, each opened for its frames alone.
+"""Training worlds: a victim learns in other worlds of the same kind than the attacked one, each opened only for its frames.
 
-A victim that learned on the attacked road knows it, and takes what stands there for a landmark. One that learned in other places
-meets the attacked one as a car meets a street: there, only photographs are taken and a scene is learned.
+A victim that learned on the attacked road knows it, and takes objects there for landmarks. One that learned in other places
+meets the attacked one like a car an unknown street: there, only photographs are taken and a scene is learned.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from nodes.experiment.show.placing import place_by_rule
 from nodes.runtime.config import apply_overrides
 from nodes.runtime.errors import ConfigError
 
-# What a policy carries from one place to the other.
+# Properties that a policy carries from one place to the other.
 _SAME = ("car", "camera", "T_car_from_camera", "off_track_m")
 
 
 def plans_elsewhere(experiment: Experiment, opened: ExitStack) -> list[SourcePlan]:
-    """For each drive of each place two sources: half of the poses without any object, half with the objects where their rule puts them.
+    """Two sources for each drive of each place: half of the poses without any object, half with the objects at the places of their rule.
 
     Args:
-        experiment: Its ``policy.learns_in`` names the places.
+        experiment: Experiment whose ``policy.learns_in`` names the places.
         opened: Closes their worlds when the policy is trained.
 
     Raises:
@@ -50,11 +50,11 @@ def plans_elsewhere(experiment: Experiment, opened: ExitStack) -> list[SourcePla
 def place_elsewhere(
     experiment: Experiment, changes: Sequence[str], opened: ExitStack
 ) -> tuple[Experiment, World]:
-    """The experiment in another place, its objects where their rule puts them there, and that place, open.
+    """The experiment in another place, with its objects at the places of their rule there, and that place, open.
 
     Args:
-        experiment: In the attacked place.
-        changes: Of the section ``world``, as ``--set`` takes them.
+        experiment: Experiment in the attacked place.
+        changes: Changes of the section ``world``, in the form of ``--set``.
         opened: Closes the world.
 
     Raises:
@@ -72,7 +72,7 @@ def place_elsewhere(
             f"{experiment.file}: policy.learns_in: expected places with the {', '.join(_SAME)} of the attacked one, got other "
             f"{', '.join(differ)} with {' '.join(changes)}"
         )
-    # What the capture stage has kept is of the attacked place.
+    # The output of the capture stage belongs to the attacked place.
     vars(there)["world"] = found
     vars(there)["objects"] = tuple(place_by_rule(there, world))
     return there, world

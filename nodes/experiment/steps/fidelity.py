@@ -1,8 +1,8 @@
-"""Real and learned pictures, without and with an attack: what the fidelity gate and the prediction of transfer look at.
+"""Real and learned pictures, without and with an attack, for the fidelity gate and the prediction of transfer.
 
-Real pictures are the deployment scene's, with the opaque objects composed by depth, from where the car was on its drive past the plain
-objects; of a live drive those in its bag, into which a face is drawn by the code that draws it live, on a screen in the colours that its
-calibration says the camera sees. No drive with the attack is looked at.
+Real pictures come from the deployment scene, with the opaque objects composed by depth, from the car's poses on its drive past the plain
+objects; for a live drive from its bag, into which a face is drawn by the same code as live, on a screen in the colours that its
+calibration predicts for the camera. No drive with the attack is used.
 """
 
 from __future__ import annotations
@@ -53,13 +53,13 @@ _CAR, _IMAGE, _SAFETY = "/vicon/car", "/compositor/image", "/safety/state"
 
 
 def policy_of(experiment: Experiment, cell: Cell) -> tuple[Any, tuple[float, ...]]:
-    """The victim and what it is told on its path, of the first where none is named."""
+    """The victim and its goal on the cell's path, or on the first path."""
     policy = load_victim(experiment, cell.victim).policy
     return policy, told(experiment, policy, cell.scenario or experiment.config.paths[0])
 
 
 def held_out(experiment: Experiment) -> PicturePairs:
-    """The driving camera's views that nothing was learned from, about all drives, without objects."""
+    """Held-out views of the driving camera, around all drives, without objects."""
     views = load_transforms(experiment.stage_folder("capture") / capture.HELD_OUT, require_all=True).load()
     surrogate = surrogate_of(experiment, [])
     learned = [as_uint8(surrogate.render(pose[None], None).images[0]) for pose in views.T_world_from_camera]
@@ -69,16 +69,16 @@ def held_out(experiment: Experiment) -> PicturePairs:
 
 
 def driven(experiment: Experiment, cell: Cell, clean: Path, bag: Path | None = None) -> PicturePairs:
-    """What the camera sees on the deployed drive without an attack.
+    """Images of the camera on the deployed drive without an attack.
 
     Args:
         experiment: The experiment.
-        cell: Which drive.
-        clean: Where its live drives without attack are kept.
+        cell: Cell of the drive.
+        clean: Folder of its live drives without attack.
         bag: Instead, a bag of any live drive without attack.
 
     Raises:
-        RuntimeFault: A bag is given where drives are asked of the scene, or there is no live drive yet.
+        RuntimeFault: A bag is given but drives come from the scene, or there is no live drive yet.
     """
     if bag is None and not experiment.config.deploy.live:
         return _along_the_drive(experiment, cell, None, "drive without attack")
@@ -93,7 +93,7 @@ def driven(experiment: Experiment, cell: Cell, clean: Path, bag: Path | None = N
 
 
 def lacks(experiment: Experiment, cell: Cell, folder: Path, clean: Path) -> str:
-    """What a prediction still needs, in words; empty if all is there."""
+    """Missing inputs of a prediction, as text; empty if complete."""
     if not (folder / ATTACK).exists():
         return "its search"
     if experiment.config.deploy.live:
@@ -127,9 +127,9 @@ def attacked(experiment: Experiment, cell: Cell, folder: Path, clean: Path) -> P
 def loop(
     experiment: Experiment, cell: Cell, folder: Path, clean: Path
 ) -> tuple[AttackProblem, AttackableScene, torch.Tensor, Horizon]:
-    """What a prediction drives: the problem, pictures with or without the attack, the deployed starts ``[S, n]`` and the horizon.
+    """Inputs of a prediction: the problem, pictures with or without the attack, the deployed starts ``[S, n]`` and the horizon.
 
-    Its car is the deployed one as the drives without attack in the folder ``clean`` have shown it.
+    The car has the response of the deployed drives without attack in the folder ``clean``.
     """
     space, attack = _found(experiment, cell, folder)
     found, plain = space.restored(attack), space.plain
@@ -149,7 +149,7 @@ def loop(
 
 
 def _measured_car(experiment: Experiment, clean: Path) -> RespondingCar:
-    """The deployed car as its drives without attack have shown it; the search's own where it drives."""
+    """The deployed car with the response of its drives without attack; the search's own car if that one drives."""
     ideal = experiment.dynamics
     if experiment.config.deploy.car == "ideal" or not (clean / DRIVES).exists():
         return RespondingCar(ideal, CarResponse(ideal.speed_mps))
@@ -173,7 +173,7 @@ def clean_bag(cell: Cell, clean: Path) -> Path:
     """The bag of the live drive that cells of this victim and seed are compared with.
 
     Raises:
-        RuntimeFault: It is not driven yet, or its bag is gone.
+        RuntimeFault: The drive does not exist yet, or its bag is gone.
     """
     bag = clean / live_name(0) / "bag"
     if not bag.exists():
@@ -184,7 +184,7 @@ def clean_bag(cell: Cell, clean: Path) -> Path:
 
 
 def _overlay(experiment: Experiment, attack: AttackFile) -> FaceOverlay:
-    """Draws the face into pictures of the driving camera, in the colours that the camera sees."""
+    """Draws the face into pictures of the driving camera, in the colours for the camera."""
     face, texture = attack.required_face(), attack.required_face().texture
     if on_screen(experiment):
         sensor = face_space(experiment, ideal=False).sensor
@@ -205,7 +205,7 @@ def _along_the_drive(
     attack: tuple[Shown, torch.Tensor | None] | None,
     of: str,
 ) -> PicturePairs:
-    """Pictures of the deployed drive without attack, again with an attack if one is given: as it is seen in the surrogate, and as it is shown."""
+    """Pictures of the deployed drive without attack, again with an attack if one is given: in the surrogate, and in the deployment."""
     space = make_space(experiment, None)
     policy, _ = policy_of(experiment, cell)
     shown, there = attack or (space.plain, shown_there(experiment, space.plain, None))
@@ -222,7 +222,7 @@ def _along_the_drive(
 
 
 def posed_frames(bag: Path) -> tuple[list[Rgb], Array]:
-    """Frames that were captured while the car was armed, of a long drive an even choice, and the car's states ``[N, 3]`` at their stamps."""
+    """Frames that were captured while the car was armed, evenly thinned out for a long drive, and the car's states ``[N, 3]`` at their stamps."""
     poses, armed = PoseBuffer(keep_s=1e6), []
     for message in read_messages(bag, [_CAR, _SAFETY]):
         decoded = decode(topic_row(message.topic).type, message.cdr)
@@ -243,5 +243,5 @@ def posed_frames(bag: Path) -> tuple[list[Rgb], Array]:
         raise BagError(
             f"expected images on {_IMAGE} with poses on {_CAR} while the car was armed in {bag}, got none"
         )
-    step = -(-len(frames) // _MOST_FRAMES)  # neighbouring frames of a long drive say no more
+    step = -(-len(frames) // _MOST_FRAMES)  # neighbouring frames of a long drive add nothing
     return frames[::step], np.array(states)[::step]

@@ -31,7 +31,7 @@ _FRAME_S = 0.1  # of films: finer ticks are not all filmed
 
 
 def strongest(experiment: Experiment) -> str:
-    """The method that films show: the gradient if it was searched."""
+    """The method shown in films: the gradient if it was searched."""
     methods = experiment.config.method_names
     return "gradient" if "gradient" in methods else methods[-1]
 
@@ -42,11 +42,11 @@ def film_scenario(
     """The attacked drive in the surrogate, and the deployed ones without and with the attack, side by side; first seed and start.
 
     Args:
-        experiment: With all stages before finished.
-        scene: Open; None where drives were live, whose bags have the pictures.
-        space: What was searched.
-        scenario: Which drive.
-        folder: Gets the film.
+        experiment: Experiment with all earlier stages finished.
+        scene: The open scene; None for live drives, whose bags have the pictures.
+        space: The search space.
+        scenario: Name of the path.
+        folder: Folder for the film.
     """
     attacked = Cell(
         scenario, experiment.config.main_victim, strongest(experiment), experiment.config.seeds[0]
@@ -84,7 +84,7 @@ def _deployed_track(
     title: str,
     folder: Path,
 ) -> ClipTrack:
-    """What the camera saw on the first deployed drive of a cell: asked of the open scene again, or from the bag of a live drive."""
+    """Images of the first deployed drive of a cell: rendered again by the open scene, or from the bag of a live drive."""
     every, _ = filmed(experiment.config.dt_s)
     file = folder / DRIVES
     states = _states(file)[0][::every]
@@ -103,7 +103,7 @@ def _deployed_track(
 
 
 def kept_film(folder: Path) -> Path | None:
-    """The film of a cell in its folder; None where there is none yet."""
+    """The film of a cell in its folder; None without one."""
     return next(folder.glob("clip.*"), None)
 
 
@@ -115,7 +115,7 @@ def with_film(data: dict[str, Any], film: Path | None) -> dict[str, Any]:
 
 
 def filmed(dt_s: float) -> tuple[int, float]:
-    """Every how many ticks a frame is taken, and the film's frames per second, so that it runs in real time."""
+    """Number of ticks per frame, and the film's frames per second, so that it runs in real time."""
     every = max(1, round(_FRAME_S / dt_s))
     return every, 1.0 / (every * dt_s)
 

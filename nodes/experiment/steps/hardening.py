@@ -1,4 +1,4 @@
-"""Judging a victim before any gradient runs against it: the worst of N random textures of families that it was not trained on."""
+"""Judges a victim before any gradient runs against it: the worst of N random textures of families that it was not trained on."""
 
 from __future__ import annotations
 
@@ -31,24 +31,24 @@ from nodes.experiment.steps.attack import (
 )
 from nodes.experiment.steps.verdicts import TRAINED_ON, VALIDATED_ON, hardness_record
 
-_SEED = 20_000  # no search has it
+_SEED = 20_000  # no search uses it
 
 
 def margin_m(experiment: Experiment) -> float:
-    """Mean excess per tick that counts as no effect [m]: half of what a victim that drives well may be off without attack."""
+    """Mean excess per tick that counts as no effect [m]: half of the limit for a victim that drives well without attack."""
     return 0.5 * mean_cte_limit_m(experiment.limits.off_track_m)
 
 
 def judge(experiment: Experiment, victim: str, textures: int = 0) -> HardnessVerdict:
-    """Drive a victim with random textures of each validation family from the measured starts, and keep the verdict in the run folder.
+    """Drive a victim with random textures of each validation family from the measured starts, and store the verdict in the run folder.
 
     Args:
-        experiment: With scene and policies.
-        victim: Which policy.
-        textures: Drawn per family; 0 draws as many as a search of the experiment may evaluate.
+        experiment: Experiment with scene and policies.
+        victim: Name of the victim.
+        textures: Number of textures per family; 0 draws as many as a search of the experiment may evaluate.
 
     Returns:
-        The verdict; one that is there for this policy is returned as it is.
+        The verdict; an existing one for this policy is returned.
 
     Raises:
         HardnessError: A gradient search of this run folder has begun, or three other recipes were judged.
@@ -79,13 +79,13 @@ def judge(experiment: Experiment, victim: str, textures: int = 0) -> HardnessVer
 def family_hardness(
     experiment: Experiment, victim: str, families: Sequence[str], textures: int
 ) -> Iterator[FamilyHardness]:
-    """What random textures of some families do to a victim in the surrogate, scenario by scenario.
+    """Effect of random textures of some families on a victim in the surrogate, scenario by scenario.
 
     Args:
-        experiment: With scene and policies.
-        victim: Which policy.
+        experiment: Experiment with scene and policies.
+        victim: Name of the victim.
         families: Methods that draw the textures.
-        textures: Drawn per family; all measured starts are driven with each.
+        textures: Number of textures per family; each is driven from all measured starts.
     """
     space = make_space(experiment, None)
     policy = load_victim(experiment, victim)
@@ -108,7 +108,7 @@ def _totals_m(
 
 
 def _refuse_late(experiment: Experiment, victim: str) -> None:
-    """A verdict that comes after a gradient search says nothing about the choice of the victim."""
+    """Raise after a gradient search: a later verdict shows nothing about the choice of the victim."""
     for cell in experiment.cells:
         folder = experiment.cell_folder(cell)
         if cell.victim == victim and cell.method.startswith("gradient") and folder.exists():

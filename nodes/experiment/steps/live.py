@@ -1,4 +1,4 @@
-"""Live drives: one run of the node graph against the simulated lab, driven until it counts, and measured from its bag."""
+"""Live drives: one run of the node graph against the simulated lab, repeated until it counts, and measured from its bag."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ class LiveRun:
     """One live run.
 
     Attributes:
-        name: Of its folder and its result.
-        victim: Which policy.
-        scenario: Which path.
-        start: Where it starts.
-        attack: What is shown; None for nothing.
-        ticks: Over how many control ticks it is measured; None as the experiment says.
-        empty: Whether the panel is taken away.
-        compare: Whether the counterfactual node steers by the clean frames too, to measure what the attack added.
+        name: Name of its folder and its result.
+        victim: Name of the victim.
+        scenario: Name of the path.
+        start: Start pose.
+        attack: Shown attack; None for none.
+        ticks: Number of measured control ticks; None uses the experiment's.
+        empty: Whether the panel is removed.
+        compare: Whether the counterfactual node also steers by the clean frames, to measure the attack's effect.
     """
 
     name: str
@@ -61,10 +61,10 @@ class LiveRun:
 
 
 def lab_of(experiment: Experiment) -> LabConfig:
-    """The simulated lab that live nodes drive in.
+    """The simulated lab of the live nodes.
 
     Raises:
-        ConfigError: The world is another.
+        ConfigError: The world is not the lab.
     """
     config = experiment.named_world.config
     if not isinstance(config, LabConfig):
@@ -78,19 +78,19 @@ def lab_of(experiment: Experiment) -> LabConfig:
 def drive_until_it_counts(
     experiment: Experiment, live: LiveRun, folder: Path, tell: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Drive one run until it counts; see `drive_with_tries`, which says what it raises.
+    """Drive one run until it counts; see `drive_with_tries` for its errors.
 
     Args:
-        experiment: In the lab.
-        live: Which run.
-        folder: Where its folder and its JSON go; a run that is there is read.
-        tell: Told of tries that do not count.
+        experiment: Experiment in the lab.
+        live: The run.
+        folder: Folder for its folder and its JSON; an existing run is read.
+        tell: Called with a message for each try that does not count.
     """
     return drive_with_tries(lambda: drive_live(experiment, live, folder), folder / f"{live.name}.json", tell)
 
 
 def drive_live(experiment: Experiment, live: LiveRun, folder: Path) -> dict[str, Any]:
-    """Drive one run through the node graph, which leaves its bag, and measure it.
+    """Drive one run through the node graph, which records its bag, and measure it.
 
     Raises:
         SpoiledError: Load or a fault of the stack spoiled the drive. Nothing was measured.
@@ -131,7 +131,7 @@ def drive_live(experiment: Experiment, live: LiveRun, folder: Path) -> dict[str,
 
 
 def as_drive(experiment: Experiment, driven: dict[str, Any]) -> DeployedDrive:
-    """A live run as any deployed drive; what the policy commanded is in its bag."""
+    """A live run as a deployed drive; the policy's commands are in its bag."""
     metrics = driven["metrics"] | {"ctes_m": tuple(driven["metrics"]["ctes_m"])}
     states, tick = np.array(driven["states"]), blocked_tick(driven)
     hit = None if tick is None else collided_with(experiment.named_world.make(), states[tick])
@@ -139,13 +139,13 @@ def as_drive(experiment: Experiment, driven: dict[str, Any]) -> DeployedDrive:
 
 
 def blocked_tick(driven: dict[str, Any]) -> int | None:
-    """The tick from which the car stood because it had run into something; None if it had not."""
+    """The tick from which the car stood because of a collision; None without one."""
     stopped = driven["outcome"]["stopped_early"]
     return first_still_tick(driven["states"]) if not stopped or is_stall(stopped) else None
 
 
 def extra_runs(experiment: Experiment) -> dict[str, LiveRun]:
-    """Runs of the main victim beside the cells: laps without attack, and a drive with the panel taken away, where they are asked for."""
+    """Runs of the main victim besides the cells: laps without attack, and a drive without the panel, if they are requested."""
     wanted, scenario = experiment.config.deploy, experiment.config.paths[0]
     start = experiment.references[scenario].drive_start
     runs, main = {}, experiment.config.main_victim
@@ -159,16 +159,16 @@ def extra_runs(experiment: Experiment) -> dict[str, LiveRun]:
 
 
 def run(experiment: Experiment, folder: Path, report: Report) -> None:
-    """Stage live: drive the runs of `extra_runs` that are not driven yet. A run whose tries are all spoiled leaves no result."""
+    """Stage live: drive the missing runs of `extra_runs`. A run whose tries are all spoiled leaves no result."""
     runs = extra_runs(experiment)
     for index, live in enumerate(runs.values()):
         report(index / len(runs), live.name)
-        with suppress(NotDrivenError):  # the report says so
+        with suppress(NotDrivenError):  # the report shows it
             drive_until_it_counts(experiment, live, folder, partial(report, index / len(runs)))
 
 
 def live_overrides(experiment: Experiment, live: LiveRun) -> list[str]:
-    """What the launch file is told for a run: its calibration and room, its victim, its attack."""
+    """Overrides of the launch file for a run: its calibration and room, its victim, its attack."""
     overrides = [
         f"params.calibration={experiment.calibration_folder}",
         f"params.policy={victim_spec(experiment, live.victim)}",

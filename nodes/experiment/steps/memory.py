@@ -1,4 +1,4 @@
-"""Peak memory of one adjoint gradient against the horizon, in this experiment's own scene, with nothing cached.
+"""Peak memory of one adjoint gradient against the horizon, in this experiment's own scene, with an empty cache.
 
 Each horizon is measured in a fresh process: ``python -m nodes.experiment.steps.memory RUN_FOLDER TICKS`` prints the peak above idle.
 """
@@ -31,7 +31,7 @@ HORIZONS = (50, 200, 400)
 
 
 def measure(experiment: Experiment, folder: Path, report: Report) -> tuple[MemoryRow, ...]:
-    """Measure the horizons that are not measured yet; kept in ``memory.json`` so that a stopped report goes on. None of a victim without a gradient."""
+    """Measure the missing horizons; stored in ``memory.json`` so that an interrupted report resumes. Empty for a victim without a gradient."""
     if victim_without_gradient(experiment):
         return ()
     kept = folder / "memory.json"
@@ -48,7 +48,7 @@ def measure(experiment: Experiment, folder: Path, report: Report) -> tuple[Memor
 
 
 def peak_above_idle_mib(experiment: Experiment, ticks: int) -> float:
-    """Peak above idle of one gradient over so many ticks [MiB]; the process must be fresh."""
+    """Peak above idle of one gradient over ``ticks`` ticks [MiB]; the process must be fresh."""
     space = face_space(experiment, ideal=True)
     policy, scenario = load_victim(experiment, experiment.config.main_victim), experiment.config.paths[0]
     problem = attack_problem(experiment, space, policy, scenario, experiment.config.seeds[0])

@@ -1,4 +1,4 @@
-"""Stage policy: one goal-conditioned network learns all drives, from the deployment scene and the surrogate or in other places, by DAgger."""
+"""Stage policy: one goal-conditioned network learns all drives, from the deployment scene and the surrogate or in training worlds, by DAgger."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ from nodes.experiment.steps.elsewhere import plans_elsewhere
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import MeasuringReport, Point
 
-# Poses that the policy learns from: as far from the path [m, of half a lane of 1.75 m] as a recovery may have to begin.
+# Poses for training: as far from the path [m, for half a lane of 1.75 m] as a recovery may have to begin.
 _STILLS_M, _DRIVES_M, _GIVE_UP_M = 1.6, 0.8, 3.0
-# Of a face in training: as many pixels as its nearest view has.
+# Pixels of a face in training: as many as its nearest view has.
 _TRAINING_TEXTURE_PX = 128
 
 Sample = Callable[[np.random.Generator], torch.Tensor]
@@ -102,7 +102,7 @@ def run(experiment: Experiment, folder: Path, report: MeasuringReport) -> None:
 
 
 def _telling(experiment: Experiment, report: MeasuringReport) -> ImitationProgress:
-    """Progress of the training as that of the stage, with the error as a curve for each victim."""
+    """Converts progress of the training to progress of the stage, with the error as a curve for each victim."""
     unit = experiment.car.control_unit
 
     def told(fraction: float, text: str, learned: Learned | None = None) -> None:
@@ -122,14 +122,14 @@ def plans(
     objects: Sequence[VoxelGridObject] | None = None,
     ending: str = "",
 ) -> list[SourcePlan]:
-    """For each drive its frames from the deployment scene and from the surrogate, with its goal and its teacher.
+    """Frames for each drive from the deployment scene and from the surrogate, with its goal and its teacher.
 
     Args:
         experiment: The experiment.
         scene: The deployment scene.
         sample: Draws the colours of all objects ``[K, 3]``; None draws random ones.
-        objects: The objects where they are to stand; None has them where the world does.
-        ending: Of the sources' names, which tell their frames apart.
+        objects: The objects at their places; None uses the world's places.
+        ending: Suffix of the sources' names, which distinguishes their frames.
     """
     config = experiment.config.policy
     domains = (
@@ -171,7 +171,7 @@ def plans(
 
 @dataclass(frozen=True, eq=False)
 class _Domains:
-    """Where frames come from: the dressed deployment scene, and the surrogate with the objects plain (None) or in any colours."""
+    """Sources of frames: the attacked deployment scene, and the surrogate with the objects plain (None) or in any colours."""
 
     dressed: Dressed
     seen_in_surrogate: Callable[[Array], Show]
@@ -181,7 +181,7 @@ class _Domains:
 def _object_domains(
     experiment: Experiment, scene: World, objects: Sequence[VoxelGridObject] | None
 ) -> _Domains:
-    """Objects stand in both scenes, plain or coloured."""
+    """Domains with objects in both scenes, plain or coloured."""
     objects = placed_objects(experiment) if objects is None else objects
     surrogate = surrogate_of(experiment, objects, load_background(experiment))
     light = light_on_panels(experiment)
@@ -204,7 +204,7 @@ def _object_domains(
 
 
 def surrogate_plan(experiment: Experiment) -> SourcePlan:
-    """Frames of the learned scene alone, along the first path: beside recordings of the real one.
+    """Frames of the learned scene alone, along the first path, to be used with recordings of the real one.
 
     Raises:
         ConfigError: The experiment attacks no face.
@@ -223,14 +223,14 @@ def surrogate_plan(experiment: Experiment) -> SourcePlan:
 
 
 def _face_domains(experiment: Experiment, scene: World) -> _Domains:
-    """The panel is seen as it was learned, or carries a face."""
+    """Domains with the learned panel, or with a face on it."""
     space, seen = _seen_face(experiment)
     dressed = PaintedScene(experiment, scene, _TRAINING_TEXTURE_PX)
     return _Domains(dressed, seen, space.surrogate.theta_shape)
 
 
 def _seen_face(experiment: Experiment) -> tuple[FaceSpace, Callable[[Array], Show]]:
-    """The face in the learned scene, behind the display if a screen shows it, and what is seen of it."""
+    """The face in the learned scene, behind the display if a screen shows it, and the policy's view of it."""
     space = face_space(experiment, last_result_kept(load_background(experiment)), ideal=False)
     surrogate, bare, sensor = space.surrogate, space.plain.seen_by(space.surrogate), space.sensor
 
@@ -250,11 +250,11 @@ def _seen_face(experiment: Experiment) -> tuple[FaceSpace, Callable[[Array], Sho
 
 
 def agreement(experiment: Experiment, policy: Policy | None = None) -> list[dict[str, float]]:
-    """Control of a policy on each held-out view and on the surrogate's image of it, told to follow the first path.
+    """Control of a policy on each held-out view and on the surrogate's image of it, with the first path's goal.
 
     Args:
-        experiment: With photographs and a scene.
-        policy: By default the one that was trained with random textures.
+        experiment: Experiment with photographs and a scene.
+        policy: The policy; by default the one trained with random textures.
     """
     views = load_transforms(experiment.stage_folder("capture") / capture.HELD_OUT / "transforms.json")
     policy = policy or load_policy(experiment.stage_folder("policy") / "policy.safetensors").policy
@@ -273,7 +273,7 @@ def agreement(experiment: Experiment, policy: Policy | None = None) -> list[dict
 
 
 def write_placement(experiment: Experiment, folder: Path) -> None:
-    """The objects' places, and each drive's first view without and with them, plain."""
+    """Write the objects' places, and each drive's first view without and with them, plain."""
     write_json(folder / "objects.json", describe(experiment))
     background = load_background(experiment)
     bare = surrogate_of(experiment, [], background)

@@ -1,7 +1,7 @@
-"""Stage retrain: the defence. Attack, collect with the objects that were found, fine-tune on old and new, attack again, until it no longer pays.
+"""Stage retrain: the defence. Attack, collect frames with the attacked objects, fine-tune on old and new, attack again, until attacks fail.
 
-The paper retrains once and drives from an unseen start; here that is the first round, and the rounds after it say whether the defence holds
-against an adversary that answers it. Every search, collection, training and drive is kept when it is done, so a killed stage goes on.
+The paper retrains once and drives from an unseen start; here that is the first round, and later rounds show whether the defence holds
+against an adaptive adversary. Every finished search, collection, training and drive is stored, so that a killed stage resumes.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ from nodes.experiment.steps.policy import plans
 from nodes.experiment.steps.steering_gate import require_same_steering
 from nodes.runtime.progress import Report
 
-_NEAR_M, _TURNED_RAD, _GIVE_UP_M = 1.0, 0.15, 3.0  # metres of half a lane of 1.75 m
-_PLACES_SEED = 10_000  # far from the seeds of pose attacks, which must not find the places that were learned
+_NEAR_M, _TURNED_RAD, _GIVE_UP_M = 1.0, 0.15, 3.0  # metres for half a lane of 1.75 m
+_PLACES_SEED = 10_000  # far from the seeds of pose attacks, which must not find the training places
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What one round of attacks found.
+    """Result of one round of attacks.
 
     Attributes:
         thetas: Colours of all objects by scenario ``[K, 3]``.
@@ -100,7 +100,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
                 "final_policy": os.path.relpath(file, experiment.folder),
                 "settings_hash": hash_of(wanted.model_dump(mode="json")),
             }
-            # After every round: a loop takes hours, and may be stopped.
+            # After every round: a loop takes hours, and may be interrupted.
             write_json(folder / "retrain.json", summary)
             retrain_plot.draw(folder / "curve.png", rounds, wanted.pays_ratio)
             if number == wanted.rounds or not _pays(found, wanted.pays_ratio):
@@ -117,7 +117,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
 
 
 def unseen_start(experiment: Experiment, scenario: str) -> torch.Tensor:
-    """A start ``[1, 3]`` that no attack and no training drive began at: a metre back, a third of a metre to the left."""
+    """A start ``[1, 3]`` that no attack and no training drive used: a metre back, a third of a metre to the left."""
     x_m, y_m, yaw_rad = experiment.references[scenario].drive_start
     back, left = np.array([-np.cos(yaw_rad), -np.sin(yaw_rad)]), np.array([-np.sin(yaw_rad), np.cos(yaw_rad)])
     place = np.array([x_m, y_m]) + experiment.along_m(1.0) * back + experiment.across_m(0.35) * left
@@ -155,7 +155,7 @@ def _first_attacks(
     folder: Path,
     report: Callable[[float, str], None],
 ) -> Found:
-    """What the gradient's cells of the first seed find; they are searched here if they are not yet."""
+    """The results of the gradient's cells of the first seed; they are searched here if they are missing."""
     thetas: dict[str, torch.Tensor] = {}
     for index, name in enumerate(experiment.config.paths):
         cell = Cell(name, experiment.config.main_victim, "gradient", experiment.config.seeds[0])
@@ -214,7 +214,7 @@ def _judged(
     thetas: dict[str, torch.Tensor],
     folder: Path,
 ) -> Found:
-    """Ratios to no attack of the same victim in both domains, from the attack's starts; kept in the folder of the round."""
+    """Ratios to no attack for the same victim in both domains, from the attack's starts; stored in the folder of the round."""
     seed, kept = experiment.config.seeds[0], folder / "ratios.json"
     key = [policy.sha256, *(hashlib.sha256(theta.numpy().tobytes()).hexdigest() for theta in thetas.values())]
     if kept.exists() and (known := read_json(kept))["of"] == key:
@@ -257,9 +257,9 @@ def _collect(
     folder: Path,
     report: Callable[[float, str], None],
 ) -> list[Frames]:
-    """Frames of both domains with the found objects: stills about the paths, and drives of the victim, labelled by the teacher.
+    """Frames of both domains with the attacked objects: stills around the paths, and drives of the victim, labelled by the teacher.
 
-    Where it is asked for also stills with all objects in random colours at random places.
+    If requested also stills with all objects in random colours at random places.
     """
     wanted, store = experiment.config.retrain, FrameStore(folder / "frames")
     assert wanted is not None
@@ -287,13 +287,13 @@ def _frames(
     rng: np.random.Generator,
     width: float,
 ) -> Frames:
-    """Frames of one plan; distances sideways are ``width`` times those of the junction."""
+    """Frames of one plan; lateral distances are ``width`` times the junction's."""
     expert, near_m = plan.expert, width * _NEAR_M
     assert expert is not None, "every plan of a world has its own teacher"
     places = recovery_states(expert.path, stills, rng, near_m, _TURNED_RAD, plan.driven_m)
     size = plan.source.batch_size
     parts = [plan.source.look(places[first : first + size], rng) for first in range(0, stills, size)]
-    # Early on the path: what follows is driven through.
+    # Early on the path: the following part is driven through.
     begin_m = None if plan.driven_m is None else 0.3 * plan.driven_m
     starts = recovery_states(expert.path, 2 * drives, rng, 0.5 * near_m, 0.5 * _TURNED_RAD, begin_m)
     steer = steer_with(victim.policy, torch.tensor([plan.goal]))
@@ -302,7 +302,7 @@ def _frames(
         close: NDArray[np.bool_] = np.abs(expert.path.project(states[:, :2]).cte_m) <= width * _GIVE_UP_M
         return close
 
-    # Two side by side, so that one of them meets a found texture throughout.
+    # Two side by side, so that one of them meets an attacked texture throughout.
     for first in range(0, 2 * drives, 2):
         parts.append(plan.source.drive(steer, starts[first : first + 2], steps, near, rng))
     seen = PolicyImages.join(parts)
@@ -314,7 +314,7 @@ def _frames(
 def _under_old_attacks(
     experiment: Experiment, dressed: Dressed, folder: Path, first: Found
 ) -> dict[str, Any]:
-    """The retrained policy past the attacks that it was trained on, from a start that nothing has seen, beside the original undisturbed."""
+    """The retrained policy past its training attacks, from an unseen start, beside the original policy without attack."""
     original = load_victim(experiment, experiment.config.main_victim)
     file = folder / "policy.safetensors"
     retrained, rows = load_policy(file), {}

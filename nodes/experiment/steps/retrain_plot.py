@@ -1,4 +1,4 @@
-"""The curve of attack and retraining: how much an attack pays against each victim, round after round."""
+"""The curve of attack and retraining: ratio of an attack against each victim, round after round."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ def draw(file: Path, rounds: Sequence[dict[str, Any]], pays_ratio: float) -> Non
 
 
 def curve(rounds: Sequence[dict[str, Any]], pays_ratio: float) -> Figure:
-    """Ratio to no attack by round, surrogate dashed, deployed solid; the line below which an attack does not pay.
+    """Ratio to no attack by round, surrogate dashed, deployed solid; and the stop ratio.
 
     Args:
         rounds: Ratios by domain and scenario, of the original policy and after each retraining.
-        pays_ratio: Where the loop ends.
+        pays_ratio: Stop ratio of the loop.
     """
     figure = Figure(figsize=(8.0, 4.0), dpi=110)
     FigureCanvasAgg(figure)
@@ -45,7 +45,7 @@ def curve(rounds: Sequence[dict[str, Any]], pays_ratio: float) -> Figure:
     axes.set_xticks(range(len(rounds)), ["original", *map(str, range(1, len(rounds)))])
     axes.set_xlabel("times retrained")
     axes.set_ylabel("total CTE, attacked / not attacked")
-    # From a hundred down to one: on a linear axis the end of the loop cannot be seen.
+    # From a hundred down to one: on a linear axis the end of the loop is invisible.
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)

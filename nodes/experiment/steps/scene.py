@@ -67,7 +67,7 @@ def run(experiment: Experiment, folder: Path, report: MeasuringReport) -> None:
 
 
 def _colour_map(experiment: Experiment, trained: TrainedScene) -> ColourMap:
-    """From the photographs' colours to those of the driving camera, by views of the same places."""
+    """Map from the photographs' colours to the driving camera's, fitted to views of the same places."""
     pairs = load_transforms(
         experiment.stage_folder("capture") / capture.COLOUR_PAIRS, require_all=True
     ).load()
@@ -82,7 +82,7 @@ def render_like(renderer: FieldRenderer, views: ImageSet) -> NDArray[np.float32]
 
 
 def field_config(experiment: Experiment) -> SceneFieldConfig:
-    """A field in the world's box: a little larger than that if it holds everything, as it is if what lies outside is contracted."""
+    """A field in the world's box: a little larger if it holds everything, unchanged if the outside is contracted."""
     wanted, box = experiment.config.scene, experiment.world.box
     grid = HashGridConfig(
         levels=wanted.levels, features=4, log2_entries=wanted.log2_entries, finest=wanted.finest

@@ -1,4 +1,4 @@
-"""One search for all cells that differ in their deployment alone: the first that is finished is taken by the others."""
+"""One search for all cells that differ only in their deployment: the first finished one is copied by the others."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ _KEY = "search_key.json"
 
 
 def search_key(experiment: Experiment, cell: Cell) -> str:
-    """Hash of what a search, and the drives in the surrogate past what it found, depend on."""
+    """Hash of everything that a search, and the drives in the surrogate past its attack, depend on."""
     return cell_settings(experiment, cell, deployed=False).key
 
 
 def take_search(experiment: Experiment, cell: Cell, folder: Path) -> Path | None:
-    """Copy what a cell beside this one has searched, if it is the same search; nothing happens if this one has begun its own.
+    """Copy the search of a neighbouring cell if it is the same; nothing happens if this cell has begun its own.
 
     Args:
-        experiment: Its stages before the cells must be there.
-        cell: Which.
-        folder: Of this cell; the cells beside it are in the folders beside this one.
+        experiment: Experiment whose stages before the cells are finished.
+        cell: The cell.
+        folder: Folder of this cell; the other cells' folders are beside it.
 
     Returns:
-        The folder that it was copied from.
+        The source folder.
     """
     settings = cell_settings(experiment, cell, deployed=False)
     key = settings.key
@@ -44,7 +44,7 @@ def take_search(experiment: Experiment, cell: Cell, folder: Path) -> Path | None
 
 
 def _finished(folder: Path, key: str) -> Path | None:
-    """A folder beside a cell's with the same search, finished."""
+    """A folder beside a cell's with the same, finished search."""
     beside = sorted(file for file in folder.parent.glob(f"*/{_KEY}") if file.parent != folder)
     return next(
         (each.parent for each in beside if has_key(each, key) and (each.parent / SEARCHED).exists()), None

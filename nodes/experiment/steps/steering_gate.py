@@ -1,6 +1,6 @@
-"""The gate of every experiment: a scene in which the policy steers otherwise than on real pictures is not attacked.
+"""The gate of every experiment: a scene in which the policy steers differently from real pictures is not attacked.
 
-A mean PSNR does not tell whether the wall by which the car steers was learned. The steering on held-out views along the paths does.
+A mean PSNR does not show whether the wall by which the car steers was learned. The steering on held-out views along the paths does.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ MOST_DIFFERENCE, LEAST_CORRELATION = 0.25, 0.9
 def require_same_steering(
     experiment: Experiment, may_go_on: bool = False, say: Callable[[str], None] = print
 ) -> None:
-    """Refuse a learned scene in which a victim steers otherwise than on real pictures of the same places.
+    """Raise for a learned scene in which a victim steers differently from real pictures of the same places.
 
-    Of the victims that are trained here the main one is judged, of those that exist each.
+    Of the victims that are trained here the main one is judged, of existing ones each.
 
     Args:
-        experiment: With scene and victims; it is judged if its key ``gate`` is ``steering``, the default.
-        may_go_on: Whether a refusal is only told.
-        say: Told of it.
+        experiment: Experiment with scene and victims; it is judged if its key ``gate`` is ``steering``, the default.
+        may_go_on: Whether a rejection is only a warning.
+        say: Called with the warning.
 
     Raises:
-        RuntimeFault: The scene is refused.
+        RuntimeFault: The scene is rejected.
     """
     if experiment.config.gate != STEERING:
         return
@@ -51,7 +51,7 @@ def require_same_steering(
 
 
 def steering_of_victims(experiment: Experiment) -> dict[str, list[dict[str, float]]]:
-    """Control of victims on each held-out view, ``real``, and on the learned scene's image of it, ``surrogate``: of those that `require_same_steering` judges."""
+    """Control of the victims that `require_same_steering` judges on each held-out view, ``real``, and on the learned scene's image of it, ``surrogate``."""
     found = {
         name: agreement(experiment, load_victim(experiment, name).policy)
         for name in given_in(experiment.config)
@@ -65,12 +65,12 @@ def steering_of_victims(experiment: Experiment) -> dict[str, list[dict[str, floa
 
 @dataclass(frozen=True)
 class SteeringDifference:
-    """How the steering on some pictures differs from that on others of the same places.
+    """Difference of the steering on two sets of pictures of the same places.
 
     Attributes:
         mean: Mean of the absolute differences, in the unit of the car's control.
-        allowed: The largest mean at which both still steer alike.
-        correlation: Of both.
+        allowed: The largest mean at which both count as equal.
+        correlation: Correlation of both.
     """
 
     mean: float
@@ -79,7 +79,7 @@ class SteeringDifference:
 
     @classmethod
     def between(cls, one: NDArray[np.float64], other: NDArray[np.float64]) -> SteeringDifference:
-        """The difference of steering ``[N]`` from that on the first pictures."""
+        """The difference of steering ``[N]`` from the steering on the first pictures."""
         varies = min(np.ptp(one), np.ptp(other)) > 0.0
         correlation = np.corrcoef(one, other)[0, 1] if varies else np.array_equal(one, other)
         spread = float(np.abs(one - one.mean()).mean())
@@ -87,12 +87,12 @@ class SteeringDifference:
 
     @property
     def alike(self) -> bool:
-        """Whether both are the same to the gate."""
+        """Whether the gate counts both as equal."""
         return self.mean <= self.allowed and self.correlation >= LEAST_CORRELATION
 
 
 def other_steering(views: Sequence[dict[str, float]], unit: str) -> str:
-    """How the steering on learned pictures departs from that on real ones, in a sentence; empty if it does not."""
+    """Difference between the steering on learned and on real pictures, as a sentence; empty if they count as equal."""
     real, learned = (np.array([view[name] for view in views], np.float64) for name in ("real", "surrogate"))
     found = SteeringDifference.between(real, learned)
     if found.alike:
