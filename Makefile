@@ -101,7 +101,7 @@ bench-quick: setup  ## Compare the main rates with the recorded ones (a minute);
 campaign: setup  ## What the live stack must bear: faults, strangers, kills, half an hour (hours; goes on where it was stopped)
 	@$(BIN)/python -m benchmarks.run_all --campaign
 
-rooms: setup  ## Draw the rooms of the code into docs/architecture.md
+rooms: setup  ## Draw the imports between sub-packages for docs/architecture.md
 	@$(BIN)/python docs/draw_rooms.py
 
 api: setup  ## Write docs/api.md from the docstrings of the public names

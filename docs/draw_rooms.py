@@ -1,14 +1,12 @@
 """Draws the rooms of the house from the code: ``make rooms`` (or ``python docs/draw_rooms.py``).
 
 A room is a sub-package, or a module that stands beside them; an arrow is an import, wherever in the file it stands, those for type
-checkers left out. Arrows that follow from others are not drawn. Writes ``docs/rooms_PACKAGE.svg`` and the lists of ``docs/architecture.md``.
+checkers left out. Arrows that follow from others are not drawn. Writes ``docs/rooms_PACKAGE.svg``.
 """
 
 from __future__ import annotations
 
-import ast
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from html import escape
 from itertools import pairwise
 from pathlib import Path
@@ -18,7 +16,6 @@ import grimp
 from advnerf_core.files import write_atomically
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE = ROOT / "docs" / "architecture.md"
 PACKAGES = ("advnerf_core", "hardware", "calibration", "nodes")
 DRAWN = ("nodes", "hardware", "advnerf_core")
 PROCESSES = "processes"
@@ -29,37 +26,19 @@ _SWEEPS = 12
 _STYLE = "font: 13px sans-serif; fill: #1f2933"
 
 
-@dataclass(frozen=True)
-class House:
-    """Rooms of a package.
-
-    Attributes:
-        about: What each room holds, by name; single modules are left out.
-        arrows: Which rooms each one imports from.
-    """
-
-    about: dict[str, str]
-    arrows: dict[str, frozenset[str]]
-
-
-def survey(package: str, graph: grimp.ImportGraph) -> House:
-    """Read the rooms of a package from its imports."""
-    about: dict[str, str] = {}
+def survey(package: str, graph: grimp.ImportGraph) -> dict[str, frozenset[str]]:
+    """The rooms of a package, and which rooms each one imports from."""
     arrows: dict[str, set[str]] = {}
     for module in sorted(graph.modules):
         name = _room(package, module)
         if name is None:
             continue
         arrows.setdefault(name, set())
-        if name == PROCESSES:
-            about[name] = "One process per file."
-        elif (ROOT / package / name).is_dir():
-            about.setdefault(name, _first_line(package, name))
         for imported in graph.find_modules_directly_imported_by(module):
             other = _room(package, imported)
             if other is not None and other != name:
                 arrows[name].add(other)
-    return House(about, {name: frozenset(found) for name, found in arrows.items()})
+    return {name: frozenset(found) for name, found in arrows.items()}
 
 
 def _room(package: str, module: str) -> str | None:
@@ -69,13 +48,6 @@ def _room(package: str, module: str) -> str | None:
     if package == "nodes" and parts[1] not in _CONDUCTORS and not (ROOT / "nodes" / parts[1]).is_dir():
         return PROCESSES
     return parts[1]
-
-
-def _first_line(package: str, name: str) -> str:
-    file = ROOT / package / name / "__init__.py"
-    docstring = ast.get_docstring(ast.parse(file.read_text(encoding="utf-8"))) or ""
-    sentence, stop, _ = docstring.split("\n\n")[0].replace("\n", " ").replace("``", "`").partition(". ")
-    return sentence + stop.strip()
 
 
 def reduced(arrows: Mapping[str, frozenset[str]]) -> dict[str, set[str]]:
@@ -113,9 +85,9 @@ def floors(arrows: Mapping[str, frozenset[str]]) -> list[list[str]]:
     ]
 
 
-def draw(house: House) -> str:
+def draw(arrows: Mapping[str, frozenset[str]]) -> str:
     """The rooms as an SVG picture."""
-    rows, lines = _laid_out(house)
+    rows, lines = _laid_out(arrows)
     place, width = _places(rows)
     height = 2 * _MARGIN + len(rows) * (_BOX_H + _GAP_Y) - _GAP_Y
     parts = [
@@ -133,7 +105,7 @@ def draw(house: House) -> str:
             path.append(f"L{nx:g},{ny + _BOX_H:g}")  # between the boxes of a floor that it only passes
             x, y = nx, ny
         parts.append(f'<path d="{" ".join(path[:-1])}" fill="none" stroke="#7b8794" marker-end="url(#a)"/>')
-    for name in sorted(house.arrows):
+    for name in sorted(arrows):
         x, y = place[name]
         parts.append(
             f'<rect x="{x - _BOX_W / 2:g}" y="{y:g}" width="{_BOX_W}" height="{_BOX_H}" rx="4" fill="#e6f0fa" stroke="#486581"/>'
@@ -142,16 +114,16 @@ def draw(house: House) -> str:
     return "\n".join([*parts, "</svg>", ""])
 
 
-def _laid_out(house: House) -> tuple[list[list[str]], list[list[str]]]:
+def _laid_out(arrows: Mapping[str, frozenset[str]]) -> tuple[list[list[str]], list[list[str]]]:
     """Rooms and passages of each floor from left to right, and each arrow as the names it goes by.
 
     An arrow over several floors gets a passage on each of those between (Sugiyama's layered drawing). Everything then moves towards
     the mean place of what it is joined to, which leaves few crossings.
     """
-    rows = floors(house.arrows)
+    rows = floors(arrows)
     floor = {name: number for number, row in enumerate(rows) for name in row}
     lines = []
-    for name, found in sorted(reduced(house.arrows).items()):
+    for name, found in sorted(reduced(arrows).items()):
         for other in sorted(found):
             passages = [f"{name}>{other} {number}" for number in range(floor[name] + 1, floor[other])]
             for number, passage in enumerate(passages, floor[name] + 1):
@@ -187,27 +159,14 @@ def _mean(values: Sequence[float], otherwise: float) -> float:
     return sum(values) / len(values) if values else otherwise
 
 
-def listed(house: House) -> str:
-    """What the rooms hold as a Markdown list, the roof first."""
-    names = [name for row in floors(house.arrows) for name in row if name in house.about]
-    return "\n".join(f"- `{name}`: {house.about[name]}" for name in names)
-
-
 def written() -> dict[Path, str]:
     """What every file should hold, from the code as it is now."""
     graph = grimp.build_graph(*PACKAGES, exclude_type_checking_imports=True, cache_dir=None)
-    texts, page = {}, PAGE.read_text(encoding="utf-8")
-    for package in DRAWN:
-        house = survey(package, graph)
-        texts[ROOT / "docs" / f"rooms_{package}.svg"] = draw(house)
-        begin, end = f"<!-- rooms of {package} -->", f"<!-- end of rooms of {package} -->"
-        head, _, rest = page.partition(begin)
-        page = f"{head}{begin}\n{listed(house)}\n{end}{rest.partition(end)[2]}"
-    return {**texts, PAGE: page}
+    return {ROOT / "docs" / f"rooms_{package}.svg": draw(survey(package, graph)) for package in DRAWN}
 
 
 def main() -> None:
-    """Write the pictures and the lists."""
+    """Write the pictures."""
     for file, text in written().items():
         write_atomically(file, text)
         print(f"wrote {file.relative_to(ROOT)}")

@@ -1,4 +1,4 @@
-"""The pictures and lists of the architecture page are those of the code; ``make rooms`` draws them again."""
+"""The pictures of the architecture page are those of the code; ``make rooms`` draws them again."""
 
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
