@@ -57,8 +57,8 @@ class MountView:
     """A view of the board while board and car stood still.
 
     Attributes:
-        T_world_from_car: By motion capture ``[4, 4]``.
-        T_world_from_board: By motion capture ``[4, 4]``; None if the board is not tracked.
+        T_world_from_car: Pose from motion capture ``[4, 4]``.
+        T_world_from_board: Pose from motion capture ``[4, 4]``; None if the board is not tracked.
         found: The pattern in the picture.
     """
 
@@ -123,7 +123,7 @@ def calibrate_mount(
     """Find the mounting pose of the camera.
 
     Args:
-        views: Moments at which everything stood still; all with a tracked board, or none.
+        views: Views while everything stood still; all with a tracked board, or none.
         camera: Calibrated lens.
         T_board_from_pattern: Pose of the print on the tracked board ``[4, 4]``, probed with a wand; None solves for it.
 

@@ -116,7 +116,7 @@ def board_pose(found: Detection, matrix: Array, distortion: Array, most_ratio: f
         found: Corners.
         matrix: Camera matrix ``[3, 3]``, pixel centres at +0.5.
         distortion: OpenCV's coefficients.
-        most_ratio: A second solution with less than 1 / ``most_ratio`` of the error of the first makes the pose ambiguous.
+        most_ratio: The pose is ambiguous where the error of the first solution is above this share of the second's.
     """
     count, turns, moves, errors = cv2.solvePnPGeneric(
         found.board_m, found.pixels, matrix, distortion, flags=cv2.SOLVEPNP_IPPE

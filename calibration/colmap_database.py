@@ -24,7 +24,7 @@ _FILE, _KEY = "database.db", "inputs.json"
 _MOST_TRIALS = 2000
 # Pairs are matched in calls of about this length, so that progress moves; each call builds its index of features again.
 _CALL_S, _FIRST_PAIRS, _MOST_PAIRS = 2.0, 8, 400
-# Raised when cameras or features are made in another way: work of before is then begun again.
+# Raised when cameras or features are made in another way: earlier work is then repeated.
 _VERSION = 2
 # Where the focal length is unknown: a phone's main camera and most others lie within a factor of two of this many image widths.
 _GUESSED_FOCAL_LENGTH = 0.9
@@ -211,7 +211,7 @@ def match(file: Path, work: Path, pairs: Sequence[tuple[str, str]], seed: int, r
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu, options.num_threads = False, threads()
     geometry, listing = pycolmap.TwoViewGeometryOptions(), pycolmap.ImportedPairingOptions()
-    # Most pairs do not overlap, and proving that takes all the trials there are; a pair that needs more is not worth them.
+    # Most pairs do not overlap, and proving that takes the full number of trials; a pair that needs more is not worth them.
     geometry.ransac.max_num_trials = _MOST_TRIALS
     listing.match_list_path = work / "pairs.txt"
     geometry.ransac.random_seed = seed

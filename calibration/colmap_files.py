@@ -44,7 +44,7 @@ def _number_first(folder: Path) -> tuple[int, str]:
 
 
 def check_binary_files(folder: Path) -> None:
-    """Refuse binary files of a model that end too early or too late; text files are not looked at.
+    """Raise for binary files of a model that end too early or too late; text files are not checked.
 
     Raises:
         ReconstructionError: A file is damaged.

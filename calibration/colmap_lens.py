@@ -1,4 +1,4 @@
-"""COLMAP's camera models in the words of the data sets: a pinhole and a lens.
+"""Converts COLMAP's camera models to a pinhole and a lens of the data sets.
 
 Pixel centres are at +0.5 in both. COLMAP defines its models in ``src/colmap/sensor/models.h``.
 """
@@ -16,7 +16,7 @@ _FISHEYE = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEY
 
 
 def lens_of(camera: Any) -> tuple[Pinhole, Lens] | None:
-    """Intrinsics of a COLMAP camera; None if no `Lens` has its model.
+    """Intrinsics of a COLMAP camera; None if its model has no `Lens`.
 
     Raises:
         ValueError: The camera's size or parameters are impossible.

@@ -24,7 +24,7 @@ def main() -> None:
         return
     root, sources, work, config = unpack_job(sys.stdin.buffer.readline())
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what libraries print must not get between the answers
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # output of libraries must not mix with the answers
 
     def say(line: bytes) -> None:
         answers.write(line)

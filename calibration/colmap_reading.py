@@ -1,4 +1,4 @@
-"""Reads the models that COLMAP wrote, with pycolmap: poses, lenses and points of photographs."""
+"""Reads COLMAP's models with pycolmap: poses, lenses and points of photographs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _MIN_TRACK = 3
 
 @dataclass(frozen=True, eq=False)
 class ColmapModel:
-    """A model as COLMAP wrote it, in COLMAP's world and unit.
+    """A COLMAP model in its own world and unit.
 
     Attributes:
         model: Images, points and cameras. Cameras that no `Lens` describes have the pinhole of their undistorted images.
@@ -123,10 +123,10 @@ def _found_camera(number: int, camera: Any, lens: tuple[Pinhole, Lens], count: i
 
 
 def _intrinsics(camera: Any, folder: Path) -> tuple[Pinhole, Lens]:
-    """Intrinsics of the images as the data set will hold them.
+    """Intrinsics of the images in the data set.
 
     Raises:
-        ReconstructionError: Nothing undistorts such a camera.
+        ReconstructionError: Images of such a camera cannot be undistorted.
     """
     import pycolmap
 

@@ -29,7 +29,7 @@ _SMOOTH = 0.002  # against a change of the curve's slope by a factor e from leve
 _MIN_COLOURS = 60
 # Every camera channel must change by this much between black and white.
 _LEAST_RANGE = 0.15
-# Share of the mixed colours that are kept out of the fit and judge it.
+# Share of the mixed colours that is held out from the fit to judge it.
 _HELD_OUT = 0.3
 # A larger error on them is refused.
 _MOST_RMSE = 0.03
@@ -69,7 +69,7 @@ class DisplayFit:
         model: The model.
         shown: Colours in 0..1 ``[N, 3]``.
         seen: Camera means in 0..1 ``[N, 3]``.
-        cos_angle: At which each was seen ``[N]``.
+        cos_angle: Cosine of the viewing angle of each ``[N]``.
         held_out: ``[N]`` bool: not fitted.
         drift: Largest change of a colour that was shown more than once.
     """

@@ -43,8 +43,8 @@ class IntrinsicsFit:
         calibration: The file.
         coverage: Corners per cell ``[rows, columns]``.
         used: ``[N]`` bool: pictures that were fitted.
-        view_rms_px: ``[N]`` reprojection error of each picture; NaN where left out.
-        errors_px: ``[M, 2]`` seen less predicted, all corners.
+        view_rms_px: ``[N]`` reprojection error of each picture; NaN for excluded ones.
+        errors_px: ``[M, 2]`` measured minus predicted positions of all corners.
     """
 
     calibration: LensCalibration

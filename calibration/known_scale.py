@@ -88,7 +88,7 @@ def fit_known_positions(model: Model, positions_m: Mapping[str, Array], ground: 
     """Place a model by the positions ``[3]`` of cameras by image name, in a world with z up.
 
     Args:
-        ground: Ground of the model, which gives up if the positions are on one line.
+        ground: Ground of the model; it determines the up direction if the positions are on one line.
 
     Raises:
         ReconstructionError: The positions do not fit the model.

@@ -97,11 +97,11 @@ def choose_lenses(
     Args:
         reconstruction: COLMAP's model, with ``FIRST_MODEL`` for cameras that are not held; changed in place.
         held: Cameras whose intrinsics are known.
-        exif_focal_px: Focal lengths that photographs name themselves, by camera [px].
+        exif_focal_px: Focal lengths from the photographs' EXIF data, by camera [px].
         report: Progress callback.
 
     Returns:
-        The choice for each camera that stays, and the reason for each image that was taken out.
+        The choice for each remaining camera, and the reason for each image that was removed.
     """
     images = _images_of(reconstruction)
     known = {number: LensChoice("OPENCV", "known, held") for number in images if number in held}
@@ -227,7 +227,7 @@ def _simplest(criteria: Mapping[str, float], images: int) -> LensChoice:
 
 
 def _set_model(camera: Any, model: str) -> None:
-    """Change a camera's model; what both models have is kept."""
+    """Change a camera's model; parameters of both models are kept."""
     import pycolmap
 
     if camera.model_name == model:

@@ -51,8 +51,8 @@ class TimeOffsetCalibration(Calibration):
     """Delay of camera stamps relative to motion-capture stamps.
 
     Attributes:
-        camera_minus_mocap_s: Camera stamp less mocap stamp of the same instant [s]; what ``latency_s`` of the camera takes off.
-        stddev_s: Standard deviation of that by the residuals [s].
+        camera_minus_mocap_s: Camera stamp less mocap stamp of the same instant [s]; the camera's ``latency_s`` subtracts it.
+        stddev_s: Standard deviation of the offset from the residuals [s].
     """
 
     kind: Literal["time_offset"] = "time_offset"
@@ -61,7 +61,7 @@ class TimeOffsetCalibration(Calibration):
 
 
 def rows_of(T: Array) -> tuple[Row4, Row4, Row4, Row4]:
-    """A transform ``[4, 4]`` as a file holds it, its rotation made orthogonal to the last bit that matters."""
+    """A transform ``[4, 4]`` from a file's rows, with an orthogonal rotation."""
     u, _, vt = np.linalg.svd(T[:3, :3])
     clean = np.eye(4)
     clean[:3, :3], clean[:3, 3] = u @ vt, T[:3, 3]

@@ -38,7 +38,7 @@ class SceneFit:
     Attributes:
         alignment: Similarity, inliers and residuals of all cameras.
         names: Names of the cameras, in the order of the residuals.
-        held_out_m: Distance of each inlier from where the similarity of the others puts it ``[I]`` [m].
+        held_out_m: Distance of each inlier from its place by the similarity of the others ``[I]`` [m].
         held_out_rad: Angle of the same ``[I]`` [rad].
         T_world_from_camera: Motion-capture poses ``[N, 4, 4]``.
         placed: The scene's poses in the world ``[N, 4, 4]``.
@@ -114,7 +114,7 @@ def _align(source: Array, target: Array, share: float) -> Alignment:
 
 
 def _held_out(source: Array, target: Array) -> tuple[Array, Array]:
-    """Errors of each camera under the similarity of the others, in blocks of neighbours: next-door frames know too much."""
+    """Errors of each camera under the similarity of the others, in blocks of neighbours, as adjacent frames are not independent."""
     fold = np.arange(len(source)) * _FOLDS // len(source)
     far, angle = np.empty(len(source)), np.empty(len(source))
     for k in range(_FOLDS):

@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 from advnerf_core.geometry import Array, invert_transform, make_transform
 from calibration.charuco import Detection
 
-# How well a corner is found, per axis [px].
+# Standard deviation of a corner's position, per axis [px].
 _CORNER_STDDEV_PX = 0.15
-# How well motion capture places a body, per axis [m].
+# Standard deviation of a body's position from motion capture, per axis [m].
 _MOCAP_STDDEV_M = 0.0005
-# How well it turns it, per axis [rad].
+# Standard deviation of its rotation, per axis [rad].
 _MOCAP_STDDEV_RAD = 0.001
 
 
@@ -50,7 +50,7 @@ class MountProblem:
 
         size = 6 if self._known is not None else 12
         found = least_squares(residuals, np.zeros(size), x_scale="jac")
-        # Scaled by what is left over, so that a larger noise than stated is not hidden.
+        # Scaled by the residuals, so that a larger noise than stated is not hidden.
         scale = 2.0 * found.cost / (len(found.fun) - size)
         covariance = np.linalg.pinv(found.jac.T @ found.jac) * max(scale, 1.0)
         turn, move = (np.sqrt(np.linalg.eigvalsh(covariance[a : a + 3, a : a + 3])[-1]) for a in (0, 3))

@@ -24,13 +24,13 @@ _SMOOTH_M = 0.30  # over which the heading is taken: a tracked point's noise of 
 _STRAIGHT_1PM = 0.1  # a radius over 10 m is a line
 _CUT_PRICE_RAD2 = 0.02
 _SHORTEST_PIECE_M = 0.20
-_MEAN_PIECE_M = 0.5  # of more pieces than that a trace is noise, not a track
+_MEAN_PIECE_M = 0.5  # shorter pieces on average mean noise, not a track
 _LEAST_LENGTH_M = 1.0
 _CLOSING_WEIGHT = 100.0
 _POINTS = 600
-# How near to its start a loop comes again [m].
+# Distance from its start at which a loop counts as closed [m].
 _CLOSING_M = 0.3
-# A fit that leaves more is no fit [m].
+# A fit with a larger error is rejected [m].
 _WORST_RMS_M = 0.05
 
 
@@ -42,7 +42,7 @@ class PathFit:
         path: Lines and arcs.
         trace: Points that it was fitted to ``[N, 2]`` [m].
         residuals_m: Signed distance of each from the path ``[N]`` [m].
-        laps: Laps that the trace made; 1 on an open path.
+        laps: Number of laps of the trace; 1 on an open path.
     """
 
     path: Path
@@ -66,10 +66,10 @@ def fit_path(trace: ArrayLike, closed: bool | None = None) -> PathFit:
 
     Args:
         trace: Positions in the order of time ``[N, 2]`` [m]; standing still does no harm, a loop may be driven several times.
-        closed: Whether the path is a loop; None looks whether the trace comes back to its start.
+        closed: Whether the path is a loop; None detects whether the trace returns to its start.
 
     Raises:
-        DegenerateDataError: The trace is too short, does not close where it should, or is not made of lines and arcs.
+        DegenerateDataError: The trace is too short, does not close as requested, or is not made of lines and arcs.
     """
     points = _thinned(np.asarray(trace, dtype=np.float64))
     lap_ends = _returns(points, _CLOSING_M)

@@ -64,12 +64,12 @@ def place_in_mocap(
 
     Args:
         model: Images of the phone and of the car.
-        T_world_from_camera: Motion-capture pose ``[4, 4]`` of every frame of the car, by the name it has in the model.
-        tolerance_m: Farthest that a frame in the right place is from its motion-capture pose [m].
+        T_world_from_camera: Motion-capture pose ``[4, 4]`` of every frame of the car, by its name in the model.
+        tolerance_m: Largest distance of a correctly placed frame from its motion-capture pose [m].
 
     Raises:
         ReconstructionError: Too few of the car's frames are in the model.
-        SimilarityError: Their poses fix no similarity: on one line, or too few agree.
+        SimilarityError: Their poses determine no similarity: on one line, or too few agree.
     """
     shared = [image for image in model.images if image.name in T_world_from_camera]
     if len(shared) < _MIN_SHARED:

@@ -23,7 +23,7 @@ class ReconstructionError(AdvnerfError):
 
 @dataclass(frozen=True)
 class PhotoSource:
-    """Photographs that come from one place: a folder, a video, or a camera with known intrinsics.
+    """Photographs from one source: a folder, a video, or a camera with known intrinsics.
 
     Sources with the same ``camera_id`` share a camera. A source holds several cameras if its images differ in size, or if their
     EXIF data name another camera or focal length.
@@ -59,8 +59,8 @@ class SfmConfig:
         max_features: Most local features of an image.
         peak_threshold: Contrast below which a spot is no feature; lower finds more in smooth rooms.
         all_pairs_up_to: Number of images up to which all pairs are matched. With more, neighbours and similar images are matched.
-        overlap: Followers of an image in its video that it is matched with.
-        look_alikes: Images that look like it that each is matched with.
+        overlap: Number of following images in its video that an image is matched with.
+        look_alikes: Number of similar images that each is matched with.
         min_registered_share: With fewer registered images than this share the result is rejected.
         seed: Seed of all randomness.
     """
@@ -118,7 +118,7 @@ class FoundCamera:
     focal_error_percent: float | None
 
     def summary(self) -> dict[str, Any]:
-        """The camera as the report of an import lists it."""
+        """The camera in the form of an import report."""
         p = self.pinhole
         return {
             "model": self.model,
@@ -179,7 +179,7 @@ class Model(PlainData):
         return np.stack([image.T_world_from_camera for image in self.images])
 
     def summary(self) -> dict[str, Any]:
-        """The model as the report of an import lists it."""
+        """The model in the form of an import report."""
         return {
             "registered": len(self.images),
             "left_out": [asdict(image) for image in self.left_out],

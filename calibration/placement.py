@@ -33,7 +33,7 @@ class Misplacement:
 
     @property
     def distance_m(self) -> float:
-        """Length of the way to its place [m]."""
+        """Distance to its place [m]."""
         return float(np.sqrt(self.right_m**2 + self.up_m**2 + self.near_m**2))
 
     @property

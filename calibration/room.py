@@ -1,6 +1,6 @@
 """Measures the room with motion capture: the fence from a walk, the start before a corner, and the corners of a target.
 
-Everything is measured with what a lab has anyway: the car driven by hand, or a wand whose tip is known.
+It uses equipment that a lab has anyway: the car driven by hand, or a wand with a known tip.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def fence_from_trace(trace: ArrayLike, margin_m: float) -> tuple[tuple[float, fl
 
 
 def fence_around(path: Path, margin_m: float) -> tuple[tuple[float, float], ...]:
-    """Polygon ``[n][2]`` [m] a margin outside of a path; the inside of a loop belongs to it."""
+    """Polygon ``[n][2]`` [m] a margin outside of a path; for a loop its inside is included."""
     xy = path.pose_at(np.linspace(0.0, path.length_m, 1000))[:, :2]
     canvas, origin = _canvas(xy, margin_m + 0.2)
     pixels = _to_pixels(xy, origin)
@@ -60,7 +60,7 @@ def fence_around(path: Path, margin_m: float) -> tuple[tuple[float, float], ...]
 
 
 def clearance(path: Path, fence: ArrayLike) -> float:
-    """Least distance of a path to the inside of a fence [m]; negative where it leaves it."""
+    """Smallest distance of a path to the inside of a fence [m]; negative if it leaves it."""
     polygon = np.asarray(fence, np.float32)[:, None]
     points = path.pose_at(np.linspace(0.0, path.length_m, 1000))[:, :2].astype(np.float32)
     return min(cv2.pointPolygonTest(polygon, (float(x), float(y)), True) for x, y in points)
@@ -172,7 +172,7 @@ def find_touches(
 def target_of_touches(subject: str, touches: Touches) -> TargetCalibration:
     """A target from its four corners, touched in the order top left, top right, bottom right, bottom left.
 
-    The corners become the nearest rectangle; how far they were from it is written down.
+    The corners become the nearest rectangle; their distance from it is recorded.
 
     Raises:
         DegenerateDataError: Not four touches, or no rectangle in that order.

@@ -144,11 +144,11 @@ class ResponseSection(StrictModel):
     """Delay and lag of the car.
 
     Attributes:
-        pipeline_delay_s: From the capture of an image to the command written for it, in the mean [s].
-        steering_delay_s: From the written command until the wheels begin to move [s].
+        pipeline_delay_s: Mean time from the capture of an image to the command written for it [s].
+        steering_delay_s: Time from the written command until the wheels begin to move [s].
         steering_lag_s: Time constant of the wheel angle [s].
         steering_slew_radps: Greatest rate of the wheel angle [rad/s]; None if the commands never reached it.
-        speed_delay_s: From the written command until the speed begins to change [s].
+        speed_delay_s: Time from the written command until the speed begins to change [s].
         speed_lag_s: Time constant of the speed [s].
     """
 
@@ -177,7 +177,7 @@ class VehicleCalibration(Calibration):
 
     Attributes:
         wheelbase_m: Distance between the axles [m].
-        gains: From speed and steering to the motor controller.
+        gains: Conversion of speed and steering to the motor controller's units.
         limits: Limits of the sent commands.
         response: Delay and lag; None if they were not measured.
     """
@@ -190,18 +190,18 @@ class VehicleCalibration(Calibration):
 
     @model_validator(mode="after")
     def _possible(self) -> VehicleCalibration:
-        # The driver's own classes check what makes sense.
+        # The driver's own classes check plausibility.
         _ = self.vehicle_gains, self.drive_limits
         return self
 
     @property
     def vehicle_gains(self) -> VehicleGains:
-        """For the driver."""
+        """Gains in the driver's class."""
         return VehicleGains(**self.gains.model_dump())
 
     @property
     def drive_limits(self) -> DriveLimits:
-        """For the driver."""
+        """Limits in the driver's class."""
         return DriveLimits(**self.limits.model_dump())
 
 
@@ -210,8 +210,8 @@ class TargetCalibration(Calibration):
 
     Attributes:
         subject: Name of the motion-capture subject it is fixed to.
-        corners_in_subject_m: The face's corners in the subject's frame, where the texture's top left, top right, bottom right and
-            bottom left go, as seen from the front [m].
+        corners_in_subject_m: The face's corners in the subject's frame, for the texture's top left, top right, bottom right and
+            bottom left, as seen from the front [m].
     """
 
     kind: Literal["target"] = "target"
@@ -278,7 +278,7 @@ C = TypeVar("C", bound=Calibration)
 
 
 def load_calibration(model: type[C], path: Path | str) -> C:
-    """Read a calibration file. Everything wrong in it is one `CalibrationError` that names the file, the lines and the keys."""
+    """Read a calibration file. All its errors are one `CalibrationError` that names the file, the lines and the keys."""
     try:
         return validate(model, read_yaml(Path(path)))
     except MissingFileError:
@@ -288,7 +288,7 @@ def load_calibration(model: type[C], path: Path | str) -> C:
 
 
 def parse_calibration(model: type[C], text: str, source: str) -> C:
-    """The same from text; messages call it ``source``."""
+    """The same from text; ``source`` names it in messages."""
     try:
         return validate(model, parse_yaml(text, source))
     except ConfigError as error:

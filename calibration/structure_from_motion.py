@@ -82,14 +82,14 @@ def _require_colmap() -> None:
 
 
 def _converse(process: subprocess.Popen[bytes], job: bytes, report: Report) -> Model | None:
-    """Hand over the job and follow its progress; the model, or None if the process ended before it had one."""
+    """Hand over the job and follow its progress; returns the model, or None if the process ended without one."""
     assert process.stdin is not None
     assert process.stdout is not None
     try:
         process.stdin.write(job)
         process.stdin.flush()
     except BrokenPipeError:
-        pass  # it has ended; what it wrote before, if anything, says why
+        pass  # it has ended; its earlier output, if any, has the reason
     while (line := process.stdout.readline()).endswith(b"\n"):
         answer = unpack_answer(line)
         if isinstance(answer, Model):

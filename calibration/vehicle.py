@@ -29,9 +29,9 @@ _SETTLE_S = 0.8
 _LEAST_S = 0.5
 # Longer ones are cut, so that one long circle does not count as one measurement [s].
 _LONGEST_S = 3.0
-# Servo values this near are one.
+# Servo values this near count as equal.
 _SERVO_TOLERANCE = 0.004
-# Speed commands this near are one.
+# Speed commands this near count as equal.
 _ERPM_TOLERANCE = 20.0
 # Slower segments are left out [m/s].
 _LEAST_SPEED_MPS = 0.15
@@ -52,10 +52,10 @@ class RecordedDrive:
     Attributes:
         pose_s: Stamps of the motion-capture poses, increasing ``[N]`` [s].
         poses: x [m], y [m], yaw [rad] of the car's subject, yaw unwrapped ``[N, 3]``.
-        command_s: When commands were written to the motor controller, increasing ``[M]`` [s], on the same clock.
+        command_s: Times at which commands were written to the motor controller, increasing ``[M]`` [s], on the same clock.
         servo: Servo value of each ``[M]``.
         erpm: Speed command of each ``[M]`` [electrical rpm]; NaN while braking or letting go.
-        pipeline_s: From the capture of the image behind each command to its writing ``[M]`` [s]; NaN where unknown.
+        pipeline_s: Time from the capture of the image behind each command to its writing ``[M]`` [s]; NaN if unknown.
     """
 
     pose_s: Array

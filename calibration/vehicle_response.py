@@ -24,7 +24,7 @@ from calibration.vehicle import GainsFit, RecordedDrive
 GRID_S, WINDOW = 0.01, 6  # the window in steps of the grid
 _DELAYS_S = np.arange(0.0, 0.41, 0.02)
 _SLEW_RANGE = (0.3, 30.0)
-# A stop is not first order: what follows it counts again after this.
+# A stop is not first order: the following motion counts again after this time.
 _AFTER_STOP_S = 1.0
 # Fewer changes of the command are refused.
 _MIN_CHANGES = 6
@@ -41,7 +41,7 @@ class Followed:
     """One channel's fit.
 
     Attributes:
-        delay_s: From the written command until something moves [s].
+        delay_s: Time from the written command until the motion begins [s].
         lag_s: Time constant [s].
         slew: Greatest rate [units/s]; None if nothing reached it.
         delay_stddev_s: Standard deviation of the delay [s].
@@ -120,14 +120,14 @@ def follow(command_s: Array, target: Array, at_s: Array, lag_s: float, slew: flo
     """A first-order lag with a limited rate behind commands that are held until the next.
 
     Args:
-        command_s: When each takes effect, increasing ``[M]`` [s].
+        command_s: Time at which each takes effect, increasing ``[M]`` [s].
         target: The commands ``[M]``; before the first, it stands at the first.
-        at_s: When to look ``[K]`` [s].
+        at_s: Times of the result ``[K]`` [s].
         lag_s: Time constant, > 0 [s].
         slew: Greatest rate [units/s].
 
     Returns:
-        ``[K]``.
+        Response ``[K]`` at these times.
     """
     at_command = np.empty(len(target))
     value = float(target[0])
@@ -200,7 +200,7 @@ def _require_changes(values: Array, least: float, needed: int, what: str, unit: 
 
 
 def _motion(drive: RecordedDrive, gains: GainsFit, grid: Array) -> tuple[Array, Array]:
-    """Yaw and way of the rear axle on the grid ``[K]``."""
+    """Yaw and distance of the rear axle on the grid ``[K]``."""
     yaw = np.interp(grid, drive.pose_s, drive.poses[:, 2])
     c, s = np.cos(yaw), np.sin(yaw)
     x = np.interp(grid, drive.pose_s, drive.poses[:, 0]) - gains.origin_ahead_m * c

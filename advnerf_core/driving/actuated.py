@@ -1,8 +1,8 @@
-"""A bicycle whose wheels obey late and slowly: control delay, first-order servo lag and a limited steering rate.
+"""A bicycle with slow, delayed steering: control delay, first-order servo lag and a limited steering rate.
 
 The state is ``x, y, yaw, wheel angle, c_1 .. c_m``: the last ``m`` commands, youngest first, where ``m`` is the delay in ticks rounded
-up. A delay of ``(k + f)`` ticks lets command ``c_{k+1}`` rule the first share ``f`` of a tick and ``c_k`` the rest (``c_0`` is the
-control given now). While a command ``c`` rules, the wheel angle ``d`` follows ``dd/dt = clip((c - d) / lag, -slew, slew)``, which has
+up. A delay of ``(k + f)`` ticks lets command ``c_{k+1}`` act for the first share ``f`` of a tick and ``c_k`` for the rest (``c_0`` is the
+current control). While a command ``c`` acts, the wheel angle ``d`` follows ``dd/dt = clip((c - d) / lag, -slew, slew)``, which has
 a closed form: with the error ``a = |d - c|`` the wheels move at the limit until ``a = slew * lag``, then the error decays
 exponentially. Each part of the tick is driven as an arc with the mean wheel angle of that part.
 
@@ -37,13 +37,13 @@ class ActuatedAckermann:
     """Kinematic bicycle at the rear axle with constant speed behind a late, slow servo; see the module's docstring.
 
     The control is the commanded steering angle [rad], left positive. Commands beyond the limits are clamped when they are given,
-    with zero derivative there. Past commands before the start are what the start state says; zero is straight ahead.
+    with zero derivative there. Past commands before the start come from the start state; zero is straight ahead.
 
     Attributes:
         wheelbase_m: Distance between the axles [m].
         speed_mps: Forward speed [m/s].
         dt_s: Length of one tick [s].
-        delay_s: From the control to the servo, whole ticks and a fraction [s].
+        delay_s: Delay from the control to the servo, whole ticks and a fraction [s].
         lag_s: Time constant of the servo [s]; 0 follows at once.
         slew_radps: Fastest change of the wheel angle [rad/s]; None has no limit.
         steering_limits_rad: Rightmost and leftmost steering angle [rad].
@@ -67,7 +67,7 @@ class ActuatedAckermann:
 
     @property
     def state_size(self) -> int:
-        """Four (x, y, yaw, wheel angle) and the past commands that are still to come."""
+        """Number of states: four (x, y, yaw, wheel angle) and the past commands that have not acted yet."""
         whole, fraction = self._delay()
         return _PAST + whole + (fraction > 0.0)
 
@@ -127,7 +127,7 @@ class ActuatedAckermann:
         return [(whole + 1, fraction * self.dt_s), (whole, (1.0 - fraction) * self.dt_s)]
 
     def _commands(self, states: Tensor, controls: Tensor) -> Tensor:
-        """Commands ``[B, m + 1]`` by age, the present one first."""
+        """Commands ``[B, m + 1]`` by age, the current one first."""
         return torch.cat([controls.clamp(*self.steering_limits_rad)[:, None], states[:, _PAST:]], dim=1)
 
     def _yaw_rate(self, wheel: Tensor) -> Tensor:
@@ -136,7 +136,7 @@ class ActuatedAckermann:
     def _follow(
         self, wheel: Tensor, command: Tensor, duration_s: float
     ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
-        """The wheel angle under a constant command.
+        """Response of the wheel angle to a constant command.
 
         Returns:
             Its mean over the duration, its end, and the derivatives of both with respect to the first wheel angle (those with

@@ -1,4 +1,4 @@
-"""The drive of a policy without an attack, which every result of an attack is read against. No torch here: attack files hold it."""
+"""The drive of a policy without an attack, the baseline of every result. No torch here, as attack files contain it."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class CleanDrive(PlainData):
 
     @classmethod
     def of(cls, metrics: Sequence[DriveMetrics], horizon: Horizon) -> CleanDrive:
-        """From the metrics of each drive and what they were taken over."""
+        """Summarise the metrics of each drive over a horizon."""
         return cls(
             tuple(each.total_cte_m for each in metrics),
             tuple(each.mean_cte_m for each in metrics),
@@ -56,12 +56,12 @@ class CleanDrive(PlainData):
 
     @property
     def mean_total_cte_m(self) -> float:
-        """Total CTE, averaged over the starts [m]: what an attack's total is compared with."""
+        """Total CTE, averaged over the starts [m]: the baseline of an attack's total."""
         return float(np.mean(self.total_cte_m))
 
     @property
     def drives(self) -> bool:
-        """Whether the policy drives at all: the rule of `advnerf_core.driving.metrics.drives` over all starts."""
+        """Whether the policy drives at all, by `advnerf_core.driving.metrics.drives` over all starts."""
         return drives(float(np.mean(self.mean_cte_m)), any(self.off_track), self.off_track_m)
 
     @property
@@ -79,7 +79,7 @@ class CleanDrive(PlainData):
 
     @property
     def warning(self) -> str:
-        """Why this is no drive and what to do; empty if it is one."""
+        """Why the policy does not drive, and what to do; empty if it drives."""
         if self.drives:
             return ""
         left = sum(self.off_track)

@@ -53,7 +53,7 @@ class Dubins:
 
     @property
     def state_size(self) -> int:
-        """Three: x, y, yaw."""
+        """Number of states: x, y, yaw."""
         return 3
 
     def step(self, states: Tensor, controls: Tensor) -> Tensor:
@@ -92,7 +92,7 @@ class Ackermann:
 
     @property
     def state_size(self) -> int:
-        """Three: x, y, yaw."""
+        """Number of states: x, y, yaw."""
         return 3
 
     def step(self, states: Tensor, controls: Tensor) -> Tensor:
@@ -139,7 +139,7 @@ class AckermannServoLag:
 
     @property
     def state_size(self) -> int:
-        """Four: x, y, yaw, steering."""
+        """Number of states: x, y, yaw, steering."""
         return 4
 
     def step(self, states: Tensor, controls: Tensor) -> Tensor:
@@ -172,7 +172,7 @@ class AckermannServoLag:
         return df_dx, df_du * inside[:, None]
 
     def _remaining(self) -> tuple[float, float]:
-        """Share of the initial steering error that is left at the end of a tick, and on average over it."""
+        """Share of the initial steering error that remains at the end of a tick, and on average over it."""
         decay = exp(-self.dt_s / self.lag_s)
         return decay, (1.0 - decay) * self.lag_s / self.dt_s
 

@@ -1,4 +1,4 @@
-"""The teacher: follows the reference path with ground-truth state. Knows nothing of images; needs no torch."""
+"""The teacher: follows the reference path with ground-truth state. It uses no images and needs no torch."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ class ExpertConfig:
     Attributes:
         wheelbase_m: Distance between the axles [m].
         speed_mps: Speed at which it drives [m/s].
-        delay_s: From seeing to wheels that have turned: half a control tick, computing, command delay and servo lag [s].
+        delay_s: Delay from image to turned wheels: half a control tick, computing, command delay and servo lag [s].
         stiffness_1pm: Natural frequency of the return to the path, per metre driven [1/m]. A steering error that is worth a
-            curvature ``k`` costs ``k / stiffness^2`` of offset, so this decides how much a fooled policy can be led astray.
+            curvature ``k`` costs ``k / stiffness^2`` of offset, so this decides how far a fooled policy can be diverted.
         damping: Damping ratio of that return.
-        max_approach_rad: The path is never approached more steeply than this [rad].
+        max_approach_rad: Largest angle of approach to the path [rad].
         feed_forward: Share of the path's curvature that is steered ahead, 0..1. At 0 it is the plain PD law on the tracked pose,
             which runs wide in corners by ``curvature / stiffness^2``; at 1 it holds them.
         smoothing_m: Path curvature is averaged over this length, so that the steering is continuous in the state [m].
@@ -65,9 +65,9 @@ class Expert:
 
     With lateral error ``e`` and heading error ``p``, per metre driven ``e' = sin p`` and ``p' = k - k_path``. The law
     ``k = k_path - 2 z w p - w^2 e`` gives a return of natural frequency ``w`` and damping ``z``; for large ``e`` the wanted
-    heading saturates at ``max_approach_rad``. Errors and path curvature are taken where the car will be after the delay.
+    heading saturates at ``max_approach_rad``. Errors and path curvature are taken at the car's predicted position after the delay.
 
-    The steering is a continuous function of the pose alone, so that an image can tell it.
+    The steering is a continuous function of the pose alone, so that a policy can infer it from an image.
 
     Args:
         path: Reference path.

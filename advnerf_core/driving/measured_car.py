@@ -1,7 +1,7 @@
-"""The deployed car as its drives without attack show it: speed, steering gain and offset, delay and lag. For predictions; it has no Jacobians.
+"""The deployed car's measured response from its drives without attack: speed, steering gain and offset, delay and lag. For predictions; it has no Jacobians.
 
-During a tick of length T the command c' of the tick before is still in force for the delay d; then c = gain * control + offset. The
-control that acts follows it with a first-order lag tau: u(t) = c + (u(0) - c) exp(-t / tau). The car drives the tick with the mean of u.
+During a tick of length T the last tick's command c' stays active for the delay d; then c = gain * control + offset. The
+acting control follows it with a first-order lag tau: u(t) = c + (u(0) - c) exp(-t / tau). The car drives the tick with the mean of u.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from advnerf_core.driving.dynamics import Ackermann, Dubins
 from advnerf_core.geometry import Array
 
 _LONGEST_LAG_S, _SHORTEST_LAG_S = 1.0, 1e-4
-# A drive that hardly steers says little of the gain: it is then near one, and the offset near zero (standard deviations; of the limit).
+# A drive that hardly steers does not determine the gain: it is then near one, and the offset near zero (standard deviations; of the limit).
 _GAIN_SIGMA, _OFFSET_SIGMA, _YAW_SIGMA_RAD = 0.2, 0.05, 1e-3
 _LAGS_S = (0.02, 0.15, 0.4)
 _POSE, _ACTING, _BEFORE = 3, 3, 4

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from advnerf_core.driving.path import Array, Path
 
-# The protocol's rule of what drives without an attack, in metres: the car never leaves the track, and its mean |CTE| is at most
+# The protocol's rule for driving without an attack, in metres: the car never leaves the track, and its mean |CTE| is at most
 # this share of the off-track limit: 0.08 m in the lab, where the limit is 0.4 m.
 MEAN_CTE_SHARE = 0.2
 _STILL_M, _STILL_TICKS = 0.005, 3
@@ -28,7 +28,7 @@ def mean_cte_limit_m(off_track_m: float = LAB_OFF_TRACK_M) -> float:
 
 
 def drives(mean_cte_m: float, off_track: bool, off_track_m: float = LAB_OFF_TRACK_M) -> bool:
-    """Whether a policy drives: it never left the track, and stayed near its path in the mean.
+    """Whether a policy drives: it never left the track, and stayed near its path on average.
 
     Args:
         mean_cte_m: Mean |CTE| over all drives [m].

@@ -13,7 +13,7 @@ from advnerf_core.geometry import wrap_angle
 
 Array = NDArray[np.float64]
 
-# A closed path must come back to its start this well [m and rad].
+# A closed path must return to its start with this accuracy [m and rad].
 CLOSURE_TOLERANCE = 1e-6
 
 
@@ -33,7 +33,7 @@ class Line:
 
     @property
     def curvature_1pm(self) -> float:
-        """Zero."""
+        """Curvature of a line: zero."""
         return 0.0
 
 
@@ -158,7 +158,7 @@ class Path:
         return self._describe(xy, best_s)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data from which :meth:`from_dict` makes the same path."""
+        """Plain data from which :meth:`from_dict` rebuilds the path."""
         pieces = [
             {"line_m": piece.length_m}
             if isinstance(piece, Line)

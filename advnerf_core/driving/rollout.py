@@ -65,11 +65,11 @@ def drive(
 
 
 class Remembering:
-    """A policy with memory as a drive sees it.
+    """A policy with memory during a drive.
 
     Args:
         policy: Called as ``policy(images, goals, memory) -> (steering, memory)``; it has ``initial_memory(batch)``.
-        keep: Whether every memory that it had is kept in ``memories``, which a gradient needs, or the last one. Past images are large.
+        keep: Whether to keep all memories in ``memories``, which a gradient needs, instead of the last one. Past images are large.
     """
 
     stateless = True
@@ -94,7 +94,7 @@ class Remembering:
 
 
 def _steer(policy: Policy, images: Tensor, goals: Tensor | None) -> Tensor:
-    """The policy's controls; of few images on one of torch's threads, with the same bits."""
+    """The policy's controls; few images run on a single torch thread, with the same bits."""
     threads = torch.get_num_threads()
     if len(images) > _FEW_IMAGES:
         return policy(images, goals)

@@ -68,7 +68,7 @@ class Solids:
 
 
 def _turned(points: Tensor, angle: Tensor) -> Tensor:
-    """Points ``[..., 2]`` turned by angles ``[...]``, left positive."""
+    """Points ``[..., 2]`` rotated by angles ``[...]``, left positive."""
     c, s, x, y = angle.cos(), angle.sin(), points[..., 0], points[..., 1]
     return torch.stack([c * x - s * y, s * x + c * y], dim=-1)
 

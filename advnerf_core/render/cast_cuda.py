@@ -33,7 +33,7 @@ from advnerf_core.render.cast_cuda_kernels import (
 from advnerf_core.render.cast_object import prepared, windows
 from advnerf_core.render.cuda_launch import cuda_device, launch
 
-# Whole numbers of 64 bits hold the sum of all pixels' slopes with a bit to spare.
+# 64-bit whole numbers hold the sum of all pixels' slopes with a bit to spare.
 _SUM_BITS = 62
 
 
@@ -53,17 +53,17 @@ def check_drawable(objects: Sequence[ColouredObject]) -> list[VoxelGridObject]:
 
 
 class CudaObjects:
-    """Objects that stand where they stand.
+    """Objects at fixed places.
 
     Args:
         objects: At least one, at most `MOST_OBJECTS`, all voxel grids.
         pinhole: Camera of all images.
         supersample: Rays along each side of a pixel.
         dtype: Type of densities and images; geometry is float64 in any case.
-        tolerance_m: By how much an object may be behind the background and still be seen [m].
+        tolerance_m: Distance behind the background at which an object is still visible [m].
 
     Raises:
-        DeviceError: No device; and see `check_drawable`.
+        DeviceError: No device is available; and see `check_drawable`.
     """
 
     def __init__(
@@ -131,14 +131,14 @@ class CudaObjects:
         behind_m: Tensor,
         image: Tensor,
     ) -> Tensor:
-        """Draw into ``image [B, 3, H, W]``, a background of planar depth ``behind_m [B, H, W]``; gives the ``shares`` of `draw_objects`.
+        """Draw into ``image [B, 3, H, W]``, a background of planar depth ``behind_m [B, H, W]``; returns the ``shares`` of `draw_objects`.
 
         Args:
             places: From `placed`.
             colours: All objects' colour vectors in their order, for each texture ``[N, V, 3]``.
             texture_of: Index of each image's texture ``[B]`` int32.
             behind_m: Planar depth of the background ``[B, H, W]`` [m].
-            image: Drawn into.
+            image: Background, which is drawn into.
         """
         shares = torch.empty((len(self.objects), *behind_m.shape), dtype=self.dtype, device=self.device)
         nothing = torch.zeros((0, 3), dtype=torch.int64, device=self.device)
@@ -154,9 +154,9 @@ class CudaObjects:
         shares: Tensor,
         slopes: Tensor,
     ) -> Tensor:
-        """Gradient with respect to ``colours [N, V, 3]`` of one with respect to the images ``[B, 3, H, W]``; the same bits every time."""
+        """Gradient with respect to ``colours [N, V, 3]`` from one with respect to the images ``[B, 3, H, W]``; the same bits every time."""
         largest = slopes.abs().max().double()
-        slopes = slopes.nan_to_num(0.0, 0.0, 0.0).contiguous()  # whole numbers know no NaN: the end says it
+        slopes = slopes.nan_to_num(0.0, 0.0, 0.0).contiguous()  # NaN is restored at the end
         pixels = slopes.numel() // 3
         # No sum over all pixels reaches the largest whole number, as a pixel's weights sum to at most one.
         scale = (2.0 ** (_SUM_BITS - pixels.bit_length()) / largest.clamp(1e-200, 1e200)).reshape(1)

@@ -1,9 +1,9 @@
 """CUDA kernels that draw voxel-grid objects before a background, and pull slopes of images back to the objects' colours.
 
-One thread for each pixel marches its rays through all objects, exactly as ``cast_kernels`` does on the processor. A device has arithmetic to
-spare and little memory next to it, so no weights are kept: the gradient marches the same rays again.
+One thread for each pixel marches its rays through all objects, exactly as ``cast_kernels`` does on the CPU. A GPU has arithmetic to
+spare and little fast memory, so no weights are kept: the gradient marches the same rays again.
 
-Sums of slopes are of whole numbers, whose order does not matter: threads add in any order, and the gradient has the same bits every time.
+Sums of slopes use whole numbers, whose order does not matter: threads add in any order, and the gradient has the same bits every time.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The CPU kernel that casts a voxel-grid object into a window of pixels.
 
 Rays run in voxel coordinates: voxel ``i`` of an axis has its value at ``i``, the box reaches from ``-0.5`` to ``n - 0.5``. Samples lie
-evenly between where a ray enters and leaves the box. Those in empty cells are leapt over, several at a time: a table says for
-each cell how far around it all cells are empty, so what is skipped is exactly what would have added nothing.
+evenly between entry and exit of the ray. Those in empty cells are leapt over, several at a time: a table gives for
+each cell the distance within which all cells are empty, so skipped samples are exactly those without contribution.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from numba import njit
 
 from advnerf_core.parallel import KERNEL_OPTIONS
 
-NEAR_M = 0.02  # closer than this to the camera nothing is drawn
-# A ray ends where less than a quarter of an 8-bit step of light is left; its last sample takes the rest.
+NEAR_M = 0.02  # anything closer to the camera is not drawn
+# A ray ends when less than a quarter of an 8-bit step of light remains; its last sample takes the rest.
 LEAST_TRANSMITTANCE = 1e-3
 # Progress of a cast: next pixel of the window, covered pixels, weights written.
 NEXT, FOUND, FILLED = 0, 1, 2
@@ -55,7 +55,7 @@ def cell_of(position: float, count: int) -> int:
 
 @njit(**KERNEL_OPTIONS)
 def steps_to_leap(position: float, stride: float, cell: int, clear: int) -> int:
-    """Samples from ``position`` on, itself included, that surely stay within ``clear`` cells of ``cell``."""
+    """Number of samples from ``position`` on, itself included, that surely stay within ``clear`` cells of ``cell``."""
     if stride > 0.0:
         return int(min((cell + clear - position) / stride - _ROUNDING, 1e9)) + 1
     if stride < 0.0:
@@ -71,7 +71,7 @@ def share_of(position: float, first: int, count: int) -> float:
 
 @njit(**KERNEL_OPTIONS)
 def box_windows(T: Any, box: Any, intrinsics: Any, width: int, height: int) -> Any:
-    """Pixels ``[B, 4]`` (first row, end row, first column, end column) that surely hold a box.
+    """Pixels ``[B, 4]`` (first row, end row, first column, end column) that surely contain a box.
 
     Args:
         T: Box to camera ``[B, 4, 4]``; one that is not finite sees nothing.
@@ -110,12 +110,12 @@ def box_windows(T: Any, box: Any, intrinsics: Any, width: int, height: int) -> A
 def reach_of_bricks(
     C: Any, o: Any, bricks: Any, window: Any, intrinsics: Any, nearest_m: Any, furthest_m: Any
 ) -> None:
-    """Between which planar depths the rays of each pixel may meet something; where nearest > furthest, they meet nothing.
+    """Planar depths between which the rays of each pixel may meet the object; where nearest > furthest, they do not.
 
     Args:
         C: Voxel coordinates to the camera ``[3, 3]``, the inverse of ``R`` in `cast_window`.
         o: Camera centre in voxel coordinates ``[3]``.
-        bricks: Boxes in voxel coordinates that hold the object ``[N, 2, 3]``.
+        bricks: Boxes in voxel coordinates that contain the object ``[N, 2, 3]``.
         window: First row, end row, first column, end column ``[4]``.
         intrinsics: ``fx, fy, cx, cy`` ``[4]``.
         nearest_m: ``[rows, columns]`` of the window, infinite; lowered.
@@ -154,12 +154,12 @@ def _set_out(R: Any, o: Any, edges: Any, sizes: Any, aims: Any, count: int, soli
         o: ``[3]``.
         edges: ``[3]``.
         sizes: Voxels along each axis.
-        aims: ``x`` and ``y`` of each ray at unit depth, and between which depths it may meet something ``[4, N]``.
+        aims: ``x`` and ``y`` of each ray at unit depth, and its range of depths that may meet the object ``[4, N]``.
         solid: One sample where the ray enters.
         one_sided: Only rays through the ``+x`` face count.
         step: Object units between samples.
         rays: ``[9, N]``, written.
-        spans: First sample worth a look, and one past the last, ``[2, N]``; written.
+        spans: First relevant sample, and one past the last, ``[2, N]``; written.
     """
     # By name, so that the loop need not read them again after each write.
     xx, xy, xz = R[0, 0], R[0, 1], R[0, 2]
@@ -205,7 +205,7 @@ def _set_out(R: Any, o: Any, edges: Any, sizes: Any, aims: Any, count: int, soli
 
 @njit(**KERNEL_OPTIONS)
 def _leap(rays: Any, n: int, i: int, clear: Any) -> int:
-    """The sample of ray ``n`` to look at after sample ``i``, which is ``i`` itself where its cell is not empty."""
+    """The next relevant sample of ray ``n`` at or after sample ``i``; ``i`` itself if its cell is not empty."""
     nx, ny, nz = clear.shape[0] + 1, clear.shape[1] + 1, clear.shape[2] + 1
     x, y, z = rays[0, n] + i * rays[3, n], rays[1, n] + i * rays[4, n], rays[2, n] + i * rays[5, n]
     cx, cy, cz = cell_of(x, nx), cell_of(y, ny), cell_of(z, nz)
@@ -251,7 +251,7 @@ def _march(rays: Any, n: int, spans: Any, slots: Any, density: Any, clear: Any, 
     while i < samples:
         x, y, z = gx + i * sx, gy + i * sy, gz + i * sz
         cx, cy, cz = cell_of(x, nx), cell_of(y, ny), cell_of(z, nz)
-        # Unsigned, because numba asks of each signed index whether it counts from the end.
+        # Unsigned, because numba checks each signed index for counting from the end.
         lx, ly, lz = np.uint64(cx), np.uint64(cy), np.uint64(cz)
         if not solid and clear[lx, ly, lz] > 0:
             i = _leap(rays, n, i, clear)
@@ -288,7 +288,7 @@ def _march(rays: Any, n: int, spans: Any, slots: Any, density: Any, clear: Any, 
                 )
                 if part > 0.0:
                     slot = np.uint64(slots[hx if k & 1 else lx, hy if k & 2 else ly, hz if k & 4 else lz])
-                    # Written in any case: a processor cannot foresee whether a slot is new.
+                    # Written in any case: whether a slot is new is an unpredictable branch.
                     touched[np.uint64(count)] = slot
                     count += 1 if row[slot] == 0.0 else 0
                     row[slot] += part
@@ -303,7 +303,7 @@ def _march(rays: Any, n: int, spans: Any, slots: Any, density: Any, clear: Any, 
 def cast_window(R: Any, o: Any, edges: Any, window: Any, intrinsics: Any, nearest_m: Any, furthest_m: Any, width: int, supersample: int, slots: Any,
                 density: Any, clear: Any, solid: bool, one_sided: bool, step: float, row: Any, touched: Any,
                 progress: Any, pixels: Any, alphas: Any, depths: Any, ends: Any, indices: Any, values: Any) -> bool:  # fmt: skip
-    """Cast the rays of one window, from where ``progress`` says.
+    """Cast the rays of one window, starting at ``progress``.
 
     Args:
         R: Directions of unit planar depth in the camera to voxel coordinates ``[3, 3]``.
@@ -322,7 +322,7 @@ def cast_window(R: Any, o: Any, edges: Any, window: Any, intrinsics: Any, neares
         step: Object units between samples.
         row: Scratch ``[slots]``, zero before and after.
         touched: Scratch ``[slots + 1]``.
-        progress: ``[NEXT, FOUND, FILLED]``, kept up.
+        progress: ``[NEXT, FOUND, FILLED]``, updated.
         pixels: Flat indices ``[P]``, written.
         alphas: ``[P]``, written.
         depths: ``[P]``, written.
@@ -330,7 +330,7 @@ def cast_window(R: Any, o: Any, edges: Any, window: Any, intrinsics: Any, neares
         indices: Slots of the weights, written.
 
     Returns:
-        Whether the window is done; if not, there was no room left in ``indices`` and ``values``: give more and call again.
+        Whether the window is finished; if not, ``indices`` and ``values`` were full: enlarge them and call again.
     """
     share, sizes, per_pixel = 1.0 / (supersample * supersample), slots.shape, supersample * supersample
     down, across = window[1] - window[0], window[3] - window[2]

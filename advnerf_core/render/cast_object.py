@@ -5,7 +5,7 @@ With frozen geometry the premultiplied colour of a pixel is ``sum_k w_k c_k`` ov
 as a sparse matrix ``W [pixels, slots]``: the render is ``W c`` and its vector-Jacobian product is ``W^T g``. Nothing here is
 differentiable with respect to poses, density or camera; ``render/soft_pose`` is, with respect to poses.
 
-Several rays a pixel (``supersample``) are averaged over the pixel's area, which is what an area filter does to a finer image.
+Several rays a pixel (``supersample``) are averaged over the pixel's area, like an area filter on a finer image.
 Depth is planar z in the camera frame: rays are marched with directions of unit planar depth, so the ray parameter is z in
 metres, and extinction is integrated over length in object units.
 """
@@ -63,7 +63,7 @@ class ObjectCast:
 
 @runtime_checkable
 class CastsItself(Protocol):
-    """An object that is no voxel grid and knows how to be cast."""
+    """An object with its own casting, other than a voxel grid."""
 
     def cast(self, T_world_from_camera: Array, pinhole: Pinhole, supersample: int, dtype: Any) -> ObjectCast:
         """Cast into cameras ``[B, 4, 4]``; see :func:`cast_objects`."""
@@ -168,9 +168,9 @@ def made_opaque(cast: ObjectCast) -> ObjectCast:
 
 @dataclass(frozen=True, eq=False)
 class KernelGrids:
-    """An object as the kernel reads it.
+    """An object in the form of the kernel.
 
-    ``low`` and ``high`` bound what is not empty, in object units; ``bricks [N, 2, 3]`` are boxes in voxel coordinates that hold it.
+    ``low`` and ``high`` bound the non-empty part, in object units; ``bricks [N, 2, 3]`` are boxes in voxel coordinates that contain it.
     """
 
     slots: NDArray[np.int32]
@@ -229,7 +229,7 @@ def cells_with_density(density: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def bricks_of(filled: NDArray[np.bool_], voxels: tuple[int, ...]) -> Array:
-    """Boxes ``[N, 2, 3]`` in voxel coordinates that hold all cells that are ``filled``, a few cells along each side."""
+    """Boxes ``[N, 2, 3]`` in voxel coordinates that contain all ``filled`` cells, a few cells along each side."""
     corners = np.argwhere(filled)
     brick = np.unique(corners // _BRICK_CELLS, axis=0, return_inverse=True)[1].reshape(-1)
     count = int(brick.max()) + 1 if len(brick) else 0
@@ -280,7 +280,7 @@ class _ObjectCast:
             np.empty(area),
             np.empty(area, np.int64),
         )
-        room = area * 16 * self._supersample + 64  # what is not used is never touched
+        room = area * 16 * self._supersample + 64  # unused memory is never touched
         indices, values = np.empty(room, np.int32), np.empty(room, grids.density.dtype)
         # The kernel leaves the row as zeros.
         shape = max(0, window[1] - window[0]), max(0, window[3] - window[2])
@@ -351,7 +351,7 @@ def _bands(window: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
 
 
 def windows(field: VoxelGridObject, T_camera_from_world: Array, pinhole: Pinhole) -> NDArray[np.int64]:
-    """Pixel out ``[B, 4]`` (first row, end row, first column, end column) that surely hold the object."""
+    """Pixel ranges ``[B, 4]`` (first row, end row, first column, end column) that surely contain the object."""
     grids = prepared(field, np.float32)
     T_camera_from_object = np.ascontiguousarray(T_camera_from_world @ field.T_world_from_object)
     intrinsics = np.array([pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy])

@@ -1,7 +1,7 @@
 """Depth-ordered composition of layers: ``C = C_1 + (1 - a_1) C_2 + (1 - a_1)(1 - a_2) C_3 ...``, nearest first, per pixel.
 
 Colours are premultiplied by alpha. Depth is planar z in the camera frame [m]. Dense layers are tensors that cover all pixels;
-sparse ones, as objects are, name the pixels that they cover: the work then grows with the pixels covered, not with the layers
+sparse ones, such as objects, list the pixels that they cover: the work then grows with the covered pixels, not with the layers
 times the image.
 """
 

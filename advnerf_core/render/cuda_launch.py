@@ -1,7 +1,7 @@
-"""Running numba's CUDA kernels on torch's tensors, or in numba's simulator on a machine without a device.
+"""Runs numba's CUDA kernels on torch's tensors, or in numba's simulator on a machine without a device.
 
 With ``NUMBA_ENABLE_CUDASIM=1`` in the environment, numba runs each CUDA thread as Python code: thousands of times slower, but the same
-source line by line. That is how the kernels are tested where there is no device; tensors then stay in the memory of the processor.
+source line by line. The tests use it on machines without a device; tensors then stay on the CPU.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def cuda_device() -> torch.device:
     """Device of tensors that the kernels can read.
 
     Raises:
-        DeviceError: No device.
+        DeviceError: No device is available.
     """
     if is_simulated():
         return torch.device("cpu")
@@ -40,7 +40,7 @@ def cuda_device() -> torch.device:
 
 
 def launch(kernel: Any, threads: int, *arguments: Any) -> None:
-    """Run a kernel after what torch has queued.
+    """Run a kernel after the work that torch has queued.
 
     Args:
         kernel: Kernel of ``numba.cuda.jit``; it returns at once if ``cuda.grid(1)`` is not below ``threads``.

@@ -1,4 +1,4 @@
-"""Placing samples on batches of rays: the settings, and the packed result."""
+"""Placement of samples on batches of rays: the settings, and the packed result."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class MarchConfig:
     """Placement of samples on rays.
 
     Attributes:
-        near_m: Nothing is sampled closer to the camera [m].
+        near_m: Smallest sampled distance from the camera [m].
         smallest_step_m: Shortest sample interval [m].
-        largest_step_m: Longest sample interval [m]; in a contracted field that is the one of the inner region.
-        step_growth: Interval per metre of distance, between the two: pixels get wider with distance, so may samples.
+        largest_step_m: Longest sample interval [m]; in a contracted field the inner region's.
+        step_growth: Interval per metre of distance, between the two, because pixels get wider with distance.
         max_samples: Most samples on one ray.
     """
 
@@ -68,7 +68,7 @@ class Samples:
     """Samples packed by ray.
 
     Attributes:
-        points: ``[N, 3]`` in box coordinates, or in the cube of a contracted field: where the field is asked.
+        points: ``[N, 3]`` sample positions in box coordinates, or in the cube of a contracted field.
         t_mid_m: Ray parameters ``[N]`` [m].
         widths: Intervals ``[N]`` in box coordinates.
         begins: First sample of each ray ``[R + 1]``.
@@ -106,7 +106,7 @@ class Marcher:
     def __call__(
         self, rays: Array32, jitter: Array32, leaps: Leaps, step_scale: float = 1.0
     ) -> tuple[Samples, NDArray[np.int64]]:
-        """Samples of the rays that fit, and which rays those are ``[R']``."""
+        """Samples of the rays that fit, and the indices of these rays ``[R']``."""
         bounds = slot_bounds(len(rays), SLOTS)
         begins = [np.zeros(stop - start + 1, np.int64) for start, stop in bounds]
         fitted = [0] * SLOTS

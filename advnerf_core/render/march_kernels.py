@@ -1,7 +1,7 @@
 """CPU kernels that walk rays through a box, leap over empty space and place samples in occupied space.
 
 Rays live in box coordinates: positions are metres divided by the longest side of the box, measured from its low corner, so the box
-is ``[0, high]`` with ``max(high) = 1``; the ray parameter stays in metres. ``distance`` tells per cell how many cells one may go in any
+is ``[0, high]`` with ``max(high) = 1``; the ray parameter stays in metres. ``distance`` gives per cell the number of cells that are free in any
 direction: 0 is occupied, d > 0 means that all cells at Chebyshev distance below d are empty. With a contracted field the box is only the
 inner region: rays continue outside it, and cells and sample positions refer to the unit cube that ``contraction`` maps all space to.
 """
@@ -92,7 +92,7 @@ def march(
     distance: Array8, cells: Array32, points: Array32, t_mid: Array32, widths: Array32, begins: NDArray[np.int64],
     max_samples: int, contracted: bool = False,
 ) -> int:  # fmt: skip
-    """Place samples on rays ``first..stop`` until they are through or the room for samples is used up.
+    """Place samples on rays ``first..stop`` until they end or the room for samples is used up.
 
     Args:
         rays: ``[R, 6]`` origins and unit directions in box coordinates.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from advnerf_core.parallel import KERNEL_OPTIONS
 from advnerf_core.render.contraction import radial_stretch
 
-# Random places in each part of a cell where density is looked at.
+# Random places in each part of a cell where density is probed.
 _PROBES = 6
 
 Array32 = NDArray[np.float32]
@@ -102,7 +102,7 @@ def refine_occupied(
     least_depth: float = 0.05,
     contracted: bool = False,
 ) -> NDArray[np.bool_]:
-    """Split occupied cells and keep the parts that a ray would notice.
+    """Split occupied cells and keep the parts that affect a ray.
 
     Args:
         occupied: ``[X, Y, Z]``.

@@ -128,7 +128,7 @@ def shade_pixels(first: int, last: int, pixels: Any, R: Any, o: Any, intrinsics:
         one_sided: Only rays that come from in front (``+x``) count.
         step_m: Planar depth between samples [m].
         scale: World metres per object unit.
-        least: A ray is followed until so little light is left.
+        least: A ray is followed until less light than this remains.
         colours: Colour vector ``[rows, 3]``.
         depths: Scratch for the samples of a ray.
         taus: Scratch.

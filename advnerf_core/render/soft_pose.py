@@ -1,9 +1,9 @@
-"""Renders of voxel-grid objects that are differentiable with respect to where the objects stand: position, yaw and scale.
+"""Renders of voxel-grid objects that are differentiable with respect to their placements: position, yaw and scale.
 
 Where an object's density is soft, a picture changes smoothly as the object moves. Here rays are sampled at depths that do not depend
 on the placement, so that the sum which makes the picture is a smooth function of it, and its derivative is exact and in closed
-form (``pose_kernels``). Which samples to look at (those in cells that are not empty, until nearly no light is left) is found
-first and held. Not differentiated: which of two layers is nearer, and edges of a solid without density, which have no
+form (``pose_kernels``). The relevant samples (those in cells that are not empty, until nearly no light remains) are found
+first and held fixed. Not differentiated: the order of layers in depth, and edges of a solid without density, which have no
 derivative (``fields/soft_edges`` gives it a density).
 """
 
@@ -101,7 +101,7 @@ def soft_layer(
     supersample: int = 2,
     least_transmittance: float = LEAST_TRANSMITTANCE,
 ) -> SoftLayer:
-    """One object at a placement, as the pixels that it covers.
+    """The layer of one object at a placement, with the pixels that it covers.
 
     Args:
         field: The object; must have a density.
@@ -109,10 +109,10 @@ def soft_layer(
         colours: Colour vector of the object ``[rows, 3]`` (``VoxelGridObject.colours``).
         T_world_from_camera: ``[B, 4, 4]``.
         supersample: Rays along each side of a pixel.
-        least_transmittance: A ray is followed until so little light is left.
+        least_transmittance: A ray is followed until less light than this remains.
 
     Raises:
-        ValueError: No density, or a placement that is none.
+        ValueError: The object has no density, or the placement is invalid.
     """
     if field.density is None:
         raise ValueError(
@@ -157,10 +157,10 @@ def render_soft(
         placement: ``(x_m, y_m, yaw_rad, scale)`` ``[4]``, finite, with a positive scale.
         T_world_from_camera: ``[B, 4, 4]``.
         supersample: Rays along each side of a pixel.
-        least_transmittance: A ray is followed until so little light is left.
+        least_transmittance: A ray is followed until less light than this remains.
 
     Returns:
-        Premultiplied colours ``[B, H, W, 3]``, alpha ``[B, H, W]`` and planar depth ``[B, H, W]`` [m] (infinite where nothing is),
+        Premultiplied colours ``[B, H, W, 3]``, alpha ``[B, H, W]`` and planar depth ``[B, H, W]`` [m] (infinite for empty pixels),
         all float64; depth has no history.
     """
     settings = (field, T_world_from_camera, pinhole, supersample, least_transmittance)

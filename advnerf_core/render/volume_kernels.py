@@ -36,7 +36,7 @@ def mark_visible(
     least: np.float32,
     keep: NDArray[np.bool_],
 ) -> None:
-    """Mark the samples of rays ``first..stop`` that show in the image.
+    """Mark the samples of rays ``first..stop`` that are visible in the image.
 
     Args:
         log_density: Tiles ``[tiles, >= 1, TILE]``, channel 0.

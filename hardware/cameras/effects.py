@@ -1,7 +1,7 @@
 """Imperfections of a real camera: lens, moving exposure, noise, compression, lost frames.
 
-A picture is put together from ideal ones that are drawn along the way the camera moved while its rows were exposed. Light adds up
-linearly, so blur, gain and noise act on linear values; sRGB's curve (IEC 61966-2-1) leads there and back.
+A picture is composed of ideal ones drawn along the camera's motion while its rows were exposed. Light adds up
+linearly, so blur, gain and noise act on linear values, converted by sRGB's curve (IEC 61966-2-1).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Draw = Callable[[Array], Rgb]
 
 _NotNegative = Annotated[float, Field(ge=0.0)]
 _Share = Annotated[float, Field(ge=0.0, lt=1.0)]
-# Pictures that are drawn between two ticks. Between them the scene is taken to fade from one to the next.
+# Number of pictures drawn between two ticks. Between them the scene is assumed to fade from one to the next.
 _MOMENTS = 5
 # Points in time at which the exposure of a row is sampled.
 _SAMPLES = 16
@@ -41,9 +41,9 @@ class CameraEffects(StrictModel):
         gain_sigma: Spread of the logarithm of a drive's exposure.
         colour_sigma: Spread of the logarithm of a drive's gain of red and of blue: its white balance.
         read_noise: Standard deviation of the noise of a dark pixel, of full scale 1.
-        shot_noise: Variance of the noise of a pixel at full scale, beside that; in between it grows with the light (EMVA 1288, linear model).
-        k1: Radial distortion that calibration left, OpenCV's first coefficient.
-        k2: The second one.
+        shot_noise: Variance of the additional noise of a pixel at full scale; it grows linearly with the light (EMVA 1288, linear model).
+        k1: Radial distortion left by calibration, OpenCV's first coefficient.
+        k2: OpenCV's second radial coefficient.
         jpeg_quality: Quality of JPEG compression, 1 to 100; None for none.
         lost: Share of frames that never arrive.
         seed: Seed of all draws.
@@ -63,7 +63,7 @@ class CameraEffects(StrictModel):
 
     @property
     def ideal(self) -> bool:
-        """Whether it changes nothing."""
+        """Whether all effects are off."""
         return self == CameraEffects(seed=self.seed)
 
 
@@ -115,7 +115,7 @@ class ImperfectCamera:
     """A camera on one drive.
 
     Args:
-        drive: Number of the drive; two drives of one number see the same draws.
+        drive: Number of the drive; equal numbers give the same draws.
     """
 
     effects: CameraEffects
@@ -131,7 +131,7 @@ class ImperfectCamera:
         self._maps = _distortion(self.pinhole, e.k1, e.k2) if e.k1 or e.k2 else None
 
     def see(self, draw: Draw, state: Array, dt_s: float) -> Rgb | None:
-        """The picture ``[H, W, 3]`` of a tick, None if it is lost, which the first one never is. Call it once for each tick, in order.
+        """The picture ``[H, W, 3]`` of a tick, None if it is lost; the first one never is. Call it once for each tick, in order.
 
         Args:
             draw: Ideal pictures.

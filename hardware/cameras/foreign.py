@@ -1,7 +1,7 @@
-"""Cameras that users bring: an entry point of the group ``advnerf.cameras``, or ``file.py:Class``.
+"""Cameras of users: an entry point of the group ``advnerf.cameras``, or ``file.py:Class``.
 
-The class derives from `hardware.cameras.interface.Camera`. Its attribute ``Config``, a pydantic model or a dataclass, holds the keys
-that stand beside ``kind``; the class is called with it. See docs/cameras.md.
+The class derives from `hardware.cameras.interface.Camera`. Its attribute ``Config``, a pydantic model or a dataclass, defines the keys
+beside ``kind``; the class is called with it. See docs/cameras.md.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def foreign_source(
 
     Args:
         written: The section ``source``: ``kind``, the camera's own keys, and the keys of every source.
-        built_in: Kinds that this project brings.
+        built_in: Kinds of the built-in cameras.
         folder: Folder that a relative ``file.py`` is relative to; the working folder if it is not given.
 
     Returns:

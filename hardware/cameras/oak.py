@@ -30,9 +30,9 @@ class OakSource(Source):
         width: Columns [px].
         height: Rows [px].
         fps: Frames per second [Hz].
-        undistort: Let the device take the distortion out.
+        undistort: Whether the device removes the distortion.
         exposure_us: Exposure time to fix [us]; None for automatic.
-        iso: Sensitivity that goes with it.
+        iso: Sensitivity for a fixed exposure.
         white_balance_k: Colour temperature to fix [K]; None for automatic.
     """
 

@@ -13,10 +13,10 @@ from hardware.emulators.unix_socket import listen
 
 
 class FrameServer:
-    """Every client gets the newest frame when it asks, or the next one if it has had that.
+    """Sends every client the newest frame on request, or the next one if it has that already.
 
     Args:
-        path: Path of the socket; a dead one from an earlier run is replaced, a living one is an error.
+        path: Path of the socket; a dead one from an earlier run is replaced, a live one is an error.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -42,7 +42,7 @@ class FrameServer:
             return len(self._clients)
 
     def close(self) -> None:
-        """Hang up on everybody and remove the socket."""
+        """Disconnect all clients and remove the socket."""
         with self._condition:
             if self._stopping:
                 return
@@ -70,7 +70,7 @@ class FrameServer:
                 return  # closed
             with self._condition:
                 self._clients.add(client)
-                # A client that has just come waits for the next frame: the last one may be old.
+                # A new client waits for the next frame: the last one may be old.
                 last = self._newest
             threading.Thread(
                 target=self._serve, args=(client, last), name="frame client", daemon=True

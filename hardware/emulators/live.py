@@ -1,6 +1,6 @@
 """The simulated lab in real time, behind the real protocols: a VESC on a pty, VICON packets, stamped frames on a socket.
 
-Four threads share one car: the VESC's (bytes in, bytes out), physics (200 Hz, absolute schedule; time held up is made up for,
+Four threads share one car: the VESC's (bytes in, bytes out), physics (200 Hz, absolute schedule; it catches up after a delay,
 as in real time), VICON (100 Hz), and the camera, which owns the OpenGL context and draws the world at the time of the stamp.
 """
 
@@ -72,12 +72,12 @@ class PoseHistory:
             self._changed.notify_all()
 
     def clear(self) -> None:
-        """Forget: the car was lifted, nothing between then and now is a motion."""
+        """Discard all states: the car was lifted, and the displacement is no motion."""
         with self._changed:
             self._states.clear()
 
     def at(self, mono_ns: int, wait_s: float = 0.0) -> VehicleState | None:
-        """State at an instant, interpolated; after waiting up to ``wait_s`` for it, the newest there is."""
+        """State at an instant, interpolated; after waiting up to ``wait_s`` for it, the newest one."""
         with self._changed:
             self._changed.wait_for(lambda: bool(self._states) and self._states[-1][0] >= mono_ns, wait_s)
             if not self._states:
@@ -107,12 +107,12 @@ def _between(a: tuple[int, VehicleState], b: tuple[int, VehicleState], mono_ns: 
 class LiveLab:
     """The whole lab; it lives from construction to `close`.
 
-    In the run folder: ``vesc`` (link to the pty), ``vesc_wire.csv`` (what the controller read); in the socket folder: ``frames``, and ``monitor``, the plug of the monitor.
+    In the run folder: ``vesc`` (link to the pty), ``vesc_wire.csv`` (bytes that the controller read); in the socket folder: ``frames``, and ``monitor``, the plug of the monitor.
 
     Args:
-        config: All numbers.
+        config: Configuration of the twin.
         run_dir: Folder for the link and the log.
-        socket_dir: Folder for the socket, whose path may have 107 characters at most; None is the run folder.
+        socket_dir: Folder for the socket, whose path may have at most 107 characters; None uses the run folder.
         ready_timeout_s: Limit for building the world [s].
     """
 
@@ -167,7 +167,7 @@ class LiveLab:
         return self._vicon
 
     def freeze_camera(self, fault: str | None) -> None:
-        """Let the camera fall ``silent``, or hand out its last frame ``repeated`` with its old stamp; None heals it."""
+        """Make the camera ``silent``, or make it repeat its last frame with its old stamp (``repeated``); None ends the fault."""
         if fault not in (None, *CAMERA_FAULTS):
             raise ValueError(f"expected a fault of {', '.join(CAMERA_FAULTS)}, got {fault!r}")
         self._camera_fault = fault
@@ -179,17 +179,17 @@ class LiveLab:
 
     @property
     def missed(self) -> dict[str, int]:
-        """Ticks left out because a thread was held up."""
+        """Number of skipped ticks because a thread was delayed."""
         missed = {"camera": self._camera_pacer.missed, "physics": self._physics_pacer.missed}
         return missed if self._vicon is None else {**missed, "vicon": self._vicon.missed}
 
     def check(self) -> None:
-        """Raise what a thread of the lab died of."""
+        """Raise the error that ended a thread of the lab."""
         if self._failure is not None:
             raise self._failure
 
     def place(self, x_m: float, y_m: float, yaw_rad: float) -> None:
-        """Lift the car to a start pose; refused while it moves or a motor command is in force."""
+        """Lift the car to a start pose; refused while it moves or a motor command is active."""
         self.vesc.place(x_m, y_m, yaw_rad)
         self._history.clear()
 
@@ -259,7 +259,7 @@ class LiveLab:
                 pose = np.array([state.x_m, state.y_m, state.yaw_rad])
                 rgb = camera.see(drawn, pose, (tick_ns - last_ns) / NS_PER_S)
                 last_ns = tick_ns
-                if rgb is None:  # lost on its way: its number is missing
+                if rgb is None:  # lost on the way: its number is missing
                     sequence += 1
                     continue
                 frame = Frame(rgb, real_ns, tick_ns, sequence)
@@ -269,7 +269,7 @@ class LiveLab:
                 elif self._camera_fault == "repeated" and last is not None:
                     self._frames.publish(
                         replace(last)
-                    )  # another object: the server tells frames apart by that
+                    )  # a new object: the server distinguishes frames by identity
 
     def _light_monitor(self, lab: Lab) -> None:
         assert self._monitor is not None
@@ -278,7 +278,7 @@ class LiveLab:
             lab.set_monitor_image(shown)
 
     def _subject_poses(self, mono_ns: int) -> dict[str, Array]:
-        # Physics that is held up makes poses late, never wrong: an old state with a new stamp would be a car that leaps afterwards.
+        # Delayed physics makes poses late, never wrong: an old state with a new stamp would be a car that jumps afterwards.
         state = self._history.at(mono_ns, wait_s=_HELD_UP_S) or self.state
         return {
             "car": np.asarray(state.T_world_from_car),

@@ -1,7 +1,7 @@
-"""The plug of the simulated monitor: a Unix socket that takes pictures and says what the panel shows.
+"""The plug of the simulated monitor: a Unix socket that takes pictures and reports the panel's content.
 
-On connection it sends its EDID. ``S`` and ``height * width * 3`` bytes show a picture, answered by the SHA-256 of what is shown
-then; ``R`` reads the shown pixels back. When the picture's source hangs up, the screen falls back to idle, as a desktop does when a
+On connection it sends its EDID. ``S`` and ``height * width * 3`` bytes show a picture, answered by the SHA-256 of the shown
+picture; ``R`` reads the shown pixels back. When the picture's source disconnects, the screen returns to idle, as a desktop does when a
 window closes: a dead monitor node shows no attack.
 """
 
@@ -26,7 +26,7 @@ _IDLE = object()
 
 
 class MonitorPort:
-    """Serves one picture source at a time; a second one is hung up on.
+    """Serves one picture source at a time; a second one is disconnected.
 
     Args:
         path: Path of the socket; a dead one from an earlier run is replaced.
@@ -41,20 +41,20 @@ class MonitorPort:
         width_mm, height_mm = (round(1000.0 * side) for side in size_m)
         self._edid = make_edid("ADV", 1, "twin monitor", size_px, (width_mm, height_mm))
         self._lock = threading.Lock()
-        self._next: object | Rgb | None = None  # what the camera thread has not taken yet
+        self._next: object | Rgb | None = None  # not yet taken by the camera thread
         self._client: socket.socket | None = None
         self._listener = listen(self.path, "a simulated monitor", backlog=1)
         self._thread = threading.Thread(target=self._accept, name="twin monitor", daemon=True)
         self._thread.start()
 
     def take(self) -> tuple[bool, Rgb | None]:
-        """Whether the screen has changed since the last call, and what it shows now; None is the idle screen."""
+        """Whether the screen has changed since the last call, and its current picture; None is the idle screen."""
         with self._lock:
             taken, self._next = self._next, None
         return taken is not None, taken if isinstance(taken, np.ndarray) else None
 
     def close(self) -> None:
-        """Hang up and remove the socket."""
+        """Disconnect and remove the socket."""
         with self._lock:
             sockets = [self._listener, *([self._client] if self._client else [])]
         for each in sockets:

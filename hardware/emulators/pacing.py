@@ -1,4 +1,4 @@
-"""Keeping a thread on an absolute schedule: no drift, and no burst after a stall."""
+"""Keeps a thread on an absolute schedule: no drift, and no burst after a stall."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ NS_PER_S = 1_000_000_000
 
 
 class Pacer:
-    """Ticks at ``start + k * period``; ticks missed while the thread was held up are skipped and counted.
+    """Ticks at ``start + k * period``; ticks missed while the thread was delayed are skipped and counted.
 
     Args:
         rate_hz: Ticks per second.

@@ -9,15 +9,15 @@ from hardware.errors import DeviceBusy, HardwareError
 
 
 def listen(path: Path, who: str, backlog: int = 8) -> socket.socket:
-    """Listen at ``path`` for the owner of this process alone; a dead socket of an earlier run is replaced.
+    """Listen at ``path`` for this process's user alone; a dead socket of an earlier run is replaced.
 
     Args:
         path: Path of the socket; its length is limited by the system (108 bytes on Linux).
         who: Name of the server, for messages, e.g. ``"a frame server"``.
-        backlog: Connections that may wait.
+        backlog: Number of connections that may wait.
 
     Raises:
-        DeviceBusy: A living one answers there.
+        DeviceBusy: A live server answers there.
         HardwareError: The socket cannot be made.
     """
     if path.exists():

@@ -1,4 +1,4 @@
-"""The state of an emulated video device: modes, controls, buffers, and the hands that expose frames and pull the cable."""
+"""The state of an emulated video device: modes, controls, buffers, and methods that expose frames and unplug it."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class ControlState:
         minimum: Smallest value.
         maximum: Greatest value.
         step: Values are rounded down to a multiple of it.
-        value: Present value.
-        stuck: Accepts values and keeps its own.
+        value: Current value.
+        stuck: Whether it accepts new values but keeps its own.
     """
 
     minimum: int
@@ -33,7 +33,7 @@ class ControlState:
 
 
 def webcam_controls() -> dict[int, ControlState]:
-    """Controls of a usual USB webcam, with its automatics on."""
+    """Controls of a usual USB webcam, with its automatic modes on."""
     return {
         AUTO_EXPOSURE: ControlState(0, 3, 1, 3),
         EXPOSURE: ControlState(3, 2047, 1, 250),
@@ -47,7 +47,7 @@ def webcam_controls() -> dict[int, ControlState]:
 
 @dataclass
 class FrameBuffer:
-    """A buffer and what the device has put into it."""
+    """A buffer and the data that the device has written to it."""
 
     memory: bytearray
     used: int = 0
@@ -62,7 +62,7 @@ class VideoDevice:
 
     Attributes:
         formats: Sizes by pixel format.
-        rates: Frames per second that it can do.
+        rates: Supported frame rates [Hz].
         metadata_only: Whether this is the second device of a webcam, which delivers no pictures.
         padding_bytes: Unused bytes at the end of every row.
         stamp_flags: Clock and event of its stamps, as in ``v4l2_buffer.flags``.
@@ -112,7 +112,7 @@ class VideoDevice:
         return rows * self.row_bytes or self.width * self.height * 2
 
     def expose(self, data: bytes, stamp_ns: int | None = None, damaged: bool = False) -> None:
-        """One frame; lost, with its number, if no buffer is queued."""
+        """Expose one frame; it is lost, with its number, if no buffer is queued."""
         with self.condition:
             if not (self.there and self.streaming):
                 return
@@ -136,7 +136,7 @@ class VideoDevice:
             self.condition.notify_all()
 
     def plug(self) -> None:
-        """Put the cable back; the device has forgotten its settings."""
+        """Plug the cable in again; the device has forgotten its settings."""
         with self.condition:
             self.reset()
             self.owner = None

@@ -1,4 +1,4 @@
-"""System calls on emulated video devices: what the V4L2 drivers are proved against.
+"""System calls on emulated video devices, for testing the V4L2 drivers.
 
 Frames are dropped when no buffer is queued, an unplugged device answers ENODEV, and one that another program holds answers EBUSY.
 """

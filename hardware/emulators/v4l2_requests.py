@@ -1,7 +1,7 @@
 """Answers of an emulated video device to the kernel's requests, packed and unpacked by offset.
 
-The numbers are what a C compiler says about ``linux/videodev2.h`` on 64-bit machines; no structure is shared with the driver that is
-tested with them. Sizes are rounded and formats replaced without an error, values clamped, as ``uvcvideo`` does.
+The numbers come from a C compiler and ``linux/videodev2.h`` on 64-bit machines; no structure is shared with the tested
+driver. Sizes are rounded and formats replaced without an error, values clamped, as in ``uvcvideo``.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def _querycap(device: VideoDevice, fd: int, view: memoryview) -> None:
     _text(view, 16, device.card)
     _text(view, 48, "usb-0000:00:14.0-1")
     caps = _METADATA if device.metadata_only else _CAPTURE_AND_STREAMING
-    # The first number is about the whole device, the second about this node.
+    # The first number refers to the whole device, the second to this node.
     struct.pack_into("<II", view, 84, _CAPTURE_AND_STREAMING | _METADATA | _HAS_DEVICE_CAPS, caps)
 
 

@@ -1,7 +1,7 @@
 """A VESC on a pseudo terminal that drives the twin's car: the driver opens it like a USB port.
 
-The other end of the wire is where safety is decided, so every command is logged with a monotonic stamp, together with what the
-car did at that moment.
+Safety is decided at this end of the wire, so every command is logged with a monotonic stamp, together with the
+car's motion at that moment.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from hardware.errors import HardwareError
 from hardware.motor.vesc_settings import TimeoutSettings
 from hardware.worlds.lab.vehicle import TwinVehicle, require_jam
 
-# Slower than this the car stands.
+# Below this speed the car counts as standing.
 STANDSTILL_MPS = 0.005
 LOG_HEADER = "mono_ns,event,value,speed_mps,odometer_m\n"
 
@@ -57,7 +57,7 @@ class VescEmulator:
             self._log.write(LOG_HEADER)
         self._link = link
         self._fault: str | None = None
-        self._rng = random.Random(0)  # noise on a wire must come again in a repeated test
+        self._rng = random.Random(0)  # repeatable noise on the wire
         self._stop_read, self._stop_write = os.pipe()
         self._open = True
         self._master = self._slave = -1
@@ -77,11 +77,11 @@ class VescEmulator:
 
     @property
     def timeout(self) -> TimeoutSettings:
-        """The controller's own time-out and brake current, as stored in it now."""
+        """The controller's stored time-out and brake current."""
         return self._firmware.timeout
 
     def report_fault(self, code: int) -> None:
-        """Let the controller report a fault, and obey no command to move meanwhile; 0 ends it."""
+        """Make the controller report a fault and ignore commands to move; 0 ends it."""
         with self._lock:
             self._firmware.fault = code
             if code:
@@ -89,7 +89,7 @@ class VescEmulator:
 
     @property
     def timed_out(self) -> bool:
-        """Whether the firmware's time-out is in force."""
+        """Whether the firmware's time-out is active."""
         return self._firmware.timed_out
 
     def events(self, since_mono_ns: int = 0) -> list[WireEvent]:
@@ -98,7 +98,7 @@ class VescEmulator:
             return [event for event in self._events if event.mono_ns >= since_mono_ns]
 
     def advance(self, dt_s: float, mono_ns: int) -> VehicleState:
-        """Move the car on by ``dt_s`` up to monotonic time ``mono_ns`` [ns] and let the firmware's watchdog look."""
+        """Move the car by ``dt_s`` up to monotonic time ``mono_ns`` [ns] and run the firmware's watchdog."""
         with self._lock:
             self._note(self._firmware.check_timeout(mono_ns))
             if self._jam is not None and mono_ns >= self._jam[1]:
@@ -124,16 +124,16 @@ class VescEmulator:
             self._note([WireEvent(time.monotonic_ns(), "PLACED")])
 
     def jam(self, how: str | None) -> None:
-        """Jam the car from now on, as `TwinVehicle.jam` does; None releases it.
+        """Jam the car from now on, see `TwinVehicle.jam`; None releases it.
 
-        A step up to an earlier time, made late, is made without it: the log must not show an effect before its cause.
+        A delayed step up to an earlier time is made without the jam: the log must not show an effect before its cause.
         """
         require_jam(how)
         with self._lock:
             self._jam = how, time.monotonic_ns()
 
     def disturb(self, fault: str | None) -> None:
-        """Let replies reach the computer with a fault of `WIRE_FAULTS`; None heals the wire."""
+        """Let replies reach the computer with a fault of `WIRE_FAULTS`; None repairs the wire."""
         require_wire_fault(fault)
         with self._lock:
             self._fault = fault
@@ -162,7 +162,7 @@ class VescEmulator:
         self._master = self._slave = -1
 
     def close(self) -> None:
-        """Hang up and remove the link."""
+        """Disconnect and remove the link."""
         if not self._open:
             return
         self._open = False

@@ -1,7 +1,7 @@
 """Firmware of the twin's motor controller: how a VESC reacts to received bytes, without I/O and without a clock.
 
-It keeps the habits of the stock firmware that matter for safety: the command time-out (checked every 10 ms, not fed by telemetry
-requests, braking with a configured current that is 0 A as delivered), the servo that no time-out touches, the servo output that
+It reproduces the behaviour of the stock firmware that matters for safety: the command time-out (checked every 10 ms, not reset by telemetry
+requests, braking with a configured current that is 0 A as delivered), the servo without any time-out, the servo output that
 is off in stock builds, and speed commands below the slowest closed-loop speed that short the motor instead.
 """
 
@@ -20,7 +20,7 @@ from hardware.motor.vesc_settings import AppConfiguration, TimeoutSettings, deco
 
 TWIN_HARDWARE_NAME = "TWIN"
 _TIMEOUT_CHECK_NS = 10_000_000
-# Heads of the application configuration by firmware, the signature of none in particular, and the settings behind the head.
+# Heads of the application configuration by firmware, an arbitrary signature, and the settings behind the head.
 _SIGNATURE, _TAIL = b"\x54\x57\x49\x4e", bytes(range(256)) + bytes(100)
 _RESETS_TIMEOUT = {
     CommandId.SET_DUTY, CommandId.SET_CURRENT, CommandId.SET_CURRENT_BRAKE, CommandId.SET_RPM, CommandId.ALIVE,
@@ -31,16 +31,16 @@ class VescEmulatorConfig(StrictModel):
     """Settings that a real VESC keeps in its application and motor configuration.
 
     Attributes:
-        timeout_ms: Time without a motor command after which the firmware takes over; 0 never. As delivered: 1000 ms.
+        timeout_ms: Time without a motor command after which the firmware takes over [ms]; 0 never. As delivered: 1000 ms.
         timeout_brake_current_a: Brake current on time-out [A]. As delivered: 0 A, the car coasts.
         servo_output: Whether SET_SERVO_POS moves the servo; stock builds silently ignore it.
         min_erpm: Speed commands below this short the motor.
         max_erpm: Speed commands are clamped to plus and minus this.
         max_current_a: Currents are clamped to plus and minus this [A].
-        firmware: Version it reports.
-        hardware_name: Name it reports; ``TWIN`` tells the motor node that no real car can move.
-        generation: Layout of its telemetry, ``A`` to ``G``.
-        supply_v: Battery voltage it reports [V].
+        firmware: Reported version.
+        hardware_name: Reported name; ``TWIN`` tells the motor node that no real car can move.
+        generation: Layout of the telemetry, ``A`` to ``G``.
+        supply_v: Reported battery voltage [V].
         readable_settings: Whether it answers GET_APPCONF.
     """
 
@@ -62,7 +62,7 @@ class Plant(Protocol):
 
     @property
     def erpm(self) -> float:
-        """Electrical rpm measured."""
+        """Measured electrical rpm."""
         ...
 
     @property
@@ -85,12 +85,12 @@ class Plant(Protocol):
 
 @dataclass(frozen=True)
 class WireEvent:
-    """Something that happened at the controller.
+    """An event at the controller.
 
     Attributes:
-        mono_ns: When, in monotonic time [ns].
+        mono_ns: Monotonic time [ns].
         name: Command name, or TIMEOUT, STANDSTILL, MOVING, RESET.
-        value: Argument of the command, if it has one.
+        value: Argument of the command, if any.
     """
 
     mono_ns: int
@@ -105,8 +105,8 @@ class VescFirmware:
         erpm_per_mps: Electrical rpm per speed of the plant, for the tachometer [1/(m/s)].
 
     Attributes:
-        fault: Fault code it reports and, while it is not 0, answers every command to move with a released motor.
-        timed_out: Whether the firmware's time-out is in force.
+        fault: Reported fault code; while it is not 0, every command to move releases the motor.
+        timed_out: Whether the firmware's time-out is active.
         commanded: Whether the last motor command makes the car move.
     """
 
@@ -126,16 +126,16 @@ class VescFirmware:
 
     @property
     def skipped_bytes(self) -> int:
-        """Received bytes that were no frame."""
+        """Number of received bytes outside of frames."""
         return self._decoder.skipped_bytes
 
     @property
     def timeout(self) -> TimeoutSettings:
-        """Time-out and brake current in force."""
+        """Current time-out and brake current."""
         return self._settings.timeout
 
     def receive(self, data: bytes, mono_ns: int) -> tuple[bytes, list[WireEvent]]:
-        """Take bytes off the wire; the reply bytes and what was understood."""
+        """Process received bytes; returns the reply bytes and the decoded commands."""
         replies, events = b"", []
         for payload in self._decoder.feed(data):
             command = decode_command(payload)
@@ -148,7 +148,7 @@ class VescFirmware:
         return replies, events
 
     def check_timeout(self, mono_ns: int) -> list[WireEvent]:
-        """Call often: the firmware's own watchdog, which looks every 10 ms."""
+        """Call often: the firmware's watchdog, which checks every 10 ms."""
         if mono_ns - self._checked_ns < _TIMEOUT_CHECK_NS:
             return []
         self._checked_ns = mono_ns
@@ -179,7 +179,7 @@ class VescFirmware:
             self._settings.layout != "signed" or data.startswith(_SIGNATURE)
         )
         if not same_kind:
-            return b""  # the firmware refuses a wrong signature without a word
+            return b""  # the firmware silently rejects a wrong signature
         self._settings = decode_app_configuration(bytes([CommandId.GET_APPCONF]) + data, self._version)
         return encode_frame(bytes([CommandId.SET_APPCONF]))
 
@@ -189,7 +189,7 @@ class VescFirmware:
             if self.config.servo_output:
                 self._plant.command(servo=min(max(value, 0.0), 1.0))
             return
-        # Whether a command makes the car move. Meanwhile it must not be lifted.
+        # Whether a command makes the car move. It must not be lifted meanwhile.
         self.commanded = False
         if self.fault:
             self._plant.command(current_a=0.0)
@@ -229,7 +229,7 @@ class VescFirmware:
 
 
 def _app_configuration(config: VescEmulatorConfig) -> AppConfiguration:
-    """Application configuration as stored by this firmware version: the head, then unused bytes."""
+    """Application configuration in the form of this firmware version: the head, then unused bytes."""
     if config.firmware < (3, 7):
         empty = AppConfiguration(bytes(9) + _TAIL, "scaled")
     elif config.firmware < (5, 0):

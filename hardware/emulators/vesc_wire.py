@@ -34,7 +34,7 @@ def wire_chunks(reply: bytes, fault: str | None, rng: random.Random) -> list[byt
 
 
 def require_wire_fault(fault: str | None) -> None:
-    """A `ValueError` that names the choice, for anything but a fault of `WIRE_FAULTS` or None."""
+    """Raise a `ValueError` that names the choices, unless ``fault`` is one of `WIRE_FAULTS` or None."""
     if fault is not None and fault not in WIRE_FAULTS:
         raise ValueError(f"expected a fault of {', '.join(WIRE_FAULTS)}, got {fault!r}")
 

@@ -1,6 +1,6 @@
-"""Motion capture of the twin: sends Vicon Tracker's object stream for poses that a function tells.
+"""Motion capture of the twin: sends Vicon Tracker's object stream for poses from a function.
 
-It adds the noise of a real measurement, without which a standing object would be taken for a frozen one, and produces every
+It adds the noise of a real measurement, without which a standing object would count as frozen, and produces every
 known form of occlusion, loss and restart on request.
 """
 
@@ -150,7 +150,7 @@ class ViconEmulator:
 
     @property
     def missed(self) -> int:
-        """Frames left out because the thread was held up."""
+        """Number of skipped frames because the thread was delayed."""
         return self._pacer.missed
 
     def occlude(self, name: str, form: str | None) -> None:
@@ -164,7 +164,7 @@ class ViconEmulator:
             self._frames.displace(name, T_there_from_true)
 
     def restart(self) -> None:
-        """Begin to count frames from 0, as Tracker does when it is started again."""
+        """Restart the frame numbers from 0, as Tracker does when it is restarted."""
         with self._lock:
             self._frames.frame_number = 0
 

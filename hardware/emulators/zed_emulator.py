@@ -18,7 +18,7 @@ class ZedRegisters:
     Attributes:
         processor: Registers of the image processor by address; the automatic is on at first.
         sensors: Registers of the left and the right sensor by address.
-        stuck: Addresses that accept values and keep their own.
+        stuck: Addresses that accept new values but keep their own.
         messages: Every message that was written.
     """
 

@@ -20,7 +20,7 @@ from advnerf_core.geometry import make_transform, rotation_from_quaternion
 from hardware.errors import DeviceNotFound, HardwareError
 from hardware.mocap.vicon import SubjectPose, SubjectTracker, ViconConfig, ViconCounts
 
-# Where a system listens, so that a host that is not there is an error at once: the library would wait for ever.
+# Ports of the systems, so that a missing host is an error at once: the library would wait for ever.
 _TCP_PORTS = {"vicon": 801, "qualisys": 22223}
 SYSTEMS = ("vicon", "optitrack", "qualisys", "nokov", "vrpn", "fzmotion", "mock")
 _PROBE_S = 2.0
@@ -33,7 +33,7 @@ class LibraryConfig:
 
     Attributes:
         system: One of `SYSTEMS`.
-        hostname: Computer of the system.
+        hostname: Host name of the system.
         subjects: Names to report; others are ignored.
         latency_s: From exposure to receipt, as measured in calibration [s].
         frozen_frames: Number of bit-identical frames after which a subject counts as lost.
@@ -61,7 +61,7 @@ class LibraryReceiver:
         self._frames: queue.Queue[list[SubjectPose]] = queue.Queue(_WAITING_FRAMES)
         self._failure: Exception | None = None
         self._stop = threading.Event()
-        # A daemon: a wait inside the library cannot be ended, only left behind.
+        # A daemon: a wait inside the library cannot be ended, only abandoned.
         self._thread = threading.Thread(target=self._run, name="motioncapture", daemon=True)
         self._thread.start()
 

@@ -44,8 +44,8 @@ class SubjectPose:
         name: Subject.
         T_world_from_subject: Pose ``[4, 4]`` [m].
         frame_number: Tracker's frame.
-        stamp_real_ns: When it was measured, in real time: receipt less the configured latency [ns].
-        receive_mono_ns: When it was received, in monotonic time [ns].
+        stamp_real_ns: Time of the measurement, in real time: receipt less the configured latency [ns].
+        receive_mono_ns: Time of receipt, in monotonic time [ns].
     """
 
     name: str
@@ -63,7 +63,7 @@ class ViconConfig:
         subjects: Names to report; others are ignored.
         host: Local address to bind; empty for all.
         port: UDP port of the object stream; 0 lets the system choose (tests).
-        latency_s: From exposure to receipt, as measured in calibration [s].
+        latency_s: Time from exposure to receipt, measured in calibration [s].
         frozen_frames: Number of bit-identical frames after which a subject counts as lost.
         source: Accept datagrams of this address only; None accepts all.
     """
@@ -143,7 +143,7 @@ class SubjectTracker:
         ]
 
     def _accept_frame(self, frame_number: int, mono_ns: int, sender: Address) -> bool:
-        # The oldest go first: a sender that is heard moves to the end.
+        # The oldest go first: an active sender moves to the end.
         stream = self._streams.pop(sender, None) or _Stream(frame_number, mono_ns)
         self._streams[sender] = stream
         while len(self._streams) > _MOST_STREAMS:

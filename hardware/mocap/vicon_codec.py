@@ -3,7 +3,7 @@
 Little-endian, packed: frame number u32, item count u8, then per item: id u8, data size u16 (72), name char[24] padded with zeros,
 translation 3 x f64 [mm], rotation 3 x f64 [rad] (Euler XYZ intrinsic, ``R = Rx Ry Rz``). Datagrams are usually padded to the block
 size set in Tracker (256, 512 or 1024 bytes: at most 3, 6 or 13 objects); larger sets come as several datagrams of one frame
-number. The layout is what five independent public readers agree on.
+number. Five independent public readers agree on this layout.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ BLOCK_SIZES = (256, 512, 1024)
 
 @dataclass(frozen=True)
 class ObjectPose:
-    """One tracked object as Tracker sends it.
+    """One tracked object in Tracker's units.
 
     Attributes:
         name: Subject name.
@@ -72,7 +72,7 @@ def euler_from_rotation(R: NDArray[np.float64]) -> tuple[float, float, float]:
 
 
 def decode_block(datagram: bytes) -> ObjectBlock:
-    """Read one datagram; padding after the counted items is ignored, and so is what newer versions add to an item."""
+    """Read one datagram; padding after the counted items is ignored, and so are additions of newer versions to an item."""
     if len(datagram) < _HEADER.size:
         raise ProtocolError(
             f"expected a VICON object block of at least {_HEADER.size} bytes, got {len(datagram)}"

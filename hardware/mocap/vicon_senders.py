@@ -39,7 +39,7 @@ class SenderWatch:
         self._faults: dict[str, tuple[str, int]] = {}
 
     def measured(self, name: str, sender: Address, frame_number: int, numbers: bytes, mono_ns: int) -> None:
-        """A datagram brought a measurement of a subject, new or late; ``numbers`` as they came."""
+        """Note a measurement of a subject, new or late, with its raw ``numbers``."""
         subject = self._subjects.get(name)
         if subject is None:
             return
@@ -60,7 +60,7 @@ class SenderWatch:
             del subject.frames[next(iter(subject.frames))]
 
     def leapt(self, sender: Address, last: int, frame_number: int, silence_s: float, mono_ns: int) -> None:
-        """The frame numbers of a sender begin somewhere else; after a silence that is a Tracker that was started again."""
+        """Whether the frame numbers of a sender restart; after a silence that is a restarted Tracker."""
         for name, subject in self._subjects.items():
             if subject.sender != sender:
                 continue

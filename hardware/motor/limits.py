@@ -1,4 +1,4 @@
-"""Limits of the car and the map from speed and steering to what its motor controller takes.
+"""Limits of the car, and the conversion of speed and steering to the units of its motor controller.
 
 This is the lowest layer above the wire: no caller can send anything faster, sharper or more sudden than stated here.
 The driver reports what it really sent, so a clipped command is visible in every recording.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-# A command after a pause may move the setpoints by no more than what the slew limits allow in this time [s].
+# A command after a pause may move the setpoints by no more than the slew limits allow in this time [s].
 MAX_SLEW_STEP_S = 0.1
 
 
@@ -24,7 +24,7 @@ class DriveLimits:
         steering_max_rad: Leftmost front wheel angle [rad].
         acceleration_mps2: Largest increase of the magnitude of the speed setpoint [m/s^2]; slowing down is never delayed.
         steering_rate_radps: Largest change of the steering setpoint [rad/s].
-        current_max_a: Largest magnitude of any current that is commanded [A].
+        current_max_a: Largest magnitude of any commanded current [A].
     """
 
     speed_min_mps: float = -0.87
@@ -51,7 +51,7 @@ class DriveLimits:
 
 @dataclass(frozen=True)
 class VehicleGains:
-    """Affine maps between the car's motion and its motor controller, as the RACECAR family states them.
+    """Affine maps between the car's motion and its motor controller, in the form of the RACECAR family.
 
     Attributes:
         erpm_per_mps: Electrical rpm per speed [1/(m/s)].
@@ -107,8 +107,8 @@ class Sent:
     """Commands really sent, after limits and the rounding of the protocol.
 
     Attributes:
-        speed_mps: Speed that the sent rpm means [m/s]; 0 when braking or coasting.
-        steering_rad: Front wheel angle that the sent servo value means [rad]; the last one when no servo was sent.
+        speed_mps: Speed of the sent rpm [m/s]; 0 when braking or coasting.
+        steering_rad: Front wheel angle of the sent servo value [rad]; the last one when no servo was sent.
         erpm: Electrical rpm sent; 0 when braking or coasting.
         servo: Servo value sent, or the last one sent.
         brake_current_a: Brake current sent [A]; None if this was no brake command.
@@ -131,7 +131,7 @@ class Sent:
 
 
 class DriveLimiter:
-    """Holds commands inside `DriveLimits`; it knows the last setpoint and therefore the next possible one."""
+    """Keeps commands inside `DriveLimits`; it knows the last setpoint and therefore the next possible one."""
 
     def __init__(self, limits: DriveLimits) -> None:
         self.limits = limits
@@ -162,14 +162,14 @@ class DriveLimiter:
         return self._last
 
     def steer(self, steering_rad: float) -> float:
-        """A steering angle for a standing car inside its limits, at once: nothing slips at standstill [rad]."""
+        """Limit a steering angle for a standing car, without slew limit: nothing slips at standstill [rad]."""
         steering_rad = steering_rad if math.isfinite(steering_rad) else 0.0
         steering_rad = min(max(steering_rad, self.limits.steering_min_rad), self.limits.steering_max_rad)
         self._last = Setpoint(0.0, steering_rad)
         return steering_rad
 
     def current(self, current_a: float) -> float:
-        """A current inside the limits [A]."""
+        """Limit a current [A]."""
         return min(max(current_a, -self.limits.current_max_a), self.limits.current_max_a)
 
     def stop(self) -> None:
@@ -185,5 +185,5 @@ class DriveLimiter:
 
 
 def _toward(start: float, goal: float, step: float) -> float:
-    # Not by the difference: adding it again may miss the goal by a last bit, and a limit with it.
+    # Not by adding the difference: rounding may miss the goal by a last bit, and exceed a limit.
     return min(start + step, goal) if goal > start else max(start - step, goal)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 # Longest pause that is integrated, because the motion during longer pauses is unknown [s].
 LONGEST_STEP_S = 0.2
-# Variances of x, y [m^2] and yaw [rad^2], as the RACECAR stack reports them.
+# Variances of x, y [m^2] and yaw [rad^2], as in the RACECAR stack.
 POSITION_VARIANCE, YAW_VARIANCE = 0.2, 0.4
 
 
@@ -49,7 +49,7 @@ class Odometry:
         self.state = OdometryState()
 
     def update(self, speed_mps: float, steering_rad: float, mono_ns: int) -> OdometryState:
-        """Speed [m/s] and front wheel angle [rad] since the last update, measured now [ns]."""
+        """Update with speed [m/s] and front wheel angle [rad] since the last update, measured now [ns]."""
         if not (math.isfinite(speed_mps) and math.isfinite(steering_rad)):
             return self.state
         step_s = (

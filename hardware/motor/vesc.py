@@ -1,7 +1,7 @@
 """Driver of the VESC motor controller on a serial port: sends speed and steering, and receives telemetry.
 
-One thread, no heartbeat: the controller's own time-out must see it when this process stops deciding, so nothing here sends
-anything by itself. The servo has no acknowledgement and no watchdog; every drive command therefore sends the servo first, then
+One thread, no heartbeat: the controller's own time-out must act when this process stops deciding, so nothing here sends
+by itself. The servo has no acknowledgement and no watchdog; every drive command therefore sends the servo first, then
 the rpm.
 """
 
@@ -24,7 +24,7 @@ from hardware.motor.vesc_settings import AppConfiguration, Stored, TimeoutSettin
 STANDSTILL_ERPM = 100.0
 # Storing a configuration takes the firmware 0.2 s of deliberate waiting, and the flash memory some more.
 _STORE_S = 2.0
-# The bytes of one frame follow one another at once; a pause of so long within it means that it has no end [ns].
+# The bytes of one frame are contiguous; after a pause of this length within it the rest will not come [ns].
 _SILENCE_NS = 20_000_000
 
 
@@ -87,7 +87,7 @@ class Vesc:
             self._brake_to_standstill(brake_s)
             self.release()
         except (LinkLost, LinkTimeout):
-            pass  # the controller's own time-out is all that is left
+            pass  # only the controller's own time-out remains
         finally:
             self.abandon()
 
@@ -118,18 +118,18 @@ class Vesc:
         return self._wait_for(FirmwareVersion, timeout_s)
 
     def request_app_configuration(self) -> None:
-        """Ask for the application configuration; the answer comes with a later `receive`. Identify the controller first."""
+        """Request the application configuration; a later `receive` returns the answer. Identify the controller first."""
         self._write(encode_command(CommandId.GET_APPCONF))
 
     def read_timeout(self, timeout_s: float = 0.5) -> TimeoutSettings:
-        """The controller's own time-out and the current it then brakes with. Identify the controller first."""
+        """The controller's own time-out and its brake current then. Identify the controller first."""
         return self._read_app_configuration(timeout_s).timeout
 
     def set_timeout(self, settings: TimeoutSettings) -> TimeoutSettings:
-        """Store another time-out and brake current in a controller whose motor stands; what it then reads back.
+        """Store another time-out and brake current in a controller whose motor stands; returns the values read back.
 
         Raises:
-            ProtocolError: The motor turns, or what is read back is not what was sent.
+            ProtocolError: The motor turns, or the values read back differ from the sent ones.
             LinkTimeout: The controller does not answer.
         """
         before = self._read_app_configuration(0.5)
@@ -184,7 +184,7 @@ class Vesc:
         return self._sent()
 
     def request_values(self) -> None:
-        """Ask for telemetry; the answer comes with a later `receive`."""
+        """Request telemetry; a later `receive` returns the answer."""
         self._write(encode_command(CommandId.GET_VALUES))
 
     def receive(self) -> list[Reply]:
@@ -205,17 +205,17 @@ class Vesc:
         if data or not self._decoder.pending:
             self._heard_ns = now_ns
             return self._decoder.feed(data)
-        # A false start byte in noise would otherwise hold back the reply behind it until 500 more bytes have come.
+        # A false start byte in noise would otherwise hold back the next reply until 500 more bytes have come.
         return self._decoder.give_up() if now_ns - self._heard_ns > _SILENCE_NS else []
 
     def read_values(self, timeout_s: float = 0.1) -> Values:
-        """Ask for telemetry and wait for it."""
+        """Request telemetry and wait for it."""
         self.request_values()
         return self._wait_for(Values, timeout_s)
 
     @property
     def skipped_bytes(self) -> int:
-        """Received bytes that belonged to no frame since the port was opened."""
+        """Number of received bytes outside of frames since the port was opened."""
         return self._decoder.skipped_bytes
 
     @property
@@ -233,7 +233,7 @@ class Vesc:
             return decode_app_configuration(payload, self.firmware)
         if payload == bytes([CommandId.SET_APPCONF]):
             return Stored()
-        return None  # some other program's question, or a message of the controller's script
+        return None  # another program's question, or a message of the controller's script
 
     def _wait_for(self, kind: type[R], timeout_s: float) -> R:
         deadline = time.monotonic() + timeout_s

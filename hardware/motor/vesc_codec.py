@@ -53,7 +53,7 @@ class Command:
     """One decoded host-to-VESC message.
 
     Attributes:
-        id: Command byte; an int that is no `CommandId` is a command this codec does not know.
+        id: Command byte; an int without a `CommandId` is a command unknown to this codec.
         value: Argument in SI-like units (duty -1..1, current [A], electrical rpm, servo 0..1), or None.
     """
 
@@ -101,7 +101,7 @@ class FrameDecoder:
         return self._search(patient=True)
 
     def give_up(self) -> list[bytes]:
-        """After silence on the line: what waits for its rest waits in vain; return the frames behind it."""
+        """Call after silence on the line: the rest of an incomplete frame will not come; returns the frames behind it."""
         return self._search(patient=False)
 
     @property
@@ -151,7 +151,7 @@ class FrameDecoder:
 
 
 def encode_command(command: CommandId, value: float | None = None) -> bytes:
-    """Frame of a command. ``value`` is in units (duty, ampere, electrical rpm, servo 0..1); the firmware's truncation is ours too."""
+    """Frame of a command. ``value`` is in units (duty, ampere, electrical rpm, servo 0..1); it is truncated as in the firmware."""
     if command not in _SET_FORMATS:
         if value is not None:
             raise ValueError(f"expected no value for {command.name}, got {value}")

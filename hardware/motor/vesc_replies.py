@@ -98,7 +98,7 @@ class Values:
 
     @property
     def fault_name(self) -> str:
-        """Words for the fault code."""
+        """Name of the fault code."""
         return FAULT_NAMES.get(self.fault, f"code {self.fault}")
 
 
@@ -149,7 +149,7 @@ class FirmwareVersion:
 
 
 def decode_firmware_version(payload: bytes) -> FirmwareVersion:
-    """Decode an FW_VERSION reply, as far as it goes: 3 bytes up to firmware 2.18, then a name, a UUID, and ever more flags."""
+    """Decode an FW_VERSION reply, as far as it goes: 3 bytes up to firmware 2.18, then a name, a UUID, and more flags with each version."""
     if len(payload) < 3 or payload[0] != CommandId.FW_VERSION:
         raise ProtocolError(
             f"expected an FW_VERSION reply of at least 3 bytes, got {payload.hex(' ') or 'nothing'}"

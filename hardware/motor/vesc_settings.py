@@ -1,4 +1,4 @@
-"""The two settings of a VESC that decide how far a car rolls on when its computer is gone: command time-out and brake current.
+"""The two settings of a VESC that decide how far a car rolls after its computer has failed: command time-out and brake current.
 
 They lie at the head of the controller's application configuration, which is read as a whole, changed in eight bytes and written
 back as a whole: everything behind them differs between firmware versions and is not changed. Three heads are known (firmware
@@ -21,7 +21,7 @@ from hardware.motor.vesc_replies import FirmwareVersion
 
 _HEADS = {"scaled": struct.Struct(">BIi"), "plain": struct.Struct(">BIf"), "signed": struct.Struct(">IBIf")}
 _FIRST_PLAIN = (3, 7)
-# Beyond these a number is no setting that anybody made, and the layout is another one.
+# Beyond these a number is no plausible setting, and the layout is another one.
 _LONGEST_MS, _LARGEST_A, _SMALLEST_A = 600_000, 200.0, 1e-3
 
 
@@ -31,7 +31,7 @@ class TimeoutSettings:
 
     Attributes:
         timeout_ms: Time without a motor command after which it takes over [ms]; 0: never.
-        brake_current_a: Current it then brakes with [A]; 0: the car coasts.
+        brake_current_a: Brake current then [A]; 0: the car coasts.
     """
 
     timeout_ms: int
@@ -48,7 +48,7 @@ class TimeoutSettings:
         return f"{self.timeout_ms} ms with {self.brake_current_a:g} A" if self.timeout_ms else "switched off"
 
     def at_least(self, other: TimeoutSettings) -> bool:
-        """Whether it stops a car as early and as hard as another."""
+        """Whether these settings stop a car as early and as hard as others."""
         return (
             0 < self.timeout_ms <= other.timeout_ms and self.brake_current_a >= other.brake_current_a - 1e-3
         )
@@ -68,12 +68,12 @@ class AppConfiguration:
 
     @property
     def timeout(self) -> TimeoutSettings:
-        """The settings in its head."""
+        """The settings in the head."""
         *_, timeout_ms, brake = _HEADS[self.layout].unpack_from(self.data)
         return TimeoutSettings(timeout_ms, brake / 1000.0 if self.layout == "scaled" else brake)
 
     def with_timeout(self, settings: TimeoutSettings) -> AppConfiguration:
-        """The same configuration with other settings; not one byte else changes."""
+        """The same configuration with other settings; no other byte changes."""
         head = _HEADS[self.layout]
         *kept, _, _ = head.unpack_from(self.data)
         brake = (
@@ -84,7 +84,7 @@ class AppConfiguration:
         )
 
     def encode_set(self) -> bytes:
-        """Frame that makes it the controller's configuration, and stores it there."""
+        """Frame that sends and stores this configuration in the controller."""
         return encode_frame(bytes([CommandId.SET_APPCONF]) + self.data)
 
 
@@ -97,7 +97,7 @@ def decode_app_configuration(payload: bytes, firmware: FirmwareVersion) -> AppCo
     """Read the reply to GET_APPCONF.
 
     Raises:
-        ProtocolError: No known head, or more than one, gives settings that a person can have made.
+        ProtocolError: No known head, or more than one, gives plausible settings.
     """
     if not payload or payload[0] != CommandId.GET_APPCONF:
         raise ProtocolError(f"expected a GET_APPCONF reply, got {payload[:1].hex() or 'nothing'}")

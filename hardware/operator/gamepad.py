@@ -78,9 +78,9 @@ class Gamepad:
 
     Args:
         path: Device file.
-        layout: Codes; None takes the usual ones of the interface.
-        mono_ns: The clock that paces opening [ns].
-        ioctl: For devices that are emulated.
+        layout: Codes; None uses the usual ones of the interface.
+        mono_ns: Clock that paces opening [ns].
+        ioctl: Replacement of the system call for emulated devices.
     """
 
     def __init__(

@@ -17,7 +17,7 @@ class Hands:
         stops: Number of e-stop presses since the device was opened.
         rearms: Number of re-arm presses since then.
         connected: Whether the device is connected; a lost device holds no button.
-        text: For people.
+        text: Description for people.
     """
 
     human: bool = False

@@ -27,7 +27,7 @@ class Keyboard:
 
     Args:
         mono_ns: Monotonic clock [ns].
-        late_s: A repeat that comes later than this after the one before is no repeat [s].
+        late_s: A repeat that comes later than this after the last one does not count [s].
     """
 
     def __init__(self, fd: int, mono_ns: Callable[[], int], late_s: float = 0.15) -> None:
@@ -80,7 +80,7 @@ class Keyboard:
             self._rearms += key == _REARM
         if not keys:
             return
-        # What came at once after a pause says that keys were pressed, not that one is held: it counts as one.
+        # A burst after a pause shows pressed keys, not a held one: it counts as one.
         key = keys[-1]
         again = key == self._key and now_ns - self._key_ns <= self._late_ns
         self._key, self._repeats, self._key_ns = key, self._repeats + 1 if again else 0, now_ns

@@ -119,7 +119,7 @@ class PygameDisplay:
         return np.ascontiguousarray(self._pygame.surfarray.array3d(self._surface).swapaxes(0, 1))
 
     def keep_alive(self) -> None:
-        """Take the window system's events: a window that never does is greyed out as hung."""
+        """Handle the window system's events: a window that never does is greyed out as hung."""
         if any(event.type == self._pygame.QUIT for event in self._pygame.event.get()):
             raise LinkLost("the window of the attack was closed at the monitor; restart the launch")
         now = self._pygame.display.get_window_size()
@@ -183,12 +183,12 @@ class TwinDisplay:
 
     def keep_alive(self) -> None:
         """Notice when the twin has hung up."""
-        # It never speaks unasked: what can be read now is its end.
+        # It never sends unasked: readable data means its end.
         if select.select([self._socket], [], [], 0.0)[0]:
             raise LinkLost(f"the simulated monitor at {self._path} is gone")
 
     def close(self) -> None:
-        """Hang up; the panel goes back to its idle screen."""
+        """Disconnect; the panel returns to its idle screen."""
         self._socket.close()
 
     def _send(self, data: bytes) -> None:

@@ -77,7 +77,7 @@ def parse_edid(data: bytes) -> Edid:
 def make_edid(
     maker: str, product: int, name: str, size_px: tuple[int, int], size_mm: tuple[int, int]
 ) -> bytes:
-    """EDID of a monitor that exists only here (the twin's): the fields that `parse_edid` reads, 60 Hz, version 1.4."""
+    """EDID of a simulated monitor (the twin's): the fields that `parse_edid` reads, 60 Hz, version 1.4."""
     block = bytearray(BLOCK_BYTES)
     block[:8] = _HEADER
     block[8:10] = sum(
@@ -101,12 +101,12 @@ def make_edid(
 
 
 def connected_displays(folder: Path = DRM_FOLDER) -> dict[str, Edid]:
-    """Monitors that the kernel sees, by connector (``HDMI-A-1``); one whose EDID cannot be read is left out."""
+    """Connected monitors in the kernel's list, by connector (``HDMI-A-1``); one whose EDID cannot be read is left out."""
     found = {}
     for file in sorted(folder.glob("card*-*/edid")):
         try:
             data = file.read_bytes()
-            if data:  # the file is empty where nothing is plugged in
+            if data:  # the file is empty if nothing is plugged in
                 found[file.parent.name.split("-", 1)[1]] = parse_edid(data)
         except (OSError, ProtocolError):
             continue

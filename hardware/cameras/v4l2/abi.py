@@ -1,7 +1,7 @@
 """The part of Linux's video interface that we use: structures, request numbers, constants.
 
 Source: ``linux/videodev2.h`` and ``linux/uvcvideo.h``; layouts apply to 64-bit machines (x86-64, aarch64), where a ``timeval``
-is two 64-bit numbers. The tests compare sizes, offsets and numbers with what a C compiler makes of these headers.
+is two 64-bit numbers. The tests compare sizes, offsets and numbers with those of a C compiler for these headers.
 """
 
 from __future__ import annotations

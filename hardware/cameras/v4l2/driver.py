@@ -174,7 +174,7 @@ class V4l2Camera(Camera):
         while len(taken) < len(self._maps) and (buffer := self._dequeue()) is not None:
             self._count(buffer)
             taken.append(buffer)
-        # With every buffer full the driver had to stop: even the newest is old, and the next one is not far.
+        # With every buffer full the driver had to stop: even the newest is old, and the next one comes soon.
         starved = len(taken) == len(self._maps)
         keep = None if starved or not taken else taken.pop()
         for buffer in taken:

@@ -40,7 +40,7 @@ class VideoPort(Protocol):
         ...
 
     def names(self) -> list[str]:
-        """Stable paths of the devices that are there, for messages."""
+        """Stable paths of the existing devices, for messages."""
         ...
 
 

@@ -40,7 +40,7 @@ class ZedExposure:
 
     Attributes:
         exposure_percent: Exposure, in percent of the longest that the frame rate allows; None leaves the automatic on.
-        gain_raw: Gain as the sensor's register holds it (0x3507 to 0x3509); None keeps what the automatic had found, which
+        gain_raw: Gain in the sensor's register (0x3507 to 0x3509); None keeps the automatic's last value, which
             differs from start to start.
     """
 
@@ -59,7 +59,7 @@ class ZedExposure:
 
 
 def exposure_lines(percent: float, fps: float) -> int:
-    """Exposure as the sensor counts it [lines] for a share of the longest at a frame rate."""
+    """Exposure in the sensor's unit [lines] for a share of the longest at a frame rate."""
     longest = _RAW_MAX.get(round(fps))
     if longest is None:
         raise ValueError(f"expected a rate of {', '.join(map(str, _RAW_MAX))} Hz, got {fps:g}")
@@ -169,12 +169,12 @@ def lock_exposure(unit: ExtensionUnit, exposure: ZedExposure, fps: float) -> Non
 
 
 def read_gain(unit: ExtensionUnit, eye: int = 0) -> int:
-    """Present gain of an eye, as ``gain_raw`` takes it."""
+    """Current gain of an eye, in the unit of ``gain_raw``."""
     return int.from_bytes(bytes(unit.read_sensor(eye, address) for address in _GAIN_REGISTERS), "big")
 
 
 def read_exposure_lines(unit: ExtensionUnit, eye: int = 0) -> int:
-    """Present exposure of an eye [lines]."""
+    """Current exposure of an eye [lines]."""
     return (
         int.from_bytes(bytes(unit.read_sensor(eye, address) for address in _EXPOSURE_REGISTERS), "big") >> 4
     )
