@@ -1,8 +1,8 @@
-"""The attack node: takes a request, searches in a process of its own, and ends with the attack file on the bus.
+"""The attack node: takes a request, searches in a separate process, and ends with the attack file on the bus.
 
-The search may take hours; this loop stays free: it answers a cancel at once and tells its health. What it is doing is on disk
-before it begins, so a node that was killed goes on with the same request when it is started in the same run folder.
-The file is sent in pieces several times, and once more whenever somebody new listens.
+The search may take hours. The node's loop meanwhile answers a cancel at once and reports its health. Each step is on disk
+before it begins, so a node that was killed continues with the same request when it is started in the same run folder.
+The file is sent in pieces several times, and once more for every new subscriber.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ class AttackNodeConfig(StrictModel):
     """Configuration of the attack node.
 
     Attributes:
-        folder: Where requests, states and attack files are kept, one folder each; relative to the run folder.
-        sends: How often a finished attack file is sent.
-        repeat_s: Pause between [s].
+        folder: Folder of requests, states and attack files, with one folder each; relative to the run folder.
+        sends: Times a finished attack file is sent.
+        repeat_s: Pause between two sends [s].
         threads: Threads of the search; 0 leaves it to the libraries.
     """
 
@@ -58,10 +58,10 @@ class AttackNodeConfig(StrictModel):
 
 
 class AttackNode(Node):
-    """Request in; progress, pictures and the attack file out.
+    """Takes requests; publishes progress, pictures and the attack file.
 
     Args:
-        subscribers: How many listen to a topic.
+        subscribers: Number of subscribers of a topic.
     """
 
     subscriptions = (_REQUEST, _CANCEL)
@@ -83,7 +83,7 @@ class AttackNode(Node):
 
     @classmethod
     def build(cls, config: AttackNodeConfig, context: NodeContext) -> AttackNode:
-        """Make the node of a process; it goes on with what it was doing when it was killed."""
+        """Make the node of a process; it continues with the request it had when it was killed."""
         folder = context.run_dir.resolve() / config.folder
         folder.mkdir(parents=True, exist_ok=True)
         return cls(config, folder, context.subscribers)
@@ -99,7 +99,7 @@ class AttackNode(Node):
         return [self._message(now, str(message.request_id), _fresh("refused", answer.text))]
 
     def receive(self, item: Said, now: Now) -> list[Out]:
-        """Take what the search says; what an earlier one said is too late."""
+        """Take a report of the search; reports of an earlier search are ignored."""
         if item.job is not self._job:
             return []
         if item.kind == "progress":
@@ -122,7 +122,7 @@ class AttackNode(Node):
         return [self._tell(now)]
 
     def tick(self, now: Now) -> list[Out]:
-        """Say now and then how far it is, and send a piece of the file."""
+        """Publish the progress regularly, and send a piece of the file."""
         outs = [self._tell(now)] if now.mono_ns - self._told_ns >= _TELL_NS else []
         if (
             self._sender is not None
@@ -132,7 +132,7 @@ class AttackNode(Node):
         return outs
 
     def status(self) -> tuple[str, str]:
-        """Active while it searches."""
+        """Active during a search."""
         if not self._request_id:
             return READY, "waiting for a request"
         state, p = self._progress["state"], self._progress
@@ -142,12 +142,12 @@ class AttackNode(Node):
         return ACTIVE, f"{text} {p['evaluation']}/{p['evaluations']}, best {p['best_total_cte_m']:.2f} m"
 
     def counters(self) -> dict[str, float]:
-        """Evaluations of the present search, and its process."""
+        """Evaluations of the present search, and its process id."""
         job = {"worker_pid": float(self._job.pid)} if self._job is not None else {}
         return {"evaluation": float(self._progress.get("evaluation", 0)), **job}
 
     def close(self) -> None:
-        """End the search; its request stays the current one, so that the next node goes on with it."""
+        """End the search; its request stays the current one, so that the next node continues it."""
         if self._job is not None:
             self._job.stop()
             self._job = None
@@ -202,7 +202,7 @@ class AttackNode(Node):
         write_atomically(self._folder / _CURRENT, json.dumps(content) + "\n")
 
     def _resume(self) -> None:
-        """Go on with a search that was cut off, and send again what was finished."""
+        """Continue an interrupted search, and send again a finished file."""
         try:
             current = read_json(self._folder / _CURRENT)
         except FileNotFoundError:

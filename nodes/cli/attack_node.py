@@ -59,7 +59,7 @@ def attack_cancel(
     ] = "",
     reason: Annotated[str, typer.Option(help="Why, for the record.")] = "",
 ) -> None:
-    """End the search of a running attack node; what was found so far stays in its folder."""
+    """End the search of a running attack node; its results up to then stay in its folder."""
     from nodes.experiment.node.client import cancel_attack
     from nodes.launching.watching import find_run_dir
 

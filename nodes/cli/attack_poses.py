@@ -27,7 +27,7 @@ FoundAttack = Annotated[
 
 
 def attack_poses(file: RequestFile, output: Output = None, overrides: Overrides = None) -> None:
-    """Search for where objects should stand, alone or with their colours; the same command goes on after a kill."""
+    """Search for where objects should stand, alone or with their colours; the same command resumes it after a kill."""
     from advnerf_core.attack.artifact import load_attack
     from nodes.experiment.node.poses import run_poses
     from nodes.experiment.node.printed import print_attacks
@@ -54,7 +54,7 @@ def attack_poses(file: RequestFile, output: Output = None, overrides: Overrides 
 def attack_landscape(
     file: RequestFile, output: Output = None, attack: FoundAttack = None, overrides: Overrides = None
 ) -> None:
-    """Map the total CTE over where one object stands: landscape.json and landscape.png; goes on after a kill."""
+    """Map the total CTE over where one object stands: landscape.json and landscape.png; resumes after a kill."""
     import numpy as np
 
     from nodes.experiment.node.pose_maps import make_landscape
@@ -81,7 +81,7 @@ def attack_landscape(
 def attack_robustness(
     file: RequestFile, output: Output = None, attack: FoundAttack = None, overrides: Overrides = None
 ) -> None:
-    """Map what an attack does from other starts and with an object moved: robustness.json and .png; goes on after a kill."""
+    """Map what an attack does from other starts and with an object moved: robustness.json and .png; resumes after a kill."""
     import numpy as np
 
     from nodes.experiment.node.pose_maps import make_robustness

@@ -42,7 +42,7 @@ def carla_check(
         Path | None, typer.Option(help="Folder for what the driving camera sees: look at it.")
     ] = None,
 ) -> None:
-    """Say what is right and what is wrong with a server; the world is left as it was."""
+    """Say what is right and what is wrong with a server; the world is left unchanged."""
     from nodes.lab.carla.check import check_server
 
     rows, failed = table("check", "state", "found"), False

@@ -61,7 +61,7 @@ class CellChoice:
 
 
 def load_cells(choice: CellChoice, executes: bool = True) -> tuple[Experiment, list[Cell]]:
-    """An experiment, and those of its cells that are wanted; see `load_experiment` for ``executes``."""
+    """An experiment and its requested cells; see `load_experiment` for ``executes``."""
     os.environ.setdefault("MUJOCO_GL", "egl")
     from nodes.experiment.plan.cell import select
     from nodes.experiment.steps.run import load_experiment

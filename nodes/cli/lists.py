@@ -21,7 +21,7 @@ def list_command(
 ) -> None:
     """List what can be named: built in, and of installed packages, with one line each and where it comes from.
 
-    Exit code 1 if two things have one name.
+    Exit code 1 if a name occurs twice.
     """
     from advnerf_core.plugins import PluginError, unknown
     from nodes.lab.plugin_tables import TABLES, names_twice, rows_of

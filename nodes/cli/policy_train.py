@@ -61,7 +61,7 @@ class ExpertOptions:
     ] = 1.0
 
     def expert(self, bags: list[Path], needed: bool) -> Expert:
-        """The expert on the path of the room, which is that of the first bag unless a file is given."""
+        """The expert on the room's path, which is the path of the first bag unless a file is given."""
         from advnerf_core.driving.expert import Expert, ExpertConfig
         from advnerf_core.driving.path import Path as DrivingPath
         from calibration.schema import RoomCalibration

@@ -226,7 +226,7 @@ def match_colours(
     ] = None,
     most: Annotated[int, typer.Option(min=1, help="Use at most this many frames, evenly spread.")] = 16,
 ) -> None:
-    """Fit the map from the colours of a scene to those of the driving camera, and store it in the scene file."""
+    """Fit the map from a scene's colours to the driving camera's colours, and store it in the scene file."""
     from nodes.lab.importing.colours import match_colours as run
 
     result = run(scene, images, output or scene, most)

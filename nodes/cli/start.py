@@ -31,7 +31,7 @@ def demo(
 def init(
     folder: Annotated[Path, typer.Argument(help="Folder to work in.", file_okay=False)],
 ) -> None:
-    """Copy launch and experiment files, the examples and the simulated lab's calibration into a folder, to edit. What is there already stays."""
+    """Copy launch and experiment files, the examples and the simulated lab's calibration into a folder, to edit. Existing files are kept."""
     from advnerf_core.files import write_atomically
     from nodes.runtime.paths import shipped
 
