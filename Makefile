@@ -37,12 +37,12 @@ demo: $(VENV)/.installed-demo  ## The whole experiment, small setting, on the si
 
 experiment: setup  ## The full experiment, 3 seeds (a quarter of an hour on 2 cores); writes its rows to docs/results.json
 	@began=$$(date +%s) && \
-	$(BIN)/advnerf experiment launch/room.experiment.yaml --setting full --run-folder runs/full && \
+	$(BIN)/advnerf experiment run launch/room.experiment.yaml --setting full --folder runs/full && \
 	$(BIN)/python -m benchmarks.experiment_rows runs/full --wall-s $$(( $$(date +%s) - began ))
 
 evidence: setup  ## The registered experiment, six searches x five live starts (an hour on 2 cores), published and verified
-	@$(BIN)/advnerf experiment launch/room.experiment.yaml --setting evidence --run-folder runs/evidence --only victim=hardened
-	@$(BIN)/advnerf publish launch/room.experiment.yaml --setting evidence --run-folder runs/evidence --only victim=hardened
+	@$(BIN)/advnerf experiment run launch/room.experiment.yaml --setting evidence --folder runs/evidence --only victim=hardened
+	@$(BIN)/advnerf experiment publish launch/room.experiment.yaml --setting evidence --folder runs/evidence --only victim=hardened
 	@$(BIN)/advnerf verify
 
 NAME ?= metadrive
@@ -51,8 +51,8 @@ CHANGES ?=
 CONSENT ?=
 world: setup  ## A simulator of other people, from its installation to its table: make world NAME=duckietown (under an hour on 2 cores)
 	@began=$$(date +%s) && \
-	$(BIN)/advnerf world install $(NAME) $(CONSENT) && \
-	$(BIN)/advnerf experiment launch/$(NAME).experiment.yaml --setting panel --run-folder runs/$(NAME) $(CHANGES) && \
+	$(BIN)/advnerf scene world install $(NAME) $(CONSENT) && \
+	$(BIN)/advnerf experiment run launch/$(NAME).experiment.yaml --setting panel --folder runs/$(NAME) $(CHANGES) && \
 	$(BIN)/python -m benchmarks.learned_roads runs/$(NAME) --wall-s $$(( $$(date +%s) - began ))
 
 test: setup  ## The default tests (six to twelve minutes on 2 cores)

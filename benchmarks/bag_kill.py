@@ -138,7 +138,7 @@ def _record_and_kill(
     folder: Path, rng: np.random.Generator, settings: tuple[str, ...]
 ) -> tuple[dict[str, int], dict[str, list[float]]]:
     """Send until a random moment, kill; how many were sent, and the sums that are expected of their contents."""
-    command = [sys.executable, "-m", "nodes.recorder", "--run-dir", str(folder)]
+    command = [sys.executable, "-m", "nodes.recorder", "--folder", str(folder)]
     command += ["--set", f"topics=[{IMAGE}, {POSE}]"]
     command += [part for setting in settings for part in ("--set", setting)]
     process = subprocess.Popen(command, cwd=REPOSITORY, stderr=subprocess.DEVNULL)

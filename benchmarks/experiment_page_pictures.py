@@ -52,12 +52,13 @@ def watched_experiment(
         "-m",
         "nodes.cli",
         "experiment",
+        "run",
         str(EXPERIMENT),
         "--setting",
         "demo",
         "--anew",
     ]
-    command += ["--run-folder", str(folder / "run"), "--page", "--page-port", "0", *changes]
+    command += ["--folder", str(folder / "run"), "--page", "--page-port", "0", *changes]
     file = folder / "experiment.log"
     with file.open("wb") as log:
         process = subprocess.Popen(

@@ -86,7 +86,7 @@ class Graph:
         config = folder / "twin.yaml"
         config.write_text(json.dumps({"vesc": CONFIGURED, "vicon": {"port": VICON_PORT}}), encoding="utf-8")
         self.log = (folder / "campaign.log").open("ab")
-        arguments = ("--name", "twin", "--config", str(config), "--run-dir", str(folder))
+        arguments = ("--name", "twin", "--config", str(config), "--folder", str(folder))
         self.twin = self._start(
             "benchmarks.faulty_twin", *arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE
         )
@@ -97,7 +97,7 @@ class Graph:
         """Start the launch; its process."""
         settings = ("twin.if=false", f"params.vicon_port={VICON_PORT}", *self.settings)
         overrides = [part for setting in settings for part in ("--set", setting)]
-        return self._start("nodes.cli", "launch", str(LAUNCH_FILE), "--run-dir", str(self.folder), *overrides)
+        return self._start("nodes.cli", "launch", str(LAUNCH_FILE), "--folder", str(self.folder), *overrides)
 
     def _start(
         self, module: str, *arguments: str, stdin: int | None = None, stdout: Any = None

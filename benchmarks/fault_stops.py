@@ -63,7 +63,7 @@ def live_graph(controller: dict[str, float]) -> Iterator[tuple[LiveOperator, sub
     with tempfile.TemporaryDirectory(prefix="advnerf-") as folder:
         config = Path(folder) / "twin.yaml"
         config.write_text(json.dumps({"vesc": controller, "vicon": {"port": VICON_PORT}}), encoding="utf-8")
-        twin = _start("nodes.twin", "--config", str(config), "--run-dir", folder)
+        twin = _start("nodes.twin", "--config", str(config), "--folder", folder)
         settings = (
             "record=false",
             "twin.if=false",
@@ -73,7 +73,7 @@ def live_graph(controller: dict[str, float]) -> Iterator[tuple[LiveOperator, sub
             f"motor.controller_brake_current_a={controller['timeout_brake_current_a']}",
         )
         overrides = [part for setting in settings for part in ("--set", setting)]
-        supervisor = _start("nodes.cli", "launch", str(LAUNCH_FILE), "--run-dir", folder, *overrides)
+        supervisor = _start("nodes.cli", "launch", str(LAUNCH_FILE), "--folder", folder, *overrides)
         operator = LiveOperator(Path(folder), NODES)
         try:
             operator.wait_ready(timeout_s=90.0)

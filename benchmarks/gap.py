@@ -52,7 +52,9 @@ def ledger_rows(names: str) -> list[LedgerRow]:
 def _published(name: str) -> dict[str, Any]:
     file = PUBLISHED / name / "set" / "set.json"
     if not file.exists():
-        raise SystemExit(f"expected a published set in {PUBLISHED / name}, got none; run advnerf publish")
+        raise SystemExit(
+            f"expected a published set in {PUBLISHED / name}, got none; run advnerf experiment publish"
+        )
     data: dict[str, Any] = read_json(file)
     return data
 

@@ -1,6 +1,6 @@
 """Does a victim withstand random textures? ``python -m benchmarks.hardening RUN_FOLDER`` judges one, and keeps the verdict.
 
-Run it when the policies are trained, and before any gradient search: ``advnerf experiment FILE --until policy``. Without a run folder it tells what the
+Run it when the policies are trained, and before any gradient search: ``advnerf experiment run FILE --until policy``. Without a run folder it tells what the
 best random search of each published set did to the set's victim, from the kept drives.
 """
 

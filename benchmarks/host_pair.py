@@ -176,7 +176,7 @@ class HostPair:
         config = self.car / "twin.yaml"
         config.write_text(json.dumps({"vesc": CONFIGURED, "vicon": {"port": _VICON_PORT}}), encoding="utf-8")
         try:
-            self._start(0, {}, "nodes.twin", "--config", str(config), "--run-dir", str(self.car))
+            self._start(0, {}, "nodes.twin", "--config", str(config), "--folder", str(self.car))
             common = (*self._settings(policy), *settings)
             self._launch(0, ROBOT, self.car, {}, (*common, f"keys={keys[ROBOT]}"))
             self._launch(1, WORKSTATION, self.desk, environment or {}, (*common, f"keys={keys[WORKSTATION]}"))
@@ -201,7 +201,7 @@ class HostPair:
         self, host: int, name: str, folder: Path, environment: Mapping[str, str], settings: Sequence[str]
     ) -> None:
         overrides = [part for setting in settings for part in ("--set", setting)]
-        arguments = ("launch", str(LAUNCH_FILE), "--host", name, "--run-dir", str(folder), *overrides)
+        arguments = ("launch", str(LAUNCH_FILE), "--host", name, "--folder", str(folder), *overrides)
         self._start(host, environment, "nodes.cli", *arguments)
 
     def _start(self, host: int, environment: Mapping[str, str], module: str, *arguments: str) -> None:

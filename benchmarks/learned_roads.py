@@ -2,7 +2,7 @@
 
 Reads run folders of experiments in worlds of other people: held-out views of the driving camera at the policy's size, the policy's control on
 true and learned views, and the deployed drives without attack of the hardened victim, judged by the limit that registrations fix. A road
-of which there are photographs and a scene alone (``advnerf experiment ... --until bake``) is looked at by the victim of another run folder,
+of which there are photographs and a scene alone (``advnerf experiment run ... --until bake``) is looked at by the victim of another run folder,
 with ``--victim-of``.
 """
 

@@ -66,7 +66,7 @@ def live_page(
             "nodes.cli",
             "launch",
             str(LAUNCH_FILE),
-            "--run-dir",
+            "--folder",
             folder,
             *overrides,
         ]

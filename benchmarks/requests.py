@@ -67,7 +67,7 @@ def busy_lab() -> Iterator[Graph]:
     """The graph with a recorder, a viewer beside it, and a core that has no time."""
     with tempfile.TemporaryDirectory(prefix="advnerf-") as folder:
         graph = Graph(Path(folder), SETTINGS)
-        arguments = ("-m", "nodes.viewer", "--run-dir", folder, "--set", "port=0")
+        arguments = ("-m", "nodes.viewer", "--folder", folder, "--set", "port=0")
         others = [
             subprocess.Popen([sys.executable, *words], cwd=REPOSITORY, stdout=graph.log, stderr=graph.log)
             for words in (arguments, ("-c", "while True: pass"))

@@ -109,7 +109,7 @@ def run(seconds: float, domain: int) -> tuple[Tally, list[dict[str, Any]]]:
             bus.publisher(topic)
         bus.subscribe("/policy/drive", queue=1000)
         bus.subscribe("/status/ros2")
-        command = [sys.executable, "-m", "nodes.ros2", "--config", str(config), "--run-dir", name]
+        command = [sys.executable, "-m", "nodes.ros2", "--config", str(config), "--folder", name]
         node = subprocess.Popen(command, cwd=REPOSITORY)
         peer = RclpyPeer(domain, PEERS / "answering.py", "--commands", "/cmd_vel", "--poses", "/pose")
         try:

@@ -59,7 +59,7 @@ class Programs:
             "record=false",
         )
         options = [word for setting in settings for word in ("--set", setting)]
-        launch = ["launch", "launch/ros2.launch.yaml", "--run-dir", str(self.run_dir), *options]
+        launch = ["launch", "launch/ros2.launch.yaml", "--folder", str(self.run_dir), *options]
         self._log = open(folder / "launch.log", "wb")  # noqa: SIM115 - belongs to the child
         self._launch = subprocess.Popen(
             [sys.executable, "-m", "nodes.cli.main", *launch],

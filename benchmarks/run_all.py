@@ -41,12 +41,12 @@ def commands(run_folder: Path, quick: bool) -> list[str]:
 def main() -> int:
     """Run them all; the exit code is 1 if one failed."""
     parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("--run-folder", type=Path, default=Path("runs/full"))
+    parser.add_argument("--folder", type=Path, default=Path("runs/full"))
     parser.add_argument("--campaign", action="store_true", help="what the live stack must bear, instead")
     parser.add_argument("--quick", action="store_true", help="leave out what takes more than a few minutes")
     options = parser.parse_args()
     failed = []
-    for command in CAMPAIGN if options.campaign else commands(options.run_folder, options.quick):
+    for command in CAMPAIGN if options.campaign else commands(options.folder, options.quick):
         began = time.monotonic()
         module, *arguments = command.split()
         code = subprocess.run(

@@ -1,6 +1,6 @@
 """Write the numbers, pictures and page of published sets again from what is kept: ``python -m benchmarks.set_pages [SET ...]``.
 
-Registrations, cells and films stay as they are. `advnerf publish` does the same for one set whose run folder is on this machine.
+Registrations, cells and films stay as they are. `advnerf experiment publish` does the same for one set whose run folder is on this machine.
 """
 
 from __future__ import annotations

@@ -103,7 +103,7 @@ class Rig(threading.Thread):
         command = [sys.executable, "-m", f"nodes.{module or name}", "--config", str(file), "--name", name]
         log = open(folder / f"{name}.log", "ab")  # noqa: SIM115 - belongs to the child
         self.processes[name] = subprocess.Popen(
-            [*command, "--run-dir", str(folder)], cwd=REPOSITORY, stdout=log, stderr=log
+            [*command, "--folder", str(folder)], cwd=REPOSITORY, stdout=log, stderr=log
         )
 
     def _gateways(self) -> None:
@@ -178,7 +178,7 @@ def run_out(what: str, rig: Rig) -> Iterator[None]:
             for pid in pids:
                 resource.prlimit(pid, kind, before[pid])
     elif what in ("endpoints", "hung reader", "full queue"):
-        command = [sys.executable, "-m", "benchmarks.stops", "--as", what, "--run-dir", str(rig.folder)]
+        command = [sys.executable, "-m", "benchmarks.stops", "--as", what, "--folder", str(rig.folder)]
         other = subprocess.Popen(command, cwd=REPOSITORY, stdout=subprocess.PIPE, text=True)
         try:
             assert other.stdout is not None
@@ -262,7 +262,7 @@ def ask(origin: str, kind: str, rig: Rig, browser: Browser | None, keys: int | N
         ["-m", "benchmarks.stops", "--as", "trial"] if origin == "trial" else ["-m", "nodes.cli", "disarm"]
     )
     process = subprocess.Popen(
-        [sys.executable, *words, "--run-dir", str(folder)],
+        [sys.executable, *words, "--folder", str(folder)],
         cwd=REPOSITORY,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -354,7 +354,7 @@ def rig_of(teleop: bool) -> Iterator[tuple[Rig, Browser | None, int | None]]:
             if teleop:
                 keys, other = pty.openpty()
                 with open(Path(folder) / "teleop.log", "wb") as log:
-                    command = [sys.executable, "-m", "nodes.teleop", "--run-dir", folder, "--name", "teleop"]
+                    command = [sys.executable, "-m", "nodes.teleop", "--folder", folder, "--name", "teleop"]
                     teleoperator = subprocess.Popen(
                         command, cwd=REPOSITORY, stdin=other, stdout=log, stderr=log
                     )
@@ -377,12 +377,12 @@ def main() -> None:
     parser.add_argument("--only", choices=[origin for origin, _ in CELLS], action="append")
     parser.add_argument("--resource", choices=RESOURCES, action="append")
     parser.add_argument("--as", dest="role", help=argparse.SUPPRESS)
-    parser.add_argument("--run-dir", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.role == "trial":
-        end_trial(options.run_dir)
+        end_trial(options.folder)
     elif options.role:
-        disturb(options.role, options.run_dir)
+        disturb(options.role, options.folder)
     else:
         _matrix(options.repeats, options.only, options.resource or RESOURCES)
 

@@ -75,7 +75,7 @@ def start_car(folder: Path) -> Car:
     for name in _COMMANDS:
         bus.subscribe(name)
     with open(folder / "gateway.log", "wb") as log:
-        command = [sys.executable, "-m", "nodes.gateway", "--config", str(config), "--run-dir", str(folder)]
+        command = [sys.executable, "-m", "nodes.gateway", "--config", str(config), "--folder", str(folder)]
         process = subprocess.Popen(command, cwd=REPOSITORY, stderr=log)
     return Car(folder, keys, ports[1], bus, process, public)
 

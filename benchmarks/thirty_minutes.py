@@ -1,7 +1,7 @@
 """Half an hour live with the trained policy on the simulated lab: ``python -m benchmarks.thirty_minutes`` (35 minutes, real time).
 
 The policy of the demo drives lap after lap, and everything is recorded (7 GB under ``runs/thirty_minutes``). It needs a policy:
-``advnerf experiment launch/room.experiment.yaml --until policy --setting demo --run-folder runs/demo`` trains it in about 17 minutes on 2 cores.
+``advnerf experiment run launch/room.experiment.yaml --until policy --setting demo --folder runs/demo`` trains it in about 17 minutes on 2 cores.
 
 Every ten seconds the counters and the memory of every node are noted in ``samples.jsonl``. Asked afterwards: does the car stop
 without being told to, does any node miss a tick, does memory grow after the warm-up, and is every message that a topic's publisher
@@ -283,8 +283,8 @@ def main() -> None:
     options = parser.parse_args()
     if not options.policy.is_file():
         raise SystemExit(
-            f"expected a policy at {options.policy}; train one: advnerf experiment launch/room.experiment.yaml --until policy "
-            "--setting demo --run-folder runs/demo (about 17 minutes on 2 cores), or give one with --policy"
+            f"expected a policy at {options.policy}; train one: advnerf experiment run launch/room.experiment.yaml --until policy "
+            "--setting demo --folder runs/demo (about 17 minutes on 2 cores), or give one with --policy"
         )
     if not options.trial and options.minutes * 60.0 < WARM_UP_S + 120.0:
         raise SystemExit(

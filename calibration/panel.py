@@ -79,7 +79,7 @@ def make_panel(
     if any(abs(m / s - 1.0) > _SIZE_TOLERANCE for m, s in zip(measured, said, strict=True)):
         raise CalibrationError(
             f"the monitor reports a picture of {said[0]:.3f} x {said[1]:.3f} m, but the corners of target {target.subject} give "
-            f"{measured[0]:.3f} x {measured[1]:.3f} m; measure the whole panel (advnerf room target), or set size_mm to override"
+            f"{measured[0]:.3f} x {measured[1]:.3f} m; measure the whole panel (advnerf scene room target), or set size_mm to override"
         )
     return MonitorPanel(size_px, said)
 

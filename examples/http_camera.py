@@ -1,6 +1,6 @@
 """A camera of your own: a network camera that streams JPEG pictures over HTTP.
 
-    .venv/bin/advnerf camera check examples/http_camera.py:HttpCamera --set url=http://192.168.0.20:8080/stream
+    .venv/bin/advnerf car camera check examples/http_camera.py:HttpCamera --set url=http://192.168.0.20:8080/stream
 
 In a launch file: `source: {kind: ../examples/http_camera.py:HttpCamera, url: ...}`; see docs/cameras.md.
 """

@@ -1,7 +1,7 @@
 """A network of your own as the policy: trained on a painted line here, and by every command that trains.
 
     .venv/bin/python examples/my_architecture.py
-    .venv/bin/advnerf experiment examples/warehouse.experiment.yaml --setting tiny --run-folder runs/mine --set policy.architecture=my_architecture.py:Mixer
+    .venv/bin/advnerf experiment run examples/warehouse.experiment.yaml --setting tiny --folder runs/mine --set policy.architecture=my_architecture.py:Mixer
 
 The class holds the layers and turns images into one number. SteeringNetwork checks the inputs and bounds the steering.
 """

@@ -1,6 +1,6 @@
 """A policy of your own as the victim of an experiment, `my_policy.experiment.yaml`: nothing is trained.
 
-    .venv/bin/advnerf experiment examples/my_policy.experiment.yaml --setting quick --run-folder runs/my_policy
+    .venv/bin/advnerf experiment run examples/my_policy.experiment.yaml --setting quick --folder runs/my_policy
 
 This one steers to where the picture is green, as the tape of the simulated room is; put your network and its weights in its place.
 """

@@ -1,6 +1,6 @@
 """A driving policy as a plain ROS 2 node: rclpy and ONNX Runtime, nothing of advnerf.
 
-    .venv/bin/advnerf launch launch/ros2.launch.yaml --run-dir runs/ros2
+    .venv/bin/advnerf launch launch/ros2.launch.yaml --folder runs/ros2
     .venv-ros2/bin/python examples/ros2_policy.py policy.onnx
 
 Run it in any ROS 2 environment; `make setup-ros2` makes `.venv-ros2`. It answers each image with a command that carries the image's

@@ -1,6 +1,6 @@
 """A node of your own: it steers towards the brighter half of the camera's image.
 
-    .venv/bin/advnerf launch examples/steer_to_the_light.launch.yaml --run-dir runs/light
+    .venv/bin/advnerf launch examples/steer_to_the_light.launch.yaml --folder runs/light
     .venv/bin/python examples/read_a_bag.py runs/light/bag
 
 A node is a class that turns messages into messages. The launch file runs it as a process, beside a player of a recording.
@@ -64,7 +64,7 @@ class LightNode(Node):
         return [Out(COMMANDS, drive_message(self._config.speed_mps, self._steering_rad, stamp_ns(message)))]
 
     def status(self) -> tuple[str, str]:
-        """What `advnerf node list` says about it."""
+        """What `advnerf car node list` says about it."""
         return "active", f"steers {self._steering_rad:+.3f} rad"
 
 

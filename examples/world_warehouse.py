@@ -1,7 +1,7 @@
 """A world of your own in one file: a warehouse that numpy draws by casting rays at boxes, and a car that steers.
 
-    .venv/bin/advnerf world check examples/world_warehouse.py:Warehouse
-    .venv/bin/advnerf experiment examples/warehouse.experiment.yaml --setting demo --run-folder runs/warehouse
+    .venv/bin/advnerf scene world check examples/world_warehouse.py:Warehouse
+    .venv/bin/advnerf experiment run examples/warehouse.experiment.yaml --setting demo --folder runs/warehouse
 
 Metres, radians, seconds; the world's z points up, cameras have OpenCV axes (x right, y down, z forward). docs/worlds.md says what a world must have.
 """

@@ -1,4 +1,4 @@
-"""The calibration drive for ``advnerf calibrate vehicle``. It replaces the policy: ``--set policy.module=nodes.calibration_drive``.
+"""The calibration drive for ``advnerf car calibrate vehicle``. It replaces the policy: ``--set policy.module=nodes.calibration_drive``.
 
 The car drives circles to both sides, straight runs and wide curves at two speeds, then steps of steering and speed. This takes about
 45 s and 6 x 5.5 m, with 3.5 m behind the start and 3.2 m to its right. The car drives only while the safety node has armed it,

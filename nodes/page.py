@@ -54,7 +54,7 @@ class PageConfig(StrictModel):
 
     Attributes:
         host: Address to listen on. Any address other than loopback is served with TLS, and asks for the one-time code that
-            ``advnerf page`` shows on this computer.
+            ``advnerf car page`` shows on this computer.
         port: TCP port; 0 selects a free one.
         names: Further names of this computer by which browsers may call it.
         role: ``operate``, or ``watch`` for a page that only shows the launch and can stop the car.

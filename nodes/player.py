@@ -318,7 +318,7 @@ def _require_free(names: Iterable[str]) -> None:
     if never := [name for name in names if not may_replay(name)]:
         raise BagError(
             f"expected topics that a recording may publish, got {', '.join(never)}: a recording must not move or arm a car, under no name."
-            " Run nodes over these messages with advnerf replay, which has no bus"
+            " Run nodes over these messages with advnerf bag replay, which has no bus"
         )
 
 

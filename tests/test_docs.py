@@ -79,10 +79,10 @@ def is_a_command(command, line):
 
 
 def test_what_is_no_command_is_noticed(command):
-    assert is_a_command(command, "advnerf experiment FILE --jobs 2")
-    assert not is_a_command(command, "advnerf keys ran FILE")
-    assert not is_a_command(command, "advnerf experiment FILE --jobbs 2")
-    assert commands_of("text\n\n    advnerf arm   # drives\n") == ["advnerf arm"]
+    assert is_a_command(command, "advnerf experiment run FILE --jobs 2")
+    assert not is_a_command(command, "advnerf car keys ran FILE")
+    assert not is_a_command(command, "advnerf experiment run FILE --jobbs 2")
+    assert commands_of("text\n\n    advnerf car arm   # drives\n") == ["advnerf car arm"]
 
 
 def test_results_hold_no_path_of_the_machine_they_were_made_on():

@@ -178,7 +178,7 @@ def test_the_node_steers_by_every_image_of_a_recording(expected):
 
 @pytest.mark.live
 def test_the_launch_file_runs_the_node_beside_the_player_and_records_what_it_says(tmp_path, expected):
-    run("-m", "nodes.cli", "launch", "examples/steer_to_the_light.launch.yaml", "--run-dir", tmp_path / "run")
+    run("-m", "nodes.cli", "launch", "examples/steer_to_the_light.launch.yaml", "--folder", tmp_path / "run")
     bag = tmp_path / "run" / "bag"
     counts = {topic.name: topic.count for topic in read_info(bag).topics}
     commands = [decode(DRIVE_TYPE, message.cdr) for message in read_messages(bag, [DRIVE])]

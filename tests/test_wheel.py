@@ -117,7 +117,7 @@ def test_init_copies_what_can_be_edited_and_keeps_what_was(unpacked, tmp_path):
     (tmp_path / "car" / "launch").mkdir(parents=True)
     own = tmp_path / "car" / "launch" / "page.launch.yaml"
     own.write_text("name: mine\n")
-    done = advnerf("init", "car")
+    done = advnerf("experiment", "init", "car")
     assert done.returncode == 0, done.stderr
     expected = {
         name: file
@@ -204,7 +204,8 @@ def test_the_commands_work_for_a_user_without_a_home_among_files_of_strange_name
     if os.getuid() == 0:
         assert (states["home"], states["cache"]) == ("warning", "warning")
     assert (
-        "46 files copied" in advnerf("init", "x").stdout or "files copied to x" in advnerf("init", "y").stdout
+        "46 files copied" in advnerf("experiment", "init", "x").stdout
+        or "files copied to x" in advnerf("init", "y").stdout
     )
     policy = advnerf.packages / "nodes" / "shipped" / POLICY
     plan = advnerf("launch", "green_screen", "--check", "--set", f"params.policy={policy}")
@@ -212,6 +213,6 @@ def test_the_commands_work_for_a_user_without_a_home_among_files_of_strange_name
     checked = advnerf("policy", "check", policy)
     assert "drives without attack" in checked.stdout
     assert str(STRANGER) in checked.stderr or os.getuid() != 0  # where the kernels are kept
-    advnerf("experiment", "room", "--setting", "demo", "--until", "object", "--set", "scene.steps=20")
+    advnerf("experiment", "run", "room", "--setting", "demo", "--until", "object", "--set", "scene.steps=20")
     assert (advnerf.folder / "runs" / "demo" / "scene" / "scene.safetensors").is_file()
     assert advnerf.listing() == before

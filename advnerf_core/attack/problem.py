@@ -174,7 +174,7 @@ class AttackProblem:
         if not self.differentiable:
             raise BlackBoxError(
                 "expected a policy with a gradient, got one that declares differentiable = False; search with a "
-                "method that asks for answers only (advnerf list methods)"
+                "method that asks for answers only (advnerf experiment list methods)"
             )
 
     def coloured(self, method: str) -> ColouringSensor:

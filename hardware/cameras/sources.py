@@ -32,7 +32,7 @@ class _ControlledSource(Source):
     Attributes:
         white_balance_k: Colour temperature to fix [K]; None for automatic.
         power_line_hz: Mains frequency for the device's flicker compensation [Hz].
-        controls: Further controls by name, in the device's own units (``advnerf camera list`` shows them).
+        controls: Further controls by name, in the device's own units (``advnerf car camera list`` shows them).
     """
 
     white_balance_k: int | None = None
@@ -99,7 +99,7 @@ class ZedSource(_ControlledSource):
         rate_hz: Frames to deliver per second, chosen by their stamps [Hz]; None for all.
         size: Width and height of the delivered images [px].
         exposure_percent: Exposure to fix [% of the longest at this rate]; None for automatic.
-        gain_raw: Gain to fix, as in the sensor's register; ``advnerf camera list`` shows the current value.
+        gain_raw: Gain to fix, as in the sensor's register; ``advnerf car camera list`` shows the current value.
     """
 
     kind: Literal["zed"] = "zed"

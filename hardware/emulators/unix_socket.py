@@ -38,6 +38,6 @@ def listen(path: Path, who: str, backlog: int = 8) -> socket.socket:
     except OSError as error:
         listener.close()
         raise HardwareError(
-            f"cannot serve {who} at {path}: {error.strerror or error}; try a shorter --run-dir"
+            f"cannot serve {who} at {path}: {error.strerror or error}; try a shorter --folder"
         ) from error
     return listener

@@ -1,6 +1,6 @@
 """Environments of third-party simulators: where they are installed, and whether they match their lock file.
 
-``advnerf world install NAME`` creates one (`nodes.lab.worlds.install`); the worlds only look for its interpreter.
+``advnerf scene world install NAME`` creates one (`nodes.lab.worlds.install`); the worlds only look for its interpreter.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Environment:
         """
         if (state := self.state) != "installed":
             raise WorldNotInstalled(
-                f"expected the environment of the world {self.name} in {self.folder}; it is {state}: run `advnerf world install {self.name}`"
+                f"expected the environment of the world {self.name} in {self.folder}; it is {state}: run `advnerf scene world install {self.name}`"
             )
         return self.interpreter
 

@@ -1,4 +1,4 @@
-"""Common base of the third-party worlds that ``advnerf world install`` installs."""
+"""Common base of the third-party worlds that ``advnerf scene world install`` installs."""
 
 from __future__ import annotations
 

@@ -94,7 +94,7 @@ class RemoteServer:
         except OSError as error:
             _end(None, self._context, self._folder)
             raise ServerLost(
-                f"world {name}: expected to start {python}, got: {error}; run `advnerf world install {name}` again"
+                f"world {name}: expected to start {python}, got: {error}; run `advnerf scene world install {name}` again"
             ) from error
         self._end = weakref.finalize(self, _end, self._process, self._context, self._folder)
         self.call("hello", {}, {}, starting_s)

@@ -269,7 +269,7 @@ class RemoteWorld(ABC):
             if not isinstance(error, RemoteWorldError):
                 raise
             raise type(error)(
-                f"world {self._name}: {error}; its process was ended and the drive does not count; run `advnerf world check {self._name}`"
+                f"world {self._name}: {error}; its process was ended and the drive does not count; run `advnerf scene world check {self._name}`"
             ) from None
 
     def _lose(self) -> None:

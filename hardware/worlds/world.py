@@ -1,7 +1,7 @@
 """The contract of a place that can be driven: a world has a car, a camera with depth, photographs, and a description for an experiment.
 
 The simulated junction (`hardware.worlds.junction.scene.Intersection`) and a junction of a CARLA map (`hardware.worlds.carla.scene.CarlaScene`)
-are worlds; your own world is one class in one file (docs/worlds.md), and ``advnerf world check`` checks it against this contract.
+are worlds; your own world is one class in one file (docs/worlds.md), and ``advnerf scene world check`` checks it against this contract.
 
 Axes are right-handed, the world's z points up; metres, radians, seconds. Cameras have OpenCV axes: x right, y down, z forward. The car's frame lies on
 the ground under the point whose x, y and heading are its state, x forward, y left.

@@ -136,13 +136,13 @@ def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any
 def write_experiment(
     folder: Path, question: AuditedQuestion, settings: Mapping[str, Mapping[str, Any]]
 ) -> Path:
-    """Write the experiment file: the place, the victim, and one setting for each search; ``advnerf experiment`` can run it again."""
+    """Write the experiment file: the place, the victim, and one setting for each search; ``advnerf experiment run`` can run it again."""
     text = dump_yaml(
         {**experiment_data(question), "settings": {"place": {}, **_of_halves(question), **settings}},
         default_flow_style=None,
         width=140,
     )
-    head = "# Written by advnerf audit: each setting is one search; advnerf experiment FILE --setting NAME --run-folder FOLDER runs it again.\n"
+    head = "# Written by advnerf audit: each setting is one search; advnerf experiment run FILE --setting NAME --folder FOLDER runs it again.\n"
     file = folder / FILE
     write_atomically(file, head + text)
     return file

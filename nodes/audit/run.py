@@ -168,7 +168,7 @@ class Audit:
         known.planted = self._plant(copies, plan, spots, known.limit_m)
         if not known.planted.found:
             raise CannotJudgeError(
-                "the search does not find a planted weakness of this policy at this place with this budget; give it a larger --budget or object (--size)"
+                "the search does not find a planted weakness of this policy at this place with this budget; give it a larger --budget or object (--object-size)"
             )
 
     def _require_drives(self, experiment: Experiment, limit_m: float) -> None:
@@ -194,7 +194,7 @@ class Audit:
         spots = plan.spots
         if not spots:
             raise CannotJudgeError(
-                "there is no spot beside the path where the object is seen; give it another --size, or the path another start"
+                "there is no spot beside the path where the object is seen; give it another --object-size, or the path another start"
             )
         for number, spot in enumerate(spots, start=1):
             at, seen_s = spot.placed, spot.seen_ticks * experiment.config.dt_s

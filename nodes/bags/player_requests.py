@@ -35,5 +35,5 @@ def ask_player(run_dir: Path, command: str) -> tuple[bool, str]:
             return ask(bus, _CONTROL, make, _STATE, read, every_s=_REPEAT_S, patience_s=_PATIENCE_S)
         except NoAnswerError:
             raise LaunchError(
-                f"expected an answer from a player within {_PATIENCE_S:g} s, got none; is one running with the same --run-dir ({run_dir})?"
+                f"expected an answer from a player within {_PATIENCE_S:g} s, got none; is one running with the same --folder ({run_dir})?"
             ) from None

@@ -1,4 +1,4 @@
-"""The commands ``advnerf arm``, which names the launch and asks, and ``advnerf disarm``, which stops all launches and never asks."""
+"""The commands ``advnerf car arm``, which names the launch and asks, and ``advnerf disarm``, which stops all launches and never asks."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ def arm(run_dir: RunDir = None, reason: Reason = "") -> None:
 
 def disarm(
     run_dir: Annotated[
-        Path | None, typer.Option(help="Folder of the run.", show_default="all running launches")
+        Path | None,
+        typer.Option("--folder", help="Folder of the run.", show_default="all running launches"),
     ] = None,
     reason: Reason = "",
 ) -> None:
@@ -65,7 +66,7 @@ def _run_to_arm(given: Path | None) -> Path:
             else f"{len(launches)} launches are running"
         )
         raise LaunchError(
-            f"expected a terminal to confirm which car to arm, because {why}; name it with --run-dir"
+            f"expected a terminal to confirm which car to arm, because {why}; name it with --folder"
         )
     return Path(launches[_chosen(len(launches))]["run_dir"])
 

@@ -144,7 +144,10 @@ def attack_print(
     overlap_mm: Annotated[float, typer.Option(help="Strip that neighbouring tiles share, for glue.")] = 5.0,
     name: Annotated[str | None, typer.Option("--object", help="Name or number of the object.")] = None,
     size_m: Annotated[
-        float | None, typer.Option(min=0.01, help="Edge of a panel, for attack files that do not hold it.")
+        float | None,
+        typer.Option(
+            "--object-size", min=0.01, help="Edge of a panel [m], for attack files that do not hold it."
+        ),
     ] = None,
 ) -> None:
     """Write a face's or panel's texture at its true size: a PDF in tiles with marks to cut and glue, or one PNG."""

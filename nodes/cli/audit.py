@@ -98,7 +98,7 @@ class SearchOptions:
         float | None,
         _option(
             _SEARCH,
-            "--size",
+            "--object-size",
             min=0.01,
             help="Width of the object in metres.",
             show_default="0.8 of half the lane",

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from nodes.cli.replay import replay
+from nodes.cli.trial import evaluate
 from nodes.runtime.terminal import RunDir, Topics, print_table, say_error, table
 
 if TYPE_CHECKING:
@@ -17,8 +19,11 @@ if TYPE_CHECKING:
 _DAMAGED_EXIT = 2  # as for every bag that cannot be read
 
 app = typer.Typer(
-    no_args_is_help=True, help="Record, inspect, play and repair bags (MCAP, as rosbag2 writes them)."
+    no_args_is_help=True,
+    help="Record, inspect, play, replay, evaluate and repair bags (MCAP, as rosbag2 writes them).",
 )
+app.command("replay")(replay)
+app.command("evaluate")(evaluate)
 
 
 @app.command("info")

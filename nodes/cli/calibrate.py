@@ -1,4 +1,4 @@
-"""The commands ``advnerf calibrate ...``. Each measures one quantity and writes a dated YAML file and a plot."""
+"""The commands ``advnerf car calibrate ...``. Each measures one quantity and writes a dated YAML file and a plot."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Source = Annotated[
     typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file.", exists=True, show_default="--live"),
 ]
 Lens = Annotated[
-    Path, typer.Option("--lens", help="Lens file (calibrate intrinsics) or camera file.", exists=True)
+    Path, typer.Option("--lens", help="Lens file (car calibrate intrinsics) or camera file.", exists=True)
 ]
 
 

@@ -1,4 +1,4 @@
-"""The commands ``advnerf calibrate display-colours`` and ``advnerf calibrate display``."""
+"""The commands ``advnerf car calibrate display-colours`` and ``advnerf car calibrate display``."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def display_colours(
     height: Annotated[int, typer.Option(min=16, help="Height of the monitor [px].")] = 1080,
     seed: Annotated[int, typer.Option(help="Random seed of the mixed colours.")] = 0,
 ) -> None:
-    """Write the sequence of plain-colour images to show full-screen for ``calibrate display``."""
+    """Write the sequence of plain-colour images to show full-screen for ``car calibrate display``."""
     import cv2
     import numpy as np
 

@@ -1,4 +1,4 @@
-"""The commands ``advnerf camera ...``."""
+"""The commands ``advnerf car camera ...``."""
 
 from __future__ import annotations
 
@@ -33,7 +33,9 @@ def camera_try(
         ),
     ],
     frames: Annotated[int, typer.Option(min=2, help="Number of frames to read.")] = 50,
-    out: Annotated[Path | None, typer.Option(help="Save the last image here (.png, .jpg).")] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Save the last image here (.png, .jpg).")
+    ] = None,
     timeout_s: Annotated[
         float, typer.Option("--timeout", min=0.5, help="Give up after this many seconds.")
     ] = 15.0,
@@ -48,9 +50,9 @@ def camera_try(
     print(f"mean brightness {trial.brightness:.0f} of 255")
     if counted := ", ".join(f"{name} {value:g}" for name, value in trial.counters.items() if value):
         print(f"counters: {counted}")
-    if out is not None:
-        save_picture(trial.picture, out)
-        print(f"saved {out}")
+    if output is not None:
+        save_picture(trial.picture, output)
+        print(f"saved {output}")
 
 
 @app.command("check")
@@ -67,8 +69,8 @@ def camera_check(
         Literal["red", "green", "blue"] | None,
         typer.Option(help="Colour of what is held before the camera; checks the order of colours."),
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="Save the last image here (.png, .jpg): look at it.")
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Save the last image here (.png, .jpg): look at it.")
     ] = None,
 ) -> None:
     """Hold cameras against the contract: form of the images, stamps, reopening, timeouts, stalls.
@@ -88,9 +90,9 @@ def camera_check(
         findings = check_camera(bench)
         print_findings(findings)
         met &= all(finding.met for finding in findings)
-        if out is not None and bench.seen:
-            save_picture(bench.seen[-1].rgb, out)
-            print(f"saved {out}")
+        if output is not None and bench.seen:
+            save_picture(bench.seen[-1].rgb, output)
+            print(f"saved {output}")
     if not met:
         raise typer.Exit(_FAILURE_EXIT)
 
@@ -99,7 +101,7 @@ def camera_check(
 def camera_factory(
     factory: Annotated[Path, typer.Argument(help="Factory calibration of the ZED, SN<serial>.conf.")],
     mount: Annotated[Path, typer.Option(help="Camera file from which the pose on the car is copied.")],
-    out: Annotated[Path, typer.Option(help="Path of the camera.yaml to write.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Path of the camera.yaml to write.")],
     mode: Annotated[str, typer.Option(help="Camera mode: 2K, HD1080, HD720 or VGA.")] = "VGA",
     width: Annotated[int, typer.Option(min=1, help="Width of the delivered images [px].")] = 336,
     height: Annotated[int, typer.Option(min=1, help="Height of the delivered images [px].")] = 188,
@@ -117,5 +119,5 @@ def camera_factory(
             f"expected at most {largest[0]} x {largest[1]} in mode {mode}; got {width} x {height}. Reduce --width and --height"
         )
     found = calibration_from_zed(factory, mode, (width, height), mount)
-    save_calibration(found, out)
-    print(f"fx {found.fx:.2f}, fy {found.fy:.2f}, cx {found.cx:.2f}, cy {found.cy:.2f}: saved {out}")
+    save_calibration(found, output)
+    print(f"fx {found.fx:.2f}, fy {found.fy:.2f}, cx {found.cx:.2f}, cy {found.cy:.2f}: saved {output}")

@@ -1,4 +1,4 @@
-"""The commands ``advnerf carla ...``: look at a server, list junctions, photograph one, drive it, free a server."""
+"""The commands ``advnerf scene carla ...``: look at a server, list junctions, photograph one, drive it, free a server."""
 
 from __future__ import annotations
 
@@ -21,7 +21,14 @@ Host = Annotated[
     str | None, typer.Argument(help="Computer of the server.", show_default="of the configuration: 127.0.0.1")
 ]
 Port = Annotated[
-    int | None, typer.Option("--port", min=1, max=65534, show_default="of the configuration: 2000")
+    int | None,
+    typer.Option(
+        "--port",
+        min=1,
+        max=65534,
+        help="TCP port of the server.",
+        show_default="of the configuration: 2000",
+    ),
 ]
 ConfigFile = Annotated[
     Path | None,
@@ -39,7 +46,8 @@ def carla_check(
     config: ConfigFile = None,
     overrides: Overrides = None,
     pictures: Annotated[
-        Path | None, typer.Option(help="Folder for what the driving camera sees: look at it.")
+        Path | None,
+        typer.Option("--output", "-o", help="Folder for what the driving camera sees: look at it."),
     ] = None,
 ) -> None:
     """Say what is right and what is wrong with a server; the world is left unchanged."""
@@ -97,7 +105,7 @@ def carla_capture(
     overrides: Overrides = None,
     photos: Annotated[int, typer.Option(min=1, help="Photographs to learn from.")] = 1800,
     held_out: Annotated[int, typer.Option(min=0, help="Views that nothing learns from.")] = 60,
-    seed: Annotated[int, typer.Option()] = 0,
+    seed: Annotated[int, typer.Option(help="Random seed of the views.")] = 0,
 ) -> None:
     """Photograph a junction along its lanes: transforms.json for `advnerf scene train --open`, and the reference paths."""
     from nodes.lab.carla.capture import CaptureRequest, capture
@@ -117,7 +125,9 @@ def carla_drive(
     port: Port = None,
     config: ConfigFile = None,
     overrides: Overrides = None,
-    path: Annotated[Literal["straight", "right", "left"], typer.Option()] = "straight",
+    path: Annotated[
+        Literal["straight", "right", "left"], typer.Option(help="Reference path of the junction.")
+    ] = "straight",
     seconds: Annotated[float, typer.Option(min=0.1, help="How long to drive.")] = 6.0,
     output: Annotated[
         Path | None,

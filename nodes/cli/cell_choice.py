@@ -34,7 +34,7 @@ Setting = Annotated[
 Folder = Annotated[
     Path | None,
     typer.Option(
-        "--run-folder",
+        "--folder",
         help="Folder of all results.",
         show_default="run_folder of the file, or runs/<setting>",
     ),

@@ -1,10 +1,11 @@
-"""The commands ``advnerf status``, ``table`` and ``report``: how far cells are, and their table."""
+"""The commands ``advnerf experiment status``, ``table`` and ``report``: how far cells are, and their table."""
 
 from __future__ import annotations
 
 import sys
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,6 +19,14 @@ if TYPE_CHECKING:
     from nodes.experiment.plan.cell import Cell
     from nodes.experiment.show.context import Experiment
 
+Published = Annotated[
+    bool,
+    typer.Option(
+        "--published",
+        help="Of the cells that were published, whatever their settings; --folder is then that of all published sets (docs/results).",
+    ),
+]
+_PUBLISHED = Path("docs/results")
 _COLOURS = {
     "done": "green",
     "not driven live": "yellow",
@@ -49,16 +58,10 @@ def status(choice: CellChoice) -> None:
 
 def table_command(
     choice: CellChoice,
-    source: Annotated[
-        Path | None,
-        typer.Option(
-            "--from",
-            help="Show the cells that were published there, e.g. in docs/results, of whatever settings.",
-            show_default="those of these settings",
-        ),
-    ] = None,
+    published: Published = False,
 ) -> None:
     """Print the table of all cells, and the targets."""
+    choice, source = _published(choice, published)
     experiment, cells = load_cells(choice, executes=False)
     _show(experiment, cells, None, source)
 
@@ -71,10 +74,7 @@ def report(
             "--output", "-o", help="Folder of the page.", show_default="table in the folder of the cells"
         ),
     ] = None,
-    source: Annotated[
-        Path | None,
-        typer.Option("--from", help="Of the cells that were published there.", show_default="the own cells"),
-    ] = None,
+    published: Published = False,
 ) -> None:
     """Write the table as JSON, CSV, Markdown and a page with the films by outcome, and print it."""
     from nodes.runtime.errors import ConfigError
@@ -83,8 +83,16 @@ def report(
         raise ConfigError(
             "expected --output with --only, as the page of some cells would replace that of all"
         )
+    choice, source = _published(choice, published)
     experiment, cells = load_cells(choice, executes=False)
     _show(experiment, cells, output or page_folder(experiment), source)
+
+
+def _published(choice: CellChoice, published: bool) -> tuple[CellChoice, Path | None]:
+    """The choice of cells, and the folder of the published sets that they are in; None for those of the run folder."""
+    if not published:
+        return choice, None
+    return replace(choice, folder=None), choice.folder or _PUBLISHED
 
 
 def _show(experiment: Experiment, cells: Sequence[Cell], output: Path | None, source: Path | None) -> None:
@@ -156,5 +164,5 @@ def _write_and_print(
 def _say_where(full: ResultTable, cells: Sequence[Cell], page: Path | None) -> None:
     print(
         f"{len(full.cells)} of {len(cells)} cells; "
-        + (f"page: {page}" if page else "advnerf report writes a page of them")
+        + (f"page: {page}" if page else "advnerf experiment report writes a page of them")
     )

@@ -29,8 +29,10 @@ def doctor(
             metavar="[FILE|NAME]", help="Check only what this *.launch.yaml needs.", parser=launch_argument
         ),
     ] = None,
-    folder: Annotated[Path, typer.Option(help="Folder for results.")] = Path("runs"),
-    vicon_port: Annotated[int, typer.Option(min=1, max=65535)] = 51001,
+    folder: Annotated[Path, typer.Option(help="Folder of runs, whose disk is checked.")] = Path("runs"),
+    vicon_port: Annotated[
+        int, typer.Option(min=1, max=65535, help="UDP port of the motion-capture stream.")
+    ] = 51001,
     vesc: Annotated[
         str | None, typer.Option(help="Serial device of the VESC.", show_default="detected")
     ] = None,

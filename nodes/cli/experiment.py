@@ -1,4 +1,4 @@
-"""The command ``advnerf experiment``, which runs cells, and those that look at finished searches: ``predict`` and ``maps``."""
+"""The command ``advnerf experiment run``, which runs cells, and those that look at finished searches: ``predict`` and ``maps``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,11 @@ import typer
 
 from nodes.cli.cell_choice import CellChoice, load_cells
 from nodes.cli.cell_tables import page_folder, report, show_table, status, table_command
+from nodes.cli.init import init
+from nodes.cli.lists import list_command
+from nodes.cli.panels import in_panels
 from nodes.cli.publish import publish
+from nodes.cli.register import register
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.options import with_groups
 from nodes.runtime.terminal import Device, say_error
@@ -25,6 +29,18 @@ if TYPE_CHECKING:
     from nodes.experiment.run.worker import Ended
     from nodes.experiment.show.context import Experiment
 
+app = typer.Typer(
+    no_args_is_help=True,
+    cls=in_panels(
+        {
+            "Run": ("run", "status", "table", "report"),
+            "Look closer": ("predict", "maps"),
+            "Publish": ("register", "publish"),
+            "Write experiments": ("init", "list"),
+        }
+    ),
+    help="Run an experiment from the photographs to the report, look at its results, and publish them.",
+)
 _FAILURE_EXIT = 1
 _MANY = 1000
 
@@ -203,8 +219,10 @@ def maps(
         print(picture)
 
 
-def add_to(app: typer.Typer) -> None:
-    """Add the commands."""
-    for command in (experiment, status, report, predict, maps, publish):
-        app.command()(with_groups(command))
-    app.command(name="table")(with_groups(table_command))
+app.command("run")(with_groups(experiment))
+for command in (status, report, predict, maps, publish):
+    app.command()(with_groups(command))
+app.command("table")(with_groups(table_command))
+app.command("register")(register)
+app.command("init")(init)
+app.command("list")(list_command)

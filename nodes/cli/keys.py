@@ -1,4 +1,4 @@
-"""The commands ``advnerf keys ...``: which keys may watch this host over the network, and which may drive."""
+"""The commands ``advnerf car keys ...``: which keys may watch this host over the network, and which may drive."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ app = typer.Typer(
 Folder = Annotated[
     Path | None,
     typer.Option(
-        "--keys", help="Key folder.", show_default="advnerf/keys in the user's configuration folder"
+        "--folder", help="Key folder.", show_default="advnerf/keys in the user's configuration folder"
     ),
 ]
 Name = Annotated[str, typer.Argument(help="Name of the key, such as a host or a person.")]
@@ -36,7 +36,7 @@ def keys_new(name: Name, folder: Folder = None) -> None:
 def keys_allow(
     name: Name,
     right: Annotated[
-        str, typer.Option("--to", help="Right to grant: watch, or drive (which includes watch).")
+        str, typer.Option("--right", help="Right to grant: watch, or drive (which includes watch).")
     ] = "watch",
     public: Annotated[str | None, typer.Option(help="Public key, if this host does not have it yet.")] = None,
     folder: Folder = None,
@@ -46,7 +46,7 @@ def keys_allow(
     from nodes.runtime.errors import SecurityError
 
     if right not in RIGHTS:
-        raise SecurityError(f"--to: expected {' or '.join(RIGHTS)}; got {right}")
+        raise SecurityError(f"--right: expected {' or '.join(RIGHTS)}; got {right}")
     keys = _folder(folder)
     if public is not None:
         keys.add(name, public)
@@ -55,7 +55,11 @@ def keys_allow(
 
 
 @app.command("add")
-def keys_add(name: Name, public: str, folder: Folder = None) -> None:
+def keys_add(
+    name: Name,
+    public: Annotated[str, typer.Argument(help="Public key, as `advnerf car keys new` prints it.")],
+    folder: Folder = None,
+) -> None:
     """Store the public key of a host that this host connects to."""
     _folder(folder).add(name, public)
 
@@ -64,7 +68,7 @@ def keys_add(name: Name, public: str, folder: Folder = None) -> None:
 def keys_revoke(
     name: Name,
     right: Annotated[
-        str | None, typer.Option("--to", help="Revoke only this right (drive).", show_default="all")
+        str | None, typer.Option("--right", help="Revoke only this right (drive).", show_default="all")
     ] = None,
     folder: Folder = None,
 ) -> None:

@@ -1,4 +1,4 @@
-"""The command ``advnerf list``: what can be named in files and commands."""
+"""The command ``advnerf experiment list``: what can be named in files and commands."""
 
 from __future__ import annotations
 
@@ -38,8 +38,3 @@ def list_command(
         say_error(problem)
     if problems:
         raise typer.Exit(_FAILURE_EXIT)
-
-
-def add_to(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("list")(list_command)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import signal
+import sys
 import time
 from pathlib import Path
 from types import FrameType
@@ -20,30 +20,26 @@ from nodes.cli import attack_node as cli_attack_node
 from nodes.cli import attack_poses as cli_attack_poses
 from nodes.cli import audit as cli_audit
 from nodes.cli import bag as cli_bag
-from nodes.cli import calibrate as cli_calibrate
-from nodes.cli import camera as cli_camera
-from nodes.cli import carla as cli_carla
+from nodes.cli import car as cli_car
+from nodes.cli import demo as cli_demo
 from nodes.cli import doctor as cli_doctor
 from nodes.cli import experiment as cli_experiment
-from nodes.cli import keys as cli_keys
-from nodes.cli import lists as cli_lists
 from nodes.cli import method as cli_method
-from nodes.cli import motor as cli_motor
-from nodes.cli import node as cli_node
-from nodes.cli import object as cli_object
-from nodes.cli import page as cli_page
 from nodes.cli import policy as cli_policy
-from nodes.cli import replay as cli_replay
-from nodes.cli import room as cli_room
 from nodes.cli import scene as cli_scene
-from nodes.cli import start as cli_start
-from nodes.cli import teleop as cli_teleop
-from nodes.cli import topic as cli_topic
-from nodes.cli import trial as cli_trial
 from nodes.cli import verify as cli_verify
-from nodes.cli import world as cli_world
+from nodes.cli.endings import (
+    INTERRUPTED,
+    TERMINATED,
+    how_to_resume,
+    is_resumable,
+    text_for_people,
+    usage_text,
+)
+from nodes.cli.panels import in_panels
 from nodes.runtime.extras import installs
 from nodes.runtime.terminal import LaunchFile, Overrides, print_table, say_error, table
+from nodes.runtime.termination import ends_in_order
 
 if TYPE_CHECKING:
     from nodes.launching.launch import Launch
@@ -51,42 +47,35 @@ if TYPE_CHECKING:
 OUR_PACKAGES = ("advnerf_core", "hardware", "calibration", "nodes")
 ERROR_EXIT, FAILURE_EXIT = 2, 1
 
+PANELS = {
+    "Audit and experiments": ("audit", "demo", "experiment", "verify"),
+    "Places and objects": ("scene",),
+    "Policies": ("policy", "attack"),
+    "The car": ("launch", "car", "disarm"),
+    "Bags and tools": ("bag", "doctor"),
+}
+
 app = typer.Typer(
     name="advnerf",
     no_args_is_help=True,
-    add_completion=False,
+    cls=in_panels(PANELS),
     pretty_exceptions_enable=False,
     help="Find objects that drive a self-driving policy off its path, and prove it on the car or on its simulated lab.",
 )
-app.add_typer(cli_topic.app, name="topic")
-app.add_typer(cli_bag.app, name="bag")
-app.add_typer(cli_keys.app, name="keys")
-app.add_typer(cli_node.app, name="node")
-cli_node.add_to(app)
-app.add_typer(cli_motor.app, name="motor")
-app.add_typer(cli_calibrate.app, name="calibrate")
-app.add_typer(cli_camera.app, name="camera")
+cli_audit.add_to(app)
+cli_demo.add_to(app)
+cli_verify.add_to(app)
+app.add_typer(cli_experiment.app, name="experiment")
+app.add_typer(cli_scene.app, name="scene")
+app.add_typer(cli_policy.app, name="policy")
 cli_attack_node.add_to(cli_attack.app)
 cli_attack_poses.add_to(cli_attack.app)
+cli_attack.app.add_typer(cli_method.app, name="method")
 app.add_typer(cli_attack.app, name="attack")
-app.add_typer(cli_method.app, name="method")
-app.add_typer(cli_object.app, name="object")
-app.add_typer(cli_policy.app, name="policy")
-app.add_typer(cli_scene.app, name="scene")
-app.add_typer(cli_room.app, name="room")
-app.add_typer(cli_carla.app, name="carla")
-app.add_typer(cli_world.app, name="world")
-cli_start.add_to(app)
-cli_audit.add_to(app)
-cli_arm.add_to(app)
+app.add_typer(cli_car.app, name="car")
+app.command("disarm")(cli_arm.disarm)
+app.add_typer(cli_bag.app, name="bag")
 cli_doctor.add_to(app)
-cli_experiment.add_to(app)
-cli_lists.add_to(app)
-cli_verify.add_to(app)
-cli_page.add_to(app)
-cli_replay.add_to(app)
-cli_teleop.add_to(app)
-cli_trial.add_to(app)
 _debug = False
 
 
@@ -115,7 +104,12 @@ def launch(
     file: LaunchFile,
     overrides: Overrides = None,
     run_dir: Annotated[
-        Path | None, typer.Option(help="Folder for logs, sockets and bag.", show_default="runs/<name>-<time>")
+        Path | None,
+        typer.Option(
+            "--folder",
+            help="Folder of the run: logs, sockets and bag.",
+            show_default="runs/<name>-<time>",
+        ),
     ] = None,
     duration_s: Annotated[
         float | None, typer.Option("--duration", min=0.0, help="Stop after this many seconds.")
@@ -187,39 +181,53 @@ def _say_problems(plan: Any) -> None:
         raise typer.Exit(ERROR_EXIT)
 
 
-def _is_for_people(error: Exception) -> bool:
-    """Whether the message of an exception was written for the user."""
-    return isinstance(error, AdvnerfError | OSError)
-
-
 def main() -> None:
-    """Run the command line. An error that the user can fix is printed as one line, with exit code 2 and no traceback."""
+    """Run the command line. An error that the user can fix is printed as one line, without a traceback."""
     with contextlib.suppress(
         AdvnerfError, OSError
     ):  # only what needs a cache fails without one; stopping the car does not
         use_writable_cache()
+    words = sys.argv[1:]
+    resumable = is_resumable(words)
+    with ends_in_order() if resumable else contextlib.nullcontext():
+        code = _exit_code()
+    if resumable and code in (INTERRUPTED, TERMINATED):
+        say_error(how_to_resume(words))
+    raise SystemExit(code)
+
+
+def _exit_code() -> int:
     try:
-        app()
+        ended = app(standalone_mode=False)
     except KeyboardInterrupt:
-        raise SystemExit(130) from None
+        return INTERRUPTED
+    except SystemExit as asked:
+        return asked.code if isinstance(asked.code, int) else FAILURE_EXIT
+    except typer.Abort:
+        say_error("aborted")
+        return FAILURE_EXIT
     except ModuleNotFoundError as error:
         missing = (error.name or "").split(".")[0]
         if _debug or missing in OUR_PACKAGES or (command := installs(missing)) is None:
             raise
         say_error(f"this command needs {missing}, which is not installed: {command}")
-        raise SystemExit(ERROR_EXIT) from None
-    except Exception as error:  # any other exception is a bug and keeps its traceback
-        if _debug or not _is_for_people(error):
-            raise
-        say_error(_words(error))
-        raise SystemExit(ERROR_EXIT) from None
+        return ERROR_EXIT
+    except Exception as error:
+        return _code_of(error)
+    return ended if isinstance(ended, int) else 0
 
 
-def _words(error: Exception) -> str:
-    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
-        where = f" of {error.filename}" if error.filename else ""
-        return f"the disk{where} is full: free some space or choose another folder. Finished work is kept"
-    return str(error) or type(error).__name__
+def _code_of(error: Exception) -> int:
+    """Print an error that the user can fix, and return its exit code; raise any other again."""
+    if (usage := usage_text(error)) is not None:
+        if usage:
+            say_error(usage)
+        return int(getattr(error, "exit_code", ERROR_EXIT))
+    text = text_for_people(error)
+    if _debug or text is None:
+        raise error
+    say_error(text)
+    return ERROR_EXIT
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The commands ``advnerf method ...``."""
+"""The commands ``advnerf attack method ...``."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ def method_check(
     methods: Annotated[
         list[str],
         typer.Argument(
-            metavar="METHOD...", help="A method of `advnerf list methods`, or file.py:Name of your own."
+            metavar="METHOD...",
+            help="A method of `advnerf experiment list methods`, or file.py:Name of your own.",
         ),
     ],
     overrides: Overrides = None,

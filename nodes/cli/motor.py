@@ -1,4 +1,4 @@
-"""The commands ``advnerf motor ...``, for the motor controller and the steering check."""
+"""The commands ``advnerf car motor ...``, for the motor controller and the steering check."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 app = typer.Typer(
     no_args_is_help=True, help="Inspect the motor controller, set its timeout, check the steering."
 )
-Port = Annotated[str, typer.Option("--port", help="Serial device. Stop the launch that uses it first.")]
+Port = Annotated[
+    str, typer.Option("--vesc", help="Serial device of the VESC. Stop the launch that uses it first.")
+]
 _CHECK_S, _ANSWER_S = 75.0, 3.0
 
 

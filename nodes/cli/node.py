@@ -1,4 +1,4 @@
-"""The commands ``advnerf node ...`` and ``advnerf top``."""
+"""The commands ``advnerf car node ...`` and ``advnerf car top``."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 app = typer.Typer(no_args_is_help=True, help="Inspect the nodes of a running launch.")
 
 
-def add_to(root: typer.Typer) -> None:
+def add_to(car: typer.Typer) -> None:
     """Register ``top`` beside the group."""
-    root.command("top")(top)
+    car.command("top")(top)
 
 
 @app.command("list")

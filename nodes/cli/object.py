@@ -1,4 +1,4 @@
-"""The commands ``advnerf object ...``."""
+"""The commands ``advnerf scene object ...``."""
 
 from __future__ import annotations
 

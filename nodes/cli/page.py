@@ -1,4 +1,4 @@
-"""The command ``advnerf page``: the address of the running page, or a recording on the page without a car."""
+"""The command ``advnerf car page``: the address of the running page, or a recording on the page without a car."""
 
 from __future__ import annotations
 

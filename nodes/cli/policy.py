@@ -38,6 +38,7 @@ def policy_check(
     run_folder: Annotated[
         Path | None,
         typer.Option(
+            "--folder",
             exists=True,
             help="Run folder of an experiment: check on the camera frames of its capture and on drives in its learned scene.",
         ),
@@ -50,7 +51,11 @@ def policy_check(
     ] = None,
     calibration: Annotated[
         Path | None,
-        typer.Option(exists=True, help="Folder with camera.yaml, room.yaml and vehicle.yaml of the scene."),
+        typer.Option(
+            exists=True,
+            dir_okay=False,
+            help="camera.yaml of the scene, with room.yaml and vehicle.yaml beside it.",
+        ),
     ] = None,
     bag: Annotated[
         Path | None, typer.Option(exists=True, help="Bag of a drive: check on its frames and poses.")
@@ -131,14 +136,14 @@ def _reference(
 
     if sum(each is not None for each in (run_folder, bag, scene, picture)) > 1:
         raise ConfigError(
-            "expected at most one of --run-folder, --bag, --scene and --picture, got several; keep one"
+            "expected at most one of --folder, --bag, --scene and --picture, got several; keep one"
         )
     if picture is not None:
         return from_picture(picture, view)
     if (scene is None) != (calibration is None):
         raise ConfigError("expected --scene and --calibration together, got one of them; add the other")
     if scene is not None and calibration is not None:
-        return from_scene(scene, calibration, view)
+        return from_scene(scene, calibration.parent, view)
     if run_folder is not None:
         return from_run(run_folder, view)
     return from_bag(bag, room, view) if bag is not None else from_twin(view)
@@ -156,12 +161,19 @@ def policy_serve(
     ] = "127.0.0.1:6789",
     wheelbase_m: Annotated[
         float | None,
-        typer.Option(min=0.0, help="Wheelbase that makes an arc of a wheel angle; not needed for waypoints."),
+        typer.Option(
+            "--wheelbase",
+            min=0.0,
+            help="Wheelbase that makes an arc of a wheel angle [m]; not needed for waypoints.",
+        ),
     ] = None,
     speed_mps: Annotated[
         float | None,
         typer.Option(
-            min=0.0, help="Speed of the plans.", show_default="the car's own; not used with waypoints"
+            "--speed",
+            min=0.0,
+            help="Speed of the plans [m/s].",
+            show_default="the car's own; not used with waypoints",
         ),
     ] = None,
     goal: Goal = None,

@@ -28,7 +28,12 @@ Camera = Annotated[
 ]
 Labels = Literal["expert", "recorded"]
 ImageTopic = Annotated[
-    str | None, typer.Option("--image-topic", show_default="the compositor's, else the camera's")
+    str | None,
+    typer.Option(
+        "--image-topic",
+        help="Topic of the images in a bag.",
+        show_default="the compositor's, else the camera's",
+    ),
 ]
 
 
@@ -103,9 +108,13 @@ class LogOptions:
 
 
 def train(
-    out: Annotated[
+    output: Annotated[
         Path,
-        typer.Option(help="Folder of the policy. Run the same command again to resume a stopped training."),
+        typer.Option(
+            "--output",
+            "-o",
+            help="Folder of the policy. Run the same command again to resume a stopped training.",
+        ),
     ],
     expert_options: ExpertOptions,
     log_options: LogOptions,
@@ -129,6 +138,7 @@ def train(
     surrogate: Annotated[
         Path | None,
         typer.Option(
+            "--folder",
             exists=True,
             help="Run folder of an experiment. Views of its learned room are added to the training data.",
         ),
@@ -138,7 +148,7 @@ def train(
     ] = Path("room"),
     setting: Annotated[str, typer.Option(help="Setting of that run.")] = "demo",
     steps: Annotated[int, typer.Option(min=1, help="Optimiser steps.")] = 800,
-    seed: Annotated[int, typer.Option()] = 0,
+    seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
     architecture: Annotated[
         str, typer.Option(help="pilotnet, resnet, vit_tiny, or file.py:Class of your own.")
     ] = "pilotnet",
@@ -175,7 +185,7 @@ def train(
     )
     plan = None if surrogate is None else _surrogate(surrogate, experiment, setting, view)
     with ProgressDisplay() as display:
-        done = train_from_recordings(parts, view, expert, config, out, plan, display.start("policy"))
+        done = train_from_recordings(parts, view, expert, config, output, plan, display.start("policy"))
     rows = table("recording", "frames", "left out")
     for name, count in done.frames.items():
         left_out = ", ".join(f"{n} {why}" for why, n in done.left_out.get(name, {}).items() if n)
@@ -197,7 +207,15 @@ def evaluate(
     ],
     expert_options: ExpertOptions,
     log_options: LogOptions,
-    out: Annotated[Path | None, typer.Option(help="Folder for the plot and the saliency maps.")] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            help="Folder for the plot and the saliency maps.",
+            show_default="runs/eval_<bag>",
+        ),
+    ] = None,
     labels: Annotated[
         Labels,
         typer.Option(
@@ -241,7 +259,7 @@ def evaluate(
         ]
         rows.add_row(name, str(e.count), *numbers)
     print_table(rows)
-    folder = out or Path("runs") / f"eval_{recording.resolve().parent.name}_{recording.stem}"
+    folder = output or Path("runs") / f"eval_{recording.resolve().parent.name}_{recording.stem}"
     folder.mkdir(parents=True, exist_ok=True)
     measure.draw(found, predicted, f"{policy} on {recording}", folder / "steering.png")
     files = measure.write_saliency(loaded.policy, found, folder, maps, video, goals)

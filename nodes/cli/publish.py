@@ -1,4 +1,4 @@
-"""The command ``advnerf publish``: finished cells, and what they were run with, go to where they are kept with the code."""
+"""The command ``advnerf experiment publish``: finished cells, and what they were run with, go to where they are kept with the code."""
 
 from __future__ import annotations
 
@@ -16,9 +16,14 @@ if TYPE_CHECKING:
 
 def publish(
     choice: CellChoice,
-    to: Annotated[Path, typer.Option(help="Gets a folder with the experiment's name.")] = Path(
-        "docs/results"
-    ),
+    to: Annotated[
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            help="Folder of all published sets; gets a folder with the experiment's name.",
+        ),
+    ] = Path("docs/results"),
     prune: Annotated[
         bool, typer.Option("--prune", help="Remove cells there that other settings have made.")
     ] = False,

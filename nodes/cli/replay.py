@@ -1,4 +1,4 @@
-"""The command ``advnerf replay``."""
+"""The command ``advnerf bag replay``."""
 
 from __future__ import annotations
 
@@ -19,11 +19,6 @@ if TYPE_CHECKING:
 _DIFFERENT_EXIT = 1
 _DEG = 57.29577951308232
 _RETRO_NODES = "compositor,policy"
-
-
-def add_to(app: typer.Typer) -> None:
-    """Register the command."""
-    app.command("replay")(replay)
 
 
 def replay(

@@ -1,4 +1,4 @@
-"""The commands ``advnerf room ...``: reference path, fence, targets, and the placement of board and monitor."""
+"""The commands ``advnerf scene room ...``: reference path, fence, targets, and the placement of board and monitor."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def room_path(
     print(f"start {before_m:g} m before corner {corner}: {room.start_pose}")
     print(
         f"{output} and {picture}"
-        + ("" if old else "; the fence is provisional, measure it with advnerf room fence")
+        + ("" if old else "; the fence is provisional, measure it with advnerf scene room fence")
     )
 
 
@@ -85,7 +85,7 @@ def room_fence(
         float, typer.Option("--margin", min=0.0, help="Distance of the fence inside the walked outline [m].")
     ] = 0.3,
 ) -> None:
-    """Fit the fence to a walk around the free floor with the car or a wand. Run ``advnerf room path`` first."""
+    """Fit the fence to a walk around the free floor with the car or a wand. Run ``advnerf scene room path`` first."""
     from calibration.plots import save_with_plot
     from calibration.room import clearance, fence_from_trace
     from calibration.schema import CalibrationError
@@ -93,7 +93,7 @@ def room_fence(
     old = _old_room(output)
     if old is None:
         raise CalibrationError(
-            f"expected a room file at {output}, found none; fit the path first with advnerf room path"
+            f"expected a room file at {output}, found none; fit the path first with advnerf scene room path"
         )
     trace = _trace(bag, topic)
     fence = fence_from_trace(trace, margin_m)
@@ -120,7 +120,8 @@ def room_target(
         Path | None, typer.Argument(help="Bag in which a wand touches the corners.", exists=True)
     ] = None,
     size: Annotated[
-        str | None, typer.Option(metavar="WxH", help="Width x height instead of a bag [m].")
+        str | None,
+        typer.Option("--face-size", metavar="WxH", help="Width x height instead of a bag [m]."),
     ] = None,
     centre: Annotated[
         str, typer.Option(metavar="X,Y,Z", help="Centre of the face in the subject's frame [m].")
@@ -146,10 +147,10 @@ def room_target(
 
     if (bag is None) == (size is None):
         raise CalibrationError(
-            "expected either a bag in which a wand touches the corners or --size WxH; give one of them"
+            "expected either a bag in which a wand touches the corners or --face-size WxH; give one of them"
         )
     if size is not None:
-        width, height = _numbers(size.replace("x", ","), 2, "--size")
+        width, height = _numbers(size.replace("x", ","), 2, "--face-size")
         target = target_of_size(
             subject,
             (width, height),
@@ -181,8 +182,12 @@ def room_place(
             help="The attack's *.attack.yaml. A copy for the measured pose is written.", exists=True
         ),
     ] = None,
-    tolerance_cm: Annotated[float, typer.Option(min=0.1)] = 2.0,
-    tolerance_deg: Annotated[float, typer.Option(min=0.1)] = 2.0,
+    tolerance_cm: Annotated[
+        float, typer.Option(min=0.1, help="Largest accepted distance from the pose [cm].")
+    ] = 2.0,
+    tolerance_deg: Annotated[
+        float, typer.Option(min=0.1, help="Largest accepted rotation from the pose [deg].")
+    ] = 2.0,
     once: Annotated[
         bool, typer.Option("--once", help="Measure once. Exit code 1 if the target is out of place.")
     ] = False,

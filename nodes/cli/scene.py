@@ -7,17 +7,33 @@ from typing import Annotated, Any
 
 import typer
 
+from nodes.cli import carla as cli_carla
+from nodes.cli import object as cli_object
+from nodes.cli import room as cli_room
 from nodes.cli import scene_gate as cli_scene_gate
 from nodes.cli import scene_import as cli_scene_import
+from nodes.cli import world as cli_world
+from nodes.cli.panels import in_panels
 from nodes.lab.training_request import TrainingRequest
 from nodes.runtime.options import with_groups
-from nodes.runtime.terminal import print_table, table
+from nodes.runtime.terminal import listen_address, print_table, table
 
 app = typer.Typer(
-    no_args_is_help=True, help="Make posed images from videos, photographs and bags; train and show scenes."
+    no_args_is_help=True,
+    cls=in_panels(
+        {
+            "Posed images": ("from-video", "from-images", "from-bag", "from-phone-and-car", "from-colmap"),
+            "Learned scenes": ("train", "eval", "render", "view", "match-colours", "gate"),
+            "Objects": ("object",),
+            "Places to drive": ("world", "room", "carla"),
+        }
+    ),
+    help="Learn scenes from videos, photographs and bags; build objects; check worlds, measure a room, use CARLA.",
 )
 app.add_typer(cli_scene_import.app)
 cli_scene_gate.add_to(app)
+for name, group in (("object", cli_object), ("world", cli_world), ("room", cli_room), ("carla", cli_carla)):
+    app.add_typer(group.app, name=name)
 
 DataSet = Annotated[Path, typer.Argument(help="A transforms.json, or its folder.", exists=True)]
 SceneFile = Annotated[
@@ -27,6 +43,7 @@ Size = Annotated[
     tuple[int, int] | None,
     typer.Option("--size", help="Resize the images to this width and height.", show_default="their size"),
 ]
+Every = Annotated[int, typer.Option("--every", min=2, help="Every N-th image is held out.")]
 IntervalScale = Annotated[
     float,
     typer.Option(
@@ -62,7 +79,7 @@ def scene_eval(
     scene: SceneFile,
     transforms: DataSet,
     size: Size = None,
-    every: int = _HELD_OUT_EVERY,
+    every: Every = _HELD_OUT_EVERY,
     interval_scale: IntervalScale = 1.0,
 ) -> None:
     """Evaluate a scene on the held-out images of a data set."""
@@ -84,7 +101,7 @@ def scene_render(
     held_out: Annotated[
         bool, typer.Option("--held-out", help="Render only the cameras of held-out images.")
     ] = False,
-    every: int = _HELD_OUT_EVERY,
+    every: Every = _HELD_OUT_EVERY,
     interval_scale: IntervalScale = 1.0,
 ) -> None:
     """Render a scene from the cameras of a data set: colour, depth and, optionally, a video."""
@@ -113,15 +130,19 @@ def scene_view(
     room: Annotated[
         Path | None, typer.Option(help="Room calibration whose path is drawn.", exists=True)
     ] = None,
-    port: Annotated[int, typer.Option(min=1, max=65535)] = 8080,
-    host: Annotated[
-        str, typer.Option(help="Address to serve on. 0.0.0.0 lets other computers on the network connect.")
-    ] = "127.0.0.1",
+    listen: Annotated[
+        str,
+        typer.Option(
+            metavar="HOST:PORT",
+            help="Where to listen. 0.0.0.0 lets other computers on the network connect.",
+        ),
+    ] = "127.0.0.1:8080",
 ) -> None:
     """Fly through a scene in the browser."""
     from nodes.lab.scene_view import SceneView
 
-    view = SceneView(scene, transforms, objects or [], room, host, port)
+    host, port = listen_address(listen)
+    view = SceneView(scene, transforms, objects or [], room, host.strip("[]"), port)
     print(f"http://{host}:{view.port} shows {scene}; press Ctrl-C to stop", flush=True)
     view.serve()
 

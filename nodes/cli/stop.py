@@ -35,7 +35,7 @@ def _stop(run_dir: Path | None, reason: str) -> bool:
 
     if run_dir is not None:
         if not run_dir.is_dir():
-            raise LaunchError(f"expected a run folder at {run_dir}, found none; correct --run-dir")
+            raise LaunchError(f"expected a run folder at {run_dir}, found none; correct --folder")
         names = {run_dir: ""}
     else:
         names = {
@@ -44,7 +44,7 @@ def _stop(run_dir: Path | None, reason: str) -> bool:
         }
     if not names:
         raise LaunchError(
-            f"found no running launch of user {os.getuid()} on this computer; name its folder with --run-dir"
+            f"found no running launch of user {os.getuid()} on this computer; name its folder with --folder"
         )
     confirmed = True
 

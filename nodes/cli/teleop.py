@@ -1,4 +1,4 @@
-"""The command ``advnerf teleop``, which lets the car drive while a button is held."""
+"""The command ``advnerf car teleop``, which lets the car drive while a button is held."""
 
 from __future__ import annotations
 
@@ -7,12 +7,19 @@ from typing import Annotated
 
 import typer
 
+from nodes.runtime.terminal import RunDir
+
 
 def teleop(
-    device: Annotated[
-        str, typer.Option(help="keyboard, or the path of a gamepad: /dev/input/by-id/...-event-joystick.")
-    ] = "keyboard",
-    run_dir: Annotated[Path | None, typer.Option(show_default="the launch that is running")] = None,
+    gamepad: Annotated[
+        Path | None,
+        typer.Option(
+            exists=True,
+            help="Path of a gamepad: /dev/input/by-id/...-event-joystick.",
+            show_default="the keyboard",
+        ),
+    ] = None,
+    run_dir: RunDir = None,
     speed_mps: Annotated[
         float, typer.Option("--speed", min=0.05, max=2.0, help="Speed at full throttle [m/s].")
     ] = 0.8,
@@ -27,15 +34,15 @@ def teleop(
     from nodes.runtime.process import run_node
     from nodes.teleop import TeleopConfig, TeleopNode
 
-    if device == "keyboard" and not sys.stdin.isatty():
+    if gamepad is None and not sys.stdin.isatty():
         raise ConfigError(
-            "expected a terminal to read keys from, got none; run the command in a terminal, or give --device of a gamepad"
+            "expected a terminal to read keys from, got none; run the command in a terminal, or give --gamepad"
         )
-    config = TeleopConfig(device="keyboard" if device == "keyboard" else Path(device), speed_mps=speed_mps)
+    config = TeleopConfig(device=gamepad or "keyboard", speed_mps=speed_mps)
     folder = find_run_dir(run_dir)
     print(
         HELP
-        if device == "keyboard"
+        if gamepad is None
         else "hold LB: drive by hand, hold RB: let the software drive, B: e-stop, Start: re-arm"
     )
 

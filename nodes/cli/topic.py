@@ -1,4 +1,4 @@
-"""The commands ``advnerf topic ...``."""
+"""The commands ``advnerf car topic ...``."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import Annotated
 import typer
 
 from nodes.runtime.terminal import RunDir, print_table, table
+
+TopicName = Annotated[str, typer.Argument(help="Name of the topic, such as /vicon/car.")]
 
 app = typer.Typer(no_args_is_help=True, help="Inspect the topics of a running launch.")
 
@@ -33,7 +35,7 @@ def topic_list(run_dir: RunDir = None) -> None:
 
 @app.command("hz")
 def topic_hz(
-    topic: str,
+    topic: TopicName,
     duration_s: Annotated[float, typer.Option("--duration", min=0.1, help="Time to listen [s].")] = 5.0,
     run_dir: RunDir = None,
 ) -> None:
@@ -51,7 +53,7 @@ def topic_hz(
 
 @app.command("echo")
 def topic_echo(
-    topic: str,
+    topic: TopicName,
     count: Annotated[int | None, typer.Option(min=1, help="Stop after this many messages.")] = None,
     duration_s: Annotated[
         float | None, typer.Option("--duration", min=0.1, help="Stop after this many seconds.")
@@ -70,7 +72,7 @@ def topic_echo(
 
 @app.command("delay")
 def topic_delay(
-    topic: str,
+    topic: TopicName,
     duration_s: Annotated[float, typer.Option("--duration", min=0.1, help="Time to listen [s].")] = 5.0,
     run_dir: RunDir = None,
 ) -> None:

@@ -1,4 +1,4 @@
-"""The commands ``advnerf trial`` and ``advnerf evaluate``."""
+"""The commands ``advnerf car trial`` and ``advnerf bag evaluate``."""
 
 from __future__ import annotations
 
@@ -16,9 +16,8 @@ if TYPE_CHECKING:
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register both commands."""
+    """Register ``trial``; ``evaluate`` is a command of ``bag``."""
     app.command("trial")(trial)
-    app.command("evaluate")(evaluate)
 
 
 def trial(
@@ -36,7 +35,10 @@ def trial(
     start: Annotated[
         str | None, typer.Option(metavar="X,Y,YAW", help="Start pose [m, rad].", show_default="the room's")
     ] = None,
-    ready_timeout_s: Annotated[float, typer.Option("--ready-timeout", min=1.0)] = 60.0,
+    ready_timeout_s: Annotated[
+        float,
+        typer.Option("--ready-timeout", min=1.0, help="Time in which all nodes must be ready [s]."),
+    ] = 60.0,
     host: Annotated[
         str | None,
         typer.Option(

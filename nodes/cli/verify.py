@@ -1,4 +1,4 @@
-"""The commands ``advnerf register`` and ``advnerf verify``: what will be run, and whether what was published is what it gave."""
+"""The command ``advnerf verify``: computes published numbers again from the kept drives."""
 
 from __future__ import annotations
 
@@ -13,40 +13,12 @@ import typer
 from advnerf_core.documents import parse_json
 from advnerf_core.errors import ConfigError
 from advnerf_core.run_module import module_command
-from nodes.cli.cell_choice import CellChoice, File, Folder, Only, Setting, load_cells
-from nodes.runtime.terminal import Overrides, say_error
+from nodes.cli.cell_choice import CellChoice, load_cells
+from nodes.runtime.terminal import say_error
 
-Published = Annotated[
-    Path, typer.Option("--in", help="Folder of all published sets.", exists=True, file_okay=False)
-]
 _FAILURE_EXIT = 1
 # What ``advnerf audit`` leaves in its folder.
 AUDIT = "audit.json"
-
-
-def register(
-    file: File,
-    setting: Setting = None,
-    folder: Folder = None,
-    only: Only = "",
-    published: Published = Path("docs/results"),
-    overrides: Overrides = None,
-) -> None:
-    """Write down what an experiment will run, and which tests will be claimed, before anything is run."""
-    from advnerf_core.report.evidence.registration import FILE
-    from nodes.experiment.run.registering import register as write_registration
-
-    experiment, cells = load_cells(CellChoice(file, setting, folder, only, overrides))
-    found = write_registration(experiment, cells, published)
-    print(f"{published / found.name / FILE}: {found.digest[:12]}")
-    print(
-        f"{len(found.cells)} cells, {len(found.scenarios)} paths and variants, {len(found.primary)} primary tests; commit it, then run the experiment"
-    )
-    for name, scenario in found.scenarios.items():
-        limit_m = scenario.drives_well_mean_cte_m
-        print(
-            f"{name}: a victim whose mean |CTE| without attack exceeds {limit_m:.3g} m, or that leaves the track, fails the set"
-        )
 
 
 def verify(
@@ -54,7 +26,9 @@ def verify(
         str | None,
         typer.Argument(metavar="SET", help="Name of a set, or folder of an audit.", show_default="all sets"),
     ] = None,
-    published: Published = Path("docs/results"),
+    published: Annotated[
+        Path, typer.Option("--folder", help="Folder of all published sets.", exists=True, file_okay=False)
+    ] = Path("docs/results"),
     again: Annotated[
         int,
         typer.Option("--redrive", min=0, help="Also drive so many cells again, in the surrogate."),
@@ -177,6 +151,5 @@ def _redrive(folder: Path, count: int, seed: int) -> int:
 
 
 def add_to(app: typer.Typer) -> None:
-    """Add the commands."""
-    for command in (register, verify):
-        app.command()(command)
+    """Add the command."""
+    app.command()(verify)

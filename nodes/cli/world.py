@@ -1,4 +1,4 @@
-"""The commands ``advnerf world ...``."""
+"""The commands ``advnerf scene world ...``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ app = typer.Typer(
 )
 Name = Annotated[
     str,
-    typer.Argument(metavar="WORLD", help="A world of `advnerf world list`, or file.py:Class of your own."),
+    typer.Argument(
+        metavar="WORLD", help="A world of `advnerf scene world list`, or file.py:Class of your own."
+    ),
 ]
 _FAILURE_EXIT = 1
 
@@ -26,7 +28,7 @@ def world_check(
     world: Name,
     overrides: Overrides = None,
     pictures: Annotated[
-        Path | None, typer.Option(help="Folder for what the cameras see: look at it.")
+        Path | None, typer.Option("--output", "-o", help="Folder for what the cameras see: look at it.")
     ] = None,
     only: Annotated[
         list[str] | None, typer.Option(metavar="PART", help="A part to look at alone; again for another.")
@@ -68,14 +70,14 @@ def world_list() -> None:
         elif (state := environment.state) == "installed":
             rows.add_row(name, state, str(environment.folder))
         else:
-            rows.add_row(name, state, f"advnerf world install {name}")
+            rows.add_row(name, state, f"advnerf scene world install {name}")
     rows.show_header = False
     print_table(rows)
 
 
 @app.command("install")
 def world_install(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="A world of `advnerf world list`.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="A world of `advnerf scene world list`.")],
     yes: Annotated[bool, typer.Option("--yes", help="Accept the licence without being asked.")] = False,
     python: Annotated[
         Path | None,
@@ -99,4 +101,4 @@ def world_install(
         if not yes and not typer.confirm(f"Install it into {environment.folder}?"):
             raise typer.Exit(_FAILURE_EXIT)
     made = install(environment, lambda text: print(text, flush=True), python)
-    print(f"{'installed' if made else 'it is installed already'}: advnerf world check {name}")
+    print(f"{'installed' if made else 'it is installed already'}: advnerf scene world check {name}")

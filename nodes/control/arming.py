@@ -260,7 +260,7 @@ class Arming:
         if source != OPERATOR and not is_twin(self.peer):
             refusal = (
                 f"expected source {OPERATOR!r} for a real car, got {source!r}; the motor's peer is {self.peer or 'unknown'},"
-                " not the twin. Arm with advnerf arm"
+                " not the twin. Arm with advnerf car arm"
             )
         elif not (refusal := self.problem(mono_ns)) and explicit and asked_ns <= self._fault_ns:
             refusal = f"a fault occurred after the request: {self._fault}; arm again"

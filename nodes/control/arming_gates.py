@@ -74,7 +74,7 @@ class HandGate:
         if not self.required:
             return ""
         if self._since_ns is None:
-            return self._refused or "no message from the teleop node yet; start it: advnerf teleop"
+            return self._refused or "no message from the teleop node yet; start it: advnerf car teleop"
         if (age_s := (mono_ns - self._since_ns) / NS_PER_S) > self.age_limit_s:
             return self._refused or f"no message from the teleop node for {age_s:.2f} s"
         if self.mode == IDLE:

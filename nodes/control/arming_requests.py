@@ -40,7 +40,7 @@ class ArmRequests:
         if self._answers.repeat(ask_id):
             return
         if not is_id(ask_id):
-            refusal = f"expected an ask_id of 1 to 64 characters, got {len(ask_id)}; use advnerf arm"
+            refusal = f"expected an ask_id of 1 to 64 characters, got {len(ask_id)}; use advnerf car arm"
         elif asked_ns <= self._forgotten_ns:
             refusal = "the request is older than one that was already decided and forgotten; arm again"
         elif not refusal:

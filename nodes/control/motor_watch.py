@@ -138,7 +138,7 @@ class ControllerWatch:
         if self.timeout is not None and not self.timeout.at_least(self._wanted):
             return (
                 f"expected a time-out of the controller of at most {self._wanted.timeout_ms} ms with at least"
-                f" {self._wanted.brake_current_a:g} A, it is {self.timeout}; stop the launch and run advnerf motor set-timeout"
+                f" {self._wanted.brake_current_a:g} A, it is {self.timeout}; stop the launch and run advnerf car motor set-timeout"
             )
         return "" if self.steering_good else self.check.text
 

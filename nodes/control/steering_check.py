@@ -62,7 +62,7 @@ class SteeringCheck:
         self._arcs = (_Arc(), _Arc())
         self._last: tuple[float, float, float] | None = None
         self.passed = False
-        self.text = "steering was not checked: advnerf motor check-steering"
+        self.text = "steering was not checked: advnerf car motor check-steering"
 
     @property
     def showing(self) -> bool:
@@ -82,7 +82,7 @@ class SteeringCheck:
     def forget(self, reason: str) -> None:
         """Discard the result, for example because the controller was replaced."""
         self._began_ns, self.passed = None, False
-        self.text = f"{reason}: steering must be checked again: advnerf motor check-steering"
+        self.text = f"{reason}: steering must be checked again: advnerf car motor check-steering"
 
     def steering_rad(self, mono_ns: int) -> float | None:
         """Front wheel angle to command now [rad]; None if the check is not turning the wheels."""
@@ -114,7 +114,7 @@ class SteeringCheck:
         if all(abs(arc.forward_m) >= self._settings.push_m for arc in self._arcs):
             self._judge()
         elif (mono_ns - self._began_ns) / NS_PER_S > 2.0 * self._settings.hold_s + self._settings.answer_s:
-            self._end(False, "steering check: no answer; start it again: advnerf motor check-steering")
+            self._end(False, "steering check: no answer; start it again: advnerf car motor check-steering")
         else:
             self.text = "steering check: did the front wheels turn left, then right? confirm or deny"
 

@@ -1,4 +1,4 @@
-"""Implementation of ``advnerf camera``: finds cameras, tests a source, and converts a ZED's factory calibration."""
+"""Implementation of ``advnerf car camera``: finds cameras, tests a source, and converts a ZED's factory calibration."""
 
 from __future__ import annotations
 

@@ -99,7 +99,7 @@ TABLES: Mapping[str, PluginTable] = MappingProxyType(
         "cameras": PluginTable(_cameras, "advnerf.cameras", ("kind",)),
     }
 )
-"""One row makes a list of `advnerf list`, and has its entry points named before they are executed."""
+"""One row makes a list of `advnerf experiment list`, and has its entry points named before they are executed."""
 
 
 def rows_of(table: PluginTable) -> list[PluginRow]:

@@ -9,7 +9,6 @@ Needs ``pip install 'advnerf[egodriver]'``.
 from __future__ import annotations
 
 import copy
-import re
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -32,9 +31,9 @@ from advnerf_core.policies.driver import Driver
 from nodes.linking.keys import is_loopback
 from nodes.operator_page.certificate import certificate
 from nodes.runtime.errors import ConfigError
+from nodes.runtime.terminal import listen_address
 
 _US_PER_S, _PERIOD_S, _HORIZON_S = 1_000_000, 0.1, 3.0
-_ADDRESS = re.compile(r"(\[[0-9a-f:]+\]|[^:/\s]+):(\d{1,5})")
 # Two calibrations of one camera differ by less than this share of its focal length.
 _FOCAL_SHARE = 0.02
 _WORKERS, _GRACE_S = 8, 1.0
@@ -72,7 +71,7 @@ class ServedPolicy(BaseDriver):
         self.wheelbase_m = contract.wheelbase_m if car.wheelbase_m is None else car.wheelbase_m
         if contract.trajectory is None and self.wheelbase_m is None:
             raise ConfigError(
-                "expected a wheelbase for a policy that answers with wheel angles; give --wheelbase-m of the car that it was trained for"
+                "expected a wheelbase for a policy that answers with wheel angles; give --wheelbase of the car that it was trained for"
             )
         if len(car.goal) != driver.goal_size:
             raise ConfigError(
@@ -175,10 +174,7 @@ def serving(policy: BaseDriver, listen: str, mode: ServiceMode = "carla") -> Ite
     Raises:
         ConfigError: The address is invalid, or taken.
     """
-    found = _ADDRESS.fullmatch(listen)
-    if found is None:
-        raise ConfigError(f"expected HOST:PORT to listen on, got {listen}")
-    host, port = found.groups()
+    host, port = listen_address(listen)
     # Two servers would silently share a port, and each answer some of the requests.
     options = [*channel_options(), ("grpc.so_reuseport", 0)]
     server = grpc.server(ThreadPoolExecutor(max_workers=_WORKERS), options=options)

@@ -26,7 +26,12 @@ class TrainingRequest:
         Path, typer.Option("--output", "-o", help="Folder of the results. A stopped training resumes there.")
     ]
     steps: Annotated[
-        int | None, typer.Option(min=1, show_default="1000 without --minutes; presets with a time: none")
+        int | None,
+        typer.Option(
+            min=1,
+            help="Steps of the optimiser.",
+            show_default="1000 without --minutes; presets with a time: none",
+        ),
     ] = None
     minutes: Annotated[
         float | None, typer.Option(min=0.01, help="Train for this many minutes instead of --steps.")
@@ -38,7 +43,7 @@ class TrainingRequest:
         typer.Option(help="Resize the images to this width and height.", show_default="their size"),
     ] = None
     open_scene: Annotated[bool, typer.Option("--open", help="Outdoor scene: rays may leave the box.")] = False
-    every: Annotated[int, typer.Option(min=2, help="Hold out every N-th image.")] = 8
+    every: Annotated[int, typer.Option(min=2, help="Every N-th image is held out.")] = 8
     near: Annotated[
         float | None,
         typer.Option(
@@ -47,7 +52,7 @@ class TrainingRequest:
             show_default="1/80 of the box's longest side",
         ),
     ] = None
-    seed: Annotated[int, typer.Option()] = 0
+    seed: Annotated[int, typer.Option(help="Random seed.")] = 0
     checkpoint_every_s: Annotated[
         float,
         typer.Option(

@@ -68,7 +68,7 @@ class Child:
         command = [
             *(sys.executable, "-I", "-S", str(_SHIM), str(os.getpid())),
             *module_command(self.entry.module, "--config", str(self.config)),
-            *("--run-dir", str(self._run_dir), "--name", self.name),
+            *("--folder", str(self._run_dir), "--name", self.name),
         ]
         environment = {**os.environ, "PYTHONUNBUFFERED": "1", **self.entry.env}
         with open(self.log, "ab") as log:

@@ -283,5 +283,5 @@ def _lock_run(run_dir: Path) -> TextIO:
     except HeldError as error:
         raise LaunchError(
             f"{run_dir} is in use by the launch of process {error.owner}, and two launches cannot share endpoints; stop it, or use "
-            "another --run-dir"
+            "another --folder"
         ) from None

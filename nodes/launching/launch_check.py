@@ -50,7 +50,7 @@ def _processes(plan: Plan, folder: Path) -> Iterator[dict[str, subprocess.Popen[
             config.write_text(dump_yaml(node_document(plan.documents[name])), encoding="utf-8")
             command = module_command(entry.module, "--check", "--config", str(config))
             processes[name] = subprocess.Popen(
-                [*command, "--run-dir", str(folder), "--name", name],
+                [*command, "--folder", str(folder), "--name", name],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,

@@ -78,7 +78,7 @@ def _watching_only(
         raise ConfigError(
             f"{document.place(('hosts',))}: without keys the hosts can only watch each other, but {_listener(launch)} would accept "
             f"{', '.join(commands[:4])}{' and more' if len(commands) > 4 else ''} from the other, so any local process could drive the "
-            f"car. Give --set keys=FOLDER (advnerf keys new), run the nodes that command on {_listener(launch)} (and set operator: "
+            f"car. Give --set keys=FOLDER (advnerf car keys new), run the nodes that command on {_listener(launch)} (and set operator: "
             f"{_listener(launch)}), or run all nodes on one computer with --host all"
         )
     return (exports, []) if listens else ([], imports)

@@ -53,13 +53,13 @@ def find_run_dir(given: Path | None) -> Path:
     """Return the given run folder, or the only running launch's."""
     if given is not None:
         if not given.is_dir():
-            raise LaunchError(f"expected a run folder at {given}, found none; correct --run-dir")
+            raise LaunchError(f"expected a run folder at {given}, found none; correct --folder")
         return given
     launches = active_launches()
     if len(launches) != 1:
         found = ", ".join(str(launch["run_dir"]) for launch in launches) or "none"
         raise LaunchError(
-            f"expected one running launch, found {len(launches)} ({found}); select one with --run-dir"
+            f"expected one running launch, found {len(launches)} ({found}); select one with --folder"
         )
     return Path(launches[0]["run_dir"])
 

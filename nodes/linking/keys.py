@@ -23,7 +23,7 @@ from nodes.runtime.errors import SecurityError
 
 WATCH, DRIVE = "watch", "drive"
 RIGHTS = (WATCH, DRIVE)
-_MAKE_KEYS = "Create keys with advnerf keys new, allow the other host with advnerf keys allow, and set keys to the folder"
+_MAKE_KEYS = "Create keys with advnerf car keys new, allow the other host with advnerf car keys allow, and set keys to the folder"
 _NAME = re.compile(r"[a-z][a-z0-9_-]{0,31}")
 _KEY = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
 
@@ -104,7 +104,7 @@ class KeyFolder:
                 file.unlink()
                 taken.append(lost)
         if not taken:
-            raise SecurityError(f"{name} has no such right in {self.path}; see advnerf keys list")
+            raise SecurityError(f"{name} has no such right in {self.path}; see advnerf car keys list")
         return tuple(taken)
 
     def public(self, name: str) -> str:
@@ -113,8 +113,8 @@ class KeyFolder:
         if not file.exists():
             known = ", ".join(row.name for row in self.rows()) or "none"
             raise SecurityError(
-                f"expected a public key at {file}, found none; known are {known}. Create it with advnerf keys new {name}, or copy it from its "
-                f"host with advnerf keys allow {name} --public KEY"
+                f"expected a public key at {file}, found none; known are {known}. Create it with advnerf car keys new {name}, or copy it from its "
+                f"host with advnerf car keys allow {name} --public KEY"
             )
         return _read_key(file)
 
@@ -123,7 +123,7 @@ class KeyFolder:
         file = self._file("secret", name, ".key")
         if not file.exists():
             raise SecurityError(
-                f"expected a secret key at {file}, found none; create it on this host with advnerf keys new {name}"
+                f"expected a secret key at {file}, found none; create it on this host with advnerf car keys new {name}"
             )
         mode = stat.S_IMODE(file.stat().st_mode)
         if mode & 0o077:

@@ -1,6 +1,6 @@
 """A trial on the page: one drive from the start pose over a fixed time, and how far it left the path. Pure.
 
-The trial runs from the moment the car is armed. Its metrics equal those of ``advnerf trial`` and ``advnerf evaluate``. A trial that a
+The trial runs from the moment the car is armed. Its metrics equal those of ``advnerf car trial`` and ``advnerf bag evaluate``. A trial that a
 fault of the stack ended has no metrics, by the rule for stops that those commands have too.
 """
 

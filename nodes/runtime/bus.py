@@ -328,7 +328,7 @@ class Bus:
             if time.monotonic() > deadline:
                 raise BusError(
                     f"expected {count} subscriber(s) of {', '.join(waiting)} within {timeout_s:g} s, got fewer; is the receiving node running "
-                    f"with the same --run-dir ({self._run_dir})?"
+                    f"with the same --folder ({self._run_dir})?"
                 )
             time.sleep(0.005)
 
@@ -424,5 +424,5 @@ def _taken(topic: Topic, run_dir: Path, owners: list[str]) -> str:
         )
     return (
         f"{topic.name} is already published in {run_dir} by process {', '.join(owners)}: another launch uses the same endpoints. "
-        "Stop it, or use another --run-dir"
+        "Stop it, or use another --folder"
     )

@@ -56,7 +56,7 @@ def named_file(name: str | Path, *kinds: str) -> Path:
     )
     raise PlaceError(
         f"expected a file {' or '.join(f'*.{kind}.yaml' for kind in kinds)}, found none at {name}; correct the path, or give one of the names "
-        f"{', '.join(known)} (advnerf init copies these files to edit)"
+        f"{', '.join(known)} (advnerf experiment init copies these files to edit)"
     )
 
 
@@ -92,7 +92,7 @@ def bus_folder(run_dir: Path) -> Path:
         if len(os.fsencode(folder)) + 1 + _LONGEST_NAME > UNIX_PATH_LIMIT:
             raise BusError(
                 f"expected socket paths of at most {UNIX_PATH_LIMIT} characters, got the longer {folder}; "
-                "use a --run-dir under /tmp or a short XDG_RUNTIME_DIR"
+                "use a --folder under /tmp or a short XDG_RUNTIME_DIR"
             )
     return private_folder(folder)
 

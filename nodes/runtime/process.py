@@ -183,7 +183,7 @@ def run_node_main(config_type: type[C], build: Callable[[C, NodeContext], Node])
         type=Path,
         help="YAML or JSON file with the configuration of the node (default: default values)",
     )
-    parser.add_argument("--run-dir", type=Path, required=True, help="folder of the run, for sockets and logs")
+    parser.add_argument("--folder", type=Path, required=True, help="folder of the run, for sockets and logs")
     parser.add_argument("--name", default=role, help="name of the node (default: %(default)s)")
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help="override a key"
@@ -198,7 +198,7 @@ def run_node_main(config_type: type[C], build: Callable[[C, NodeContext], Node])
         return 2
     if options.check:
         return 0
-    return run_node(lambda context: build(config, context), options.name, options.run_dir)
+    return run_node(lambda context: build(config, context), options.name, options.folder)
 
 
 def _one_line(error: BaseException) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from nodes.runtime.errors import ConfigError
 from nodes.runtime.paths import named_file
 
 if TYPE_CHECKING:
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
 
     from nodes.runtime.findings import ContractFinding
 
+_ADDRESS = re.compile(r"(\[[0-9a-f:]+\]|[^:/\s]+):(\d{1,5})")
 _POLICY_FILES = (".safetensors", ".onnx", ".pt2")
 Overrides = Annotated[
     list[str] | None,
@@ -68,11 +71,19 @@ LaunchFile = Annotated[
     ),
 ]
 RunDir = Annotated[
-    Path | None, typer.Option("--run-dir", help="Folder of the run.", show_default="the only running launch")
+    Path | None, typer.Option("--folder", help="Folder of the run.", show_default="the only running launch")
 ]
 Topics = Annotated[
     list[str] | None, typer.Option("--topics", metavar="TOPIC", help="Use only this topic. May be repeated.")
 ]
+
+
+def listen_address(text: str) -> tuple[str, int]:
+    """Host and port of ``HOST:PORT``; an IPv6 host keeps its brackets. Anything else raises `ConfigError`."""
+    found = _ADDRESS.fullmatch(text)
+    if found is None:
+        raise ConfigError(f"expected HOST:PORT to listen on, got {text}")
+    return found[1], int(found[2])
 
 
 def table(*columns: str) -> Table:

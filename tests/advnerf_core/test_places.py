@@ -122,9 +122,9 @@ def test_a_path_that_is_no_utf8_is_refused_before_work(tmp_path):
     "words",
     [
         ("scene", "train", "{data}", "-o", "{folder}/out", "--steps", "1"),
-        ("experiment", str(ROOT / "launch" / "room.experiment.yaml"), "--run-folder", "{folder}/run"),
-        ("object", "build", "--generate", "hydrant", "-o", "{folder}/h.object.safetensors"),
-        ("launch", str(ROOT / "launch" / "green_screen.launch.yaml"), "--run-dir", "{folder}/run"),
+        ("experiment", "run", str(ROOT / "launch" / "room.experiment.yaml"), "--folder", "{folder}/run"),
+        ("scene", "object", "build", "--generate", "hydrant", "-o", "{folder}/h.object.safetensors"),
+        ("launch", str(ROOT / "launch" / "green_screen.launch.yaml"), "--folder", "{folder}/run"),
     ],
     ids=lambda words: words[0],
 )

@@ -60,7 +60,7 @@ class Lab:
                     bus.publish("/motor/sent", sent(speed, now_ns))
 
     def start(self):
-        command = [sys.executable, "-m", "nodes.safety", "--run-dir", str(self.folder), "--name", "safety"]
+        command = [sys.executable, "-m", "nodes.safety", "--folder", str(self.folder), "--name", "safety"]
         self.process = subprocess.Popen(
             [
                 *command,
@@ -125,7 +125,7 @@ def lab(tmp_path):
 
 
 def command(lab, *words):
-    program = [sys.executable, "-m", "nodes.cli", *words, "--run-dir", str(lab.folder)]
+    program = [sys.executable, "-m", "nodes.cli", *words, "--folder", str(lab.folder)]
     # A shell starts what it runs in the background with SIGINT ignored, and children inherit that.
     heeds = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     return subprocess.Popen(
@@ -188,7 +188,7 @@ def test_why_it_is_not_armed(lab):
     lab.wait_ready()
     lab.well = False
     time.sleep(0.4)
-    asking = command(lab, "arm")
+    asking = command(lab, "car", "arm")
     output, errors = asking.communicate(timeout=600)
     assert (asking.returncode, errors) == (1, "")
     named, answer = output.splitlines()

@@ -107,7 +107,7 @@ def test_an_id_is_decided_once_even_when_it_claims_to_be_asked_now(car):
     for no_id in ("", "x" * 65):
         assert (
             car.ask(no_id).text
-            == f"expected an ask_id of 1 to 64 characters, got {len(no_id)}; use advnerf arm"
+            == f"expected an ask_id of 1 to 64 characters, got {len(no_id)}; use advnerf car arm"
         )
         assert not car.arming.armed
         assert car.ask(no_id, arm=False).granted

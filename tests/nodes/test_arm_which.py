@@ -125,7 +125,7 @@ def test_a_stop_without_a_launch_is_not_confirmed(desk):
 def test_a_launch_of_this_folder_is_named_and_armed(desk):
     motor = {"port": str(desk.folder / "twin" / "vesc"), "calibration": "calibration/twin/vehicle.yaml"}
     lab = desk.launch("twin", desk.folder, motor)
-    output, errors = (asking := desk.advnerf("arm")).communicate(timeout=600)
+    output, errors = (asking := desk.advnerf("car", "arm")).communicate(timeout=600)
     assert (asking.returncode, errors) == (0, "")
     car = "the simulated car, calibration/twin/vehicle.yaml"
     assert output.splitlines() == [f"twin in {lab.folder}: {car}", "armed by operator"]
@@ -134,15 +134,15 @@ def test_a_launch_of_this_folder_is_named_and_armed(desk):
 @pytest.mark.parametrize(
     ("launches", "why"),
     [
-        ([("one", "/elsewhere")], "because it was not started in this folder; name it with --run-dir"),
-        ([("one", None), ("two", None)], "because 2 launches are running; name it with --run-dir"),
+        ([("one", "/elsewhere")], "because it was not started in this folder; name it with --folder"),
+        ([("one", None), ("two", None)], "because 2 launches are running; name it with --folder"),
     ],
 )
 def test_without_a_terminal_a_launch_that_is_not_plain_is_refused(desk, launches, why):
     real = {"port": "/dev/serial/by-id/vesc", "calibration": "car/vehicle.yaml"}
     for name, cwd in launches:
         desk.launch(name, cwd or desk.folder, real, safety=False)
-    output, errors = (asking := desk.advnerf("arm")).communicate(timeout=600)
+    output, errors = (asking := desk.advnerf("car", "arm")).communicate(timeout=600)
     assert asking.returncode == 2
     assert why in errors
     assert output.count("a REAL car at /dev/serial/by-id/vesc, car/vehicle.yaml") == len(launches)
@@ -155,7 +155,7 @@ def test_without_a_terminal_a_launch_that_is_not_plain_is_refused(desk, launches
 def test_in_a_terminal_the_person_decides(desk, names, typed, armed):
     labs = {name: desk.launch(name, "/elsewhere", safety=name == armed) for name in names}
     terminal, other_end = pty.openpty()
-    asking = desk.advnerf("arm", stdin=other_end)
+    asking = desk.advnerf("car", "arm", stdin=other_end)
     os.close(other_end)
     os.write(terminal, typed.encode())
     output, _ = asking.communicate(timeout=600)

@@ -231,7 +231,7 @@ def node_process(module, run_dir, config):
     name = module.rpartition(".")[2]
     file = run_dir / f"{name}.yaml"
     file.write_text(yaml.safe_dump(config))
-    command = [sys.executable, "-m", module, "--config", str(file), "--run-dir", str(run_dir)]
+    command = [sys.executable, "-m", module, "--config", str(file), "--folder", str(run_dir)]
     return subprocess.Popen(command, cwd=REPOSITORY, stderr=(run_dir / f"{name}.log").open("ab"))
 
 

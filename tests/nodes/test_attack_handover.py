@@ -66,7 +66,7 @@ class Drive:
             "nodes.compositor",
             "--config",
             str(config),
-            "--run-dir",
+            "--folder",
             str(run_dir),
         ]
         self.process = subprocess.Popen(command, cwd=REPOSITORY)

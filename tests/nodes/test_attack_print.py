@@ -71,7 +71,7 @@ def test_a_png_and_a_page_of_the_posters_size(printed, tmp_path):
         (["-o", "poster.jpg"], "expected a .pdf or .png file to write, got poster.jpg; correct --output"),
         (["--margin-mm", 1], "expected a margin of 4 to 40 mm"),
         (["--object", "car"], "expected an object of face; got 'car'"),
-        (["--size-m", 1], "whose attack file says 0.4 x 0.4 m"),
+        (["--object-size", 1], "whose attack file says 0.4 x 0.4 m"),
         (["--paper", "a7"], "'a7' is not one of"),
     ],
 )

@@ -153,7 +153,7 @@ def test_wrong_source(source, message):
 
 
 def test_node_process_says_what_is_wrong_in_one_line(tmp_path):
-    command = [sys.executable, "-m", "nodes.camera", "--run-dir", str(tmp_path), "--check"]
+    command = [sys.executable, "-m", "nodes.camera", "--folder", str(tmp_path), "--check"]
     command += [
         "--set",
         "source={kind: zed, device: /dev/video0, factory: x, fps: 12}",
@@ -198,7 +198,7 @@ def test_camera_process_sends_both_kinds_of_picture_over_the_bus(tmp_path):
         sys.executable,
         "-m",
         "nodes.camera",
-        "--run-dir",
+        "--folder",
         str(tmp_path),
         "--set",
         f"calibration={TWIN}",

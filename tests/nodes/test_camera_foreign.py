@@ -176,14 +176,14 @@ def test_a_package_brings_a_camera(generator: Path, monkeypatch: pytest.MonkeyPa
     (info / "entry_points.txt").write_text("[advnerf.cameras]\ngrey = mine:Generator\n")
     monkeypatch.syspath_prepend(str(generator.parent))
     assert parse_source("{kind: grey, width: 6}").config.width == 6
-    code, printed = command("list", "cameras")
+    code, printed = command("experiment", "list", "cameras")
     assert code == 0
     assert "grey" in printed
     assert "stranger-camera 1.0  Grey pictures that grow brighter." in printed
 
 
 def test_the_check_meets_a_good_camera_and_says_what_it_executes(generator: Path) -> None:
-    code, printed = command("camera", "check", f"{generator}:Generator", "--set", "width=6")
+    code, printed = command("car", "camera", "check", f"{generator}:Generator", "--set", "width=6")
     assert code == 0, printed
     assert printed.count(" met ") == len(CHECKS)
     assert f"executes {generator}:Generator (sha256 " in printed
@@ -246,7 +246,7 @@ def test_a_relative_file_is_relative_to_the_launch_file_that_names_it(
 
 def test_the_example_is_a_camera(stream: str) -> None:
     code, printed = command(
-        "camera", "check", f"{EXAMPLE}:HttpCamera", "--set", f"url={stream}", "--shows", "red"
+        "car", "camera", "check", f"{EXAMPLE}:HttpCamera", "--set", f"url={stream}", "--shows", "red"
     )
     assert code == 0, printed
     assert "336 x 188" in printed

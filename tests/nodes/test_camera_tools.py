@@ -1,4 +1,4 @@
-"""``advnerf camera``: what it says about emulated devices, and the files it writes."""
+"""``advnerf car camera``: what it says about emulated devices, and the files it writes."""
 
 from pathlib import Path
 
@@ -54,7 +54,7 @@ def test_devices_are_described_with_what_can_be_set():
 
 def test_trial_measures_a_source(pictures, tmp_path):
     out = tmp_path / "last.png"
-    result = run("try", f"{{kind: folder, folder: {pictures}, rate_hz: 50}}", "--frames", 12, "--out", out)
+    result = run("try", f"{{kind: folder, folder: {pictures}, rate_hz: 50}}", "--frames", 12, "-o", out)
     assert result.exit_code == 0
     assert "12 frames of 336 x 188" in result.output
     assert "0 missed" in result.output
@@ -85,14 +85,14 @@ def test_picture_format_that_nobody_knows(pictures, tmp_path):
             f"{{kind: folder, folder: {pictures}, rate_hz: 100}}",
             "--frames",
             2,
-            "--out",
+            "-o",
             tmp_path / "p.xyz",
         )
 
 
 def test_factory_file_becomes_a_camera_file(tmp_path):
     (tmp_path / "SN1.conf").write_text(CONF)
-    result = run("factory", tmp_path / "SN1.conf", "--mount", TWIN, "--out", tmp_path / "camera.yaml")
+    result = run("factory", tmp_path / "SN1.conf", "--mount", TWIN, "-o", tmp_path / "camera.yaml")
     assert result.exit_code == 0
     made = load_calibration(CameraCalibration, tmp_path / "camera.yaml")
     expected = Rectifier(load_factory_calibration(tmp_path / "SN1.conf"), (336, 188)).pinhole
@@ -108,4 +108,4 @@ def test_factory_file_becomes_a_camera_file(tmp_path):
 )
 def test_wrong_factory_options(tmp_path, options, message):
     with pytest.raises(CameraToolError, match=message):
-        run("factory", tmp_path / "SN1.conf", "--mount", TWIN, "--out", tmp_path / "camera.yaml", *options)
+        run("factory", tmp_path / "SN1.conf", "--mount", TWIN, "-o", tmp_path / "camera.yaml", *options)

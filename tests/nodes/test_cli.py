@@ -58,7 +58,7 @@ def folder(tmp_path_factory):
 
 
 def environment(folder):
-    return {**os.environ, "PYTHONPATH": str(folder)}
+    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), *sys.path])}
 
 
 def start(folder, *arguments):
@@ -76,7 +76,7 @@ def start(folder, *arguments):
 @pytest.fixture(scope="module")
 def running(folder):
     """A launch at work; its run folder."""
-    process = start(folder, "--run-dir", str(folder / "run"))
+    process = start(folder, "--folder", str(folder / "run"))
     for line in process.stdout:
         if "all nodes are ready" in line:
             break
@@ -108,7 +108,7 @@ def command(monkeypatch, capsys):
 
 
 def test_topic_list_names_publishers(running, command):
-    code, output, _ = command("topic", "list", "--run-dir", running)
+    code, output, _ = command("car", "topic", "list", "--folder", running)
     assert code == 0
     rows = {line.split()[0]: line.split() for line in output.splitlines()}
     assert rows["/vicon/car"][1:] == ["geometry_msgs/msg/PoseStamped", "100", "Hz", "sender", "0"]
@@ -117,15 +117,15 @@ def test_topic_list_names_publishers(running, command):
 
 
 def test_a_node_that_hangs_is_listed_as_silent_with_its_age(running, command):
-    _, output, _ = command("node", "list", "--run-dir", running)
+    _, output, _ = command("car", "node", "list", "--folder", running)
     rows = {line.split()[0]: line.split() for line in output.splitlines()}
     pid = int(rows["sender"][2])
     assert rows["sender"][1] == "active"
     os.kill(pid, signal.SIGSTOP)
     try:
         time.sleep(0.3)
-        code, output, _ = command("node", "list", "--run-dir", running)
-        _, top, _ = command("top", "--period", "0.5", "--count", "1", "--run-dir", running)
+        code, output, _ = command("car", "node", "list", "--folder", running)
+        _, top, _ = command("car", "top", "--period", "0.5", "--count", "1", "--folder", running)
     finally:
         os.kill(pid, signal.SIGCONT)
     silent = (
@@ -136,11 +136,11 @@ def test_a_node_that_hangs_is_listed_as_silent_with_its_age(running, command):
     assert re.search(
         r"(?m)^sender +silent .*last status \d+\.\d s ago; its process is stopped by a signal", top
     )
-    assert rows["sender"] == command("node", "list", "--run-dir", running)[1].splitlines()[1].split()
+    assert rows["sender"] == command("car", "node", "list", "--folder", running)[1].splitlines()[1].split()
 
 
 def test_topic_hz_measures_the_rate(running, command):
-    code, output, _ = command("topic", "hz", "/vicon/car", "--duration", 1, "--run-dir", running)
+    code, output, _ = command("car", "topic", "hz", "/vicon/car", "--duration", 1, "--folder", running)
     assert code == 0
     assert float(output.split()[1]) == pytest.approx(50, rel=0.1)
     assert ", 0 lost" in output
@@ -148,7 +148,7 @@ def test_topic_hz_measures_the_rate(running, command):
 
 
 def test_topic_echo_prints_messages(running, command):
-    code, output, _ = command("topic", "echo", "/vicon/car", "--count", 2, "--run-dir", running)
+    code, output, _ = command("car", "topic", "echo", "/vicon/car", "--count", 2, "--folder", running)
     assert code == 0
     assert output.count("---") == 2
     assert "frame_id: 'world'" in output
@@ -164,7 +164,7 @@ def test_long_arrays_are_cut():
 
 def test_bag_is_recorded_in_several_files_and_played_as_one(running, folder, command):
     bag = folder / "split"
-    program = [sys.executable, "-m", "nodes.cli", "bag", "record", "-o", str(bag), "--run-dir", str(running)]
+    program = [sys.executable, "-m", "nodes.cli", "bag", "record", "-o", str(bag), "--folder", str(running)]
     recorder = subprocess.Popen(
         [*program, "--max-bag-duration", "0.3", "--max-bag-size", "10"], stdout=subprocess.DEVNULL
     )
@@ -174,7 +174,7 @@ def test_bag_is_recorded_in_several_files_and_played_as_one(running, folder, com
     files = len(list(bag.glob("*.mcap")))
     code, output, _ = command("bag", "info", bag / "split_1.mcap")
     assert (code, f" in {files} files, " in output) == (0, True)
-    played = ("bag", "play", bag, "--rate", 20, "--no-wait", "--run-dir", folder / "other")
+    played = ("bag", "play", bag, "--rate", 20, "--no-wait", "--folder", folder / "other")
     assert command(*played)[0] == 0
     (bag / "split_1.mcap").unlink()
     code, _, errors = command("bag", "info", bag)
@@ -183,7 +183,7 @@ def test_bag_is_recorded_in_several_files_and_played_as_one(running, folder, com
 
 def test_bag_is_recorded_described_played_and_repaired(running, folder, command):
     bag = folder / "recorded"
-    program = [sys.executable, "-m", "nodes.cli", "bag", "record", "-o", str(bag), "--run-dir", str(running)]
+    program = [sys.executable, "-m", "nodes.cli", "bag", "record", "-o", str(bag), "--folder", str(running)]
     recorder = subprocess.Popen(program, stdout=subprocess.DEVNULL)
     wait_for(lambda: sum(f.stat().st_size for f in bag.glob("*.mcap")) >= 20_000, "20 kB on disk")
     recorder.send_signal(signal.SIGINT)
@@ -194,7 +194,7 @@ def test_bag_is_recorded_described_played_and_repaired(running, folder, command)
     rows = {line.split()[0]: line.split() for line in output.splitlines()}
     assert rows["/vicon/car"][-1] == "0"
     assert "/status/sender" in rows
-    played = ("bag", "play", bag, "--rate", 20, "--no-wait", "--run-dir", folder / "other")
+    played = ("bag", "play", bag, "--rate", 20, "--no-wait", "--folder", folder / "other")
     assert command(*played)[0] == 0
     whole = (bag / "recorded_0.mcap").read_bytes()
     (bag / "recorded_0.mcap").write_bytes(whole[:-100])
@@ -206,7 +206,7 @@ def test_bag_is_recorded_described_played_and_repaired(running, folder, command)
 
 
 def test_second_launch_in_the_same_folder_is_one_clear_line(running, folder):
-    process = start(folder, "--run-dir", str(running))
+    process = start(folder, "--folder", str(running))
     errors = but_for_code(process.communicate(timeout=600)[1])
     assert process.returncode == 2
     assert errors.startswith("error: ")
@@ -215,7 +215,7 @@ def test_second_launch_in_the_same_folder_is_one_clear_line(running, folder):
 
 
 def test_dead_node_is_one_line_and_exit_code_1(folder):
-    process = start(folder, "--run-dir", str(folder / "bad"), "--set", "sender.speed=3")
+    process = start(folder, "--folder", str(folder / "bad"), "--set", "sender.speed=3")
     errors = but_for_code(process.communicate(timeout=600)[1])
     assert process.returncode == 1
     assert errors.count("\n") == 1
@@ -224,7 +224,7 @@ def test_dead_node_is_one_line_and_exit_code_1(folder):
 
 
 def test_launch_can_end_by_itself(folder):
-    process = start(folder, "--run-dir", str(folder / "short"), "--duration", "0.3")
+    process = start(folder, "--folder", str(folder / "short"), "--duration", "0.3")
     errors = but_for_code(process.communicate(timeout=600)[1])
     assert (process.returncode, errors) == (0, "")
 
@@ -249,13 +249,13 @@ def test_launch_check_asks_the_nodes_about_their_configuration(folder):
     [
         (["bag", "info", "{folder}"], "{folder} is a folder without a bag: it has "),
         (
-            ["topic", "echo", "/nothing", "--run-dir", "{folder}"],
+            ["car", "topic", "echo", "/nothing", "--folder", "{folder}"],
             "unknown topic '/nothing'; known are /camera/image_raw",
         ),
-        (["topic", "list", "--run-dir", "{folder}/none"], "expected a run folder at"),
+        (["car", "topic", "list", "--folder", "{folder}/none"], "expected a run folder at"),
         (["launch", "{folder}/little.launch.yaml", "--set", "x"], "no node called 'x'; known are sender"),
         (
-            ["topic", "hz", "/arm", "--duration", "0.1", "--run-dir", "{folder}"],
+            ["car", "topic", "hz", "/arm", "--duration", "0.1", "--folder", "{folder}"],
             "expected at least two messages of /arm",
         ),
     ],
@@ -271,7 +271,7 @@ def test_mistake_is_one_line_without_a_traceback(folder, command, arguments, mes
 
 def test_a_full_disk_is_told_with_the_way_out(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["advnerf"])
-    monkeypatch.setattr(cli, "app", lambda: Path("/dev/full").write_bytes(bytes(10)))
+    monkeypatch.setattr(cli, "app", lambda **_: Path("/dev/full").write_bytes(bytes(10)))
     with pytest.raises(SystemExit, match="2"):
         cli.main()
     assert capsys.readouterr().err.startswith(
@@ -295,7 +295,7 @@ def test_debug_shows_the_traceback(monkeypatch, tmp_path):
 
 
 def test_defect_of_ours_keeps_its_traceback(monkeypatch):
-    def broken():
+    def broken(**_):
         raise IndexError("list index out of range")
 
     monkeypatch.setattr(cli, "app", broken)
@@ -307,7 +307,7 @@ def test_play_refuses_what_is_not_there(command, tmp_path):
     with BagWriter(tmp_path / "bag") as writer:
         writer.write("/vicon/car", encode(pose_message(np.eye(4), 1)), 1, 1, 0)
     code, _, errors = command(
-        "bag", "play", tmp_path / "bag", "--topics", "/arm", "--run-dir", tmp_path / "run"
+        "bag", "play", tmp_path / "bag", "--topics", "/arm", "--folder", tmp_path / "run"
     )
     assert code == 2
     assert "has no topic /arm; it has /vicon/car" in errors
@@ -315,7 +315,7 @@ def test_play_refuses_what_is_not_there(command, tmp_path):
 
 
 def test_a_missing_extra_is_named_with_its_installation(monkeypatch, capsys):
-    def without_torch():
+    def without_torch(**_):
         raise ModuleNotFoundError("No module named 'torch'", name="torch")
 
     monkeypatch.setattr(cli, "app", without_torch)

@@ -87,6 +87,7 @@ def test_vehicle_from_a_bag(tmp_path, capsys):
     bag = drive_bag(tmp_path / "bag", drive(np.random.default_rng(0), program(hold_s=1.6, steps=8)))
     assert (
         run(
+            "car",
             "calibrate",
             "vehicle",
             bag,
@@ -106,14 +107,17 @@ def test_vehicle_from_a_bag(tmp_path, capsys):
     # The drive holds no camera: said in one line, and nothing is written.
     camera = tmp_path / "camera.yaml"
     save_calibration(twin_calibrations(LabConfig())["camera"], camera)
-    assert run("calibrate", "time-offset", bag, "--camera", camera, "-o", tmp_path / "no.yaml") == 2
+    assert run("car", "calibrate", "time-offset", bag, "--camera", camera, "-o", tmp_path / "no.yaml") == 2
     assert "expected images on /camera/image_raw or " in capsys.readouterr().err
     assert not (tmp_path / "no.yaml").exists()
 
 
 def test_a_source_is_needed_and_only_one(tmp_path, capsys):
     save_calibration(twin_calibrations(LabConfig())["vehicle"], tmp_path / "before.yaml")
-    assert run("calibrate", "vehicle", "--before", tmp_path / "before.yaml", "-o", tmp_path / "v.yaml") == 2
+    assert (
+        run("car", "calibrate", "vehicle", "--before", tmp_path / "before.yaml", "-o", tmp_path / "v.yaml")
+        == 2
+    )
     assert "either a bag or --live SECONDS" in capsys.readouterr().err
 
 
@@ -157,7 +161,8 @@ def test_intrinsics_from_a_folder_then_refused_with_half_of_it(tmp_path, capsys)
         cv2.imwrite(str(folder / f"{k:02d}.png"), view_of(picture, T, wide))
     board = ("--columns", 8, "--rows", 6, "--square", 0.1, "--marker", 0.075)
     assert (
-        run("calibrate", "intrinsics", folder, *board, "--model", "none", "-o", tmp_path / "lens.yaml") == 0
+        run("car", "calibrate", "intrinsics", folder, *board, "--model", "none", "-o", tmp_path / "lens.yaml")
+        == 0
     )
     found = load_calibration(LensCalibration, tmp_path / "lens.yaml")
     assert found.fx == pytest.approx(PINHOLE.fx, rel=0.01)
@@ -166,12 +171,21 @@ def test_intrinsics_from_a_folder_then_refused_with_half_of_it(tmp_path, capsys)
     for file in sorted(folder.glob("*.png"))[15:]:
         file.unlink()
     capsys.readouterr()
-    assert run("calibrate", "intrinsics", folder, *board, "-o", tmp_path / "no.yaml") == 2
+    assert run("car", "calibrate", "intrinsics", folder, *board, "-o", tmp_path / "no.yaml") == 2
     error = capsys.readouterr().err
     assert "expected at least 20 pictures with the board" in error
     assert error.count("\n") == 1
     assert (
-        run("calibrate", "intrinsics", tmp_path / "pictures", "--model", "seven", "-o", tmp_path / "no.yaml")
+        run(
+            "car",
+            "calibrate",
+            "intrinsics",
+            tmp_path / "pictures",
+            "--model",
+            "seven",
+            "-o",
+            tmp_path / "no.yaml",
+        )
         == 2
     )
 
@@ -243,7 +257,10 @@ def test_camera_to_car_from_a_bag_of_stops(tmp_path, capsys):
         "--lens",
         tmp_path / "lens.yaml",
     )
-    assert run("calibrate", "camera-to-car", tmp_path / "bag", *options, "-o", tmp_path / "camera.yaml") == 0
+    assert (
+        run("car", "calibrate", "camera-to-car", tmp_path / "bag", *options, "-o", tmp_path / "camera.yaml")
+        == 0
+    )
     found = load_calibration(CameraCalibration, tmp_path / "camera.yaml")
     np.testing.assert_allclose(found.mount[:3, 3], mount[:3, 3], atol=0.004)
     assert (tmp_path / "camera.png").exists()
@@ -251,6 +268,7 @@ def test_camera_to_car_from_a_bag_of_stops(tmp_path, capsys):
     # The car itself only drove on the floor: without the board's poses the same bag fixes nothing.
     assert (
         run(
+            "car",
             "calibrate",
             "camera-to-car",
             tmp_path / "bag",
@@ -285,6 +303,7 @@ def test_mocap_to_scene_from_two_transforms_files(tmp_path):
         write_transforms(tmp_path / f"{name}.json", paths, np.stack(listed), PINHOLE)
     assert (
         run(
+            "car",
             "calibrate",
             "mocap-to-scene",
             tmp_path / "scene.json",
@@ -300,7 +319,7 @@ def test_mocap_to_scene_from_two_transforms_files(tmp_path):
 
 
 def test_display_from_a_folder(tmp_path, capsys):
-    assert run("calibrate", "display-colours", "-o", tmp_path, "--width", 32, "--height", 18) == 0
+    assert run("car", "calibrate", "display-colours", "-o", tmp_path, "--width", 32, "--height", 18) == 0
     colours = colours_to_show()
     (tmp_path / "seen").mkdir()
     rng = np.random.default_rng(4)
@@ -313,7 +332,16 @@ def test_display_from_a_folder(tmp_path, capsys):
         noisy = np.clip(image + rng.normal(0.0, 2.0, image.shape), 0, 255).round().astype(np.uint8)
         cv2.imwrite(str(tmp_path / "seen" / f"{k:03d}.png"), noisy[..., ::-1])
     assert (
-        run("calibrate", "display", tmp_path, "--conditions", "lamps on", "-o", tmp_path / "display.yaml")
+        run(
+            "car",
+            "calibrate",
+            "display",
+            tmp_path,
+            "--conditions",
+            "lamps on",
+            "-o",
+            tmp_path / "display.yaml",
+        )
         == 0
     )
     found = load_calibration(DisplayCalibration, tmp_path / "display.yaml")
@@ -334,11 +362,11 @@ def test_display_from_a_folder(tmp_path, capsys):
             f"seen/{name}.png,9,9,9",
         ]
         (tmp_path / "shown.csv").write_text("\n".join(rows))
-        assert run("calibrate", "display", tmp_path, "-o", tmp_path / "no.yaml") == 2
+        assert run("car", "calibrate", "display", tmp_path, "-o", tmp_path / "no.yaml") == 2
         assert words in capsys.readouterr().err
     (tmp_path / "shown.csv").write_text("file,red\nseen/000.png,0\n")
     capsys.readouterr()
-    assert run("calibrate", "display", tmp_path, "-o", tmp_path / "no.yaml") == 2
+    assert run("car", "calibrate", "display", tmp_path, "-o", tmp_path / "no.yaml") == 2
     assert "columns file, red, green, blue" in capsys.readouterr().err
 
 
@@ -411,7 +439,19 @@ def test_live_topics_become_a_bag_and_silence_is_told(tmp_path):
 
 def test_a_board_to_print(tmp_path, capsys):
     assert (
-        run("calibrate", "board", "-o", tmp_path / "board.png", "--columns", 7, "--rows", 5, "--square", 0.04)
+        run(
+            "car",
+            "calibrate",
+            "board",
+            "-o",
+            tmp_path / "board.png",
+            "--columns",
+            7,
+            "--rows",
+            5,
+            "--square",
+            0.04,
+        )
         == 0
     )
     printed = cv2.imread(str(tmp_path / "board.png"), cv2.IMREAD_GRAYSCALE)

@@ -1,4 +1,4 @@
-"""The commands `advnerf object ...` as a user types them."""
+"""The commands `advnerf scene object ...` as a user types them."""
 
 import json
 import sys
@@ -28,17 +28,17 @@ def command(monkeypatch, capsys):
 def test_build_show_and_info(command, tmp_path):
     path = tmp_path / "hydrant.object.safetensors"
     code, output, _ = command(
-        "object", "build", "--generate", "hydrant", "--resolution", 16, "--steps", 2, "-o", path
+        "scene", "object", "build", "--generate", "hydrant", "--resolution", 16, "--steps", 2, "-o", path
     )
     assert code == 0
     assert "on held-out views" in output
     assert load_object(path).about["source"] == {"generator": "hydrant"}
-    assert command("object", "show", path, "-o", tmp_path / "h.png")[0] == 0
+    assert command("scene", "object", "show", path, "-o", tmp_path / "h.png")[0] == 0
     sheet = cv2.imread(str(tmp_path / "h.png"))
     assert sheet.shape == (480, 960, 3)
     red = (sheet[..., 2] > 120) & (sheet[..., 1] < 80)
     assert 0.02 < red.mean() < 0.3
-    code, output, _ = command("object", "info", path)
+    code, output, _ = command("scene", "object", "info", path)
     assert code == 0
     assert "0.75" in output
 
@@ -65,7 +65,7 @@ def test_build_from_cut_out_pictures(command, tmp_path):
     path = tmp_path / "o.object.safetensors"
     transforms = write_pictures(tmp_path, 8) / "transforms.json"
     code, output, errors = command(
-        "object", "build", "--images", transforms, "--resolution", 16, "--steps", 3, "-o", path
+        "scene", "object", "build", "--images", transforms, "--resolution", 16, "--steps", 3, "-o", path
     )
     assert (code, errors) == (0, "")
     assert "8 training, 0 held-out images" in output
@@ -82,7 +82,19 @@ def test_a_data_sets_own_split_is_followed(command, tmp_path):
     write_pictures(folder, 2, file="transforms_val.json", phase=0.3, spoilt=True)
     write_pictures(folder, 14, file="transforms_test.json", phase=0.6, spoilt=True)
     path = tmp_path / "o.object.safetensors"
-    arguments = ("object", "build", "--images", folder, "--resolution", 16, "--steps", 40, "-o", path)
+    arguments = (
+        "scene",
+        "object",
+        "build",
+        "--images",
+        folder,
+        "--resolution",
+        16,
+        "--steps",
+        40,
+        "-o",
+        path,
+    )
     code, output, errors = command(*arguments)
     assert (code, errors) == (0, "")
     assert "10 training, 16 held-out images (split of the data set)" in output
@@ -98,6 +110,7 @@ def test_sixteen_pictures_hold_out_two_and_can_be_made_smaller(command, tmp_path
     path = tmp_path / "o.object.safetensors"
     write_pictures(tmp_path, 16, pixels=64)
     code, output, errors = command(
+        "scene",
         "object",
         "build",
         "--images",
@@ -133,7 +146,7 @@ def test_sixteen_pictures_hold_out_two_and_can_be_made_smaller(command, tmp_path
     ],
 )
 def test_mistakes_are_one_line(command, tmp_path, arguments, message):
-    code, _, errors = command("object", "build", *(a.format(folder=tmp_path) for a in arguments))
+    code, _, errors = command("scene", "object", "build", *(a.format(folder=tmp_path) for a in arguments))
     assert code == 2
     assert message in errors
     assert errors.count("\n") == 1

@@ -49,7 +49,9 @@ def test_path_and_fence_make_a_room_file_that_the_stack_reads(tmp_path):
     poses = SQUARE.pose_at(np.arange(0.0, 1.05 * SQUARE.length_m, 0.02))
     poses[:, :2] += rng.normal(0.0, 0.002, (len(poses), 2))
     bag = write_trace(tmp_path / "lap", "/vicon/car", poses)
-    done = advnerf("room", "path", bag, "-o", tmp_path / "room.yaml", "--corner", "1", "--before", "1.5")
+    done = advnerf(
+        "scene", "room", "path", bag, "-o", tmp_path / "room.yaml", "--corner", "1", "--before", "1.5"
+    )
     assert done.returncode == 0, done.stderr
     assert "closed" in done.stdout
     assert "mm rms" in done.stdout
@@ -62,13 +64,13 @@ def test_path_and_fence_make_a_room_file_that_the_stack_reads(tmp_path):
         [np.linspace(a, b, 200) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
     )
     wand = write_trace(tmp_path / "walk", "/vicon/wand", np.column_stack([walk, np.zeros(len(walk))]))
-    done = advnerf("room", "fence", wand, "-o", tmp_path / "room.yaml")
+    done = advnerf("scene", "room", "fence", wand, "-o", tmp_path / "room.yaml")
     assert done.returncode == 0, done.stderr
     fenced = load_calibration(RoomCalibration, tmp_path / "room.yaml")
     assert np.abs(np.array(fenced.fence_m)).max() == pytest.approx(3.5, abs=0.03)
     assert fenced.path == room.path
     small = write_trace(tmp_path / "small", "/vicon/wand", np.column_stack([0.4 * walk, np.zeros(len(walk))]))
-    done = advnerf("room", "fence", small, "-o", tmp_path / "room.yaml")
+    done = advnerf("scene", "room", "fence", small, "-o", tmp_path / "room.yaml")
     assert done.returncode == 2
     assert "outside. Walk around the whole path" in done.stderr
     assert load_calibration(RoomCalibration, tmp_path / "room.yaml") == fenced
@@ -143,18 +145,26 @@ def test_the_guide_accepts_the_right_place_and_refuses_a_wrong_one(tmp_path):
     file = save_attack_at(tmp_path, T_FACE)
     with Board(tmp_path / "right", T_FACE @ make_transform(np.eye(3), [0.0, 0.005, 0.0])):
         done = advnerf(
-            "room", "place", file, "--target", tmp_path / "board.yaml", "--run-dir", tmp_path / "right"
-        )
-    assert done.returncode == 0, done.stderr
-    assert "0.5 cm and 0.0 deg" in done.stdout
-    with Board(tmp_path / "wrong", T_FACE @ make_transform(rotation_z(0.1), [0.0, 0.06, 0.0])):
-        done = advnerf(
+            "scene",
             "room",
             "place",
             file,
             "--target",
             tmp_path / "board.yaml",
-            "--run-dir",
+            "--folder",
+            tmp_path / "right",
+        )
+    assert done.returncode == 0, done.stderr
+    assert "0.5 cm and 0.0 deg" in done.stdout
+    with Board(tmp_path / "wrong", T_FACE @ make_transform(rotation_z(0.1), [0.0, 0.06, 0.0])):
+        done = advnerf(
+            "scene",
+            "room",
+            "place",
+            file,
+            "--target",
+            tmp_path / "board.yaml",
+            "--folder",
             tmp_path / "wrong",
             "--once",
             "--request",
@@ -178,11 +188,21 @@ def test_a_request_without_one_face_is_refused(tmp_path):
 
 def test_targets_by_ruler_and_bad_options(tmp_path):
     done = advnerf(
-        "room", "target", "-o", tmp_path / "m.yaml", "--subject", "monitor", "--size", "0.598x0.336"
+        "scene",
+        "room",
+        "target",
+        "-o",
+        tmp_path / "m.yaml",
+        "--subject",
+        "monitor",
+        "--face-size",
+        "0.598x0.336",
     )
     assert done.returncode == 0, done.stderr
     assert "size_m: 0.3360" in done.stdout
     target = load_calibration(TargetCalibration, tmp_path / "m.yaml")
     np.testing.assert_allclose(target.corners[0], [0.0, -0.299, 0.168])
-    done = advnerf("room", "target", "-o", tmp_path / "n.yaml", "--subject", "monitor", "--size", "27")
+    done = advnerf(
+        "scene", "room", "target", "-o", tmp_path / "n.yaml", "--subject", "monitor", "--face-size", "27"
+    )
     assert (done.returncode, "expected 2 numbers in metres" in done.stderr) == (2, True)

@@ -1,4 +1,4 @@
-"""The counterfactual node in process, in lockstep over a bag, and what ``advnerf evaluate`` makes of its words."""
+"""The counterfactual node in process, in lockstep over a bag, and what ``advnerf bag evaluate`` makes of its words."""
 
 import json
 import subprocess
@@ -261,15 +261,17 @@ def test_lockstep_over_a_bag_gives_one_word_per_image_and_the_same_digest(replay
 
 
 def test_evaluate_says_what_the_attack_added(replayed, tmp_path, policy):
-    result = CliRunner().invoke(app, ["evaluate", str(replayed), "--ticks", "15"])
+    result = CliRunner().invoke(app, ["bag", "evaluate", str(replayed), "--ticks", "15"])
     assert result.exit_code == 0, result.output
-    found = json.loads(CliRunner().invoke(app, ["evaluate", str(replayed), "--ticks", "15", "--json"]).output)
+    found = json.loads(
+        CliRunner().invoke(app, ["bag", "evaluate", str(replayed), "--ticks", "15", "--json"]).output
+    )
     added = found["counterfactual"]
     mean, largest = np.rad2deg(added["mean_abs_delta_rad"]), np.rad2deg(added["max_abs_delta_rad"])
     text = f"mean {mean:.2f}, max {largest:.2f} deg ({added['frames_drawn']} of {added['frames']} images)"
     assert text in " ".join(result.output.split())
     without = CliRunner().invoke(
-        app, ["evaluate", str(drive(tmp_path / "plain", policy)), "--ticks", "15", "--json"]
+        app, ["bag", "evaluate", str(drive(tmp_path / "plain", policy)), "--ticks", "15", "--json"]
     )
     assert "counterfactual" not in json.loads(without.output)
 

@@ -84,7 +84,7 @@ def test_the_commands_to_train_and_to_make_a_data_set_take_a_foreign_bag(tmp_pat
         ROOM,
         "--steps",
         2,
-        "--out",
+        "-o",
         tmp_path / "policy",
     )
     assert trained.exit_code == 0, trained.output
@@ -166,7 +166,7 @@ def test_a_whole_replay_of_a_foreign_bag_says_what_it_leaves_out(tmp_path):
         "-o",
         tmp_path / "again",
     )
-    done = advnerf("replay", bag, *arguments)
+    done = advnerf("bag", "replay", bag, *arguments)
     assert done.exit_code == 0, done.output
     assert "without /chatter (not in the topic table)" in " ".join(done.output.split())
     kept = {topic.name: (topic.type, topic.count) for topic in read_info(tmp_path / "again").topics}
@@ -182,7 +182,7 @@ def player(bag, run_dir, *arguments):
         "bag",
         "play",
         str(bag),
-        "--run-dir",
+        "--folder",
         str(run_dir),
         *map(str, arguments),
     ]

@@ -1,4 +1,4 @@
-"""`advnerf method check`: what a method promises, met by ours and by the page's, and what is wrong is found."""
+"""`advnerf attack method check`: what a method promises, met by ours and by the page's, and what is wrong is found."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_every_built_in_method_keeps_the_contract(name: str) -> None:
 def test_the_command_says_what_it_executes_and_takes_options(tmp_path: Path) -> None:
     file = tmp_path / "spiral.py"
     file.write_text(spiral_code())
-    done = CliRunner().invoke(app, ["method", "check", f"{file}:Spiral", "--set", "turns=0.3"])
+    done = CliRunner().invoke(app, ["attack", "method", "check", f"{file}:Spiral", "--set", "turns=0.3"])
     assert done.exit_code == 0, done.output
     assert f"executes {file}:Spiral (sha256 " in done.output
     assert done.output.count(" met ") == len(CHECKS)

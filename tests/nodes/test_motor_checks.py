@@ -289,18 +289,18 @@ def test_a_repeated_request_for_the_check_is_obeyed_once_and_answered_every_time
 
 def test_command_line(tmp_path):
     with VescEmulator(VescEmulatorConfig(), TwinVehicle(CarConfig()), tmp_path / "vesc") as emulator:
-        port = ["--port", str(tmp_path / "vesc")]
-        shown = CliRunner().invoke(app, ["motor", "info", *port])
+        port = ["--vesc", str(tmp_path / "vesc")]
+        shown = CliRunner().invoke(app, ["car", "motor", "info", *port])
         assert shown.exit_code == 0, shown.output
         assert "TWIN firmware 5.02" in shown.output
         assert "1000 ms with 0 A" in shown.output
         stored = CliRunner().invoke(
-            app, ["motor", "set-timeout", "--timeout-ms", "250", "--brake-current", "20", *port]
+            app, ["car", "motor", "set-timeout", "--timeout-ms", "250", "--brake-current", "20", *port]
         )
         assert stored.exit_code == 0, stored.output
         assert "was 1000 ms with 0 A, is 250 ms with 20 A" in stored.output
         assert str(emulator.timeout) == "250 ms with 20 A"
-    assert CliRunner().invoke(app, ["motor", "set-timeout", "--timeout-ms", "0"]).exit_code == 2
+    assert CliRunner().invoke(app, ["car", "motor", "set-timeout", "--timeout-ms", "0"]).exit_code == 2
 
 
 @pytest.mark.parametrize(
@@ -321,14 +321,14 @@ def test_a_person_confirms_over_the_bus(tmp_path, answer, code, text):
             "nodes.motor",
             "--config",
             str(tmp_path / "motor.json"),
-            "--run-dir",
+            "--folder",
             str(tmp_path),
         ]
         node = subprocess.Popen(command, cwd=Path(__file__).parents[2])
         try:
             wait_for(lambda: any(e.name == "GET_VALUES" for e in emulator.events()), "the motor node")
             done = CliRunner().invoke(
-                app, ["motor", "check-steering", "--run-dir", str(tmp_path)], input=answer + "\n"
+                app, ["car", "motor", "check-steering", "--folder", str(tmp_path)], input=answer + "\n"
             )
         finally:
             node.terminate()

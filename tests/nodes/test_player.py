@@ -159,7 +159,7 @@ def test_wrong_choices_are_errors(bag, tmp_path):
 
 
 def test_process_plays_a_bag_to_a_subscriber_and_ends(bag, tmp_path):
-    command = [sys.executable, "-m", "nodes.player", "--run-dir", str(tmp_path), "--set", f"bag={bag}"]
+    command = [sys.executable, "-m", "nodes.player", "--folder", str(tmp_path), "--set", f"bag={bag}"]
     command += ["--set", "rate=4", "--set", "wait_for=[/vicon/car]"]
     with Bus(tmp_path) as bus:
         bus.subscribe("/vicon/car")

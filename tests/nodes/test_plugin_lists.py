@@ -38,7 +38,7 @@ def test_a_package_is_listed_with_its_version_and_title(
 ) -> None:
     titled = spiral_code().replace("Options=Options)", 'Options=Options, title="along a spiral")')
     install_method(tmp_path, monkeypatch, titled)
-    code, printed = command("list", "methods")
+    code, printed = command("experiment", "list", "methods")
     assert code == 0
     (line,) = [line for line in printed.splitlines() if line.startswith("spiral")]
     assert line.split() == ["spiral", "stranger-methods", "1.0", "along", "a", "spiral"]
@@ -48,7 +48,7 @@ def test_a_package_that_is_broken_is_listed_with_its_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     install_method(tmp_path, monkeypatch, "import a_package_that_is_not_there\n")
-    code, printed = command("list", "methods")
+    code, printed = command("experiment", "list", "methods")
     assert code == 0
     assert "cannot be loaded: ModuleNotFoundError: No module named 'a_package_that_is_not_there'" in printed
 
@@ -57,7 +57,7 @@ def test_a_name_that_two_things_have_is_an_error_of_the_list(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     install_method(tmp_path, monkeypatch, spiral_code(), "gradient")
-    code, printed = command("list", "methods")
+    code, printed = command("experiment", "list", "methods")
     assert code == 1
     assert "expected one thing of the name gradient, got 2 (built in, stranger-methods 1.0)" in printed
 
@@ -93,6 +93,6 @@ def trap(tmp_path: Path) -> tuple[Path, Path]:
 def test_reading_commands_execute_no_method(trap: tuple[Path, Path], tmp_path: Path, word: str) -> None:
     file, trace = trap
     methods = f"over.method=[none,'{file}:Spiral']"
-    code, printed = command(word, "junction", "--run-folder", tmp_path / "run", "--set", methods)
+    code, printed = command("experiment", word, "junction", "--folder", tmp_path / "run", "--set", methods)
     assert "Spiral" in printed or code == 0
     assert not trace.exists()

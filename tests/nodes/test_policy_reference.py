@@ -181,7 +181,7 @@ def test_the_command_fails_for_a_policy_that_does_not_drive_where_it_was_asked_t
     monkeypatch.syspath_prepend(str(tmp_path))
     for name, code in (("bad", 1), ("good", 0)):
         done = CliRunner().invoke(
-            app, ["policy", "check", f"circling_{name}:factory", "--run-folder", str(folder)]
+            app, ["policy", "check", f"circling_{name}:factory", "--folder", str(folder)]
         )
         assert done.exit_code == code, done.output
         assert ("NO DRIVE" in done.output) == (code == 1)

@@ -61,7 +61,7 @@ def test_the_fake_loop_drives_a_served_file_100_of_100_steps(tmp_path):
     export_onnx(KeepsTheLane().eval(), PolicyContract(VIEW), file)
     command = [sys.executable, "-m", "nodes.cli", "policy", "serve", str(file), "--listen", "127.0.0.1:0"]
     with subprocess.Popen(
-        [*command, "--wheelbase-m", "2.5", "--speed-mps", "6"], stdout=subprocess.PIPE, text=True
+        [*command, "--wheelbase", "2.5", "--speed", "6"], stdout=subprocess.PIPE, text=True
     ) as served:
         try:
             line = served.stdout.readline()
@@ -156,7 +156,7 @@ def test_other_computers_are_served_by_tls(tmp_path, monkeypatch):
 
 
 def test_what_is_missing_is_said():
-    with pytest.raises(ConfigError, match="give --wheelbase-m"):
+    with pytest.raises(ConfigError, match="give --wheelbase"):
         ServedPolicy(driver_of(constant), "constant", ServedCar())
     with pytest.raises(ConfigError, match="expected a goal of 2 numbers for this policy, got 0; give --goal"):
         ServedPolicy(driver_of(constant, goal_size=2), "constant", ServedCar(WHEELBASE_M))

@@ -87,7 +87,7 @@ def test_provenance_names_the_version():
 
 
 def start_recorder(tmp_path, bus, *settings):
-    command = [sys.executable, "-m", "nodes.recorder", "--run-dir", str(tmp_path)]
+    command = [sys.executable, "-m", "nodes.recorder", "--folder", str(tmp_path)]
     command += [part for setting in settings for part in ("--set", setting)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     for topic in ("/camera/image_raw", "/vicon/car"):
@@ -157,7 +157,7 @@ def test_killed_process_that_splits_its_bag_loses_at_most_what_came_in_its_last_
 def test_bag_that_exists_is_one_clear_line_and_exit_code_2(tmp_path):
     (tmp_path / "bag").mkdir()
     (tmp_path / "bag" / "x").write_text("")
-    command = [sys.executable, "-m", "nodes.recorder", "--run-dir", str(tmp_path)]
+    command = [sys.executable, "-m", "nodes.recorder", "--folder", str(tmp_path)]
     result = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert result.returncode == 2
     assert result.stderr.count("\n") == 1

@@ -67,7 +67,7 @@ class Car:
 
     def start(self, name, *settings, folder=None):
         arguments = [argument for setting in settings for argument in ("--set", setting)]
-        command = [sys.executable, "-m", f"nodes.{name}", "--run-dir", str(folder or self.folder), *arguments]
+        command = [sys.executable, "-m", f"nodes.{name}", "--folder", str(folder or self.folder), *arguments]
         self._processes[str(folder), name] = subprocess.Popen(command, cwd=REPOSITORY)
         return self._processes[str(folder), name]
 
@@ -128,7 +128,7 @@ def car(tmp_path):
 
 
 def played(folder, bag, *settings):
-    command = [sys.executable, "-m", "nodes.player", "--run-dir", str(folder), "--set", f"bag={bag}"]
+    command = [sys.executable, "-m", "nodes.player", "--folder", str(folder), "--set", f"bag={bag}"]
     for setting in ("rate=4", "wait_for=[]", *settings):
         command += ["--set", setting]
     return subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=600)

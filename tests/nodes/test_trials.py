@@ -282,7 +282,7 @@ def test_numbers_of_a_bag_without_checksums_are_unchecked(tmp_path):
     (unchecked,) = evaluate_bag(bag, None, ticks=20)
     assert "chunks have no checksum" in unchecked["unchecked"]
     assert unchecked["total_cte_m"] == checked["total_cte_m"]
-    shown = CliRunner().invoke(app, ["evaluate", str(bag), "--ticks", "20"], env={"COLUMNS": "240"})
+    shown = CliRunner().invoke(app, ["bag", "evaluate", str(bag), "--ticks", "20"], env={"COLUMNS": "240"})
     assert "unchecked" in shown.stdout
     rows = summarise([{**unchecked, "condition": "none"}, {**checked, "condition": "none"}])
     assert rows[0]["unchecked"] == 1

@@ -19,7 +19,7 @@ PIXELS = ["--tolerance", "/compositor/image:data=2", "--tolerance", "/policy/dri
 
 
 def replay(*arguments):
-    command = [sys.executable, "-m", "nodes.cli", "replay", *map(str, arguments)]
+    command = [sys.executable, "-m", "nodes.cli", "bag", "replay", *map(str, arguments)]
     root = str(Path(__file__).parents[2])
     environment = {"PYTHONPATH": f"{root}:{HERE}", "PATH": "/usr/bin:/bin", "HOME": "/tmp"}
     return subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=HERE, env=environment)
@@ -55,7 +55,7 @@ def test_the_first_difference_is_named():
 
 def here(*arguments):
     """Exit code of the command, run in this process."""
-    return cli.app(["replay", *map(str, arguments)], standalone_mode=False) or 0
+    return cli.app(["bag", "replay", *map(str, arguments)], standalone_mode=False) or 0
 
 
 def test_another_face_is_seen_in_the_pixels(capsys):

@@ -94,7 +94,7 @@ def make_folder(folder: Path) -> None:
 def command(policy: str, *options: str, output: str = "") -> list[str]:
     """The command that audits one of the policies, run in their folder."""
     words = ["--place", "photos", "-o", output or policy, "--car", "car.yaml", "--limit", str(LIMIT_M)]
-    words += ["--evaluations", "60", "--starts", "8", "--size", "0.5"]
+    words += ["--evaluations", "60", "--starts", "8", "--object-size", "0.5"]
     changes = [word for each in CHANGES for word in ("--set", each)]
     return [sys.executable, "-m", "nodes.cli", "audit", f"drivers:{policy}", *words, *changes, *options]
 

@@ -138,7 +138,7 @@ class Run:
             command = [sys.executable, "-m", f"nodes.{name}", "--config", str(file)]
             log = open(self.folder / f"{name}.log", "ab")  # noqa: SIM115 - belongs to the child
             self.processes[name] = subprocess.Popen(
-                [*command, "--run-dir", str(self.folder), "--name", name],
+                [*command, "--folder", str(self.folder), "--name", name],
                 stdout=log,
                 stderr=log,
                 cwd=REPOSITORY,

@@ -62,7 +62,7 @@ class Stack(LiveOperator):
             self.processes[name] = self._start(name)
 
     def _start(self, name: str) -> subprocess.Popen:
-        arguments = ["--run-dir", str(self.run_dir), "--name", name]
+        arguments = ["--folder", str(self.run_dir), "--name", name]
         config = self.run_dir / f"{name}.yaml"
         config.write_text(yaml.safe_dump(self.configs[name]))
         module = "benchmarks.straight_policy" if name == "policy" else f"nodes.{name}"

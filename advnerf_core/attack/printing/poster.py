@@ -156,12 +156,12 @@ def _size(
 ) -> tuple[float, float]:
     if held_m is not None and edge_m is not None:
         raise PrintError(
-            f"expected no --size-m for {chosen.name}, whose attack file says {held_m[0]:g} x {held_m[1]:g} m; leave it out"
+            f"expected no --object-size for {chosen.name}, whose attack file says {held_m[0]:g} x {held_m[1]:g} m; leave it out"
         )
     if held_m is None and edge_m is None:
         raise PrintError(
             f"expected the size of {chosen.name} in the attack file, got an older file without it; "
-            "give the edge with --size-m (of an experiment's panel: 2 m times its scale)"
+            "give the edge with --object-size (of an experiment's panel: 2 m times its scale)"
         )
     return held_m or (edge_m or 0.0, edge_m or 0.0)
 

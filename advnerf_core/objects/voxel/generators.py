@@ -85,7 +85,7 @@ def small_car(length_m: float = 3.6) -> SurfaceMesh:
 
 
 GENERATORS: dict[str, Callable[[], SurfaceMesh]] = {"hydrant": hydrant, "car": small_car}
-"""What ``advnerf object build --generate`` knows."""
+"""What ``advnerf scene object build --generate`` knows."""
 
 
 def _wheel(centre: ArrayLike, side: float) -> list[MeshPart]:

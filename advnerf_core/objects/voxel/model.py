@@ -121,7 +121,7 @@ def load_object(path: Path) -> ObjectModel:
     """
     if not path.is_file():
         raise ObjectFileError(
-            f"expected an object file at {path}, found none: make one with `advnerf object build`"
+            f"expected an object file at {path}, found none: make one with `advnerf scene object build`"
         )
     try:
         with open_tensors(path, "numpy") as stream:

@@ -257,7 +257,9 @@ def withdraw(folder: FilePath, scenarios: Mapping[str, str]) -> None:
     """
     registration = read_registration(folder)
     if registration is None:
-        raise RegistrationError(f"{folder}: expected {FILE}, which advnerf register writes, got none")
+        raise RegistrationError(
+            f"{folder}: expected {FILE}, which advnerf experiment register writes, got none"
+        )
     names = {cell.scenario for cell in registration.cells}
     for scenario, reason in scenarios.items():
         if scenario not in names:

@@ -88,7 +88,7 @@ def check_nobody_else(world: Any, server: ServerConfig) -> None:
     if world.get_settings().synchronous_mode and not server.take_over:
         raise CarlaBusy(
             "expected a world that ticks by itself, got a synchronous one: another client drives it, or one was killed and could not "
-            "put it back; end that client, run `advnerf carla release`, or set server.take_over"
+            "put it back; end that client, run `advnerf scene carla release`, or set server.take_over"
         )
     if server.allow_traffic:
         return

@@ -121,7 +121,7 @@ def find_drives(
                 return drives
             reasons.append(
                 f"expected a flat junction, heights within {max_height_range_m:g} m, got {drives.height_range_m:.2f} m at junction "
-                f"{drives.junction_id}; take another one (`advnerf carla junctions`), or shorter roads"
+                f"{drives.junction_id}; take another one (`advnerf scene carla junctions`), or shorter roads"
             )
         except CarlaMapError as error:
             reasons.append(str(error))
@@ -168,7 +168,7 @@ def _candidates(carla_map: Any, library: Any, junction_id: int | None) -> list[A
         if junction_id not in junctions:
             raise CarlaMapError(
                 f"expected junction {junction_id} in the map {carla_map.name}, which has {sorted(junctions) or 'none'}; "
-                "`advnerf carla junctions` lists them"
+                "`advnerf scene carla junctions` lists them"
             )
         return [junctions[junction_id]]
     fit = [info.id for info in list_junctions(carla_map, library) if info.arms == 3 and info.drives]

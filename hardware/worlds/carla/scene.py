@@ -238,7 +238,7 @@ class CarlaScene:
         failed = self._put_back()
         if failed:
             raise CarlaError(
-                f"could not put CARLA's world back: {'; '.join(failed)}. If the server still runs, `advnerf carla release` frees it"
+                f"could not put CARLA's world back: {'; '.join(failed)}. If the server still runs, `advnerf scene carla release` frees it"
             )
 
     def __exit__(

@@ -1,1 +1,1 @@
-"""Duckietown as a world, in a separate process and environment: ``advnerf world install duckietown``."""
+"""Duckietown as a world, in a separate process and environment: ``advnerf scene world install duckietown``."""

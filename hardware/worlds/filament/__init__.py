@@ -1,1 +1,1 @@
-"""The lab drawn by another renderer, MuJoCo 4's Filament, in a separate process and environment: ``advnerf world install filament``."""
+"""The lab drawn by another renderer, MuJoCo 4's Filament, in a separate process and environment: ``advnerf scene world install filament``."""

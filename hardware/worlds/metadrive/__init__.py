@@ -1,1 +1,1 @@
-"""MetaDrive as a world, in a separate process and environment: ``advnerf world install metadrive``."""
+"""MetaDrive as a world, in a separate process and environment: ``advnerf scene world install metadrive``."""

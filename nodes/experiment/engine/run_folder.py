@@ -92,7 +92,7 @@ def require_own_folder(experiment: RunFolder[Any]) -> None:
     if there != experiment.config.name:
         raise ConfigError(
             f"expected a run folder of experiment {experiment.config.name!r} or a new one, got {experiment.folder} of {there!r}; name another one "
-            f"with --run-folder (for a variant: run_folder), or remove {manifest} to have its stages replaced where they differ"
+            f"with --folder (for a variant: run_folder), or remove {manifest} to have its stages replaced where they differ"
         )
 
 

@@ -92,7 +92,7 @@ def _ask(bus: Bus, topic: str, make: Callable[[RequestIdentity, Now], Any]) -> A
         return ask(bus, topic, make, "/attack/progress", read, every_s=_REPEAT_S, patience_s=_ANSWER_S)
     except NoAnswerError:
         raise LaunchError(
-            f"the attack node did not answer within {_ANSWER_S:g} s; is it running with the same --run-dir?"
+            f"the attack node did not answer within {_ANSWER_S:g} s; is it running with the same --folder?"
         ) from None
 
 

@@ -40,7 +40,7 @@ class ObjectRequest(StrictModel):
     """One object: where it is, and which of its colours are free.
 
     A ``face`` is a thin slab seen from its front only, as a projected or displayed texture is; a ``cube`` has one textured face
-    and plain sides; a ``file`` is what ``advnerf object build`` wrote; a ``mesh`` is a textured surface as it is. The frame of a face or cube has its origin in the middle of
+    and plain sides; a ``file`` is what ``advnerf scene object build`` wrote; a ``mesh`` is a textured surface as it is. The frame of a face or cube has its origin in the middle of
     the textured face, x out of it, z up.
     """
 
@@ -76,7 +76,7 @@ class ObjectRequest(StrictModel):
     )
     display: Path | None = Field(
         default=None,
-        description="What 'advnerf calibrate display' wrote, where a monitor shows the face: its colours are in the loop.",
+        description="What 'advnerf car calibrate display' wrote, where a monitor shows the face: its colours are in the loop.",
     )
     display_cos: Annotated[float, Field(gt=0, le=1)] = Field(
         default=1.0,
@@ -255,7 +255,7 @@ class AttackRequest(StrictModel):
         meshes = [wanted.kind == "mesh" for wanted in self.objects]
         if self.poses is not None and any(meshes):
             raise ValueError(
-                "poses: expected objects made of voxels, got a mesh; 'advnerf object build' makes voxels of it"
+                "poses: expected objects made of voxels, got a mesh; 'advnerf scene object build' makes voxels of it"
             )
         if self.shape is not None:
             if not all(meshes):

@@ -123,5 +123,5 @@ def select(cells: Sequence[Cell], only: str) -> list[Cell]:
         cell for cell in cells if all(str(getattr(cell, key)) in values for key, values in wanted.items())
     ]
     if not chosen:
-        raise ConfigError(f"--only {only}: expected some cells, got none; see advnerf status")
+        raise ConfigError(f"--only {only}: expected some cells, got none; see advnerf experiment status")
     return chosen

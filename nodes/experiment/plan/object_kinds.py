@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from advnerf_core.objects.voxel.mesh import SurfaceMesh
 
 PANEL = "panel"
-# Length and width [m] at scale 1: of the objects that ``advnerf object build --generate`` makes, and of a square panel that stands upright.
+# Length and width [m] at scale 1: of the objects that ``advnerf scene object build --generate`` makes, and of a square panel that stands upright.
 MADE_HERE_M: dict[str, tuple[float, float]] = {
     "small_car": (3.64, 1.7),
     "hydrant": (0.48, 0.48),
     PANEL: (0.1, 2.0),
 }
-# What ``advnerf object build`` writes; and meshes whose format says which unit they are in.
+# What ``advnerf scene object build`` writes; and meshes whose format says which unit they are in.
 OBJECT_SUFFIX, MESH_SUFFIXES = ".object.safetensors", (".glb", ".gltf")
 
 
@@ -37,7 +37,7 @@ def _located(kind: str, info: ValidationInfo) -> str:
             COMPLETE,
             "{text}",
             {
-                "text": f"{unknown(kind, 'kind of object', MADE_HERE_M)}; one of your own is a file of 'advnerf object build' "
+                "text": f"{unknown(kind, 'kind of object', MADE_HERE_M)}; one of your own is a file of 'advnerf scene object build' "
                 f"(*{OBJECT_SUFFIX}) or a mesh ({', '.join(MESH_SUFFIXES)}, in metres), relative to this file"
             },
         )

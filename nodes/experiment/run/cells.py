@@ -40,7 +40,7 @@ class Bench:
     """Common resources of an experiment's cells while several are run one after the other: the open world, the space, the deployer.
 
     Args:
-        experiment: Experiment with finished scene, objects and policies (``advnerf experiment FILE --until policy``).
+        experiment: Experiment with finished scene, objects and policies (``advnerf experiment run FILE --until policy``).
     """
 
     def __init__(self, experiment: Experiment) -> None:
@@ -85,7 +85,7 @@ def run_cell(
     """Search, drive in both domains, and film; resumes from the content of ``folder``.
 
     Args:
-        experiment: Experiment with finished scene, objects and policies (``advnerf experiment FILE --until policy``).
+        experiment: Experiment with finished scene, objects and policies (``advnerf experiment run FILE --until policy``).
         cell: The cell to run.
         folder: Folder of this cell, for search state, attack file, drives and film.
         report: Called with the finished fraction.

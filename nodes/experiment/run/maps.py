@@ -37,6 +37,6 @@ def map_cells(experiment: Experiment, cells: Sequence[Cell], number: int) -> lis
     if not pictures:
         raise ConfigError(
             f"expected finished cells that have placed objects (space.kind=places), got none of {len(cells)}; run them first, "
-            "see advnerf status"
+            "see advnerf experiment status"
         )
     return pictures

@@ -29,7 +29,7 @@ def predict_cells(
 ) -> int:
     """Predict every attacked cell with a search and without a prediction; returns their number.
 
-    A prediction needs the finished search (``advnerf experiment --search-only`` does only that) and the drive without attack. It reads
+    A prediction needs the finished search (``advnerf experiment run --search-only`` does only that) and the drive without attack. It reads
     no drive with the attack, so it is the same before and after that drive.
 
     Args:

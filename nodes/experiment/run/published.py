@@ -184,7 +184,7 @@ def published_table(folder: Path, experiment: Experiment, cells: Sequence[Cell] 
     """
     found = read_cells(folder)
     if not found:
-        raise ConfigError(f"expected published cells in {folder}, got none; run advnerf publish")
+        raise ConfigError(f"expected published cells in {folder}, got none; run advnerf experiment publish")
     return make_table(
         wanted_rows(experiment.cells if cells is None else cells),
         found,

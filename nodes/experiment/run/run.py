@@ -218,7 +218,7 @@ def _run_on_ray(jobs: list[Job], at_a_time: int, options: Options, say: Say) -> 
     from nodes.experiment.run.cluster import ray_session, run_on_ray
 
     with ray_session(options.address, at_a_time or _cores()) as cores:
-        say(f"Ray cluster with {cores} cores; advnerf status tells how far it is")
+        say(f"Ray cluster with {cores} cores; advnerf experiment status tells how far it is")
         at_a_time = at_a_time or max(1, cores // (options.threads or 1))
         ended: list[Ended] = []
         left = jobs

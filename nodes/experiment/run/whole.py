@@ -1,4 +1,4 @@
-"""Runs a whole experiment: its stages, its cells (here, over cores or over a cluster), its report. Called by ``advnerf experiment``."""
+"""Runs a whole experiment: its stages, its cells (here, over cores or over a cluster), its report. Called by ``advnerf experiment run``."""
 
 from __future__ import annotations
 

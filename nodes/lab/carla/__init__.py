@@ -1,1 +1,1 @@
-"""Implementation of ``advnerf carla ...``: check a server, photograph a junction, drive it with the expert."""
+"""Implementation of ``advnerf scene carla ...``: check a server, photograph a junction, drive it with the expert."""

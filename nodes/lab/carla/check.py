@@ -181,7 +181,7 @@ def _ground(
         return CarlaCheck("depth", "ok", text)
     text += (
         f"; depth there is {float(np.median(ratio)):.2f} of what a flat road gives. Does the camera see the car itself, is the ground at the "
-        "height of the map's lanes, is the camera higher than they say? Look at the pictures (--pictures)"
+        "height of the map's lanes, is the camera higher than they say? Look at the pictures (-o)"
     )
     return CarlaCheck("depth", "failure", text)
 
@@ -190,7 +190,7 @@ def _look_at_settings(world: Any, checks: list[CarlaCheck]) -> bool:
     settings = world.get_settings()
     if settings.synchronous_mode:
         raise CarlaFrameError(
-            "expected the world to tick by itself again, it does not: `advnerf carla release`"
+            "expected the world to tick by itself again, it does not: `advnerf scene carla release`"
         )
     checks.append(CarlaCheck("put back", "ok", "the world ticks by itself again"))
     return True

@@ -28,7 +28,7 @@ def video_devices(port: VideoPort | None = None) -> list[CheckResult]:
     port = port or KernelPort()
     rows = [row for name in port.names() if (row := _device(port, Path(name))) is not None]
     return rows or [
-        CheckResult(_NAME, ABSENT, "no video device", "check its USB cable, then run advnerf camera list")
+        CheckResult(_NAME, ABSENT, "no video device", "check its USB cable, then run advnerf car camera list")
     ]
 
 
@@ -94,7 +94,7 @@ def source(
         do = (
             "stop the launch or program that uses it"
             if "in use" in str(error)
-            else "run advnerf camera list; see docs/cameras.md"
+            else "run advnerf car camera list; see docs/cameras.md"
         )
         return [CheckResult(_NAME, FAILURE, str(error), do)]
     return [*_measured(config, trial, calibration), *_stable(getattr(config, "device", None))]

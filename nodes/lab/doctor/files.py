@@ -21,7 +21,7 @@ from nodes.compositor import show
 from nodes.lab.doctor.check import FAILURE, OK, CheckResult
 from nodes.launching.launch_file import Plan
 
-_CURE = "run advnerf calibrate (docs/calibration.md), or set params.calibration to the right folder"
+_CURE = "run advnerf car calibrate (docs/calibration.md), or set params.calibration to the right folder"
 _COMMON: dict[str, type[Calibration]] = {
     "camera": CameraCalibration, "target": TargetCalibration, "room": RoomCalibration, "vehicle": VehicleCalibration,
 }  # fmt: skip

@@ -197,7 +197,7 @@ def keys(folder: Path | None = None) -> list[CheckResult]:
     drivers = ", ".join(row.name for row in rows if DRIVE in row.rights) or "no key"
     if not ours:
         return [
-            CheckResult("keys", ABSENT, f"none in {folder}", "two hosts need them: advnerf keys new NAME")
+            CheckResult("keys", ABSENT, f"none in {folder}", "two hosts need them: advnerf car keys new NAME")
         ]
     return [CheckResult("keys", OK, f"ours: {ours}; {drivers} may drive over the network")]
 

@@ -151,7 +151,9 @@ def vesc(
         ]
     except HardwareError as error:
         return [
-            CheckResult("VESC", FAILURE, str(error), "run advnerf motor info, then check cable and firmware")
+            CheckResult(
+                "VESC", FAILURE, str(error), "run advnerf car motor info, then check cable and firmware"
+            )
         ]
     finally:
         device.abandon()
@@ -181,7 +183,7 @@ def _time_out(device: Vesc, wanted: TimeoutSettings) -> CheckResult:
     if found.at_least(wanted):
         return CheckResult(name, OK, f"{found}; required is at most {wanted}")
     do = (
-        f"advnerf motor set-timeout --port {device.port} --timeout-ms {wanted.timeout_ms} "
+        f"advnerf car motor set-timeout --vesc {device.port} --timeout-ms {wanted.timeout_ms} "
         f"--brake-current {wanted.brake_current_a:g}"
     )
     return CheckResult(
@@ -210,7 +212,7 @@ def gamepads(required: bool) -> Sequence[CheckResult]:
         Path("/dev/input").glob("js*")
     )
     if not found:
-        do = "use advnerf teleop with the keyboard, or plug in a gamepad (docs/driving.md)"
+        do = "use advnerf car teleop with the keyboard, or plug in a gamepad (docs/driving.md)"
         return [CheckResult("gamepad", WARNING if required else ABSENT, "none", do)]
     denied = [str(path) for path in found if not os.access(path, os.R_OK)]
     if denied:

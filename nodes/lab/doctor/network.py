@@ -42,7 +42,7 @@ def _keys(config: GatewayConfig, address: str) -> list[CheckResult]:
                 "keys",
                 FAILURE,
                 str(error),
-                "create and allow keys with advnerf keys new, add, allow (docs/two_hosts.md)",
+                "create and allow keys with advnerf car keys new, add, allow (docs/two_hosts.md)",
             )
         ]
     if not drivers:
@@ -51,7 +51,7 @@ def _keys(config: GatewayConfig, address: str) -> list[CheckResult]:
                 "keys",
                 FAILURE,
                 "no key may drive over the network",
-                "advnerf keys allow workstation --to drive",
+                "advnerf car keys allow workstation --right drive",
             )
         ]
     return [CheckResult("keys", OK, f"ours is {config.key}; {drivers} may drive")]

@@ -150,7 +150,7 @@ def _drive_once(
     trial = TrialPlan(plan.start_pose, plan.ticks * TICK_S + _TAIL_S, series.nodes, by_hand=True)
     overrides = [*plan.overrides, f"params.attack={run.attack}"]
     outcome = run_trial(Path(plan.launch), overrides, run_dir, trial, ready_timeout_s, guide, plan.host)
-    # Evaluated from the bag alone, so that `advnerf evaluate` gives exactly the same numbers.
+    # Evaluated from the bag alone, so that `advnerf bag evaluate` gives exactly the same numbers.
     found = measure_drives(run_dir / "bag", series.room, plan.ticks)[-1]
     wanted = [run.attack_id] if run.attack_id else []
     if found["attack_ids"] != wanted:

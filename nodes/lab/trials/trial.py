@@ -227,7 +227,9 @@ class TrialNode(Node):
                 self._enter(Phase.PLACING, now)
                 return []
             why = self._seen.safety_reason or "not armed since the start"
-            return self._tell(f"on the start. ARM to drive (gamepad, or: advnerf arm). Not armed: {why}", now)
+            return self._tell(
+                f"on the start. ARM to drive (gamepad, or: advnerf car arm). Not armed: {why}", now
+            )
         if self._asked is not None and self._seen.answered_id == self._asked.ask_id:
             if self._seen.granted:  # armed, and stopped before the trial noticed; do not arm a second time
                 self._enter(Phase.DRIVING, now)

@@ -1,4 +1,4 @@
-"""Installs the environment of a third-party world from its lock file: ``advnerf world install NAME``."""
+"""Installs the environment of a third-party world from its lock file: ``advnerf scene world install NAME``."""
 
 from __future__ import annotations
 

@@ -177,7 +177,7 @@ def photographs_match(bench: WorldBench) -> str:
     told = (
         "too grey to tell the order of colours"
         if np.mean(colour) < _COLOURLESS
-        else "the same order of colours (whether that is red, green, blue only a look at --pictures tells)"
+        else "the same order of colours (whether that is red, green, blue only a look at -o tells)"
     )
     return f"correlation {np.median(correlations):.3f}, difference {np.mean(plain):.1f} grey levels; {told}"
 

@@ -166,7 +166,7 @@ element("enter-form").addEventListener("submit", async (event) => {
   event.preventDefault();
   const code = element("code").value;
   text("enter-answer", "");
-  let wrong = "This code is wrong, was used, or has expired. Run advnerf page on the robot for a new one.";
+  let wrong = "This code is wrong, was used, or has expired. Run advnerf car page on the robot for a new one.";
   try {
     const response = await fetch("/enter", {
       method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify({ code }),

@@ -225,7 +225,7 @@ def test_a_panel_has_the_size_of_its_file_or_the_given_one():
             r"--object and its number: 0 \(a\), 1 \(b\)",
         ),
         ((panel("board", (1.0, 1.0)),), "bord", None, r"--object: .*board.*did you mean board"),
-        ((panel("board"),), None, None, "--size-m"),
+        ((panel("board"),), None, None, "--object-size"),
         ((panel("board", (1.0, 1.0)),), None, 2.0, "whose attack file says 1 x 1 m; leave it out"),
     ],
 )

@@ -217,7 +217,7 @@ def all_runs(starts=2, seeds=(0, 1, 2), victims=("hardened", "naive")):
 
 def manifest():
     return rd.Manifest(
-        "advnerf experiment launch/room.experiment.yaml --setting full",
+        "advnerf experiment run launch/room.experiment.yaml --setting full",
         "2025-03-02T10:11:12+00:00",
         {"scene": "b1946ac92492d2347c6235b4d2611184", "policy": "591785b794601e212b260e25925636fd"},
         {"advnerf": "0.1.0", "numpy": np.__version__},
@@ -276,7 +276,7 @@ def bare_report():
     """Only what a report cannot do without."""
     return rd.ReportData(
         (drives(),),
-        rd.Manifest("advnerf experiment", "2025-03-02T10:11:12+00:00"),
+        rd.Manifest("advnerf experiment run", "2025-03-02T10:11:12+00:00"),
         live=True,
         not_measured={"latency": "No <live> drive."},
     )

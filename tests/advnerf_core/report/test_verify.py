@@ -202,7 +202,7 @@ def test_a_set_that_contradicts_its_registration_is_not_written(copied):
 
 
 def test_a_folder_without_registration_is_no_set(tmp_path, copied):
-    with pytest.raises(SetError, match="advnerf register"):
+    with pytest.raises(SetError, match="advnerf experiment register"):
         write_set(tmp_path)
     (copied / FILE).write_text("{}")
     with pytest.raises(RegistrationError, match="restore it from git"):
@@ -212,7 +212,7 @@ def test_a_folder_without_registration_is_no_set(tmp_path, copied):
 
 def test_the_command_verifies_all_sets_and_fails_where_one_is_wrong(copied):
     def call(*arguments):
-        return CliRunner().invoke(app, ["verify", "--in", str(copied.parent), *arguments])
+        return CliRunner().invoke(app, ["verify", "--folder", str(copied.parent), *arguments])
 
     assert sets_in(copied.parent) == ["simulated"]
     done = call()
@@ -234,7 +234,7 @@ def test_what_is_only_registered_awaits_its_results_and_what_vanished_does_not(c
     found = verify_set(copied)
     assert found.problems == ()
     assert found.awaits_results
-    done = CliRunner().invoke(app, ["verify", "--in", str(copied.parent)])
+    done = CliRunner().invoke(app, ["verify", "--folder", str(copied.parent)])
     assert done.exit_code == 0
     assert "registered, nothing published yet" in done.output
 
@@ -355,7 +355,7 @@ def test_pictures_films_and_the_reference_build_are_those_of_their_manifest(copi
         assert verify_beside(published) == (f"{file}: its digest is not the one in {BESIDE}",)
         file.write_bytes(data)
     (published / BESIDE).unlink()
-    assert "advnerf publish writes it" in verify_beside(published)[0]
+    assert "advnerf experiment publish writes it" in verify_beside(published)[0]
 
 
 def test_a_picture_of_something_else_is_found_by_drawing_it_again(copied):

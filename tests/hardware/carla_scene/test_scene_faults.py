@@ -200,7 +200,9 @@ def test_a_step_is_whole_ticks(library, settings, duration):
 def test_a_world_in_other_hands(library, settings):
     world = library.world
     world.settings.synchronous_mode = True
-    with pytest.raises(CarlaBusy, match=r"another client drives it.*advnerf carla release.*server.take_over"):
+    with pytest.raises(
+        CarlaBusy, match=r"another client drives it.*advnerf scene carla release.*server.take_over"
+    ):
         scene_of(library, settings).__enter__()
     assert world.settings.synchronous_mode  # not ours to change
     with scene_of(library, settings, server={**settings["server"], "take_over": True}):

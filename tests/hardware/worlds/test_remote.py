@@ -116,7 +116,7 @@ def test_what_the_process_wrote_is_told(tmp_path: Path) -> None:
 
 
 def test_an_interpreter_that_is_not_there_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ServerLost, match="advnerf world install gone"):
+    with pytest.raises(ServerLost, match="advnerf scene world install gone"):
         RemoteServer("gone", tmp_path / "python", SERVERS / "serve.py")
 
 

@@ -1,4 +1,4 @@
-"""What `advnerf carla check` finds, on a scripted server that is right, and on one that is wrong in each way."""
+"""What `advnerf scene carla check` finds, on a scripted server that is right, and on one that is wrong in each way."""
 
 import cv2
 import numpy as np

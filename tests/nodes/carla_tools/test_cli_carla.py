@@ -1,4 +1,4 @@
-"""The commands `advnerf carla ...` as a person types them; behind some, the scripted server stands in for a real one."""
+"""The commands `advnerf scene carla ...` as a person types them; behind some, the scripted server stands in for a real one."""
 
 import json
 import os
@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[3]
 
 def advnerf(*arguments):
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "200"}
-    command = [sys.executable, "-m", "nodes.cli", "carla", *map(str, arguments)]
+    command = [sys.executable, "-m", "nodes.cli", "scene", "carla", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=ROOT, env=environment)
 
 

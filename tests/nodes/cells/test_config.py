@@ -177,7 +177,9 @@ def test_two_variants_in_one_run_folder_need_the_same_scene_and_policies(tmp_pat
 
 def test_more_than_a_thousand_cells_ask(file):
     """Without a terminal the answer is an option."""
-    asked = CliRunner().invoke(app, ["experiment", str(file), "--set", f"over.seed={list(range(300))}"])
+    asked = CliRunner().invoke(
+        app, ["experiment", "run", str(file), "--set", f"over.seed={list(range(300))}"]
+    )
     assert isinstance(asked.exception, ConfigError)
     assert "expected at most 1000 cells without --many, got 3010; add it" in str(asked.exception)
 
@@ -186,7 +188,7 @@ def test_a_page_of_some_cells_does_not_take_the_place_of_the_page_of_all(bench, 
     monkeypatch.syspath_prepend(str(bench.folder))
 
     def call(name, *options):
-        done = CliRunner().invoke(app, [name, str(bench.file), *options])
+        done = CliRunner().invoke(app, ["experiment", name, str(bench.file), *options])
         assert done.exit_code == 0, done.output
         return done.output
 
@@ -195,10 +197,12 @@ def test_a_page_of_some_cells_does_not_take_the_place_of_the_page_of_all(bench, 
     assert {row["method"] for row in json.loads(whole)["rows"]} == {"none", "gradient"}
     said = call("table", "--only", "method=gradient")
     assert said.count(" missing ") == 2  # in either domain
-    assert "0 of 2 cells; advnerf report writes a page of them" in said
+    assert "0 of 2 cells; advnerf experiment report writes a page of them" in said
     assert (bench.cells.parent / "table" / "table.json").read_text() == whole
     with pytest.raises(ConfigError, match="expected --output with --only"):
-        CliRunner().invoke(app, ["report", str(bench.file), "--only", "seed=0"], catch_exceptions=False)
+        CliRunner().invoke(
+            app, ["experiment", "report", str(bench.file), "--only", "seed=0"], catch_exceptions=False
+        )
     call("report", "--only", "method=gradient", "-o", str(tmp_path / "some"))
     assert {row["method"] for row in json.loads((tmp_path / "some" / "table.json").read_text())["rows"]} == {
         "gradient"

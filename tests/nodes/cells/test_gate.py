@@ -156,7 +156,7 @@ def test_the_gate_is_a_command_of_its_own_with_an_exit_code(gated, wrong, code):
     (gated.folder / "run").mkdir()
     arguments = (
         str(gated.plain()),
-        "--run-folder",
+        "--folder",
         str(gated.folder / "run"),
     )
     found = CliRunner().invoke(app, ["scene", "gate", *arguments, "--bag", str(gated.file), "--json"])

@@ -69,7 +69,7 @@ def test_a_cell_that_was_not_driven_live_is_shown_and_never_published(here, tmp_
     assert learned.drives == 2
     written = publish(loaded, found, tmp_path / "kept").written
     assert set(written) == {each.cell.name for each in plan if each.cell.method == "none"}
-    output = command("publish", here.file, "--to", tmp_path / "kept", "--no-build")
+    output = command("experiment", "publish", here.file, "-o", tmp_path / "kept", "--no-build")
     assert (
         "straight_hardened_gradient_0 is no evidence and is not published: it was not driven live" in output
     )
@@ -111,7 +111,7 @@ def test_a_table_and_published_cells_from_finished_cells(here, tmp_path):
     shown = published_table(tmp_path / "kept" / "toy", loaded)
     assert shown.find("straight", "hardened", "none", "deployed").ratio == 3.0
     assert shown.find("straight", "hardened", "gradient", "deployed").missing == (0, 1)
-    with pytest.raises(ConfigError, match="advnerf publish"):
+    with pytest.raises(ConfigError, match="advnerf experiment publish"):
         published_table(tmp_path / "nowhere", loaded)
     # A cell that other settings have made goes when it is asked for, unless it is not the one that is here; one that was never begun here stays.
     changed, missing = next(each for each in found if each.state == "changed").cell.name, found[-1].cell.name
@@ -151,11 +151,11 @@ def test_a_published_cell_whose_key_matches_is_done_on_any_machine(here, tmp_pat
     ]
     first, second = (here.cells / f"{cell.name}.json" for cell in cells)
     assert json.loads(first.read_bytes())["stages"] == {"capture": "c1", "policy": "p1"}
-    assert "2 cells written" in command("publish", here.file, *only)
+    assert "2 cells written" in command("experiment", "publish", here.file, *only)
     shutil.rmtree(here.cells)
-    assert "2 of 2 cells" in command("table", here.file, *only)
-    assert "2 of 2 cells" in command("table", here.file, "--from", kept, *only)
-    said = command("report", here.file, "-o", tmp_path / "page")
+    assert "2 of 2 cells" in command("experiment", "table", here.file, *only)
+    assert "2 of 2 cells" in command("experiment", "table", here.file, "--published", "--folder", kept, *only)
+    said = command("experiment", "report", here.file, "-o", tmp_path / "page")
     assert f"2 of 3 cells; page: {tmp_path / 'page' / 'index.html'}" in said.replace("\n", "")
     rows = list(csv.DictReader((tmp_path / "page" / "table.csv").open()))
     (attacked,) = [row for row in rows if (row["method"], row["domain"]) == ("gradient", "deployed")]

@@ -112,10 +112,10 @@ def test_a_killed_run_takes_its_workers_along_and_goes_on(here):
 def test_failed_cells_say_why_and_are_retried_when_asked(here):
     here.write(seed=[0, 1], method=["none", "cem"])
     (here.folder / "fail").touch()
-    code, out, err = here.call("experiment", str(here.file), "--jobs", "2")
+    code, out, err = here.call("experiment", "run", str(here.file), "--jobs", "2")
     assert code == 1
     assert "straight_hardened_cem_0: RuntimeError: the search came to nothing" in err
-    code, out, _ = here.call("status", str(here.file))
+    code, out, _ = here.call("experiment", "status", str(here.file))
     assert code == 0
     assert "the search came to nothing" in out
     assert "2 failed, 1 done of 3 cells" in out
@@ -166,19 +166,19 @@ def cluster(here):
 
 @pytest.mark.slow
 def test_a_ray_cluster_of_several_workers_runs_the_cells(here, cluster):
-    code, out, err = here.call("experiment", str(here.file), "--cluster", cluster.address)
+    code, out, err = here.call("experiment", "run", str(here.file), "--cluster", cluster.address)
     assert code == 0, err
     assert "Ray cluster with 2 cores" in out
     assert set(states(here).values()) == {"done"}
     assert len(here.begun()) == 3
-    code, out, _ = here.call("experiment", str(here.file), "--cluster", cluster.address)
+    code, out, _ = here.call("experiment", "run", str(here.file), "--cluster", cluster.address)
     assert "nothing to do" in out
 
 
 @pytest.mark.slow
 def test_a_lost_machine_costs_only_its_cells(here, cluster):
     (here.folder / "hang").touch()
-    process = here.start("experiment", str(here.file), "--cluster", cluster.address)
+    process = here.start("experiment", "run", str(here.file), "--cluster", cluster.address)
     workers = [pid_of(here, f"straight_hardened_gradient_{seed}") for seed in (0, 1)]  # one on each machine
     cluster.remove_node(cluster.list_all_nodes()[-1], allow_graceful=False)
     wait_for(lambda: not all(map(is_alive, workers)), "the cells of the lost machine to end")
@@ -196,7 +196,7 @@ def test_a_lost_machine_costs_only_its_cells(here, cluster):
 
 @pytest.mark.slow
 def test_no_cluster_is_one_clear_error(here):
-    code, _, err = here.call("experiment", str(here.file), "--cluster", "127.0.0.1:1")
+    code, _, err = here.call("experiment", "run", str(here.file), "--cluster", "127.0.0.1:1")
     assert code == 2
     assert "expected a Ray cluster at 127.0.0.1:1" in err
     assert "ray start --head" in err
@@ -206,7 +206,7 @@ def test_no_cluster_is_one_clear_error(here):
 def start_hanging(bench, jobs=1):
     """The process of the command, and the pid of the worker that hangs in the gradient cell of seed 0."""
     (bench.folder / "hang").touch()
-    process = bench.start("experiment", str(bench.file), "--jobs", str(jobs))
+    process = bench.start("experiment", "run", str(bench.file), "--jobs", str(jobs))
     return process, pid_of(bench, "straight_hardened_gradient_0")
 
 

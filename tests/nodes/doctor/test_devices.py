@@ -47,7 +47,7 @@ def test_a_good_controller():
 def test_as_delivered_the_car_rolls_on_and_the_cure_is_a_command():
     row = vesc({"timeout_ms": 1000.0})["VESC time-out", FAILURE]
     assert "1000 ms with 0 A" in row.found
-    assert row.do.startswith("advnerf motor set-timeout --port /dev/pts/")
+    assert row.do.startswith("advnerf car motor set-timeout --vesc /dev/pts/")
     assert row.do.endswith("--timeout-ms 250 --brake-current 20")
     assert ("VESC time-out", FAILURE) in vesc({**GOOD, "timeout_ms": 0.0})
 

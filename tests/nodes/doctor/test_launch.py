@@ -152,7 +152,9 @@ def test_each_host_has_its_own_needs(tmp_path):
     robot = plan_of("two_hosts", *shared, "camera.source={kind: folder, folder: nowhere}", host="robot")
     rows = findings(robot, tmp_path, (*SLOW, "VICON", "camera", "VESC"))
     assert states(rows, "network") == [OK, OK]
-    assert [row.do for row in rows if row.check == "keys"] == ["advnerf keys allow workstation --to drive"]
+    assert [row.do for row in rows if row.check == "keys"] == [
+        "advnerf car keys allow workstation --right drive"
+    ]
     keys.add("workstation", keys.public("robot"))
     keys.allow("workstation", DRIVE)
     with socket.create_server(("127.0.0.1", watch)):
@@ -203,7 +205,7 @@ def test_the_command_prints_one_line_per_finding_and_tells_by_its_exit_code(tmp_
     told = json.loads(output)
     assert (code, told["state"]) == (1, FAILURE)
     rows = [row for row in told["findings"] if row["check"] == "calibration"]
-    assert (rows[0]["state"], "advnerf calibrate" in rows[0]["do"]) == (FAILURE, True)
+    assert (rows[0]["state"], "advnerf car calibrate" in rows[0]["do"]) == (FAILURE, True)
 
 
 def test_what_the_command_cannot_understand_is_exit_code_2(tmp_path, monkeypatch, capsys):
@@ -243,7 +245,7 @@ def test_a_computer_without_a_launch_file_in_mind(tmp_path, monkeypatch, capsys)
             monkeypatch, capsys, "--folder", tmp_path, "--vesc", vesc.port, "--vicon-port", free_port()
         )
     assert code == 1
-    assert f"-> advnerf motor set-timeout --port {vesc.port}" in output
+    assert f"-> advnerf car motor set-timeout --vesc {vesc.port}" in output
 
 
 @pytest.mark.slow  # imports torch, starts EGL and compiles with LLVM

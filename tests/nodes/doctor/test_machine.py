@@ -16,7 +16,7 @@ pytestmark = pytest.mark.live
 
 def test_keys_are_shown_and_one_that_others_may_read_is_a_finding_with_its_cure(tmp_path):
     (found,) = machine.keys(tmp_path)
-    assert (found.state, found.do) == (ABSENT, "two hosts need them: advnerf keys new NAME")
+    assert (found.state, found.do) == (ABSENT, "two hosts need them: advnerf car keys new NAME")
     keys = KeyFolder(tmp_path)
     keys.new("robot")
     keys.allow("robot", DRIVE)

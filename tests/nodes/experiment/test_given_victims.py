@@ -174,6 +174,7 @@ def test_a_factory_is_found_beside_the_experiment_file(folder: Path, tmp_path: P
         sys.executable,
         "-m",
         "nodes.cli",
+        "experiment",
         "status",
         str(folder / "mine.experiment.yaml"),
         "--setting",
@@ -181,7 +182,7 @@ def test_a_factory_is_found_beside_the_experiment_file(folder: Path, tmp_path: P
     ]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
     done = subprocess.run(
-        [*command, "--run-folder", str(folder / "run")],
+        [*command, "--folder", str(folder / "run")],
         cwd=tmp_path,
         env=environment,
         capture_output=True,

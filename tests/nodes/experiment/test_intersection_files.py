@@ -123,7 +123,7 @@ def test_bad_files_are_one_clear_error(
     said: str,
 ) -> None:
     file = tiny_file(**changes)
-    words = ["experiment", str(file), "--setting", "tiny", "--run-folder", str(tmp_path / "run")]
+    words = ["experiment", "run", str(file), "--setting", "tiny", "--folder", str(tmp_path / "run")]
     monkeypatch.setattr(sys, "argv", ["advnerf", *words])
     with pytest.raises(SystemExit) as ended:
         main()

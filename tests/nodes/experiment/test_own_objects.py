@@ -1,4 +1,4 @@
-"""Objects of a user's: a mesh or what `advnerf object build` wrote stands in an experiment by the name of its file."""
+"""Objects of a user's: a mesh or what `advnerf scene object build` wrote stands in an experiment by the name of its file."""
 
 import shutil
 from pathlib import Path
@@ -89,7 +89,7 @@ def test_experiments_without_files_depend_on_their_kinds_alone(tmp_path: Path) -
     ("kind", "message"),
     [
         ("bilboard.glb", "which is not there"),
-        ("hydrnt", r"did you mean hydrant\?.*one of your own is a file of 'advnerf object build'"),
+        ("hydrnt", r"did you mean hydrant\?.*one of your own is a file of 'advnerf scene object build'"),
         ("billboard.stl", "expected a kind of object of .*; one of your own"),
         ("broken.glb", "broken.glb"),
     ],

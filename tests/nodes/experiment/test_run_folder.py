@@ -23,7 +23,7 @@ def run(folder, name, value=1):
 def test_the_folder_of_another_experiment_is_not_emptied(tmp_path):
     run(tmp_path, "room")
     with pytest.raises(
-        ConfigError, match=r"run folder of experiment 'town' .* of 'room'; name another one with --run-folder"
+        ConfigError, match=r"run folder of experiment 'town' .* of 'room'; name another one with --folder"
     ):
         run(tmp_path, "town", 2)
     assert (tmp_path / "capture" / "photo").read_text() == "room 1"

@@ -36,7 +36,7 @@ def test_all_cells_and_the_report(trained: Experiment, tmp_path: Path) -> None:
     (folder / "policy" / "policy.json").write_text(json.dumps({"on_held_out_views": rates}))
     config = experiment.config.model_dump(mode="json")
     (folder / "manifest.json").write_text(
-        json.dumps({"command": "advnerf experiment <it>", "config": config, "versions": {}})
+        json.dumps({"command": "advnerf experiment run <it>", "config": config, "versions": {}})
     )
 
     with Bench(experiment) as bench:

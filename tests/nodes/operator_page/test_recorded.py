@@ -1,4 +1,4 @@
-"""``advnerf page BAG``: a recording on the page, in real processes, without a car."""
+"""``advnerf car page BAG``: a recording on the page, in real processes, without a car."""
 
 import os
 import re
@@ -53,13 +53,14 @@ def test_a_recording_plays_again_and_again_and_nobody_can_drive(bag, tmp_path):
         sys.executable,
         "-m",
         "nodes.cli",
+        "car",
         "page",
         str(bag),
         "--port",
         "0",
         "--rate",
         "4",
-        "--run-dir",
+        "--folder",
         str(run_dir),
     ]
     with log.open("wb") as said:

@@ -207,7 +207,7 @@ def test_without_cyclone_dds_the_error_says_what_to_install(tmp_path, monkeypatc
 def test_a_wrong_file_is_one_line_with_its_place(tmp_path):
     file = tmp_path / "ros2.yaml"
     file.write_text("send:\n  - {topic: /nonsense}\n")
-    command = [sys.executable, "-m", "nodes.ros2", "--config", str(file), "--run-dir", str(tmp_path)]
+    command = [sys.executable, "-m", "nodes.ros2", "--config", str(file), "--folder", str(tmp_path)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
     assert done.returncode == 2
     assert "unknown topic '/nonsense'" in done.stderr

@@ -50,7 +50,7 @@ class Bridge:
             self.bus.publisher(route["topic"])
         file = run_dir / "ros2.yaml"
         file.write_text(yaml.safe_dump({"domain_id": domain, "vehicle": str(VEHICLE), **config}))
-        command = [sys.executable, "-m", "nodes.ros2", "--config", str(file), "--run-dir", str(run_dir)]
+        command = [sys.executable, "-m", "nodes.ros2", "--config", str(file), "--folder", str(run_dir)]
         self.process = subprocess.Popen(command, cwd=ROOT)
         self.bus.wait_for_subscribers([route["topic"] for route in config["send"]], 20.0)
 
@@ -240,7 +240,7 @@ def launch_of(file, run_dir, *settings):
             "nodes.cli.main",
             "launch",
             file,
-            "--run-dir",
+            "--folder",
             str(run_dir),
             *options,
         ]

@@ -228,12 +228,12 @@ def test_command_plays_under_a_terminal_and_obeys_keys_and_bus(bag, tmp_path):
         str(bag),
         "--paused",
         "--loop",
-        "--run-dir",
+        "--folder",
         str(tmp_path),
     ]
 
     def control_says(*words):
-        program = [sys.executable, "-m", "nodes.cli", "bag", "control", *words, "--run-dir", str(tmp_path)]
+        program = [sys.executable, "-m", "nodes.cli", "bag", "control", *words, "--folder", str(tmp_path)]
         return subprocess.run(program, capture_output=True, text=True, timeout=600, check=False)
 
     with Bus(tmp_path) as bus:

@@ -111,7 +111,7 @@ def test_second_publisher_is_one_clear_error_and_the_endpoint_is_free_afterwards
     with Bus(tmp_path) as first, Bus(tmp_path) as second:
         first.publisher("/attack/request")
         with pytest.raises(
-            BusError, match=r"/attack/request is already published in .* by process \d+.*--run-dir"
+            BusError, match=r"/attack/request is already published in .* by process \d+.*--folder"
         ):
             second.publisher("/attack/request")
     with Bus(tmp_path) as third:

@@ -145,7 +145,7 @@ def test_socket_folder_is_private_and_short(tmp_path, monkeypatch):
     long_base = tmp_path / ("y" * 90)
     long_base.mkdir()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(long_base))
-    with pytest.raises(BusError, match=r"at most 107 characters.*--run-dir under /tmp"):
+    with pytest.raises(BusError, match=r"at most 107 characters.*--folder under /tmp"):
         bus_folder(tmp_path / ("x" * 100))
 
 
@@ -168,7 +168,7 @@ def test_a_file_is_named_by_its_path_or_by_its_name_here_before_what_is_shipped(
     assert named_file("mine", "launch") == Path("mine")
     for wrong in ("launch/monitor.launch.yaml", "mones", "../green_screen"):
         with pytest.raises(
-            PlaceError, match=rf"none at {wrong}.* green_screen, mine, monitor, .*advnerf init"
+            PlaceError, match=rf"none at {wrong}.* green_screen, mine, monitor, .*advnerf experiment init"
         ):
             named_file(wrong, "launch")
 

@@ -104,7 +104,7 @@ def test_starts_waits_until_all_are_connected_refuses_a_second_launch_and_stops_
         pids = launch.pids
         assert set(pids) == {"a", "b", "c"}
         assert str(tmp_path / "run") in [active["run_dir"] for active in active_launches()]
-        with pytest.raises(LaunchError, match=r"in use by the launch of process \d+.*--run-dir"):
+        with pytest.raises(LaunchError, match=r"in use by the launch of process \d+.*--folder"):
             Launch(file, run_dir=tmp_path / "run").start()
         assert launch.stop() == 0
     assert_gone(pids.values())

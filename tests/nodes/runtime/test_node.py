@@ -293,7 +293,7 @@ def test_signal_ends_a_process_cleanly(script, tmp_path, number):
     with Bus(tmp_path) as bus:
         bus.subscribe("/status/counter")
         process = subprocess.Popen(
-            [sys.executable, script, "--run-dir", tmp_path], stdout=subprocess.PIPE, text=True
+            [sys.executable, script, "--folder", tmp_path], stdout=subprocess.PIPE, text=True
         )
         hear(bus, "/status/counter", accept=lambda m: m.state == "active")
         process.send_signal(number)
@@ -305,7 +305,7 @@ def test_signal_ends_a_process_cleanly(script, tmp_path, number):
 def test_wrong_config_is_one_line_with_file_line_and_valid_keys(script, tmp_path):
     config = tmp_path / "counter.yaml"
     config.write_text("# comment\nrate: 5\n")
-    command = [sys.executable, script, "--run-dir", tmp_path, "--config", config]
+    command = [sys.executable, script, "--folder", tmp_path, "--config", config]
     result = subprocess.run(command, capture_output=True, text=True)
     assert result.returncode == 2
     assert result.stderr == f"counter: {config}:2: unknown key rate; valid keys here: rate_hz\n"

@@ -1,4 +1,4 @@
-"""Retro-attack, golden comparison, and the options of ``advnerf replay``."""
+"""Retro-attack, golden comparison, and the options of ``advnerf bag replay``."""
 
 import json
 import sys
@@ -96,7 +96,7 @@ def test_retro_attack_is_the_difference_of_two_drives(clean_drive, tmp_path):
 def test_retro_attack_on_the_command_line(clean_drive, tmp_path, capsys):
     attack = tmp_path / "new.attack.safetensors"
     attack.write_bytes(read_attachments(CORNER)["corner.attack.safetensors"])
-    command = ["replay", str(clean_drive), "--attack", str(attack), "--replace", "policy=green_policy"]
+    command = ["bag", "replay", str(clean_drive), "--attack", str(attack), "--replace", "policy=green_policy"]
     cli.app([*command, "--json", str(tmp_path / "r.json")], standalone_mode=False)
     printed = capsys.readouterr().out
     assert "with the face in view (12 of 12 images) the policy would have steered" in printed
@@ -125,7 +125,7 @@ def test_retro_attack_on_the_command_line(clean_drive, tmp_path, capsys):
 )
 def test_options_that_do_not_go_together_are_one_clear_error(arguments, words):
     with pytest.raises(BagError, match=words):
-        cli.app(["replay", str(CORNER), *arguments], standalone_mode=False)
+        cli.app(["bag", "replay", str(CORNER), *arguments], standalone_mode=False)
 
 
 @pytest.mark.parametrize(

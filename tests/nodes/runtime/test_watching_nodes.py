@@ -42,7 +42,7 @@ def test_delay_of_a_topic_is_split_at_publication(tmp_path):
 
 @pytest.mark.slow
 def test_top_shows_process_memory_rate_and_restarts(tmp_path):
-    command = [sys.executable, "-m", "nodes.safety", "--run-dir", str(tmp_path), "--name", "safety"]
+    command = [sys.executable, "-m", "nodes.safety", "--folder", str(tmp_path), "--name", "safety"]
     for name in ("room", "vehicle"):
         command += ["--set", f"{name}={os.path.abspath(f'calibration/twin/{name}.yaml')}"]
     process = subprocess.Popen(command)

@@ -1,4 +1,4 @@
-"""``advnerf world check``: good worlds pass, and each of the planted faults is found and named."""
+"""``advnerf scene world check``: good worlds pass, and each of the planted faults is found and named."""
 
 import math
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Worlds of other people as they are installed: skipped where they are not (``advnerf world install NAME``)."""
+"""Worlds of other people as they are installed: skipped where they are not (``advnerf scene world install NAME``)."""
 
 import math
 from pathlib import Path
@@ -22,7 +22,7 @@ from nodes.lab.worlds.named import read_world
 from nodes.runtime.config import apply_overrides
 
 installed = {
-    name: pytest.mark.skipif(each.state != "installed", reason=f"advnerf world install {name}")
+    name: pytest.mark.skipif(each.state != "installed", reason=f"advnerf scene world install {name}")
     for name, each in ENVIRONMENTS.items()
 }
 

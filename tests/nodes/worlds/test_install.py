@@ -54,7 +54,7 @@ def _write_wheel(file: Path) -> None:
 
 def test_an_environment_is_made_once_and_has_what_its_lock_file_says(small: Small) -> None:
     said: list[str] = []
-    with pytest.raises(WorldNotInstalled, match="advnerf world install small"):
+    with pytest.raises(WorldNotInstalled, match="advnerf scene world install small"):
         small.python()
     assert install(small, said.append)
     assert "the 1 packages of small.lock.txt" in said[1]
@@ -98,27 +98,30 @@ def test_a_foreign_world_has_its_simulator_and_a_lock_of_pinned_versions(name: s
 def test_the_list_says_what_is_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
     environment = ENVIRONMENTS["metadrive"]
-    listed = CliRunner().invoke(app, ["world", "list"]).output
-    assert "advnerf world install metadrive" in listed
+    listed = CliRunner().invoke(app, ["scene", "world", "list"]).output
+    assert "advnerf scene world install metadrive" in listed
     environment.interpreter.parent.mkdir(parents=True)
     environment.interpreter.touch()
     (environment.folder / MADE).write_text(json.dumps({"lock_sha256": sha256_of(environment.lock)}))
-    assert "advnerf world install metadrive" not in CliRunner().invoke(app, ["world", "list"]).output
+    assert (
+        "advnerf scene world install metadrive"
+        not in CliRunner().invoke(app, ["scene", "world", "list"]).output
+    )
 
 
 def test_nothing_is_installed_before_its_licence_is_accepted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
-    refused = CliRunner().invoke(app, ["world", "install", "metadrive"], input="n\n")
+    refused = CliRunner().invoke(app, ["scene", "world", "install", "metadrive"], input="n\n")
     assert refused.exit_code == 1
     assert "Apache License" in refused.output
     assert list(tmp_path.iterdir()) == []
-    unknown = CliRunner().invoke(app, ["world", "install", "metadrivee"])
+    unknown = CliRunner().invoke(app, ["scene", "world", "install", "metadrivee"])
     assert "did you mean metadrive?" in str(unknown.exception)
 
 
 def test_a_world_that_is_not_installed_says_how(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
-    checked = CliRunner().invoke(app, ["world", "check", "metadrive"])
-    assert "advnerf world install metadrive" in str(checked.exception)
+    checked = CliRunner().invoke(app, ["scene", "world", "check", "metadrive"])
+    assert "advnerf scene world install metadrive" in str(checked.exception)

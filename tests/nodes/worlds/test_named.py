@@ -113,7 +113,7 @@ def test_a_package_brings_a_world(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     with (tmp_path / "stranger_yard.py").open("a") as stream:
         stream.write("# edited\n")
     assert read(tmp_path, "{kind: yard, seed: 4}").settings["source_sha256"] != code
-    listed = CliRunner().invoke(app, ["world", "list"])
+    listed = CliRunner().invoke(app, ["scene", "world", "list"])
     names = [line.split()[0] for line in listed.output.splitlines()]
     assert names == ["lab", "junction", "carla", "metadrive", "duckietown", "filament", "photographs", "yard"]
 
@@ -180,11 +180,11 @@ def test_the_command_says_what_is_not_met(tmp_path: Path, monkeypatch: pytest.Mo
     (tmp_path / "askew.py").write_text(body)
     monkeypatch.chdir(tmp_path)
     small = ["--set", "width=112", "--set", "height=63"]
-    found = CliRunner().invoke(app, ["world", "check", "askew.py:Warehouse", *small])
+    found = CliRunner().invoke(app, ["scene", "world", "check", "askew.py:Warehouse", *small])
     assert found.exit_code == 1
     assert "not met" in found.output
     assert "on path loop it turns right" in found.output
     (tmp_path / "good.py").write_text((EXAMPLES / "world_warehouse.py").read_text())
-    good = CliRunner().invoke(app, ["world", "check", "good.py:Warehouse", *small])
+    good = CliRunner().invoke(app, ["scene", "world", "check", "good.py:Warehouse", *small])
     assert good.exit_code == 0, good.output
     assert "not met" not in good.output

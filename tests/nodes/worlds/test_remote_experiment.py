@@ -25,7 +25,7 @@ def test_a_cell_whose_process_dies_has_no_result_and_the_others_go_on(
         "objects": [{"name": "hydrant", "kind": "hydrant", "x_m": 7.0, "y_m": 2.0}],
     }
     file.write_text(yaml.safe_dump(tiny))
-    asked = ("experiment", str(file), "--setting", "tiny", "--run-folder", str(run))
+    asked = ("experiment", "run", str(file), "--setting", "tiny", "--folder", str(run))
     assert advnerf(monkeypatch, *asked, "--until", "policy") == 0
     plan_fault(faulty, "step", "killed", after=2)
     assert advnerf(monkeypatch, *asked) == 1

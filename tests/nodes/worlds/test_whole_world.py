@@ -19,7 +19,7 @@ def test_every_stage_runs_in_a_strangers_world(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run, file = tmp_path / "run", str(EXAMPLES / "warehouse.experiment.yaml")
-    asked = ("experiment", file, "--setting", "tiny", "--run-folder", str(run))
+    asked = ("experiment", "run", file, "--setting", "tiny", "--folder", str(run))
     monkeypatch.chdir(tmp_path)  # the world is found beside its experiment, wherever one is
     assert advnerf(monkeypatch, *asked) == 0
     world = WorldDescription.from_dict(
@@ -88,7 +88,7 @@ def test_a_mistake_in_the_file_is_one_line(
     ):
         assert wrong != text
         file.write_text(wrong)
-        asked = ("experiment", str(file), "--setting", "tiny", "--run-folder", str(tmp_path / "run"))
+        asked = ("experiment", "run", str(file), "--setting", "tiny", "--folder", str(tmp_path / "run"))
         assert advnerf(monkeypatch, *asked) == 2
         said = capsys.readouterr().err
         assert told in said

@@ -70,7 +70,7 @@ def beside_problems(published: Path) -> Iterator[str]:
         listed = read_json(published / BESIDE)
         missing = sorted(known_digests(published).keys() - sets_in(published))
     except (OSError, ValueError) as error:
-        yield f"{published / BESIDE}: cannot be read: {error}; advnerf publish writes it"
+        yield f"{published / BESIDE}: cannot be read: {error}; advnerf experiment publish writes it"
         return
     yield from (f"{published / name}: is listed in {DIGESTS}, and has no registration" for name in missing)
     yield from _compared(published, BESIDE, listed, digests_beside(published))

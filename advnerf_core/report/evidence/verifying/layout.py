@@ -39,5 +39,5 @@ def read_set(folder: Path) -> tuple[Registration, list[CellResult]]:
     """
     registration = read_registration(folder)
     if registration is None:
-        raise SetError(f"{folder}: expected {FILE}, which advnerf register writes, got none")
+        raise SetError(f"{folder}: expected {FILE}, which advnerf experiment register writes, got none")
     return registration, [read_cell(file) for file in cell_files(folder)]

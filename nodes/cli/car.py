@@ -1,0 +1,31 @@
+"""The commands ``advnerf car ...``: what is done with the car, its devices and a running launch."""
+
+from __future__ import annotations
+
+import typer
+
+from nodes.cli import arm, calibrate, camera, keys, motor, node, page, teleop, topic, trial
+from nodes.cli.panels import in_panels
+
+app = typer.Typer(
+    no_args_is_help=True,
+    cls=in_panels(
+        {
+            "Drive": ("arm", "disarm", "teleop", "trial"),
+            "A running launch": ("page", "node", "topic", "top", "keys"),
+            "Devices": ("calibrate", "camera", "motor"),
+        }
+    ),
+    help="Arm and drive the car, measure trials, watch a running launch, calibrate, test its devices.",
+)
+arm.add_to(app)
+teleop.add_to(app)
+trial.add_to(app)
+page.add_to(app)
+node.add_to(app)
+app.add_typer(node.app, name="node")
+app.add_typer(topic.app, name="topic")
+app.add_typer(keys.app, name="keys")
+app.add_typer(calibrate.app, name="calibrate")
+app.add_typer(camera.app, name="camera")
+app.add_typer(motor.app, name="motor")

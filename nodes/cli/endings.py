@@ -1,0 +1,64 @@
+"""How a command ends: one line for every error, and how to resume what was interrupted."""
+
+from __future__ import annotations
+
+import errno
+import shlex
+from collections.abc import Sequence
+
+from advnerf_core.errors import AdvnerfError
+
+INTERRUPTED, TERMINATED = 130, 143
+# Commands that continue where they were stopped when they are given again. ``scene from-...`` say so themselves, with the folder.
+_RESUMABLE = (
+    ("demo",),
+    ("audit",),
+    ("experiment", "run"),
+    ("experiment", "predict"),
+    ("experiment", "maps"),
+    ("attack", "run"),
+    ("attack", "resume"),
+    ("attack", "poses"),
+    ("attack", "landscape"),
+    ("attack", "robustness"),
+    ("scene", "train"),
+    ("scene", "carla", "capture"),
+    ("policy", "train"),
+    ("car", "trial"),
+)
+
+
+def is_resumable(words: Sequence[str]) -> bool:
+    """Whether the command with these words continues where it was stopped."""
+    named = tuple(word for word in words if not word.startswith("-"))
+    return any(named[: len(each)] == each for each in _RESUMABLE)
+
+
+def how_to_resume(words: Sequence[str]) -> str:
+    """Text for a command that was stopped."""
+    return f"stopped; the same command continues: {shlex.join(['advnerf', *words])}"
+
+
+def usage_text(error: Exception) -> str | None:
+    """Text of an error in the words of a command line; None for another exception.
+
+    Such errors are those of click, of which typer has a copy of its own in some versions, so that their class cannot be named.
+    """
+    if not hasattr(error, "format_message"):
+        return None
+    if type(error).__name__ == "NoArgsIsHelpError":
+        return ""  # the help was printed
+    text = str(error.format_message()).strip().rstrip(".")
+    context = getattr(error, "ctx", None)
+    help_of = "" if context is None else f"; see {context.command_path} --help"
+    return f"{text[:1].lower()}{text[1:]}{help_of}"
+
+
+def text_for_people(error: Exception) -> str | None:
+    """Text of an error that the user can fix; None if the exception is a bug, which keeps its traceback."""
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+        where = f" of {error.filename}" if error.filename else ""
+        return f"the disk{where} is full: free some space or choose another folder. Finished work is kept"
+    if isinstance(error, AdvnerfError | OSError):
+        return str(error) or type(error).__name__
+    return None

@@ -1,0 +1,45 @@
+"""The command ``advnerf experiment register``: what will be run and claimed, written down before it is run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from nodes.cli.cell_choice import CellChoice, File, Folder, Only, Setting, load_cells
+from nodes.runtime.terminal import Overrides
+
+
+def register(
+    file: File,
+    setting: Setting = None,
+    folder: Folder = None,
+    only: Only = "",
+    published: Annotated[
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            help="Folder of all published sets; gets a folder with the experiment's name.",
+            exists=True,
+            file_okay=False,
+        ),
+    ] = Path("docs/results"),
+    overrides: Overrides = None,
+) -> None:
+    """Write down what an experiment will run, and which tests will be claimed, before anything is run."""
+    from advnerf_core.report.evidence.registration import FILE
+    from nodes.experiment.run.registering import register as write_registration
+
+    experiment, cells = load_cells(CellChoice(file, setting, folder, only, overrides))
+    found = write_registration(experiment, cells, published)
+    print(f"{published / found.name / FILE}: {found.digest[:12]}")
+    print(
+        f"{len(found.cells)} cells, {len(found.scenarios)} paths and variants, {len(found.primary)} primary tests; commit it, then run the experiment"
+    )
+    for name, scenario in found.scenarios.items():
+        limit_m = scenario.drives_well_mean_cte_m
+        print(
+            f"{name}: a victim whose mean |CTE| without attack exceeds {limit_m:.3g} m, or that leaves the track, fails the set"
+        )
