@@ -42,7 +42,7 @@ class RunFolder(Generic[Config]):
     setting: str
 
     def stage_folder(self, stage: str) -> Path:
-        """Where a stage writes."""
+        """Folder of a stage."""
         return self.folder / stage
 
 
@@ -55,16 +55,16 @@ def run_to_end(
     reference: ReferenceBuild | None = None,
     watcher: StageDisplay | None = None,
 ) -> dict[str, Artefact]:
-    """Run the stages that are not there yet.
+    """Run the stages that are not finished yet.
 
     Args:
         experiment: The experiment.
-        stages: Its stages in order.
-        libraries: Whose versions the manifest names, of those that are installed.
+        stages: The stages in order.
+        libraries: Libraries whose versions the manifest names, if installed.
         until: Last stage to run; None for all.
-        console: Where to print.
-        reference: Where results of stages may be besides.
-        watcher: Receives the progress too.
+        console: Console to print to.
+        reference: Reference build that may have results of stages.
+        watcher: Also receives the progress.
 
     Raises:
         ConfigError: The folder has the stages of another experiment, which would be replaced.
@@ -79,10 +79,10 @@ def run_to_end(
 
 
 def require_own_folder(experiment: RunFolder[Any]) -> None:
-    """Refuse a run folder of another experiment: stages with the same names and other keys would empty each other's folders.
+    """Raise for a run folder of another experiment: stages with the same names and other keys would empty each other's folders.
 
     Raises:
-        ConfigError: It is one of another experiment.
+        ConfigError: The folder belongs to another experiment.
     """
     manifest = experiment.folder / _MANIFEST
     try:
@@ -97,7 +97,7 @@ def require_own_folder(experiment: RunFolder[Any]) -> None:
 
 
 def _installed(library: str) -> str:
-    """Version of a library; empty where it is not installed, as MuJoCo for a world that does without."""
+    """Version of a library; empty if it is not installed, such as MuJoCo for a world that does not need it."""
     try:
         return version(library)
     except PackageNotFoundError:

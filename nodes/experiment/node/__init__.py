@@ -1,1 +1,1 @@
-"""What the attack node needs."""
+"""Implementation of the attack node's searches."""

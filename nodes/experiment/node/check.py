@@ -1,4 +1,4 @@
-"""``advnerf attack check``: can the gradient be trusted for this scene, this policy and these objects, and is it of use?"""
+"""``advnerf attack check``: checks whether the gradient is correct for this scene, this policy and these objects, and useful."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _CLOSED_DIRECTIONS = 4  # each costs twelve drives of the closed loop
 
 @dataclass(frozen=True)
 class Check:
-    """What was found.
+    """Result of the check.
 
     Attributes:
         frozen_error: Relative error of the gradient against finite differences with frozen poses, float64.
@@ -54,10 +54,10 @@ class Check:
         closed: The cosine to the true closed loop, over steps of the finite differences; information only.
         gradient_norm: Norm of the gradient.
         adjoint: Derivatives along the directions, by the adjoint.
-        frozen: By finite differences with frozen poses.
+        frozen: Derivatives along the directions, by finite differences with frozen poses.
         ticks: Adjoints, saturation and visibility over time.
-        split: Where the time goes.
-        memory_mib: Peak above idle by horizon, nothing kept; empty if it was not measured.
+        split: Time by part.
+        memory_mib: Peak above idle by horizon, with an empty cache; empty if it was not measured.
     """
 
     frozen_error: float
@@ -73,12 +73,12 @@ class Check:
 
     @property
     def sound(self) -> bool:
-        """Whether the gradient is what it claims to be, and not zero."""
+        """Whether the gradient is correct, and not zero."""
         return self.frozen_error <= EXACT and self.float32_error <= FLOAT32_EXACT and self.gradient_norm > 0.0
 
     @property
     def verdict(self) -> list[str]:
-        """The same in words."""
+        """The result as text."""
         return [*_on_the_gradient(self), *_on_the_drive(self), *_on_the_cost(self)]
 
 

@@ -1,4 +1,4 @@
-"""What a person asks of a running attack node."""
+"""Requests of a user to a running attack node."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ENDED = ("done", "failed", "cancelled", "refused")
 
 
 def new_request_id(name: str) -> str:
-    """A name for a request that is not taken: its own, shortened, and the time."""
+    """A free name for a request: its own, shortened, and the time."""
     safe = "".join(
         letter if (letter.isalnum() and letter.isascii()) or letter in "-_" else "-" for letter in name
     )
@@ -37,8 +37,8 @@ def ask_for_attack(
         run_dir: Run folder of the node.
         request: What is asked for.
         request_id: Its name; the very same request under the same name goes on where it was.
-        tell: Called with every ``AttackProgress`` of it.
-        follow: Wait for the end.
+        tell: Called with every ``AttackProgress`` of the request.
+        follow: Whether to wait for the end.
 
     Returns:
         The last ``AttackProgress``.
@@ -70,7 +70,7 @@ def ask_for_attack(
 
 
 def cancel_attack(run_dir: Path, request_id: str, reason: str) -> Any:
-    """End the search of a request, or whichever there is; returns the node's ``AttackProgress`` after it."""
+    """End the search of a request, or the running one; returns the node's ``AttackProgress`` after it."""
 
     def make(asked: RequestIdentity, now: Now) -> Any:
         return types.AttackCancel(
@@ -82,7 +82,7 @@ def cancel_attack(run_dir: Path, request_id: str, reason: str) -> Any:
 
 
 def _ask(bus: Bus, topic: str, make: Callable[[RequestIdentity, Now], Any]) -> Any:
-    """Send a message until the attack node has answered it; the progress that answers."""
+    """Send a message until the attack node has answered it; returns the progress with the answer."""
 
     def read(ask_id: str, received: Received) -> Any:
         progress = received.message()

@@ -1,4 +1,4 @@
-"""A search in a process of its own, as the attack node sees it: what it says comes to an inbox, and it can be ended at once."""
+"""A search in a separate process: its output goes to an inbox of the attack node, and it can be stopped at once."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ _END_S = 2.0
 
 
 def is_begun(folder: Path) -> bool:
-    """Whether a search has written a state or a result into a folder. Until then another request may take its place."""
+    """Whether a search has written a state or a result into a folder. Until then another request may replace it."""
     return (folder / TOGETHER_STATE).exists() or any(folder.glob("seed_*.safetensors"))
 
 
 @dataclass(frozen=True, eq=False)
 class Said:
-    """What a search said.
+    """One output of a search.
 
     Attributes:
-        job: Which one.
+        job: The search.
         kind: ``progress``, ``image``, ``done``, ``failed`` or ``ended``.
-        data: Its values.
-        pixels: Of an image, ``height * width * 3`` bytes RGB.
+        data: Values of the output.
+        pixels: Pixels of an image, ``height * width * 3`` bytes RGB.
     """
 
     job: Job
@@ -50,9 +50,9 @@ class Job:
     """A running search.
 
     Args:
-        folder: Folder with the request; state, log and results go there too.
-        inbox: Where it is heard.
-        threads: Threads of its computations; 0 leaves it to the libraries.
+        folder: Folder with the request; also for state, log and results.
+        inbox: Inbox for its outputs.
+        threads: Threads of its computations; 0 uses the libraries' defaults.
     """
 
     def __init__(self, folder: Path, inbox: Inbox[Said], threads: int = 0) -> None:
@@ -60,7 +60,7 @@ class Job:
         environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
         if threads:
             environment |= {"OMP_NUM_THREADS": str(threads), "NUMBA_NUM_THREADS": str(threads)}
-        # It dies with the node, which then finds its state and goes on.
+        # It dies with the node, which then finds its state and resumes.
         shim = [sys.executable, "-I", "-S", str(_SHIM), str(os.getpid())]
         with open(self.log, "ab") as log:
             self._process = subprocess.Popen(
@@ -80,19 +80,19 @@ class Job:
 
     @property
     def log(self) -> Path:
-        """What it wrote about errors."""
+        """Log file of its errors."""
         return self.folder / "worker.log"
 
     @property
     def pid(self) -> int:
-        """Its process id."""
+        """Process id."""
         return self._process.pid
 
     def stop(self) -> None:
-        """End it at once; its state file is whole, whenever that is."""
+        """Stop it at once; its state file is always whole."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
-        # A process that hangs in the system dies when it comes back; the node must not wait for that.
+        # A process that hangs in the kernel dies when it returns; the node must not wait for that.
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(_END_S)
         self._reader.stop()
@@ -100,7 +100,7 @@ class Job:
             self._process.stdout.close()
 
     def why_it_failed(self) -> str:
-        """Last words of a search that ended by itself."""
+        """Last log lines of a search that ended by itself."""
         try:
             code = self._process.wait(_END_S)
         except subprocess.TimeoutExpired:
@@ -111,7 +111,7 @@ class Job:
         return f"{lines[-1] if lines else f'ended with exit code {code}'} (log: {self.log})"
 
     def _read(self) -> Said | None:
-        """One thing it said, if it comes within a moment."""
+        """One output, if it comes within a moment."""
         if said := self._parsed():
             return said
         if not select.select([self._pipe], [], [], _READ_S)[0] or self._ended:
@@ -124,7 +124,7 @@ class Job:
         return Said(self, "ended", {})
 
     def _parsed(self) -> Said | None:
-        """A line of JSON, and the pixels that it announces behind it."""
+        """A line of JSON, and the pixels that it announces."""
         line, newline, rest = bytes(self._buffer).partition(b"\n")
         if not newline:
             return None

@@ -1,4 +1,4 @@
-"""The results of a search as the commands print them: each total beside that of the drive without an attack."""
+"""Printed results of a search: each total beside the total of the drive without an attack."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from advnerf_core.files import write_atomically
 
 
 def in_one_line(attack: AttackFile) -> str:
-    """What was found, and what the policy does without it."""
+    """The attack's total, and the policy's without it."""
     total = "unknown" if attack.predicted_total_cte_m is None else f"{attack.predicted_total_cte_m:.1f} m"
     clean = "without attack not driven" if attack.clean_drive is None else attack.clean_drive.short
     return f"attack {attack.attack_id}, {attack.method}, predicted total CTE {total}, {clean}"
@@ -37,13 +37,13 @@ def export_attack(attack: AttackFile, folder: Path, stem: str) -> list[Path]:
 def write_poster(
     poster: Poster, target: Path, paper: Paper, dpi: float, margin_mm: float, overlap_mm: float
 ) -> str:
-    """Write a poster as PDF or PNG, as the file's name says.
+    """Write a poster as PDF or PNG, by the file's suffix.
 
     Returns:
-        What was written, in words.
+        Description of the file that was written.
 
     Raises:
-        PrintError: Another kind of file, or measures that do not go together.
+        PrintError: The file is of another kind, or the measures do not fit together.
     """
     size = f"{poster.size_m[0]:.3f} x {poster.size_m[1]:.3f} m"
     if target.suffix.lower() == ".png":

@@ -1,7 +1,7 @@
-"""The search of the attack node, in a process of its own: ``python -m nodes.experiment.node.worker FOLDER``.
+"""The search of the attack node, in a separate process: ``python -m nodes.experiment.node.worker FOLDER``.
 
-It reads the request in the folder, goes on with its state if there is one, and speaks to the node on its standard output: lines
-of JSON, an image's pixels behind the line that announces it. Whatever else writes there is led to standard error.
+It reads the request in the folder, resumes from a state if it exists, and writes to the node on its standard output: lines
+of JSON, and an image's pixels after the line that announces it. All other output is redirected to standard error.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _PREVIEW_SCALE = 2
 
 
 class Speaker:
-    """Tells the node what happens; stands in for the display of a command."""
+    """Reports to the node, in the place of a command's display."""
 
     def __init__(self, stream: BinaryIO, folder: Path) -> None:
         self._stream, self._folder, self._evaluations = stream, folder, 0
@@ -40,20 +40,20 @@ class Speaker:
         self._best: Evaluation | None = None
 
     def say(self, kind: str, pixels: bytes = b"", **data: Any) -> None:
-        """One line, and what comes behind it."""
+        """Write one line, and the pixels that follow it."""
         self._stream.write(json.dumps({"kind": kind, "bytes": len(pixels), **data}).encode() + b"\n" + pixels)
         self._stream.flush()
 
     def start(self, stage: str) -> MeasuringReport:
-        """A seed begins; its progress is told with its evaluations."""
+        """A seed begins; evaluations report its progress."""
         del stage
         return lambda fraction, text="", point=None: None
 
     def finish(self, stage: str, seconds: float, cached: bool) -> None:
-        """A seed has ended; told with its file."""
+        """A seed has ended, which is reported with its file."""
 
     def prepared(self, prepared: Prepared) -> None:
-        """A seed can be searched."""
+        """A seed is ready to be searched."""
         done, self._best = _so_far(self._state(prepared))
         self._prepared, self._evaluations = prepared, planned_evaluations(prepared)
         self.say(
@@ -69,7 +69,7 @@ class Speaker:
         )
 
     def told(self, evaluation: Evaluation) -> None:
-        """An evaluation is done and its state is on disk."""
+        """An evaluation is finished and its state is on disk."""
         assert self._prepared is not None
         better = self._best is None or evaluation.value > self._best.value
         self._best = evaluation if better else self._best
@@ -88,9 +88,9 @@ class Speaker:
             self._show(self._prepared)
 
     def _show(self, prepared: Prepared) -> None:
-        """The best texture so far, and what the policy sees of it from the first start."""
+        """The best texture, and the policy's view of it from the first start."""
         theta = self._best_theta(prepared)
-        if theta is None:  # the method keeps no state
+        if theta is None:  # the method writes no state
             return
         texture = _texture(prepared, theta)
         if texture is not None:
@@ -122,7 +122,7 @@ class Speaker:
 
 
 def _so_far(state: Path) -> tuple[int, Evaluation | None]:
-    """How many evaluations a search that was cut off has made, and the best of them."""
+    """Number of evaluations of an interrupted search, and the best of them."""
     if not state.exists():
         return 0, None
     with open_tensors(state, "pt") as handle:
@@ -140,7 +140,7 @@ def _texture(prepared: Prepared, theta: Tensor) -> NDArray[np.uint8] | None:
 
 
 def work(folder: Path, stream: BinaryIO) -> None:
-    """Search as the folder's request asks, and say which file is the best."""
+    """Search as the folder's request asks, and report the best file."""
     request = kept_request(folder)
     speaker = Speaker(stream, folder)
     files = run_attack(request, folder, speaker, speaker.told, speaker.prepared)
@@ -156,7 +156,7 @@ def work(folder: Path, stream: BinaryIO) -> None:
 
 
 def main() -> int:
-    """Run the worker; what a person can put right is one line on standard error."""
+    """Run the worker; an error that the user can correct is one line on standard error."""
     # Never closed: the node takes the end of this pipe for the end of the process, whose shutdown takes seconds on a busy machine.
     stream = os.fdopen(os.dup(1), "wb", closefd=False)
     os.dup2(2, 1)

@@ -1,1 +1,1 @@
-"""What an experiment file says."""
+"""Schema of experiment files."""

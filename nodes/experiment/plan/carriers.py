@@ -1,4 +1,4 @@
-"""The section ``carrier`` of an experiment: what shows a texture in the deployed drive, and in the frames that victims learn from."""
+"""The section ``carrier`` of an experiment: how a texture is shown in the deployed drive, and in the training frames of victims."""
 
 from __future__ import annotations
 

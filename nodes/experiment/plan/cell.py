@@ -1,4 +1,4 @@
-"""One point of the grid that experiments are made of: which variant and path, which victim meets what, which seed."""
+"""One point of an experiment's grid: variant and path, victim, condition, and seed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.plan.victims import TRAINED_PLAIN
 from nodes.runtime.errors import ConfigError
 
-# What --only may name.
+# Keys of --only.
 KEYS = ("variant", "path", "victim", "method", "seed")
 
 
@@ -21,13 +21,13 @@ class Cell:
     """One cell.
 
     Attributes:
-        scenario: What tables and file names call its variant and path: the path; of a variant its name, or PATH_VARIANT if it has several paths.
-        victim: Which policy.
-        method: Name of the method that found what it meets; ``none``: no attack, ``empty``: no object.
-        seed: Of the search and its starts; 0 without attack.
-        variant: Which variant of the experiment; empty for an experiment without variants.
-        within: The path of a variant's cell; empty where ``scenario`` is the path.
-        reference: Where the method's code is, as `advnerf_core.attack.methods.load_method` takes it, if its name does not say.
+        scenario: Name of variant and path in tables and file names: the path; for a variant its name, or PATH_VARIANT if it has several paths.
+        victim: Name of the victim.
+        method: Name of the method of attack; ``none``: no attack, ``empty``: no object.
+        seed: Seed of the search and its starts; 0 without attack.
+        variant: Name of the experiment's variant; empty for an experiment without variants.
+        within: The path of a variant's cell; empty if ``scenario`` is the path.
+        reference: Reference of the method's code for `advnerf_core.attack.methods.load_method`, if it differs from its name.
     """
 
     scenario: str
@@ -40,7 +40,7 @@ class Cell:
 
     @classmethod
     def of(cls, path: str, victim: str, method: str, seed: int) -> Cell:
-        """The cell of a method as `load_method` takes it, or of a control."""
+        """The cell of a control, or of a method by its reference for `load_method`."""
         name = name_in_results(method)
         return cls(path, victim, name, seed, reference="" if method == name else method)
 
@@ -51,7 +51,7 @@ class Cell:
 
     @property
     def inside(self) -> Cell:
-        """The cell as its variant names it."""
+        """The cell with its name in the variant."""
         return replace(self, scenario=self.path, variant="", within="")
 
     @property
@@ -61,7 +61,7 @@ class Cell:
 
     @property
     def searched(self) -> bool:
-        """Whether a search finds what it meets; else it is a control."""
+        """Whether a search finds its attack; else it is a control."""
         return self.method not in CONTROLS
 
     @property
@@ -71,14 +71,14 @@ class Cell:
 
     @property
     def code(self) -> str:
-        """Its method as `load_method` takes it, or the name of a control."""
+        """Its method's reference for `load_method`, or the name of a control."""
         return self.reference or self.method
 
 
 def cells_of(config: ExperimentConfig, variant: str = "") -> list[Cell]:
     """All cells of a resolved experiment, or of one of its variants: every seed against each victim, quick ones first.
 
-    Unless ``over`` names victims, one that was trained plain beside the main one meets the first seed alone.
+    Unless ``over`` names victims, a plainly trained one beside the main one meets the first seed alone.
     """
     paths = config.cell_paths
 
@@ -106,10 +106,10 @@ def cells_of(config: ExperimentConfig, variant: str = "") -> list[Cell]:
 
 
 def select(cells: Sequence[Cell], only: str) -> list[Cell]:
-    """The cells that fit a text such as ``path=straight,method=gradient+none,seed=0``; an empty text takes all.
+    """The cells that match a text such as ``path=straight,method=gradient+none,seed=0``; an empty text selects all.
 
     Raises:
-        ConfigError: The text is no such text, or no cell fits.
+        ConfigError: The text is invalid, or no cell matches.
     """
     wanted: dict[str, set[str]] = {}
     for part in filter(None, only.split(",")):

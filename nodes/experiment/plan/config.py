@@ -1,4 +1,4 @@
-"""The experiment file: which world, what is captured, learned, attacked and deployed, in its settings."""
+"""The experiment file: the world, and what is captured, learned, attacked and deployed, in its settings."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class ExperimentConfig(StrictModel):
 
     @property
     def attacked(self) -> dict[str, VictimConfig]:
-        """The policies that are attacked by name, the main one first; the retrained one is not among them."""
+        """The attacked policies by name, the main one first, without the retrained one."""
         if self.victims:
             return self.victims
         trained: dict[str, VictimConfig] = {HARDENED: TRAINED}
@@ -130,17 +130,17 @@ class ExperimentConfig(StrictModel):
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """Controls and methods of attack that a victim meets."""
+        """Controls and methods of attack for a victim."""
         return self.over.method
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """Methods of attack, as `advnerf_core.attack.methods.load_method` takes them."""
+        """Methods of attack, as references for `advnerf_core.attack.methods.load_method`."""
         return tuple(each for each in self.conditions if each not in CONTROLS)
 
     @property
     def method_names(self) -> tuple[str, ...]:
-        """What the methods are called in tables and file names."""
+        """Names of the methods in tables and file names."""
         return tuple(map(name_in_results, self.methods))
 
     @property

@@ -1,4 +1,4 @@
-"""The section ``deploy`` of an experiment: what drives past a found attack."""
+"""The section ``deploy`` of an experiment: how attacks are deployed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Positive = Annotated[int, Field(ge=1)]
 
 
 class DeployConfig(StrictModel):
-    """What drives past a found attack, and how often. All but ``through``, ``starts``, ``car``, ``world`` and ``camera`` concerns live nodes only."""
+    """How, and how often, attacks are deployed. All but ``through``, ``starts``, ``car``, ``world`` and ``camera`` concerns live nodes only."""
 
     through: Literal["world", "nodes", "nothing"] = Field(
         default="world",

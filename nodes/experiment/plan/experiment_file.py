@@ -20,9 +20,9 @@ from nodes.experiment.plan.over import (
 from nodes.runtime.config import apply_overrides
 from nodes.runtime.errors import ConfigError
 
-# Chosen where a file has settings and none is named.
+# Default for a file with settings.
 DEFAULT_SETTING = "demo"
-# Keys that are of the whole experiment, not of a variant.
+# Keys of the whole experiment, not of a variant.
 _OF_THE_WHOLE = ("name", "run_folder", "contrasts")
 
 
@@ -31,9 +31,9 @@ class ExperimentFile:
     """An experiment file with one of its settings laid over its values, and overrides over that.
 
     Attributes:
-        setting: Which setting; empty for a file without settings.
+        setting: Name of the setting; empty for a file without settings.
         document: The values.
-        variants: The values of each variant that the section ``over`` names.
+        variants: The values of each variant of the section ``over``.
     """
 
     setting: str
@@ -57,12 +57,12 @@ def read_experiment_file(file: Path, setting: str | None, overrides: Sequence[st
 
 @dataclass(frozen=True)
 class _Read:
-    """A file as it was read.
+    """A parsed file.
 
     Attributes:
-        setting: Which of its settings is laid over its values.
-        document: Its values.
-        of: Name of the experiment that it changes: of its base, or its own.
+        setting: Name of the setting laid over its values.
+        document: Values of the file.
+        of: Name of the experiment that it changes: its base's, or its own.
     """
 
     setting: str
@@ -112,7 +112,7 @@ def _on_its_base(file: Path, above: Sequence[Path]) -> tuple[Document, Any]:
 
 
 def _variant(file: Path, read: _Read, changes: Sequence[AxisChange], overrides: Sequence[str]) -> Document:
-    """The values of one variant: those of the experiment, or of the variant's own base, with its changes and the overrides."""
+    """The values of one variant: the experiment's, or its own base's, with its changes and the overrides."""
     values = {change.key: change.value for change in changes}
     base, setting = values.pop("base", None), values.pop("setting", None)
     if base is None:
@@ -132,7 +132,7 @@ def _variant(file: Path, read: _Read, changes: Sequence[AxisChange], overrides: 
 
 
 def _change(made: Document, change: AxisChange, document: Document) -> None:
-    """Lay one change of a variant over its values."""
+    """Apply one change of a variant to its values."""
     steps, value = tuple(change.key.split(".")), copy.deepcopy(change.value)
     places = {
         (*steps, *at[len(change.origin) :]): place
@@ -145,7 +145,7 @@ def _change(made: Document, change: AxisChange, document: Document) -> None:
 
 
 def _is_of_variants(override: str) -> bool:
-    """Whether an override changes every variant, and not which there are."""
+    """Whether an override changes every variant, rather than the list of variants."""
     first, _, rest = override.partition("=")[0].strip().partition(".")
     return rest.partition(".")[0] in COORDINATES if first == OVER else first not in _OF_THE_WHOLE
 
@@ -157,7 +157,7 @@ def _lay_over(
     key: tuple[str, ...],
     places: Mapping[Key, str] | None = None,
 ) -> None:
-    """Merge values into the document, keeping for each the place where it stands: in ``places``, or in the document itself under ``origin``."""
+    """Merge values into the document, keeping the place of each: from ``places``, or from the document itself under ``origin``."""
     source = document.places if places is None else places
     target = document.data
     for step in key:
@@ -181,5 +181,5 @@ def _lay_over(
 
 
 def _another_kind(before: Mapping[str, Any], value: Mapping[str, Any]) -> bool:
-    """Whether a section is of another ``kind``, whose keys are others: it takes the place of the one before."""
+    """Whether a section has another ``kind``, with other keys: it then replaces the earlier one."""
     return "kind" in value and value["kind"] != before.get("kind")

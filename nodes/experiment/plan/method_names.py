@@ -1,6 +1,6 @@
-"""Names of methods, objectives and architectures in experiment and request files: checked where they stand, and absolute for other processes.
+"""Names of methods, objectives and architectures in experiment and request files: checked in place, and made absolute for other processes.
 
-The title that a user's method brings is kept beside the cells that it searched: pages show it without executing the method.
+The title of a user's method is stored beside the cells that it searched, so that pages show it without executing the method.
 """
 
 from __future__ import annotations
@@ -53,12 +53,12 @@ _TITLES = "titles"
 
 
 def keep_title(cells_folder: Path, name: str, title: str) -> None:
-    """Write down what readers call a method; nothing if it has no title."""
+    """Store a method's title for readers; nothing without a title."""
     if title:
         write_atomically(cells_folder / _TITLES / name, title)
 
 
 def know_methods_of(cells_folder: Path, names: Iterable[str]) -> None:
-    """Give methods of one table colours of their own, and the titles that are kept beside its cells."""
+    """Give the methods of one table distinct colours, and the titles stored beside its cells."""
     kept = sorted((cells_folder / _TITLES).glob("*"))
     know_methods(names, {file.name: file.read_text(encoding="utf-8") for file in kept})

@@ -1,4 +1,4 @@
-"""The section ``over`` of an experiment: what its cells are made of, and the variants that are read of it."""
+"""The section ``over`` of an experiment: the dimensions of its cells, and its variants."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _MOST_VARIANTS = 10_000  # status and table read a file for each cell
 
 
 class OverConfig(StrictModel):
-    """What an experiment goes over: its cells are the product. Any other key of the experiment may be an axis too, as a dotted path
+    """Dimensions of an experiment: its cells are the product. Any other key of the experiment may be an axis too, as a dotted path
     with a list of values: ``attack.evaluations: [20, 60]``."""
 
     model_config = ConfigDict(extra="allow")
@@ -65,18 +65,18 @@ class OverConfig(StrictModel):
         return self
 
 
-# What says which cells a variant has; everything else of the section makes variants.
+# Keys that select the cells of a variant; all other keys of the section make variants.
 COORDINATES = tuple(name for name in OverConfig.model_fields if name != VARIANT)
 
 
 @dataclass(frozen=True)
 class AxisChange:
-    """What a variant changes.
+    """One change of a variant.
 
     Attributes:
         key: The key of the experiment, as a dotted path.
-        value: What it is in the variant.
-        origin: Where that stands in the experiment file.
+        value: Its value in the variant.
+        origin: Place of the value in the experiment file.
     """
 
     key: str
@@ -85,7 +85,7 @@ class AxisChange:
 
 
 def with_dotted_axes(document: Document) -> None:
-    """Make dotted paths, in place, of the sections that ``--set over.attack.evaluations=[20,60]`` makes in a section ``over``."""
+    """Convert, in place, the sections that ``--set over.attack.evaluations=[20,60]`` makes in a section ``over`` to dotted paths."""
     over = document.data.get(OVER)
     for name in list(over) if isinstance(over, dict) else ():
         if name == VARIANT or not isinstance(over[name], dict):
@@ -107,10 +107,10 @@ def variants_in(over: Any) -> dict[str, list[AxisChange]]:
     """The variants of a section ``over`` by name, each with its changes: the product of its named variants and its axes.
 
     Args:
-        over: The section as it was read; what is wrong in it is refused where it is validated.
+        over: The section before validation; its errors are reported there.
 
     Raises:
-        ValueError: Two have one name, or there are too many.
+        ValueError: Two variants have one name, or there are too many.
     """
     if not isinstance(over, dict):
         return {}
@@ -134,12 +134,12 @@ def variants_in(over: Any) -> dict[str, list[AxisChange]]:
 
 
 def coordinates_in(over: Any) -> dict[str, Any]:
-    """What of a section ``over`` says which cells a variant has."""
+    """The part of a section ``over`` that selects the cells of a variant."""
     return {name: over[name] for name in COORDINATES if name in over} if isinstance(over, dict) else {}
 
 
 def _changes(name: str, changes: Any) -> list[AxisChange]:
-    """What a named variant changes."""
+    """The changes of a named variant."""
     items = changes.items() if isinstance(changes, dict) else ()
     return [AxisChange(str(key), value, (OVER, VARIANT, name, key)) for key, value in items]
 
@@ -149,7 +149,7 @@ def _is_axis(key: str, values: Any) -> bool:
 
 
 def _values(key: str, values: list[Any]) -> list[tuple[str, list[AxisChange]]]:
-    """What the values of an axis are called in the names of variants, and what each changes."""
+    """Names of an axis's values in the names of variants, and the change of each."""
     last = key.rpartition(".")[2]
     return [
         (f"{last}-{_slug(value, at)}", [AxisChange(key, value, (OVER, key, at))])
@@ -158,7 +158,7 @@ def _values(key: str, values: list[Any]) -> list[tuple[str, list[AxisChange]]]:
 
 
 def _slug(value: Any, number: int) -> str:
-    """A value in the name of a variant; its number in the list where it is a section or a list itself."""
+    """A value in the name of a variant; for a section or a list its number in the axis."""
     letters = (
         "" if isinstance(value, dict | list) else re.sub(r"[^a-z0-9]+", "-", str(value).lower()).strip("-")
     )

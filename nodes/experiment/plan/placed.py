@@ -1,4 +1,4 @@
-"""Where the objects of an attack stand in a world, as an experiment file lists them."""
+"""Places of an attack's objects in a world, as listed in an experiment file."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ _SPACING_M = 0.05  # of the points that stand for a lane's middle
 
 
 class PlacedObject(StrictModel):
-    """Where an object of the attack stands. It is not part of the world: the deployment composes it by depth.
+    """Place of an object of the attack. It is not part of the world: the deployment composes it by depth.
 
     Attributes:
         name: Unique name.
         kind: What it is: small_car, hydrant, panel, or a file of a user's, see `object_kinds`.
         x_m: Middle of its foot [m].
         y_m: Middle of its foot [m].
-        z_m: Height it stands on [m]: the kerb's on a pavement.
+        z_m: Height of the ground under it [m]: the kerb's on a pavement.
         yaw_rad: Heading of its front [rad]; a panel shows its texture there.
         scale: Size relative to the object as it was built.
     """
@@ -66,13 +66,13 @@ class PlacedObject(StrictModel):
 
 
 class FirstSeen(StrictModel):
-    """A rule for where an object stands: the first spot beside a path where it fits and is seen; see `nodes.experiment.show.placing`.
+    """A rule for the place of an object: the first spot beside a path where it fits and is visible; see `nodes.experiment.show.placing`.
 
     Attributes:
         path: The path; None for the experiment's first.
-        side: On which side of it.
-        seen_s: For so long a drive along the path sees nearly all of it, unhidden and from the front [s].
-        least_px: So high it is then in the policy's picture [px].
+        side: Side of the path.
+        seen_s: Time for which a drive along the path sees nearly all of it, unhidden and from the front [s].
+        least_px: Its smallest height in the policy's picture during that time [px].
     """
 
     path: str | None = None
@@ -82,13 +82,13 @@ class FirstSeen(StrictModel):
 
 
 class RuledObject(StrictModel):
-    """An object that stands where a rule puts it while the world is photographed.
+    """An object that a rule places while the world is photographed.
 
     Attributes:
         name: Unique name.
-        kind: What it is: a panel.
-        z_m: Height it stands on [m].
-        scale: Size relative to the object as it was built.
+        kind: Kind of object: a panel.
+        z_m: Height of the ground under it [m].
+        scale: Size relative to the object as built.
         stands: The rule.
     """
 
@@ -99,7 +99,7 @@ class RuledObject(StrictModel):
     stands: FirstSeen
 
     def at(self, x_m: float, y_m: float, yaw_rad: float) -> PlacedObject:
-        """The object in one place; to the millimetre, so that no machine's last bit moves it."""
+        """The object at one place, rounded to the millimetre, so that no machine's last bit moves it."""
         return PlacedObject(
             name=self.name,
             kind=self.kind,
@@ -125,7 +125,7 @@ def in_a_lane(objects: Sequence[PlacedObject], world: WorldDescription) -> tuple
     """The first object that reaches into a lane, nearer than half a lane's width to its middle.
 
     Returns:
-        Its index, and what is wrong in words; None if all objects stand beside the lanes.
+        The object's index, and a description of the problem; None if all objects stand beside the lanes.
     """
     middles = np.concatenate([_middle_of(lane) for lane in world.lanes])
     for index, thing in enumerate(objects):
@@ -134,7 +134,7 @@ def in_a_lane(objects: Sequence[PlacedObject], world: WorldDescription) -> tuple
             0.5 * thing.scale * np.array(footprint_m(thing.kind)),
         )
         seen_from_it = (middles - [thing.x_m, thing.y_m]) @ turned
-        nearest = np.clip(seen_from_it, -half, half)  # of the ground that it covers
+        nearest = np.clip(seen_from_it, -half, half)  # within the ground that it covers
         distance_m = np.linalg.norm(seen_from_it - nearest, axis=1)
         at = int(distance_m.argmin())
         if distance_m[at] < world.off_track_m:
@@ -146,7 +146,7 @@ def in_a_lane(objects: Sequence[PlacedObject], world: WorldDescription) -> tuple
     return None
 
 
-@lru_cache(maxsize=64)  # of a few lanes, many spots are tried
+@lru_cache(maxsize=64)  # many spots are tried with a few lanes
 def _middle_of(lane: ReferencePath) -> Array:
     """Points ``[N, 2]`` along the middle of a lane."""
     along_m = np.linspace(0.0, lane.length_m, 2 + int(lane.length_m / _SPACING_M))

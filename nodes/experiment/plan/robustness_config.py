@@ -1,4 +1,4 @@
-"""The section ``robustness`` of requests and experiments: what an attack shall bear."""
+"""The section ``robustness`` of requests and experiments: disturbances that an attack must withstand."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _NotNegative = Annotated[float, Field(ge=0)]
 
 
 class RobustnessConfig(StrictModel):
-    """What the attack shall bear: the loss is an expectation over these, drawn anew for every evaluation."""
+    """Disturbances that the attack must withstand: the loss is an expectation over these, with new draws in every evaluation."""
 
     noise: _NotNegative = Field(default=0.0, description="Pixel noise, standard deviation in 0..1.")
     gain: _NotNegative = Field(default=0.0, description="Spread of the logarithm of the exposure of a drive.")
@@ -39,7 +39,7 @@ class RobustnessConfig(StrictModel):
 
     @property
     def disturbed(self) -> bool:
-        """Whether anything is drawn at all."""
+        """Whether any disturbance is drawn."""
         return any((self.noise, self.gain, self.brightness, self.jitter_m, self.jitter_rad))
 
     @property
@@ -48,7 +48,7 @@ class RobustnessConfig(StrictModel):
         return self.draws if self.disturbed else 1
 
     def disturbances(self, seed: int) -> Disturbances | None:
-        """What is drawn in every evaluation of a search; None if nothing is."""
+        """Disturbances of every evaluation of a search; None if there are none."""
         from advnerf_core.attack.robustness import Disturbances
 
         if not self.disturbed:
@@ -56,7 +56,7 @@ class RobustnessConfig(StrictModel):
         return Disturbances(self.noise, self.gain, self.brightness, self.jitter_m, self.jitter_rad, seed)
 
     def regulariser(self, objects: Sequence[ColouredObject]) -> Smoothness | None:
-        """What the loss charges for rough colours of the attacked objects; None if nothing is charged."""
+        """Penalty for rough colours of the attacked objects; None without a weight."""
         from advnerf_core.attack.robustness import Smoothness
 
         return Smoothness(objects, self.smoothness) if self.smoothness else None

@@ -1,4 +1,4 @@
-"""Rules between sections of the experiment file. Each refuses, with a ValueError, what one section holds and another excludes."""
+"""Rules between sections of the experiment file. Each raises a ValueError for a section that another one excludes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _refuse(wrong: object, text: str) -> None:
 
 
 def check_names(paths: Sequence[str], objects: Sequence[WantedObject]) -> None:
-    """Refuse paths, objects and files of their kinds of one name."""
+    """Raise for equal names among paths, objects and files of their kinds."""
     for what, names in (("paths", paths), ("names of objects", [each.name for each in objects])):
         _refuse(len(set(names)) != len(names), f"expected different {what}, got {', '.join(names)}")
     kinds = sorted({each.kind for each in objects})
@@ -38,7 +38,7 @@ def check_names(paths: Sequence[str], objects: Sequence[WantedObject]) -> None:
 def check_victims(
     attacked: Mapping[str, VictimConfig], policy: PolicyConfig, retrain: RetrainConfig | None
 ) -> None:
-    """Refuse victims that cannot be trained, or retrained: the first of ``attacked``."""
+    """Raise for victims that cannot be trained, or retrained: the first of ``attacked``."""
     main = next(iter(attacked))
     trained = {name: each for name, each in attacked.items() if isinstance(each, TrainedVictim)}
     _refuse(
@@ -66,7 +66,7 @@ def check_face(
     deploy: DeployConfig,
     unwanted: Mapping[str, object],
 ) -> None:
-    """Refuse whatever else is attacked beside a face; ``unwanted`` names more that must not be there, and what is."""
+    """Raise for anything else attacked beside a face; ``unwanted`` has further values that must not be present, by name."""
     there = {
         "space.kind colours": "" if isinstance(space, ColoursConfig) else space.kind,
         "no objects": ", ".join(each.name for each in objects),
@@ -83,7 +83,7 @@ def check_face(
 def check_objects(
     carrier: CarrierConfig, objects: Sequence[WantedObject], deploy: DeployConfig, retrains: bool
 ) -> None:
-    """Refuse objects that the carrier cannot show."""
+    """Raise for objects that the carrier cannot show."""
     others = [each.name for each in objects if each.kind != PANEL]
     _refuse(
         deploy.live,
@@ -100,7 +100,7 @@ def check_objects(
 
 
 def check_training(carrier: CarrierConfig, policy: PolicyConfig, objects: Sequence[WantedObject]) -> None:
-    """Refuse frames that victims cannot learn from."""
+    """Raise for frames that victims cannot learn from."""
     _refuse(
         carrier.training == "native" and policy.own_car and policy.naive_steps,
         "expected policy.naive_steps 0 or policy.own_car off with carrier.training native, got "
@@ -137,7 +137,7 @@ def check_space(
 
 
 def check_searches(methods: Sequence[str], seeds: Sequence[int], measured_seed: int, retrains: bool) -> None:
-    """Refuse searches that see the measured starts, and a retraining without its gradient."""
+    """Raise for searches that use the measured starts, and for a retraining without its gradient."""
     _refuse(
         retrains and "gradient" not in methods,
         f"expected gradient among over.method, as retrain learns from what it finds, got {', '.join(methods)}",

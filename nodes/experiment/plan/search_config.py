@@ -1,4 +1,4 @@
-"""What requests and experiments both say of a search: its objective, its budget, and how places and shapes are sampled."""
+"""Common keys of requests and experiments for a search: its objective, its budget, and the sampling of places and shapes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from nodes.experiment.plan.method_names import ObjectiveReference
 
 
 class SearchBudget(StrictModel):
-    """What a search maximises, and what it may spend."""
+    """The objective of a search, and its budget."""
 
     objective: ObjectiveReference = Field(
         default=CTE,
@@ -42,7 +42,7 @@ class PlacesBudget(StrictModel):
 
 
 class ShapeSampling(StrictModel):
-    """How the gradient of a mesh's shape is taken."""
+    """Sampling of the gradient of a mesh's shape."""
 
     smoothness: Annotated[float, Field(ge=0)] = Field(
         default=19.0, description="Lambda of the large-steps preconditioner; 0: none."

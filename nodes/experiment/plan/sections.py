@@ -15,13 +15,13 @@ from nodes.experiment.plan.search_config import SearchBudget
 Count = Annotated[int, Field(ge=0)]
 Positive = Annotated[int, Field(ge=1)]
 PositiveNumber = Annotated[float, Field(gt=0)]
-# Fields of the section policy that make the network; its description stands for them in keys.
+# Fields of the section policy that define the network; its description replaces them in keys.
 NETWORK = {"architecture", "configuration", "hidden"}
 Unit = Annotated[float, Field(ge=0, le=1)]
 
 
 class CaptureConfig(StrictModel):
-    """How the world is photographed."""
+    """Photographs of the world."""
 
     photos: Positive = Field(default=450, description="Posed photographs that the scene is learned from.")
     held_out: Annotated[int, Field(ge=3)] = Field(
@@ -39,7 +39,7 @@ class CaptureConfig(StrictModel):
 
 
 class SceneConfig(StrictModel):
-    """How the radiance field is trained; the length is in steps, so that the result does not depend on the machine."""
+    """Training of the radiance field; the length is in steps, so that the result does not depend on the machine."""
 
     steps: Positive = Field(default=1500, description="Training iterations.")
     levels: Annotated[int, Field(ge=1, le=20)] = Field(default=8, description="Levels of the hash grid.")
@@ -80,7 +80,7 @@ class SceneConfig(StrictModel):
 
 
 class ViewConfig(StrictModel):
-    """What the policy sees of the driving camera: a window of its image, resized to 200 x 66; the default fits 336 x 188."""
+    """The policy's window of the driving camera's image, resized to 200 x 66; the default fits 336 x 188."""
 
     crop_top_px: Count = Field(default=24, description="First row that is kept.")
     crop_height_px: Positive = Field(default=111, description="Number of rows that are kept.")
@@ -91,7 +91,7 @@ class ViewConfig(StrictModel):
 
 
 class PolicyConfig(StrictModel):
-    """How the goal-conditioned policy is trained: frames per path and domain, rounds, optimiser steps."""
+    """Training of the goal-conditioned policy: frames per path and domain, rounds, optimiser steps."""
 
     stiffness_1pm: PositiveNumber = Field(
         default=0.2, description="How firmly the expert returns to the path [1/m]; see ExpertConfig."
@@ -176,12 +176,12 @@ class PolicyConfig(StrictModel):
 
     @property
     def recipe(self) -> dict[str, Any]:
-        """How a policy is trained, as JSON data: of a user's architecture its code, not the place of its file."""
+        """Training settings of a policy, as JSON data; for a user's architecture its code, not the path of its file."""
         return self.model_dump(mode="json", exclude=NETWORK) | self.network.described()
 
 
 class ObjectConfig(StrictModel):
-    """How the objects are made; where they stand is the section objects."""
+    """Settings for building the objects; their places are in the section objects."""
 
     car_resolution: Annotated[int, Field(ge=8, le=128)] = Field(
         default=64, description="Voxels along a car's longest side."
@@ -203,14 +203,14 @@ class ObjectConfig(StrictModel):
 
 
 class MeasureConfig(StrictModel):
-    """From where finished attacks are measured, in both domains: the same starts for all methods and seeds."""
+    """Starts from which finished attacks are measured, in both domains: the same for all methods and seeds."""
 
     starts: Positive = Field(default=5, description="Starts, none of which a search had.")
     seed: int = Field(default=10_000, description="Of the starts.")
 
 
 class AttackConfig(SearchBudget):
-    """The adversary, and what it may spend: all methods evaluate equally often."""
+    """The adversary and its budget: all methods evaluate equally often."""
 
     starts: Positive = Field(
         default=1, description="Start poses optimised together; the first of seed 0 is the nominal one."
@@ -234,7 +234,7 @@ class AttackConfig(SearchBudget):
 
 
 class RetrainConfig(StrictModel):
-    """The defence: how often the victim answers the attack, and what it learns from."""
+    """The defence: how often the victim is retrained against the attack, and its training data."""
 
     rounds: Positive = Field(default=1, description="Rounds of attack and retraining, at most.")
     pays_ratio: PositiveNumber = Field(

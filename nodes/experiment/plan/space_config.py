@@ -1,4 +1,4 @@
-"""The section ``space`` of an experiment: what its attacks may change, and the words of the report for it (``searched``)."""
+"""The section ``space`` of an experiment: the parameters of its attacks, and the report's words for them (``searched``)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class ColoursConfig(StrictModel):
 
 
 class PlacesConfig(PlacesBudget):
-    """Where the objects stand, and their colours unless these are kept."""
+    """Places of the objects, and their colours unless these are fixed."""
 
     kind: Literal["places"]
     searched: ClassVar[str] = "The places of {} are searched together in the learned scene"

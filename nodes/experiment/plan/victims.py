@@ -1,4 +1,4 @@
-"""The section ``victims`` of an experiment: which policies are attacked, those that it trains and those that exist already."""
+"""The section ``victims`` of an experiment: the attacked policies, those that it trains and existing ones."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from advnerf_core.places import expanded
 from advnerf_core.policies.load import POLICY_SUFFIXES, is_code
 from advnerf_core.strict import COMPLETE, StrictModel
 
-# What the section policy trains, and the answer of its first to an attack; a user's victims have names of their own.
+# Policies that the section policy trains, and the first one's retrained version; a user's victims have other names.
 HARDENED, NAIVE, RETRAINED = "hardened", "naive", "retrained"
 
 # Names become parts of file names, which are separated by "_" and ".".
@@ -20,7 +20,7 @@ VictimName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9-]*$")]
 
 
 def _located(spec: str, info: ValidationInfo) -> str:
-    """A policy's name as another process in this working folder understands it."""
+    """A policy's name in a form that another process in this working folder understands."""
     if is_code(spec):
         return spec
     file = ((info.context or {}).get("folder") or Path.cwd()) / expanded(Path(spec))
@@ -32,7 +32,7 @@ def _located(spec: str, info: ValidationInfo) -> str:
 
 
 class GivenVictim(StrictModel):
-    """A policy that exists."""
+    """An existing policy."""
 
     policy: Annotated[str, AfterValidator(_located)] = Field(
         description="A .safetensors, .pt2 or .onnx file relative to this file, package.module:factory, or grpc://HOST:PORT of a driver."
@@ -40,7 +40,7 @@ class GivenVictim(StrictModel):
 
 
 class TrainingConfig(StrictModel):
-    """How a victim of the section ``policy`` is trained beyond that section."""
+    """Training of a victim of the section ``policy`` beyond that section."""
 
     textures: Literal["random", "none"] = Field(
         default="random", description="Whether it sees objects in random textures while it learns."

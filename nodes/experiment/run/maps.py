@@ -1,4 +1,4 @@
-"""Pictures about what finished cells found of a space of places."""
+"""Pictures of the results of finished cells with a space of places."""
 
 from __future__ import annotations
 

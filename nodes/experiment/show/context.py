@@ -1,4 +1,4 @@
-"""What all stages of an experiment in a world share: the resolved configuration, the world, paths, camera, car, objects."""
+"""Common context of all stages of an experiment in a world: the resolved configuration, the world, paths, camera, car, objects."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ from nodes.lab.worlds.named import NamedWorld, read_world, without
 from nodes.runtime.errors import ConfigError
 
 WORLD, PLACED, CALIBRATION = "world.json", "objects.json", "calibration"
-# What two worlds have in common in which the same attack can be deployed.
+# Fields in which two worlds must agree for the same attack to be deployed in both.
 _SHARED = ("paths", "off_track_m", "car", "camera", "T_car_from_camera", "fence_m")
-# Distances that stages use were chosen for half a lane of this width [m] and for this speed [m/s]: those of the simulated junction.
+# Distances in stages were chosen for half a lane of this width [m] and for this speed [m/s]: the simulated junction's.
 _HALF_LANE_M, _SPEED_MPS = 1.75, 6.0
 
 
@@ -56,28 +56,28 @@ class Experiment(Variants):
     """One resolved experiment in a world, or one of its variants.
 
     Attributes:
-        kept: Digests of what its stages wrote that are kept with the code, and those of the run folder before them, when it was read.
+        kept: Digests of its stages' outputs when it was loaded, from the run folder, else from the ones stored with the code.
     """
 
     kept: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def resolved_in(cls, folder: FilePath) -> Experiment:
-        """The experiment that a run folder is of, as its manifest resolved it."""
+        """The experiment of a run folder, as its manifest resolved it."""
         manifest = read_json(folder / "manifest.json")
         context = {"folder": FilePath(manifest["file"]).parent}
-        search_folder_last(str(context["folder"]))  # where package.module:factory may lie
+        search_folder_last(str(context["folder"]))  # may contain package.module:factory
         config = ExperimentConfig.model_validate(manifest["config"], context=context)
         return cls(config, FilePath(manifest["file"]), folder, manifest["setting"])
 
     @cached_property
     def named_world(self) -> NamedWorld:
-        """The world as the file names it, with its changes; its code is executed."""
+        """The world of the file, with its changes; its code is executed."""
         return read_world(Document(self.config.world, str(self.file)), self.file.parent)
 
     @property
     def world_settings(self) -> dict[str, Any]:
-        """What of the world's configuration the results depend on, as JSON data."""
+        """The world's settings that results depend on, as JSON data."""
         return self._known_world.settings
 
     @cached_property
@@ -91,22 +91,22 @@ class Experiment(Variants):
 
     @cached_property
     def traits(self) -> Traits:
-        """What is known of the world without opening it."""
+        """Properties of the world that are known before it is opened."""
         return self._known_world.traits
 
     @cached_property
     def deployed_traits(self) -> Traits:
-        """What is known of the world where attacks are deployed, without opening it."""
+        """Properties of the deployment's world that are known before it is opened."""
         return self._known(self.config.deploy.world or self.config.world).traits
 
     @property
     def deployed_settings(self) -> dict[str, Any]:
-        """What of the configuration of the world where attacks are deployed the results depend on, as JSON data."""
+        """Settings of the deployment's world that results depend on, as JSON data."""
         return self._known(self.config.deploy.world or self.config.world).settings
 
     @cached_property
     def solids(self) -> Solids | None:
-        """What the car can hit, walls included; None where the world does not say."""
+        """Obstacles of the car, walls included; None if the world does not define them."""
         world = self.named_world.make()
         if not isinstance(world, HasSolids):
             return None
@@ -114,15 +114,15 @@ class Experiment(Variants):
 
     @property
     def seen_settings(self) -> dict[str, Any]:
-        """What of the world's configuration its pictures and its description depend on, as JSON data."""
+        """The world's settings that its pictures and its description depend on, as JSON data."""
         return without(self.world_settings, self.traits.unseen)
 
     @cached_property
     def world(self) -> WorldDescription:
-        """Paths, lanes, car and camera. A world that must be asked for them was asked by the capture stage, which has kept them.
+        """Paths, lanes, car and camera. The capture stage stores the description of a world that must be open for it.
 
         Raises:
-            ConfigError: It must be asked, and nothing is captured yet.
+            ConfigError: The world must be open for it, and nothing is captured yet.
         """
         try:
             return self._known_world.describe()
@@ -137,7 +137,7 @@ class Experiment(Variants):
 
     @property
     def is_described(self) -> bool:
-        """Whether the world is known: not before the capture stage if it must be asked."""
+        """Whether the world's description is available: not before the capture stage if the world must be open for it."""
         try:
             _ = self.world
         except ConfigError:
@@ -146,21 +146,21 @@ class Experiment(Variants):
 
     @property
     def view_settings(self) -> dict[str, Any]:
-        """What of the policy's view results depend on, as JSON data."""
+        """Settings of the policy's view that results depend on, as JSON data."""
         return self.view.to_dict() if given_in(self.config) else self.config.view.model_dump(mode="json")
 
     def ask_world(self) -> None:
-        """Have a world that must be asked for its description say it, before the capture stage keeps it: nothing is photographed for it."""
+        """Open a world that must be open for its description, before the capture stage stores it; nothing is photographed."""
         if not self.is_described:
             with self.named_world.make() as world:
-                vars(self)["world"] = world.describe()  # where the cached property keeps it
+                vars(self)["world"] = world.describe()  # the place of the cached property
 
     @contextmanager
     def open_world(self) -> Iterator[World]:
         """The world, open; closed at the end.
 
         Raises:
-            ConfigError: It is not the world that was captured.
+            ConfigError: The world differs from the captured one.
         """
         with self.named_world.make() as world:
             kept, found = self._captured(), as_json(world.describe())
@@ -174,7 +174,7 @@ class Experiment(Variants):
 
     @cached_property
     def deployed_world(self) -> NamedWorld:
-        """The world where attacks are deployed."""
+        """The world of the deployment."""
         wanted = self.config.deploy.world
         return (
             self.named_world
@@ -191,10 +191,10 @@ class Experiment(Variants):
 
     @contextmanager
     def open_deployed_world(self) -> Iterator[World]:
-        """The world where attacks are deployed, open; closed at the end.
+        """The world of the deployment, open; closed at the end.
 
         Raises:
-            ConfigError: It has other paths, another camera or another car than the world that was captured.
+            ConfigError: It has other paths, another camera or another car than the captured world.
         """
         if self.config.deploy.world is None:
             with self.open_world() as world:
@@ -210,10 +210,10 @@ class Experiment(Variants):
             yield world
 
     def keep_world(self, world: World) -> None:
-        """Write what an open world says about itself into the capture stage's folder.
+        """Write an open world's description into the capture stage's folder.
 
         Raises:
-            ConfigError: It says something else than before.
+            ConfigError: The description has changed.
         """
         found = as_json(world.describe())
         text = json.dumps({"settings": self.seen_settings, "description": found}, indent=1)
@@ -252,7 +252,7 @@ class Experiment(Variants):
         """Reference paths by scenario.
 
         Raises:
-            ConfigError: The world's lines and arcs are no path, as one that does not close.
+            ConfigError: The world's lines and arcs are invalid, such as a closed path that does not close.
         """
         try:
             return {name: as_path(reference) for name, reference in self.references.items()}
@@ -261,10 +261,10 @@ class Experiment(Variants):
 
     @cached_property
     def objects(self) -> tuple[PlacedObject, ...]:
-        """The objects of the attack, beside the lanes. Those with a rule stand where the capture stage has put them.
+        """The objects of the attack, beside the lanes. The capture stage determines the places of those with a rule.
 
         Raises:
-            ConfigError: One stands in a lane, or nothing is captured yet and one has a rule.
+            ConfigError: An object stands in a lane, or has a rule and nothing is captured yet.
         """
         objects = self._objects_by_rule() if self.has_rules else self.placed_by_hand
         if (found := in_a_lane(objects, self.world)) is not None:
@@ -273,7 +273,7 @@ class Experiment(Variants):
 
     @property
     def placed_by_hand(self) -> tuple[PlacedObject, ...]:
-        """The objects whose places the file names."""
+        """The objects with places in the file."""
         return tuple(each for each in self.config.objects if isinstance(each, PlacedObject))
 
     @property
@@ -290,7 +290,7 @@ class Experiment(Variants):
         return tuple(map(PlacedObject.model_validate, read_json(file)))
 
     def goal(self, scenario: str) -> tuple[float, ...]:
-        """What the policy is told on a path; empty where it is told nothing."""
+        """Goal vector of a policy on a path; empty without a goal."""
         return self.references[scenario].goal
 
     def expert(self, scenario: str) -> Expert:
@@ -311,12 +311,12 @@ class Experiment(Variants):
 
     @property
     def car(self) -> CarDescription:
-        """The car as the surrogate believes it to be."""
+        """The car as the surrogate models it."""
         return self.world.car
 
     @property
     def mount(self) -> Array:
-        """Driving camera on the car ``[4, 4]``."""
+        """Pose ``[4, 4]`` of the driving camera on the car."""
         return self.world.T_car_from_camera
 
     @property
@@ -326,10 +326,10 @@ class Experiment(Variants):
 
     @cached_property
     def view(self) -> PolicyView:
-        """What the policy sees of the driving camera: as the section view says, or as policies that exist declare.
+        """The policy's view of the driving camera: from the section view, or from the declarations of existing policies.
 
         Raises:
-            ConfigError: The window leaves the camera's image; or a policy was made for another camera, or was not looked at yet.
+            ConfigError: The window leaves the camera's image; or a policy was made for another camera, or was not loaded yet.
         """
         for name, policy in given(self).items():
             view = policy.declared.view
@@ -360,12 +360,12 @@ class Experiment(Variants):
 
     @property
     def limits(self) -> Horizon:
-        """Over how many ticks a drive is measured, and what counts as off the track."""
+        """Ticks of a measured drive, and its off-track limit."""
         return Horizon(self.config.horizon, self.config.dt_s, self.world.off_track_m, self.config.held_cap_m)
 
     @property
     def searched_ticks(self) -> int:
-        """Over how many ticks attacks are optimised."""
+        """Number of ticks over which attacks are optimised."""
         return self.config.attack.horizon or self.config.horizon
 
     @property
@@ -374,37 +374,37 @@ class Experiment(Variants):
         return self.file.parent / self.config.deploy.launch_file
 
     def cell_folder(self, cell: Cell) -> FilePath:
-        """Where this experiment itself runs a cell."""
+        """Folder in which this experiment itself runs a cell."""
         return self.folder / CELLS / cell.name
 
     def cell_result(self, cell: Cell) -> FilePath:
-        """Where the result of a cell is that this experiment itself has run."""
+        """File of a cell's result that this experiment itself has run."""
         return self.folder / CELLS / f"{cell.name}.json"
 
     @property
     def calibration_folder(self) -> FilePath:
-        """Calibration files that the capture stage left for the live nodes, and those of a screen."""
+        """Folder of calibration files that the capture stage wrote for the live nodes, and for a screen."""
         return self.stage_folder("capture") / CALIBRATION
 
     def across_m(self, length_m: float) -> float:
-        """A distance sideways [m] that was chosen for half a lane of 1.75 m, in this world's lanes."""
+        """A lateral distance [m] that was chosen for half a lane of 1.75 m, scaled to this world's lanes."""
         return length_m * (self.world.off_track_m / _HALF_LANE_M)
 
     def along_m(self, length_m: float) -> float:
-        """A distance along a path [m] that was chosen for 6 m/s, at this car's speed."""
+        """A distance along a path [m] that was chosen for 6 m/s, scaled to this car's speed."""
         return length_m * (self.car.speed_mps / _SPEED_MPS)
 
     def start_states(self, scenario: str, seed: int) -> torch.Tensor:
-        """Start poses ``[B, 3]`` float64 of one attack, drawn about the nominal one; the first of seed 0 is the nominal one itself.
+        """Start poses ``[B, 3]`` float64 of one attack, drawn around the nominal one; the first of seed 0 is the nominal one itself.
 
-        Searches get others from `measured_starts`.
+        They differ from `measured_starts`.
         """
         wanted = self.config.attack
         first = seed == 0 or wanted.nominal_start
         return self._starts(scenario, wanted.starts, seed, nominal_first=first)
 
     def measured_starts(self, scenario: str) -> torch.Tensor:
-        """Start poses ``[M, 3]`` float64 from which all methods and seeds are measured, about the nominal one; no search has them."""
+        """Start poses ``[M, 3]`` float64 from which all methods and seeds are measured, around the nominal one; no search uses them."""
         wanted = self.config.measure
         return self._starts(scenario, wanted.starts, wanted.seed, nominal_first=False)
 
@@ -414,6 +414,6 @@ class Experiment(Variants):
 
 
 def as_json(description: WorldDescription) -> dict[str, Any]:
-    """A description as it is read back from a file."""
+    """A description after a round trip through JSON."""
     data: dict[str, Any] = json.loads(json.dumps(description.to_dict()))
     return data

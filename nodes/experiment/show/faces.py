@@ -1,4 +1,4 @@
-"""A face on a panel of the world: its object in the learned scene, the space of its colours, and how training and deployment show it."""
+"""A face on a panel of the world: its object in the learned scene, the space of its colours, and its presentation in training and deployment."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def wanted_face(experiment: Experiment) -> FaceCarrier:
 
 
 def panel_of(experiment: Experiment) -> Panel:
-    """What carries the face.
+    """The panel of the face.
 
     Raises:
         ConfigError: The world has no such panel.
@@ -59,7 +59,7 @@ def on_screen(experiment: Experiment) -> bool:
 
 
 def face_object(experiment: Experiment) -> VoxelGridObject:
-    """The cube's face that is seen, on its panel, in one colour."""
+    """The visible face of the cube, on its panel, in one colour."""
     wanted, panel = wanted_face(experiment), panel_of(experiment)
     pose = panel.T_world_from_face @ make_transform(np.eye(3), [FACE_OFFSET_M, 0.0, 0.0])
     return cube_face_object(panel.square_m, wanted.resolution, wanted.plain_rgb, pose)
@@ -68,12 +68,12 @@ def face_object(experiment: Experiment) -> VoxelGridObject:
 def corners_on(panel: Panel) -> Array:
     """Corners ``[4, 3]`` of the face in its panel's frame: top left, top right, bottom right, bottom left for a viewer [m]."""
     half = 0.5 * panel.square_m
-    # Facing the panel one looks along its -x with z up, so left is its -y.
+    # A viewer of the panel looks along its -x with z up, so left is its -y.
     return np.array([[0.0, -half, half], [0.0, half, half], [0.0, half, -half], [0.0, -half, -half]])
 
 
 def display_of(experiment: Experiment) -> DisplayModel:
-    """What the driving camera sees of the screen's colours, as measured in the capture stage."""
+    """Optics of the screen for the driving camera, measured in the capture stage."""
     return load_calibration(DisplayCalibration, experiment.calibration_folder / DISPLAY).display
 
 
@@ -83,9 +83,9 @@ def face_space(
     """The colours of the face in the learned scene.
 
     Args:
-        experiment: With a learned scene.
-        background: Of the scene, if it is loaded already.
-        ideal: Whether a screen is taken for ideal; None as the experiment says.
+        experiment: Experiment with a learned scene.
+        background: Renderer of the scene, if it is loaded already.
+        ideal: Whether a screen is assumed ideal; None uses the experiment's setting.
     """
     field, panel, wanted = face_object(experiment), panel_of(experiment), wanted_face(experiment)
     surrogate = Surrogate(
@@ -99,7 +99,7 @@ def face_space(
 
 
 def mean_cos_angle(experiment: Experiment) -> float:
-    """Cosine of the angle at which the camera looks at the panel, in the mean of the measured stretch of all paths, while it sees it."""
+    """Cosine of the camera's viewing angle to the panel, averaged over the measured stretch of all paths where the panel is visible."""
     panel, ticks = panel_of(experiment), np.arange(experiment.config.horizon + 1)
     parts = []
     for name, path in experiment.paths.items():
@@ -115,17 +115,17 @@ def mean_cos_angle(experiment: Experiment) -> float:
 
 
 def plain_screen(experiment: Experiment) -> Rgb:
-    """What the screen shows without an attack."""
+    """Picture of the screen without an attack."""
     return plain_picture(panel_of(experiment), wanted_face(experiment).plain_rgb)
 
 
 class PaintedScene:
     """A deployment scene with a face on its panel, as the policy sees it: `nodes.experiment.show.deployed.Dressed` for a face.
 
-    A board's face is drawn by the code that draws it live; a screen shows it, and the scene is seen again, as no projection knows its optics.
+    A board's face is drawn by the same code as live; a screen shows it, and the scene is rendered again, as no projection models its optics.
 
     Args:
-        experiment: Whose face.
+        experiment: Experiment of the face.
         scene: The open scene.
         texture_px: Size of the texture that is shown.
     """
@@ -143,7 +143,7 @@ class PaintedScene:
         return
 
     def prepare(self, states: Array) -> Array:
-        """The states ``[B, 3]`` themselves: a scene is asked for every picture."""
+        """The states ``[B, 3]`` themselves: the scene renders each picture on request."""
         return np.asarray(states, dtype=np.float64)
 
     def policy_images(self, frames: Any, theta: Tensor | None) -> Rgb:
@@ -151,7 +151,7 @@ class PaintedScene:
         return np.stack([self.view.image(self.camera_image(state, theta)) for state in frames])
 
     def seen_now(self, theta: Tensor | None) -> Rgb:
-        """Policy image ``[66, 200, 3]`` of the car where it is now."""
+        """Policy image ``[66, 200, 3]`` at the car's current pose."""
         state = self.scene.state
         return self.view.image(self.camera_image(np.array([state.x_m, state.y_m, state.yaw_rad]), theta))
 
@@ -163,7 +163,7 @@ class PaintedScene:
         return rgb if theta is None else self._on_board(rgb, state, theta)
 
     def paint(self, rgb: Rgb, state: Array, theta: Tensor) -> Rgb:
-        """A camera image ``[H, W, 3]`` with the face, from one without that was seen from the same state ``[3]``."""
+        """A camera image ``[H, W, 3]`` with the face, from one without it from the same state ``[3]``."""
         return self._on_board(rgb, state, theta) if self._plain is None else self._on_screen(state, theta)
 
     def _observed(self, state: Array) -> Rgb:

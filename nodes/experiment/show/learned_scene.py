@@ -1,4 +1,4 @@
-"""The scene that an experiment of any kind has learned: its file, and how near it comes to held-out views of the driving camera."""
+"""The learned scene of an experiment of any kind: its file, and its fidelity on held-out views of the driving camera."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from advnerf_core.scene.render_field import FieldRenderer
 from nodes.experiment.engine.run_folder import RunFolder
 from nodes.runtime.progress import Report
 
-HELD_OUT = "held_out"  # the captured set that nothing learns from
-FIDELITY = "fidelity.json"  # how near the learned scene comes to it
+HELD_OUT = "held_out"  # the captured set that is held out from learning
+FIDELITY = "fidelity.json"  # comparison of the learned scene with it
 
 
 def scene_file(experiment: RunFolder[Any]) -> Path:
@@ -28,7 +28,7 @@ def scene_file(experiment: RunFolder[Any]) -> Path:
 
 
 def baked_file(experiment: RunFolder[Any]) -> Path:
-    """Where the scene is as voxels, if it was baked."""
+    """File of the baked scene, if any."""
     return experiment.stage_folder("bake") / "baked.safetensors"
 
 
@@ -38,7 +38,7 @@ def load_field(experiment: RunFolder[Any]) -> FieldRenderer:
 
 
 def load_background(experiment: RunFolder[Any]) -> FieldRenderer | BakedScene:
-    """The trained scene in the colours of the driving camera, quick where it was baked."""
+    """The trained scene in the colours of the driving camera, fast if it was baked."""
     file = baked_file(experiment)
     return BakedScene.load(file) if file.exists() else load_field(experiment)
 
@@ -54,10 +54,10 @@ def compare_views(experiment: RunFolder[Any], view: PolicyView, begin: float, re
     PSNR and SSIM are taken at the camera's size and at the policy's: there the field's own render against the resized image.
 
     Args:
-        experiment: Captured and learned.
-        view: What the policy sees of the driving camera.
-        begin: Share of the stage that is done already.
-        report: Told the progress.
+        experiment: Experiment with captured and learned scene.
+        view: The policy's view of the driving camera.
+        begin: Share of the stage that is finished already.
+        report: Progress callback.
     """
     folder, renderer = experiment.stage_folder("scene"), load_field(experiment)
     listed = load_transforms(experiment.stage_folder("capture") / HELD_OUT, require_all=True)

@@ -1,4 +1,4 @@
-"""Stage object: cars and hydrants as voxels; and all objects, panels too, as they stand in the world."""
+"""Stage object: cars and hydrants as voxels; and all objects, panels too, at their places in the world."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ GENERATOR_OF: dict[str, str] = {"small_car": "car", "hydrant": "hydrant"}
 
 
 def run(experiment: Experiment, folder: Path, report: Report) -> None:
-    """Write one object file for each kind; where they stand is not part of it."""
+    """Write one object file for each kind, without places."""
     kinds = sorted({thing.kind for thing in experiment.config.objects} - {PANEL})
     for index, kind in enumerate(kinds):
 
@@ -37,7 +37,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
 
 
 def build(experiment: Experiment, kind: str, progress: Any = None) -> ObjectModel:
-    """One kind of object: from its generator, from a user's mesh, or as a user has built it.
+    """One kind of object: from its generator, from a user's mesh, or from a user's object file.
 
     Raises:
         MeshError, ObjectFileError: The user's file cannot be read.
@@ -56,7 +56,7 @@ def build(experiment: Experiment, kind: str, progress: Any = None) -> ObjectMode
 
 
 def object_file(experiment: Experiment, kind: str) -> Path:
-    """Where a kind of object is."""
+    """File of a kind of object."""
     return experiment.stage_folder("object") / f"{name_of(kind).partition('.')[0]}.object.safetensors"
 
 
@@ -75,7 +75,7 @@ def placed_objects(experiment: Experiment) -> list[VoxelGridObject]:
 def panel_object(
     experiment: Experiment, side_m: float, T_world_from_face: Array | None = None
 ) -> VoxelGridObject:
-    """A panel in its plain colour: opaque, seen from its front."""
+    """A panel in its plain colour: opaque, visible from its front."""
     wanted = experiment.config.object
     return cube_face_object(side_m, wanted.panel_resolution, wanted.panel_rgb, T_world_from_face)
 
@@ -95,7 +95,7 @@ def surrogate_of(
 
 
 def last_result_kept(render: BackgroundRenderer) -> BackgroundRenderer:
-    """The same renderer, which does not render twice in a row for the same poses (plain and textured views of one state)."""
+    """The same renderer with a cache of its last result (for plain and textured views of one state)."""
     last: list[tuple[Array, Pinhole, Any]] = []
 
     def remembered(poses: Array, pinhole: Pinhole) -> Any:
@@ -107,5 +107,5 @@ def last_result_kept(render: BackgroundRenderer) -> BackgroundRenderer:
 
 
 def random_theta(shape: tuple[int, ...], sigma: float, rng: np.random.Generator) -> torch.Tensor:
-    """Grid values as the random attack draws them."""
+    """Random grid values, drawn as in the random attack."""
     return torch.from_numpy(sigma * rng.standard_normal(shape, dtype=np.float32))

@@ -1,7 +1,7 @@
-"""Where a panel stands by a rule: the first spot beside a path where it fits and is seen for long enough.
+"""Places a panel by a rule: the first spot beside a path where it fits and is visible for long enough.
 
-A hand that places an object knows what it is for. This rule knows the world's description, its depth, and the drive without an error
-along the path; it is run while the world is photographed, before there is a learned scene or a victim.
+Placing by hand may use knowledge of the attack. This rule uses only the world's description, its depth, and the drive without an error
+along the path; it runs while the world is photographed, before there is a learned scene or a victim.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from nodes.experiment.plan.placed import PlacedObject, RuledObject, in_a_lane
 from nodes.experiment.show.context import Experiment
 from nodes.runtime.errors import ConfigError
 
-# Of half a lane: steps along the path and away from it, and how far away is looked.
+# In half lanes: steps along the path and away from it, and the largest distance.
 _ALONG, _AWAY, _FARTHEST = 0.25, 0.25, 6.0
-# Share of a panel's points that must be seen, what the scene's depth may be off by, and the steepest view [cos].
+# Share of a panel's points that must be visible, the tolerance of the scene's depth, and the steepest view [cos].
 _SEEN, _DEPTH_SHARE, _FACING = 0.9, 0.03, 0.3
 _FACE = np.stack(np.meshgrid(*[np.linspace(-0.95, 0.95, 7)] * 2), axis=-1).reshape(
     -1, 2
@@ -31,21 +31,21 @@ _FACE = np.stack(np.meshgrid(*[np.linspace(-0.95, 0.95, 7)] * 2), axis=-1).resha
 
 @dataclass(frozen=True)
 class SeenFrom:
-    """What the driving camera sees from one place of the drive: ``T_camera_from_world`` and depth ``[H, W]`` [m]."""
+    """View of the driving camera from one pose of the drive: ``T_camera_from_world`` and depth ``[H, W]`` [m]."""
 
     T_camera_from_world: Array
     depth_m: Depth
 
 
 def place_by_rule(experiment: Experiment, world: World) -> list[PlacedObject]:
-    """All objects of an experiment, those with a rule where it puts them.
+    """All objects of an experiment, with the places of those that have a rule.
 
     Args:
-        experiment: Its world must be described.
-        world: The same, open.
+        experiment: Experiment whose world is described.
+        world: The same world, open.
 
     Raises:
-        ConfigError: There is no such spot.
+        ConfigError: No spot fits the rule.
     """
     views: dict[str, list[SeenFrom]] = {}
     standing = [each for each in experiment.config.objects if isinstance(each, PlacedObject)]
@@ -96,7 +96,7 @@ def _views(experiment: Experiment, world: World, name: str) -> Iterator[SeenFrom
 
 
 def _spots(experiment: Experiment, wanted: RuledObject, name: str) -> Iterator[PlacedObject]:
-    """Spots in the order in which they are tried: along the drive, right before left, near before far."""
+    """Spots in the order of trial: along the drive, right before left, near before far."""
     path, half_lane_m = experiment.paths[name], experiment.world.off_track_m
     drive = clean_poses(experiment, name)
     ahead_m = wanted.stands.seen_s * experiment.car.speed_mps
@@ -105,7 +105,7 @@ def _spots(experiment: Experiment, wanted: RuledObject, name: str) -> Iterator[P
     sides = {"right": (-1.0,), "left": (1.0,), "either": (-1.0, 1.0)}[wanted.stands.side]
     for passed_m in np.arange(ahead_m, length_m, _ALONG * half_lane_m):
         x, y, yaw = np.asarray(path.pose_at(begin_m + passed_m)).tolist()
-        # It looks at where the car is when it must begin to be seen.
+        # It faces the car's position at the time when it must begin to be visible.
         car = np.asarray(path.pose_at(begin_m + passed_m - ahead_m))[:2]
         for side in sides:
             for away_m in half_lane_m * np.arange(1.0, _FARTHEST, _AWAY):
@@ -121,7 +121,7 @@ def _fits(
     views: Sequence[SeenFrom],
     wanted: RuledObject,
 ) -> bool:
-    """Whether a spot is beside the lanes, free of other objects, and seen long enough."""
+    """Whether a spot is beside the lanes, free of other objects, and visible long enough."""
     if in_a_lane([spot], experiment.world) is not None:
         return False
     for other in standing:
@@ -136,7 +136,7 @@ def _fits(
 
 
 def seen_from(experiment: Experiment, world: World, panel: PlacedObject, least_px: float) -> list[Pose]:
-    """Poses of the drive without an error along the first path from which nearly all of a panel is seen."""
+    """Poses of the drive without an error along the first path from which nearly all of a panel is visible."""
     name = experiment.config.paths[0]
     poses = [(float(x), float(y), float(yaw)) for x, y, yaw in clean_poses(experiment, name)]
     views = _views(experiment, world, name)
@@ -149,7 +149,7 @@ def is_seen(experiment: Experiment, spot: PlacedObject, view: SeenFrom, least_px
     """Whether nearly all of a panel is in the policy's window, in front of the scene, facing the camera and large enough."""
     T_camera_from_face = view.T_camera_from_world @ spot.T_world_from_face
     middle, normal = T_camera_from_face[:3, 3], T_camera_from_face[:3, 0]
-    # Its middle alone decides for most spots.
+    # The panel's middle alone decides for most spots.
     if middle[2] <= 0.0 or spot.side_m * experiment.view.pinhole.fy < least_px * middle[2]:
         return False
     if -(middle @ normal) < _FACING * math.sqrt(middle @ middle):

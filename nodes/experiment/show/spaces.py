@@ -1,4 +1,4 @@
-"""The spaces of an experiment: its objects, or a face on a panel, as what a search may change; and how a deployment shows them."""
+"""The search spaces of an experiment, its objects or a face on a panel, and their presentation in the deployment."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def colour_space(experiment: Experiment, surrogate: Surrogate | None = None) -> 
 
 
 def make_space(experiment: Experiment, scene: World | None) -> Space:
-    """The space that the experiment's section ``space`` asks for.
+    """The space of the experiment's section ``space``.
 
     Args:
         experiment: Its scene and objects must be there, for meshes nothing.
@@ -83,16 +83,16 @@ def make_space(experiment: Experiment, scene: World | None) -> Space:
 
 
 def dress(experiment: Experiment, scene: World, shown: Shown) -> Dressed:
-    """An open deployment scene that shows what a search found; see `shown_there` for its colours."""
+    """An open deployment scene with the attacked objects; see `shown_there` for its colours."""
     if has_face(experiment):
         return PaintedScene(experiment, scene)
     return stand_in(experiment.view, scene, shown.objects, experiment.config.carrier.kind == "native")
 
 
 def shown_there(experiment: Experiment, shown: Shown, attack: AttackFile | None) -> Tensor | None:
-    """What a dressed scene is asked to show: colours of objects; of a face those that are displayed, which a screen changes, or None.
+    """Parameters for an attacked deployment scene: colours of objects; for a face the displayed colours, which a screen changes, or None.
 
-    A composed object has the colours that are seen; what the world's own light falls on has those that are painted.
+    A composed object gets the seen colours; an object in the world's own light gets the painted ones.
     """
     if attack is None or attack.face is None:
         native = experiment.config.carrier.kind == "native" and shown.painted is not None
@@ -158,7 +158,7 @@ def random_placements(experiment: Experiment, count: int, seed: int) -> list[tup
 
 
 def geometry_sha256(experiment: Experiment, kind: str) -> str:
-    """Hash of the object file of a kind; of a panel, that of the panel at scale 1."""
+    """Hash of the object file of a kind; for a panel, the hash of the panel at scale 1."""
     if kind == PANEL:
         return panel_object(experiment, MADE_HERE_M[PANEL][1]).sha256
     path = object_file(experiment, kind)
@@ -180,5 +180,5 @@ def _named_voxels(experiment: Experiment) -> list[NamedObject]:
 
 @lru_cache(maxsize=8)
 def _file_sha256(path: Path, changed_ns: int) -> str:
-    del changed_ns  # a changed file is another entry of the cache
+    del changed_ns  # part of the cache's key
     return sha256_of(path)

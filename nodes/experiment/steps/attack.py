@@ -1,4 +1,4 @@
-"""The part of a cell in the surrogate: the search, its attack file, and the drives past what was found."""
+"""The surrogate part of a cell: the search, its attack file, and the drives past the attack."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ _STATE = "state.safetensors"
 def surrogate_part(
     experiment: Experiment, space: Space, cell: Cell, folder: Path, report: Callable[..., None]
 ) -> dict[str, Any]:
-    """Search if the cell has a method, drive in the surrogate, and keep both; what is there already is read.
+    """Search if the cell has a method, drive in the surrogate, and store both; existing parts are read.
 
     Args:
         experiment: The experiment.
-        space: What is searched.
-        cell: Which.
-        folder: The cell's; gets ``attack.safetensors`` and ``surrogate.json``.
-        report: Told the finished fraction.
+        space: The search space.
+        cell: The cell.
+        folder: Folder of the cell, for ``attack.safetensors`` and ``surrogate.json``.
+        report: Called with the finished fraction.
 
     Returns:
         Attack id (None without an attack), states and metrics of the drives, the curve of the search [m], and its seconds.
@@ -89,13 +89,13 @@ def surrogate_part(
 
 
 def surrogate_drives(experiment: Experiment, space: Space, cell: Cell, folder: Path) -> dict[str, Any]:
-    """Drives in the surrogate from the measured starts, past what the attack file in a folder says.
+    """Drives in the surrogate from the measured starts, past the attack in a folder.
 
     Args:
         experiment: The experiment.
-        space: What was searched.
-        cell: Which; of a control nothing is read.
-        folder: Holds ``attack.safetensors``.
+        space: The search space.
+        cell: The cell; for a control no file is read.
+        folder: Folder with ``attack.safetensors``.
 
     Returns:
         States ``[S, T + 1, n]``, commands ``[S, T]`` and metrics, as JSON data.
@@ -119,7 +119,7 @@ def attack_problem(
 ) -> AttackProblem:
     """The attack on one victim on one drive, with the starts of one seed."""
     attack, robustness = experiment.config.attack, experiment.config.attack.robustness
-    # Drives of one start differ by what is drawn in them.
+    # Drives of one start differ by their random draws.
     starts = experiment.start_states(scenario, seed).repeat_interleave(robustness.repeats, dim=0)
     goals = _goals(told(experiment, policy.policy, scenario), len(starts))
     objective = load_objective(attack.objective)
@@ -148,19 +148,19 @@ def _goals(goal: tuple[float, ...], count: int) -> torch.Tensor | None:
 
 
 def from_measured_starts(experiment: Experiment, scenario: str, problem: AttackProblem) -> AttackProblem:
-    """The problem from the starts, and over the horizon, that are measured; nothing disturbs what is seen."""
+    """The problem with the measured starts and horizon, and without disturbances."""
     starts = experiment.measured_starts(scenario)
     goals = _goals(told(experiment, problem.policy, scenario), len(starts))
     return replace(problem.undisturbed(), start_states=starts, goals=goals, steps=experiment.config.horizon)
 
 
 def past(problem: AttackProblem, space: Space, shown: Shown) -> AttackProblem:
-    """The problem with the surrogate as its sensor, in which objects stand as they are shown; its theta are their colours."""
+    """The problem with the surrogate as its sensor, with the shown objects; its theta are their colours."""
     return replace(problem, sensor=shown.seen_by(space.surrogate))
 
 
 def past_field(experiment: Experiment, problem: AttackProblem, space: Space, shown: Shown) -> AttackProblem:
-    """`past` in the learned scene itself, where searches look at it baked: it is what a finished attack is judged by."""
+    """`past` in the learned scene itself, if searches use the baked one: finished attacks are judged by it."""
     seen = shown.seen_by(space.surrogate)
     if not over_the_world(experiment):
         seen = seen.with_background(load_field(experiment))
@@ -168,7 +168,7 @@ def past_field(experiment: Experiment, problem: AttackProblem, space: Space, sho
 
 
 def load_shown(space: Space, folder: Path, cell: Cell) -> Shown:
-    """The objects as a search found them, of its attack file; of a control as they are, or none."""
+    """The attacked objects of a search's attack file; for a control the plain objects, or none."""
     if cell.method == EMPTY:
         return Shown((), torch.zeros(0, 3))
     attack = load_found(folder, cell)
@@ -176,12 +176,12 @@ def load_shown(space: Space, folder: Path, cell: Cell) -> Shown:
 
 
 def load_found(folder: Path, cell: Cell) -> AttackFile | None:
-    """The attack file of a search; None of a control."""
+    """The attack file of a search; None for a control."""
     return load_attack(folder / ATTACK) if cell.searched else None
 
 
 def search_settings(experiment: Experiment, method: Method) -> SearchSettings:
-    """What a search may spend."""
+    """Budget and settings of a search."""
     attack, space = experiment.config.attack, experiment.config.space
     cells = space.cells if isinstance(space, ColoursConfig) else 0
     return SearchSettings(
@@ -198,7 +198,7 @@ def search_settings(experiment: Experiment, method: Method) -> SearchSettings:
 
 
 def planned_evaluations(experiment: Experiment) -> int:
-    """Drives of each search."""
+    """Number of drives of each search."""
     space = experiment.config.space
     return (space if isinstance(space, PlacesConfig) else experiment.config.attack).evaluations
 

@@ -1,4 +1,4 @@
-"""What is fixed before the first search against a victim, so that nothing of it can be changed once results are known."""
+"""Hashes that are fixed before the first search against a victim, so that nothing can be changed once results are known."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from nodes.runtime.errors import RuntimeFault
 
 
 class FrozenChangedError(RuntimeFault):
-    """Something that was fixed before the first attack is no longer what it was."""
+    """Something that was fixed before the first attack has changed."""
 
 
 def frozen_hashes(experiment: Experiment) -> dict[str, str]:
-    """What is fixed before the first attack: scene, victims, objects and their places, starts and seeds."""
+    """Hashes fixed before the first attack: scene, victims, objects and their places, starts and seeds."""
     policies = {f"policy_{name}": victim_sha256(experiment, name) for name in experiment.config.attacked}
     starts = {
         f"{scenario} {seed}": experiment.start_states(scenario, seed).tolist()
@@ -35,13 +35,13 @@ def frozen_hashes(experiment: Experiment) -> dict[str, str]:
         **_frozen_place(experiment),
         **policies,
         "starts_and_seeds": hash_of(starts),
-        # As the experiment was run: a report may be of fewer methods.
+        # As the experiment was run: a report may have fewer methods.
         "config": hash_of(read_json(experiment.folder / "manifest.json")["config"]),
     }
 
 
 def frozen_for(experiment: Experiment, cell: Cell) -> dict[str, str]:
-    """What is fixed before the search of a cell; other seeds and victims do not matter to it."""
+    """Hashes fixed before the search of a cell; they do not depend on other seeds and victims."""
     return {
         **_frozen_place(experiment),
         "policy": victim_sha256(experiment, cell.victim),
@@ -55,7 +55,7 @@ def frozen_for(experiment: Experiment, cell: Cell) -> dict[str, str]:
 
 
 def _frozen_place(experiment: Experiment) -> dict[str, str]:
-    """Scene, objects, and where they stand."""
+    """Scene, objects, and their places."""
     things = experiment.objects
     return {
         "scene": scene_sha256(experiment),
@@ -68,7 +68,7 @@ def _frozen_place(experiment: Experiment) -> dict[str, str]:
 
 
 def freeze(experiment: Experiment, cell: Cell, folder: Path) -> None:
-    """Write what is fixed before the search of a cell, once."""
+    """Write the hashes fixed before the search of a cell, once."""
     if not (folder / FROZEN).exists():
         fixed = frozen_for(experiment, cell)
         fixed["hardness"] = passing_digest(experiment, fixed["policy"])
@@ -76,15 +76,15 @@ def freeze(experiment: Experiment, cell: Cell, folder: Path) -> None:
 
 
 def hardness_before(folder: Path) -> str:
-    """Digest of the passing verdict of the victim that was there when a search began; empty without one."""
+    """Digest of the victim's passing verdict when a search began; empty without one."""
     return str(read_json(folder / FROZEN).get("hardness", "")) if (folder / FROZEN).exists() else ""
 
 
 def check_frozen(experiment: Experiment, cell: Cell, folder: Path) -> None:
-    """Refuse to drive if scene, victims, objects, places or starts are not those of the search.
+    """Raise if scene, victims, objects, places or starts differ from the search's.
 
     Raises:
-        FrozenChangedError: Something of it changed.
+        FrozenChangedError: One of them changed.
     """
     then, now = read_json(folder / FROZEN), frozen_for(experiment, cell)
     changed = [name for name, value in now.items() if then.get(name) != value]

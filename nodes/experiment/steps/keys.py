@@ -1,4 +1,4 @@
-"""What a cell depends on, by which it is known whether it is done; and where what its methods share is kept."""
+"""Keys of cells, which decide whether they are finished; and the folders that their methods share."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from nodes.experiment.show.given import given, given_in, victim_sha256, victim_s
 from nodes.experiment.steps import bake
 from nodes.runtime.errors import RuntimeFault
 
-# The stages that cells need of their experiment; what comes after is the cells themselves.
+# The stages that cells need; later ones are the cells themselves.
 NEEDED = ("capture", "scene", "policy", "object")
-# As of a stage (`pipeline.VERSIONS`): raised when what a cell finds changes with the same settings.
+# Like a stage's version (`pipeline.VERSIONS`): raised when the result of a cell changes with the same settings.
 VERSION = 4  # 4: textures are rounded to half precision before they are driven past
-# What a cell does not depend on: which others there are, how much memory may be used, and what is an input of its own below.
+# Settings that a cell does not depend on: other cells, memory limits, and values that are separate inputs below.
 FREE: Mapping[str, Any] = {
     "name": True,
     "paths": True,
@@ -46,20 +46,20 @@ _SEARCHED_WITH = {"evaluations", "horizon", "learning_rate", "population", "time
 
 
 class NoSuchCellError(RuntimeFault):
-    """A cell was asked for that this experiment does not have."""
+    """The experiment has no such cell."""
 
 
 def cell_settings(experiment: Experiment, cell: Cell, deployed: bool = True) -> Settings:
-    """What a cell depends on: the resolved world (of a server, not its address), settings, and what the stages before it wrote.
+    """Settings that a cell depends on: the resolved world (without a server's address), settings, and the outputs of the earlier stages.
 
     Args:
         experiment: The experiment.
-        cell: Which.
-        deployed: Whether it is deployed too; else it is the search alone, which does not depend on the section ``deploy`` nor on what of
-            the world changes only how its own car moves (`Traits.unseen`).
+        cell: The cell.
+        deployed: Whether it is deployed too; else the search alone counts, which depends neither on the section ``deploy`` nor on world settings
+            that change only how its own car moves (`Traits.unseen`).
 
     Raises:
-        CellError: No such drive, victim or method.
+        CellError: The experiment has no such drive, victim or method.
     """
     require_known(experiment, cell)
     free, given_victims = dict(FREE), given_in(experiment.config)
@@ -83,7 +83,7 @@ def cell_settings(experiment: Experiment, cell: Cell, deployed: bool = True) -> 
     if cell.victim in (*given_victims, RETRAINED):
         inputs["policy_sha256"] = _policy_sha256(experiment, cell.victim)
     if not deployed:
-        # Objects are searched alike, however they are shown to the car.
+        # Objects are searched in the same way for any presentation to the car.
         free |= (
             {"deploy": True} if has_face(experiment) else {"deploy": True, "carrier": {"kind", "training"}}
         )
@@ -93,7 +93,7 @@ def cell_settings(experiment: Experiment, cell: Cell, deployed: bool = True) -> 
 
 
 def _policy_sha256(experiment: Experiment, victim: str) -> str | None:
-    """Content hash of a policy that the stage policy does not make; None of one that is not retrained yet."""
+    """Content hash of a policy that the stage policy does not make; None for one that is not retrained yet."""
     if victim == RETRAINED and not Path(victim_spec(experiment, victim)).exists():
         return None
     return victim_sha256(experiment, victim)
@@ -102,7 +102,7 @@ def _policy_sha256(experiment: Experiment, victim: str) -> str | None:
 def _common_inputs(experiment: Experiment, deployed: bool = True) -> dict[str, Any]:
     """Inputs of all cells of an experiment: versions, worlds and view."""
     config = experiment.config
-    # Objectives on the path judge states alone; others may judge by the car's body.
+    # Objectives on the path judge states alone; others may use the car's body.
     seen = not deployed and config.attack.objective in ON_THE_PATH
     return {
         "version": VERSION,
@@ -114,7 +114,7 @@ def _common_inputs(experiment: Experiment, deployed: bool = True) -> dict[str, A
 
 
 def registered_settings(experiment: Experiment) -> Settings:
-    """Settings that all cells of an experiment depend on, known before any stage is run: what a registration fixes."""
+    """Settings that all cells of an experiment depend on, known before any stage is run: the content of a registration."""
     config = experiment.config
     code = {
         "objective": objective_key(config.attack.objective),
@@ -124,15 +124,15 @@ def registered_settings(experiment: Experiment) -> Settings:
 
 
 def settings_hash(experiment: Experiment, cell: Cell) -> str:
-    """The key of a cell: a hash of everything that its result depends on; a change of it makes the cell run again."""
+    """The key of a cell: a hash of everything that its result depends on; a change makes the cell run again."""
     return cell_settings(experiment, cell).key
 
 
 def require_known(experiment: Experiment, cell: Cell) -> None:
-    """Refuse a cell that there cannot be.
+    """Raise for an impossible cell.
 
     Raises:
-        CellError: No such drive, victim or method.
+        CellError: The experiment has no such drive, victim or method.
     """
     retrained = [] if experiment.config.retrain is None else [RETRAINED]
     known: tuple[tuple[str, str, Sequence[str]], ...] = (
@@ -159,7 +159,7 @@ def require_known(experiment: Experiment, cell: Cell) -> None:
 
 
 def _require_gradient(experiment: Experiment, cell: Cell) -> None:
-    """A built-in method that needs a gradient cannot attack a black box; users' methods are asked when they search."""
+    """Check that a built-in method with a gradient does not attack a black box; users' methods are checked when they search."""
     method = METHODS.get(cell.code)
     if method is None or not method.needs_gradient or cell.victim not in given_in(experiment.config):
         return
@@ -171,12 +171,12 @@ def _require_gradient(experiment: Experiment, cell: Cell) -> None:
 
 
 def clean_folder(experiment: Experiment, cell: Cell, folder: Path) -> Path:
-    """Where the drives without attack of a cell go, which belong to all methods: beside the cells' folders, named by what they depend on."""
+    """Folder of a cell's drives without attack, which all methods share: beside the cells' folders, named by their key."""
     inputs = cell_settings(experiment, cell.clean).key
     return folder.parent / "shared" / f"{experiment.config.name}_{cell.clean.name}_{inputs[:12]}"
 
 
 def driven_folder(experiment: Experiment, cell: Cell) -> Path:
-    """Where the experiment itself has the drives of a cell: those without attack are shared by its methods."""
+    """Folder of a cell's drives in the experiment; its methods share the drives without attack."""
     folder = experiment.cell_folder(cell)
     return clean_folder(experiment, cell, folder) if cell.method == NONE else folder

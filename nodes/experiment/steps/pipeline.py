@@ -1,4 +1,4 @@
-"""The stages of an experiment: what each one reads of the experiment file, its other inputs, and its version."""
+"""The stages of an experiment: the parts of the experiment file that each reads, its other inputs, and its version."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from nodes.experiment.steps import bake, capture, live, policy, retrain, scene
 from nodes.launching.launch_file import load_launch
 from nodes.runtime.progress import MeasuringReport
 
-# Raised when what a stage makes changes with the same settings, or a default that it reads does: then its old results, and all that build
+# Raised when the output of a stage changes with the same settings, or a default that it reads does: then its old results, and all that build
 # on them, are made again. tests/nodes/experiment/test_versions.py fails where one of them changed and the version did not.
 VERSIONS = {"capture": 1, "scene": 3, "bake": bake.VERSION, "object": 2, "policy": 2, "retrain": 1, "live": 1}
-# What a stage may read of the experiment file, as `BaseModel.model_dump` includes it; its key has nothing else of the file. Worlds,
-# views, and code and files of a user's are inputs.
+# Parts of the experiment file that a stage may read, as `BaseModel.model_dump` includes them; its key has no others. Worlds,
+# views, and users' code and files are inputs.
 _CARRIER: dict[str, Any] = {"carrier": {"kind", "panel", "plain_rgb", "resolution", "response"}}
 _OBJECTS: dict[str, Any] = {"objects": True, "object": {"panel_resolution", "panel_rgb"}}
 _DRIVE: dict[str, Any] = {"paths": True, "horizon": True, "dt_s": True}
@@ -43,13 +43,13 @@ READS: Mapping[str, dict[str, Any]] = {
     },
     "live": {"deploy": {"nodes", "camera", "laps", "empty_scene"}, "held_cap_m": True, **_CARRIER, **_DRIVE},
 }
-# What the defence does not read of the gradient of the first seed, which it answers; the objective is an input.
+# Settings that the defence does not read of the first seed's gradient, which it answers; the objective is an input.
 _UNREAD_BY_RETRAIN: dict[str, Any] = {
     "carrier": {"kind"},
     "policy": NETWORK,
     "attack": {"objective", "population", "cache_mib"},
 }
-# Files that policies are trained with, beside what comes of it.
+# Training files of policies, besides the results.
 _TRAINING_FILES = ("frames", "*.checkpoint.safetensors", "*.shards.json", "settings.json")
 
 
@@ -60,7 +60,7 @@ class _Module(Protocol):
 def stages_of(experiment: Experiment) -> list[Stage]:
     """The stages that cells need; the world must not have been opened for them.
 
-    More rounds of retraining go on from those that are there.
+    More rounds of retraining resume from the existing ones.
     """
     config = experiment.config
     found = [_capture(experiment), _scene(experiment), _bake(experiment), _object(experiment)]
@@ -91,10 +91,10 @@ def _capture(experiment: Experiment) -> Stage:
     config = experiment.config
     unread: dict[str, Any] = {"carrier": {"resolution"}}
     inputs = {"world": experiment.seen_settings}
-    # What a screen shows is photographed; an overlay is drawn into pictures later.
+    # The picture of a screen is photographed; an overlay is drawn into pictures later.
     if not isinstance(config.carrier, ScreenConfig):
         unread["carrier"] = {"kind", "panel", "plain_rgb", "resolution"}
-    # A rule follows the drive that is measured; so does what looks for the light on a panel.
+    # A rule follows the measured drive; so does the search for the light on a panel.
     if experiment.has_rules or config.carrier.response == "measured":
         inputs["view"] = experiment.view_settings
     else:
@@ -122,14 +122,14 @@ def _object(experiment: Experiment) -> Stage:
 
 
 def _learned_from(experiment: Experiment) -> dict[str, Any]:
-    """Inputs of what is learned from pictures of the world and of the learned scene."""
+    """Inputs of results that are learned from pictures of the world and of the learned scene."""
     return {
         "world": experiment.world_settings,
         "view": experiment.view_settings,
-        # Not the digest of what was baked, as machines differ in the last bits of it.
+        # Without the digest of the baked scene, as machines differ in its last bits.
         "bake": VERSIONS["bake"],
         "architecture": experiment.config.policy.network.described(),
-        # Its default is not the same for all carriers, and whether the deployed drive shows objects otherwise does not matter.
+        # Its default differs between carriers, and it does not matter how the deployed drive shows objects.
         "training": experiment.config.carrier.training,
     }
 
@@ -138,7 +138,7 @@ def _policy(experiment: Experiment) -> Stage:
     config = experiment.config
     unread: dict[str, Any] = {"policy": NETWORK}
     unread |= dict.fromkeys(("objects", "object"), True) if has_face(experiment) else {"carrier": {"kind"}}
-    # The angle at which a screen is seen follows the drive that is measured, and so do rules in other places.
+    # The viewing angle of a screen follows the measured drive, and so do rules in other places.
     if not (isinstance(config.carrier, ScreenConfig) or config.policy.learns_in):
         unread["horizon"] = True
     settings = Settings.of(config, READS["policy"], unread, **_learned_from(experiment))

@@ -54,11 +54,11 @@ def draw_maps(
     """Drive over a grid of one object's places, and from starts beside its own past the object moved; in the learned scene.
 
     Args:
-        experiment: Its scene and objects must be there; its space are places.
+        experiment: Experiment with finished scene and objects, whose space is places.
         cell: The finished cell.
-        attack: What it found: the other objects stand, and all are coloured, as it found them.
-        number: Of the object.
-        folder: Gets ``landscape_<name>.json``, ``robustness_<name>.json`` and a PNG of each; finished points are kept there.
+        attack: Attack of the cell: the other objects keep its places, and all keep its colours.
+        number: Number of the moved object.
+        folder: Folder for ``landscape_<name>.json``, ``robustness_<name>.json`` and a PNG of each; it also stores finished points.
         report: Told the finished fraction.
         settings: What is mapped.
 

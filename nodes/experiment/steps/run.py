@@ -49,34 +49,34 @@ def load_experiment(
 
     Args:
         file: A ``*.experiment.yaml`` file.
-        setting: Which of its settings to lay over its values; None takes demo where it has settings.
+        setting: Name of the setting to lay over its values; None uses demo if it has settings.
         overrides: ``section.key=value`` texts, applied last.
-        folder: The run folder; None takes the file's ``run_folder``, or else one under ``runs``.
-        executes: Whether a world of a user's code may be executed; else the file's values are not checked against that world.
+        folder: The run folder; None uses the file's ``run_folder``, or else one under ``runs``.
+        executes: Whether a user's world may be executed; else the file's values are not checked against that world.
 
     Raises:
-        ConfigError: With file, line and the valid keys.
+        ConfigError: The file is wrong; with file, line and the valid keys.
     """
     return resolve(Experiment, file, setting, overrides, folder, executes, _load)
 
 
 def _load(experiment: Experiment, document: Document) -> Experiment:
-    """An experiment without variants, whose values fit its world, with what of its stages is kept with the code."""
+    """An experiment without variants, checked against its world, with the digests of its stages that are stored with the code."""
     if experiment.executes or not is_users(experiment.config.world):
         _check_world(experiment, document)
     if given_in(experiment.config):
         search_folder_last(
             str(experiment.file.parent)
-        )  # package.module:factory may lie beside the experiment file
+        )  # package.module:factory may be beside the experiment file
     try:
         stages = stages_of(experiment)
     except (VictimUnknownError, WorldUnknownError):
-        return experiment  # nothing was run with its victims or its world
+        return experiment  # it was never run with its victims or its world
     return replace(experiment, kept=stage_digests(stages, experiment.folder, REFERENCE))
 
 
 def _check_world(experiment: Experiment, document: Document) -> None:
-    """Refuse what does not fit the world, with the line of the file."""
+    """Raise for values that do not fit the world, with the line of the file."""
     read_world(document.part(("world",)), experiment.file.parent)
     _check_ticks(experiment, document)
     _check_objective(experiment, document)
@@ -87,7 +87,7 @@ def _check_world(experiment: Experiment, document: Document) -> None:
 
 
 def _check_ticks(experiment: Experiment, document: Document) -> None:
-    """A control tick must be whole steps of the world."""
+    """Check that a control tick is a whole number of the world's steps."""
     step_s, dt_s = experiment.traits.step_s, experiment.config.dt_s
     if step_s is not None and abs(round(dt_s / step_s) * step_s - dt_s) > _WHOLE_STEP_S:
         raise ConfigError(
@@ -97,7 +97,7 @@ def _check_ticks(experiment: Experiment, document: Document) -> None:
 
 
 def _check_objective(experiment: Experiment, document: Document) -> None:
-    """The objective collision needs a world that says what its car can hit; users' objectives are asked when they are loaded."""
+    """Check that the objective collision has a world with obstacles; users' objectives are checked when they are loaded."""
     if experiment.config.attack.objective == "collision" and experiment.solids is None:
         raise ConfigError(
             f"{document.place(('attack', 'objective'))}: attack.objective: expected an objective that needs no solids, as the world "
@@ -106,7 +106,7 @@ def _check_objective(experiment: Experiment, document: Document) -> None:
 
 
 def _check_places(experiment: Experiment, document: Document) -> None:
-    """Paths must be the world's, and objects must stand beside its lanes; said with the line of the file."""
+    """Check that paths exist in the world, and objects stand beside its lanes; errors have the line of the file."""
     for index, name in enumerate(experiment.config.paths):
         if name not in experiment.world.paths:
             message = unknown(name, "path", experiment.world.paths)
@@ -125,12 +125,12 @@ def _check_places(experiment: Experiment, document: Document) -> None:
             f"{document.place(('capture',))}: expected capture.colour_pairs of at least 1, as the photographs of the world "
             f"{experiment.named_world.kind} have colours of their own, got 0; 12 will do"
         )
-    if not given_in(experiment.config):  # policies that exist are looked at when the experiment is run
+    if not given_in(experiment.config):  # existing policies are checked when the experiment is run
         _ = experiment.view
 
 
 def _check_panel(carrier: FaceCarrier, experiment: Experiment, document: Document) -> None:
-    """The panel of a face must be the world's, and a screen exactly where a screen shows the face."""
+    """Check that the panel of a face exists in the world, and is a screen exactly if a screen shows the face."""
     panels = experiment.world.panels
     if carrier.panel not in panels:
         message = unknown(carrier.panel, "panel", panels)
@@ -173,8 +173,8 @@ def make_ready(
     anew: bool = False,
     watcher: StageDisplay | None = None,
 ) -> dict[str, Artefact]:
-    """Look at victims that exist, and run the stages that are not there yet: what cells need. Those that are kept with the code are there, unless
-    all is to be made ``anew``.
+    """Load existing victims, and run the unfinished stages that cells need. Stages stored with the code count as finished, unless
+    ``anew`` is set.
 
     Raises:
         AdvnerfError: A stage failed, or the policy's architecture cannot be built.
@@ -189,9 +189,9 @@ def make_ready(
 
 
 def prepare_victims(experiment: Experiment) -> None:
-    """Make scene, objects and policies, also the retrained one where the experiment retrains.
+    """Make scene, objects and policies, also the retrained one if the experiment retrains.
 
-    One round of it, if none is begun; rounds that were begun are gone on with, as many as were asked for then.
+    One round of retraining, if none was begun; begun rounds are resumed, with the number requested then.
     """
     wanted = experiment.config.retrain
     if wanted is None:
@@ -200,7 +200,7 @@ def prepare_victims(experiment: Experiment) -> None:
     begun = begun_with(stages_of(experiment), experiment.folder, "retrain")
     if begun is not None and Path(victim_spec(experiment, RETRAINED)).exists():
         return
-    # Its victim is that of the first round: the others are left to the experiment itself, which goes on from here.
+    # Its victim is the first round's: the others are left to the experiment itself, which resumes from here.
     rounds = 1 if begun is None else begun.resolved["retrain"]["rounds"]
     config = experiment.config.model_copy(update={"retrain": wanted.model_copy(update={"rounds": rounds})})
     make_ready(replace(experiment, config=config), until="retrain")
