@@ -121,7 +121,7 @@ def run_stages(
 def _read_whole(stages: Sequence[Stage], folder: Path, reference: ReferenceBuild | None) -> set[str]:
     """Stages whose intermediate files will be read, because a stage that reads them has to run."""
     there, whole = _current(stages, folder, reference), set()
-    # From the last to the first: a stage that runs to restore its intermediate files reads those of earlier ones.
+    # From the last to the first: a stage that runs to restore its intermediate files reads the files of earlier ones.
     for stage in reversed(stages):
         if stage.name not in there or (stage.name in whole and there[stage.name].kept is not None):
             whole |= set(stage.reads_bulk_of)

@@ -71,7 +71,7 @@ class Cell:
 
     @property
     def code(self) -> str:
-        """Its method's reference for `load_method`, or the name of a control."""
+        """Reference of the method for `load_method`, or the name of a control."""
         return self.reference or self.method
 
 

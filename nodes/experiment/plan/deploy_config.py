@@ -14,7 +14,7 @@ Positive = Annotated[int, Field(ge=1)]
 
 
 class DeployConfig(StrictModel):
-    """How, and how often, attacks are deployed. All but ``through``, ``starts``, ``car``, ``world`` and ``camera`` concerns live nodes only."""
+    """Deployment of attacks. All keys but ``through``, ``starts``, ``car``, ``world`` and ``camera`` concern live nodes only."""
 
     through: Literal["world", "nodes", "nothing"] = Field(
         default="world",

@@ -75,7 +75,7 @@ class AxisChange:
 
     Attributes:
         key: The key of the experiment, as a dotted path.
-        value: Its value in the variant.
+        value: Value of the key in the variant.
         origin: Place of the value in the experiment file.
     """
 

@@ -72,7 +72,7 @@ class FirstSeen(StrictModel):
         path: The path; None for the experiment's first.
         side: Side of the path.
         seen_s: Time for which a drive along the path sees nearly all of it, unhidden and from the front [s].
-        least_px: Its smallest height in the policy's picture during that time [px].
+        least_px: Smallest height in the policy's picture during that time [px].
     """
 
     path: str | None = None

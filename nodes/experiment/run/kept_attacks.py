@@ -1,4 +1,4 @@
-"""Attacks that are published with their cells: each search's attack, once, as it was driven past."""
+"""Attacks that are published with their cells: the attack of each search, once, as it was deployed."""
 
 from __future__ import annotations
 

@@ -79,7 +79,7 @@ def predicted(folder: Path, results: Sequence[CellResult]) -> list[Predicted]:
 
     Args:
         folder: Folder of the experiment, or of its published set.
-        results: Its finished cells.
+        results: Finished cells of the experiment.
     """
     pairs, drives = [], CellDrives(results)
     for cell in results:

@@ -194,7 +194,7 @@ class Experiment(Variants):
         """The world of the deployment, open; closed at the end.
 
         Raises:
-            ConfigError: It has other paths, another camera or another car than the captured world.
+            ConfigError: The world has other paths, another camera or another car than the captured one.
         """
         if self.config.deploy.world is None:
             with self.open_world() as world:

@@ -72,7 +72,7 @@ class NamedWorld:
         """The description before it is opened.
 
         Raises:
-            NotOpenError: It must be open for that.
+            NotOpenError: The world is not open.
         """
         return self.make().describe()
 

@@ -217,7 +217,7 @@ def _through(pinhole: Pinhole, rgb: Rgb, own: Pinhole, file: Path) -> Rgb:
     """A photograph as a camera with other intrinsics would have taken it from the same pose.
 
     Raises:
-        WorldError: It does not show the whole view of that camera.
+        WorldError: The photographs do not show that camera's whole view.
     """
     if pinhole == own:
         return rgb
