@@ -8,9 +8,11 @@ from __future__ import annotations
 import base64
 import io
 import os
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw, ImageFont  # comes with matplotlib
 
 from advnerf_core.report.conditions import style_of
+from advnerf_core.report.data import Film
 from advnerf_core.report.palette import DARK
 
 MAX_BYTES = 1_500_000
@@ -99,6 +102,13 @@ def write_clip(
     )
 
 
+def write_film(path: Path, tracks: Sequence[ClipTrack], rate_hz: float, off_track_m: float) -> Film:
+    """Write drives side by side as `write_clip` does, the attacked one last."""
+    file = write_clip(path, tracks, rate_hz, off_track_m)
+    moment = int(np.abs(np.asarray(tracks[-1].cte_m)).argmax())
+    return Film(file, tuple(each.title for each in tracks), moment)
+
+
 def compose(tracks: Sequence[ClipTrack], rate_hz: float = 10.0, off_track_m: float = 0.4) -> Iterator[Frames]:
     """Frames of the side-by-side video with their caption strips, ``[height, width, 3]``, both sides even."""
     steps = max(len(t.frames) for t in tracks)
@@ -125,16 +135,8 @@ def webp(frames: Sequence[Image.Image], frame_ms: float, quality: int) -> bytes:
     """An animated picture that repeats, as it stands in a README."""
     buffer = io.BytesIO()
     first, *others = frames
-    first.save(
-        buffer,
-        "WEBP",
-        save_all=True,
-        append_images=others,
-        duration=round(frame_ms),
-        loop=0,
-        quality=quality,
-        method=6,
-    )
+    options = {"duration": round(frame_ms), "loop": 0, "quality": quality, "method": 6}
+    first.save(buffer, "WEBP", save_all=True, append_images=others, **options)
     return buffer.getvalue()
 
 
@@ -153,15 +155,11 @@ def image_uri(image: Frames, quality: int | None = None) -> str:
     return f"data:{_MEDIA_TYPES[suffix]};base64,{base64.b64encode(encoded.tobytes()).decode()}"
 
 
-def film_strip(path: Path, count: int = 4) -> list[Frames]:
-    """Frames ``[height, width, 3]`` of a clip at equal intervals, including the last one, for print and posters."""
-    # Two passes: a long clip does not fit into memory, and WebM does not store its length.
+def frame_of(path: Path, number: int) -> Frames:
+    """One frame ``[height, width, 3]`` of a clip, by its number; the last one of a shorter clip."""
     with av.open(str(path)) as container:
-        length = sum(1 for _ in container.decode(video=0))
-    chosen = set(np.linspace(0, length - 1, min(count, length) + 1).round().astype(int)[1:].tolist())
-    with av.open(str(path)) as container:
-        frames = enumerate(container.decode(video=0))
-        return [np.asarray(f.to_ndarray(format="rgb24"), dtype=np.uint8) for i, f in frames if i in chosen]
+        (frame,) = deque(islice(container.decode(video=0), number + 1), maxlen=1)
+        return np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8)
 
 
 def _encode(path: Path, codec: str, quality: int, rate_hz: float, frames: Iterator[Frames]) -> None:

@@ -133,3 +133,11 @@ def order_of(name: str) -> tuple[int, str]:
         return special, name
     place = names.index(name)
     return (place if place < special else place + 1), name
+
+
+def compared(methods: Iterable[str]) -> dict[str, str]:
+    """What the first screen of a page compares, in its order: conditions with their titles. The attack is the gradient, or the last method."""
+    searched = [name for name in methods if name not in CONTROLS]
+    attack = "gradient" if "gradient" in searched else searched[-1]
+    random = [name for name in searched if name.startswith("random") and name != attack]
+    return {NONE: "no attack", **dict.fromkeys(random[:1], "best random"), attack: "attack"}

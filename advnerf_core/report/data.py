@@ -79,11 +79,11 @@ def face_segment(T_world_from_face: ArrayLike, width_m: float) -> NDArray[np.flo
 
 @dataclass(frozen=True, eq=False)
 class LossCurve:
-    """Total CTE of each evaluation of one search, mean over the start poses, ``[E]`` [m], in order of evaluation."""
+    """Excess |CTE| per tick of each evaluation of one search, ``[E]`` [m]: over the plain object, from its starts, over its ticks."""
 
     method: str
     seed: int
-    total_cte_m: Floats
+    excess_m: Floats
     victim: str = "hardened"
 
 
@@ -99,6 +99,21 @@ class Texture:
     victim: str = "hardened"
 
 
+@dataclass(frozen=True)
+class Film:
+    """A film of drives side by side.
+
+    Attributes:
+        file: The video.
+        titles: Captions of the drives, left to right.
+        moment: Number of the frame in which the last drive, which is the attacked one, is farthest from its path.
+    """
+
+    file: Path
+    titles: tuple[str, ...]
+    moment: int
+
+
 @dataclass(frozen=True, eq=False)
 class Drives:
     """All drives of one scenario.
@@ -109,7 +124,7 @@ class Drives:
         dt_s: Time between control ticks [s].
         runs: The drives.
         curves: Loss curves of the searches.
-        film: Images of the driving camera; None without a film.
+        film: The driving camera's images past the plain, random and attacked object; None without a film.
         seen: Camera images of the objects, by method.
     """
 
@@ -118,7 +133,7 @@ class Drives:
     dt_s: float
     runs: tuple[Run, ...]
     curves: tuple[LossCurve, ...] = ()
-    film: Path | None = None
+    film: Film | None = None
     seen: Mapping[str, Image] = field(default_factory=dict)
 
     @property
@@ -284,6 +299,7 @@ class ReportData:
         overview: The world from above; None if it has no such picture.
         textures: Displayed faces.
         fidelity: Fidelity of the learned scene.
+        done: What was searched and driven, in one paragraph.
         live: Whether the drives were live; the following fields are then shown, or named as missing.
         latency: Live timing.
         memory: Memory use of the adjoint.
@@ -296,6 +312,7 @@ class ReportData:
     overview: Image | None = None
     textures: tuple[Texture, ...] = ()
     fidelity: Fidelity | None = None
+    done: str = ""
     live: bool = False
     latency: Latency | None = None
     memory: tuple[MemoryRow, ...] = ()

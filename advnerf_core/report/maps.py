@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from matplotlib.patches import PathPatch, Polygon
 from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 
+from advnerf_core.report.conditions import style_of
 from advnerf_core.report.data import Drives, Laps, Run, Scene
 from advnerf_core.report.palette import LIGHT
 from advnerf_core.report.plots import add_run_legend, end_style, new_axes, run_style
@@ -18,12 +20,41 @@ from advnerf_core.report.plots import add_run_legend, end_style, new_axes, run_s
 Floats = NDArray[np.float64]
 
 _MARGIN_M = 0.15  # white around what a map shows
+_PLAN_IN, _MANY = 4.6, 6  # width of the first screen's map [inch]; drives of an arm that get thin lines
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """Drives past the same object: poses ``[T + 1, 2 or more]`` of each, x [m] and y [m] first."""
+
+    title: str
+    condition: str
+    poses: Sequence[Floats]
+
+
+def drives_from_above(scene: Scene, arms: Sequence[Arm]) -> Figure:
+    """All drives of some arms from above, with the track and the objects where they stand; for a page's first screen."""
+    driven = [np.asarray(poses)[:, :2] for arm in arms for poses in arm.poses]
+    box = _box(scene, [*driven, *scene.objects_m, *list(scene.faces_m.values())[:1]])
+    with new_axes(_PLAN_IN, min(_height_in(box, width_in=_PLAN_IN) + 0.25, _PLAN_IN)) as ax:
+        _draw_scene(ax, scene)
+        for level, arm in enumerate(arms):
+            line = {"color": style_of(arm.condition).light, "alpha": 0.85, "zorder": 2.0 + 0.1 * level}
+            line["lw"] = 1.8 if len(arm.poses) < _MANY else 0.9
+            for number, poses in enumerate(arm.poses):
+                label = arm.title if number == 0 else None
+                ax.plot(*np.asarray(poses)[:, :2].T, label=label, **line)
+                ax.plot(*np.asarray(poses)[-1, :2], "o", ms=3, **line)
+        _frame(ax, box)
+        ax.figure.legend(loc="outside upper left", ncols=3, columnspacing=1.2)
+    return ax.figure
 
 
 def trajectory_map(drives: Drives, victim: str, zoom: bool = True) -> Figure:
-    """All drives of one victim from above: either the driven part, or the whole scene."""
-    runs = drives.select(victim=victim)
-    box = _driven_box(drives.scene, runs) if zoom else _whole_box(drives.scene)
+    """All drives of one victim from above: either the part that any victim drove, or the whole scene."""
+    runs, faces = drives.select(victim=victim), list(drives.scene.faces_m.values())
+    driven = _box(drives.scene, [*(run.states[:, :2] for run in drives.runs), *faces[:1]])
+    box = driven if zoom else _whole_box(drives.scene)
     with new_axes(6.0, _height_in(box, legend=zoom)) as ax:
         _draw_scene(ax, drives.scene)
         for run in runs:
@@ -96,18 +127,9 @@ def _draw_face(ax: Any, segment: Floats, name: str) -> None:
         "", middle + 0.34 * front, middle, arrowprops={"arrowstyle": "-|>", "color": LIGHT["ink"], "lw": 1.0}
     )
     away = -11.0 * front
-    ax.annotate(
-        name,
-        middle,
-        xytext=tuple(away),
-        textcoords="offset points",
-        ha="center",
-        va="center",
-        size=8.5,
-        rotation=float(np.degrees(np.arctan2(along[1], along[0]))),
-        rotation_mode="anchor",
-        annotation_clip=True,
-    )
+    turn = float(np.degrees(np.arctan2(along[1], along[0])))
+    text = {"va": "center", "size": 8.5, "rotation": turn, "rotation_mode": "anchor", "color": LIGHT["ink"]}
+    _note(ax, middle, name, (away[0], away[1]), **text)
 
 
 def _draw_starts(ax: Any, runs: Sequence[Run]) -> None:
@@ -123,26 +145,24 @@ def _draw_starts(ax: Any, runs: Sequence[Run]) -> None:
             arrowprops={"arrowstyle": "-|>", "color": LIGHT["ink"], "lw": 1.2},
         )
     if runs:
-        _note(ax, runs[0].states[0, :2], "start", (-14, 9), ha="center")
+        _note(ax, runs[0].states[0, :2], "start", (-14, 9))
 
 
-def _note(ax: Any, at: Floats, text: str, offset_pt: tuple[float, float], ha: str = "center") -> None:
-    ax.annotate(
-        text,
-        tuple(at),
-        xytext=offset_pt,
-        textcoords="offset points",
-        ha=ha,
-        size=8,
-        color=LIGHT["muted"],
-        annotation_clip=True,
-        zorder=4,
-    )
+def _note(ax: Any, at: Floats, text: str, offset_pt: tuple[float, float], **style: Any) -> None:
+    shown = {
+        "ha": "center",
+        "size": 8,
+        "color": LIGHT["muted"],
+        "annotation_clip": True,
+        "zorder": 4,
+        **style,
+    }
+    ax.annotate(text, tuple(at), xytext=offset_pt, textcoords="offset points", **shown)
 
 
-def _driven_box(scene: Scene, runs: Sequence[Run]) -> Floats:
-    """Corners ``[2, 2]`` of the part that holds all drives and the attacked face, with a margin of half a lane [m]."""
-    xy = np.concatenate([*(run.states[:, :2] for run in runs), *list(scene.faces_m.values())[:1]])
+def _box(scene: Scene, points: Sequence[Floats]) -> Floats:
+    """Corners ``[2, 2]`` of the part that holds all points, with a margin of half a lane [m]."""
+    xy = np.concatenate(points)
     return np.stack([xy.min(axis=0) - scene.off_track_m, xy.max(axis=0) + scene.off_track_m])
 
 
@@ -152,10 +172,11 @@ def _whole_box(scene: Scene) -> Floats:
     return np.stack([xy.min(axis=0), xy.max(axis=0)])
 
 
-def _height_in(box: Floats, legend: bool = False) -> float:
-    """Height of a 6 inch wide figure that shows ``box`` to scale without empty stripes [inch]."""
+def _height_in(box: Floats, legend: bool = False, width_in: float = 6.0) -> float:
+    """Height of a figure that shows ``box`` to scale without empty stripes [inch]."""
     width_m, height_m = box[1] - box[0] + 2 * _MARGIN_M
-    return float(np.clip(5.4 * height_m / width_m, 2.0, 5.4)) + (1.25 if legend else 0.45)
+    high_in = float(np.clip((width_in - 0.6) * height_m / width_m, 2.0, 0.9 * width_in))
+    return high_in + (1.25 if legend else 0.45)
 
 
 def _frame(ax: Any, box: Floats) -> None:

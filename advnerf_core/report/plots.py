@@ -62,68 +62,63 @@ def new_axes(width_in: float = 6.0, height_in: float = 3.4) -> Iterator[Any]:
         yield Figure(figsize=(width_in, height_in), layout="constrained").add_subplot()
 
 
-def cte_over_time(drives: Drives, domain: Domain, victim: str) -> Figure:
-    """Signed cross-track error of all drives in one domain; the axis is shared by both domains."""
-    off_track_m = drives.scene.off_track_m
-    everything = [abs(r.cte_m).max() for r in drives.select(victim=victim)]
-    limit = max([off_track_m * 1.25, *everything]) * 1.08
-    with new_axes() as ax:
+@contextmanager
+def _cte_axes(height_in: float, off_track_m: float, largest_m: float, longest_s: float) -> Iterator[Any]:
+    """Axes of the signed cross-track error over time, with the band that counts as on track."""
+    with new_axes(6.0, height_in) as ax:
         ax.axhspan(-off_track_m, off_track_m, color=LIGHT["band"], lw=0, zorder=0)
         ax.axhline(0.0, color=LIGHT["tape"], lw=1.2, zorder=1)
+        limit = max(off_track_m * 1.25, largest_m) * 1.08
+        ax.set(xlabel="time [s]", ylabel="cross-track error, left + [m]", ylim=(-limit, limit))
+        ax.set_xlim(0.0, longest_s)
+        where = {"xycoords": ("axes fraction", "data"), "xytext": (-4, -4), "textcoords": "offset points"}
+        ax.annotate("on track", (1, off_track_m), ha="right", va="top", color=LIGHT["muted"], size=8, **where)
+        yield ax
+
+
+def cte_over_time(drives: Drives, domain: Domain, victim: str) -> Figure:
+    """Signed cross-track error of all drives in one domain; both axes are shared by all domains and victims."""
+    largest_m = max(float(abs(r.cte_m).max()) for r in drives.runs)
+    longest_s = max(len(r.cte_m) for r in drives.runs) * drives.dt_s
+    with _cte_axes(3.4, drives.scene.off_track_m, largest_m, longest_s) as ax:
         runs = drives.select(domain=domain, victim=victim)
         for run in runs:
             ax.plot(np.arange(len(run.cte_m)) * drives.dt_s, run.cte_m, **run_style(run))
             ax.plot((len(run.cte_m) - 1) * drives.dt_s, run.cte_m[-1], **end_style(run))
-        ax.set(xlabel="time [s]", ylabel="cross-track error, left + [m]", ylim=(-limit, limit), title=domain)
-        ax.set_xlim(left=0.0)
-        ax.annotate(
-            "on track",
-            (1, off_track_m),
-            xycoords=("axes fraction", "data"),
-            xytext=(-4, -4),
-            textcoords="offset points",
-            ha="right",
-            va="top",
-            color=LIGHT["muted"],
-            size=8,
-        )
+        ax.set_title(domain)
         add_run_legend(ax, runs)
     return ax.figure
 
 
 def loss_curves(drives: Drives, victim: str) -> Figure:
-    """Total CTE per evaluation of the searches; the no-attack level of the surrogate as reference."""
+    """Excess of each evaluation of the searches; the axes are shared by all victims."""
     curves = [c for c in drives.curves if c.victim == victim]
-    clean = [r.total_cte_m for r in drives.select(domain="surrogate", condition=NONE, victim=victim)]
+    every = np.concatenate([c.excess_m for c in drives.curves])
+    low, high = min(0.0, float(every.min())), max(0.0, float(every.max()))
     handles = []
     with new_axes() as ax:
+        ax.axhline(0.0, color=LIGHT[NONE], ls="--", lw=1.2, zorder=1)
         for curve in curves:
-            x, style = np.arange(1, len(curve.total_cte_m) + 1), style_of(curve.method)
+            x, style = np.arange(1, len(curve.excess_m) + 1), style_of(curve.method)
             if style.climbs:
-                ax.plot(x, curve.total_cte_m, color=style.light)
-                ax.plot(x[-1], curve.total_cte_m[-1], marker=style.marker, ms=5, color=style.light)
+                ax.plot(x, curve.excess_m, color=style.light)
+                ax.plot(x[-1], curve.excess_m[-1], marker=style.marker, ms=5, color=style.light)
             else:
                 dots = {"marker": style.marker, "ls": "none", "ms": 2.4, "alpha": 0.55, "mew": 0}
-                ax.plot(x, curve.total_cte_m, color=style.light, **dots)
-                ax.plot(
-                    x, np.maximum.accumulate(curve.total_cte_m), drawstyle="steps-post", color=style.light
-                )
-        # Lines before dots.
-        for method in sorted(
-            {c.method for c in curves}, key=lambda name: (not style_of(name).climbs, order_of(name))
-        ):
-            style = style_of(method)
+                ax.plot(x, curve.excess_m, color=style.light, **dots)
+                ax.plot(x, np.maximum.accumulate(curve.excess_m), drawstyle="steps-post", color=style.light)
+        methods = {c.method for c in curves}
+        for method in sorted(methods, key=lambda name: (not style_of(name).climbs, order_of(name))):
+            style = style_of(method)  # lines before dots
             text = f"{method}, one line per seed" if style.climbs else f"{method}: each texture, best so far"
             marker: Any = None if style.climbs else style.marker
             handles.append(Line2D([], [], color=style.light, label=text, marker=marker, ms=2.4))
-        if clean:
-            handles.append(
-                ax.axhline(
-                    float(np.mean(clean)), color=LIGHT[NONE], ls="--", lw=1.2, label="no attack, surrogate"
-                )
-            )
-        ax.set(xlabel="evaluation", ylabel="total CTE, surrogate [m]")
-        ax.set_ylim(bottom=0.0)
+        handles.append(Line2D([], [], color=LIGHT[NONE], ls="--", lw=1.2, label="plain object"))
+        longest = max(len(c.excess_m) for c in drives.curves)
+        ax.set(
+            xlabel="evaluation", ylabel="excess |CTE| per tick, learned scene [m]", xlim=(0.0, longest + 1.0)
+        )
+        ax.set_ylim(low - 0.05 * (high - low), high + 0.05 * (high - low) or 1.0)
         _legend_above(ax, handles)
     return ax.figure
 
@@ -158,24 +153,12 @@ def latency_histogram(latency: Latency) -> Figure:
         ax.hist(samples, bins=np.linspace(0.0, end, 90).tolist(), color=LIGHT["muted"], log=True)
         ax.axvline(limit, color=LIGHT["ink"], lw=1.4)
         ax.axvline(overall.p99_ms, color=LIGHT["ink"], lw=1.2, ls=":")
-        top = ax.get_xaxis_transform()
-        ax.text(
-            limit,
-            1.01,
-            f"camera period {limit:g} ms",
-            transform=top,
-            ha="right" if end < limit * 1.3 else "center",
-            size=8.5,
-        )
-        ax.text(
-            overall.p99_ms,
-            1.01,
-            f"p99 {overall.p99_ms:.1f} ms",
-            transform=top,
-            ha="center",
-            size=8.5,
-            color=LIGHT["muted"],
-        )
+        side = "right" if end < limit * 1.3 else "center"
+        for at, text, colour, ha in (
+            (limit, f"camera period {limit:g} ms", "ink", side),
+            (overall.p99_ms, f"p99 {overall.p99_ms:.1f} ms", "muted", "center"),
+        ):
+            ax.text(at, 1.01, text, transform=ax.get_xaxis_transform(), ha=ha, size=8.5, color=LIGHT[colour])
         ax.set(xlabel="capture to serial write [ms]", ylabel="frames", xlim=(0.0, end))
     return ax.figure
 
@@ -194,13 +177,9 @@ def memory_against_horizon(rows: Iterable[MemoryRow]) -> Figure:
 
 def laps_cte(laps: Laps, period_s: float, off_track_m: float) -> Figure:
     """Signed cross-track error of the drive without attack."""
-    with new_axes(6.0, 2.6) as ax:
-        ax.axhspan(-off_track_m, off_track_m, color=LIGHT["band"], lw=0)
-        ax.axhline(0.0, color=LIGHT["tape"], lw=1.2)
-        ax.plot(np.arange(len(laps.cte_m)) * period_s, laps.cte_m, color=LIGHT["laps"], lw=1.2)
-        limit = max(off_track_m * 1.2, float(abs(laps.cte_m).max()) * 1.1)
-        ax.set(xlabel="time [s]", ylabel="cross-track error, left + [m]", ylim=(-limit, limit))
-        ax.set_xlim(left=0.0)
+    times_s = np.arange(len(laps.cte_m)) * period_s
+    with _cte_axes(2.6, off_track_m, float(abs(laps.cte_m).max()), float(times_s[-1])) as ax:
+        ax.plot(times_s, laps.cte_m, color=LIGHT["laps"], lw=1.2)
     return ax.figure
 
 

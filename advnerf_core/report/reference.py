@@ -42,7 +42,6 @@ class Limit(StrictModel):
         above: Another method, whose value must be exceeded.
         said: The limit as text; empty for the plain number.
         paper: The publication's value, as text.
-        headline: Title among the page's key figures; empty leaves it out there.
     """
 
     of: DriveMeasure | LiveMeasure = "ratio"
@@ -56,7 +55,6 @@ class Limit(StrictModel):
     above: str = ""
     said: str = ""
     paper: str = ""
-    headline: str = ""
 
     @property
     def of_drives(self) -> bool:

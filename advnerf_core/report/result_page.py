@@ -1,5 +1,7 @@
 """The table of results for readers: in the terminal, as CSV, Markdown and JSON, and as a page with the drives' clips."""
 
+# ruff: noqa: RUF001 (typography for readers: multiplication signs)
+
 from __future__ import annotations
 
 import csv
@@ -8,24 +10,21 @@ import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import jinja2
 from markupsafe import Markup
 
 from advnerf_core.report.cells import CellResult
 from advnerf_core.report.conditions import NONE, style_of
 from advnerf_core.report.evidence.words import DOMAIN_TITLES, NOT_DRIVEN, collisions, excess_cells
-from advnerf_core.report.palette import look_css
+from advnerf_core.report.pages import FirstScreen, fragments, render
 from advnerf_core.report.result_table import ResultTable, TableRow
 from advnerf_core.report.targets import Target, target_table, verdict
-from advnerf_core.report.text_table import Table, number
+from advnerf_core.report.text_table import Table, count, number
 
 SCHEMA = "advnerf-results/2"
 STRAYED_FROM = 1.5
-_LEAD = "Every scenario, victim and method, in the learned scene and where it is deployed."
 OUTCOMES = (LEFT, RAN_INTO, STRAYED, HELD) = (
     "left the track",
     "ran into something",
@@ -38,11 +37,16 @@ _EXPLAINED = {
     STRAYED: f"Total CTE at least {STRAYED_FROM:g} times that of the same drive without attack, on the track.",
     HELD: "None of these; drives without attack belong here.",
 }
-_FIRST_NUMBER, _SAYS_NOTHING = 4, ("", NOT_DRIVEN)
+_COLUMNS = (
+    "path or variant", "victim", "object shows", "driven in", "searches", "starts", "mean |CTE| [m]", "over the plain object [m]", "95 %",
+    "over no object [m]", "95 % of it", "off track", "collided",
+)  # fmt: skip
+_FIRST_NUMBER = 4
+# A column in which all lines say this says nothing.
+_SAYS_NOTHING = {"searches": ("", "1"), "over no object [m]": ("", NOT_DRIVEN), "collided": ("", "0")}
 LEGEND = (
-    "Total CTE: mean over all drives, and past the plain object from the same starts. Excess: mean |CTE| per tick minus that of a control from "
-    "the same start, past the plain object or with no object; the row of the plain object has its mean |CTE|. Intervals are nominal 95 % over "
-    "searches and starts, where there are enough. Seeds, and victims, may be of several builds of scene and policies: each cell's JSON has their "
+    "Distances are per control tick. |CTE|: distance from the path, mean over all drives. Over the plain object, and over no object: how much larger "
+    "it is than that of the control from the same start. Intervals are nominal 95 % over searches and starts, where there are enough. Seeds, and victims, may be of several builds of scene and policies: each cell's JSON has their "
     "digests, as far as they were kept."
 )
 
@@ -82,22 +86,7 @@ def outcome_of(cell: CellResult) -> str:
 
 
 def text_table(table: ResultTable) -> Table:
-    """All lines as text."""
-    columns = (
-        "path or variant",
-        "victim",
-        "object shows",
-        "driven in",
-        "seeds",
-        "total CTE [m]",
-        "plain object [m]",
-        "excess [m per tick]",
-        "95 %",
-        "over no object",
-        "95 % of it",
-        "off track",
-        "collided",
-    )
+    """All lines in metres, as text. A column that says the same nothing in all lines is left out."""
     cells, groups, classes = [], [], []
     last: TableRow | None = None
     for index, row in enumerate(table.rows):
@@ -110,16 +99,11 @@ def text_table(table: ResultTable) -> Table:
         cells.append((where if new_scenario else "", row.victim if new_victim else "", name, *_numbers(row)))
         classes.append(row.method if row.seeds else "unmeasured")
         last = row
-    # Drop a column that is empty in all lines, such as a control without drives.
-    kept = [index for index in range(len(columns)) if any(row[index] not in _SAYS_NOTHING for row in cells)]
-    return Table(
-        "Results",
-        tuple(columns[index] for index in kept),
-        tuple(tuple(row[index] for index in kept) for row in cells),
-        tuple(index >= _FIRST_NUMBER for index in kept),
-        tuple(groups),
-        tuple(classes),
-    )
+    for at, name in enumerate(_COLUMNS):
+        if all(row[at] in _SAYS_NOTHING.get(name, ("",)) for row in cells):
+            cells = [(*row[:at], "", *row[at + 1 :]) for row in cells]
+    right = tuple(at >= _FIRST_NUMBER for at in range(len(_COLUMNS)))
+    return Table("Results", _COLUMNS, tuple(cells), right, tuple(groups), tuple(classes))
 
 
 def not_driven(table: ResultTable) -> str:
@@ -136,13 +120,27 @@ def not_driven(table: ResultTable) -> str:
 
 
 def _numbers(row: TableRow) -> tuple[str, ...]:
-    begin = DOMAIN_TITLES[row.domain], f"{len(row.seeds)} of {len(row.seeds) + len(row.missing)}"
     if not row.seeds:
-        return (*begin, "missing", *[""] * 7)
-    total = number(row.total_m) + ("" if row.total_std_m is None else f" ± {row.total_std_m:.2f}")
+        return DOMAIN_TITLES[row.domain], "missing", *[""] * 8
+    wanted = len(row.seeds) + len(row.missing)
+    searches = f"{len(row.seeds)} of {wanted}" if row.missing else str(wanted)
     excess = excess_cells(vars(row.excess)) if row.excess else ("", "", "", "")
+    # The plain object exceeds itself by nothing: the column before has its mean |CTE|.
+    excess = ("", "", *excess[2:]) if row.method == NONE else excess
+    mean = "" if row.mean_abs_cte_m is None else number(row.mean_abs_cte_m, 3)
     hit = collisions(row.excess.collided) if row.excess else ""
-    return (*begin, total, number(row.plain_total_m), *excess, f"{row.off_track} of {row.drives}", hit)
+    begin = DOMAIN_TITLES[row.domain], searches, str(row.drives // len(row.seeds)), mean
+    return *begin, *excess, f"{row.off_track} of {row.drives}", hit
+
+
+def ratios(table: ResultTable) -> str:
+    """Total CTE of each line over that past the plain object, as publications in other units give it; empty without any."""
+    rows = [row for row in table.rows if row.ratio is not None and row.method != NONE]
+    named = [", ".join(filter(None, (*row.key[:3], style_of(row.method).title))) for row in rows]
+    return "; ".join(
+        f"{name}, {DOMAIN_TITLES[row.domain]}: {row.ratio:.2f} ×"
+        for name, row in zip(named, rows, strict=True)
+    )
 
 
 def as_json(table: ResultTable, targets: Sequence[Target] = ()) -> dict[str, Any]:
@@ -212,42 +210,38 @@ def gather_clips(table: ResultTable, cells_folder: Path, page_folder: Path) -> l
 
 def render_page(
     table: ResultTable,
+    first: FirstScreen,
     clips: Sequence[ShownClip] = (),
     sections: Sequence[tuple[str, Markup]] = (),
-    lead: Sequence[str | Markup] = (),
     targets: Sequence[Target] = (),
+    notes: Sequence[str] = (),
 ) -> str:
     """The page as HTML text; it loads nothing but the clips beside it.
 
     Args:
         table: The table.
+        first: What the page opens with.
         clips: Clips beside the page.
         sections: Further parts: heading and HTML.
-        lead: Paragraphs, or HTML, before the table; empty for the standard introduction.
         targets: Targets of the results.
+        notes: What a reader must know first, such as what is left out.
     """
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    resources = files("advnerf_core.report")
-    template = environment.from_string(resources.joinpath("page.html").read_text(encoding="utf-8"))
-    groups = [(name, _EXPLAINED[name], [clip for clip in clips if clip.outcome == name]) for name in OUTCOMES]
-    return template.render(
-        name=table.name or "Results",
-        legend=LEGEND,
-        style=Markup(resources.joinpath("page.css").read_text(encoding="utf-8")),
-        look=Markup(look_css()),
-        table=text_table(table).html(),
-        targets=target_table(targets).html() if targets else "",
-        headlines=[target for target in targets if target.headline],
-        verdict=verdict(targets),
-        not_driven=not_driven(table),
-        lead=lead or (_LEAD,),
-        missing=sum(len(row.missing) for row in table.rows if row.domain == "surrogate"),
-        cells=len(table.cells),
-        machines=sorted({cell.machine for cell in table.cells.values()}),
-        clips=clips,
-        groups=groups,
-        sections=sections,
-        style_of=style_of,
+    of = {name: [clip for clip in clips if clip.outcome == name] for name in OUTCOMES}
+    groups = [(name, _EXPLAINED[name], found) for name, found in of.items() if found]
+    parts = fragments("results.html", groups=groups)
+    shown = Markup(parts.table(text_table(table).html(), LEGEND, ratios(table)))
+    made = [("Results in metres", shown)]
+    if targets:
+        made.append(("Targets", Markup(parts.targets(verdict(targets), target_table(targets).html()))))
+    made += [*sections, *([("Drives by outcome", Markup(parts.drives()))] if clips else [])]
+    missing = sum(len(row.missing) for row in table.rows if row.domain == "surrogate")
+    about = [
+        table.name or "Results",
+        f"{count(len(table.cells), 'cell')}{f', {missing} missing' if missing else ''}",
+    ]
+    return render(
+        first,
+        made,
+        about=[*about, *sorted({cell.machine for cell in table.cells.values()})],
+        warnings=[each for each in (not_driven(table), *notes) if each],
     )

@@ -1,29 +1,22 @@
 """Sections of an experiment's page: maps, films, textures, fidelity, and for live drives their timing and memory."""
 
-# ruff: noqa: RUF001 (typography for readers: dashes)
-
 from __future__ import annotations
 
 from collections.abc import Iterator
-from importlib.resources import files
-from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 from markupsafe import Markup
 
-from advnerf_core.driving.metrics import drives, mean_cte_limit_m
 from advnerf_core.report import maps, plots
-from advnerf_core.report.clips import Frames, data_uri, film_strip, image_uri
-from advnerf_core.report.conditions import NONE, style_of
+from advnerf_core.report.clips import Frames, image_uri
+from advnerf_core.report.conditions import style_of
 from advnerf_core.report.data import Drives, Hop, ReportData
-from advnerf_core.report.reference import DOMAINS, Domain
-from advnerf_core.report.result_table import ResultTable, TableRow
-from advnerf_core.report.text_table import Table, count, number
+from advnerf_core.report.pages import HOW, MAX_EMBEDDED_BYTES, fits, fragments
+from advnerf_core.report.reference import DOMAINS
+from advnerf_core.report.result_table import ResultTable
+from advnerf_core.report.text_table import Table, number
 
-# Films beyond this stay beside the page: browsers open a 20 MB page at once, but not a 200 MB page.
-MAX_EMBEDDED_BYTES = 12_000_000
 _SHOWN_VIEWS = 6
 _DIFFERENCE_GAIN = 4
 
@@ -31,132 +24,70 @@ _DIFFERENCE_GAIN = 4
 def page_sections(data: ReportData, table: ResultTable) -> list[tuple[str, Markup]]:
     """Headings and HTML; parts that were not measured are named as such."""
     drawn = _fragments(data, table)
-    parts = [("overview", "The world")] if data.overview is not None else []
-    made = [(heading, Markup(getattr(drawn, name)())) for name, heading in parts]
-    made += [(each["drives"].scenario.capitalize(), Markup(drawn.driven(each))) for each in _driven(data)]
+    world = [("overview", "The world")] if data.overview is not None else []
     parts = [("texture", "What the panel showed")] if data.textures else []
-    parts.append(("fidelity", "How true the learned scene is"))
+    parts += [("views", "Learned and real pictures")] if data.fidelity else []
     if data.live:
         parts += [("laps", "Laps without attack"), ("timing", "Live timing")]
         parts.append(("memory", "Memory against the horizon"))
-    parts.append(("manifest", "How to make this page again"))
-    return [*made, *((heading, Markup(getattr(drawn, name)())) for name, heading in parts)]
+    parts.append(("manifest", HOW))
 
+    def made(*wanted: tuple[str, str]) -> list[tuple[str, Markup]]:
+        return [(heading, Markup(getattr(drawn, name)())) for name, heading in wanted]
 
-def what_it_did(data: ReportData, table: ResultTable, victim: str) -> list[str]:
-    """Effect of the attack on one victim in each scenario, as plain text."""
-    deployed = any(row.domain == "deployed" for row in table.rows)
-    return [
-        f"{each.scenario.capitalize()}: in the learned scene the cross-track error (CTE, the distance from the path) "
-        f"{_effect(table, each, victim, 'surrogate')}."
-        + (f" Deployed it {_effect(table, each, victim, 'deployed')}." if deployed else "")
-        for each in data.drives
-    ]
-
-
-def _effect(table: ResultTable, driven: Drives, victim: str, domain: Domain) -> str:
-    plain, attacked, random = (
-        table.find(driven.scenario, victim, method, domain) for method in (NONE, "gradient", "random")
-    )
-    if plain is None or attacked is None or not (plain.excess and attacked.excess):
-        return "was not measured in this run"
-    text = (
-        f"is {attacked.excess.excess_m:.3f} m per tick larger with the gradient texture than past the plain object (total "
-        f"{number(attacked.total_m)} m against {number(plain.total_m)} m), and the car left the track in {attacked.off_track} of "
-        f"{count(attacked.drives, 'drive')}"
-    )
-    if random is not None and random.excess is not None:
-        text += (
-            f"; with the best random texture it is {random.excess.excess_m:.3f} m per tick larger, and the car left in {random.off_track} "
-            f"of {random.drives}"
-        )
-    return text + _warning(plain, driven.scene.off_track_m)
-
-
-def _warning(plain: TableRow, off_track_m: float) -> str:
-    """Warning for a victim that does not drive well without an attack; else empty."""
-    mean_m = plain.mean_abs_cte_m or 0.0
-    if drives(mean_m, plain.off_track > 0, off_track_m):
-        return ""
-    return (
-        f"; but WITHOUT AN ATTACK THE POLICY DOES NOT DRIVE here (mean |CTE| {mean_m:.3f} m, expected "
-        f"<= {mean_cte_limit_m(off_track_m):g} m; off the track in {plain.off_track} of {plain.drives}), so this excess proves nothing"
-    )
+    driven = [(each["drives"].scenario.capitalize(), Markup(drawn.driven(each))) for each in _driven(data)]
+    return [*made(("fidelity", "How true the learned scene is"), *world), *driven, *made(*parts)]
 
 
 def _fragments(data: ReportData, table: ResultTable) -> Any:
-    environment = jinja2.Environment(
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    text = files("advnerf_core.report").joinpath("sections.html").read_text(encoding="utf-8")
-    return environment.from_string(text).make_module(
-        {
-            "data": data,
-            "style_of": style_of,
-            "image": lambda picture: image_uri(picture, quality=88),
-            "hops": _hop_table(data).html(),
-            "live_tries": _tries_table(table),
-            "memory_rows": _memory_table(data).html(),
-            "timings": _timing_table(data).html(),
-            "figures": _figures(data),
-            "textures": [(t, image_uri(t.image)) for t in data.textures if t.image is not None],
-            "views": _views(data),
-            "fidelity_rows": _fidelity_numbers(data),
-            "missing": lambda part: data.not_measured.get(part, ""),
-        }
+    return fragments(
+        "sections.html",
+        data=data,
+        image=lambda picture: image_uri(picture, quality=88),
+        hops=_hop_table(data).html(),
+        live_tries=_tries_table(table),
+        memory_rows=_memory_table(data).html(),
+        timings=_timing_table(data).html(),
+        figures=_figures(data),
+        textures=[(t, image_uri(t.image)) for t in data.textures if t.image is not None],
+        pairs_of_views=_views(data),
+        fidelity_rows=_fidelity_numbers(data),
+        missing=lambda part: data.not_measured.get(part, ""),
     )
 
 
 def _driven(data: ReportData) -> Iterator[dict[str, Any]]:
-    """Content of each scenario's section; films are embedded while there is room."""
-    room = MAX_EMBEDDED_BYTES
-    for each in data.drives:
-        size = _size(each.film)
-        fits = size <= room
-        room -= size if fits else 0
+    """Content of each scenario's section; films are embedded while there is room, the first scenario's on the first screen."""
+    room, whole = MAX_EMBEDDED_BYTES, data.overview is None
+    for index, each in enumerate(data.drives):
+        embedded = fits(each.film, room)
+        room -= each.film.file.stat().st_size if each.film and embedded else 0
         yield {
             "drives": each,
-            "pictures": [
-                (victim, _run_figures(each, victim, data.overview is None and bool(each.scene.edges_m)))
-                for victim in each.victims
-            ],
+            "pictures": [(name, _run_figures(each, name, whole and bool(each.scene.edges_m))) for name in each.victims],
             "notes": [run for run in each.runs if run.note],
-            "film": _video(each.film) if each.film and fits else None,
-            "beside": "" if each.film is None or fits else each.film.name,
-        }
-
-
-def _size(film: Path | None) -> int:
-    if film is None:
-        return 0
-    if not film.is_file():
-        raise FileNotFoundError(f"expected the film {film}, got no such file; run the report stage again")
-    return film.stat().st_size
+            "film": each.film if embedded and index > 0 else None,
+            "beside": "" if each.film is None or embedded else each.film.file.name,
+        }  # fmt: skip
 
 
 def _figures(data: ReportData) -> dict[str, Any]:
     """Inline SVG of all figures with data, by name."""
-    figures: dict[str, Any] = {}
+    made: dict[str, tuple[Any, str]] = {}
     if data.laps is not None:
         scene, dt_s = data.drives[0].scene, data.drives[0].dt_s
-        figures["laps_map"] = _svg(maps.laps_map(data.laps, scene), "The drive without attack from above")
-        figures["laps_cte"] = _svg(
-            plots.laps_cte(data.laps, dt_s, scene.off_track_m), "Its cross-track error over time"
+        made["laps_map"] = maps.laps_map(data.laps, scene), "The drive without attack from above"
+        made["laps_cte"] = (
+            plots.laps_cte(data.laps, dt_s, scene.off_track_m),
+            "Its cross-track error over time",
         )
     if data.fidelity is not None and len(data.fidelity.steering_rad):
-        figures["steering"] = _svg(
-            plots.steering_agreement(data.fidelity), "Control on learned against real images"
-        )
+        made["steering"] = plots.steering_agreement(data.fidelity), "Control on learned against real images"
     if data.latency is not None:
-        figures["latency"] = _svg(
-            plots.latency_histogram(data.latency), "Histogram of capture-to-serial latency"
-        )
+        made["latency"] = plots.latency_histogram(data.latency), "Histogram of capture-to-serial latency"
     if data.memory:
-        figures["memory"] = _svg(plots.memory_against_horizon(data.memory), "Peak memory against the horizon")
-    return figures
+        made["memory"] = plots.memory_against_horizon(data.memory), "Peak memory against the horizon"
+    return {name: _svg(*each) for name, each in made.items()}
 
 
 def _run_figures(driven: Drives, victim: str, whole: bool) -> dict[str, Markup]:
@@ -170,7 +101,7 @@ def _run_figures(driven: Drives, victim: str, whole: bool) -> dict[str, Markup]:
             out[domain] = _svg(figure, f"Cross-track error over time, {domain}")
     if any(c.victim == victim for c in driven.curves):
         figure = plots.loss_curves(driven, victim)
-        out["curves"] = _svg(figure, "Total cross-track error per evaluation of the searches")
+        out["curves"] = _svg(figure, "Excess of each evaluation of the searches over the plain object")
     return out
 
 
@@ -178,60 +109,29 @@ def _svg(figure: Any, description: str) -> Markup:
     return Markup(plots.svg(figure, description))
 
 
-def _video(film: Path) -> dict[str, Any]:
-    stills = film_strip(film)
-    height, width = stills[0].shape[:2]
-    return {
-        "uri": data_uri(film),
-        "width": width,
-        "height": height,
-        "poster": image_uri(stills[-1], quality=80),
-        "stills": [image_uri(s, quality=80) for s in stills],
-    }
-
-
 def _views(data: ReportData) -> list[dict[str, Any]]:
     """Image pairs with their difference, of the first few views with images."""
     out: list[dict[str, Any]] = []
     for view in data.fidelity.views if data.fidelity else ():
         if view.real is not None and view.surrogate is not None and len(out) < _SHOWN_VIEWS:
-            images = [
-                image_uri(view.real),
-                image_uri(view.surrogate),
-                image_uri(_difference(view.real, view.surrogate)),
-            ]
-            out.append({"view": view, "images": images})
+            images = view.real, view.surrogate, _difference(view.real, view.surrogate)
+            out.append({"view": view, "images": [image_uri(each) for each in images]})
     return out
 
 
 def _difference(a: Frames, b: Frames) -> Frames:
-    difference = (
-        np.abs(a.astype(np.int16) - b.astype(np.int16)).mean(axis=2, keepdims=True) * _DIFFERENCE_GAIN
-    )
-    return np.repeat(np.clip(difference, 0, 255).astype(np.uint8), 3, axis=2)
+    difference = np.abs(a.astype(np.int16) - b.astype(np.int16)).mean(axis=2, keepdims=True)
+    return np.repeat(np.clip(_DIFFERENCE_GAIN * difference, 0, 255).astype(np.uint8), 3, axis=2)
 
 
 def _fidelity_numbers(data: ReportData) -> Markup:
     f = data.fidelity
     if f is None:
         return Markup("")
-    difference = number(f.steering_difference_rad, 4)
-    rows = (
-        (
-            "camera size",
-            str(len(f.views)),
-            number(f.mean("psnr_full_db"), 2),
-            number(f.mean("ssim_full"), 3),
-            "–",
-        ),
-        (
-            "policy's image",
-            str(len(f.views)),
-            number(f.mean("psnr_policy_db"), 2),
-            number(f.mean("ssim_policy"), 3),
-            difference,
-        ),
-    )
+    rows = tuple(
+        (size, str(len(f.views)), number(f.mean(f"psnr_{name}_db"), 2), number(f.mean(f"ssim_{name}"), 3), steers)
+        for size, name, steers in (("camera size", "full", ""), ("policy's image", "policy", number(f.steering_difference_rad, 4)))
+    )  # fmt: skip
     columns = ("size", "held-out views", "PSNR [dB]", "SSIM", f"mean |control difference| [{f.unit}]")
     return Table("Surrogate fidelity", columns, rows, (False, *[True] * 4)).html()
 

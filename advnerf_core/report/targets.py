@@ -26,8 +26,6 @@ class Target:
         met: Whether the limit is kept; None without a measurement, or if seeds are missing.
         verdict: The answer as text.
         paper: The publication's value.
-        headline: Title among the page's key figures; empty leaves it out there.
-        method: Method of the drives; empty for other measures.
     """
 
     what: str
@@ -37,8 +35,6 @@ class Target:
     met: bool | None
     verdict: str
     paper: str
-    headline: str
-    method: str
 
     def record(self) -> dict[str, Any]:
         """JSON-ready values, from which ``Target(**record)`` restores it."""
@@ -97,7 +93,7 @@ def evaluate(
             value, other = _value(row, limit), _row(table, limit, limit.above)
             bound = limit.at_least if other is None else _value(other, limit)
             complete = not row.missing and (other is None or not other.missing)
-            found.append(_target(limit, value, bound, complete, len(row.seeds)))
+            found.append(_target(limit, value, bound, complete, row))
     return found
 
 
@@ -110,7 +106,9 @@ def _value(row: TableRow, limit: Limit) -> float | None:
     return _MEASURES[limit.of].of_row(row) if row.seeds else None
 
 
-def _target(limit: Limit, value: float | None, lower: float | None, complete: bool, seeds: int = 0) -> Target:
+def _target(
+    limit: Limit, value: float | None, lower: float | None, complete: bool, row: TableRow | None = None
+) -> Target:
     measure = _MEASURES[limit.of]
     bound = lower if limit.at_most is None else limit.at_most
     if value is None or bound is None or not complete:
@@ -121,13 +119,14 @@ def _target(limit: Limit, value: float | None, lower: float | None, complete: bo
         met = lacking < 0.0 if limit.above else lacking <= 0.0
         short = max(lacking, 0.0) / (bound or 1.0)  # of a limit of zero any excess counts by its own size
     if met is None:
-        verdict = "not measured" if value is None else f"{seeds} seed(s) so far"
+        verdict = "not measured" if value is None else f"{len(row.seeds) if row else 0} seed(s) so far"
     else:
         verdict = "met" if met else f"missed by {100 * short:.0f} %"
     text = "not measured in this run" if value is None else number(value, measure.digits, measure.unit)
+    if value is not None and row is not None and limit.of in ("off_track", "off_track_share"):
+        text = f"{row.off_track} of {count(row.drives, 'drive')}"
     said = limit.said or _limit_text(limit, bound)
-    named = limit.paper, limit.headline, limit.method
-    return Target(_what(limit), said, value, text, met, verdict, *named)
+    return Target(_what(limit), said, value, text, met, verdict, limit.paper)
 
 
 def _what(limit: Limit) -> str:

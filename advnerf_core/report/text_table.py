@@ -23,7 +23,7 @@ def count(number_of: int, noun: str) -> str:
 
 @dataclass(frozen=True)
 class Table:
-    """A table of text with its output formats.
+    """A table of text with its output formats. Columns that are empty in all rows are left out.
 
     Attributes:
         title: Heading in the terminal.
@@ -40,6 +40,12 @@ class Table:
     right: tuple[bool, ...]
     groups: tuple[int, ...] = ()
     classes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        kept = [i for i in range(len(self.columns)) if not self.rows or any(row[i] for row in self.rows)]
+        for name in ("columns", "right"):
+            object.__setattr__(self, name, tuple(getattr(self, name)[i] for i in kept))
+        object.__setattr__(self, "rows", tuple(tuple(row[i] for i in kept) for row in self.rows))
 
     def html(self) -> Markup:
         """The table as HTML; every cell is escaped."""

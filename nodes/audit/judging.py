@@ -15,7 +15,8 @@ from advnerf_core.attack.artifact import face_texture, load_attack
 from advnerf_core.geometry import Array, planar_poses
 from advnerf_core.report.audit_parts import AuditedDrives, DisturbedDrives, Evidence, JudgedStart, RoutePoint
 from advnerf_core.report.audit_result import AuditControl, ControlKind
-from advnerf_core.report.clips import ClipTrack, write_clip
+from advnerf_core.report.clips import ClipTrack, write_film
+from advnerf_core.report.data import Film
 from advnerf_core.scene.surrogate import Surrogate
 from hardware.worlds.world import World
 from nodes.audit.drives import (
@@ -200,7 +201,7 @@ def open_world(experiment: Experiment, evidence: Evidence) -> Iterator[World | N
         yield world
 
 
-def film(judged: Judged, file: Path) -> Path:
+def film(judged: Judged, file: Path) -> Film:
     """The drives past no object, the plain one and the attacked one, side by side, from the shown start."""
     experiment, tracks = judged.experiment, []
     every, rate_hz = filmed(experiment.config.dt_s)
@@ -211,7 +212,7 @@ def film(judged: Judged, file: Path) -> Path:
             frames = seen_on(experiment, judged.arms[name], states, world)
             cte_m = path.project(states[:, :2]).cte_m
             tracks.append(ClipTrack(TITLES[name], CONDITIONS[name], frames, cte_m))
-    return write_clip(file, tracks, rate_hz, judged.limit_m)
+    return write_film(file, tracks, rate_hz, judged.limit_m)
 
 
 def seen_on(experiment: Experiment, arm: Arm, states: Array, world: World | None) -> list[NDArray[np.uint8]]:

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from importlib.resources import files
 from pathlib import Path as FilePath
-from typing import Any
 
-import jinja2
 import numpy as np
 from markupsafe import Markup
-from matplotlib.patches import Polygon
 
 from advnerf_core.data.image_files import read_stored
 from advnerf_core.driving.path import Path
@@ -18,9 +14,11 @@ from advnerf_core.files import write_atomically
 from advnerf_core.report import plots
 from advnerf_core.report.audit_parts import AuditedObject, Evidence
 from advnerf_core.report.audit_result import AuditResult, TriedSearch
-from advnerf_core.report.clips import data_uri, film_strip, image_uri
+from advnerf_core.report.clips import image_uri
 from advnerf_core.report.conditions import style_of
-from advnerf_core.report.palette import LIGHT, look_css
+from advnerf_core.report.data import Film, Scene
+from advnerf_core.report.maps import Arm, drives_from_above
+from advnerf_core.report.pages import HOW, FirstScreen, fragments, render
 from advnerf_core.report.text_table import Table, number
 from nodes.audit.judging import CONDITIONS, FOUND, NO_OBJECT, PLAIN_OBJECT, TITLES
 from nodes.audit.verdict import ArmDrives, effect_of
@@ -42,7 +40,7 @@ def write_page(
     result: AuditResult,
     drives: Mapping[Evidence, Mapping[str, ArmDrives]],
     path: Path | None,
-    film: FilePath | None,
+    film: Film | None,
     pictures: Sequence[tuple[FilePath, str]],
 ) -> FilePath:
     """Write the page of an audit into its folder.
@@ -52,32 +50,52 @@ def write_page(
         result: Result of the audit.
         drives: The judged drives by evidence and arm.
         path: The reference path; None without judged drives.
-        film: File of the film; None without one.
+        film: Film of the shown start; None without one.
         pictures: Pictures of the object, each with its caption.
     """
     judged = _judged(result, drives)
-    template = jinja2.Environment(autoescape=True).from_string(
-        files("advnerf_core.report").joinpath("audit.html").read_text(encoding="utf-8")
+    above = _above(result, judged, path) if judged and path is not None else ""
+    first = FirstScreen(
+        result.verdict.sentence,
+        film,
+        "From the driver's seat, the start whose effect is the median.",
+        above,
+        f"All {result.starts.judging.count} drives of each kind from above, from starts that nothing else has used. Green: the lane.",
     )
-    text = template.render(
+    badge = _OUTCOMES[result.verdict.outcome], result.verdict.outcome
+    about = [result.policy.path, result.place.name]
+    text = render(first, _sections(result, drives, pictures), badge, about)
+    write_atomically(folder / PAGE, text)
+    return folder / PAGE
+
+
+def _sections(
+    result: AuditResult,
+    drives: Mapping[Evidence, Mapping[str, ArmDrives]],
+    pictures: Sequence[tuple[FilePath, str]],
+) -> list[tuple[str, Markup]]:
+    trust = _trust(result)
+    parts = fragments(
+        "audit.html",
         result=result,
-        look=Markup(look_css()),
-        outcome=_OUTCOMES[result.verdict.outcome],
-        film=None if film is None else data_uri(film),
-        poster=None if film is None else image_uri(film_strip(film)[-2], _QUALITY),
-        above=_above(result, judged, path) if judged and path is not None else None,
-        judged_starts=result.starts.judging.count,
         arms=_arms(result, drives).html() if drives else None,
         worse_camera=_worse_camera(result),
         pictures=[(image_uri(read_stored(file)[0], _QUALITY), caption) for file, caption in pictures],
         how=_how_to_print(result),
-        tried=_tried(result.tried).html() if result.tried else None,
+        searches=_tried(result.tried).html() if result.tried else None,
         planted=_planted(result),
-        trust=_trust(result),
+        trust=trust,
         facts=_facts(result),
     )
-    write_atomically(folder / PAGE, text)
-    return folder / PAGE
+    wanted = (
+        ("Why it cannot be judged", parts.reasons, result.verdict.reasons),
+        ("What was driven", parts.driven, drives),
+        ("The object", parts.object, pictures),
+        ("What was tried", parts.tried, True),
+        ("How far the learned place is trusted", parts.trusted, trust),
+        (HOW, parts.run, True),
+    )
+    return [(heading, Markup(part())) for heading, part, there in wanted if there]
 
 
 def _judged(
@@ -93,38 +111,35 @@ def _judged(
 def _above(result: AuditResult, judged: Mapping[str, ArmDrives], path: Path) -> Markup:
     """All drives from above, with the lane and the object."""
     limit_m = result.place.off_track_m or 0.0
-    with plots.new_axes(5.4, 4.6) as ax:
-        along = np.asarray(path.pose_at(np.arange(0.0, path.length_m, _SPACING * max(limit_m, 0.01))))
-        across = np.stack([-np.sin(along[:, 2]), np.cos(along[:, 2])], axis=1)
-        for side in (-limit_m, limit_m):
-            ax.plot(*(along[:, :2] + side * across).T, color=LIGHT["muted"], lw=1.0, zorder=1)
-        for level, name in enumerate((NO_OBJECT, PLAIN_OBJECT, FOUND)):
-            colour = style_of(CONDITIONS[name]).light
-            for number_of, states in enumerate(judged[name].states):
-                label = TITLES[name] if number_of == 0 else None
-                ax.plot(*states[:, :2].T, color=colour, lw=0.9, alpha=0.75, zorder=2 + level, label=label)
-        points = [each.states[:, :, :2].reshape(-1, 2) for each in judged.values()]
-        if result.strongest is not None:
-            points.append(_draw_object(ax, result.strongest.object))
-        seen = np.concatenate(points)
-        low, high = seen.min(axis=0) - 1.5 * limit_m, seen.max(axis=0) + 1.5 * limit_m
-        ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x [m]", ylabel="y [m]")
-        ax.set_aspect("equal", adjustable="box")
-        ax.figure.legend(*ax.get_legend_handles_labels(), loc="outside upper left", ncols=3)
-        return Markup(
-            plots.svg(ax.figure, "All judged drives from above, the lane, and the object where it stands")
-        )
+    along = np.asarray(path.pose_at(np.arange(0.0, path.length_m, _SPACING * max(limit_m, 0.01))))
+    placed = None if result.strongest is None else result.strongest.object
+    scene = Scene(
+        along[:, :2],
+        limit_m,
+        path.closed,
+        objects_m=() if placed is None else (_corners(placed),),
+        faces_m={} if placed is None else {"": _front(placed)},
+    )
+    arms = [
+        Arm(TITLES[name], CONDITIONS[name], list(judged[name].states))
+        for name in (NO_OBJECT, PLAIN_OBJECT, FOUND)
+    ]
+    figure = drives_from_above(scene, arms)
+    return Markup(plots.svg(figure, "All judged drives from above, the lane, and the object where it stands"))
 
 
-def _draw_object(ax: Any, placed: AuditedObject) -> np.ndarray:
+def _corners(placed: AuditedObject) -> np.ndarray:
+    """Corners ``[4, 2]`` of an object from above [m]."""
     depth_m, width_m, _ = placed.size_m
     c, s = np.cos(placed.pose.yaw_rad), np.sin(placed.pose.yaw_rad)
     corners = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * [0.5 * depth_m, 0.5 * width_m]
-    there = corners @ np.array([[c, s], [-s, c]]) + [placed.pose.x_m, placed.pose.y_m]
-    ax.add_patch(Polygon(there, closed=True, color=LIGHT["ink"], zorder=6))
-    ax.annotate("", [placed.pose.x_m + 0.6 * width_m * c, placed.pose.y_m + 0.6 * width_m * s], there.mean(axis=0),
-                arrowprops={"arrowstyle": "->", "color": LIGHT["ink"]}, zorder=6)  # fmt: skip
-    return there
+    return corners @ np.array([[c, s], [-s, c]]) + [placed.pose.x_m, placed.pose.y_m]
+
+
+def _front(placed: AuditedObject) -> np.ndarray:
+    """Ends ``[2, 2]`` of an object's front from above [m], with what is before it on the right of first to second."""
+    front_left, _, _, front_right = _corners(placed)
+    return np.stack([front_right, front_left])
 
 
 def _arms(result: AuditResult, drives: Mapping[Evidence, Mapping[str, ArmDrives]]) -> Table:

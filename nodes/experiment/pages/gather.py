@@ -22,9 +22,10 @@ from advnerf_core.report.reference import DOMAINS, Domain
 from nodes.experiment.engine.artefact import read_artefact
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.faces import has_face
+from nodes.experiment.show.faces import has_face, panel_of, wanted_face
 from nodes.experiment.show.given import victim_without_gradient
 from nodes.experiment.show.learned_scene import FIDELITY
+from nodes.experiment.steps.attack import planned_evaluations
 from nodes.experiment.steps.deploy import DRIVES
 from nodes.experiment.steps.frozen import frozen_hashes
 from nodes.experiment.steps.keys import driven_folder
@@ -40,8 +41,9 @@ _PATH_POINTS = 400
 
 def gather(
     experiment: Experiment,
-    films: Mapping[str, Path],
+    films: Mapping[str, rd.Film | None],
     seen: Mapping[str, Mapping[str, NDArray[np.uint8]]],
+    done: str,
     overview: NDArray[np.uint8] | None = None,
     memory: tuple[rd.MemoryRow, ...] = (),
 ) -> rd.ReportData:
@@ -49,8 +51,9 @@ def gather(
 
     Args:
         experiment: Experiment with all earlier stages and cells finished.
-        films: Films by scenario, for deployed drives.
+        films: Films by scenario.
         seen: Camera images of the objects, by scenario and method.
+        done: What was searched and driven, in one paragraph.
         overview: The world from above.
         memory: Memory of the adjoint, if it was measured.
     """
@@ -64,6 +67,7 @@ def gather(
         overview=overview,
         textures=tuple(_textures(experiment)) if has_face(experiment) else (),
         fidelity=_fidelity(experiment),
+        done=done,
         live=live,
         memory=memory,
         **(_live_parts(experiment) if live else {}),
@@ -71,7 +75,7 @@ def gather(
 
 
 def _drives(
-    experiment: Experiment, scenario: str, film: Path | None, seen: Mapping[str, NDArray[np.uint8]]
+    experiment: Experiment, scenario: str, film: rd.Film | None, seen: Mapping[str, NDArray[np.uint8]]
 ) -> rd.Drives:
     plan = [cell for cell in experiment.cells if cell.scenario == scenario]
     runs = [run for domain in DOMAINS for cell in plan for run in _runs(experiment, cell, domain)]
@@ -89,15 +93,18 @@ def _drives(
                 _note(empty),
             )
         )
-    curves = [
-        rd.LossCurve(
-            cell.method, cell.seed, np.array(_searched(experiment, cell)["curve_total_cte_m"]), cell.victim
-        )
-        for cell in plan
-        if cell.searched
-    ]
+    curves = [curve for cell in plan if cell.searched for curve in _curves(experiment, cell)]
     scene = _scene(experiment, scenario)
     return rd.Drives(scenario, scene, experiment.config.dt_s, tuple(runs), tuple(curves), film, seen)
+
+
+def _curves(experiment: Experiment, cell: Cell) -> Iterator[rd.LossCurve]:
+    """The curve of a search over the drive without an attack from the same starts, which its attack file holds; none of older files."""
+    clean = load_attack(experiment.cell_folder(cell) / ATTACK).clean_drive
+    if clean is not None:
+        totals_m = np.array(read_json(driven_folder(experiment, cell) / SEARCHED)["curve_total_cte_m"])
+        excess_m = (totals_m - clean.mean_total_cte_m) / clean.ticks
+        yield rd.LossCurve(cell.method, cell.seed, excess_m, cell.victim)
 
 
 def _runs(experiment: Experiment, cell: Cell, domain: Domain) -> Iterator[rd.Run]:
@@ -179,10 +186,15 @@ def _settings(experiment: Experiment) -> dict[str, str]:
         )
         for name, found in starts.items()
     }
+    rates = (
+        f", learning rate {attack.learning_rate:g}, time batch {attack.time_batch}"
+        if "gradient" in config.method_names
+        else ""
+    )
     return {
         "setting": experiment.setting,
-        "horizon": f"T = {config.horizon} control ticks of {config.dt_s:g} s, {experiment.searched_ticks} of them optimised",
-        "searches": f"{attack.evaluations} evaluations each, learning rate {attack.learning_rate:g}, time batch {attack.time_batch}",
+        "searches": f"{planned_evaluations(experiment)} evaluations each, over {experiment.searched_ticks} control ticks of {config.dt_s:g} s{rates}",
+        "drives": f"{config.horizon} control ticks of {config.dt_s:g} s",
         "space": ", ".join(f"{name} {value}" for name, value in config.space.model_dump().items()),
         "carrier": ", ".join(f"{name} {value}" for name, value in config.carrier.model_dump().items()),
         **poses,
@@ -203,6 +215,9 @@ def _scene(experiment: Experiment, scenario: str) -> rd.Scene:
             name: rd.face_segment(face.T_world_from_face, face.width_m)
             for name, face in (("board", lab.board), ("monitor", lab.monitor))
         }
+    if has_face(experiment):  # the attacked one first
+        panel, name = panel_of(experiment), wanted_face(experiment).panel
+        faces = {name: rd.face_segment(panel.T_world_from_face, panel.square_m), **faces}
     return rd.Scene(
         path_xy_m=path.pose_at(np.linspace(0.0, path.length_m, _PATH_POINTS))[:, :2],
         off_track_m=experiment.limits.off_track_m,
@@ -212,11 +227,6 @@ def _scene(experiment: Experiment, scenario: str) -> rd.Scene:
         faces_m=faces,
         fence_m=None if fence_m is None else fence_m * square[:4],
     )
-
-
-def _searched(experiment: Experiment, cell: Cell) -> dict[str, Any]:
-    found: dict[str, Any] = read_json(driven_folder(experiment, cell) / SEARCHED)
-    return found
 
 
 def _live_results(experiment: Experiment, cell: Cell) -> list[dict[str, Any]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.geometry import planar_poses
 from advnerf_core.report.cells import read_cell
 from advnerf_core.report.conditions import NONE, style_of
-from advnerf_core.report.data import ReportData
+from advnerf_core.report.data import MemoryRow, ReportData
 from advnerf_core.report.result_page import not_driven, text_table
 from advnerf_core.report.result_table import ResultTable, make_table
 from advnerf_core.report.targets import Target, evaluate, target_table
@@ -24,16 +25,18 @@ from advnerf_core.report.text_table import count
 from hardware.worlds.world import World
 from nodes.experiment.engine.run_folder import CELLS
 from nodes.experiment.pages.gather import gather
+from nodes.experiment.pages.opening import Wording, first_screen
 from nodes.experiment.pages.table import wanted_rows, write_table
 from nodes.experiment.plan.carriers import FaceCarrier
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.method_names import know_methods_of
+from nodes.experiment.plan.object_kinds import name_of
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.images import as_uint8
 from nodes.experiment.show.overview import from_above
 from nodes.experiment.show.spaces import dress, make_space, shown_there
 from nodes.experiment.steps import films, memory
-from nodes.experiment.steps.attack import load_found, load_shown
+from nodes.experiment.steps.attack import load_found, load_shown, planned_evaluations
 from nodes.experiment.steps.keys import driven_folder
 from nodes.runtime.progress import Report
 
@@ -54,41 +57,50 @@ def run(experiment: Experiment, folder: Path, report: Report, notes: Sequence[st
         report: Progress callback.
         notes: Paragraphs at the top of the page, such as missing methods.
     """
-    from advnerf_core.report.sections import page_sections, what_it_did  # matplotlib
+    from advnerf_core.report.sections import page_sections  # matplotlib
 
     know_methods_of(experiment.folder / CELLS, experiment.config.method_names)
     data, table = _measure(experiment, folder, report), table_of(experiment)
     report(0.95, "writing the page")
-    lead = (*notes, opening(experiment), *what_it_did(data, table, experiment.config.main_victim))
     targets = evaluate(experiment.held_to.targets, table, data.measured)
     sections = page_sections(data, table)
-    write_table(table, experiment.folder / CELLS, folder, sections, lead, PAGE, targets)
+    first = first_screen(data, table, experiment.config.main_victim, wording_of(experiment))
+    cells = experiment.folder / CELLS
+    write_table(table, cells, folder, sections, PAGE, targets, first=first, notes=notes)
 
 
 def _measure(experiment: Experiment, folder: Path, report: Report) -> ReportData:
     """Cut films, and render the objects if the deployed world can be opened; for live drives measure memory."""
-    names = experiment.config.cell_paths
-    if experiment.config.deploy.live:
+    config, names = experiment.config, experiment.config.cell_paths
+    rows: tuple[MemoryRow, ...] = ()
+    if config.deploy.live:
         rows = memory.measure(experiment, folder, lambda part, text="": report(0.6 * part, text))
-        report(0.6, "cutting films")
-        space = make_space(experiment, None)
-        filmed = {name: films.film_scenario(experiment, None, space, name, folder) for name in names}
-        return gather(experiment, filmed, {}, memory=rows)
-    if experiment.config.deploy.through == "nothing":
-        report(0.1, "drawing what the policy sees")
-        space = make_space(experiment, None)
-        return gather(experiment, {}, {name: seen_where_learned(experiment, space, name) for name in names})
-    filmed, seen = {}, {}
-    with experiment.open_deployed_world() as scene:
+    filmed, seen, above = {}, {}, None
+    with experiment.open_deployed_world() if config.deploy.through == "world" else nullcontext() as scene:
         space = make_space(experiment, scene)
         for index, name in enumerate(names):
-            report(0.1 + 0.8 * index / len(names), f"filming {name}")
+            report(0.6 + 0.3 * index / len(names), f"filming {name}")
             filmed[name] = films.film_scenario(experiment, scene, space, name, folder)
-            seen[name] = textures_seen(experiment, scene, space, name)
-        return gather(experiment, filmed, seen, from_above(experiment, scene))
+            if scene is not None:
+                seen[name] = textures_seen(experiment, scene, space, name)
+            elif not config.deploy.live:
+                seen[name] = seen_where_learned(experiment, space, name)
+        above = None if scene is None else from_above(experiment, scene)
+    return gather(experiment, filmed, seen, how_it_was_run(experiment), above, rows)
 
 
-def opening(experiment: Experiment) -> str:
+def wording_of(experiment: Experiment) -> Wording:
+    """What the sentences of the page call the attacked thing and the place of the drives."""
+    carrier, kinds = experiment.config.carrier, {thing.kind for thing in experiment.objects}
+    thing = carrier.panel if isinstance(carrier, FaceCarrier) else "objects"
+    if len(experiment.objects) == 1:
+        thing = name_of(kinds.pop()).partition(".")[0].replace("_", " ")
+    live = experiment.config.deploy.live
+    where = "In the simulated lab" if live else f"In the world {experiment.deployed_world.kind}"
+    return Wording(thing, where, experiment.limits.off_track_m)
+
+
+def how_it_was_run(experiment: Experiment) -> str:
     """What the experiment did, in one paragraph."""
     config, attack = experiment.config, experiment.config.attack
     methods = ", ".join(style_of(name).title for name in config.method_names)
@@ -96,8 +108,9 @@ def opening(experiment: Experiment) -> str:
     named = " and ".join(count(number, kind) for kind, number in kinds.items())
     searched = (config.carrier if isinstance(config.carrier, FaceCarrier) else config.space).searched
     return (
-        f"Policies ({', '.join(config.attacked)}) drive {', '.join(config.cell_paths)}. {searched.format(named)} ({methods}; {attack.evaluations} evaluations "
-        f"each, {count(len(config.seeds), 'seed')}, {count(attack.starts, 'start')}, T = {config.horizon} ticks of {config.dt_s:g} s){_then(experiment)}."
+        f"Policies ({', '.join(config.attacked)}) drive {', '.join(config.cell_paths)}. {searched.format(named)} ({methods}; {planned_evaluations(experiment)} evaluations "
+        f"each, {count(len(config.seeds), 'seed')}, {count(attack.starts, 'start')}, {experiment.searched_ticks} ticks of {config.dt_s:g} s)"
+        f"{_then(experiment)}. Drives last {config.horizon} ticks, from {count(config.measure.starts, 'start')} that no search used."
     )
 
 

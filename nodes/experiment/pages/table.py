@@ -10,9 +10,11 @@ from markupsafe import Markup
 
 from advnerf_core.files import write_atomically
 from advnerf_core.report.conditions import order_of
+from advnerf_core.report.pages import FirstScreen
 from advnerf_core.report.result_page import as_csv, as_json, as_markdown, gather_clips, render_page
 from advnerf_core.report.result_table import ResultTable, Wanted
 from advnerf_core.report.targets import Target
+from nodes.experiment.pages.opening import Wording, opening
 from nodes.experiment.plan.cell import Cell
 
 
@@ -36,9 +38,10 @@ def write_table(
     cells_folder: Path,
     folder: Path,
     sections: Sequence[tuple[str, Markup]] = (),
-    lead: Sequence[str | Markup] = (),
     page: str = "index.html",
     targets: Sequence[Target] = (),
+    first: FirstScreen | None = None,
+    notes: Sequence[str] = (),
 ) -> Path:
     """Write JSON, CSV, Markdown and the page with the clips beside it.
 
@@ -47,9 +50,10 @@ def write_table(
         cells_folder: Folder of the cells' clips.
         folder: Output folder.
         sections: Further parts of the page.
-        lead: Paragraphs before the table.
         page: Name of the page.
         targets: Targets of the results.
+        first: Contents of the first screen; None for the sentences of the table alone.
+        notes: Paragraphs before the sentence, such as missing methods.
 
     Returns:
         The page.
@@ -61,5 +65,6 @@ def write_table(
     )
     write_atomically(folder / "table.csv", as_csv(table))
     write_atomically(folder / "table.md", as_markdown(table, targets))
-    write_atomically(folder / page, render_page(table, clips, sections, lead, targets))
+    text = render_page(table, first or opening(table, Wording()), clips, sections, targets, notes)
+    write_atomically(folder / page, text)
     return folder / page

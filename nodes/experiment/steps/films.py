@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 from advnerf_core.attack.spaces.space import Space
 from advnerf_core.documents import read_json
 from advnerf_core.geometry import Array, planar_poses
-from advnerf_core.report.clips import ClipTrack, write_clip
-from advnerf_core.report.conditions import NONE, style_of
-from advnerf_core.scene.surrogate import Surrogate
+from advnerf_core.report.clips import ClipTrack, write_clip, write_film
+from advnerf_core.report.conditions import NONE, compared, style_of
+from advnerf_core.report.data import Film
 from hardware.worlds.world import World
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.images import as_uint8
-from nodes.experiment.show.learned_scene import load_background
 from nodes.experiment.show.spaces import dress, shown_there
 from nodes.experiment.steps.attack import load_found, load_shown
 from nodes.experiment.steps.deploy import DRIVES
@@ -30,40 +29,34 @@ DOMAINS = ("surrogate", "deployed")
 _FRAME_S = 0.1  # of films: finer ticks are not all filmed
 
 
-def strongest(experiment: Experiment) -> str:
-    """The method shown in films: the gradient if it was searched."""
-    methods = experiment.config.method_names
-    return "gradient" if "gradient" in methods else methods[-1]
-
-
 def film_scenario(
     experiment: Experiment, scene: World | None, space: Space, scenario: str, folder: Path
-) -> Path:
-    """The attacked drive in the surrogate, and the deployed ones without and with the attack, side by side; first seed and start.
+) -> Film | None:
+    """The drives without an attack, past the best random object and past the attacked one, side by side; first seed and start.
 
     Args:
         experiment: Experiment with all earlier stages finished.
-        scene: The open scene; None for live drives, whose bags have the pictures.
+        scene: The open scene; None for live drives, whose bags have the pictures, and if nothing was deployed: then the film
+            shows the learned scene as the policy sees it.
         space: The search space.
         scenario: Name of the path.
         folder: Folder for the film.
     """
-    attacked = Cell(
-        scenario, experiment.config.main_victim, strongest(experiment), experiment.config.seeds[0]
+    _, rate_hz = filmed(experiment.config.dt_s)
+    deployed, tracks = experiment.config.deploy.through != "nothing", []
+    for method, title in compared(experiment.config.method_names).items():
+        cell = Cell(scenario, experiment.config.main_victim, method, experiment.config.seeds[0])
+        cell = cell.clean if method == NONE else cell
+        driven = driven_folder(experiment, cell)
+        if not deployed:
+            tracks.append(_learned_track(experiment, space, cell, title, driven))
+        elif (driven / DRIVES).exists():  # else not driven live
+            tracks.append(_deployed_track(experiment, scene, space, cell, title, driven))
+    return (
+        write_film(folder / f"{scenario}.mp4", tracks, rate_hz, experiment.world.off_track_m)
+        if tracks
+        else None
     )
-    shown = load_shown(space, driven_folder(experiment, attacked), attacked)
-    whole = Surrogate(load_background(experiment), experiment.camera, experiment.mount, shown.objects)
-    every, rate_hz = filmed(experiment.config.dt_s)
-    learned = drives_of(experiment, "surrogate", attacked)[0][::every]
-    poses = planar_poses(learned) @ experiment.mount
-    frames = [as_uint8(whole.render(pose[None], shown.colours).images[0]) for pose in poses]
-    tracks = [_track(experiment, attacked, "learned scene, attacked", frames, learned)]
-    for cell in (attacked.clean, attacked):
-        if not (driven_folder(experiment, cell) / DRIVES).exists():
-            continue  # not driven live
-        title = "deployed, no attack" if cell.method == NONE else "deployed, attacked"
-        tracks.append(_deployed_track(experiment, scene, space, cell, title, driven_folder(experiment, cell)))
-    return write_clip(folder / f"{scenario}.mp4", tracks, rate_hz, experiment.world.off_track_m)
 
 
 def film_cell(
@@ -74,6 +67,16 @@ def film_cell(
     track = _deployed_track(experiment, scene, space, cell, title, driven)
     _, rate_hz = filmed(experiment.config.dt_s)
     return write_clip(folder / "clip.mp4", [track], rate_hz, experiment.world.off_track_m)
+
+
+def _learned_track(experiment: Experiment, space: Space, cell: Cell, title: str, folder: Path) -> ClipTrack:
+    """What the policy saw on the first drive of a cell in the learned scene."""
+    every, _ = filmed(experiment.config.dt_s)
+    states, shown = _states(folder / SEARCHED)[0][::every], load_shown(space, folder, cell)
+    sensor = shown.seen_by(space.surrogate)
+    poses = planar_poses(states) @ experiment.mount
+    frames = [as_uint8(sensor.render(pose[None], shown.colours).images[0]) for pose in poses]
+    return _track(experiment, cell, title, frames, states)
 
 
 def _deployed_track(

@@ -57,8 +57,11 @@ def test_bad_tracks_are_named():
         list(clips.compose([track(), track(height=60)]))
 
 
-def test_film_strip_ends_with_the_last_frame(tmp_path):
-    path = clips.write_clip(tmp_path / "one.mp4", [track(count=9)])
-    strip = clips.film_strip(path, 3)
-    assert len(strip) == 3
-    np.testing.assert_array_equal(strip[-1], clips.read_clip(path)[-1])
+def test_the_poster_of_a_film_is_where_the_last_drive_is_farthest_from_its_path(tmp_path):
+    tracks = [track("no attack", condition="none"), track("attack")]
+    tracks[1].cte_m[:] = [0.0, 0.1, -0.2, -0.9, 0.3, 0.2, 0.1]
+    film = clips.write_film(tmp_path / "pair.mp4", tracks, 10.0, 0.4)
+    assert (film.titles, film.moment) == (("no attack", "attack"), 3)
+    written = clips.read_clip(film.file)
+    np.testing.assert_array_equal(clips.frame_of(film.file, film.moment), written[3])
+    np.testing.assert_array_equal(clips.frame_of(film.file, 99), written[-1])

@@ -95,7 +95,7 @@ def test_a_stranger_appears_in_the_report(make):
     assert legend == [
         "gradient, one line per seed",
         "Spiral: each texture, best so far",
-        "no attack, surrogate",
+        "plain object",
     ]
     data = ReportData((drives,), make.manifest())
     assert any("Spiral" in body for _, body in page_sections(data, make.table([])))

@@ -1,3 +1,4 @@
+import dataclasses
 import itertools
 
 import cv2
@@ -90,12 +91,18 @@ def test_svg_follows_the_theme_and_loads_nothing(report):
     assert 'aria-label="drives &amp; &#34;errors&#34; \\1"' in text
 
 
-def test_figures_of_both_domains_share_the_error_axis(report):
-    limits = {
-        plots.cte_over_time(report.drives[0], d, "hardened").axes[0].get_ylim()
-        for d in ("surrogate", "deployed")
-    }
-    assert len(limits) == 1
+def test_figures_that_are_compared_have_the_same_axes(report):
+    drives, victims = report.drives[0], ("hardened", "naive")
+    axes = [plots.cte_over_time(drives, d, v).axes[0] for d in ("surrogate", "deployed") for v in victims]
+    assert len({(ax.get_xlim(), ax.get_ylim()) for ax in axes}) == 1
+    others = [
+        dataclasses.replace(curve, victim="naive", excess_m=3.0 * curve.excess_m) for curve in drives.curves
+    ]
+    both = dataclasses.replace(drives, curves=(*drives.curves, *others))
+    axes = [plots.loss_curves(both, victim).axes[0] for victim in victims]
+    assert len({(ax.get_xlim(), ax.get_ylim()) for ax in axes}) == 1
+    maps_of = [maps.trajectory_map(drives, victim).axes[0] for victim in victims]
+    assert len({(ax.get_xlim(), ax.get_ylim()) for ax in maps_of}) == 1
 
 
 def test_png_is_written_whole(report, tmp_path):

@@ -2,6 +2,7 @@
 import csv
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import yaml
 
 from advnerf_core.report.cells import CellError, CellResult, read_cell
 from advnerf_core.report.evidence.intervals import clustered_interval
+from advnerf_core.report.pages import FirstScreen
 from advnerf_core.report.predictions import Predicted, prediction_section
 from advnerf_core.report.reference import Reference
 from advnerf_core.report.result_page import (
@@ -26,6 +28,7 @@ from advnerf_core.report.targets import Target, evaluate
 ROOT = Path(__file__).parents[3]
 PAPER = Reference.model_validate(yaml.safe_load((ROOT / "launch" / "paper.reference.yaml").read_text()))
 TICKS = 10
+FIRST = FirstScreen("What happened.")
 
 
 def targets_of(table):
@@ -119,7 +122,14 @@ def test_the_excess_is_over_both_controls_where_no_object_was_driven():
     assert (row.excess_m, row.over_no_object_m) == (pytest.approx(0.75), pytest.approx(0.9))
     plain = table.find("left", "hardened", "none", "surrogate").excess
     assert (plain.excess_m, plain.over_no_object_m) == (pytest.approx(0.3), pytest.approx(0.15))
-    assert "(mean abs. CTE 0.300)" in as_markdown(table)
+    # The plain object has its mean |CTE| and exceeds itself by nothing; one search and no collision make no columns.
+    learned = make_table([replace(each, deployed=False) for each in wanted_of(cells)], cells)
+    lines = as_markdown(learned).splitlines()
+    line = "| left | hardened | plain object | learned scene | 2 | 0.300 |  |  | 0.150 | -0.485 to 0.785 | 0 of 2 |"
+    assert line in lines
+    heading = next(each for each in lines if each.startswith("| path"))
+    assert "searches" not in heading
+    assert "collided" not in heading
 
 
 def test_what_was_not_run_is_missing_and_never_a_number(table):
@@ -187,7 +197,7 @@ def test_json_and_page_hold_the_same_numbers(table):
     assert len(data["rows"]) == 6
     assert data["targets"][0]["value"] == 4.0
     assert set(data["cells"]) == set(table.cells)
-    page = render_page(table, targets=targets_of(table))
+    page = render_page(table, FIRST, targets=targets_of(table))
     assert "0.900" in page
     assert "4.00 × plain object" in page
     assert "missing" in page
@@ -289,13 +299,14 @@ def test_a_method_must_exceed_another_one_not_equal_it():
 
 
 def test_without_limits_there_are_no_targets(table):
-    assert "Targets" not in render_page(table)
+    assert "Targets" not in render_page(table, FIRST)
     assert "Targets" not in as_markdown(table)
 
 
 def test_a_cell_that_was_not_driven_live_is_named_first():
     late = cell("left", "gradient", 0, ([9.0], [3.0], [True]), None)
     late = late.model_copy(update={"not_driven_live": "the stack stopped the car"})
-    page = render_page(make_table(wanted_of([late]), [late]), lead=("What was done.",))
-    assert page.index("NOT DRIVEN LIVE: gradient (hardened, seed 0)") < page.index("What was done.")
+    page = render_page(make_table(wanted_of([late]), [late]), FIRST, notes=("What is left out.",))
+    assert page.index("NOT DRIVEN LIVE: gradient (hardened, seed 0)") < page.index("What is left out.")
+    assert page.index("What is left out.") < page.index("<h1>")
     assert "are no evidence of transfer" in page

@@ -131,7 +131,7 @@ def test_a_method_of_a_file_runs_a_cell_and_appears_in_the_tables(
     assert film_cell(experiment, wall, space, spiral, out, out).exists()
     table = text_table(report.table_of(experiment))
     assert [row[2] for row in table.rows if row[2]] == ["plain object", "gradient", "Spiral"]
-    assert "Spiral" in report.opening(experiment)
+    assert "Spiral" in report.how_it_was_run(experiment)
 
     # What its code is decides, not where it lies.
     def digest() -> str:

@@ -17,7 +17,7 @@ from advnerf_core.objects.mesh.engine import MeshEngineError, engine
 from advnerf_core.objects.mesh.glb import mesh_from_glb
 from advnerf_core.report.cells import cell_from
 from advnerf_core.report.clips import ClipTrack, read_clip
-from nodes.experiment.pages.report import opening
+from nodes.experiment.pages.report import how_it_was_run
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.sections import RetrainConfig
 from nodes.experiment.plan.space_config import (
@@ -323,7 +323,7 @@ def test_maps_are_of_what_the_cell_found(
 )
 def test_the_page_says_what_was_searched(trained: Experiment, space: Any, searched: str) -> None:
     experiment = searching(trained, space)
-    text = opening(experiment)
+    text = how_it_was_run(experiment)
     assert searched in text
     kinds = {thing.kind for thing in experiment.objects}
     assert kinds

@@ -59,7 +59,7 @@ def test_all_cells_and_the_report(trained: Experiment, tmp_path: Path) -> None:
         assert len(read_clip(folder / "report" / f"{name}.mp4")) == 4  # three ticks and the start
     page = (folder / "report" / "report.html").read_text()
     assert "&lt;it&gt;" in page  # what it quotes is escaped
-    # Of each drive and victim a map, errors in both domains and the searches; and the steering.
-    assert page.count("<svg") == 3 * 2 * 4 + 1
+    # Of each drive and victim a map, errors in both domains and the searches; the steering; and the first screen's map.
+    assert page.count("<svg") == 3 * 2 * 4 + 2
     assert page.count("<video") == 3 + 24  # a film of each drive, and one of each cell
     assert "://" not in page.replace("http://www.w3.org", "")
