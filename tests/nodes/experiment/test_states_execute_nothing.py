@@ -55,7 +55,17 @@ class Yard:
         changes = [word for change in CHANGES for word in ("--set", change)]
         done = CliRunner().invoke(
             app,
-            [name, str(self.file), "--setting", "tiny", "--folder", str(self.run), *changes, *options],
+            [
+                "experiment",
+                name,
+                str(self.file),
+                "--setting",
+                "tiny",
+                "--folder",
+                str(self.run),
+                *changes,
+                *options,
+            ],
         )
         assert done.exit_code == 0, done.output
         return done.output
@@ -118,7 +128,7 @@ def test_a_finished_cell_is_done_without_its_code_until_the_code_changes(yard):
         f"over:\n  victim: [hardened]\n  method: [none]\n  variant:\n    loop:\n      over.path: [loop]\n      run_folder: {yard.run}\n{changes}"
     )
     for state in ("done", "changed"):
-        shown = yard.command("experiment", "status", "--only", "method=none,victim=hardened")
+        shown = yard.command("status", "--only", "method=none,victim=hardened")
         assert state in shown.split()
         found = CliRunner().invoke(app, ["experiment", "status", str(variants)])
         assert ("done" in found.output.split()) == (state == "done")
