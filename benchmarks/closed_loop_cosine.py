@@ -20,38 +20,37 @@ import torch
 from advnerf_core.attack.adjoint import adjoint_gradient
 from advnerf_core.attack.closed_loop import closed_loop_cosine
 from advnerf_core.attack.health import closed_loss
-from advnerf_core.documents import read_json
-from advnerf_core.files import write_json
+from advnerf_core.documents import dump_yaml, read_json, read_yaml
+from advnerf_core.files import write_atomically, write_json
 from benchmarks.results import REPOSITORY, record_row
 from nodes.experiment.node.check import in_double
-from nodes.experiment.node.prepare import Prepared, prepare
-from nodes.experiment.node.request import AttackRequest, load_request
+from nodes.experiment.node.prepare import Prepared, load_request, prepare
+from nodes.experiment.show.context import Experiment
 
 COMMAND = "python -m benchmarks.closed_loop_cosine RUN_FOLDER"
 HORIZONS = (10, 20, 40, 60)
 
 
-def request_of(run_folder: Path, ticks: int) -> AttackRequest:
-    """The attack of ``launch/corner.attack.yaml`` on the scene and the policy of a run folder."""
-    request = load_request(REPOSITORY / "launch" / "corner.attack.yaml")
+def request_of(run_folder: Path, ticks: int, folder: Path) -> Experiment:
+    """The attack of ``launch/corner.experiment.yaml`` on the scene and the policy of a run folder; written into ``folder``."""
+    data = read_yaml(REPOSITORY / "launch" / "corner.experiment.yaml").data
     calibration = run_folder / "capture" / "calibration"
-    (face,) = request.objects
-    return request.model_copy(
-        update={
-            "scene": run_folder / "scene" / "scene.safetensors",
-            "policy": run_folder / "policy" / "policy.safetensors",
-            "calibration": calibration,
-            "objects": (face.model_copy(update={"target": calibration / "board.yaml"}),),
-            "horizon": ticks,
-        }
-    )
+    data["world"] |= {
+        "file": str(run_folder / "scene" / "scene.safetensors"),
+        "calibration": str(calibration),
+    }
+    data["victims"] = {"mine": {"policy": str(run_folder / "policy" / "policy.safetensors")}}
+    data["objects"][0]["face"]["target"] = str(calibration / "board.yaml")
+    file = folder / "corner.experiment.yaml"
+    write_atomically(file, dump_yaml(data | {"horizon": ticks}))
+    return load_request(file, folder=folder)
 
 
 def measured(prepared: Prepared, directions: int) -> dict[str, Any]:
     """The cosine of one horizon with everything that it was made from."""
     began = time.monotonic()
     exact = in_double(prepared)
-    theta = prepared.surrogate.initial_theta(torch.Generator().manual_seed(prepared.seed)).double()
+    theta = prepared.space.surrogate.initial_theta(torch.Generator().manual_seed(prepared.seed)).double()
     gradient = adjoint_gradient(exact, theta).gradient
     found = closed_loop_cosine(partial(closed_loss, exact), theta, gradient, directions, seed=prepared.seed)
     return {**found.to_dict(), "clean": prepared.clean_drive.to_dict(), "seconds": time.monotonic() - began}
@@ -95,7 +94,7 @@ def main() -> None:
     )
     options = parser.parse_args()
     for ticks in options.horizons:
-        prepared = prepare(request_of(options.run_folder.resolve(), ticks))
+        prepared = prepare(request_of(options.run_folder.resolve(), ticks, options.folder))
         found = kept_or_measured(prepared, options.count, options.folder)
         print(f"T = {ticks}: {found['in_words']} ({found['seconds']:.0f} s)", flush=True)
         record(ticks, prepared, options.count, found)

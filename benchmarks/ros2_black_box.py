@@ -2,7 +2,7 @@
 
 The policy is `examples/ros2_policy.py`, plain rclpy, in an environment of its own (`make setup-ros2`). The attack was searched by asking it:
 
-    advnerf attack run launch/corner.attack.yaml -o runs/black_ros2 --set policy=examples.ros2_black_box:factory --set search.method=cem
+    advnerf attack run launch/corner.experiment.yaml -o runs/black_ros2 --set victims.mine.policy=examples.ros2_black_box:factory --set 'over.method=[cem]'
 
 Here the same program drives the simulated lab tick by tick, past the board in its plain colour and past the attack, from the same
 starts. The simulated time stands still while it is asked, so a busy machine changes nothing. The row has the mean excess of the total

@@ -1,7 +1,7 @@
 """An objective of your own: the attack pulls the car to the left of its path, not to the nearer side.
 
     .venv/bin/python examples/left_objective.py
-    .venv/bin/advnerf attack run launch/corner.attack.yaml -o runs/left --set search.objective=../examples/left_objective.py:LeftOffset
+    .venv/bin/advnerf attack run launch/corner.experiment.yaml -o runs/left --set attack.objective=../examples/left_objective.py:LeftOffset
 
 The objective is a class with a method `value`; see docs/methods.md.
 """

@@ -5,8 +5,8 @@
 
 Start the second line in another terminal; the first one asks it for its steering. Then attack it, with images of a learned scene:
 
-    .venv/bin/advnerf attack run launch/corner.attack.yaml -o runs/black_ros2 \\
-        --set policy=examples.ros2_black_box:factory --set search.method=cem --set search.evaluations=50
+    .venv/bin/advnerf attack run launch/corner.experiment.yaml -o runs/black_ros2 \\
+        --set victims.mine.policy=examples.ros2_black_box:factory --set 'over.method=[cem]' --set attack.evaluations=50
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A method of attack of your own: it walks along a spiral of textures.
 
     .venv/bin/python examples/spiral_method.py
-    .venv/bin/advnerf attack run launch/corner.attack.yaml -o runs/spiral --set search.method=../examples/spiral_method.py:Spiral
+    .venv/bin/advnerf attack run launch/corner.experiment.yaml -o runs/spiral --set 'over.method=[../examples/spiral_method.py:Spiral]'
 
 The method is a function and a `Method` that says what the function needs; see docs/methods.md.
 """

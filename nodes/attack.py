@@ -23,7 +23,7 @@ from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
 from advnerf_core.strict import StrictModel
 from nodes.experiment.node.job import REQUEST, Job, Said, is_begun
-from nodes.experiment.node.request import parse_request, request_text
+from nodes.experiment.node.request import parse_request
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.messages import header, image_message, types
 from nodes.runtime.node import ACTIVE, READY, Inbox, MessageInfo, Node, NodeContext, Now, Out
@@ -165,7 +165,7 @@ class AttackNode(Node):
             raise AdvnerfError(
                 f"expected a request id of 1 to 40 letters, digits, - and _, got {request_id!r}"
             )
-        kept_text = request_text(parse_request(text, f"request {request_id}"))
+        kept_text = parse_request(text, f"request {request_id}")
         if self._job is not None and request_id != self._request_id:
             raise AdvnerfError(f"busy with {self._request_id}; wait for it, or cancel it")
         folder = self._folder / request_id

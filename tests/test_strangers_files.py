@@ -72,14 +72,14 @@ def test_on_is_no_speed_and_yes_no_distance(tmp_path):
     ("line", "message"),
     [
         ("horizon: yes", r"a:\d: horizon: input should be a valid integer, got 'yes'"),
-        ("search: {seeds: [010]}", "a:3: 010: expected a number without leading zeros"),
-        ("dynamics: &a {x: *a}", r"a:3: \*a is part of the value that it refers to"),
-        ("starts: {poses: [[0, 0, 3:14]]}", "got '3:14'"),
+        ("over: {seed: [010]}", "a:3: 010: expected a number without leading zeros"),
+        ("attack: &a {x: *a}", r"a:3: \*a is part of the value that it refers to"),
+        ("attack: {start_poses: [[0, 0, 3:14]]}", "got '3:14'"),
     ],
 )
 def test_an_attack_takes_no_other_number_than_the_one_that_is_written(line, message):
     with pytest.raises(ConfigError, match=message):
-        parse_request(f"scene: a\npolicy: b\n{line}\n", "a")
+        parse_request(f"name: a\npaths: [b]\n{line}\n", "a")
 
 
 @pytest.mark.parametrize(

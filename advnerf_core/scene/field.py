@@ -227,6 +227,15 @@ def save_scene(
     return content
 
 
+def load_scene_config(path: str | Path) -> SceneFieldConfig:
+    """Read the sizes of a scene file.
+
+    Raises:
+        SceneFileError: The file is missing, damaged, or of another kind.
+    """
+    return _read(Path(path), with_tensors=False)[1]
+
+
 def load_scene(path: str | Path) -> tuple[SceneField, NDArray[np.bool_], dict[str, Any]]:
     """Read a scene file: field, occupancy ``[X, Y, Z]``, metadata (with ``scene_hash``).
 
@@ -234,19 +243,8 @@ def load_scene(path: str | Path) -> tuple[SceneField, NDArray[np.bool_], dict[st
         SceneFileError: The file is missing, damaged, or of another kind.
     """
     path = Path(path)
-    try:
-        with open_tensors(path, "pt") as file:
-            header = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
-    except (OSError, SafetensorError) as error:
-        raise SceneFileError(
-            f"expected a scene file at {path}, got: {error}; train the scene again"
-        ) from error
-    if header.get("format") != FORMAT:
-        raise SceneFileError(
-            f"expected format {FORMAT} in {path}, got {header.get('format')}; train the scene again"
-        )
-    scene = SceneField(SceneFieldConfig.from_dict(json.loads(header["config"])))
+    header, config, tensors = _read(path)
+    scene = SceneField(config)
     shape = tuple(json.loads(header["occupancy_shape"]))
     occupancy = (
         np.unpackbits(tensors.pop("occupancy_bits").numpy(), count=int(np.prod(shape)))
@@ -261,3 +259,24 @@ def load_scene(path: str | Path) -> tuple[SceneField, NDArray[np.bool_], dict[st
         ) from error
     metadata = {**json.loads(header["metadata"]), "scene_hash": header["scene_hash"]}
     return scene, occupancy, metadata
+
+
+def _read(
+    path: Path, with_tensors: bool = True
+) -> tuple[dict[str, str], SceneFieldConfig, dict[str, Tensor]]:
+    """Header, sizes and tensors of a scene file."""
+    tensors: dict[str, Tensor] = {}
+    try:
+        with open_tensors(path, "pt") as file:
+            header: dict[str, str] = file.metadata() or {}
+            if with_tensors:
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
+    except (OSError, SafetensorError) as error:
+        raise SceneFileError(
+            f"expected a scene file at {path}, got: {error}; train the scene again"
+        ) from error
+    if header.get("format") != FORMAT:
+        raise SceneFileError(
+            f"expected format {FORMAT} in {path}, got {header.get('format')}; train the scene again"
+        )
+    return header, SceneFieldConfig.from_dict(json.loads(header["config"])), tensors

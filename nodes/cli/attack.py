@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from nodes.runtime.terminal import Device, Overrides, print_table, table
+
+if TYPE_CHECKING:
+    from nodes.experiment.show.context import Experiment
 
 app = typer.Typer(
     no_args_is_help=True,
     help="Search for textures and poses, go on with a search, look at and examine attacks.",
 )
 
-RequestFile = Annotated[Path, typer.Argument(help="A *.attack.yaml file.", exists=True, dir_okay=False)]
+RequestFile = Annotated[
+    Path,
+    typer.Argument(
+        help="A *.experiment.yaml file of one attack in a learned scene of your own.",
+        exists=True,
+        dir_okay=False,
+    ),
+]
 
 
 @app.command("run")
@@ -28,13 +38,13 @@ def attack_run(
 ) -> None:
     """Search as a request asks, for each of its seeds; ends in one attack file per seed."""
     from advnerf_core.attack.device import use_device
-    from nodes.experiment.node.request import load_request
+    from nodes.experiment.node.prepare import load_request
     from nodes.lab.plugin_tables import say_code
 
     use_device(device)
-    request = load_request(file, overrides or [])
-    say_code(request.model_dump(mode="json"), file.parent)
-    _run(output or Path("runs") / request.name, request)
+    request = load_request(file, overrides or [], output)
+    say_code(request.config.model_dump(mode="json"), file.parent)
+    _run(request)
 
 
 @app.command("resume")
@@ -49,20 +59,18 @@ def attack_resume(
 
     use_device(device)
     request = kept_request(folder)
-    say_code(request.model_dump(mode="json"), folder)
-    _run(folder, request)
+    say_code(request.config.model_dump(mode="json"), folder)
+    _run(request)
 
 
-def _run(folder: Path, request: object) -> None:
+def _run(request: Experiment) -> None:
     from nodes.experiment.node.printed import print_attacks
-    from nodes.experiment.node.request import AttackRequest
     from nodes.experiment.node.search import run_attack
     from nodes.runtime.locks import hold_folder
     from nodes.runtime.progress import ProgressDisplay
 
-    assert isinstance(request, AttackRequest)
-    with hold_folder(folder), ProgressDisplay() as display:
-        files = run_attack(request, folder, display)
+    with hold_folder(request.folder), ProgressDisplay() as display:
+        files = run_attack(request, request.folder, display)
     print_attacks(files)
 
 
@@ -175,18 +183,17 @@ def attack_check(
 ) -> None:
     """Say whether the gradient can be trusted for this scene, policy and objects; exit code 1 if it cannot."""
     from nodes.experiment.node.check import check, write_check
-    from nodes.experiment.node.request import load_request
+    from nodes.experiment.node.prepare import load_request
     from nodes.lab.plugin_tables import say_code
     from nodes.runtime.progress import ProgressDisplay
 
-    request = load_request(file, overrides or [])
-    say_code(request.model_dump(mode="json"), file.parent)
-    folder = output or Path("runs") / request.name
+    request = load_request(file, overrides or [], output)
+    say_code(request.config.model_dump(mode="json"), file.parent)
     with ProgressDisplay() as display:
         report = display.start("check")
         found = check(request, directions, memory, report)
     for line in found.verdict:
         print(line)
-    print(f"written: {', '.join(map(str, write_check(found, folder)))}")
+    print(f"written: {', '.join(map(str, write_check(found, request.folder)))}")
     if not found.sound:
         raise typer.Exit(1)

@@ -20,7 +20,14 @@ def add_to(app: typer.Typer) -> None:
 
 
 def attack_request(
-    file: Annotated[Path, typer.Argument(help="A *.attack.yaml file.", exists=True, dir_okay=False)],
+    file: Annotated[
+        Path,
+        typer.Argument(
+            help="A *.experiment.yaml file of one attack in a learned scene of your own.",
+            exists=True,
+            dir_okay=False,
+        ),
+    ],
     run_dir: RunDir = None,
     request_id: Annotated[
         str,
@@ -33,11 +40,11 @@ def attack_request(
 ) -> None:
     """Ask the attack node of a running launch for an attack; the compositor takes it over when it is found."""
     from nodes.experiment.node.client import ask_for_attack, new_request_id
-    from nodes.experiment.node.request import load_request
+    from nodes.experiment.node.prepare import load_request, request_text
     from nodes.launching.watching import find_run_dir
 
     request = load_request(file, overrides or [])
-    name = request_id or new_request_id(request.name)
+    name = request_id or new_request_id(request.config.name)
     print(f"request {name}", flush=True)
     seen: set[Any] = set()
 
@@ -47,7 +54,7 @@ def attack_request(
             seen.add(key)
             print(in_words(progress), flush=True)
 
-    last = ask_for_attack(find_run_dir(run_dir), request, name, tell, follow)
+    last = ask_for_attack(find_run_dir(run_dir), request_text(request), name, tell, follow)
     if last.state in ("failed", "refused", "cancelled"):
         raise typer.Exit(_FAILURE_EXIT)
 

@@ -10,7 +10,12 @@ import typer
 from nodes.runtime.terminal import Overrides, print_table, table
 
 RequestFile = Annotated[
-    Path, typer.Argument(help="A *.attack.yaml file with the key poses.", exists=True, dir_okay=False)
+    Path,
+    typer.Argument(
+        help="A *.experiment.yaml file of one attack in a learned scene of your own, with space.kind places.",
+        exists=True,
+        dir_okay=False,
+    ),
 ]
 Output = Annotated[
     Path | None, typer.Option("--output", "-o", help="Folder of the results.", show_default="runs/<name>")
@@ -29,16 +34,17 @@ FoundAttack = Annotated[
 def attack_poses(file: RequestFile, output: Output = None, overrides: Overrides = None) -> None:
     """Search for where objects should stand, alone or with their colours; the same command resumes it after a kill."""
     from advnerf_core.attack.artifact import load_attack
-    from nodes.experiment.node.poses import run_poses
+    from nodes.experiment.node.poses import require_places
+    from nodes.experiment.node.prepare import load_request
     from nodes.experiment.node.printed import print_attacks
-    from nodes.experiment.node.request import load_request
+    from nodes.experiment.node.search import run_attack
     from nodes.runtime.locks import hold_folder
     from nodes.runtime.progress import ProgressDisplay
 
-    request = load_request(file, overrides or [])
-    folder = output or Path("runs") / request.name
-    with hold_folder(folder), ProgressDisplay() as display:
-        files = run_poses(request, folder, display)
+    request = load_request(file, overrides or [], output)
+    require_places(request)
+    with hold_folder(request.folder), ProgressDisplay() as display:
+        files = run_attack(request, request.folder, display)
     rows = table("attack", "object", "x [m]", "y [m]", "yaw [rad]", "scale", "predicted total CTE [m]")
     for each in files:
         attack = load_attack(each)
@@ -57,15 +63,16 @@ def attack_landscape(
     """Map the total CTE over where one object stands: landscape.json and landscape.png; resumes after a kill."""
     import numpy as np
 
-    from nodes.experiment.node.pose_maps import make_landscape
-    from nodes.experiment.node.request import load_request
+    from nodes.experiment.node.poses import mapped
+    from nodes.experiment.node.prepare import load_request
     from nodes.runtime.locks import hold_folder
     from nodes.runtime.progress import ProgressDisplay
 
-    request = load_request(file, overrides or [])
-    folder = output or Path("runs") / request.name
+    request = load_request(file, overrides or [], output)
+    folder, maps = request.folder, request.config.maps
     with hold_folder(folder), ProgressDisplay() as display:
-        found, picture = make_landscape(request, folder, attack, display.start("landscape"))
+        about, report = mapped(request, attack), display.start("landscape")
+        found, picture = about.landscape(maps.landscape, maps.object, folder / "landscape.json", report)
     values = found.total_cte_m
     if np.isnan(values).all():
         print(f"no point of the grid is clear of the lane: {picture}")
@@ -84,15 +91,16 @@ def attack_robustness(
     """Map what an attack does from other starts and with an object moved: robustness.json and .png; resumes after a kill."""
     import numpy as np
 
-    from nodes.experiment.node.pose_maps import make_robustness
-    from nodes.experiment.node.request import load_request
+    from nodes.experiment.node.poses import mapped
+    from nodes.experiment.node.prepare import load_request
     from nodes.runtime.locks import hold_folder
     from nodes.runtime.progress import ProgressDisplay
 
-    request = load_request(file, overrides or [])
-    folder = output or Path("runs") / request.name
+    request = load_request(file, overrides or [], output)
+    folder, maps = request.folder, request.config.maps
     with hold_folder(folder), ProgressDisplay() as display:
-        found, picture = make_robustness(request, folder, attack, display.start("robustness"))
+        about, report = mapped(request, attack), display.start("robustness")
+        found, picture = about.robustness(maps.robustness, maps.object, folder / "robustness.json", report)
     ratios = found.total_cte_m / found.plain_cte_m
     clear = ratios[np.isfinite(ratios)]
     text = (

@@ -247,7 +247,7 @@ def vehicle(
         )
     if new.response is not None:
         values = ", ".join(f"{key}: {value}" for key, value in new.response.attack_dynamics().items())
-        print(f"for an attack request:\ndynamics: {{{values}}}")
+        print(f"for an experiment:\nattack: {{response: {{{values}}}}}")
 
 
 @app.command("time-offset")

@@ -208,7 +208,10 @@ def predict(
 
 def maps(
     choice: CellChoice,
-    number: Annotated[int, typer.Option("--object", min=0, help="Which object is moved.")] = 0,
+    number: Annotated[
+        int | None,
+        typer.Option("--object", min=0, help="Which object is moved.", show_default="maps.object"),
+    ] = None,
 ) -> None:
     """Draw the loss landscape and the robustness map (starts x moves of an object) of finished cells that have placed objects."""
     os.environ.setdefault("MUJOCO_GL", "egl")

@@ -179,7 +179,7 @@ def room_place(
     request: Annotated[
         Path | None,
         typer.Option(
-            help="The attack's *.attack.yaml. A copy for the measured pose is written.", exists=True
+            help="The attack's *.experiment.yaml. A copy for the measured pose is written.", exists=True
         ),
     ] = None,
     tolerance_cm: Annotated[

@@ -6,20 +6,20 @@ from pathlib import Path
 
 import numpy as np
 
+from advnerf_core.geometry import Pinhole
 from advnerf_core.policies.view import PolicyView
-from calibration.schema import CameraCalibration
 from nodes.runtime.errors import ConfigError
 
 _TOLERANCE_PX = 1e-6
 
 
-def require_camera(view: PolicyView, camera: CameraCalibration, policy: str, file: Path) -> None:
+def require_camera(view: PolicyView, mounted: Pinhole, policy: str, file: Path | str) -> None:
     """Refuse a policy that was trained for another camera than the one calibrated in ``file``.
 
     Raises:
         ConfigError: Image size or intrinsics differ.
     """
-    trained, mounted = view.camera, camera.pinhole
+    trained = view.camera
     same_size = (trained.width, trained.height) == (mounted.width, mounted.height)
     if not same_size or np.abs(trained.matrix - mounted.matrix).max() > _TOLERANCE_PX:
         raise ConfigError(

@@ -204,7 +204,7 @@ def _drives(see: See, calibration: Path) -> Drives:
 
 def _camera(view: PolicyView, calibration: Path) -> CameraCalibration:
     camera = load_calibration(CameraCalibration, calibration / "camera.yaml")
-    require_camera(view, camera, "", calibration / "camera.yaml")
+    require_camera(view, camera.pinhole, "", calibration / "camera.yaml")
     return camera
 
 

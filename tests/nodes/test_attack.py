@@ -16,7 +16,7 @@ from nodes.attack import AttackNode, AttackNodeConfig
 from nodes.cli.attack_node import in_words
 from nodes.experiment.node import job, search
 from nodes.experiment.node.client import ask_for_attack, cancel_attack, new_request_id
-from nodes.experiment.node.request import load_request, request_text
+from nodes.experiment.node.prepare import request_text
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import ManualClock, SystemClock
 from nodes.runtime.errors import LaunchError
@@ -24,7 +24,7 @@ from nodes.runtime.messages import decode, encode, header, image_message, pose_m
 from nodes.runtime.node import MessageInfo, NodeContext
 from nodes.runtime.pictures import rgb_image
 from nodes.runtime.transfer import Assembler, FileSender, chunk_messages
-from tests.support.tiny_request import tiny_request
+from tests.support.tiny_request import loaded, tiny_request
 
 REPOSITORY = Path(__file__).parents[2]
 CALIBRATION = REPOSITORY / "calibration" / "twin"
@@ -102,7 +102,7 @@ def bench(tmp_path):
 
 
 def test_a_request_ends_in_the_attack_file_that_the_command_would_have_written(bench, tmp_path):
-    request = load_request(tiny_request(tmp_path, evaluations=3))
+    request = loaded(tiny_request(tmp_path, evaluations=3))
     assert bench.node.status() == ("ready", "waiting for a request")
     bench.request(request_text(request))
     assert bench.state() == "preparing"
@@ -150,7 +150,7 @@ class _Silent:
 
 @pytest.mark.slow
 def test_a_cancel_is_answered_at_once_and_the_same_request_goes_on(bench, tmp_path):
-    text = request_text(load_request(tiny_request(tmp_path, evaluations=400)))
+    text = request_text(loaded(tiny_request(tmp_path, evaluations=400)))
     bench.request(text)
     bench.run_until(lambda: bench.progress()[-1].evaluation >= 3)
     worker = int(bench.node.counters()["worker_pid"])
@@ -168,7 +168,7 @@ def test_a_cancel_is_answered_at_once_and_the_same_request_goes_on(bench, tmp_pa
 
 
 def test_what_cannot_be_done_is_refused_in_words(bench, tmp_path):
-    text = request_text(load_request(tiny_request(tmp_path, evaluations=400)))
+    text = request_text(loaded(tiny_request(tmp_path, evaluations=400)))
 
     def refused(text, request_id="a"):
         bench.request(text, request_id)
@@ -185,22 +185,23 @@ def test_what_cannot_be_done_is_refused_in_words(bench, tmp_path):
 
 
 def test_a_search_that_fails_says_why(bench, tmp_path):
-    request = load_request(tiny_request(tmp_path))
-    request.policy.unlink()
-    bench.request(request_text(request))
+    request = loaded(tiny_request(tmp_path))
+    text = request_text(request)
+    (tmp_path / "policy.safetensors").write_bytes(b"nothing")
+    bench.request(text)
     bench.run_until(lambda: bench.state() == "failed")
     assert "policy.safetensors" in bench.progress()[-1].text
     assert "worker.log" in bench.progress()[-1].text
     assert bench.node.status()[0] == "ready"
     # Nothing was found: the corrected request may have the same id.
-    bench.request(request_text(load_request(tiny_request(tmp_path), ["horizon=4"])))
+    bench.request(request_text(loaded(tiny_request(tmp_path), ["horizon=4"])))
     assert bench.state() not in ("refused", "failed")
     bench.cancel()
 
 
 @pytest.mark.slow
 def test_a_killed_search_fails_and_goes_on_when_asked_again(bench, tmp_path):
-    text = request_text(load_request(tiny_request(tmp_path, evaluations=400)))
+    text = request_text(loaded(tiny_request(tmp_path, evaluations=400)))
     bench.request(text)
     bench.run_until(lambda: bench.progress()[-1].evaluation >= 2)
     os.kill(int(bench.node.counters()["worker_pid"]), signal.SIGKILL)
@@ -269,7 +270,7 @@ class Car:
 @pytest.mark.slow
 def test_a_killed_node_goes_on_and_a_running_compositor_takes_the_attack_over(tmp_path):
     run_dir = tmp_path / "run"
-    request = load_request(tiny_request(tmp_path / "data", evaluations=20))
+    request = loaded(tiny_request(tmp_path / "data", evaluations=20))
     attack = node_process("nodes.attack", run_dir, {"repeat_s": 0.2})
     compositor = node_process(
         "nodes.compositor",
@@ -280,7 +281,7 @@ def test_a_killed_node_goes_on_and_a_running_compositor_takes_the_attack_over(tm
         with Bus(run_dir) as bus:
             car = Car(bus)
             seen = []
-            ask_for_attack(run_dir, request, "live", seen.append, follow=False)
+            ask_for_attack(run_dir, request_text(request), "live", seen.append, follow=False)
             assert seen[0].state == "preparing"
             bus.subscribe("/attack/progress")
             _wait(bus, lambda message: message.evaluation >= 3)

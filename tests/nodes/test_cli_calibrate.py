@@ -103,7 +103,7 @@ def test_vehicle_from_a_bag(tmp_path, capsys):
     assert found.response.pipeline_delay_s == pytest.approx(0.04, abs=1e-3)
     assert found.limits == load_calibration(VehicleCalibration, tmp_path / "before.yaml").limits
     assert cv2.imread(str(tmp_path / "new" / "vehicle.png")).shape[1] > 500
-    assert "dynamics: {delay_s:" in capsys.readouterr().out
+    assert "attack: {response: {delay_s:" in capsys.readouterr().out
     # The drive holds no camera: said in one line, and nothing is written.
     camera = tmp_path / "camera.yaml"
     save_calibration(twin_calibrations(LabConfig())["camera"], camera)

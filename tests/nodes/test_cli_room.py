@@ -82,13 +82,13 @@ REQUEST = {
     "name": "corner",
     "objects": [
         {
-            "kind": "face",
-            "target": "board.yaml",
+            "name": "board",
+            "kind": "panel",
             "x_m": 3.04,
             "y_m": -1.8,
-            "z_m": 0.52,
+            "z_m": 0.02,
             "yaw_rad": 3.28,
-            "size_m": 1.0,
+            "face": {"size_m": 1.0, "target": "board.yaml"},
         }
     ],
 }
@@ -141,7 +141,7 @@ class Board:
 
 def test_the_guide_accepts_the_right_place_and_refuses_a_wrong_one(tmp_path):
     save_calibration(FACE, tmp_path / "board.yaml")
-    (tmp_path / "corner.attack.yaml").write_text(yaml.safe_dump(REQUEST))
+    (tmp_path / "corner.experiment.yaml").write_text(yaml.safe_dump(REQUEST))
     file = save_attack_at(tmp_path, T_FACE)
     with Board(tmp_path / "right", T_FACE @ make_transform(np.eye(3), [0.0, 0.005, 0.0])):
         done = advnerf(
@@ -168,21 +168,22 @@ def test_the_guide_accepts_the_right_place_and_refuses_a_wrong_one(tmp_path):
             tmp_path / "wrong",
             "--once",
             "--request",
-            tmp_path / "corner.attack.yaml",
+            tmp_path / "corner.experiment.yaml",
         )
     assert done.returncode == 1
     assert "6.0 cm and 5.7 deg" in done.stderr
-    measured = tmp_path / "corner.measured.attack.yaml"
+    measured = tmp_path / "corner.measured.experiment.yaml"
     assert f"advnerf attack run {measured}" in done.stdout
     face = yaml.safe_load(measured.read_text())["objects"][0]
     assert face["yaw_rad"] == pytest.approx(np.deg2rad(188.0) - 2.0 * np.pi + 0.1, abs=1e-3)
-    assert face["target"] == "board.yaml"
+    assert face["z_m"] == pytest.approx(0.02, abs=1e-3), "its lower edge"
+    assert face["face"] == {"size_m": 1.0, "target": "board.yaml"}
 
 
 def test_a_request_without_one_face_is_refused(tmp_path):
-    file = tmp_path / "a.attack.yaml"
+    file = tmp_path / "a.experiment.yaml"
     file.write_text(yaml.safe_dump({"objects": [{"kind": "cube"}]}))
-    with pytest.raises(ConfigError, match="one object of kind face, got 0"):
+    with pytest.raises(ConfigError, match="one object with the section face, got 0"):
         write_measured_request(file, {"x_m": 0.0})
 
 

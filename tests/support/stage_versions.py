@@ -83,18 +83,15 @@ def measured(folder: Path, watcher: StageDisplay | None = None) -> dict[str, dic
 
 
 def versions() -> dict[str, int]:
-    """Version of every stage, of cells and of requests."""
-    from nodes.experiment.node import prepare
+    """Version of every stage and of cells."""
     from nodes.experiment.steps import keys
     from nodes.experiment.steps.pipeline import VERSIONS
 
-    return {**VERSIONS, "cells": keys.VERSION, "requests": prepare.VERSION}
+    return {**VERSIONS, "cells": keys.VERSION}
 
 
 def defaults() -> dict[str, dict[str, Any]]:
-    """Defaults of all settings that every stage, cells and requests read, by their names with dots; what is in a union has its class in the name."""
-    from nodes.experiment.node import prepare
-    from nodes.experiment.node.request import AttackRequest
+    """Defaults of all settings that every stage and cells read, by their names with dots; what is in a union has its class in the name."""
     from nodes.experiment.plan.config import ExperimentConfig
     from nodes.experiment.steps import keys
     from nodes.experiment.steps.pipeline import READS
@@ -103,7 +100,6 @@ def defaults() -> dict[str, dict[str, Any]]:
     # Of what stages alone read cells have the digests.
     by_digest = dict.fromkeys(("capture", "scene", "policy"), True)
     found["cells"] = dict(sorted(_defaults(ExperimentConfig, True, {**keys.FREE, **by_digest})))
-    found["requests"] = dict(sorted(_defaults(AttackRequest, True, prepare.FREE)))
     return found
 
 

@@ -2,36 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from torch import Tensor
 
-from advnerf_core.attack.artifact import COLOURS, AttackedObject, AttackFace, AttackFile, face_texture
+from advnerf_core.attack.artifact import COLOURS, AttackedObject, AttackFile
 from advnerf_core.attack.methods import SearchRun, SearchSettings, load_method
 from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.attack.search.record import SearchResult
 from advnerf_core.attack.spaces.displayed import DisplayedSensor
-from advnerf_core.attack.spaces.space import NamedObject, Shown, require_same
+from advnerf_core.attack.spaces.space import FaceMount, NamedObject, Shown, require_same
 from advnerf_core.display import DisplayModel
-from advnerf_core.geometry import Array
 from advnerf_core.scene.surrogate import Surrogate
-
-
-@dataclass(frozen=True, eq=False)
-class FaceMount:
-    """Mounting of a face.
-
-    Attributes:
-        subject: Name of the panel, which is also the name of its motion-capture subject.
-        size_m: Width and height [m].
-        corners_in_subject: Corners ``[4, 3]`` [m], see `advnerf_core.attack.artifact.AttackFace`.
-    """
-
-    subject: str
-    size_m: tuple[float, float]
-    corners_in_subject: Array
 
 
 class FaceSpace:
@@ -81,11 +63,6 @@ class FaceSpace:
                 self._named.name, colours, field.T_world_from_object, field.scale, self._named.sha256
             ),
         )
-
-    def face(self, theta: Tensor) -> AttackFace:
-        """The displayed face."""
-        texture = face_texture(theta.detach().numpy().astype(np.float32))
-        return AttackFace(texture, self.mount.size_m, self.mount.subject, self.mount.corners_in_subject)
 
     def restored(self, attack: AttackFile) -> Shown:
         """The face in the seen colours, behind the display if there is one; see `Space.restored`."""

@@ -16,7 +16,14 @@ from advnerf_core.attack.search.poses import MultiStart, multi_start, random_pos
 from advnerf_core.attack.search.record import SearchResult
 from advnerf_core.attack.spaces.placed_sensor import PlacedSensor
 from advnerf_core.attack.spaces.placement import KeepOut, PoseBounds, PoseSpace, placed
-from advnerf_core.attack.spaces.space import NamedObject, Shown, SpaceError, colours_of, require_same
+from advnerf_core.attack.spaces.space import (
+    FaceMount,
+    NamedObject,
+    Shown,
+    SpaceError,
+    colours_of,
+    require_same,
+)
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.scene.surrogate import Surrogate, split_theta
 
@@ -30,20 +37,25 @@ class PlaceLimits:
     Attributes:
         keep_out: Lanes that stay free; None allows everything within the bounds.
         colours: Whether colours are searched too; else the objects keep their own.
+        kept_colours: Those that they keep, in the surrogate's ``theta_shape``; None for their plain ones.
+        edge_width: Width of the soft edges, see `PlacedSensor`.
     """
 
     bounds: Sequence[PoseBounds]
     keep_out: KeepOut | None
     colours: bool = True
+    kept_colours: Tensor | None = None
+    edge_width: float | None = None
 
 
 class PlaceSpace:
     """Places of voxel objects; its methods are ``gradient`` (several drawn placements, each refined) and ``random``.
 
     Args:
-        surrogate: The scene with the objects at their places without an attack.
-        named: Entries of the objects in attack files, in their order.
-        budget: Number of drawn placements, and steps of each.
+        surrogate: The scene with the objects where they stand without an attack.
+        named: What attack files say of them, in their order.
+        budget: Placements that are drawn, and steps of each.
+        mount: What shows the texture of one of them.
 
     Raises:
         PoseBoundsError: Not one bound for each object, or bounds that leave no place beside the lanes.
@@ -53,16 +65,25 @@ class PlaceSpace:
     name = PLACES
 
     def __init__(
-        self, surrogate: Surrogate, named: Sequence[NamedObject], limits: PlaceLimits, budget: MultiStart
+        self,
+        surrogate: Surrogate,
+        named: Sequence[NamedObject],
+        limits: PlaceLimits,
+        budget: MultiStart,
+        mount: FaceMount | None = None,
     ) -> None:
-        self.surrogate, self._named, self._budget = surrogate, tuple(named), budget
+        self.surrogate, self._named, self._budget, self.mount = surrogate, tuple(named), budget, mount
         self._fields = [each for each in surrogate.objects if isinstance(each, VoxelGridObject)]
         if len(self._fields) != len(surrogate.objects):
             raise SpaceError(
                 "expected objects made of voxels, got a mesh: only voxels are differentiable in their pose"
             )
         self.sensor = PlacedSensor(
-            surrogate, PoseSpace(self._fields, limits.bounds, limits.keep_out), limits.colours
+            surrogate,
+            PoseSpace(self._fields, limits.bounds, limits.keep_out),
+            limits.colours,
+            limits.kept_colours,
+            limits.edge_width,
         )
 
     @property
@@ -96,9 +117,6 @@ class PlaceSpace:
             )
             for named, field, part in rows
         )
-
-    def face(self, theta: Tensor) -> None:
-        """None: a solid object has no face."""
 
     def restored(self, attack: AttackFile) -> Shown:
         """The objects at the places of the file; see `Space.restored`."""

@@ -22,6 +22,7 @@ from advnerf_core.attack.artifact import (
     AttackFace,
     AttackFile,
     AttackFileError,
+    face_texture,
 )
 from advnerf_core.attack.methods import SearchRun, SearchSettings, load_method
 from advnerf_core.attack.problem import AttackProblem, Sensor
@@ -31,6 +32,7 @@ from advnerf_core.display import DisplayModel
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.fields.voxel_grid import VoxelGridObject
+from advnerf_core.geometry import Array
 from advnerf_core.objects.mesh.field import MeshField
 from advnerf_core.objects.mesh.glb import glb_bytes
 from advnerf_core.objects.mesh.shape import ShapeLimits, ShapeSensor
@@ -72,6 +74,28 @@ class NamedObject:
     sha256: str
 
 
+@dataclass(frozen=True, eq=False)
+class FaceMount:
+    """What shows the texture of an object in the room.
+
+    Attributes:
+        subject: What carries it: the panel's name, which is also that of the motion-capture subject.
+        size_m: Width and height [m].
+        corners_in_subject: As of `advnerf_core.attack.artifact.AttackFace`, ``[4, 3]`` [m].
+        number: Of the object.
+    """
+
+    subject: str
+    size_m: tuple[float, float]
+    corners_in_subject: Array
+    number: int = 0
+
+    def face(self, objects: Sequence[AttackedObject]) -> AttackFace:
+        """The face that shows what was found."""
+        texture = face_texture(objects[self.number].theta)
+        return AttackFace(texture, self.size_m, self.subject, self.corners_in_subject, self.number)
+
+
 def half_precision(theta: Tensor) -> Tensor:
     """Theta rounded to half precision, in its own type: drives use the theta that is stored."""
     largest = torch.finfo(torch.float16).max
@@ -109,8 +133,9 @@ class Space(Protocol):
     def attacked(self, theta: Tensor) -> tuple[AttackedObject, ...]:
         """The attacked objects of ``theta`` for an attack file."""
 
-    def face(self, theta: Tensor) -> AttackFace | None:
-        """The face for a projection or a display; None if the objects have none."""
+    @property
+    def mount(self) -> FaceMount | None:
+        """What shows the texture of an object in the room; None where nothing does."""
 
     def restored(self, attack: AttackFile) -> Shown:
         """The objects of an attack file, in their deployed form.
@@ -145,15 +170,22 @@ class ColourSpace:
 
     Args:
         surrogate: The scene with the objects.
-        named: Entries of the objects in attack files, in their order.
-        light: Measured response from painted to seen colours; None for the identity.
+        named: What attack files say of them, in their order.
+        light: What the camera sees of a painted colour, as measured, or of one that a monitor shows; None where it is seen as it is painted.
+        cos_angle: Cosine of the angle at which the camera looks at a monitor; see `DisplayedSensor`.
+        mount: What shows the texture of one of them.
     """
 
     def __init__(
-        self, surrogate: Surrogate, named: Sequence[NamedObject], light: DisplayModel | None = None
+        self,
+        surrogate: Surrogate,
+        named: Sequence[NamedObject],
+        light: DisplayModel | None = None,
+        cos_angle: float = 1.0,
+        mount: FaceMount | None = None,
     ) -> None:
-        self.surrogate, self._named = surrogate, tuple(named)
-        self._lit = None if light is None else DisplayedSensor(surrogate, light)
+        self.surrogate, self._named, self.mount = surrogate, tuple(named), mount
+        self._lit = None if light is None else DisplayedSensor(surrogate, light, cos_angle)
         self.name = (
             MESH_TEXTURE if all(isinstance(each, MeshField) for each in surrogate.objects) else COLOURS
         )
@@ -181,9 +213,6 @@ class ColourSpace:
         )
         return tuple(_attacked(named, field, part, _textured_glb(field, part)) for named, field, part in rows)
 
-    def face(self, theta: Tensor) -> None:
-        """None: a solid object has no face."""
-
     def restored(self, attack: AttackFile) -> Shown:
         """The objects at their places, in the colours of the file; see `Space.restored`."""
         require_same(attack, self._named)
@@ -204,7 +233,7 @@ class ShapeSpace:
         limits: Largest displacement of vertices.
     """
 
-    name = MESH_SHAPE
+    name, mount = MESH_SHAPE, None
 
     def __init__(self, surrogate: Surrogate, named: Sequence[NamedObject], limits: ShapeLimits) -> None:
         self.surrogate, self._named = surrogate, tuple(named)
@@ -234,9 +263,6 @@ class ShapeSpace:
         return tuple(
             _attacked(named, field, part, _textured_glb(field, colour)) for named, field, part, colour in rows
         )
-
-    def face(self, theta: Tensor) -> None:
-        """None: a mesh has no face."""
 
     def restored(self, attack: AttackFile) -> Shown:
         """The meshes in the shapes of the file; see `Space.restored`."""

@@ -16,6 +16,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.files import write_json
 from nodes.experiment.engine.artefact import Artefact, ReferenceBuild
 from nodes.experiment.engine.stages import Stage, check_until, run_stages
+from nodes.lab.located import READ_AGAIN
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay, StageDisplay
 
@@ -110,7 +111,7 @@ def _write_manifest(experiment: RunFolder[Any], libraries: Sequence[str]) -> Non
         "setting": experiment.setting,
         "file": str(experiment.file),
         "command": " ".join(["advnerf", *sys.argv[1:]]),
-        "config": experiment.config.model_dump(mode="json"),
+        "config": experiment.config.model_dump(mode="json", context=READ_AGAIN),
         "versions": {"advnerf": version("advnerf"), "python": platform.python_version()}
         | {name: found for name in libraries if (found := _installed(name))},
     }

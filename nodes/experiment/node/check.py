@@ -31,8 +31,10 @@ from advnerf_core.attack.methods import alternatives, black_box_methods
 from advnerf_core.driving.clean_drive import CleanDrive
 from advnerf_core.files import write_atomically, write_json
 from nodes.experiment.node.memory import measured_mib
-from nodes.experiment.node.prepare import Prepared, prepare, sensor_of
-from nodes.experiment.node.request import AttackRequest
+from nodes.experiment.node.prepare import Prepared, prepare
+from nodes.experiment.plan.space_config import MeshShapeConfig
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.spaces import colour_space
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import Report
 
@@ -82,7 +84,7 @@ class Check:
         return [*_on_the_gradient(self), *_on_the_drive(self), *_on_the_cost(self)]
 
 
-def check(request: AttackRequest, directions: int, memory: bool, report: Report) -> Check:
+def check(request: Experiment, directions: int, memory: bool, report: Report) -> Check:
     """Measure everything at the start of the attack; disturbances and smoothness are as requested.
 
     Raises:
@@ -90,16 +92,18 @@ def check(request: AttackRequest, directions: int, memory: bool, report: Report)
         ConfigError: Shapes are attacked, whose gradient is random.
     """
     prepared = prepare(request)
+    colours = colour_space(request, prepared.space.surrogate)
+    prepared = replace(prepared, space=colours, problem=replace(prepared.problem, sensor=colours.sensor))
     if not prepared.problem.differentiable:
         raise BlackBoxError(
-            f"{request.policy} has no gradient that could be checked; search with {alternatives(black_box_methods())}"
+            f"victim {prepared.cell.victim} has no gradient that could be checked; search with {alternatives(black_box_methods())}"
         )
-    if request.shape is not None:
+    if isinstance(request.config.space, MeshShapeConfig):
         raise ConfigError(
             "the gradient of shapes is a Monte Carlo estimate, which this check would call wrong; 'python -m benchmarks.mesh_render' "
             "compares it with finite differences"
         )
-    theta = prepared.surrogate.initial_theta(torch.Generator().manual_seed(prepared.seed))
+    theta = colours.surrogate.initial_theta(torch.Generator().manual_seed(prepared.seed))
     report(0.05, "time of a gradient")
     split, result = time_split(prepared.problem, theta)
     ticks = tick_health(prepared.problem, result)
@@ -136,7 +140,8 @@ def in_double(prepared: Prepared) -> AttackProblem:
     if isinstance(policy, nn.Module):
         policy = copy.deepcopy(policy).double().eval()
     goals = None if problem.goals is None else problem.goals.double()
-    sensor = sensor_of(prepared.request, prepared.surrogate.in_type(torch.float64))
+    surrogate = prepared.space.surrogate.in_type(torch.float64)
+    sensor = colour_space(prepared.experiment, surrogate).sensor
     return replace(problem, policy=policy, sensor=sensor, goals=goals)
 
 
@@ -151,9 +156,9 @@ def _difference(got: Tensor, expected: Tensor) -> float:
     return relative_error(got.flatten().numpy(), expected.flatten().numpy())
 
 
-def _memory(request: AttackRequest, report: Report) -> dict[int, float]:
+def _memory(request: Experiment, report: Report) -> dict[int, float]:
     # Below two time batches the batch itself is not full yet.
-    found, shortest = {}, max(request.horizon, 2 * request.search.time_batch)
+    found, shortest = {}, max(request.searched_ticks, 2 * request.config.attack.time_batch)
     for index, ticks in enumerate((shortest, 2 * shortest, 4 * shortest)):
         report(0.7 + index / 10, f"memory at T = {ticks}")
         found[ticks] = measured_mib(request, ticks)

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from nodes.experiment.node.request import AttackRequest, request_text
 from nodes.runtime.asking import NoAnswerError, ask
 from nodes.runtime.bus import Bus, Received
 from nodes.runtime.clock import Now
@@ -29,13 +28,13 @@ def new_request_id(name: str) -> str:
 
 
 def ask_for_attack(
-    run_dir: Path, request: AttackRequest, request_id: str, tell: Callable[[Any], None], follow: bool = True
+    run_dir: Path, request: str, request_id: str, tell: Callable[[Any], None], follow: bool = True
 ) -> Any:
     """Send a request and listen until it has ended, or only until the node has answered.
 
     Args:
         run_dir: Run folder of the node.
-        request: What is asked for.
+        request: What is asked for, as `request.as_text` writes it.
         request_id: Its name; the very same request under the same name goes on where it was.
         tell: Called with every ``AttackProgress`` of the request.
         follow: Whether to wait for the end.
@@ -51,12 +50,11 @@ def ask_for_attack(
         return types.AttackRequest(
             header=header(asked.real_ns),
             request_id=request_id,
-            request=text,
+            request=request,
             source="operator",
             ask_id=asked.ask_id,
         )
 
-    text = request_text(request)
     with Bus(run_dir) as bus:
         progress = _ask(bus, "/attack/request", make)
         tell(progress)

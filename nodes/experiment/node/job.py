@@ -17,7 +17,7 @@ from advnerf_core.run_module import module_command
 from nodes.runtime.inbox import Inbox, ReaderThread
 
 # Names that nodes.experiment.node.search shares; the node does not import that, because it would bring torch.
-REQUEST, TOGETHER_STATE = "request.attack.yaml", "together.state.safetensors"
+REQUEST, TOGETHER_STATE = "request.experiment.yaml", "together.state.safetensors"
 _SHIM = Path(__file__).parents[2] / "launching" / "shim.py"
 _READ_S = 0.2
 _PIECE = 1 << 16

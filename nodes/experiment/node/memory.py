@@ -16,11 +16,12 @@ import torch
 from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
 from advnerf_core.memory import peak_mib, restart_peak
 from advnerf_core.run_module import module_command
-from nodes.experiment.node.prepare import prepare
-from nodes.experiment.node.request import AttackRequest, load_request, request_text
+from nodes.experiment.node.job import REQUEST
+from nodes.experiment.node.prepare import load_request, prepare, request_text
+from nodes.experiment.show.context import Experiment
 
 
-def peak_above_idle_mib(request: AttackRequest, ticks: int, cache_mib: float) -> float:
+def peak_above_idle_mib(request: Experiment, ticks: int, cache_mib: float) -> float:
     """Measure in this process, which must be fresh; idle is after one tick, as libraries and compiled kernels are idle memory."""
     prepared = prepare(request)
     problem = replace(
@@ -30,17 +31,17 @@ def peak_above_idle_mib(request: AttackRequest, ticks: int, cache_mib: float) ->
         goals=None if prepared.problem.goals is None else prepared.problem.goals[:1],
         cache_bytes=int(cache_mib * 2**20),
     )
-    theta = prepared.surrogate.initial_theta(torch.Generator().manual_seed(0))
+    theta = prepared.space.surrogate.initial_theta(torch.Generator().manual_seed(0))
     evaluate(replace(problem, steps=1), theta)
     idle_mib = restart_peak()
     adjoint_gradient(problem, theta)
     return peak_mib() - idle_mib
 
 
-def measured_mib(request: AttackRequest, ticks: int, cache_mib: float = 0.0) -> float:
+def measured_mib(request: Experiment, ticks: int, cache_mib: float = 0.0) -> float:
     """The same in a fresh process."""
     with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "request.attack.yaml"
+        file = Path(folder) / REQUEST
         file.write_text(request_text(request))
         command = module_command("nodes.experiment.node.memory", str(file), str(ticks), str(cache_mib))
         done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
@@ -49,7 +50,8 @@ def measured_mib(request: AttackRequest, ticks: int, cache_mib: float = 0.0) -> 
 
 def main() -> None:
     """Measure one horizon."""
-    print(peak_above_idle_mib(load_request(Path(sys.argv[1])), int(sys.argv[2]), float(sys.argv[3])))
+    file = Path(sys.argv[1])
+    print(peak_above_idle_mib(load_request(file, folder=file.parent), int(sys.argv[2]), float(sys.argv[3])))
 
 
 if __name__ == "__main__":

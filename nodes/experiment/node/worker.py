@@ -21,7 +21,6 @@ from advnerf_core.attack.search.record import Evaluation
 from advnerf_core.attack.search.search import evaluation_from_json
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.places import open_tensors
-from advnerf_core.scene.surrogate import split_theta
 from nodes.experiment.node.job import TOGETHER_STATE
 from nodes.experiment.node.prepare import Prepared
 from nodes.experiment.node.search import kept_request, planned_evaluations, run_attack
@@ -101,7 +100,7 @@ class Speaker:
 
     def _best_theta(self, prepared: Prepared) -> Tensor | None:
         """Of the seed at work; of the best, where all are searched together; None without a state file."""
-        together = prepared.request.search.together
+        together = prepared.experiment.config.attack.together
         state = self._folder / TOGETHER_STATE if together else self._state(prepared)
         if not state.exists():
             return None
@@ -132,11 +131,10 @@ def _so_far(state: Path) -> tuple[int, Evaluation | None]:
 
 
 def _texture(prepared: Prepared, theta: Tensor) -> NDArray[np.uint8] | None:
-    parts = split_theta(prepared.surrogate.objects, theta)
-    for placed, part in zip(prepared.objects, parts, strict=True):
-        if placed.face is not None:
-            return face_texture(part.detach().numpy(), 256)
-    return None
+    mount = prepared.space.mount
+    if mount is None:
+        return None
+    return face_texture(prepared.space.attacked(theta)[mount.number].theta, 256)
 
 
 def work(folder: Path, stream: BinaryIO) -> None:

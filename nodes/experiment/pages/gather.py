@@ -66,7 +66,7 @@ def gather(
         manifest=_manifest(experiment),
         overview=overview,
         textures=tuple(_textures(experiment)) if has_face(experiment) else (),
-        fidelity=_fidelity(experiment),
+        fidelity=None if experiment.given_scene is not None else _fidelity(experiment),
         done=done,
         live=live,
         memory=memory,

@@ -15,6 +15,7 @@ from advnerf_core.strict import StrictModel
 from nodes.experiment.plan import rules
 from nodes.experiment.plan.carriers import CarrierConfig, ComposedConfig, FaceCarrier
 from nodes.experiment.plan.deploy_config import DeployConfig
+from nodes.experiment.plan.maps_config import MapsConfig
 from nodes.experiment.plan.over import OverConfig
 from nodes.experiment.plan.placed import WantedObject
 from nodes.experiment.plan.sections import (
@@ -40,13 +41,16 @@ from nodes.experiment.plan.victims import (
     VictimName,
 )
 
+SCENE = "scene"
+
 
 class ExperimentConfig(StrictModel):
     """One experiment, resolved: the file's values, one of its settings over them, then the command line."""
 
     name: str = Field(min_length=1)
     world: dict[str, Any] = Field(
-        description="kind: junction, carla, an installed package's, or file.py:Class relative to this file; and changes of that world's Config."
+        description="kind: junction, carla, an installed package's, scene (a learned scene of your own), or file.py:Class relative to this file; and "
+        "changes of that world's Config."
     )
     paths: tuple[str, ...] = Field(min_length=1, description="Which of the world's paths are driven.")
     objects: tuple[WantedObject, ...] = Field(
@@ -81,6 +85,10 @@ class ExperimentConfig(StrictModel):
     )
     space: SpaceConfig = Field(
         default=ColoursConfig(kind="colours"), description="What the attacks may change."
+    )
+    maps: MapsConfig = Field(
+        default=MapsConfig(),
+        description="What is mapped about places that were found; no result depends on it.",
     )
     deploy: DeployConfig = DeployConfig()
     gate: Literal["steering"] | GateLimits | None = Field(
@@ -149,6 +157,11 @@ class ExperimentConfig(StrictModel):
         return next(iter(self.attacked))
 
     @property
+    def own_scene(self) -> bool:
+        """Whether the place is a learned scene of the user's own, for which no stages are run."""
+        return self.world.get("kind") == SCENE
+
+    @property
     def trains(self) -> bool:
         """Whether a victim is trained here."""
         return any(isinstance(each, TrainedVictim) for each in self.attacked.values())
@@ -177,7 +190,13 @@ class ExperimentConfig(StrictModel):
         else:
             rules.check_objects(carrier, objects, self.deploy, retrain is not None)
         rules.check_training(carrier, self.policy, objects)
-        rules.check_space(self.space, objects, self.attack, self.deploy)
+        if self.own_scene:
+            rules.check_own_scene(self.space, objects, self.attack)
+        else:
+            rules.check_space(self.space, objects, self.attack, self.deploy)
         rules.check_searches(self.methods, self.seeds, self.measure.seed, retrain is not None)
-        rules.check_drives(self.attack, self.policy, retrain, self.horizon, self.dt_s)
+        rules.check_methods(self.methods, self.attack, self.own_scene)
+        rules.check_drives(
+            self.attack, self.policy if self.trains else None, retrain, self.horizon, self.dt_s
+        )
         return self

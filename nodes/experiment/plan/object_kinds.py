@@ -7,32 +7,40 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
-from pydantic import AfterValidator, PlainSerializer, ValidationInfo
+from pydantic import AfterValidator, PlainSerializer, SerializationInfo, ValidationInfo
 from pydantic_core import PydanticCustomError
 
 from advnerf_core.files import sha256_of
 from advnerf_core.places import expanded
 from advnerf_core.plugins import unknown
 from advnerf_core.strict import COMPLETE
+from nodes.lab.located import is_read_again
 
 if TYPE_CHECKING:
     from advnerf_core.objects.voxel.mesh import SurfaceMesh
 
-PANEL = "panel"
-# Length and width [m] at scale 1: of the objects that ``advnerf scene object build --generate`` makes, and of a square panel that stands upright.
+PANEL, CUBE, BALL = "panel", "cube", "ball"
+# Length and width [m] at scale 1: of the objects that ``advnerf scene object build --generate`` makes, of a square panel that stands upright, and of
+# what only a learned scene of a user's own takes: a cube with one textured face, and a ball.
 MADE_HERE_M: dict[str, tuple[float, float]] = {
     "small_car": (3.64, 1.7),
     "hydrant": (0.48, 0.48),
     PANEL: (0.1, 2.0),
+    CUBE: (2.0, 2.0),
+    BALL: (0.7, 0.7),
 }
-# What ``advnerf scene object build`` writes; and meshes whose format says which unit they are in.
-OBJECT_SUFFIX, MESH_SUFFIXES = ".object.safetensors", (".glb", ".gltf")
+# What ``advnerf scene object build`` writes; meshes whose format says which unit they are in; and those that must be told.
+OBJECT_SUFFIX, MESH_SUFFIXES, UNITLESS_SUFFIXES = (
+    ".object.safetensors",
+    (".glb", ".gltf"),
+    (".obj", ".ply", ".stl"),
+)
 
 
 def _located(kind: str, info: ValidationInfo) -> str:
     if kind in MADE_HERE_M:
         return kind
-    if not kind.endswith((OBJECT_SUFFIX, *MESH_SUFFIXES)):
+    if not kind.endswith((OBJECT_SUFFIX, *MESH_SUFFIXES, *UNITLESS_SUFFIXES)):
         raise PydanticCustomError(
             COMPLETE,
             "{text}",
@@ -53,13 +61,17 @@ def name_of(kind: str) -> str:
     return kind if kind in MADE_HERE_M else Path(kind).name
 
 
-ObjectKind = Annotated[str, AfterValidator(_located), PlainSerializer(name_of)]
-"""A kind of object; a file becomes absolute, and is written by its name alone: its content counts, see `files_of`."""
+def _written(kind: str, info: SerializationInfo) -> str:
+    return kind if is_read_again(info) else name_of(kind)
+
+
+ObjectKind = Annotated[str, AfterValidator(_located), PlainSerializer(_written)]
+"""A kind of object; a file becomes absolute, and what results depend on has its name alone: its content counts, see `files_of`."""
 
 
 def is_mesh(kind: str) -> bool:
     """Whether a kind is a user's mesh."""
-    return kind.endswith(MESH_SUFFIXES)
+    return kind.endswith((*MESH_SUFFIXES, *UNITLESS_SUFFIXES))
 
 
 def files_of(kinds: list[str]) -> dict[str, str]:

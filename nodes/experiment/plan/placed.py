@@ -8,15 +8,95 @@ from functools import lru_cache
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Discriminator, Field, Tag
+from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
-from advnerf_core.geometry import Array, make_transform, rotation_z
+from advnerf_core.geometry import Array, make_transform, rotation_x, rotation_y, rotation_z
 from advnerf_core.strict import StrictModel
 from hardware.worlds.paths import ReferencePath
 from hardware.worlds.world import WorldDescription
-from nodes.experiment.plan.object_kinds import ObjectKind, footprint_m
+from nodes.experiment.plan.object_kinds import (
+    BALL,
+    CUBE,
+    MESH_SUFFIXES,
+    OBJECT_SUFFIX,
+    PANEL,
+    UNITLESS_SUFFIXES,
+    ObjectKind,
+    footprint_m,
+    name_of,
+)
+from nodes.lab.located import NamedFile
 
+Interval = tuple[float, float]
+PositiveNumber = Annotated[float, Field(gt=0.0)]
+Unit = Annotated[float, Field(ge=0.0, le=1.0)]
+FLAT = (PANEL, CUBE)
+_PLACE = {"name", "kind", "x_m", "y_m", "z_m", "yaw_rad", "scale"}
+_OF_OWN_SCENES = {"pitch_rad", "roll_rad", "face", "mesh", "levels"}
 _SPACING_M = 0.05  # of the points that stand for a lane's middle
+
+
+class PoseBoundsConfig(StrictModel):
+    """Where one object may stand; an axis that is not given stays as it is.
+
+    Attributes:
+        x_m: Lowest and highest x of the object's origin [m].
+        y_m: The same of y [m].
+        yaw_rad: Of its heading [rad].
+        scale: Of its size; not of a panel or cube, which are as large as their boards.
+    """
+
+    x_m: Interval | None = None
+    y_m: Interval | None = None
+    yaw_rad: Interval | None = None
+    scale: Interval | None = None
+
+    @field_validator("x_m", "y_m", "yaw_rad", "scale")
+    @classmethod
+    def _ordered(cls, interval: Interval | None) -> Interval | None:
+        if interval is not None and interval[0] > interval[1]:
+            raise ValueError(f"expected the lower bound first, got {list(interval)}")
+        return interval
+
+
+class FaceConfig(StrictModel):
+    """The textured square of a panel or cube in a learned scene of a user's own, and what shows it in the room.
+
+    Attributes:
+        size_m: Its edge at scale 1 [m].
+        resolution: Colours along each edge; None: as of all panels (object.panel_resolution).
+        rgb: Colour of what is not attacked; None: as of all panels (object.panel_rgb).
+        target: Calibration of what shows it: its motion-capture subject and its corners.
+        subject: That subject, where there is no target; None: nothing shows it.
+        display: What 'advnerf car calibrate display' wrote, where a monitor shows it: its colours are in the loop.
+        display_cos: Cosine of the angle at which the camera looks at the monitor, in the mean of a drive.
+    """
+
+    size_m: PositiveNumber = 2.0
+    resolution: Annotated[int, Field(ge=2, le=128)] | None = None
+    rgb: tuple[Unit, Unit, Unit] | None = None
+    target: NamedFile | None = None
+    subject: Annotated[str, Field(min_length=1)] | None = None
+    display: NamedFile | None = None
+    display_cos: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
+
+
+class MeshConfig(StrictModel):
+    """An object that is attacked as a mesh, not as voxels, in a learned scene of a user's own.
+
+    Attributes:
+        texels: Along its longest side.
+        up: Which axis of its file points up; None: y for glTF, z for others.
+        unit: Its file's unit; needed for others than glTF, or height_m.
+        height_m: It is scaled to this height [m]; of a ball its diameter.
+        rgb: Colour of a ball.
+    """
+
+    texels: Annotated[int, Field(ge=2, le=512)] = 32
+    up: Literal["z", "y"] | None = None
+    unit: Literal["mm", "cm", "m", "in"] | None = None
+    height_m: PositiveNumber | None = None
+    rgb: tuple[Unit, Unit, Unit] = (0.75, 0.1, 0.08)
 
 
 class PlacedObject(StrictModel):
@@ -24,12 +104,18 @@ class PlacedObject(StrictModel):
 
     Attributes:
         name: Unique name.
-        kind: What it is: small_car, hydrant, panel, or a file of a user's, see `object_kinds`.
+        kind: What it is: small_car, hydrant, panel, or a file of a user's, see `object_kinds`; in a scene of a user's own also cube and ball.
         x_m: Middle of its foot [m].
         y_m: Middle of its foot [m].
         z_m: Height of the ground under it [m]: the kerb's on a pavement.
         yaw_rad: Heading of its front [rad]; a panel shows its texture there.
         scale: Size relative to the object as it was built.
+        bounds: Where a search of places may move it; None: as the section space says, about its place.
+        pitch_rad: Its front is tilted down by this [rad]; as all that follows in a learned scene of a user's own alone.
+        roll_rad: It leans to its right by this [rad].
+        face: Of a panel or cube: its square, and what shows it.
+        mesh: It is a mesh, not voxels.
+        levels: Of an object file: summed grids, coarse to fine, that give its colours; 0: one value per voxel.
     """
 
     name: str = Field(min_length=1)
@@ -39,22 +125,64 @@ class PlacedObject(StrictModel):
     z_m: float = 0.0
     yaw_rad: float = 0.0
     scale: float = Field(default=1.0, gt=0.0, le=2.0)
+    bounds: PoseBoundsConfig | None = None
+    pitch_rad: float = 0.0
+    roll_rad: float = 0.0
+    face: FaceConfig | None = None
+    mesh: MeshConfig | None = None
+    levels: Annotated[int, Field(ge=0, le=32)] = 0
+
+    @model_validator(mode="after")
+    def _consistent(self) -> PlacedObject:
+        flat, found = self.kind in FLAT, name_of(self.kind)
+        if self.face is not None and not flat:
+            raise ValueError(f"expected no face, which a panel or cube has, got one of {found}")
+        if self.mesh is not None and (flat or self.kind.endswith(OBJECT_SUFFIX)):
+            raise ValueError(f"expected no mesh of {found}, which is made of voxels, got one")
+        if self.levels and not self.kind.endswith(OBJECT_SUFFIX):
+            raise ValueError(
+                f"expected levels of an object file (*{OBJECT_SUFFIX}) only, got those of {found}"
+            )
+        if self.mesh is None and self.kind.endswith(UNITLESS_SUFFIXES):
+            raise ValueError(
+                f"expected the section mesh, with a unit or height_m, of {found}, or a mesh whose format knows its unit "
+                f"({', '.join(MESH_SUFFIXES)})"
+            )
+        if self.bounds is not None and self.bounds.scale is not None and flat:
+            raise ValueError(f"expected no bounds of the scale of a {found}, which is as large as its board")
+        return self
+
+    @property
+    def is_of_own_scenes(self) -> bool:
+        """Whether only a learned scene of a user's own takes it."""
+        short = self.model_dump(exclude_defaults=True)
+        return self.kind in (CUBE, BALL) or not short.keys().isdisjoint(_OF_OWN_SCENES)
+
+    @property
+    def place(self) -> dict[str, Any]:
+        """Name, kind and place as JSON data, and what else is not as it is by default."""
+        short = self.model_dump(mode="json", exclude_defaults=True)
+        return self.model_dump(mode="json", include=_PLACE) | short
 
     @property
     def side_m(self) -> float:
         """Width [m]; of a panel also its height."""
-        return self.scale * footprint_m(self.kind)[1]
+        return self.scale * (footprint_m(self.kind)[1] if self.face is None else self.face.size_m)
 
     @property
     def T_world_from_face(self) -> Array:
         """Pose ``[4, 4]`` of a panel's face: its middle, x out of it, z up."""
-        middle = [self.x_m, self.y_m, self.z_m + 0.5 * self.side_m]
-        return make_transform(rotation_z(self.yaw_rad), middle)
+        turned, half_m = self.T_world_from_object, 0.5 * self.side_m
+        turned[:3, 3] += turned[:3, 2] * half_m
+        return turned
 
     @property
     def T_world_from_object(self) -> Array:
         """Pose ``[4, 4]`` of its foot, x to its front, z up; the scale is not part of it."""
-        return make_transform(rotation_z(self.yaw_rad), [self.x_m, self.y_m, self.z_m])
+        turned = rotation_z(self.yaw_rad)
+        if self.pitch_rad or self.roll_rad:
+            turned = turned @ rotation_y(self.pitch_rad) @ rotation_x(self.roll_rad)
+        return make_transform(turned, [self.x_m, self.y_m, self.z_m])
 
     def corners_m(self) -> list[tuple[float, float]]:
         """The four corners [m] of the ground it covers."""

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from advnerf_core.attack.methods import METHODS
 from nodes.experiment.plan.carriers import CarrierConfig, FaceCarrier
 from nodes.experiment.plan.deploy_config import DeployConfig
 from nodes.experiment.plan.object_kinds import OBJECT_SUFFIX, PANEL, name_of
-from nodes.experiment.plan.placed import PlacedObject, WantedObject
+from nodes.experiment.plan.placed import FLAT, PlacedObject, WantedObject
 from nodes.experiment.plan.sections import AttackConfig, PolicyConfig, RetrainConfig
 from nodes.experiment.plan.space_config import (
     ColoursConfig,
@@ -118,9 +119,12 @@ def check_space(
     space: SpaceConfig, objects: Sequence[WantedObject], attack: AttackConfig, deploy: DeployConfig
 ) -> None:
     """Refuse a space that does not fit the objects, the loss or the world where it is deployed."""
+    _check_smoothness(space, attack)
+    own = [each.name for each in objects if isinstance(each, PlacedObject) and each.is_of_own_scenes]
     _refuse(
-        attack.robustness.smoothness and isinstance(space, (PlacesConfig, MeshShapeConfig)),
-        f"expected attack.robustness.smoothness only where colours are searched, got it with space.kind {space.kind}",
+        own,
+        "expected cubes, balls, and the keys face, mesh, levels, pitch_rad and roll_rad of objects only in a learned scene of your own (world: "
+        f"{{kind: scene}}), got them of {', '.join(own)}",
     )
     if not isinstance(space, (MeshTextureConfig, MeshShapeConfig)):
         return
@@ -133,6 +137,57 @@ def check_space(
     _refuse(
         deploy.world is not None,
         f"expected space.kind colours or places with deploy.world, got {space.kind}, which is bound to the world that was captured",
+    )
+
+
+def check_own_scene(space: SpaceConfig, objects: Sequence[WantedObject], attack: AttackConfig) -> None:
+    """Refuse what cannot be attacked in a learned scene of a user's own, for which nothing is built."""
+    _check_smoothness(space, attack)
+    things = [each for each in objects if isinstance(each, PlacedObject)]
+    _refuse(
+        not things or len(things) < len(objects),
+        f"expected objects whose places are given (x_m, y_m, yaw_rad), got {len(objects) - len(things)} by a rule of {len(objects)}",
+    )
+    of_meshes = isinstance(space, (MeshTextureConfig, MeshShapeConfig))
+    voxels = [each.name for each in things if each.kind in FLAT or each.kind.endswith(OBJECT_SUFFIX)]
+    _refuse(
+        of_meshes and voxels,
+        f"expected objects with a mesh with space.kind {space.kind}, got {', '.join(voxels)}",
+    )
+    meshes = [each.name for each in things if each.mesh is not None]
+    _refuse(
+        isinstance(space, PlacesConfig) and meshes,
+        f"expected objects made of voxels with space.kind places, got the mesh {', '.join(meshes)}; 'advnerf scene object build' makes voxels of it",
+    )
+    unbuilt = [each.name for each in things if each.name not in (*voxels, *meshes)]
+    _refuse(
+        unbuilt and not of_meshes,
+        f"expected panels, cubes, files of 'advnerf scene object build' (*{OBJECT_SUFFIX}) or objects with the section mesh in a learned scene of your "
+        f"own, got {', '.join(unbuilt)}",
+    )
+    shown = [each.name for each in things if each.face is not None and each.face.display is not None]
+    _refuse(
+        shown and (len(things) > 1 or attack.together or isinstance(space, PlacesConfig)),
+        "face.display: expected one object, whose colours are searched, and seeds searched one after the other, got "
+        f"{', '.join(each.name for each in things)} with space.kind {space.kind}",
+    )
+
+
+def _check_smoothness(space: SpaceConfig, attack: AttackConfig) -> None:
+    _refuse(
+        attack.robustness.smoothness and isinstance(space, (PlacesConfig, MeshShapeConfig)),
+        f"expected attack.robustness.smoothness only where colours are searched, got it with space.kind {space.kind}",
+    )
+
+
+def check_methods(methods: Sequence[str], attack: AttackConfig, own_scene: bool) -> None:
+    """Refuse options that a built-in method does not have, and seeds searched together without a gradient; others are looked at when they are loaded."""
+    for name in methods:
+        if (built_in := METHODS.get(name)) is not None:
+            built_in.options(attack.options, "attack.options")
+    _refuse(
+        attack.together and (list(methods) != ["gradient"] or not own_scene),
+        f"attack.together is for the gradient method only, in a learned scene of your own, got {', '.join(methods)}",
     )
 
 
@@ -149,17 +204,20 @@ def check_searches(methods: Sequence[str], seeds: Sequence[int], measured_seed: 
 
 
 def check_drives(
-    attack: AttackConfig, policy: PolicyConfig, retrain: RetrainConfig | None, horizon: int, dt_s: float
+    attack: AttackConfig,
+    policy: PolicyConfig | None,
+    retrain: RetrainConfig | None,
+    horizon: int,
+    dt_s: float,
 ) -> None:
-    """Refuse searched drives that are longer than the measured ones, and drives to learn from that end before the junction."""
+    """Refuse searched drives that are longer than the measured ones, and drives to learn from that end before the junction; ``policy`` if one learns."""
     _refuse(
         attack.horizon is not None and attack.horizon > horizon,
         f"expected attack.horizon to be at most horizon = {horizon} ticks, which are measured, got {attack.horizon}",
     )
     asked = {} if retrain is None else {"retrain.drive_steps": retrain.drive_steps}
-    learns_from_drives = policy.dagger_rounds and (policy.deployed_drives or policy.surrogate_drives)
-    if learns_from_drives and policy.driven_m is not None:  # of a closed path every part is passed
-        asked["policy.drive_steps"] = policy.drive_steps
+    if policy is not None and policy.learns_from_drives and policy.driven_m is not None:
+        asked["policy.drive_steps"] = policy.drive_steps  # of a closed path every part is passed
     for key, ticks in asked.items():
         _refuse(
             2 * ticks < horizon,

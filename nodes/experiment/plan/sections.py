@@ -175,6 +175,11 @@ class PolicyConfig(StrictModel):
         return Architecture(self.architecture, own)
 
     @property
+    def learns_from_drives(self) -> bool:
+        """Whether it learns from its own drives."""
+        return bool(self.dagger_rounds and (self.deployed_drives or self.surrogate_drives))
+
+    @property
     def recipe(self) -> dict[str, Any]:
         """Training settings of a policy, as JSON data; for a user's architecture its code, not the path of its file."""
         return self.model_dump(mode="json", exclude=NETWORK) | self.network.described()
@@ -209,6 +214,20 @@ class MeasureConfig(StrictModel):
     seed: int = Field(default=10_000, description="Of the starts.")
 
 
+class ResponseConfig(StrictModel):
+    """What the searched car is like beyond its calibration; it needs wheels that steer."""
+
+    delay_s: Annotated[float, Field(ge=0)] = Field(
+        default=0.0, description="From image to wheels, fractions of a tick allowed [s]."
+    )
+    lag_s: Annotated[float, Field(ge=0)] = Field(
+        default=0.0, description="Time constant of the steering [s]."
+    )
+    slew_radps: PositiveNumber | None = Field(
+        default=None, description="Limit of the wheels' rate [rad/s]; none: no limit."
+    )
+
+
 class AttackConfig(SearchBudget):
     """The adversary and its budget: all methods evaluate equally often."""
 
@@ -221,16 +240,55 @@ class AttackConfig(SearchBudget):
     start_sigma: Annotated[float, Field(ge=0)] = Field(
         default=0.1, description="Spread of starts [m and rad]; headings a quarter of it."
     )
+    start_poses: tuple[tuple[float, float, float], ...] = Field(
+        default=(), description="x [m], y [m], yaw [rad] of each start; if given, nothing is drawn."
+    )
+    goals: tuple[tuple[float, ...], ...] = Field(
+        default=(),
+        description="What a goal-conditioned policy is told from each start pose; none: what the path says.",
+    )
     horizon: Positive | None = Field(
         default=None,
         description="Control ticks of the drives that are optimised; none: all that are measured.",
     )
-    learning_rate: PositiveNumber = 0.1
+    response: ResponseConfig = Field(
+        default=ResponseConfig(), description="How late and slowly the searched car's wheels obey."
+    )
+    learning_rate: PositiveNumber = Field(default=0.1, description="Adam's step along a gradient.")
     random_sigma: PositiveNumber = Field(default=5.0, description="Spread of the random textures' theta.")
+    step: PositiveNumber | None = Field(
+        default=None,
+        description="Step of whichever method searches: if not given, 0.3 for guided, 0.5 for evolution, and learning_rate for gradients.",
+    )
+    sigma: PositiveNumber | None = Field(
+        default=None,
+        description="Spread of whichever method searches: if not given, 3 to begin with for cem, 1 for evolution, and random_sigma for random.",
+    )
+    probes: Positive | None = Field(
+        default=None,
+        description="Pairs of textures asked about after each drive: 3 for guided, 1 for distilled.",
+    )
+    warm_pairs: Positive | None = Field(
+        default=None, description="Pairs of the first lesson of distilled and guided; 300 if not given."
+    )
+    options: dict[str, Any] = Field(default={}, description="What the method alone knows.")
+    together: bool = Field(
+        default=False,
+        description="'advnerf attack run' searches all seeds in one batch, not one after the other; gradient only.",
+    )
     robustness: RobustnessConfig = Field(
         default=RobustnessConfig(),
         description="What the attacks shall bear, in expectation.",
     )
+
+    @model_validator(mode="after")
+    def _a_goal_for_each_start(self) -> AttackConfig:
+        count = len(self.start_poses)
+        if len(self.goals) not in (0, count):
+            raise ValueError(
+                f"expected no attack.goals, or one for each of {count} start_poses, got {len(self.goals)}"
+            )
+        return self
 
 
 class RetrainConfig(StrictModel):

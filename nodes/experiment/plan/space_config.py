@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from advnerf_core.strict import StrictModel
 from nodes.experiment.plan.search_config import PlacesBudget, ShapeSampling
+from nodes.lab.located import NamedFile
 
 Positive = Annotated[int, Field(ge=1)]
 PositiveNumber = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -36,9 +37,28 @@ class PlacesConfig(PlacesBudget):
         default=0.6,
         description="A car's heading may change by this [rad]; a hydrant may turn all the way round.",
     )
+    pose_rate: PositiveNumber = Field(
+        default=0.1, description="Adam's step of a pose; 2 is the whole width of the bounds."
+    )
     colour_rate: PositiveNumber = Field(
         default=0.5, description="Adam's step of the colours before squashing."
     )
+    keep_out_m: NotNegative | None = Field(
+        default=None,
+        description="Least distance of every footprint from the middles of the lanes [m]; none: half a lane.",
+    )
+    edge_width: PositiveNumber | None = Field(
+        default=None, description="Width of the soft edges [object units]; none: two voxels."
+    )
+    coloured_by: NamedFile | None = Field(
+        default=None, description="Attack file whose colours the objects have where colours are not searched."
+    )
+
+    @model_validator(mode="after")
+    def _coloured_once(self) -> PlacesConfig:
+        if self.colours and self.coloured_by is not None:
+            raise ValueError("expected space.colours false with coloured_by, whose colours are not searched")
+        return self
 
 
 class _MeshConfig(StrictModel):

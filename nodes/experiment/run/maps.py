@@ -14,13 +14,13 @@ from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
 
 
-def map_cells(experiment: Experiment, cells: Sequence[Cell], number: int) -> list[Path]:
+def map_cells(experiment: Experiment, cells: Sequence[Cell], number: int | None = None) -> list[Path]:
     """Draw the maps of all cells that are finished; those that are drawn already are read from their files.
 
     Args:
         experiment: The experiment.
         cells: Which of its cells.
-        number: Of the object that is moved.
+        number: Of the object that is moved; None: as the experiment says.
 
     Raises:
         ConfigError: No cell is finished, or none has placed objects.
@@ -33,7 +33,9 @@ def map_cells(experiment: Experiment, cells: Sequence[Cell], number: int) -> lis
             continue
         with ProgressDisplay() as display:
             report = display.start(cell.name)
-            pictures += draw_maps(experiment.of(cell), cell.inside, number, store.work(cell.name), report)
+            inside = experiment.of(cell)
+            wanted = inside.config.maps.object if number is None else number
+            pictures += draw_maps(inside, cell.inside, wanted, store.work(cell.name), report)
     if not pictures:
         raise ConfigError(
             f"expected finished cells that have placed objects (space.kind=places), got none of {len(cells)}; run them first, "

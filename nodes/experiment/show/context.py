@@ -14,7 +14,8 @@ import torch
 
 from advnerf_core.attack.search.search import draw_start_states
 from advnerf_core.documents import Document, read_json
-from advnerf_core.driving.dynamics import Ackermann, Dubins
+from advnerf_core.driving.actuated import ActuatedAckermann
+from advnerf_core.driving.dynamics import Ackermann, Dubins, Dynamics
 from advnerf_core.driving.expert import Expert, ExpertConfig
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.driving.path import Path
@@ -37,9 +38,11 @@ from nodes.experiment.engine.run_folder import CELLS
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.plan.placed import PlacedObject, in_a_lane
+from nodes.experiment.plan.sections import ResponseConfig
 from nodes.experiment.show.given import given, given_in
 from nodes.experiment.show.kept_worlds import KeptWorld, is_users, kept_world
 from nodes.experiment.show.variants import Variants
+from nodes.lab.policy_camera import require_camera
 from nodes.lab.worlds.expert_drive import as_path
 from nodes.lab.worlds.named import NamedWorld, read_world, without
 from nodes.runtime.errors import ConfigError
@@ -57,9 +60,11 @@ class Experiment(Variants):
 
     Attributes:
         kept: Digests of its stages' outputs when it was loaded, from the run folder, else from the ones stored with the code.
+        given_scene: The learned scene of the user's own, if that is the place; no stage is run then.
     """
 
     kept: Mapping[str, str] = field(default_factory=dict)
+    given_scene: FilePath | None = None
 
     @classmethod
     def resolved_in(cls, folder: FilePath) -> Experiment:
@@ -68,7 +73,11 @@ class Experiment(Variants):
         context = {"folder": FilePath(manifest["file"]).parent}
         search_folder_last(str(context["folder"]))  # may contain package.module:factory
         config = ExperimentConfig.model_validate(manifest["config"], context=context)
-        return cls(config, FilePath(manifest["file"]), folder, manifest["setting"])
+        return cls(config, FilePath(manifest["file"]), folder, manifest["setting"]).with_given_scene()
+
+    def with_given_scene(self) -> Experiment:
+        """The same, which knows the learned scene of the user's own if that is the place."""
+        return replace(self, given_scene=self.named_world.config.file) if self.config.own_scene else self
 
     @cached_property
     def named_world(self) -> NamedWorld:
@@ -267,7 +276,8 @@ class Experiment(Variants):
             ConfigError: An object stands in a lane, or has a rule and nothing is captured yet.
         """
         objects = self._objects_by_rule() if self.has_rules else self.placed_by_hand
-        if (found := in_a_lane(objects, self.world)) is not None:
+        # Nothing meets what stands in a learned scene alone.
+        if self.given_scene is None and (found := in_a_lane(objects, self.world)) is not None:
             raise ConfigError(f"{self.file}: objects.{found[0]}: {found[1]}")
         return objects
 
@@ -337,7 +347,10 @@ class Experiment(Variants):
                 raise ConfigError(
                     f"{self.file}: expected no section view with victims.{name}, whose declaration says what it sees; remove the section"
                 )
-            if view.camera != self.camera or any(view.distortion):
+            # A calibrated camera may have distortion, which the policy takes out of its pictures; worlds have none.
+            if self.given_scene is not None:
+                require_camera(view, self.camera, policy.policy, f"{self.file}: world.camera")
+            elif view.camera != self.camera or any(view.distortion):
                 raise ConfigError(
                     f"{self.file}: victims.{name}: expected a policy that was trained for the driving camera, {self.camera} without distortion, "
                     f"got {view.camera}{' with distortion' * any(view.distortion)}; correct its declaration, or the world's camera"
@@ -357,6 +370,26 @@ class Experiment(Variants):
         if car.wheelbase_m is None:
             return Dubins(car.speed_mps, dt_s)
         return Ackermann(car.wheelbase_m, car.speed_mps, dt_s, car.control_limits)
+
+    @property
+    def searched_dynamics(self) -> Dynamics:
+        """The same, behind the delay, lag and slew limit that searches shall reckon with.
+
+        Raises:
+            ConfigError: The car has no wheels that steer.
+        """
+        wanted, car = self.config.attack.response, self.dynamics
+        if wanted == ResponseConfig():
+            return car
+        if not isinstance(car, Ackermann):
+            raise ConfigError(
+                f"{self.file}: expected a car with wheels that steer with attack.response, got one that turns by {self.car.control_unit}; "
+                "remove the section"
+            )
+        limits = car.steering_limits_rad
+        return ActuatedAckermann(
+            car.wheelbase_m, car.speed_mps, car.dt_s, **wanted.model_dump(), steering_limits_rad=limits
+        )
 
     @property
     def limits(self) -> Horizon:
@@ -400,6 +433,8 @@ class Experiment(Variants):
         They differ from `measured_starts`.
         """
         wanted = self.config.attack
+        if wanted.start_poses:
+            return torch.tensor(wanted.start_poses, dtype=torch.float64)
         first = seed == 0 or wanted.nominal_start
         return self._starts(scenario, wanted.starts, seed, nominal_first=first)
 

@@ -15,40 +15,40 @@ from advnerf_core.scene.baked import BakedScene
 from advnerf_core.scene.field import load_scene
 from advnerf_core.scene.metrics import psnr, ssim
 from advnerf_core.scene.render_field import FieldRenderer
-from nodes.experiment.engine.run_folder import RunFolder
+from nodes.experiment.show.context import Experiment
 from nodes.runtime.progress import Report
 
 HELD_OUT = "held_out"  # the captured set that is held out from learning
 FIDELITY = "fidelity.json"  # comparison of the learned scene with it
 
 
-def scene_file(experiment: RunFolder[Any]) -> Path:
+def scene_file(experiment: Experiment) -> Path:
     """Where the trained scene is."""
-    return experiment.stage_folder("scene") / "scene.safetensors"
+    return experiment.given_scene or experiment.stage_folder("scene") / "scene.safetensors"
 
 
-def baked_file(experiment: RunFolder[Any]) -> Path:
+def baked_file(experiment: Experiment) -> Path:
     """File of the baked scene, if any."""
     return experiment.stage_folder("bake") / "baked.safetensors"
 
 
-def load_field(experiment: RunFolder[Any]) -> FieldRenderer:
+def load_field(experiment: Experiment) -> FieldRenderer:
     """The trained scene itself in the colours of the driving camera."""
     return FieldRenderer.from_file(scene_file(experiment))
 
 
-def load_background(experiment: RunFolder[Any]) -> FieldRenderer | BakedScene:
+def load_background(experiment: Experiment) -> FieldRenderer | BakedScene:
     """The trained scene in the colours of the driving camera, fast if it was baked."""
     file = baked_file(experiment)
     return BakedScene.load(file) if file.exists() else load_field(experiment)
 
 
-def scene_sha256(experiment: RunFolder[Any]) -> str:
+def scene_sha256(experiment: Experiment) -> str:
     """Content hash of the trained scene."""
     return str(load_scene(scene_file(experiment))[2]["scene_hash"])
 
 
-def compare_views(experiment: RunFolder[Any], view: PolicyView, begin: float, report: Report) -> None:
+def compare_views(experiment: Experiment, view: PolicyView, begin: float, report: Report) -> None:
     """Write ``fidelity.json`` and pictures of true and learned views into the scene's folder.
 
     PSNR and SSIM are taken at the camera's size and at the policy's: there the field's own render against the resized image.

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object
 from advnerf_core.geometry import Array, Pinhole
 from advnerf_core.objects.voxel.build import build_from_mesh
@@ -87,11 +88,14 @@ def describe(experiment: Experiment) -> list[dict[str, Any]]:
 
 
 def surrogate_of(
-    experiment: Experiment, objects: Sequence[VoxelGridObject], background: BackgroundRenderer | None = None
+    experiment: Experiment, objects: Sequence[ColouredObject], background: BackgroundRenderer | None = None
 ) -> Surrogate:
-    """The learned junction as the policy's camera sees it; ``background`` if it is loaded already."""
+    """The learned scene as the policy's camera sees it; ``background`` if it is loaded already."""
     render = background or load_background(experiment)
-    return Surrogate(render, experiment.view.pinhole, experiment.mount, objects)
+    given = {}
+    if experiment.given_scene is not None:
+        given["depth_tolerance_m"] = experiment.named_world.config.depth_tolerance_m
+    return Surrogate(render, experiment.view.pinhole, experiment.mount, objects, **given)
 
 
 def last_result_kept(render: BackgroundRenderer) -> BackgroundRenderer:

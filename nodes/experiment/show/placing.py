@@ -76,7 +76,7 @@ def place_by_rule(experiment: Experiment, world: World) -> list[PlacedObject]:
 
 def as_text(objects: Sequence[PlacedObject]) -> str:
     """Placed objects as JSON."""
-    return json.dumps([each.model_dump(mode="json") for each in objects], indent=1) + "\n"
+    return json.dumps([each.place for each in objects], indent=1) + "\n"
 
 
 def clean_poses(experiment: Experiment, name: str) -> Array:

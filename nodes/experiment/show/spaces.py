@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -10,11 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advnerf_core.attack.artifact import AttackFile
+from advnerf_core.attack.artifact import AttackFile, load_attack
 from advnerf_core.attack.search.poses import MultiStart
 from advnerf_core.attack.spaces.placement import KeepOut, PoseBounds
 from advnerf_core.attack.spaces.places import PlaceLimits, PlaceSpace, randomly_placed
-from advnerf_core.attack.spaces.space import ColourSpace, NamedObject, ShapeSpace, Shown, Space
+from advnerf_core.attack.spaces.space import ColourSpace, NamedObject, ShapeSpace, Shown, Space, colours_of
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.files import sha256_of
 from advnerf_core.objects.mesh.field import MeshField
@@ -46,40 +47,60 @@ from nodes.experiment.show.objects import (
     placed_objects,
     surrogate_of,
 )
+from nodes.experiment.show.own_scene import display_of, mount_of, own_objects
 from nodes.lab.worlds.expert_drive import as_path
+from nodes.runtime.errors import ConfigError
 
 
 def colour_space(experiment: Experiment, surrogate: Surrogate | None = None) -> ColourSpace:
-    """The colours of the voxel objects, in the learned scene; ``surrogate`` if it is made already."""
-    behind = surrogate or surrogate_of(experiment, placed_objects(experiment))
-    return ColourSpace(behind, _named_voxels(experiment), light_on_panels(experiment))
+    """The colours of the objects, in the learned scene; ``surrogate`` if it is made already."""
+    behind, named = surrogate or _surrogate(experiment), named_objects(experiment)
+    if experiment.given_scene is None:
+        return ColourSpace(behind, named, light_on_panels(experiment))
+    light, cos_angle = display_of(experiment)
+    return ColourSpace(behind, named, light, cos_angle, mount_of(experiment))
 
 
 def make_space(experiment: Experiment, scene: World | None) -> Space:
     """The space of the experiment's section ``space``.
 
     Args:
-        experiment: Its scene and objects must be there, for meshes nothing.
+        experiment: Its scene and objects must be there, for meshes over the world's own pictures nothing.
         scene: The open deployment scene; needed where `over_the_world`.
     """
     wanted = experiment.config.space
     if has_face(experiment):
         return face_space(experiment)
-    if isinstance(wanted, ColoursConfig):
-        return colour_space(experiment)
     if isinstance(wanted, PlacesConfig):
         return _place_space(experiment, wanted)
-    assert scene is not None, "meshes are searched over the pictures of an open scene"
-    fields = mesh_objects(experiment, wanted)
-    frames = DeployedFrames(scene, experiment.view)
-    surrogate = Surrogate(frames, experiment.view.pinhole, experiment.mount, fields, depth_tolerance_m=0.0)
-    named = [
-        NamedObject(thing.name, field.sha256) for thing, field in zip(experiment.objects, fields, strict=True)
-    ]
+    if over_the_world(experiment):
+        assert scene is not None, "meshes are searched over the pictures of an open scene"
+        surrogate, named = _over_pictures(experiment, scene)
+    else:
+        surrogate, named = _surrogate(experiment), named_objects(experiment)
+    if isinstance(wanted, ColoursConfig):
+        return colour_space(experiment, surrogate)
     if isinstance(wanted, MeshTextureConfig):
         return ColourSpace(surrogate, named)
     limits = ShapeLimits(wanted.bound_m, wanted.smoothness, wanted.samples, wanted.boundary_samples)
     return ShapeSpace(surrogate, named, limits)
+
+
+def _over_pictures(experiment: Experiment, scene: World) -> tuple[Surrogate, list[NamedObject]]:
+    """The objects as meshes over the pictures of an open scene."""
+    wanted = experiment.config.space
+    assert isinstance(wanted, (MeshTextureConfig, MeshShapeConfig)), "others are searched in a learned scene"
+    fields, frames = mesh_objects(experiment, wanted), DeployedFrames(scene, experiment.view)
+    surrogate = Surrogate(frames, experiment.view.pinhole, experiment.mount, fields, depth_tolerance_m=0.0)
+    things = zip(experiment.objects, fields, strict=True)
+    return surrogate, [NamedObject(thing.name, field.sha256) for thing, field in things]
+
+
+def _surrogate(experiment: Experiment) -> Surrogate:
+    """The objects in the learned scene."""
+    if experiment.given_scene is not None:
+        return surrogate_of(experiment, [each.field for each in own_objects(experiment)])
+    return surrogate_of(experiment, placed_objects(experiment))
 
 
 def dress(experiment: Experiment, scene: World, shown: Shown) -> Dressed:
@@ -102,7 +123,8 @@ def shown_there(experiment: Experiment, shown: Shown, attack: AttackFile | None)
 
 def over_the_world(experiment: Experiment) -> bool:
     """Whether attacks are searched over the world's own pictures, as those on meshes: nothing is learned for them."""
-    return isinstance(experiment.config.space, (MeshTextureConfig, MeshShapeConfig))
+    of_meshes = isinstance(experiment.config.space, (MeshTextureConfig, MeshShapeConfig))
+    return of_meshes and experiment.given_scene is None
 
 
 def mesh_objects(experiment: Experiment, wanted: MeshTextureConfig | MeshShapeConfig) -> list[MeshField]:
@@ -122,14 +144,18 @@ def mesh_objects(experiment: Experiment, wanted: MeshTextureConfig | MeshShapeCo
 
 
 def place_limits(experiment: Experiment, wanted: PlacesConfig) -> PlaceLimits:
-    """Where each object may stand: about its place in the configuration, at its size, in no lane."""
-    return PlaceLimits(bounds_of(experiment.objects, wanted), lanes_of(experiment), wanted.colours)
+    """Where each object may stand: within its own bounds, or about its place in the configuration, at its size; in no lane."""
+    bounds, lanes = bounds_of(experiment.objects, wanted), lanes_of(experiment, wanted.keep_out_m)
+    return PlaceLimits(bounds, lanes, wanted.colours, edge_width=wanted.edge_width)
 
 
 def bounds_of(things: Sequence[PlacedObject], wanted: PlacesConfig) -> list[PoseBounds]:
-    """Bounds of each object about its place in the configuration."""
+    """Bounds of each object: its own, or about its place in the configuration."""
     found = []
     for thing in things:
+        if thing.bounds is not None:
+            found.append(PoseBounds(**thing.bounds.model_dump()))
+            continue
         turn_rad = np.pi if thing.kind == "hydrant" else wanted.turn_rad
         x, y, yaw = (
             (at - reach, at + reach)
@@ -143,9 +169,10 @@ def bounds_of(things: Sequence[PlacedObject], wanted: PlacesConfig) -> list[Pose
     return found
 
 
-def lanes_of(experiment: Experiment) -> KeepOut:
-    """All lanes, driven or not: objects stand at the height of the pavement."""
-    return KeepOut(tuple(as_path(lane) for lane in experiment.world.lanes), experiment.world.off_track_m)
+def lanes_of(experiment: Experiment, clearance_m: float | None = None) -> KeepOut:
+    """All lanes, driven or not, and how far from their middles objects stay; half a lane by default."""
+    lanes, world = tuple(as_path(lane) for lane in experiment.world.lanes), experiment.world
+    return KeepOut(lanes, world.off_track_m if clearance_m is None else clearance_m)
 
 
 def random_placements(experiment: Experiment, count: int, seed: int) -> list[tuple[VoxelGridObject, ...]]:
@@ -165,17 +192,41 @@ def geometry_sha256(experiment: Experiment, kind: str) -> str:
     return _file_sha256(path, path.stat().st_mtime_ns)
 
 
+def named_objects(experiment: Experiment) -> list[NamedObject]:
+    """What attack files say of the objects in the learned scene."""
+    if experiment.given_scene is not None:
+        return [each.named for each in own_objects(experiment)]
+    return [NamedObject(thing.name, geometry_sha256(experiment, thing.kind)) for thing in experiment.objects]
+
+
 def _place_space(experiment: Experiment, wanted: PlacesConfig) -> PlaceSpace:
-    surrogate, attack = surrogate_of(experiment, placed_objects(experiment)), experiment.config.attack
+    surrogate, attack = _surrogate(experiment), experiment.config.attack
     # The gradient is that of the frames that were driven past: the scene in them is not rendered a second time.
     one_evaluation = experiment.config.horizon * attack.starts * frame_bytes(surrogate.camera)
     remembering = surrogate.remembering(min(one_evaluation, int(attack.cache_mib * 2**20)))
-    budget = MultiStart(wanted.samples, wanted.steps, colour_rate=wanted.colour_rate)
-    return PlaceSpace(remembering, _named_voxels(experiment), place_limits(experiment, wanted), budget)
+    budget = MultiStart(wanted.samples, wanted.steps, wanted.pose_rate, wanted.colour_rate)
+    limits = place_limits(experiment, wanted)
+    if wanted.coloured_by is not None:
+        limits = replace(limits, kept_colours=_colours_in(wanted.coloured_by, surrogate))
+    mount = None if experiment.given_scene is None else mount_of(experiment)
+    return PlaceSpace(remembering, named_objects(experiment), limits, budget, mount)
 
 
-def _named_voxels(experiment: Experiment) -> list[NamedObject]:
-    return [NamedObject(thing.name, geometry_sha256(experiment, thing.kind)) for thing in experiment.objects]
+def _colours_in(file: Path, surrogate: Surrogate) -> Tensor:
+    """Colours that an attack file holds of the same objects, wherever they stand there.
+
+    Raises:
+        AttackFileError: No attack file.
+        ConfigError: It has other objects.
+    """
+    attack = load_attack(file)
+    shapes = [each.theta.shape for each in attack.objects]
+    expected = [tuple(field.theta_shape) for field in surrogate.objects]
+    if shapes != expected:
+        raise ConfigError(
+            f"{file}: expected colours of shapes {expected} for the objects of the experiment, got {shapes}"
+        )
+    return colours_of(attack, torch.float64).reshape(surrogate.theta_shape)
 
 
 @lru_cache(maxsize=8)

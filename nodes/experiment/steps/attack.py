@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -20,6 +20,8 @@ from advnerf_core.attack.on_device import on_chosen_device, said_of_device
 from advnerf_core.attack.search.record import SearchResult
 from advnerf_core.attack.spaces.space import Shown, Space, half_precision
 from advnerf_core.documents import read_json
+from advnerf_core.driving.clean_drive import CleanDrive
+from advnerf_core.driving.dynamics import Dynamics
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.policy_file import LoadedPolicy
 from advnerf_core.report.conditions import EMPTY
@@ -39,7 +41,9 @@ from nodes.experiment.show.learned_scene import baked_file, load_field, scene_sh
 from nodes.experiment.show.spaces import over_the_world
 from nodes.experiment.show.victims import load_victim, told
 from nodes.experiment.steps.frozen import frozen_for, hardness_before
+from nodes.experiment.steps.keys import registered_settings
 from nodes.experiment.steps.search_files import ATTACK, SEARCHED
+from nodes.runtime.errors import ConfigError
 
 _STATE = "state.safetensors"
 
@@ -72,7 +76,8 @@ def surrogate_part(
         curve = [evaluation.predicted_total_cte_m for evaluation in result.history]
         if experiment.config.attack.objective != CTE:
             values = {"curve_value": [evaluation.value for evaluation in result.history]}
-        attack = _attack_file(experiment, space, problem, policy, cell, result)
+        rounded = replace(result, theta=half_precision(result.theta))
+        attack = attack_file(experiment, space, problem, policy, cell, rounded)
         attack_id = save_attack(folder / ATTACK, attack)
     data = {
         "attack_id": attack_id,
@@ -121,16 +126,16 @@ def attack_problem(
     attack, robustness = experiment.config.attack, experiment.config.attack.robustness
     # Drives of one start differ by their random draws.
     starts = experiment.start_states(scenario, seed).repeat_interleave(robustness.repeats, dim=0)
-    goals = _goals(told(experiment, policy.policy, scenario), len(starts))
-    objective = load_objective(attack.objective)
+    told_goals = attack.goals or [told(experiment, policy.policy, scenario)]
+    dynamics, objective = experiment.searched_dynamics, load_objective(attack.objective)
     return AttackProblem(
         policy.policy,
         space.sensor,
-        experiment.dynamics,
+        dynamics,
         experiment.paths[scenario],
-        starts,
+        _at_rest(starts, dynamics),
         experiment.searched_ticks,
-        goals,
+        _goals(experiment, policy.policy, told_goals, len(starts)),
         time_batch=attack.time_batch,
         cache_bytes=int(attack.cache_mib * 2**20),
         fence_m=experiment.world.fence_m,
@@ -143,15 +148,36 @@ def attack_problem(
     )
 
 
-def _goals(goal: tuple[float, ...], count: int) -> torch.Tensor | None:
-    return torch.tensor([goal], dtype=torch.float32).expand(count, -1) if goal else None
+def _at_rest(starts: torch.Tensor, dynamics: Dynamics) -> torch.Tensor:
+    """Start states ``[B, n]`` of start poses ``[B, 3]``: wheels are straight, and no command is under way."""
+    return torch.nn.functional.pad(starts, (0, dynamics.state_size - starts.shape[1]))
+
+
+def _goals(
+    experiment: Experiment, policy: Any, goals: Sequence[tuple[float, ...]], count: int
+) -> torch.Tensor | None:
+    """Goals ``[B, n]`` of drives from a number of starts, one for all or one for each; None for a policy that takes none."""
+    lengths = {len(goal) for goal in goals}
+    if lengths != {int(policy.goal_size)}:
+        raise ConfigError(
+            f"{experiment.file}: attack.goals: expected vectors of length {policy.goal_size} for this policy (0: none), got lengths "
+            f"{', '.join(map(str, sorted(lengths)))}"
+        )
+    if lengths == {0}:
+        return None
+    return torch.tensor(goals, dtype=torch.float32).repeat_interleave(count // len(goals), dim=0)
 
 
 def from_measured_starts(experiment: Experiment, scenario: str, problem: AttackProblem) -> AttackProblem:
     """The problem with the measured starts and horizon, and without disturbances."""
     starts = experiment.measured_starts(scenario)
-    goals = _goals(told(experiment, problem.policy, scenario), len(starts))
-    return replace(problem.undisturbed(), start_states=starts, goals=goals, steps=experiment.config.horizon)
+    goals = _goals(experiment, problem.policy, [told(experiment, problem.policy, scenario)], len(starts))
+    return replace(
+        problem.undisturbed(),
+        start_states=_at_rest(starts, problem.dynamics),
+        goals=goals,
+        steps=experiment.config.horizon,
+    )
 
 
 def past(problem: AttackProblem, space: Space, shown: Shown) -> AttackProblem:
@@ -184,16 +210,18 @@ def search_settings(experiment: Experiment, method: Method) -> SearchSettings:
     """Budget and settings of a search."""
     attack, space = experiment.config.attack, experiment.config.space
     cells = space.cells if isinstance(space, ColoursConfig) else 0
+    of_meshes = space.learning_rate if isinstance(space, (MeshTextureConfig, MeshShapeConfig)) else None
     return SearchSettings(
         evaluations=planned_evaluations(experiment),
-        learning_rate=space.learning_rate
-        if isinstance(space, (MeshTextureConfig, MeshShapeConfig))
-        else None,
+        learning_rate=attack.step or of_meshes,
+        sigma=attack.sigma,
         population=attack.population,
         cells=cells,
+        probes=attack.probes,
+        warm_pairs=attack.warm_pairs,
         gradient_rate=attack.learning_rate,
         random_sigma=attack.random_sigma,
-        options=method.options({}),
+        options=method.options(attack.options, "attack.options"),
     )
 
 
@@ -227,41 +255,64 @@ def _search(
     return space.search(cell.code, on_chosen_device(problem), budget, run)
 
 
-def _attack_file(
+def attack_file(
     experiment: Experiment,
     space: Space,
     problem: AttackProblem,
     policy: LoadedPolicy,
     cell: Cell,
     result: SearchResult,
+    clean: CleanDrive | None = None,
 ) -> AttackFile:
-    clean = clean_drive(past(problem, space, space.plain), space.plain.colours)
-    theta = half_precision(result.theta)
+    """The attack file of a search's result; its prediction is made without disturbances. ``clean`` is the drive without attack, if it is known."""
     attack = AttackFile(
         method=cell.method,
         space=space.name,
-        objects=space.attacked(theta),
-        face=space.face(theta),
+        objects=space.attacked(result.theta),
+        face=None,
         camera=experiment.view.pinhole,
         scene_sha256=hash_of(experiment.world_settings)
         if over_the_world(experiment)
         else scene_sha256(experiment),
         policy_sha256=policy.sha256,
-        config_sha256=hash_of(experiment.config.model_dump(mode="json")),
+        config_sha256=registered_settings(experiment).key,
         seed=cell.seed,
         predicted_total_cte_m=result.best.predicted_total_cte_m,
         software_version=version("advnerf"),
-        extra={
-            "victim": cell.victim,
-            "scenario": cell.scenario,
-            "horizon": experiment.searched_ticks,
-            **said_of_device(),
-            **objective_entry(experiment.config.attack.objective, problem.objective, result.best.value),
-        },
-        clean_drive=clean,
+        extra=_extra(experiment, problem, policy, cell, result),
+        clean_drive=clean or clean_drive(past(problem, space, space.plain), space.plain.colours),
     )
+    if space.mount is not None:
+        attack = replace(attack, face=space.mount.face(attack.objects))
+    shown = space.restored(attack)
+    if problem.disturbances is not None:
+        _, found = evaluate(past(problem.undisturbed(), space, shown), shown.colours)
+        entry = objective_entry(
+            experiment.config.attack.objective, problem.objective, float(found.values.mean())
+        )
+        total_m = float(found.protocol_cte_m.mean())
+        attack = replace(attack, predicted_total_cte_m=total_m, extra=attack.extra | entry)
     if not baked_file(experiment).exists() or over_the_world(experiment):
         return attack
-    shown = space.restored(attack)
     _, totals_m = evaluate(past_field(experiment, problem.undisturbed(), space, shown), shown.colours)
     return replace(attack, field_total_cte_m=float(totals_m.protocol_cte_m.mean()))
+
+
+def _extra(
+    experiment: Experiment, problem: AttackProblem, policy: LoadedPolicy, cell: Cell, result: SearchResult
+) -> dict[str, Any]:
+    """What an attack file says beside its fields."""
+    found = {
+        "experiment": experiment.config.name,
+        "victim": cell.victim,
+        "scenario": cell.scenario,
+        "horizon": experiment.searched_ticks,
+        "evaluations": len(result.history),
+        "start_states": problem.start_states[:, :3].tolist(),
+        "searched_space": experiment.config.space.model_dump(mode="json"),
+        **said_of_device(),
+        **objective_entry(experiment.config.attack.objective, problem.objective, result.best.value),
+    }
+    if identity := policy.metadata.get("not_fixed"):
+        found["policy_not_fixed"] = identity
+    return found

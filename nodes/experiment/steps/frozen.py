@@ -12,7 +12,7 @@ from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.faces import has_face, panel_of
 from nodes.experiment.show.given import victim_sha256
 from nodes.experiment.show.learned_scene import scene_sha256
-from nodes.experiment.show.spaces import geometry_sha256
+from nodes.experiment.show.spaces import named_objects
 from nodes.experiment.steps.search_files import FROZEN
 from nodes.experiment.steps.verdicts import passing_digest
 from nodes.runtime.errors import RuntimeFault
@@ -59,9 +59,9 @@ def _frozen_place(experiment: Experiment) -> dict[str, str]:
     things = experiment.objects
     return {
         "scene": scene_sha256(experiment),
-        "objects": hash_of([geometry_sha256(experiment, thing.kind) for thing in things]),
+        "objects": hash_of([each.sha256 for each in named_objects(experiment)]),
         "placement": hash_of(
-            [thing.model_dump(mode="json") for thing in things]
+            [thing.place for thing in things]
             + ([panel_of(experiment).to_dict()] if has_face(experiment) else [])
         ),
     }

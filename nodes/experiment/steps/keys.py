@@ -10,13 +10,14 @@ from advnerf_core.attack.methods import METHODS, black_box_methods, method_diges
 from advnerf_core.attack.objectives import ON_THE_PATH, objective_key
 from advnerf_core.plugins import PluginError
 from advnerf_core.report.conditions import EMPTY, NONE
-from nodes.experiment.engine.artefact import Settings, digests_in
+from nodes.experiment.engine.artefact import Settings, digests_in, hash_of
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.sections import NETWORK
 from nodes.experiment.plan.victims import RETRAINED
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.faces import has_face
 from nodes.experiment.show.given import given, given_in, victim_sha256, victim_spec
+from nodes.experiment.show.spaces import named_objects
 from nodes.experiment.steps import bake
 from nodes.runtime.errors import RuntimeFault
 
@@ -35,14 +36,18 @@ FREE: Mapping[str, Any] = {
     "over": True,
     "contrasts": True,
     "run_folder": True,
+    "maps": True,
     "world": True,
     "view": True,
     "policy": NETWORK,
-    "attack": {"objective", "cache_mib"},
+    "attack": {"objective", "cache_mib", "together"},
     "deploy": {"world", "laps", "empty_scene", "ready_timeout_s"},
 }
 # What a drive without attack does not depend on besides.
-_SEARCHED_WITH = {"evaluations", "horizon", "learning_rate", "population", "time_batch", "robustness"}
+_SEARCHED_WITH = {
+    *("evaluations", "horizon", "learning_rate", "population", "time_batch", "robustness"),
+    *("step", "sigma", "probes", "warm_pairs", "options", "start_poses", "goals"),
+}
 
 
 class NoSuchCellError(RuntimeFault):
@@ -87,6 +92,8 @@ def cell_settings(experiment: Experiment, cell: Cell, deployed: bool = True) -> 
         free |= (
             {"deploy": True} if has_face(experiment) else {"deploy": True, "carrier": {"kind", "training"}}
         )
+    if experiment.given_scene is not None:  # for which no stage makes them
+        inputs["geometry"] = hash_of([each.sha256 for each in named_objects(experiment)])
     kept = {name: digest for name, digest in experiment.kept.items() if name in stages}
     inputs["stages"] = {**kept, **digests_in(experiment.folder, stages)}
     return Settings.of(experiment.config, None, free, **inputs, **_common_inputs(experiment, deployed))

@@ -58,11 +58,13 @@ class _Module(Protocol):
 
 
 def stages_of(experiment: Experiment) -> list[Stage]:
-    """The stages that cells need; the world must not have been opened for them.
+    """The stages that cells need, none in a learned scene of the user's own; the world must not have been opened for them.
 
     More rounds of retraining resume from the existing ones.
     """
     config = experiment.config
+    if config.own_scene:
+        return []
     found = [_capture(experiment), _scene(experiment), _bake(experiment), _object(experiment)]
     if config.trains:
         found.append(_policy(experiment))

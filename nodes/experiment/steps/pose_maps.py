@@ -1,4 +1,4 @@
-"""Maps about a finished pose cell of the junction: the loss landscape over one object's place, and starts against moves of that object."""
+"""Maps about what a search of places found: the loss landscape over one object's place, and starts against moves of that object."""
 
 from __future__ import annotations
 
@@ -7,13 +7,24 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from advnerf_core.attack.artifact import AttackFile
-from advnerf_core.attack.pose_maps import landscape, places_over, robustness_map, starts_beside
+from advnerf_core.attack.pose_maps import (
+    Landscape,
+    PoseMapError,
+    RobustnessMap,
+    landscape,
+    places_over,
+    robustness_map,
+    starts_beside,
+)
 from advnerf_core.attack.pose_plots import draw_landscape, draw_robustness
+from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.attack.spaces.placed_sensor import PlacedSensor
 from advnerf_core.files import write_atomically
 from nodes.experiment.plan.cell import Cell
+from nodes.experiment.plan.maps_config import LandscapeConfig, RobustnessMapConfig
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import make_space
 from nodes.experiment.show.victims import load_victim
@@ -21,37 +32,72 @@ from nodes.experiment.steps.attack import attack_problem
 from nodes.runtime.progress import Report
 
 
-@dataclass(frozen=True)
-class PoseMapSettings:
-    """What is mapped.
+@dataclass(frozen=True, eq=False)
+class Mapped:
+    """What maps are about.
 
     Attributes:
-        points: Of the landscape, along x and y of the object's bounds.
-        sideways_m: Starts of the map, to the left of the cell's first one [m].
-        object_moves_m: Moves of the object along x and y [m].
+        problem: With a `PlacedSensor`.
+        theta: Places and colours of all objects.
+        digest: Names what must not change between a map and its file.
+        mark: What the landscape calls the object's place in ``theta``; empty for no mark.
     """
 
-    points: tuple[int, int] = (9, 9)
-    sideways_m: tuple[float, ...] = (-0.6, -0.3, 0.0, 0.3, 0.6)
-    object_moves_m: tuple[tuple[float, float], ...] = (
-        (0.0, 0.0),
-        (-1.0, 0.0),
-        (1.0, 0.0),
-        (0.0, -1.0),
-        (0.0, 1.0),
-    )
+    problem: AttackProblem
+    theta: Tensor
+    digest: str
+    mark: str = ""
+
+    @property
+    def sensor(self) -> PlacedSensor:
+        """Its sensor."""
+        assert isinstance(self.problem.sensor, PlacedSensor), "the space of places has this sensor"
+        return self.problem.sensor
+
+    def landscape(
+        self, wanted: LandscapeConfig, number: int, file: Path, report: Report
+    ) -> tuple[Landscape, Path]:
+        """Drive over a grid of one object's places.
+
+        Args:
+            wanted: The grid.
+            number: Of the object.
+            file: A JSON file, where finished points are kept; the picture goes beside it.
+            report: Told the finished fraction.
+
+        Raises:
+            PoseMapError: An object that is not there, or the file of another map.
+        """
+        places = self.sensor.placements(self.theta)
+        if number >= len(places):
+            raise PoseMapError(f"expected an object of 0..{len(places) - 1}, got {number}")
+        place = places[number]
+        x_m, y_m = places_over(self.sensor.space, number, wanted.points)
+        grid = (x_m, y_m, wanted.yaws_rad or (float(place[2]),))
+        found = landscape(self.problem, self.theta, grid, number, file, _telling(report), self.digest)
+        marked = {self.mark: (float(place[0]), float(place[1]))} if self.mark else None
+        picture = file.with_suffix(".png")
+        write_atomically(picture, draw_landscape(found, [self.problem.path], marked))
+        return found, picture
+
+    def robustness(
+        self, wanted: RobustnessMapConfig, number: int, file: Path, report: Report
+    ) -> tuple[RobustnessMap, Path]:
+        """Drive from starts beside the first one past the object moved; see `landscape`."""
+        starts = starts_beside(self.problem.start_states[0, :3].tolist(), wanted.sideways_m, wanted.turn_rad)
+        moves = [(dx, dy, turn) for turn in wanted.object_turns_rad for dx, dy in wanted.object_moves_m]
+        found = robustness_map(
+            self.problem, self.theta, starts, moves, number, file, _telling(report), self.digest
+        )
+        picture = file.with_suffix(".png")
+        write_atomically(picture, draw_robustness(found))
+        return found, picture
 
 
 def draw_maps(
-    experiment: Experiment,
-    cell: Cell,
-    attack: AttackFile,
-    number: int,
-    folder: Path,
-    report: Report,
-    settings: PoseMapSettings | None = None,
+    experiment: Experiment, cell: Cell, attack: AttackFile, number: int, folder: Path, report: Report
 ) -> list[Path]:
-    """Drive over a grid of one object's places, and from starts beside its own past the object moved; in the learned scene.
+    """Both maps about a finished cell, in the learned scene.
 
     Args:
         experiment: Experiment with finished scene and objects, whose space is places.
@@ -60,50 +106,29 @@ def draw_maps(
         number: Number of the moved object.
         folder: Folder for ``landscape_<name>.json``, ``robustness_<name>.json`` and a PNG of each; it also stores finished points.
         report: Told the finished fraction.
-        settings: What is mapped.
 
     Returns:
         The pictures.
     """
-    settings = settings or PoseMapSettings()
-    space = make_space(experiment, None)
-    sensor, name = space.sensor, experiment.objects[number].name
-    assert isinstance(sensor, PlacedSensor), "the space of places has this sensor"
-    victim = load_victim(experiment, cell.victim)
-    problem = attack_problem(experiment, space, victim, cell.scenario, cell.seed)
+    space, name, maps = make_space(experiment, None), experiment.objects[number].name, experiment.config.maps
+    assert isinstance(space.sensor, PlacedSensor), "the space of places has this sensor"
+    problem = attack_problem(
+        experiment, space, load_victim(experiment, cell.victim), cell.scenario, cell.seed
+    )
     places = torch.tensor([each.placement for each in attack.objects], dtype=torch.float64)
     # In the unit box also where only the plain colours are meant.
-    theta = sensor.join(sensor.space.unit(places), space.restored(attack).colours)
-    place = sensor.placements(theta)[number]
-    x_m, y_m = places_over(sensor.space, number, settings.points)
-    digest = attack.sha256
-    flat = landscape(
-        problem,
-        theta,
-        (x_m, y_m, (float(place[2]),)),
-        number,
-        folder / f"landscape_{name}.json",
-        _half(report, 0.0, "landscape"),
-        digest,
-    )
-    starts = starts_beside(problem.start_states[0, :3].tolist(), settings.sideways_m)
-    moves = [(dx, dy, 0.0) for dx, dy in settings.object_moves_m]
-    rough = robustness_map(
-        problem,
-        theta,
-        starts,
-        moves,
-        number,
-        folder / f"robustness_{name}.json",
-        _half(report, 0.5, "starts x moves"),
-        digest,
-    )
-    pictures = [folder / f"{what}_{name}.png" for what in ("landscape", "robustness")]
-    marked = {"found": (float(place[0]), float(place[1]))}
-    write_atomically(pictures[0], draw_landscape(flat, [experiment.paths[cell.scenario]], marked))
-    write_atomically(pictures[1], draw_robustness(rough))
-    return pictures
+    theta = space.sensor.join(space.sensor.space.unit(places), space.restored(attack).colours)
+    about = Mapped(problem, theta, attack.sha256, "found")
+    flat, rough = folder / f"landscape_{name}.json", folder / f"robustness_{name}.json"
+    return [
+        about.landscape(maps.landscape, number, flat, _half(report, 0.0, "landscape"))[1],
+        about.robustness(maps.robustness, number, rough, _half(report, 0.5, "starts x moves"))[1],
+    ]
 
 
-def _half(report: Report, begin: float, what: str) -> Callable[[int, int], None]:
-    return lambda done, count: report(begin + 0.5 * done / count, f"{what} {done}/{count}")
+def _telling(report: Report) -> Callable[[int, int], None]:
+    return lambda done, count: report(done / count, f"{done}/{count} cells")
+
+
+def _half(report: Report, begin: float, what: str) -> Report:
+    return lambda fraction, text="": report(begin + 0.5 * fraction, f"{what} {text}")

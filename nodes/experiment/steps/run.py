@@ -62,6 +62,7 @@ def load_experiment(
 
 def _load(experiment: Experiment, document: Document) -> Experiment:
     """An experiment without variants, checked against its world, with the digests of its stages that are stored with the code."""
+    experiment = experiment.with_given_scene()
     if experiment.executes or not is_users(experiment.config.world):
         _check_world(experiment, document)
     if given_in(experiment.config):
@@ -111,12 +112,13 @@ def _check_places(experiment: Experiment, document: Document) -> None:
         if name not in experiment.world.paths:
             message = unknown(name, "path", experiment.world.paths)
             raise ConfigError(f"{document.place(('paths', index))}: paths: {message}")
-    if isinstance(experiment.named_world.make(), Photographed):
-        _check_photographed(experiment, document)
+    if experiment.config.own_scene or isinstance(experiment.named_world.make(), Photographed):
+        _check_undriven(experiment, document)
     by_hand = [
         index for index, each in enumerate(experiment.config.objects) if isinstance(each, PlacedObject)
     ]
-    if (found := in_a_lane(experiment.placed_by_hand, experiment.world)) is not None:
+    _ = experiment.searched_dynamics
+    if not experiment.config.own_scene and (found := in_a_lane(experiment.placed_by_hand, experiment.world)):
         raise ConfigError(f"{document.place(('objects', by_hand[found[0]]))}: {found[1]}")
     if isinstance(carrier := experiment.config.carrier, FaceCarrier):
         _check_panel(carrier, experiment, document)
@@ -143,10 +145,10 @@ def _check_panel(carrier: FaceCarrier, experiment: Experiment, document: Documen
         )
 
 
-def _check_photographed(experiment: Experiment, document: Document) -> None:
-    """Nothing drives in a place that is known by photographs alone, so that policies must exist and objects stand by hand."""
-    config = experiment.config
-    refused: tuple[tuple[tuple[str, ...], bool, str], ...] = (
+def _check_undriven(experiment: Experiment, document: Document) -> None:
+    """Nothing drives in a place that is known by photographs or by a learned scene alone: policies must exist, and objects stand by hand."""
+    config, what = experiment.config, "a learned scene" if experiment.config.own_scene else "photographs"
+    refused: list[tuple[tuple[str, ...], bool, str]] = [
         (("deploy", "through"), config.deploy.through != "nothing", "deploy.through nothing"),
         (("victims",), config.trains, "victims that exist ({policy: ...})"),
         (
@@ -154,14 +156,18 @@ def _check_photographed(experiment: Experiment, document: Document) -> None:
             experiment.has_rules,
             "objects whose places are given (x_m, y_m, yaw_rad)",
         ),
-        (("space", "kind"), config.space.kind not in ("colours", "places"), "space.kind colours or places"),
         (("capture", "colour_pairs"), config.capture.colour_pairs > 0, "capture.colour_pairs 0"),
         (("carrier",), config.carrier != ComposedConfig(kind="composed"), "carrier {kind: composed}"),
-    )
+    ]
+    if config.own_scene:
+        refused.append((("gate",), config.gate is not None, "gate null"))
+    else:
+        over_pictures = config.space.kind not in ("colours", "places")
+        refused.append((("space", "kind"), over_pictures, "space.kind colours or places"))
     for key, wrong, wanted in refused:
         if wrong:
             raise ConfigError(
-                f"{document.place(key)}: expected {wanted} in a place that is known by photographs alone, as nothing can be driven or "
+                f"{document.place(key)}: expected {wanted} in a place that is known by {what} alone, as nothing can be driven or "
                 "photographed there"
             )
 
@@ -185,7 +191,8 @@ def make_ready(
     keep_worlds(experiment.folder, experiment.named_worlds)
     if experiment.config.trains:
         experiment.config.policy.network.check()
-    return run_to_end(experiment, stages_of(experiment), _LIBRARIES, until, console, reference, watcher)
+    stages = stages_of(experiment)
+    return run_to_end(experiment, stages, _LIBRARIES, until if stages else None, console, reference, watcher)
 
 
 def prepare_victims(experiment: Experiment) -> None:

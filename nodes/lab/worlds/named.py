@@ -28,8 +28,18 @@ def _photographs() -> WorldClass:
     return Photographs
 
 
-WORLDS: Mapping[str, Callable[[], WorldClass]] = {**DRIVEN, "photographs": _photographs}
-"""Loaders of the worlds' classes by name: those that can be driven, and a place of photographs alone."""
+def _own_scene() -> WorldClass:
+    from nodes.lab.worlds.own_scene import OwnScene
+
+    return OwnScene
+
+
+WORLDS: Mapping[str, Callable[[], WorldClass]] = {
+    **DRIVEN,
+    "photographs": _photographs,
+    "scene": _own_scene,
+}
+"""Loaders of the worlds' classes by name: those that can be driven, a place of photographs alone, and a learned scene alone."""
 
 
 @dataclass(frozen=True)

@@ -10,14 +10,14 @@ from advnerf_core.attack.artifact import load_attack
 from advnerf_core.attack.methods import MethodError
 from advnerf_core.attack.search.search import SearchStateError
 from nodes.cli import main as cli
-from nodes.experiment.node.prepare import prepare
-from nodes.experiment.node.request import load_request, parse_request, request_text
+from nodes.experiment.node.prepare import prepare, request_text
+from nodes.experiment.node.request import parse_request
 from nodes.experiment.node.search import run_attack
 from nodes.experiment.node.worker import work
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
 from tests.support.strangers import install_method, spiral_code, spiral_theta, write_spiral
-from tests.support.tiny_request import tiny_request
+from tests.support.tiny_request import loaded, tiny_request
 
 FORGETFUL = """
 import torch
@@ -33,7 +33,7 @@ def search(problem, settings, run):
 
 Spiral = Method(search)
 """
-FROM_FILE = "search.method=spiral.py:Spiral"
+FROM_FILE = "over.method=[spiral.py:Spiral]"
 
 
 class StoppedError(Exception):
@@ -55,8 +55,8 @@ def command(monkeypatch, *words):
 def test_a_method_of_a_file_runs_a_request_and_resumes_to_the_same_bytes(tmp_path):
     file = tiny_request(tmp_path)
     write_spiral(tmp_path)
-    request = load_request(file, [FROM_FILE, "search.options.turns=0.25"])
-    assert parse_request(request_text(request), folder=tmp_path / "elsewhere") == request
+    request = loaded(file, [FROM_FILE, "attack.options.turns=0.25"])
+    assert parse_request(request_text(request), folder=tmp_path / "elsewhere") == request_text(request)
     (whole,) = run_attack(request, tmp_path / "whole", ProgressDisplay())
     with pytest.raises(StoppedError):
         run_attack(request, tmp_path / "stopped", ProgressDisplay(), stop_at_one)
@@ -73,7 +73,7 @@ def test_a_method_of_an_installed_package_runs_a_request(tmp_path, monkeypatch):
     (tmp_path / "package").mkdir()
     install_method(tmp_path / "package", monkeypatch, spiral_code())
     (file,) = run_attack(
-        load_request(tiny_request(tmp_path, 2), ["search.method=spiral"]), tmp_path / "out", ProgressDisplay()
+        loaded(tiny_request(tmp_path, 2), ["over.method=[spiral]"]), tmp_path / "out", ProgressDisplay()
     )
     assert load_attack(file).method == "spiral"
 
@@ -81,7 +81,7 @@ def test_a_method_of_an_installed_package_runs_a_request(tmp_path, monkeypatch):
 def test_another_code_of_the_method_does_not_go_on_with_its_state(tmp_path):
     file = tiny_request(tmp_path)
     spiral = write_spiral(tmp_path)
-    request = load_request(file, [FROM_FILE])
+    request = loaded(file, [FROM_FILE])
     before = prepare(request).settings_hash
     with pytest.raises(StoppedError):
         run_attack(request, tmp_path / "out", ProgressDisplay(), stop_at_one)
@@ -97,7 +97,7 @@ def test_the_attack_node_shows_a_search_that_keeps_no_state(tmp_path):
     (tmp_path / "spiral.py").write_text(FORGETFUL)
     folder = tmp_path / "run"
     folder.mkdir()
-    (folder / "request.attack.yaml").write_text(request_text(load_request(request, [FROM_FILE])))
+    (folder / "request.experiment.yaml").write_text(request_text(loaded(request, [FROM_FILE])))
     said = tmp_path / "said"
     with open(said, "wb") as stream:
         work(folder, stream)
@@ -109,17 +109,17 @@ def test_the_attack_node_shows_a_search_that_keeps_no_state(tmp_path):
     ("changes", "says"),
     [
         (
-            ["search.method=spirel.py:Spiral"],
-            r"search.method: attack method spirel.py:Spiral: expected a Python file at .*spirel.py, found none",
+            ["over.method=[spirel.py:Spiral]"],
+            r"over.method.*: attack method spirel.py:Spiral: expected a Python file at .*spirel.py, found none",
         ),
-        (["search.options.turns=1"], "search.options.turns: expected an option of this method of none"),
-        ([FROM_FILE, "search.together=true"], "gradient method only"),
+        (["attack.options.turns=1"], "attack.options.turns: expected an option of this method of none"),
+        ([FROM_FILE, "attack.together=true"], "gradient method only"),
     ],
 )
 def test_what_cannot_be_is_told_with_its_place(tmp_path, changes, says):
     write_spiral(tmp_path)
     with pytest.raises(ConfigError, match=says):
-        load_request(tiny_request(tmp_path), changes)
+        loaded(tiny_request(tmp_path), changes)
 
 
 def test_a_broken_method_is_one_line_before_anything_is_written(tmp_path, monkeypatch, capsys):
@@ -133,5 +133,5 @@ def test_a_broken_method_is_one_line_before_anything_is_written(tmp_path, monkey
     assert "cannot be loaded: ZeroDivisionError: division by zero" in said
     assert not list(out.glob("*.yaml"))
     write_spiral(tmp_path)
-    with pytest.raises(MethodError, match=r"search.options.turn: .*did you mean turns"):
-        run_attack(load_request(file, [FROM_FILE, "search.options.turn=1"]), out, ProgressDisplay())
+    with pytest.raises(MethodError, match=r"attack.options.turn: .*did you mean turns"):
+        run_attack(loaded(file, [FROM_FILE, "attack.options.turn=1"]), out, ProgressDisplay())

@@ -7,12 +7,12 @@ import torch
 
 from advnerf_core.attack.adjoint import evaluate
 from advnerf_core.attack.artifact import load_attack
-from nodes.experiment.node.prepare import prepare, request_hash
-from nodes.experiment.node.request import load_request, parse_request, request_text
+from nodes.experiment.node.prepare import prepare, request_text
+from nodes.experiment.node.request import parse_request
 from nodes.experiment.node.search import run_attack
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
-from tests.support.tiny_request import tiny_request
+from tests.support.tiny_request import loaded, tiny_request
 
 LEFT = """
 from advnerf_core.attack.objective import Objective
@@ -26,8 +26,8 @@ class Left(Objective):
 def test_a_request_is_chosen_by_the_objective_of_a_file_and_reports_the_total_too(tmp_path):
     file = tiny_request(tmp_path)
     (tmp_path / "mine.py").write_text(LEFT)
-    request = load_request(file, ["search.objective=mine.py:Left", "search.method=random"])
-    assert parse_request(request_text(request), folder=tmp_path / "elsewhere") == request
+    request = loaded(file, ["attack.objective=mine.py:Left", "over.method=[random]"])
+    assert parse_request(request_text(request), folder=tmp_path / "elsewhere") == request_text(request)
     (found,) = run_attack(request, tmp_path / "run", ProgressDisplay())
     attack, curve = load_attack(found), json.loads(found.with_name("seed_0.json").read_text())
     problem = prepare(request).problem
@@ -39,16 +39,20 @@ def test_a_request_is_chosen_by_the_objective_of_a_file_and_reports_the_total_to
     assert attack.predicted_total_cte_m == pytest.approx(float(totals.protocol_cte_m.mean()), rel=1e-6)
 
 
+def hash_with(file, changes):
+    return prepare(loaded(file, changes)).settings_hash
+
+
 def test_its_hash_follows_the_code_and_cte_leaves_it_unchanged(tmp_path):
     file, own = tiny_request(tmp_path), tmp_path / "mine.py"
     own.write_text(LEFT)
-    plain = load_request(file)
-    assert request_hash(load_request(file, ["search.objective=cte"])) == request_hash(plain)
-    hashes = [request_hash(load_request(file, ["search.objective=mine.py:Left"]))]
+    plain = hash_with(file, [])
+    assert hash_with(file, ["attack.objective=cte"]) == plain
+    hashes = [hash_with(file, ["attack.objective=mine.py:Left"])]
     own.write_text(LEFT.replace("min=0.0", "min=0.1"))
-    hashes.append(request_hash(load_request(file, ["search.objective=mine.py:Left"])))
-    hashes.append(request_hash(load_request(file, ["search.objective=peak"])))
-    assert len({request_hash(plain), *hashes}) == 4
+    hashes.append(hash_with(file, ["attack.objective=mine.py:Left"]))
+    hashes.append(hash_with(file, ["attack.objective=peak"]))
+    assert len({plain, *hashes}) == 4
 
 
 def test_wrong_objectives_are_one_line_before_anything_is_loaded(tmp_path):
@@ -56,8 +60,11 @@ def test_wrong_objectives_are_one_line_before_anything_is_loaded(tmp_path):
     with pytest.raises(
         ConfigError, match=r"objective.*expected an objective of cte, .*got 'tce' .did you mean cte"
     ):
-        load_request(file, ["search.objective=tce"])
-    request = load_request(file, ["search.objective=collision"])
+        loaded(file, ["attack.objective=tce"])
+    with pytest.raises(ConfigError, match="expected an objective that needs no solids"):
+        loaded(file, ["attack.objective=collision"])
+    (tmp_path / "mine.py").write_text(LEFT.replace("def value", "needs_solids = True\n\n    def value"))
+    request = loaded(file, ["attack.objective=mine.py:Left"])
     with pytest.raises(ConfigError, match="expected an objective that needs no solids"):
         run_attack(request, tmp_path / "run", ProgressDisplay())
     assert not (tmp_path / "run").exists()

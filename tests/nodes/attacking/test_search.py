@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from advnerf_core.attack.adjoint import BlackBoxError, evaluate
+from advnerf_core.attack.adjoint import evaluate
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.attack.search.black_box import BudgetError
 from advnerf_core.display import DisplayModel
@@ -19,12 +19,12 @@ from calibration.display_colour import DisplayCalibration
 from calibration.schema import save_calibration
 from nodes.cli import main as cli
 from nodes.experiment.node.check import check
-from nodes.experiment.node.prepare import prepare
-from nodes.experiment.node.request import load_request
+from nodes.experiment.node.prepare import load_request, prepare, request_text
 from nodes.experiment.node.search import attack_file, run_attack
+from nodes.experiment.steps.keys import NoSuchCellError
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
-from tests.support.tiny_request import tiny_request
+from tests.support.tiny_request import loaded, tiny_request
 
 
 class StoppedError(Exception):
@@ -51,12 +51,12 @@ _SLOW = pytest.mark.slow  # the same loop with another search inside; tests of t
 def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, method):
     file = tiny_request(tmp_path)
     changes = [
-        f"search.method={method}",
-        "search.population=4",
-        "robustness.noise=0.01",
-        "dynamics.delay_s=0.05",
+        f"over.method=[{method}]",
+        "attack.population=4",
+        "attack.robustness.noise=0.01",
+        "attack.response.delay_s=0.05",
     ]
-    request = load_request(file, changes)
+    request = loaded(file, changes)
     (whole,) = run_attack(request, tmp_path / "whole", ProgressDisplay())
     with pytest.raises(StoppedError):
         run_attack(request, tmp_path / "stopped", ProgressDisplay(), stop_at_one)
@@ -68,17 +68,23 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, method):
     assert attack.required_face().subject == "board"
     assert len(json.loads((tmp_path / "whole" / "seed_0.json").read_text())["loss_m"]) == 3
     with pytest.raises(ConfigError, match="belongs to another attack"):
-        run_attack(load_request(file), tmp_path / "whole", ProgressDisplay())
+        run_attack(loaded(file), tmp_path / "whole", ProgressDisplay())
 
 
 def test_a_request_that_failed_to_load_does_not_lock_its_folder(tmp_path, monkeypatch, capsys):
     file, folder = tiny_request(tmp_path, evaluations=1), tmp_path / "out"
-    assert command(monkeypatch, "run", file, "-o", folder, "--set", "policy=not_here.safetensors") != 0
+    assert (
+        command(monkeypatch, "run", file, "-o", folder, "--set", "victims.mine.policy=not_here.safetensors")
+        != 0
+    )
     assert "not_here.safetensors" in capsys.readouterr().err
     assert command(monkeypatch, "run", file, "-o", folder) == 0
     assert command(monkeypatch, "run", file, "-o", folder, "--set", "horizon=4") != 0
     assert "belongs to another attack" in capsys.readouterr().err
-    assert load_request(folder / "request.attack.yaml") == load_request(file)
+    kept = load_request(folder / "request.experiment.yaml", folder=folder)
+    assert (
+        request_text(kept) == request_text(loaded(file)) == (folder / "request.experiment.yaml").read_text()
+    )
 
 
 @pytest.mark.parametrize(
@@ -92,13 +98,13 @@ def test_an_onnx_policy_is_attacked_by_questions_within_the_budget_and_resumes_t
     export_onnx(loaded.policy, PolicyContract(loaded.view), tmp_path / "policy.onnx")
     # 4 calls for the first lesson, 9 for each drive of 3 ticks with one pair of questions: three of them fit into 11 x 3.
     changes = [
-        "policy=policy.onnx",
-        f"search.method={method}",
-        "search.evaluations=11",
-        "search.probes=1",
-        "search.warm_pairs=2",
+        "victims.mine.policy=policy.onnx",
+        f"over.method=[{method}]",
+        "attack.evaluations=11",
+        "attack.probes=1",
+        "attack.warm_pairs=2",
     ]
-    request = load_request(file, changes)
+    request = loaded(file, changes)
     (whole,) = run_attack(request, tmp_path / "whole", ProgressDisplay())
     with pytest.raises(StoppedError):
         run_attack(request, tmp_path / "stopped", ProgressDisplay(), stop_at_one)
@@ -107,25 +113,21 @@ def test_an_onnx_policy_is_attacked_by_questions_within_the_budget_and_resumes_t
     assert load_attack(whole).method == method
     assert len(json.loads((tmp_path / "whole" / "seed_0.json").read_text())["loss_m"]) == 3
     with pytest.raises(BudgetError, match="allow more evaluations"):
-        run_attack(
-            load_request(file, [*changes, "search.evaluations=4"]), tmp_path / "poor", ProgressDisplay()
-        )
-    with pytest.raises(BlackBoxError, match="guided"):
-        run_attack(
-            load_request(file, [*changes, "search.method=gradient"]), tmp_path / "blind", ProgressDisplay()
-        )
+        run_attack(loaded(file, [*changes, "attack.evaluations=4"]), tmp_path / "poor", ProgressDisplay())
+    with pytest.raises(NoSuchCellError, match="guided"):
+        run_attack(loaded(file, [*changes, "over.method=[gradient]"]), tmp_path / "blind", ProgressDisplay())
 
 
 @pytest.mark.slow  # tests/advnerf_core/attack/test_together.py has the search itself
 def test_seeds_searched_together_resume_to_the_same_bytes_and_end_as_they_do_alone(tmp_path):
     file = tiny_request(tmp_path)
-    request = load_request(file, ["search.seeds=[0, 1]", "search.together=true"])
+    request = loaded(file, ["over.seed=[0, 1]", "attack.together=true"])
     whole = run_attack(request, tmp_path / "whole", ProgressDisplay())
     with pytest.raises(StoppedError):
         run_attack(request, tmp_path / "stopped", ProgressDisplay(), stop_at_one)
     resumed = run_attack(request, tmp_path / "stopped", ProgressDisplay())
     assert [one.read_bytes() for one in resumed] == [one.read_bytes() for one in whole]
-    alone = run_attack(load_request(file, ["search.seeds=[0, 1]"]), tmp_path / "alone", ProgressDisplay())
+    alone = run_attack(loaded(file, ["over.seed=[0, 1]"]), tmp_path / "alone", ProgressDisplay())
     for one, other in zip(whole, alone, strict=True):
         assert load_attack(one).predicted_total_cte_m == pytest.approx(
             load_attack(other).predicted_total_cte_m, rel=1e-4
@@ -134,7 +136,7 @@ def test_seeds_searched_together_resume_to_the_same_bytes_and_end_as_they_do_alo
             load_attack(one).face_object.theta, load_attack(other).face_object.theta, atol=1e-3
         )
     with pytest.raises(ConfigError, match="gradient method only"):
-        load_request(file, ["search.method=random", "search.together=true"])
+        loaded(file, ["over.method=[random]", "attack.together=true"])
 
 
 def test_a_monitor_in_the_loop_is_searched_through_its_colours_and_the_gradient_is_sound(tmp_path):
@@ -144,24 +146,26 @@ def test_a_monitor_in_the_loop_is_searched_through_its_colours_and_the_gradient_
     calibration = DisplayCalibration(date=datetime.date(2026, 1, 1), method="computed", model=dim.to_dict())
     save_calibration(calibration, tmp_path / "display.yaml")
     file = tiny_request(tmp_path)
-    changes = ["search.evaluations=2", "robustness.jitter_m=0.001"]
-    shown = load_request(file, changes)
+    changes = ["attack.evaluations=2", "attack.robustness.jitter_m=0.001"]
+    shown = loaded(file, changes)
     text = file.read_text().replace(
         "resolution: 8,", "resolution: 8, display: display.yaml, display_cos: 0.9,"
     )
     file.write_text(text)
-    request = load_request(file, changes)
+    request = loaded(file, changes)
     prepared = prepare(request)
     theta = torch.randn(prepared.problem.sensor.theta_shape, generator=torch.manual_seed(0))
     seen = torch.logit(torch.tensor(dim.forward(torch.sigmoid(theta).numpy(), 0.9)), eps=1e-4).float()
     images = prepared.problem.sensor.sense(prepared.problem.start_states, theta).images
-    torch.testing.assert_close(images, prepared.surrogate.sense(prepared.problem.start_states, seen).images)
+    torch.testing.assert_close(
+        images, prepared.space.surrogate.sense(prepared.problem.start_states, seen).images
+    )
     assert prepared.settings_hash != prepare(shown).settings_hash
     (attack,) = run_attack(request, tmp_path / "out", ProgressDisplay())
     assert load_attack(attack).required_face().subject == "board"
-    assert check(load_request(file), 2, False, lambda fraction, text="": None).sound
+    assert check(loaded(file), 2, False, lambda fraction, text="": None).sound
     with pytest.raises(ConfigError, match="display: expected one object"):
-        load_request(file, ["search.together=true"])
+        loaded(file, ["attack.together=true"])
 
 
 def test_show_writes_the_texture_and_resume_needs_a_folder_of_a_run(tmp_path, monkeypatch, capsys):
@@ -185,7 +189,7 @@ def test_show_writes_the_texture_and_resume_needs_a_folder_of_a_run(tmp_path, mo
 
 
 def test_the_check_confirms_the_gradient_and_says_so(tmp_path):
-    found = check(load_request(tiny_request(tmp_path)), 3, False, lambda fraction, text="": None)
+    found = check(loaded(tiny_request(tmp_path)), 3, False, lambda fraction, text="": None)
     assert found.frozen_error <= 1e-4
     assert found.sound
     assert found.verdict[0].startswith("gradient right")
@@ -193,8 +197,8 @@ def test_the_check_confirms_the_gradient_and_says_so(tmp_path):
 
 
 def test_an_object_out_of_sight_has_no_gradient_and_the_check_says_so(tmp_path):
-    away = ["objects=[{x_m: -3.5, y_m: 3.0, z_m: 0.4, yaw_rad: 0.0, resolution: 4}]"]
-    found = check(load_request(tiny_request(tmp_path), away), 2, False, lambda fraction, text="": None)
+    away = ["objects=[{name: a, kind: panel, x_m: -3.5, y_m: 3.0, face: {size_m: 0.8, resolution: 4}}]"]
+    found = check(loaded(tiny_request(tmp_path), away), 2, False, lambda fraction, text="": None)
     assert not found.sound
     assert found.verdict[0].startswith("NO GRADIENT")
 
@@ -208,13 +212,13 @@ def command(monkeypatch, *words):
 
 def test_every_result_stands_beside_the_drive_without_attack(tmp_path, monkeypatch, capsys):
     file = tiny_request(tmp_path, evaluations=2)
-    starts = "starts.poses=[[0.0, -1.65, 0.5], [0.0, -2.3, -0.4]]"  # they head away from the path
+    starts = "attack.start_poses=[[0.0, -1.65, 0.5], [0.0, -2.3, -0.4]]"  # they head away from the path
     changes = ["--set", starts]
     assert command(monkeypatch, "run", file, "-o", tmp_path / "out", *changes) == 0
     printed = capsys.readouterr().out
     attack = load_attack(tmp_path / "out" / "seed_0.attack.safetensors")
-    prepared = prepare(load_request(file, [starts]))
-    _, totals = evaluate(prepared.problem, prepared.surrogate.plain_theta())
+    prepared = prepare(loaded(file, [starts]))
+    _, totals = evaluate(prepared.problem, prepared.space.surrogate.plain_theta())
     clean = attack.clean_drive
     assert clean.total_cte_m == pytest.approx(totals.protocol_cte_m.tolist(), rel=1e-6)
     assert len(clean.total_cte_m) == 2

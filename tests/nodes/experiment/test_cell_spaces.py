@@ -19,6 +19,7 @@ from advnerf_core.report.cells import cell_from
 from advnerf_core.report.clips import ClipTrack, read_clip
 from nodes.experiment.pages.report import how_it_was_run
 from nodes.experiment.plan.cell import Cell
+from nodes.experiment.plan.maps_config import MapsConfig
 from nodes.experiment.plan.sections import RetrainConfig
 from nodes.experiment.plan.space_config import (
     ColoursConfig,
@@ -31,11 +32,10 @@ from nodes.experiment.run.cells import has_learned_scene, is_predictable, run_ce
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import make_space, mesh_objects
 from nodes.experiment.show.victims import load_victim
-from nodes.experiment.steps import attack, films, pose_maps, run
+from nodes.experiment.steps import attack, films, run
 from nodes.experiment.steps.attack import surrogate_part
 from nodes.experiment.steps.deploy import DRIVES, ThroughWorld, cell_data
 from nodes.experiment.steps.keys import NoSuchCellError, settings_hash
-from nodes.experiment.steps.pose_maps import PoseMapSettings
 from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError
 
@@ -288,13 +288,12 @@ def test_the_retrained_victim_is_that_of_the_first_round(trained: Experiment, tm
     assert json.dumps(naive["deployed"]) == json.dumps(cell["deployed"])  # the very same weights
 
 
-def test_maps_are_of_what_the_cell_found(
-    trained: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    experiment = searching(trained, ONE)
+def test_maps_are_of_what_the_cell_found(trained: Experiment, tmp_path: Path) -> None:
+    moves = {"sideways_m": [0.0, 0.3], "object_moves_m": [[0.0, 0.0], [0.0, 0.2]]}
+    small = MapsConfig.model_validate({"landscape": {"points": [2, 2]}, "robustness": moves})
+    experiment = searching(trained, ONE, maps=small)
+    assert settings_hash(experiment, PLACES) == settings_hash(searching(trained, ONE), PLACES)
     run_cell(experiment, PLACES, tmp_path, silent)
-    small = PoseMapSettings(points=(2, 2), sideways_m=(0.0, 0.3), object_moves_m=((0.0, 0.0), (0.0, 0.2)))
-    monkeypatch.setattr(pose_maps, "PoseMapSettings", lambda: small)
     asked = (experiment, PLACES)
     pictures = cells.draw_maps(*asked, 1, tmp_path, silent)
     assert [cv2.imread(str(picture)) is not None for picture in pictures] == [True, True]

@@ -90,12 +90,14 @@ def test_experiments_without_files_depend_on_their_kinds_alone(tmp_path: Path) -
     [
         ("bilboard.glb", "which is not there"),
         ("hydrnt", r"did you mean hydrant\?.*one of your own is a file of 'advnerf scene object build'"),
-        ("billboard.stl", "expected a kind of object of .*; one of your own"),
+        ("billboard.xyz", "expected a kind of object of .*; one of your own"),
+        ("broken.stl", "expected the section mesh, with a unit or height_m"),
         ("broken.glb", "broken.glb"),
     ],
 )
 def test_a_kind_that_is_none_is_said_with_its_line(tmp_path: Path, kind: str, message: str) -> None:
-    (tmp_path / "broken.glb").write_bytes(b"glTF")
+    for name in ("broken.glb", "broken.stl"):
+        (tmp_path / name).write_bytes(b"glTF")
     with pytest.raises(AdvnerfError, match=message):
         experiment_in(tmp_path, kind)
 

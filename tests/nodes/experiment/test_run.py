@@ -1,16 +1,11 @@
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import torch
 
 from advnerf_core.scene.presets import FAST
 from nodes.experiment.engine.stages import StageError
-from nodes.experiment.node.prepare import start_states
-from nodes.experiment.node.request import AttackRequest, StartsRequest
 from nodes.experiment.plan.cell import Cell
-from nodes.experiment.plan.robustness_config import RobustnessConfig
 from nodes.experiment.run.whole import run_experiment
 from nodes.experiment.steps.pipeline import stages_of
 from nodes.experiment.steps.run import load_experiment
@@ -166,16 +161,3 @@ def test_an_unknown_last_stage_leaves_nothing_behind(tmp_path):
     with pytest.raises(StageError, match="got 'flight'"):
         run_experiment(experiment, "flight")
     assert not (tmp_path / "run").exists()
-
-
-def test_a_request_of_the_same_seed_has_the_same_starts(tmp_path):
-    experiment = room(tmp_path, "full")
-    starts = StartsRequest(nominal=experiment.references["track"].drive_start, count=3)
-    for seed, nominal_start in ((0, False), (1, False), (2, True)):
-        config = experiment.config.attack.model_copy(update={"starts": 3, "nominal_start": nominal_start})
-        ours = replace(experiment, config=experiment.config.model_copy(update={"attack": config}))
-        request = AttackRequest.model_construct(
-            starts=starts.model_copy(update={"nominal_start": nominal_start}), robustness=RobustnessConfig()
-        )
-        found = start_states(request, None, ours.dynamics, seed)
-        assert torch.equal(found, ours.start_states("track", seed))

@@ -3,36 +3,24 @@
 from __future__ import annotations
 
 import hashlib
-from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, ValidationInfo, computed_field, model_validator
-from pydantic_core import PydanticCustomError
 
 from advnerf_core.data.transforms import load_transforms
 from advnerf_core.data.views import PosedImages
-from advnerf_core.files import sha256_of
 from advnerf_core.geometry import Pinhole
-from advnerf_core.places import expanded
-from advnerf_core.strict import COMPLETE, StrictModel
+from advnerf_core.strict import StrictModel
 from hardware.worlds.world import CarDescription
+from nodes.lab.located import content_sha256, located
 
 DRIVEN = "driven"
 AboveZero = Annotated[float, Field(gt=0.0)]
 
 
 def _located(name: str, info: ValidationInfo) -> str:
-    if name == DRIVEN:
-        return name
-    path = ((info.context or {}).get("folder") or Path.cwd()) / expanded(name)
-    if not path.exists():
-        raise PydanticCustomError(
-            COMPLETE,
-            "{text}",
-            {"text": f"expected a file or folder relative to this file, got {name}, which is not there"},
-        )
-    return str(path.resolve())
+    return name if name == DRIVEN else str(located(Path(name), info))
 
 
 Located = Annotated[str, AfterValidator(_located)]
@@ -138,7 +126,7 @@ class PhotographsConfig(StrictModel):
         files |= {listed.file} if listed.file else set()
         if self.path != DRIVEN:
             files |= {Path(self.path), *(each.path for each in self.driven.frames)}
-        digests = [_digest(each, each.stat().st_mtime_ns) for each in sorted(files)]
+        digests = [content_sha256(each) for each in sorted(files)]
         return hashlib.sha256("".join(digests).encode()).hexdigest()
 
 
@@ -149,9 +137,3 @@ def read_images(images: str) -> PosedImages:
         DatasetError: They cannot be read.
     """
     return load_transforms(Path(images), require_all=True)
-
-
-@lru_cache(maxsize=4096)
-def _digest(file: Path, changed_ns: int) -> str:
-    del changed_ns
-    return sha256_of(file)

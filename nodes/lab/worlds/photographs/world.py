@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, NoReturn
+from typing import ClassVar
 
 import cv2
 import numpy as np
 
 from advnerf_core.data.posed_image import PosedImage
 from advnerf_core.data.view_loading import load_image
-from advnerf_core.geometry import Array, Pinhole, VehicleState, camera_mount, invert_transform, make_transform
+from advnerf_core.geometry import Array, Pinhole, camera_mount, invert_transform, make_transform
 from hardware.worlds.world import Box, Photograph, Rgb, WorldDescription, WorldError
 from nodes.lab.worlds.photographs.config import PhotographsConfig, read_images
 from nodes.lab.worlds.photographs.track import driven_track, path_along, points_of
+from nodes.lab.worlds.undriven import Undriven
 
 PATH = "track"
 # The learned box reaches beyond cameras and path by this share of their extent; anything outside is learned with less detail.
@@ -22,14 +23,15 @@ _BESIDE, _BELOW_M = 0.5, 0.1
 _HALF_PX = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
 
 
-class Photographs:
-    """A place of photographs. Its frame is the photographs', moved up or down so that the ground is at z = 0.
+class Photographs(Undriven):
+    """A place of photographs. Its frame is that of the photographs, moved up or down so that the ground is at z = 0.
 
     Args:
         config: The photographs, the path, the car and its camera.
     """
 
     Config: ClassVar[type[PhotographsConfig]] = PhotographsConfig
+    known_by = "photographs"
 
     def __init__(self, config: PhotographsConfig) -> None:
         self.config = config
@@ -160,57 +162,13 @@ class Photographs:
 
         return Photograph(pose, look)
 
-    @property
-    def state(self) -> VehicleState:
-        """Always an error, as the place has no car."""
-        self._refuse()
-
-    @property
-    def blocked(self) -> bool:
-        """Always an error, as the place has no car."""
-        self._refuse()
-
     def photo_poses(self, count: int, rng: np.random.Generator) -> list[Array]:
         """Poses of the photographs, for any ``count``."""
         del count, rng
         return [self._T_world_from_images @ each.T_world_from_camera for each in self._all]
 
-    def reset(self, x_m: float, y_m: float, yaw_rad: float) -> VehicleState:
-        """Always an error, as nothing is driven here."""
-        del x_m, y_m, yaw_rad
-        self._refuse()
-
-    def step(self, control: float, speed_mps: float, duration_s: float) -> VehicleState:
-        """Always an error, as nothing is driven here."""
-        del control, speed_mps, duration_s
-        self._refuse()
-
-    def observe(self, depth: bool = True) -> Any:
-        """Always an error, as nothing is driven here."""
-        del depth
-        self._refuse()
-
-    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True) -> Any:
-        """Always an error, as no other pictures can be taken."""
-        del x_m, y_m, yaw_rad, depth
-        self._refuse()
-
-    def photograph(self, T_world_from_camera: Array) -> Rgb:
-        """Always an error, as no other pictures can be taken."""
-        del T_world_from_camera
-        self._refuse()
-
-    def _refuse(self) -> NoReturn:
-        raise WorldError(
-            "expected a place that can be driven and photographed anew, got one that is known by photographs alone; attacks are searched in "
-            "what is learned from them"
-        )
-
     def __enter__(self) -> Photographs:
         return self
-
-    def __exit__(self, *raised: object) -> None:
-        return
 
 
 def _through(pinhole: Pinhole, rgb: Rgb, own: Pinhole, file: Path) -> Rgb:

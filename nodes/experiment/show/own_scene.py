@@ -1,0 +1,118 @@
+"""Objects in a learned scene of a user's own: nothing is built for them, and what shows a face in the room is said with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from advnerf_core.attack.spaces.space import FaceMount, NamedObject
+from advnerf_core.display import DisplayModel
+from advnerf_core.fields.summed_levels import with_summed_levels
+from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object, face_corners_in_object
+from advnerf_core.objects.mesh.field import MeshField
+from advnerf_core.objects.mesh.surface import sphere, unwrapped
+from advnerf_core.objects.voxel.generators import GENERATORS
+from advnerf_core.objects.voxel.mesh import stand
+from advnerf_core.objects.voxel.mesh_files import load_mesh
+from advnerf_core.objects.voxel.model import load_object
+from calibration.display_colour import DisplayCalibration
+from calibration.schema import TargetCalibration, load_calibration
+from nodes.experiment.engine.artefact import hash_of
+from nodes.experiment.plan.object_kinds import BALL, CUBE, MADE_HERE_M
+from nodes.experiment.plan.placed import FLAT, FaceConfig, MeshConfig, PlacedObject
+from nodes.experiment.plan.space_config import MeshShapeConfig, MeshTextureConfig
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.objects import GENERATOR_OF
+
+_BALL_M, _SLAB_M = 0.7, 0.01
+
+
+class OwnObject(NamedTuple):
+    """An object as it stands in the scene, and what attack files say of it."""
+
+    field: VoxelGridObject | MeshField
+    named: NamedObject
+
+
+def own_objects(experiment: Experiment) -> list[OwnObject]:
+    """The objects in the order of the experiment file, in their plain colours.
+
+    Raises:
+        MeshError, ObjectFileError: A file that cannot be read.
+    """
+    return [_own_object(experiment, thing) for thing in experiment.objects]
+
+
+def _own_object(experiment: Experiment, thing: PlacedObject) -> OwnObject:
+    if thing.kind in FLAT:
+        field: VoxelGridObject | MeshField = _flat(experiment, thing)
+    elif (wanted := _as_mesh(experiment, thing)) is not None:
+        field, file_sha256 = _mesh(thing, wanted)
+        if file_sha256:
+            return OwnObject(field, NamedObject(thing.name, hash_of([field.sha256, file_sha256])))
+    else:
+        voxels = load_object(Path(thing.kind)).placed(thing.T_world_from_object, thing.scale)
+        levels = thing.levels
+        field = with_summed_levels(voxels, levels, finest=max(voxels.slots.shape)) if levels else voxels
+    return OwnObject(field, NamedObject(thing.name, field.sha256))
+
+
+def _flat(experiment: Experiment, thing: PlacedObject) -> VoxelGridObject:
+    of_all, face = experiment.config.object, thing.face or FaceConfig()
+    field = cube_face_object(
+        face.size_m,
+        face.resolution or of_all.panel_resolution,
+        face.rgb or of_all.panel_rgb,
+        thing.T_world_from_face,
+        one_sided=thing.kind != CUBE,
+        depth_m=face.size_m if thing.kind == CUBE else _SLAB_M,
+    )
+    return replace(field, scale=field.scale * thing.scale)
+
+
+def _as_mesh(experiment: Experiment, thing: PlacedObject) -> MeshConfig | None:
+    space = experiment.config.space
+    if thing.mesh is None and isinstance(space, (MeshTextureConfig, MeshShapeConfig)):
+        return MeshConfig(texels=space.texels)
+    return thing.mesh
+
+
+def _mesh(thing: PlacedObject, wanted: MeshConfig) -> tuple[MeshField, str]:
+    """A mesh where it stands, and the hash of the files that it was read from; empty of one that is made."""
+    if thing.kind == BALL:
+        surface = sphere(0.5 * (wanted.height_m or _BALL_M), wanted.rgb)
+    elif thing.kind in MADE_HERE_M:
+        surface = stand(GENERATORS[GENERATOR_OF[thing.kind]](), height_m=wanted.height_m)
+    else:
+        surface = load_mesh(Path(thing.kind), wanted.up, wanted.height_m, wanted.unit)
+        for note in surface.notes:
+            print(f"warning: {note}")
+    field = MeshField(unwrapped(surface, wanted.texels), thing.T_world_from_object, thing.scale)
+    return field, surface.sha256
+
+
+def mount_of(experiment: Experiment) -> FaceMount | None:
+    """What shows a face in the room: that of the first object that says it; None where nothing does."""
+    for number, thing in enumerate(experiment.objects):
+        face = thing.face
+        if face is None or (face.target is None and face.subject is None):
+            continue
+        if face.target is None:
+            subject, corners = str(face.subject), face_corners_in_object(thing.side_m)
+            return FaceMount(subject, (thing.side_m, thing.side_m), corners, number)
+        target = load_calibration(TargetCalibration, face.target)
+        corners = target.corners
+        width_m, height_m = (float(np.linalg.norm(corners[end] - corners[0])) for end in (1, 3))
+        return FaceMount(target.subject, (width_m, height_m), corners, number)
+    return None
+
+
+def display_of(experiment: Experiment) -> tuple[DisplayModel | None, float]:
+    """The monitor that shows the only object, as it was measured, and the cosine of the angle at which it is seen; None without."""
+    face = experiment.objects[0].face
+    if face is None or face.display is None:
+        return None, 1.0
+    return load_calibration(DisplayCalibration, face.display).display, face.display_cos

@@ -1,0 +1,135 @@
+"""A place that is known by a learned scene: a scene file, and the calibration of the room, the car and its camera."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from advnerf_core.driving.path import Line
+from advnerf_core.driving.path import Path as DrivingPath
+from advnerf_core.geometry import Array, Pinhole
+from advnerf_core.strict import StrictModel
+from calibration.schema import CameraCalibration, RoomCalibration, VehicleCalibration, load_calibration
+from hardware.worlds.paths import ReferencePath, Segment
+from hardware.worlds.world import Box, CarDescription, WorldDescription
+from nodes.lab.located import NamedFile, NamedFolder
+from nodes.lab.worlds.undriven import Undriven
+
+SCENE, PATH = "scene", "track"
+_FILES = ("camera", "vehicle", "room")
+Pose = tuple[float, float, float]
+
+
+class OwnSceneConfig(StrictModel):
+    """A place that is known by a learned scene.
+
+    Attributes:
+        file: What ``advnerf scene train`` wrote.
+        calibration: Folder with ``camera.yaml``, ``vehicle.yaml`` and ``room.yaml``.
+        camera: Camera calibration, instead of the folder's.
+        vehicle: Vehicle calibration, instead of the folder's.
+        room: Room calibration, instead of the folder's: path, fence, width of the track and where drives start.
+        start: x [m], y [m], yaw [rad] where drives start; None: as the room says.
+        goal: What a goal-conditioned policy is told; empty: nothing.
+        speed_mps: Driving speed [m/s].
+        depth_tolerance_m: An object is hidden only by a surface nearer than this much in front of it [m].
+    """
+
+    file: NamedFile
+    calibration: NamedFolder | None = Field(default=None, exclude=True)
+    camera: NamedFile | None = None
+    vehicle: NamedFile | None = None
+    room: NamedFile | None = None
+    start: Pose | None = None
+    goal: tuple[float, ...] = ()
+    speed_mps: Annotated[float, Field(gt=0.0)] = 0.8
+    depth_tolerance_m: Annotated[float, Field(ge=0.0)] = 0.15
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_the_folder(cls, given: Any) -> Any:
+        """Name the three files, which are looked for like any other."""
+        if not isinstance(given, dict):
+            return given
+        folder = given.get("calibration")
+        missing = [name for name in _FILES if given.get(name) is None]
+        if folder is None and missing:
+            raise ValueError(f"expected a calibration folder, or files for {', '.join(missing)}")
+        return given | {name: str(Path(str(folder)) / f"{name}.yaml") for name in missing}
+
+
+class OwnScene(Undriven):
+    """A learned scene with a path through it."""
+
+    Config: ClassVar[type[OwnSceneConfig]] = OwnSceneConfig
+    known_by = "a learned scene"
+
+    def __init__(self, config: OwnSceneConfig) -> None:
+        self.config = config
+
+    @cached_property
+    def _calibrated(self) -> tuple[CameraCalibration, VehicleCalibration, RoomCalibration]:
+        camera, vehicle, room = (Path(str(getattr(self.config, name))) for name in _FILES)
+        return (
+            load_calibration(CameraCalibration, camera),
+            load_calibration(VehicleCalibration, vehicle),
+            load_calibration(RoomCalibration, room),
+        )
+
+    @property
+    def camera_pinhole(self) -> Pinhole:
+        """Intrinsics of the calibrated camera."""
+        return self._calibrated[0].pinhole
+
+    @property
+    def photo_pinhole(self) -> Pinhole:
+        """The same: there are no photographs."""
+        return self.camera_pinhole
+
+    @property
+    def T_car_from_camera(self) -> Array:
+        """Where the driving camera sits on the car ``[4, 4]``."""
+        return self._calibrated[0].mount
+
+    def describe(self) -> WorldDescription:
+        """What an experiment must know: as calibrated.
+
+        Raises:
+            SceneFileError: The file holds no scene.
+            CalibrationError: A calibration file is missing or wrong.
+        """
+        camera, vehicle, room = self._calibrated
+        limits = (vehicle.limits.steering_min_rad, vehicle.limits.steering_max_rad)
+        start = self.config.start or room.start_pose
+        return WorldDescription(
+            paths={PATH: _reference(room.reference_path, start, self.config.goal)},
+            off_track_m=room.off_track_m,
+            car=CarDescription("ackermann", self.config.speed_mps, limits, vehicle.wheelbase_m),
+            camera=camera.pinhole,
+            T_car_from_camera=camera.mount,
+            box=self._box(),
+            fence_m=float(np.abs(np.array(room.fence_m)).min()),
+        )
+
+    def _box(self) -> Box:
+        from advnerf_core.scene.field import load_scene_config  # brings torch
+
+        learned = load_scene_config(self.config.file)
+        return Box(learned.box_low_m, learned.box_high_m, learned.contraction)
+
+    def __enter__(self) -> OwnScene:
+        return self
+
+
+def _reference(path: DrivingPath, start: Pose, goal: tuple[float, ...]) -> ReferencePath:
+    """A calibrated path as worlds describe theirs."""
+    pieces: list[Segment] = [
+        ("line", piece.length_m) if isinstance(piece, Line) else ("arc", piece.radius_m, piece.angle_rad)
+        for piece in path.segments
+    ]
+    x, y, yaw = path.start_pose
+    return ReferencePath((x, y, yaw), tuple(pieces), goal, path.closed, start)

@@ -1,0 +1,52 @@
+"""An experiment in a learned scene of a user's own: no stages are run, and its methods are compared like those of any other."""
+
+import shutil
+
+from advnerf_core.attack.artifact import load_attack
+from advnerf_core.documents import read_json
+from nodes.experiment.node.search import run_attack
+from nodes.experiment.run.whole import run_experiment
+from nodes.experiment.steps.keys import settings_hash
+from nodes.experiment.steps.pipeline import stages_of
+from nodes.experiment.steps.run import load_experiment
+from nodes.runtime.progress import ProgressDisplay
+from tests.support.tiny_request import loaded, tiny_request
+
+CHANGES = ["over.method=[none, random, gradient]", "measure.starts=1", "attack.evaluations=2"]
+
+
+def test_methods_are_compared_in_it_and_find_what_a_request_finds(tmp_path):
+    file = tiny_request(tmp_path, evaluations=2)
+    experiment = load_experiment(file, None, CHANGES, tmp_path / "run")
+    assert stages_of(experiment) == []
+    run_experiment(experiment)
+    results = {cell.method: read_json(experiment.cell_result(cell)) for cell in experiment.cells}
+    assert {method: result["attack_id"] is None for method, result in results.items()} == {
+        "none": True,
+        "random": False,
+        "gradient": False,
+    }
+    assert (experiment.folder / "report" / "report.html").stat().st_size > 1000
+    (asked,) = run_attack(loaded(file), tmp_path / "asked", ProgressDisplay())
+    gradient = next(cell for cell in experiment.cells if cell.method == "gradient")
+    found = load_attack(experiment.cell_folder(gradient) / "attack.safetensors")
+    assert found.predicted_total_cte_m == load_attack(asked).predicted_total_cte_m
+    assert found.face.subject == load_attack(asked).face.subject == "board"
+
+
+def test_cells_depend_on_what_files_hold_and_not_on_where_they_lie(tmp_path):
+    from nodes.experiment.show.victims import look_at_given
+
+    def keys(folder, *changes):
+        experiment = load_experiment(
+            folder / "tiny.experiment.yaml", None, [*CHANGES, *changes], folder / "run"
+        )
+        look_at_given(experiment)
+        return [settings_hash(experiment, cell) for cell in experiment.cells]
+
+    tiny_request(tmp_path / "a")
+    shutil.copytree(tmp_path / "a", tmp_path / "b")
+    before = keys(tmp_path / "a")
+    assert keys(tmp_path / "b") == before
+    assert not set(keys(tmp_path / "b", "objects=[{name: a, kind: panel, x_m: 1, y_m: -1}]")) & set(before)
+    assert not set(keys(tmp_path / "b", "world.speed_mps=0.7")) & set(before)
