@@ -6,6 +6,7 @@ import contextlib
 import signal
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
 
 OUR_PACKAGES = ("advnerf_core", "hardware", "calibration", "nodes")
 ERROR_EXIT, FAILURE_EXIT = 2, 1
+_POLICY = "nodes.policy"
 
 PANELS = {
     "Audit and experiments": ("audit", "demo", "experiment", "verify"),
@@ -124,7 +126,10 @@ def launch(
         ),
     ] = False,
 ) -> None:
-    """Start the nodes of a launch file and supervise them. Ctrl-C stops them; a second Ctrl-C kills them."""
+    """Start the nodes of a launch file and supervise them. Ctrl-C stops them; a second Ctrl-C kills them.
+
+    Nothing is started if a node refuses its configuration or a policy file is missing.
+    """
     from nodes.lab.plugin_tables import say_code
     from nodes.launching.launch import Launch
     from nodes.launching.launch_file import load_launch
@@ -133,8 +138,9 @@ def launch(
     say_code(plan.resolved, file.parent)
     if check:
         _print_plan(plan)
-        _say_problems(plan)
+        _refuse(_problems(plan))
         return
+    _refuse(_cheap_problems(plan))
     run_dir = run_dir or Path("runs") / f"{plan.launch.name}-{time.strftime('%Y%m%d-%H%M%S')}"
     started = Launch(file, overrides or [], run_dir, lambda line: print(f"[launch] {line}", flush=True), host)
     _watch_launch(started, duration_s)
@@ -169,12 +175,27 @@ def _print_plan(plan: Any) -> None:
     print_table(rows)
 
 
-def _say_problems(plan: Any) -> None:
-    from nodes.lab.doctor.launch import policy_problems
+def _cheap_problems(plan: Any) -> list[str]:
+    """Errors that show in a second: of the nodes' configurations, and policy files that are not there."""
     from nodes.launching.launch_check import check_nodes
 
-    # The policies are loaded only if every node accepts its configuration.
-    problems = list(check_nodes(plan).values()) or policy_problems(plan)
+    if problems := list(check_nodes(plan).values()):
+        return problems
+    if not any(entry.module == _POLICY for entry in plan.nodes.values()):
+        return []
+    from nodes.lab.doctor.launch import missing_policies
+
+    return missing_policies(plan)
+
+
+def _problems(plan: Any) -> list[str]:
+    """All errors. The policies are loaded, in seconds, only if nothing else is wrong."""
+    from nodes.lab.doctor.launch import policy_problems
+
+    return _cheap_problems(plan) or policy_problems(plan)
+
+
+def _refuse(problems: Sequence[str]) -> None:
     for problem in problems:
         say_error(problem)
     if problems:

@@ -190,7 +190,8 @@ def run_node_main(config_type: type[C], build: Callable[[C, NodeContext], Node])
     )
     parser.add_argument("--check", action="store_true", help="check the configuration, print errors and exit")
     options = parser.parse_args()
-    prepare_process(role)
+    if not options.check:  # several nodes are checked in one process
+        prepare_process(role)
     try:
         config = load_node_config(config_type, options.name, options.config, options.overrides)
     except (ValueError, OSError) as error:

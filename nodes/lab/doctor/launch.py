@@ -91,19 +91,25 @@ def policy_problems(plan: Plan) -> list[str]:
 
     Each policy is loaded in a separate process. Nodes and devices are not used.
     """
-    problems = []
-    for name, entry in plan.nodes.items():
-        if entry.module != _POLICY:
-            continue
-        asked = _Asked(plan, name)
-        if (missing := _missing_policy(asked.config(PolicyNodeConfig))) is not None:
-            problems.append(
-                f"{name}: expected a policy file at {missing}, found none; give another with --set params.policy=FILE"
-            )
-            continue
-        _, unfit = _try_policy(asked.config(PolicyNodeConfig), _image_size(plan))
-        problems += [f"{name}: {finding.found}; {finding.do}" for finding in unfit]
+    problems = missing_policies(plan)
+    for name, asked in _policies(plan):
+        if _missing_policy(asked.config(PolicyNodeConfig)) is None:
+            _, unfit = _try_policy(asked.config(PolicyNodeConfig), _image_size(plan))
+            problems += [f"{name}: {finding.found}; {finding.do}" for finding in unfit]
     return problems
+
+
+def missing_policies(plan: Plan) -> list[str]:
+    """Return an error for each policy file that is not there; no policy is loaded."""
+    return [
+        f"{name}: expected a policy file at {missing}, found none; give another with --set params.policy=FILE"
+        for name, asked in _policies(plan)
+        if (missing := _missing_policy(asked.config(PolicyNodeConfig))) is not None
+    ]
+
+
+def _policies(plan: Plan) -> list[tuple[str, _Asked]]:
+    return [(name, _Asked(plan, name)) for name, entry in plan.nodes.items() if entry.module == _POLICY]
 
 
 def _missing_policy(config: PolicyNodeConfig) -> str | None:

@@ -277,7 +277,7 @@ def test_launch_check_says_which_policy_does_not_fit_the_camera(tmp_path, monkey
     )
     monkeypatch.setattr("nodes.launching.launch_check.check_nodes", lambda plan: {})
     with pytest.raises(typer.Exit):
-        cli._say_problems(missing)
+        cli._refuse(cli._problems(missing))
     assert "trained for 400 x 224" in capsys.readouterr().err
 
 
