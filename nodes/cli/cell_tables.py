@@ -89,7 +89,7 @@ def report(
 
 
 def _published(choice: CellChoice, published: bool) -> tuple[CellChoice, Path | None]:
-    """The choice of cells, and the folder of the published sets that they are in; None for those of the run folder."""
+    """The choice of cells, and the folder of their published sets; None for cells of the run folder."""
     if not published:
         return choice, None
     return replace(choice, folder=None), choice.folder or _PUBLISHED

@@ -42,7 +42,7 @@ def how_to_resume(words: Sequence[str]) -> str:
 def usage_text(error: Exception) -> str | None:
     """Text of an error in the words of a command line; None for another exception.
 
-    Such errors are those of click, of which typer has a copy of its own in some versions, so that their class cannot be named.
+    These are errors of click. Some versions of typer contain a copy of click, so that the class is not fixed.
     """
     if not hasattr(error, "format_message"):
         return None

@@ -1,4 +1,4 @@
-"""Files that a user's file names: relative to it, absolute once it is read; results depend on what they hold, not on where they lie."""
+"""Files that a user's file names: relative to it, absolute after reading; results depend on their content, not on their location."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ READ_AGAIN = {"read_again": True}
 
 
 def located(path: Path, info: ValidationInfo) -> Path:
-    """A file or folder, absolute.
+    """Absolute path of a file or folder.
 
     Raises:
-        PydanticCustomError: It is not there.
+        PydanticCustomError: The file or folder does not exist.
     """
     found = ((info.context or {}).get("folder") or Path.cwd()) / expanded(path)
     if not found.exists():
@@ -31,7 +31,7 @@ def located(path: Path, info: ValidationInfo) -> Path:
 
 
 def is_read_again(info: SerializationInfo) -> bool:
-    """Whether what is written is a file that is read again, and not what results depend on."""
+    """Whether the output is a file that is read again; otherwise it is what results depend on."""
     return isinstance(info.context, dict) and bool(info.context.get("read_again"))
 
 
@@ -40,7 +40,7 @@ def _written(path: Path, info: SerializationInfo) -> str:
 
 
 def content_sha256(path: Path) -> str:
-    """Hash of a file; kept until it is written again."""
+    """Hash of a file; cached until the file changes."""
     return _digest(path, path.stat().st_mtime_ns)
 
 

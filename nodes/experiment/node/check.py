@@ -85,7 +85,7 @@ class Check:
 
 
 def check(request: Experiment, directions: int, memory: bool, report: Report) -> Check:
-    """Measure everything at the start of the attack; disturbances and smoothness are as requested.
+    """Measure everything at the start of the attack; disturbances and smoothness as requested.
 
     Raises:
         BlackBoxError: The policy has no gradient.

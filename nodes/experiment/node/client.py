@@ -34,8 +34,8 @@ def ask_for_attack(
 
     Args:
         run_dir: Run folder of the node.
-        request: What is asked for, as `request.as_text` writes it.
-        request_id: Its name; the very same request under the same name goes on where it was.
+        request: The request, as `request.as_text` writes it.
+        request_id: Name of the request; an identical request under the same name is resumed.
         tell: Called with every ``AttackProgress`` of the request.
         follow: Whether to wait for the end.
 

@@ -1,4 +1,4 @@
-"""What a search of places found, from above, with the drives past it; and the maps about it."""
+"""Results of a search of places: a picture from above with the drives past it, and the maps about it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def require_places(experiment: Experiment) -> None:
     """Refuse a request that moves nothing.
 
     Raises:
-        ConfigError: It does.
+        ConfigError: The request moves nothing.
     """
     if not isinstance(experiment.config.space, PlacesConfig):
         raise ConfigError(
@@ -45,12 +45,12 @@ def draw_found(prepared: Prepared, attack: AttackFile) -> bytes:
 
 
 def mapped(experiment: Experiment, attack: Path | None) -> Mapped:
-    """What maps of a request are about: what an attack file of its objects says, or where they stand without it, in their own colours.
+    """The state that maps of a request start from: places and colours of an attack file, or the configured places and plain colours.
 
     Raises:
         ConfigError: The request moves nothing, or the file has other colours.
-        AttackFileError: It has other objects.
-        PoseBoundsError: They stand outside their bounds.
+        AttackFileError: The file has other objects.
+        PoseBoundsError: The objects stand outside their bounds.
     """
     require_places(experiment)
     prepared = prepare(experiment)

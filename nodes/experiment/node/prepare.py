@@ -1,4 +1,4 @@
-"""From a request to everything a search needs."""
+"""Loads everything that the search of a request needs."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from nodes.experiment.steps.shared_search import search_key
 
 
 def load_request(file: Path, overrides: Sequence[str] = (), folder: Path | None = None) -> Experiment:
-    """Read an experiment that is one request.
+    """Read an experiment file with a single request.
 
     Args:
         file: A ``*.experiment.yaml`` file.
         overrides: ``section.key=value`` texts.
-        folder: Where its search is kept; None for the file's ``run_folder``, or ``runs/<name>``.
+        folder: Folder of the search; None for the file's ``run_folder``, or ``runs/<name>``.
 
     Raises:
-        ConfigError: Anything unknown or wrong, with file and line; or another experiment.
+        ConfigError: A key is unknown or a value wrong, reported with file and line; or the experiment is not a single request.
     """
     experiment = load_experiment(file, None, overrides, folder)
     require_request(experiment.config, str(file))
@@ -45,14 +45,14 @@ def request_text(experiment: Experiment) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """An attack, ready to be searched for.
+    """An attack, ready for the search.
 
     Attributes:
-        experiment: What was asked for.
-        cell: Its victim, path and method, and the seed of starts, search and disturbances.
+        experiment: The requested experiment.
+        cell: The victim, path and method of the attack, and the seed of starts, search and disturbances.
         policy: The victim with its view and hash.
-        space: What is searched.
-        problem: What the searches take.
+        space: The search space.
+        problem: The attack problem for the searches.
     """
 
     experiment: Experiment
@@ -63,16 +63,16 @@ class Prepared:
 
     @property
     def seed(self) -> int:
-        """Of starts, search and disturbances."""
+        """Seed of starts, search and disturbances."""
         return self.cell.seed
 
     @property
     def settings_hash(self) -> str:
-        """Names everything that must not change between a search and its resumption."""
+        """Hash of everything that must be the same when a search is resumed."""
         return search_key(self.experiment, self.cell)
 
     def with_seed(self, seed: int) -> Prepared:
-        """The same with another seed: other starts, other draws."""
+        """The same attack with another seed: other starts, other draws."""
         cell = replace(self.cell, seed=seed)
         return replace(self, cell=cell, problem=_problem(self.experiment, self.space, self.policy, cell))
 

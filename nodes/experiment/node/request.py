@@ -1,4 +1,4 @@
-"""What the attack commands and the attack node are asked for: an experiment with one victim in a learned scene of the user's own, and no stages.
+"""Requests to the attack commands and the attack node: an experiment with one victim in a learned scene of the user's own, and no stages.
 
 The same text goes to the node and into the folder of a search: paths in it are absolute. Needs no torch.
 """
@@ -19,7 +19,7 @@ def require_request(config: ExperimentConfig, source: str) -> None:
     """Refuse an experiment of several searches, or one that needs stages.
 
     Raises:
-        ConfigError: It is one; ``source`` is what the message calls it.
+        ConfigError: The experiment has several searches or needs stages; ``source`` is its name in the message.
     """
     over = config.over
     wanted = {
@@ -37,7 +37,7 @@ def require_request(config: ExperimentConfig, source: str) -> None:
 
 
 def as_text(config: ExperimentConfig, world: NamedWorld) -> str:
-    """YAML text from which the same experiment is read on the same machine, wherever the text lies."""
+    """YAML text from which the same experiment is read on the same machine, wherever the text is stored."""
     data = config.model_dump(mode="json", context=READ_AGAIN, exclude_unset=True)
     section = world.config.model_dump(mode="json", context=READ_AGAIN, exclude_unset=True)
     data = {"name": config.name, "world": {"kind": world.kind, **section}} | {
@@ -47,15 +47,15 @@ def as_text(config: ExperimentConfig, world: NamedWorld) -> str:
 
 
 def parse_request(text: str, source: str = "request", folder: Path | None = None) -> str:
-    """The text of a request as the folder of its search keeps it.
+    """Check the text of a request; returns it as the folder of its search stores it.
 
     Args:
-        text: Of an experiment file; its paths are absolute, or relative to ``folder``.
-        source: What messages call it.
+        text: Text of an experiment file; its paths are absolute, or relative to ``folder``.
+        source: Name of the text in messages.
         folder: The working folder if it is None.
 
     Raises:
-        ConfigError: Something is wrong in it; with its line and the valid keys.
+        ConfigError: The text has an error, which is reported with its line and the valid keys.
     """
     document, here = parse_yaml(text, source), folder or Path.cwd()
     config = validate(ExperimentConfig, document, here)

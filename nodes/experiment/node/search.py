@@ -34,8 +34,8 @@ def chosen_method(experiment: Experiment) -> tuple[Method, SearchSettings]:
 
     Raises:
         PluginError: The method's code cannot be loaded.
-        MethodError: It has no such options.
-        ConfigError: It cannot search what is asked for.
+        MethodError: The method has no such options.
+        ConfigError: The method cannot search the requested parameters.
     """
     config = experiment.config
     (reference,), (name,) = config.methods, config.method_names
@@ -59,14 +59,14 @@ def chosen_method(experiment: Experiment) -> tuple[Method, SearchSettings]:
 def search(
     prepared: Prepared, state_path: Path | None = None, on_evaluation: OnEvaluation | None = None
 ) -> SearchResult:
-    """Search as the request asks; what ``on_evaluation`` raises ends it, and a state file then goes on from there."""
+    """Search as requested; an exception from ``on_evaluation`` ends the search, which then resumes from its state file."""
     _, settings = chosen_method(prepared.experiment)
     run = SearchRun(prepared.seed, state_path, on_evaluation, prepared.settings_hash)
     return prepared.space.search(prepared.cell.code, on_chosen_device(prepared.problem), settings, run)
 
 
 def planned_evaluations(prepared: Prepared) -> int:
-    """Drives that the budget allows the method."""
+    """Number of drives that the budget allows the method."""
     method, settings = chosen_method(prepared.experiment)
     return method.evaluations(prepared.problem, settings)
 
@@ -78,12 +78,12 @@ def run_attack(
     on_evaluation: OnEvaluation | None = None,
     on_prepared: Callable[[Prepared], None] | None = None,
 ) -> list[Path]:
-    """Run every seed of a request in a folder, going on where it was stopped.
+    """Run every seed of a request in a folder, resuming an interrupted run.
 
     Args:
-        experiment: What is asked for; kept in the folder.
-        folder: Where states and attack files go.
-        display: Told of the progress of each seed.
+        experiment: The requested experiment; it is stored in the folder.
+        folder: Folder for states and attack files.
+        display: Progress display of each seed.
         on_evaluation: Also called after every evaluation.
         on_prepared: Called before the search of each seed.
 
@@ -91,7 +91,7 @@ def run_attack(
         The attack files, ``seed_<seed>.attack.safetensors``, each with its curve in a JSON file beside it, and of places with a picture.
 
     Raises:
-        ConfigError: The folder holds another request, or the method cannot search what is asked for.
+        ConfigError: The folder holds another request, or the method cannot search the requested parameters.
         PluginError: The method's code cannot be loaded.
     """
     chosen_method(experiment)  # before anything is loaded or written
@@ -116,7 +116,7 @@ def run_attack(
 
 
 def attack_file(folder: Path, seed: int) -> Path:
-    """Where the attack file of a seed is."""
+    """Path of the attack file of a seed."""
     return folder / f"seed_{seed}.attack.safetensors"
 
 
@@ -160,7 +160,7 @@ def _run_together(
     on_evaluation: OnEvaluation | None,
     on_prepared: Callable[[Prepared], None] | None,
 ) -> list[Path]:
-    """All seeds of a gradient attack in one batch; their files are written when all are done."""
+    """All seeds of a gradient attack in one batch; their files are written when all are finished."""
     seeds, wanted, state_path = (
         experiment.config.seeds,
         experiment.config.attack,

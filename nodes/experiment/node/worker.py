@@ -99,7 +99,7 @@ class Speaker:
         self._image(PREVIEW, pixels.repeat(_PREVIEW_SCALE, 0).repeat(_PREVIEW_SCALE, 1))
 
     def _best_theta(self, prepared: Prepared) -> Tensor | None:
-        """Of the seed at work; of the best, where all are searched together; None without a state file."""
+        """Best theta of the current seed; of the best seed if all are searched together; None without a state file."""
         together = prepared.experiment.config.attack.together
         state = self._folder / TOGETHER_STATE if together else self._state(prepared)
         if not state.exists():

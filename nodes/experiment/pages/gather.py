@@ -53,7 +53,7 @@ def gather(
         experiment: Experiment with all earlier stages and cells finished.
         films: Films by scenario.
         seen: Camera images of the objects, by scenario and method.
-        done: What was searched and driven, in one paragraph.
+        done: Summary of the searches and drives, in one paragraph.
         overview: The world from above.
         memory: Memory of the adjoint, if it was measured.
     """

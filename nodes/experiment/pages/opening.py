@@ -1,4 +1,4 @@
-"""What a page of results opens with: a sentence for readers who know nothing of the experiment, the film, and the drives from above."""
+"""Opening of a page of results: a sentence for readers who know nothing of the experiment, the film, and the drives from above."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class Wording:
     """Words and limits of an experiment for the sentences about it.
 
     Attributes:
-        thing: What was attacked.
-        deployed: Where it was deployed, as the begin of a sentence.
+        thing: Name of the attacked object.
+        deployed: Place of the deployment, as the beginning of a sentence.
         off_track_m: |CTE| beyond which the car is off the track [m]; None if it is unknown.
     """
 
@@ -34,7 +34,7 @@ class Wording:
 
 
 def first_screen(data: ReportData, table: ResultTable, victim: str, wording: Wording) -> FirstScreen:
-    """What the page opens with: sentence, film and map of the first scenario, with the drives past the plain, random and attacked object."""
+    """Opening of the page: sentence, film and map of the first scenario, with the drives past the plain, random and attacked object."""
     from advnerf_core.report.maps import Arm, drives_from_above  # matplotlib
     from advnerf_core.report.plots import svg
 
@@ -62,7 +62,7 @@ def first_screen(data: ReportData, table: ResultTable, victim: str, wording: Wor
 
 
 def opening(table: ResultTable, wording: Wording, key: Condition | None = None) -> FirstScreen:
-    """The sentences of a table: that of one scenario, placement and victim, or the first one, and the others below it."""
+    """The sentences of a table: first the one of a scenario, placement and victim, by default the table's first; the others below it."""
     found = summaries(table, wording)
     main = key if key in found else next(iter(found), None)
     if main is None:
@@ -81,7 +81,7 @@ def summaries(table: ResultTable, wording: Wording) -> dict[Condition, str]:
 
 
 def _name_of(key: Condition) -> str:
-    """What the sentence of a scenario, placement and victim is about, for readers."""
+    """Readable name of a scenario, placement and victim."""
     return ", ".join(filter(None, (*key[:2], f"{key[2]} policy"))).replace("_", " ")
 
 

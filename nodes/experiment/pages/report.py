@@ -90,7 +90,7 @@ def _measure(experiment: Experiment, folder: Path, report: Report) -> ReportData
 
 
 def wording_of(experiment: Experiment) -> Wording:
-    """What the sentences of the page call the attacked thing and the place of the drives."""
+    """Words for the attacked object and the place of the drives in the sentences of the page."""
     carrier, kinds = experiment.config.carrier, {thing.kind for thing in experiment.objects}
     thing = carrier.panel if isinstance(carrier, FaceCarrier) else "objects"
     if len(experiment.objects) == 1:
@@ -101,7 +101,7 @@ def wording_of(experiment: Experiment) -> Wording:
 
 
 def how_it_was_run(experiment: Experiment) -> str:
-    """What the experiment did, in one paragraph."""
+    """Summary of the experiment in one paragraph."""
     config, attack = experiment.config, experiment.config.attack
     methods = ", ".join(style_of(name).title for name in config.method_names)
     kinds = Counter(thing.kind.replace("_", " ") for thing in experiment.objects)

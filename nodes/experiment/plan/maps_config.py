@@ -41,7 +41,7 @@ class RobustnessMapConfig(StrictModel):
 
 
 class MapsConfig(StrictModel):
-    """What is mapped."""
+    """Maps to make."""
 
     object: Annotated[int, Field(ge=0)] = Field(default=0, description="Number of the object that is moved.")
     landscape: LandscapeConfig = LandscapeConfig()

@@ -1,4 +1,4 @@
-"""Kinds of objects that an experiment places: those that this project makes, and object and mesh files of a user's."""
+"""Kinds of objects that an experiment places: built-in ones, and a user's object and mesh files."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MADE_HERE_M: dict[str, tuple[float, float]] = {
     CUBE: (2.0, 2.0),
     BALL: (0.7, 0.7),
 }
-# What ``advnerf scene object build`` writes; meshes whose format says which unit they are in; and those that must be told.
+# What ``advnerf scene object build`` writes; meshes whose format specifies the unit; and meshes whose unit must be given.
 OBJECT_SUFFIX, MESH_SUFFIXES, UNITLESS_SUFFIXES = (
     ".object.safetensors",
     (".glb", ".gltf"),
@@ -57,7 +57,7 @@ def _located(kind: str, info: ValidationInfo) -> str:
 
 
 def name_of(kind: str) -> str:
-    """What a kind is called in results: of a file its name, wherever it lies."""
+    """Name of a kind in results: for a file its name, without its folder."""
     return kind if kind in MADE_HERE_M else Path(kind).name
 
 
@@ -83,7 +83,7 @@ def footprint_m(kind: str) -> tuple[float, float]:
     """Length and width [m] of the ground that an object of a kind covers at scale 1.
 
     Raises:
-        MeshError, ObjectFileError: Its file cannot be read.
+        MeshError, ObjectFileError: The file cannot be read.
     """
     if kind in MADE_HERE_M:
         return MADE_HERE_M[kind]
@@ -92,7 +92,7 @@ def footprint_m(kind: str) -> tuple[float, float]:
 
 @lru_cache(maxsize=16)
 def _footprint_m(kind: str, changed_ns: int) -> tuple[float, float]:
-    del changed_ns  # a changed file is another entry
+    del changed_ns  # part of the cache's key
     if is_mesh(kind):
         low, high = load_mesh_of(kind).box
     else:
@@ -108,7 +108,7 @@ def load_mesh_of(kind: str) -> SurfaceMesh:
     """A user's mesh: upright, its base on the ground.
 
     Raises:
-        MeshError: It cannot be read.
+        MeshError: The mesh cannot be read.
     """
     from advnerf_core.objects.voxel.mesh_files import load_mesh
 

@@ -33,17 +33,17 @@ Unit = Annotated[float, Field(ge=0.0, le=1.0)]
 FLAT = (PANEL, CUBE)
 _PLACE = {"name", "kind", "x_m", "y_m", "z_m", "yaw_rad", "scale"}
 _OF_OWN_SCENES = {"pitch_rad", "roll_rad", "face", "mesh", "levels"}
-_SPACING_M = 0.05  # of the points that stand for a lane's middle
+_SPACING_M = 0.05  # between points along a lane's middle
 
 
 class PoseBoundsConfig(StrictModel):
-    """Where one object may stand; an axis that is not given stays as it is.
+    """Allowed places of one object; an axis that is not given is fixed.
 
     Attributes:
         x_m: Lowest and highest x of the object's origin [m].
         y_m: The same of y [m].
-        yaw_rad: Of its heading [rad].
-        scale: Of its size; not of a panel or cube, which are as large as their boards.
+        yaw_rad: Lowest and highest heading [rad].
+        scale: Lowest and highest scale; not for a panel or cube, whose size is the size of their boards.
     """
 
     x_m: Interval | None = None
@@ -63,13 +63,13 @@ class FaceConfig(StrictModel):
     """The textured square of a panel or cube in a learned scene of a user's own, and what shows it in the room.
 
     Attributes:
-        size_m: Its edge at scale 1 [m].
-        resolution: Colours along each edge; None: as of all panels (object.panel_resolution).
-        rgb: Colour of what is not attacked; None: as of all panels (object.panel_rgb).
-        target: Calibration of what shows it: its motion-capture subject and its corners.
-        subject: That subject, where there is no target; None: nothing shows it.
-        display: What 'advnerf car calibrate display' wrote, where a monitor shows it: its colours are in the loop.
-        display_cos: Cosine of the angle at which the camera looks at the monitor, in the mean of a drive.
+        size_m: Edge of the square at scale 1 [m].
+        resolution: Colours along each edge; None: the value for all panels (object.panel_resolution).
+        rgb: Colour of faces that are not attacked; None: the value for all panels (object.panel_rgb).
+        target: Calibration of the board that shows it: motion-capture subject and corners.
+        subject: Motion-capture subject of the board if there is no target; None: no board shows it.
+        display: File of 'advnerf car calibrate display' if a monitor shows the face: the monitor's colours are part of the search.
+        display_cos: Mean cosine, over a drive, of the angle at which the camera sees the monitor.
     """
 
     size_m: PositiveNumber = 2.0
@@ -85,10 +85,10 @@ class MeshConfig(StrictModel):
     """An object that is attacked as a mesh, not as voxels, in a learned scene of a user's own.
 
     Attributes:
-        texels: Along its longest side.
-        up: Which axis of its file points up; None: y for glTF, z for others.
-        unit: Its file's unit; needed for others than glTF, or height_m.
-        height_m: It is scaled to this height [m]; of a ball its diameter.
+        texels: Texels along the object's longest side.
+        up: Axis of the file that points up; None: y for glTF, z for others.
+        unit: Unit of the file; formats other than glTF need it, or height_m.
+        height_m: Height to which the object is scaled [m]; for a ball its diameter.
         rgb: Colour of a ball.
     """
 
@@ -104,18 +104,18 @@ class PlacedObject(StrictModel):
 
     Attributes:
         name: Unique name.
-        kind: What it is: small_car, hydrant, panel, or a file of a user's, see `object_kinds`; in a scene of a user's own also cube and ball.
+        kind: Kind of object: small_car, hydrant, panel, or a user's file, see `object_kinds`; in a scene of a user's own also cube and ball.
         x_m: Middle of its foot [m].
         y_m: Middle of its foot [m].
         z_m: Height of the ground under it [m]: the kerb's on a pavement.
         yaw_rad: Heading of its front [rad]; a panel shows its texture there.
-        scale: Size relative to the object as it was built.
-        bounds: Where a search of places may move it; None: as the section space says, about its place.
-        pitch_rad: Its front is tilted down by this [rad]; as all that follows in a learned scene of a user's own alone.
-        roll_rad: It leans to its right by this [rad].
-        face: Of a panel or cube: its square, and what shows it.
-        mesh: It is a mesh, not voxels.
-        levels: Of an object file: summed grids, coarse to fine, that give its colours; 0: one value per voxel.
+        scale: Size relative to the object as built.
+        bounds: Bounds for a search of places; None: the ones of the section space, about the object's place.
+        pitch_rad: Downward tilt of its front [rad]; this and the following keys only for a learned scene of a user's own.
+        roll_rad: Tilt to its right [rad].
+        face: Square of a panel or cube, and the board that shows it.
+        mesh: Settings for an object that is attacked as a mesh, not as voxels.
+        levels: Number of summed grids, coarse to fine, that give the colours of an object file; 0: one value per voxel.
     """
 
     name: str = Field(min_length=1)
@@ -154,19 +154,19 @@ class PlacedObject(StrictModel):
 
     @property
     def is_of_own_scenes(self) -> bool:
-        """Whether only a learned scene of a user's own takes it."""
+        """Whether the object is possible only in a learned scene of a user's own."""
         short = self.model_dump(exclude_defaults=True)
         return self.kind in (CUBE, BALL) or not short.keys().isdisjoint(_OF_OWN_SCENES)
 
     @property
     def place(self) -> dict[str, Any]:
-        """Name, kind and place as JSON data, and what else is not as it is by default."""
+        """Name, kind and place as JSON data, and all other values that differ from their defaults."""
         short = self.model_dump(mode="json", exclude_defaults=True)
         return self.model_dump(mode="json", include=_PLACE) | short
 
     @property
     def side_m(self) -> float:
-        """Width [m]; of a panel also its height."""
+        """Width [m]; for a panel also its height."""
         return self.scale * (footprint_m(self.kind)[1] if self.face is None else self.face.size_m)
 
     @property

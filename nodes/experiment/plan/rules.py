@@ -118,7 +118,7 @@ def check_training(carrier: CarrierConfig, policy: PolicyConfig, objects: Sequen
 def check_space(
     space: SpaceConfig, objects: Sequence[WantedObject], attack: AttackConfig, deploy: DeployConfig
 ) -> None:
-    """Refuse a space that does not fit the objects, the loss or the world where it is deployed."""
+    """Raise for a space that does not fit the objects, the loss or the world of the deployment."""
     _check_smoothness(space, attack)
     own = [each.name for each in objects if isinstance(each, PlacedObject) and each.is_of_own_scenes]
     _refuse(

@@ -215,7 +215,7 @@ class MeasureConfig(StrictModel):
 
 
 class ResponseConfig(StrictModel):
-    """What the searched car is like beyond its calibration; it needs wheels that steer."""
+    """Response of the searched car beyond its calibration; the car needs wheels that steer."""
 
     delay_s: Annotated[float, Field(ge=0)] = Field(
         default=0.0, description="From image to wheels, fractions of a tick allowed [s]."

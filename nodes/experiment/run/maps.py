@@ -15,12 +15,12 @@ from nodes.runtime.progress import ProgressDisplay
 
 
 def map_cells(experiment: Experiment, cells: Sequence[Cell], number: int | None = None) -> list[Path]:
-    """Draw the maps of all cells that are finished; those that are drawn already are read from their files.
+    """Draw the maps of all finished cells; existing ones are read from their files.
 
     Args:
         experiment: The experiment.
-        cells: Which of its cells.
-        number: Of the object that is moved; None: as the experiment says.
+        cells: Cells whose maps are drawn.
+        number: Number of the moved object; None: the experiment's choice.
 
     Raises:
         ConfigError: No cell is finished, or none has placed objects.

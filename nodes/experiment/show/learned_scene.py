@@ -23,7 +23,7 @@ FIDELITY = "fidelity.json"  # comparison of the learned scene with it
 
 
 def scene_file(experiment: Experiment) -> Path:
-    """Where the trained scene is."""
+    """File of the trained scene."""
     return experiment.given_scene or experiment.stage_folder("scene") / "scene.safetensors"
 
 

@@ -1,4 +1,4 @@
-"""Objects in a learned scene of a user's own: nothing is built for them, and what shows a face in the room is said with it."""
+"""Objects in a learned scene of a user's own: they need no building, and each gives the board that shows its face in the room."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _BALL_M, _SLAB_M = 0.7, 0.01
 
 
 class OwnObject(NamedTuple):
-    """An object as it stands in the scene, and what attack files say of it."""
+    """An object as it stands in the scene, and its description in attack files."""
 
     field: VoxelGridObject | MeshField
     named: NamedObject
@@ -41,7 +41,7 @@ def own_objects(experiment: Experiment) -> list[OwnObject]:
     """The objects in the order of the experiment file, in their plain colours.
 
     Raises:
-        MeshError, ObjectFileError: A file that cannot be read.
+        MeshError, ObjectFileError: A file cannot be read.
     """
     return [_own_object(experiment, thing) for thing in experiment.objects]
 
@@ -81,7 +81,7 @@ def _as_mesh(experiment: Experiment, thing: PlacedObject) -> MeshConfig | None:
 
 
 def _mesh(thing: PlacedObject, wanted: MeshConfig) -> tuple[MeshField, str]:
-    """A mesh where it stands, and the hash of the files that it was read from; empty of one that is made."""
+    """A mesh at its place, and the hash of the files that it was read from; empty for a generated mesh."""
     if thing.kind == BALL:
         surface = sphere(0.5 * (wanted.height_m or _BALL_M), wanted.rgb)
     elif thing.kind in MADE_HERE_M:
@@ -95,7 +95,7 @@ def _mesh(thing: PlacedObject, wanted: MeshConfig) -> tuple[MeshField, str]:
 
 
 def mount_of(experiment: Experiment) -> FaceMount | None:
-    """What shows a face in the room: that of the first object that says it; None where nothing does."""
+    """The board that shows a face in the room: the first one that an object gives; None if no object gives one."""
     for number, thing in enumerate(experiment.objects):
         face = thing.face
         if face is None or (face.target is None and face.subject is None):
@@ -111,7 +111,7 @@ def mount_of(experiment: Experiment) -> FaceMount | None:
 
 
 def display_of(experiment: Experiment) -> tuple[DisplayModel | None, float]:
-    """The monitor that shows the only object, as it was measured, and the cosine of the angle at which it is seen; None without."""
+    """The measured monitor that shows the only object, and the cosine of its viewing angle; None without a monitor."""
     face = experiment.objects[0].face
     if face is None or face.display is None:
         return None, 1.0

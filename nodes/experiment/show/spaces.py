@@ -65,8 +65,8 @@ def make_space(experiment: Experiment, scene: World | None) -> Space:
     """The space of the experiment's section ``space``.
 
     Args:
-        experiment: Its scene and objects must be there, for meshes over the world's own pictures nothing.
-        scene: The open deployment scene; needed where `over_the_world`.
+        experiment: The experiment; its scene and objects must exist, except for meshes over the world's own pictures.
+        scene: The open deployment scene; needed if `over_the_world`.
     """
     wanted = experiment.config.space
     if has_face(experiment):
@@ -122,7 +122,7 @@ def shown_there(experiment: Experiment, shown: Shown, attack: AttackFile | None)
 
 
 def over_the_world(experiment: Experiment) -> bool:
-    """Whether attacks are searched over the world's own pictures, as those on meshes: nothing is learned for them."""
+    """Whether attacks are searched over the world's own pictures, as for meshes, without a learned scene."""
     of_meshes = isinstance(experiment.config.space, (MeshTextureConfig, MeshShapeConfig))
     return of_meshes and experiment.given_scene is None
 
@@ -193,7 +193,7 @@ def geometry_sha256(experiment: Experiment, kind: str) -> str:
 
 
 def named_objects(experiment: Experiment) -> list[NamedObject]:
-    """What attack files say of the objects in the learned scene."""
+    """Descriptions of the objects in the learned scene for attack files."""
     if experiment.given_scene is not None:
         return [each.named for each in own_objects(experiment)]
     return [NamedObject(thing.name, geometry_sha256(experiment, thing.kind)) for thing in experiment.objects]
@@ -201,7 +201,7 @@ def named_objects(experiment: Experiment) -> list[NamedObject]:
 
 def _place_space(experiment: Experiment, wanted: PlacesConfig) -> PlaceSpace:
     surrogate, attack = _surrogate(experiment), experiment.config.attack
-    # The gradient is that of the frames that were driven past: the scene in them is not rendered a second time.
+    # The gradient comes from the frames of the drive: their background is not rendered a second time.
     one_evaluation = experiment.config.horizon * attack.starts * frame_bytes(surrogate.camera)
     remembering = surrogate.remembering(min(one_evaluation, int(attack.cache_mib * 2**20)))
     budget = MultiStart(wanted.samples, wanted.steps, wanted.pose_rate, wanted.colour_rate)
@@ -216,8 +216,8 @@ def _colours_in(file: Path, surrogate: Surrogate) -> Tensor:
     """Colours that an attack file holds of the same objects, wherever they stand there.
 
     Raises:
-        AttackFileError: No attack file.
-        ConfigError: It has other objects.
+        AttackFileError: The file is not an attack file.
+        ConfigError: The file has other objects.
     """
     attack = load_attack(file)
     shapes = [each.theta.shape for each in attack.objects]

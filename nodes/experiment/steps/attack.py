@@ -301,7 +301,7 @@ def attack_file(
 def _extra(
     experiment: Experiment, problem: AttackProblem, policy: LoadedPolicy, cell: Cell, result: SearchResult
 ) -> dict[str, Any]:
-    """What an attack file says beside its fields."""
+    """Further data of an attack file beside its fields."""
     found = {
         "experiment": experiment.config.name,
         "victim": cell.victim,

@@ -43,7 +43,7 @@ FREE: Mapping[str, Any] = {
     "attack": {"objective", "cache_mib", "together"},
     "deploy": {"world", "laps", "empty_scene", "ready_timeout_s"},
 }
-# What a drive without attack does not depend on besides.
+# Further settings that a drive without attack does not depend on.
 _SEARCHED_WITH = {
     *("evaluations", "horizon", "learning_rate", "population", "time_batch", "robustness"),
     *("step", "sigma", "probes", "warm_pairs", "options", "start_poses", "goals"),

@@ -1,4 +1,4 @@
-"""Maps about what a search of places found: the loss landscape over one object's place, and starts against moves of that object."""
+"""Maps about the result of a search of places: the loss landscape over one object's place, and starts against moves of that object."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ from nodes.runtime.progress import Report
 
 @dataclass(frozen=True, eq=False)
 class Mapped:
-    """What maps are about.
+    """The state that maps start from.
 
     Attributes:
-        problem: With a `PlacedSensor`.
+        problem: The attack problem, with a `PlacedSensor`.
         theta: Places and colours of all objects.
-        digest: Names what must not change between a map and its file.
-        mark: What the landscape calls the object's place in ``theta``; empty for no mark.
+        digest: Hash of everything that must not change between a map and its file.
+        mark: Label of the object's place in ``theta`` in the landscape; empty for no mark.
     """
 
     problem: AttackProblem
@@ -50,7 +50,7 @@ class Mapped:
 
     @property
     def sensor(self) -> PlacedSensor:
-        """Its sensor."""
+        """Sensor of the problem."""
         assert isinstance(self.problem.sensor, PlacedSensor), "the space of places has this sensor"
         return self.problem.sensor
 
@@ -61,12 +61,12 @@ class Mapped:
 
         Args:
             wanted: The grid.
-            number: Of the object.
+            number: Number of the moved object.
             file: A JSON file, where finished points are kept; the picture goes beside it.
-            report: Told the finished fraction.
+            report: Called with the finished fraction.
 
         Raises:
-            PoseMapError: An object that is not there, or the file of another map.
+            PoseMapError: The object does not exist, or the file holds another map.
         """
         places = self.sensor.placements(self.theta)
         if number >= len(places):
@@ -105,7 +105,7 @@ def draw_maps(
         attack: Attack of the cell: the other objects keep its places, and all keep its colours.
         number: Number of the moved object.
         folder: Folder for ``landscape_<name>.json``, ``robustness_<name>.json`` and a PNG of each; it also stores finished points.
-        report: Told the finished fraction.
+        report: Called with the finished fraction.
 
     Returns:
         The pictures.
@@ -116,7 +116,7 @@ def draw_maps(
         experiment, space, load_victim(experiment, cell.victim), cell.scenario, cell.seed
     )
     places = torch.tensor([each.placement for each in attack.objects], dtype=torch.float64)
-    # In the unit box also where only the plain colours are meant.
+    # In the unit box even if only the plain colours are used.
     theta = space.sensor.join(space.sensor.space.unit(places), space.restored(attack).colours)
     about = Mapped(problem, theta, attack.sha256, "found")
     flat, rough = folder / f"landscape_{name}.json", folder / f"robustness_{name}.json"

@@ -8,7 +8,7 @@ from advnerf_core.documents import dump_yaml, read_yaml
 from advnerf_core.files import write_atomically
 from nodes.runtime.errors import ConfigError
 
-_PANEL_M = 2.0  # edge of a face at scale 1 that says nothing
+_PANEL_M = 2.0  # edge of a face at scale 1 whose request gives none
 _TILT = ("pitch_rad", "roll_rad")
 
 
@@ -17,7 +17,7 @@ def write_measured_request(request: Path, pose: dict[str, float]) -> Path:
 
     Args:
         request: A ``*.experiment.yaml`` file with one panel or cube that has a face.
-        pose: Of the face's middle: ``x_m``, ``y_m``, ``z_m`` and ``yaw_rad``.
+        pose: Pose of the face's middle: ``x_m``, ``y_m``, ``z_m`` and ``yaw_rad``.
 
     Returns:
         The new file. Its relative paths stay valid, because it is in the same folder.

@@ -1,4 +1,4 @@
-"""A place that is known by a learned scene: a scene file, and the calibration of the room, the car and its camera."""
+"""A place described by a learned scene: a scene file, and the calibration of the room, the car and its camera."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ Pose = tuple[float, float, float]
 
 
 class OwnSceneConfig(StrictModel):
-    """A place that is known by a learned scene.
+    """A place described by a learned scene.
 
     Attributes:
-        file: What ``advnerf scene train`` wrote.
+        file: Scene file of ``advnerf scene train``.
         calibration: Folder with ``camera.yaml``, ``vehicle.yaml`` and ``room.yaml``.
         camera: Camera calibration, instead of the folder's.
         vehicle: Vehicle calibration, instead of the folder's.
         room: Room calibration, instead of the folder's: path, fence, width of the track and where drives start.
-        start: x [m], y [m], yaw [rad] where drives start; None: as the room says.
-        goal: What a goal-conditioned policy is told; empty: nothing.
+        start: x [m], y [m], yaw [rad] of the start of drives; None: the start of the room calibration.
+        goal: Goal for a goal-conditioned policy; empty: none.
         speed_mps: Driving speed [m/s].
-        depth_tolerance_m: An object is hidden only by a surface nearer than this much in front of it [m].
+        depth_tolerance_m: A surface hides an object only if it is nearer by more than this [m].
     """
 
     file: NamedFile
@@ -52,7 +52,7 @@ class OwnSceneConfig(StrictModel):
     @model_validator(mode="before")
     @classmethod
     def _from_the_folder(cls, given: Any) -> Any:
-        """Name the three files, which are looked for like any other."""
+        """Set the three files, whose paths are then resolved like any others."""
         if not isinstance(given, dict):
             return given
         folder = given.get("calibration")
@@ -87,16 +87,16 @@ class OwnScene(Undriven):
 
     @property
     def photo_pinhole(self) -> Pinhole:
-        """The same: there are no photographs."""
+        """The camera's intrinsics, as there are no photographs."""
         return self.camera_pinhole
 
     @property
     def T_car_from_camera(self) -> Array:
-        """Where the driving camera sits on the car ``[4, 4]``."""
+        """Pose of the driving camera on the car ``[4, 4]``."""
         return self._calibrated[0].mount
 
     def describe(self) -> WorldDescription:
-        """What an experiment must know: as calibrated.
+        """Description of the world from its calibration.
 
         Raises:
             SceneFileError: The file holds no scene.
@@ -126,7 +126,7 @@ class OwnScene(Undriven):
 
 
 def _reference(path: DrivingPath, start: Pose, goal: tuple[float, ...]) -> ReferencePath:
-    """A calibrated path as worlds describe theirs."""
+    """A calibrated path in the form that worlds use."""
     pieces: list[Segment] = [
         ("line", piece.length_m) if isinstance(piece, Line) else ("arc", piece.radius_m, piece.angle_rad)
         for piece in path.segments

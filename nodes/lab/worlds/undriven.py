@@ -1,4 +1,4 @@
-"""What a place refuses where nothing can be driven or photographed: attacks are searched in its learned scene."""
+"""Errors of a place where nothing can be driven or photographed: attacks are searched in its learned scene."""
 
 from __future__ import annotations
 
@@ -11,47 +11,47 @@ from hardware.worlds.world import Rgb, WorldError
 
 
 class Undriven:
-    """The part of a world that drives, which this one lacks."""
+    """Driving part of a world that cannot drive."""
 
     known_by: ClassVar[str]
 
     @property
     def state(self) -> VehicleState:
-        """There is no car."""
+        """Refuse, as there is no car."""
         self._refuse()
 
     @property
     def blocked(self) -> bool:
-        """There is no car."""
+        """Refuse, as there is no car."""
         self._refuse()
 
     def photo_poses(self, count: int, rng: np.random.Generator) -> list[Array]:
-        """No pictures can be taken."""
+        """Refuse, as no pictures can be taken."""
         del count, rng
         self._refuse()
 
     def reset(self, x_m: float, y_m: float, yaw_rad: float) -> VehicleState:
-        """Nothing is driven here."""
+        """Refuse, as nothing is driven here."""
         del x_m, y_m, yaw_rad
         self._refuse()
 
     def step(self, control: float, speed_mps: float, duration_s: float) -> VehicleState:
-        """Nothing is driven here."""
+        """Refuse, as nothing is driven here."""
         del control, speed_mps, duration_s
         self._refuse()
 
     def observe(self, depth: bool = True) -> Any:
-        """Nothing is driven here."""
+        """Refuse, as nothing is driven here."""
         del depth
         self._refuse()
 
     def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True) -> Any:
-        """No other pictures can be taken."""
+        """Refuse, as no other pictures can be taken."""
         del x_m, y_m, yaw_rad, depth
         self._refuse()
 
     def photograph(self, T_world_from_camera: Array) -> Rgb:
-        """No other pictures can be taken."""
+        """Refuse, as no other pictures can be taken."""
         del T_world_from_camera
         self._refuse()
 

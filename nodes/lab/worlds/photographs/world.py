@@ -24,7 +24,7 @@ _HALF_PX = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
 
 
 class Photographs(Undriven):
-    """A place of photographs. Its frame is that of the photographs, moved up or down so that the ground is at z = 0.
+    """A place of photographs. Its frame is the photographs' frame, moved up or down so that the ground is at z = 0.
 
     Args:
         config: The photographs, the path, the car and its camera.
