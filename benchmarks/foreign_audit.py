@@ -76,6 +76,7 @@ def main() -> None:
     parser.add_argument("--python", default=sys.executable, help="interpreter that trains, which has Keras")
     parser.add_argument("--budget", default="4m")
     parser.add_argument("--starts", type=int, default=50)
+    parser.add_argument("--set", action="append", default=[], help="handed on to the audit")
     parser.add_argument("--output", type=Path, help="keep the audit here")
     options = parser.parse_args()
     os.environ.setdefault("MUJOCO_GL", "egl")
@@ -91,6 +92,7 @@ def main() -> None:
         subprocess.run([options.python, script, "data.npz", "policy.onnx"], cwd=folder, check=True)
         words = ["policy.onnx", "--world", named, "--limit", "off-lane", "--budget", options.budget]
         words += ["--starts", str(options.starts), "-o", "audit"]
+        words += [word for each in options.set for word in ("--set", each)]
         began = time.monotonic()
         environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
         ended = subprocess.run(
@@ -106,7 +108,8 @@ def main() -> None:
     record_row(
         f"audit of a policy that plain {options.by} trained, in {name}: verdict",
         result.verdict.outcome, "", "a verdict", result.verdict.outcome in ("found", "nothing_found"),
-        f"python -m benchmarks.foreign_audit {options.world} --by {options.by}", f"{result.verdict.sentence} {driven}; {minutes:.1f} min",
+        f"python -m benchmarks.foreign_audit {options.world} --by {options.by} --budget {options.budget}"
+        + "".join(f" --set {each}" for each in options.set), f"{result.verdict.sentence} {driven}; {minutes:.1f} min",
     )  # fmt: skip
 
 
