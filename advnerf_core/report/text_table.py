@@ -23,7 +23,7 @@ def count(number_of: int, noun: str) -> str:
 
 @dataclass(frozen=True)
 class Table:
-    """A table of text with its output formats. Columns that are empty in all rows are left out.
+    """A table of text with its output formats.
 
     Attributes:
         title: Heading in the terminal.
@@ -32,6 +32,7 @@ class Table:
         right: Columns with numbers, aligned right.
         groups: Rows before which a new group starts.
         classes: One CSS class per row, or "" (page only).
+        drops_empty: Whether columns that are empty in all rows are left out.
     """
 
     title: str
@@ -40,9 +41,11 @@ class Table:
     right: tuple[bool, ...]
     groups: tuple[int, ...] = ()
     classes: tuple[str, ...] = ()
+    drops_empty: bool = True
 
     def __post_init__(self) -> None:
-        kept = [i for i in range(len(self.columns)) if not self.rows or any(row[i] for row in self.rows)]
+        all_kept = not (self.rows and self.drops_empty)
+        kept = [i for i in range(len(self.columns)) if all_kept or any(row[i] for row in self.rows)]
         for name in ("columns", "right"):
             object.__setattr__(self, name, tuple(getattr(self, name)[i] for i in kept))
         object.__setattr__(self, "rows", tuple(tuple(row[i] for i in kept) for row in self.rows))

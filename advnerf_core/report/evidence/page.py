@@ -296,7 +296,7 @@ def _cells(row: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _markdown(columns: tuple[str, ...], rows: tuple[tuple[str, ...], ...]) -> str:
-    return Table("", columns, rows, (False,) * len(columns)).markdown()
+    return Table("", columns, rows, (False,) * len(columns), drops_empty=False).markdown()
 
 
 def _commands(name: str, registration: Mapping[str, Any]) -> str:

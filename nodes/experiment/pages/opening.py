@@ -123,7 +123,7 @@ def _doubt(plain: TableRow, where: str, wording: Wording) -> str:
     if limit_m is None or drives(mean_m, plain.off_track > 0, limit_m):
         return ""
     return (
-        f"{where} THE POLICY DOES NOT DRIVE even past the plain {wording.thing}: there the car {_course(plain)}, on average {mean_m:.2f} m from its path "
+        f"{where} THE POLICY DOES NOT DRIVE even past the plain {wording.thing}: there the car {_course(plain)}, on average {mean_m:.3f} m from its path "
         f"(expected at most {mean_cte_limit_m(limit_m):g} m), so its drives past the attacked one prove nothing."
     )
 

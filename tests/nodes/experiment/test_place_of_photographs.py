@@ -87,7 +87,10 @@ def test_it_is_attacked_in_what_is_learned_and_held_out_views_are_not_learned_fr
     page = (experiment.folder / "report" / "report.html").read_text()
     assert "nothing was driven in the place itself" in page
     assert ">deployed<" not in page, "no rows of drives that there cannot be"
-    assert ">over no object<" not in page, "no column of a control that nobody drove"
+    assert ">over the plain object [m]<" in page
+    assert ">over no object [m]<" not in page, "no column of a control that nobody drove"
+    assert "<h1>In the learned scene " in page
+    assert "<video autoplay" in page, "the learned scene is filmed where nothing else is"
 
 
 def test_the_same_photographs_elsewhere_are_the_same_place(folder: Path, tmp_path: Path) -> None:
