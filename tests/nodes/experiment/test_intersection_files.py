@@ -90,7 +90,7 @@ def test_every_shipped_experiment_names_its_world(tmp_path: Path) -> None:
     [
         (
             {"world": {"kind": "moon"}},
-            "expected a world of lab, junction, carla, metadrive, duckietown, filament, photographs; got 'moon'",
+            "expected a world of lab, junction, carla, metadrive, duckietown, filament, photographs, scene; got 'moon'",
         ),
         ({"world": {"road": {}}}, "expected kind: NAME"),
         (
