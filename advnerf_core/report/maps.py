@@ -83,9 +83,8 @@ def band_outline(scene: Scene) -> Outline:
     if scene.closed and np.allclose(xy[0], xy[-1]):
         xy = xy[:-1]
     tangent = np.roll(xy, -1, axis=0) - np.roll(xy, 1, axis=0) if scene.closed else np.gradient(xy, axis=0)
-    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1) / np.linalg.norm(
-        tangent, axis=1, keepdims=True
-    )
+    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     left, right = xy + scene.off_track_m * normal, (xy - scene.off_track_m * normal)[::-1]
     if not scene.closed:
         return Outline(np.concatenate([left, right]), closed=False)
@@ -103,9 +102,7 @@ def _draw_scene(ax: Any, scene: Scene) -> None:
     for corners in scene.objects_m:
         ax.add_patch(Polygon(corners, closed=True, fc=LIGHT["grid"], ec=LIGHT["ink"], lw=1.0, zorder=1.5))
     path = np.concatenate([scene.path_xy_m, scene.path_xy_m[:1]]) if scene.closed else scene.path_xy_m
-    ax.plot(
-        path[:, 0], path[:, 1], color=LIGHT["tape"], lw=2.6, alpha=0.55, zorder=1.1, solid_joinstyle="round"
-    )
+    ax.plot(*path.T, color=LIGHT["tape"], lw=2.6, alpha=0.55, zorder=1.1, solid_joinstyle="round")
     _note(ax, path[len(path) * 5 // 8], "path, on-track band", (0, 12))
     if scene.fence_m is not None:
         ax.add_patch(Polygon(scene.fence_m, fill=False, ec=LIGHT["muted"], lw=1.0, ls=(0, (1, 2)), zorder=1))
@@ -123,9 +120,8 @@ def _draw_face(ax: Any, segment: Floats, name: str) -> None:
     front = np.array([along[1], -along[0]]) / np.linalg.norm(along)
     ax.plot(*segment.T, color=LIGHT["ink"], lw=4.0, solid_capstyle="butt", zorder=2.5)
     middle = segment.mean(axis=0)
-    ax.annotate(
-        "", middle + 0.34 * front, middle, arrowprops={"arrowstyle": "-|>", "color": LIGHT["ink"], "lw": 1.0}
-    )
+    arrow = {"arrowstyle": "-|>", "color": LIGHT["ink"], "lw": 1.0}
+    ax.annotate("", middle + 0.34 * front, middle, arrowprops=arrow)
     away = -11.0 * front
     turn = float(np.degrees(np.arctan2(along[1], along[0])))
     text = {"va": "center", "size": 8.5, "rotation": turn, "rotation_mode": "anchor", "color": LIGHT["ink"]}
@@ -180,6 +176,5 @@ def _height_in(box: Floats, legend: bool = False, width_in: float = 6.0) -> floa
 
 
 def _frame(ax: Any, box: Floats) -> None:
-    margin = _MARGIN_M
-    ax.set_xlim(box[0, 0] - margin, box[1, 0] + margin)
-    ax.set_ylim(box[0, 1] - margin, box[1, 1] + margin)
+    ax.set_xlim(box[0, 0] - _MARGIN_M, box[1, 0] + _MARGIN_M)
+    ax.set_ylim(box[0, 1] - _MARGIN_M, box[1, 1] + _MARGIN_M)

@@ -93,7 +93,7 @@ def test_a_tiny_experiment_is_watched_until_its_report(browser, tmp_path):
         watcher.sees("document.querySelector('#searches img')?.naturalWidth > 0")
         assert "best" in watcher.page.inner_text("#searches")
         watcher.sees("location.pathname === '/report/report.html'")
-        assert watcher.page.inner_text("h1").startswith("In the world lab the car ")
+        assert watcher.page.inner_text("h1").startswith("In the world lab ")
         watcher.page.go_back()
         watcher.sees(part_is("report", "done"))
         watcher.sees("document.querySelector('#films video')?.readyState >= 1")
