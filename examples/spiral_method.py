@@ -17,7 +17,6 @@ from torch import Tensor
 
 import advnerf_core as adv
 from advnerf_core.attack.methods import Method, SearchRun, SearchSettings, load_method
-from advnerf_core.attack.search.record import SearchResult
 from advnerf_core.attack.search.search import begin, evaluate_theta, search_fingerprint
 
 CAMERA, EVALUATIONS = adv.Pinhole(width=48, height=24, fx=30.0, fy=30.0, cx=24.0, cy=12.0), 10
@@ -31,7 +30,7 @@ class Options:
     growth: float = 0.4
 
 
-def search(problem: Any, settings: SearchSettings, run: SearchRun) -> SearchResult:
+def search(problem: Any, settings: SearchSettings, run: SearchRun) -> adv.SearchResult:
     """Evaluate textures along a spiral in a random plane; a stopped search goes on from its state file."""
     options, shape = settings.options, problem.sensor.theta_shape
     across, up = torch.randn((2, *shape), generator=torch.Generator().manual_seed(run.seed))
