@@ -38,7 +38,9 @@ def test_the_history_of_the_repository_agrees_where_there_is_one():
 def test_numbers_on_pages_are_published_or_marked():
     found = count_numbers(DOCS, read_rows())
     assert found.problems == ()
-    assert found.published > 100
+    # Results stand on generated pages alone; what is counted on the others are settings.
+    assert (found.published, found.marked) == (0, 0)
+    assert found.settings > 100
 
 
 def test_pages_are_those_of_their_rows_and_verdicts_those_of_their_targets():

@@ -140,9 +140,9 @@ def launch(
         _print_plan(plan)
         _refuse(_problems(plan))
         return
-    _refuse(_cheap_problems(plan))
     run_dir = run_dir or Path("runs") / f"{plan.launch.name}-{time.strftime('%Y%m%d-%H%M%S')}"
     started = Launch(file, overrides or [], run_dir, lambda line: print(f"[launch] {line}", flush=True), host)
+    _refuse(_cheap_problems(plan))
     _watch_launch(started, duration_s)
 
 

@@ -17,7 +17,7 @@ from nodes.runtime.errors import ConfigError
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--no-such-option"], "No such option"),
+        (["--no-such-option"], "no such option"),
         (["--place", "nowhere"], "nowhere"),
         (["--world", "lab", "--place", "."], "expected either --place or --world"),
     ],

@@ -12,7 +12,7 @@ from nodes.runtime.errors import ConfigError
 
 
 def run(folder, name, value=1):
-    config = SimpleNamespace(name=name, model_dump=lambda mode: {"value": value})
+    config = SimpleNamespace(name=name, model_dump=lambda **_: {"value": value})
     stage = Stage(
         "capture", lambda here, told: (here / "photo").write_text(f"{name} {value}"), Settings.of(value=value)
     )

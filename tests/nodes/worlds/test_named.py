@@ -73,7 +73,7 @@ def read(folder: Path, text: str) -> NamedWorld:
 
 def test_the_built_in_worlds_are_what_they_are_called() -> None:
     for name, load in WORLDS.items():
-        if name == "photographs":  # there is none without photographs
+        if name in ("photographs", "scene"):  # there is none without photographs, or a scene file
             continue
         world = NamedWorld(name, load(), load().Config(), "").make()
         assert world.camera_pinhole.width == 336
@@ -115,7 +115,8 @@ def test_a_package_brings_a_world(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert read(tmp_path, "{kind: yard, seed: 4}").settings["source_sha256"] != code
     listed = CliRunner().invoke(app, ["scene", "world", "list"])
     names = [line.split()[0] for line in listed.output.splitlines()]
-    assert names == ["lab", "junction", "carla", "metadrive", "duckietown", "filament", "photographs", "yard"]
+    assert names == [*WORLDS, "yard"]
+    assert "scene" in WORLDS
 
 
 @pytest.mark.parametrize(
@@ -123,7 +124,7 @@ def test_a_package_brings_a_world(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     [
         (
             "kind: moon",
-            r"yard\.experiment\.yaml:1: expected a world of lab, junction, carla, metadrive, duckietown, filament, photographs; got 'moon'",
+            r"yard\.experiment\.yaml:1: expected a world of lab, junction, carla, metadrive, duckietown, filament, photographs, scene; got 'moon'",
         ),
         ("kind: junctoin", r"did you mean junction\?"),
         ("{}", r"expected kind: NAME"),
