@@ -130,6 +130,7 @@ def launch(
 
     Nothing is started if a node refuses its configuration or a policy file is missing.
     """
+    from advnerf_core.places import require_utf8
     from nodes.lab.plugin_tables import say_code
     from nodes.launching.launch import Launch
     from nodes.launching.launch_file import load_launch
@@ -141,8 +142,9 @@ def launch(
         _refuse(_problems(plan))
         return
     run_dir = run_dir or Path("runs") / f"{plan.launch.name}-{time.strftime('%Y%m%d-%H%M%S')}"
-    started = Launch(file, overrides or [], run_dir, lambda line: print(f"[launch] {line}", flush=True), host)
+    require_utf8(run_dir.absolute())
     _refuse(_cheap_problems(plan))
+    started = Launch(file, overrides or [], run_dir, lambda line: print(f"[launch] {line}", flush=True), host)
     _watch_launch(started, duration_s)
 
 
