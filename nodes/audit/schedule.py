@@ -6,6 +6,7 @@ counted once, before the first search, so that a resumed run does the same.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -42,8 +43,9 @@ BLACK_BOX = (
 )
 # Adam's rates: searches of an audit are short, so that they take larger steps than those of an experiment.
 LEARNING_RATE = 0.5
-FEWEST = {"cem": 20, "guided": 20}  # evaluations below which a method cannot begin
-_FEWEST = 4
+_FEWEST, _FEWEST_CEM = 4, 20
+# The student of `guided` asks for its first lesson about 300 pairs of pictures; each step is a drive and 3 pairs about each of its pictures.
+_LESSON_CALLS, _STEP_DRIVES, _STEPS = 600, 7, 2
 # Methods that no schedule has; with the reason, for the report.
 NEVER_TRIED = {
     "where the object stands, as part of a search": "the schedule searches colours at spots that a rule chose (space.kind places)",
@@ -69,19 +71,26 @@ class PlannedSearch:
     evaluations: int
 
 
-def planned(rounds: Sequence[Round], evaluations: int) -> list[list[PlannedSearch]]:
+def fewest(method: str, ticks: int) -> int:
+    """Evaluations below which a method cannot begin, for drives of so many ticks."""
+    if method == "guided":
+        return math.ceil(_LESSON_CALLS / ticks) + _STEPS * _STEP_DRIVES
+    return _FEWEST_CEM if method == "cem" else _FEWEST
+
+
+def planned(rounds: Sequence[Round], evaluations: int, ticks: int) -> list[list[PlannedSearch]]:
     """The searches of each round for a budget.
 
     Args:
         rounds: The schedule.
         evaluations: Evaluations of one start that the budget buys; an evaluation from several starts counts as many.
+        ticks: Control ticks of a drive.
     """
-    return [list(_of_round(number, each, evaluations)) for number, each in enumerate(rounds)]
+    return [list(_of_round(number, each, evaluations, ticks)) for number, each in enumerate(rounds)]
 
 
-def _of_round(number: int, wanted: Round, evaluations: int) -> Iterator[PlannedSearch]:
-    fewest = FEWEST.get(wanted.method, _FEWEST)
+def _of_round(number: int, wanted: Round, evaluations: int, ticks: int) -> Iterator[PlannedSearch]:
     each = int(wanted.share * evaluations / (wanted.spots * wanted.seeds * wanted.starts))
     for spot in range(wanted.spots):
         for seed in range(wanted.seeds):
-            yield PlannedSearch(number, spot, 100 * number + seed, max(fewest, each))
+            yield PlannedSearch(number, spot, 100 * number + seed, max(fewest(wanted.method, ticks), each))

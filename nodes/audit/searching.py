@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -127,8 +128,12 @@ class Searches:
     @property
     def planned(self) -> list[list[PlannedSearch]]:
         """The searches of each round; fewer if there are fewer spots."""
-        rounds = planned(self.rounds, self.evaluations)
+        rounds = planned(self.rounds, self.evaluations, self._ticks)
         return [[each for each in row if each.spot < len(self.spots)] for row in rounds]
+
+    @cached_property
+    def _ticks(self) -> int:
+        return self.copies.experiment("place").searched_ticks
 
     @property
     def best(self) -> FoundAttack | None:

@@ -2,7 +2,8 @@
 
 import pytest
 
-from nodes.audit.schedule import BLACK_BOX, FEWEST, WITH_GRADIENT, planned
+from advnerf_core.attack.search.black_box import BlackBoxSearch
+from nodes.audit.schedule import BLACK_BOX, WITH_GRADIENT, fewest, planned
 
 
 @pytest.mark.parametrize("rounds", [WITH_GRADIENT, BLACK_BOX])
@@ -10,7 +11,7 @@ from nodes.audit.schedule import BLACK_BOX, FEWEST, WITH_GRADIENT, planned
 def test_a_budget_is_spent_and_not_exceeded(rounds, evaluations):
     row_costs = [
         sum(search.evaluations * wanted.starts for search in row)
-        for wanted, row in zip(rounds, planned(rounds, evaluations), strict=True)
+        for wanted, row in zip(rounds, planned(rounds, evaluations, 60), strict=True)
     ]
     assert 0.9 * evaluations <= sum(row_costs) <= evaluations
 
@@ -22,10 +23,17 @@ def test_shares_are_of_the_whole(rounds):
 
 @pytest.mark.parametrize("rounds", [WITH_GRADIENT, BLACK_BOX])
 def test_a_tiny_budget_still_lets_every_method_begin(rounds):
-    for wanted, row in zip(rounds, planned(rounds, 1), strict=True):
-        assert all(search.evaluations >= FEWEST.get(wanted.method, 4) for search in row)
+    for wanted, row in zip(rounds, planned(rounds, 1, 60), strict=True):
+        assert all(search.evaluations >= fewest(wanted.method, 60) for search in row)
 
 
 def test_no_search_has_the_seed_of_another():
-    seeds = [search.seed + 1000 * search.spot for row in planned(WITH_GRADIENT, 100) for search in row]
+    seeds = [search.seed + 1000 * search.spot for row in planned(WITH_GRADIENT, 100, 60) for search in row]
     assert len(set(seeds)) == len(seeds)
+
+
+@pytest.mark.parametrize("ticks", [10, 40, 60])
+def test_the_student_gets_the_calls_that_it_needs_to_begin(ticks: int) -> None:
+    calls = fewest("guided", ticks) * ticks
+    student = BlackBoxSearch.usual("guided")
+    assert calls >= student.first_calls() + ticks * (1 + 2 * student.probes)
