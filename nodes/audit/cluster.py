@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
+from advnerf_core.errors import AdvnerfError
 from advnerf_core.run_module import search_folder_last
 from nodes.audit.searching import SearchJob
 from nodes.experiment.run.cells import search_cell
-from nodes.experiment.run.cluster import ray_session
-from nodes.experiment.steps.run import load_experiment
-from nodes.runtime.errors import ConfigError
+from nodes.experiment.run.cluster import ray_session, run_on_ray
 
 HERE = "here"
 
@@ -33,24 +34,16 @@ class Cluster:
         Raises:
             ConfigError: The cluster does not answer, or a machine in it cannot run a search.
         """
-        with ray_session("" if self.address == HERE else self.address, os.cpu_count() or 1):
-            import ray
-            from ray.exceptions import RayError
-
-            run = ray.remote(num_cpus=1, scheduling_strategy="SPREAD")(_search)
-            try:
-                ray.get([run.remote(each, os.getcwd()) for each in searches])
-            except RayError as error:
-                raise ConfigError(
-                    f"expected every machine of the cluster to have this package and the audit's folder, got {' '.join(str(error).split())[-500:]}"
-                ) from None
+        session = ray_session("" if self.address == HERE else self.address, os.cpu_count() or 1)
+        with session as cores:
+            for _ in run_on_ray(partial(_search, os.getcwd()), searches, cores):
+                pass  # a lost search has no results in its folder, and runs here
 
 
-def _search(wanted: SearchJob, folder: str) -> None:
-    """One search, in a worker of the cluster."""
+def _search(folder: str, wanted: SearchJob) -> bool:
+    """One search, in a worker of the cluster; one that fails does so again where its results are read, with its error."""
     os.environ.setdefault("MUJOCO_GL", "egl")
     search_folder_last(folder)
-    experiment = load_experiment(
-        Path(wanted.file), wanted.setting, list(wanted.overrides), Path(wanted.run_folder)
-    )
-    search_cell(experiment, wanted.cell, Path(wanted.folder), lambda *told: None)
+    with contextlib.suppress(AdvnerfError):
+        search_cell(wanted.experiment(), wanted.cell, Path(wanted.folder), lambda *told: None)
+    return True

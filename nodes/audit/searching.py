@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -25,6 +25,7 @@ from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import colour_space
 from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.attack import attack_problem
+from nodes.experiment.steps.run import load_experiment
 from nodes.experiment.steps.search_files import ATTACK, SEARCHED
 
 SEARCHES = "searches"
@@ -86,6 +87,10 @@ class SearchJob:
     cell: Cell
     folder: str
 
+    def experiment(self) -> Experiment:
+        """The experiment of the setting."""
+        return load_experiment(Path(self.file), self.setting, self.overrides, Path(self.run_folder))
+
 
 class SearchesElsewhere(Protocol):
     """Other machines that run the searches of a round in parallel."""
@@ -144,10 +149,12 @@ class Searches:
         """Search until the schedule ends, or a result is enough."""
         for wanted, row in zip(self.rounds, self.planned, strict=True):
             spots = self._spots(wanted.spots)
+            jobs: Iterable[SearchJob] = (self._job(wanted, each, spots[each.spot]) for each in row)
             if self.elsewhere is not None:  # its results in the folders are then only read here
-                self.elsewhere.search([self._wanted(wanted, search, spots[search.spot]) for search in row])
-            for search in row:
-                found = self._search(wanted, search, spots[search.spot])
+                jobs = list(jobs)
+                self.elsewhere.search(jobs)
+            for search, job in zip(row, jobs, strict=True):
+                found = self._search(wanted, search, spots[search.spot], job)
                 self.found.append(found)
                 say(
                     f"{found.method} at spot {found.spot + 1}, {found.evaluations} evaluations: largest deviation "
@@ -164,12 +171,11 @@ class Searches:
         ranked = sorted(best, key=lambda spot: best[spot], reverse=True)
         return [*ranked, *(spot for spot in range(len(self.spots)) if spot not in best)][:count]
 
-    def _search(self, wanted: Round, search: PlannedSearch, spot: int) -> FoundAttack:
-        described = self._wanted(wanted, search, spot)
-        experiment, folder = self.copies.experiment(described.setting), Path(described.folder)
-        clean = search_cell(experiment, described.cell, folder, lambda *told: None)
+    def _search(self, wanted: Round, search: PlannedSearch, spot: int, job: SearchJob) -> FoundAttack:
+        experiment, folder = job.experiment(), Path(job.folder)
+        clean = search_cell(experiment, job.cell, folder, lambda *told: None)
         return FoundAttack(
-            described.setting,
+            job.setting,
             folder,
             spot,
             wanted.method,
@@ -178,7 +184,7 @@ class Searches:
             *_effect(experiment, folder, clean, self.limit_m),
         )
 
-    def _wanted(self, wanted: Round, search: PlannedSearch, spot: int) -> SearchJob:
+    def _job(self, wanted: Round, search: PlannedSearch, spot: int) -> SearchJob:
         """The search, after its setting was written and its object built."""
         setting = self._setting(wanted, search)
         self.plan.add(

@@ -6,14 +6,15 @@ import logging
 import os
 import socket
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypeVar
 
-from nodes.experiment.run.worker import Ended, Job, run_in_process
 from nodes.runtime.errors import ConfigError
 
 _CONNECT_S = 5.0
+Wanted = TypeVar("Wanted")
+Done = TypeVar("Done")
 
 
 @contextmanager
@@ -65,15 +66,18 @@ def _require_reachable(address: str) -> None:
         ) from None
 
 
-def run_on_ray(jobs: Sequence[Job], at_a_time: int) -> Iterator[tuple[Job, Ended | None]]:
+def run_on_ray(
+    work: Callable[[Wanted], Done], jobs: Sequence[Wanted], at_a_time: int
+) -> Iterator[tuple[Wanted, Done | None]]:
     """Run jobs on the current cluster.
 
     Args:
-        jobs: The cells to run.
-        at_a_time: Largest number of cells that run at once.
+        work: Function of one job, which runs in a worker and returns something else than None.
+        jobs: The jobs, as plain data.
+        at_a_time: Largest number of jobs that run at once.
 
     Yields:
-        Each finished job, with how it ended; None if its machine was lost.
+        Each finished job, with the result; None if its machine was lost.
 
     Raises:
         ConfigError: A machine cannot run a job at all, for example without this package.
@@ -81,9 +85,9 @@ def run_on_ray(jobs: Sequence[Job], at_a_time: int) -> Iterator[tuple[Job, Ended
     import ray
     from ray.exceptions import NodeDiedError, ObjectLostError, RayError, WorkerCrashedError
 
-    run = ray.remote(num_cpus=1, max_retries=0, scheduling_strategy="SPREAD")(run_in_process)
+    run = ray.remote(num_cpus=1, max_retries=0, scheduling_strategy="SPREAD")(work)
     waiting = deque(jobs)
-    running: dict[Any, Job] = {}
+    running: dict[Any, Wanted] = {}
     while waiting or running:
         while waiting and len(running) < at_a_time:
             job = waiting.popleft()

@@ -224,7 +224,7 @@ def _run_on_ray(jobs: list[Job], at_a_time: int, options: Options, say: Say) -> 
         left = jobs
         for _ in range(_ROUNDS):
             lost = []
-            for job, end in run_on_ray(left, min(at_a_time, cores)):
+            for job, end in run_on_ray(run_in_process, left, min(at_a_time, cores)):
                 if end is None and _is_finished(job):
                     end = Ended(job.name, "done", "", 0.0)
                 if end is None:
