@@ -10,6 +10,8 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from advnerf_core.attack.search.black_box import BlackBoxSearch
+
 
 @dataclass(frozen=True)
 class Round:
@@ -44,8 +46,7 @@ BLACK_BOX = (
 # Adam's rates: searches of an audit are short, so that they take larger steps than those of an experiment.
 LEARNING_RATE = 0.5
 _FEWEST, _FEWEST_CEM = 4, 20
-# The student of `guided` asks for its first lesson about 300 pairs of pictures; each step is a drive and 3 pairs about each of its pictures.
-_LESSON_CALLS, _STEP_DRIVES, _STEPS = 600, 7, 2
+_STEPS = 2  # of `guided` after the first lesson of its student, at least
 # Methods that no schedule has; with the reason, for the report.
 NEVER_TRIED = {
     "where the object stands, as part of a search": "the schedule searches colours at spots that a rule chose (space.kind places)",
@@ -74,7 +75,8 @@ class PlannedSearch:
 def fewest(method: str, ticks: int) -> int:
     """Evaluations below which a method cannot begin, for drives of so many ticks."""
     if method == "guided":
-        return math.ceil(_LESSON_CALLS / ticks) + _STEPS * _STEP_DRIVES
+        student = BlackBoxSearch.usual("guided")
+        return math.ceil(student.first_calls() / ticks) + _STEPS * student.drives_per_step
     return _FEWEST_CEM if method == "cem" else _FEWEST
 
 

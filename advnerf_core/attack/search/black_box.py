@@ -104,9 +104,14 @@ class BlackBoxSearch:
         """Policy calls of the first lesson."""
         return 2 * self.distillation.warm_pairs
 
+    @property
+    def drives_per_step(self) -> int:
+        """Policy calls of a step, in drives: the drive itself, and the queries at each of its frames."""
+        return 1 + 2 * self.probes
+
     def step_calls(self, problem: AttackProblem) -> int:
         """Policy calls of one drive and its queries."""
-        return calls_per_evaluation(problem) * (1 + 2 * self.probes)
+        return calls_per_evaluation(problem) * self.drives_per_step
 
     def evaluations(self, problem: AttackProblem, calls: int) -> int:
         """Drives, each with its gradient, that a budget of policy calls allows.
