@@ -16,7 +16,7 @@ from nodes.experiment.plan.object_kinds import footprint_m
 from nodes.experiment.plan.placed import PlacedObject, in_a_lane
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.learned_scene import load_background
-from nodes.experiment.show.placing import SeenFrom, clean_poses, is_seen
+from nodes.experiment.show.placing import SeenFrom, clean_poses, is_seen, poses_beside
 
 # In half lanes: steps along the path and away from it, and the largest distance.
 _ALONG, _AWAY, _FARTHEST = 0.5, 0.25, 4.0
@@ -92,22 +92,11 @@ def _places(
     ahead_m = _LOOKS_AHEAD_S * experiment.car.speed_mps
     reach_m = 0.5 * scale * min(footprint_m(kind))
     end_m = begin_m + length_m + ahead_m if path.closed else min(path.length_m, begin_m + length_m + ahead_m)
-    for along_m in np.arange(begin_m + 0.5 * ahead_m, end_m, _ALONG * half_lane_m):
-        x, y, yaw = np.asarray(path.pose_at(along_m)).tolist()
-        car = np.asarray(path.pose_at(max(begin_m, along_m - ahead_m)))[:2]
-        for side in (-1.0, 1.0):
-            for away in np.arange(1.0, _FARTHEST, _AWAY):
-                away_m = reach_m + away * half_lane_m
-                at = np.array([x - side * away_m * math.sin(yaw), y + side * away_m * math.cos(yaw)])
-                towards = car - at
-                yield PlacedObject(
-                    name=name,
-                    kind=kind,
-                    x_m=round(float(at[0]), 3),
-                    y_m=round(float(at[1]), 3),
-                    yaw_rad=round(math.atan2(towards[1], towards[0]), 3),
-                    scale=scale,
-                )
+    away_m = (reach_m + np.arange(1.0, _FARTHEST, _AWAY) * half_lane_m).tolist()
+    for along_m in np.arange(begin_m + 0.5 * ahead_m, end_m, _ALONG * half_lane_m).tolist():
+        for pose in poses_beside(path, along_m, max(begin_m, along_m - ahead_m), (-1.0, 1.0), away_m):
+            x_m, y_m, yaw_rad = (round(each, 3) for each in pose)
+            yield PlacedObject(name=name, kind=kind, x_m=x_m, y_m=y_m, yaw_rad=yaw_rad, scale=scale)
 
 
 def _seen(experiment: Experiment, placed: PlacedObject, views: Sequence[SeenFrom]) -> Spot | None:

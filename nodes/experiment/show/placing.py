@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from advnerf_core.driving.path import Path
 from advnerf_core.geometry import Array, invert_transform, planar_pose
 from hardware.worlds.paths import Pose
 from hardware.worlds.world import Depth, World, require_depth
@@ -103,15 +104,28 @@ def _spots(experiment: Experiment, wanted: RuledObject, name: str) -> Iterator[P
     begin_m = float(path.project(drive[:1, :2]).s_m[0])
     length_m = float(np.hypot(*np.diff(drive[:, :2], axis=0).T).sum())
     sides = {"right": (-1.0,), "left": (1.0,), "either": (-1.0, 1.0)}[wanted.stands.side]
-    for passed_m in np.arange(ahead_m, length_m, _ALONG * half_lane_m):
-        x, y, yaw = np.asarray(path.pose_at(begin_m + passed_m)).tolist()
+    away_m = (half_lane_m * np.arange(1.0, _FARTHEST, _AWAY)).tolist()
+    for passed_m in np.arange(ahead_m, length_m, _ALONG * half_lane_m).tolist():
+        along_m = begin_m + passed_m
         # It faces the car's position at the time when it must begin to be visible.
-        car = np.asarray(path.pose_at(begin_m + passed_m - ahead_m))[:2]
-        for side in sides:
-            for away_m in half_lane_m * np.arange(1.0, _FARTHEST, _AWAY):
-                at = np.array([x - side * away_m * math.sin(yaw), y + side * away_m * math.cos(yaw)])
-                towards = car - at
-                yield wanted.at(float(at[0]), float(at[1]), math.atan2(towards[1], towards[0]))
+        for pose in poses_beside(path, along_m, along_m - ahead_m, sides, away_m):
+            yield wanted.at(*pose)
+
+
+def poses_beside(
+    path: Path, along_m: float, facing_m: float, sides: Sequence[float], away_m: Sequence[float]
+) -> Iterator[Pose]:
+    """Poses beside a point of a path, near before far: at lateral distances ``away_m`` [m] to the ``sides`` (1: left, -1: right).
+
+    They face the point of the path at ``facing_m``.
+    """
+    x, y, yaw = np.asarray(path.pose_at(along_m)).tolist()
+    car = np.asarray(path.pose_at(facing_m))[:2]
+    for side in sides:
+        for each_m in away_m:
+            at = np.array([x - side * each_m * math.sin(yaw), y + side * each_m * math.cos(yaw)])
+            towards = car - at
+            yield float(at[0]), float(at[1]), math.atan2(towards[1], towards[0])
 
 
 def _fits(
