@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand
 
+from nodes.cli.endings import INTERRUPTED, text_for_people
 from nodes.lab.importing.metric_options import MetricOptions
 from nodes.runtime.options import with_groups
 from nodes.runtime.terminal import Overrides, say_error
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from nodes.audit.run import AuditOptions
 
 # Codes below are verdicts: see `advnerf_core.report.audit_result.EXIT_CODES`.
-USAGE_EXIT, FAULT_EXIT, INTERRUPTED_EXIT, CANNOT_JUDGE_EXIT = 64, 70, 130, 2
+USAGE_EXIT, FAULT_EXIT, CANNOT_JUDGE_EXIT = 64, 70, 2
 _PLACE, _SEARCH, _RESULT = "Place", "Search", "Result"
 _UNITS_MIN = {"s": 1 / 60, "m": 1.0, "h": 60.0}
 OFF_LANE = "off-lane"
@@ -248,7 +249,6 @@ def audit(
         raise typer.Exit(USAGE_EXIT)
     from rich.console import Console
 
-    from advnerf_core.errors import AdvnerfError
     from nodes.audit.asking import UnansweredError
     from nodes.audit.run import Audit
 
@@ -258,15 +258,14 @@ def audit(
     except UnansweredError as error:
         say_error(str(error))
         raise typer.Exit(CANNOT_JUDGE_EXIT) from None
-    except (AdvnerfError, OSError) as error:
-        say_error(str(error))
-        raise typer.Exit(USAGE_EXIT) from None
     except typer.Abort:  # Ctrl-C at a question
-        say_error("interrupted before the audit began")
-        raise typer.Exit(INTERRUPTED_EXIT) from None
-    except Exception:  # a fault of ours must not end as the verdict that Python's own code 1 stands for
-        traceback.print_exc()
-        raise typer.Exit(FAULT_EXIT) from None
+        raise typer.Exit(INTERRUPTED) from None
+    except Exception as error:
+        if (text := text_for_people(error)) is None:
+            traceback.print_exc()  # a fault of ours must not end as the verdict that Python's own code 1 stands for
+            raise typer.Exit(FAULT_EXIT) from None
+        say_error(text)
+        raise typer.Exit(USAGE_EXIT) from None
     print(f"\n{found.verdict.sentence}\n{result.output / 'audit.html'}")
     raise typer.Exit(found.exit_code)
 
