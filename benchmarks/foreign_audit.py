@@ -7,23 +7,23 @@ of this project learns from them and writes an ONNX file, which is audited as it
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from advnerf_core.attack.pose_maps import starts_beside
 from advnerf_core.documents import Document
-from advnerf_core.report.audit_result import read_audit
-from benchmarks.results import REPOSITORY, record_row
+from advnerf_core.geometry import invert_transform, planar_pose
+from advnerf_core.policies.tracker import TrackedTrajectory
+from benchmarks.own_place import run_audit
+from benchmarks.results import record_row
 from hardware.worlds.world import World, WorldDescription
-from nodes.audit.kept import check_audit
 from nodes.audit.places import Answers, place_of_world
 from nodes.lab.worlds.expert_drive import as_path
 from nodes.lab.worlds.named import read_world
@@ -40,22 +40,15 @@ def poses(
     """Poses of the car beside a path, with the control that leads back to it: pure pursuit (Coulter 1992)."""
     path, car = as_path(described.paths[name]), described.car
     ahead_m = _AHEAD_S * car.speed_mps
+    of_car = {"car_speed_mps": car.speed_mps} if car.wheelbase_m is None else {"wheelbase_m": car.wheelbase_m}
+    pursuit = TrackedTrajectory(times_s=(_AHEAD_S,), lookahead_m=ahead_m, **of_car)
     end_m = path.length_m if path.closed else path.length_m - ahead_m
     for along_m in rng.uniform(0.0, end_m, PICTURES).tolist():
-        x, y, yaw = np.asarray(path.pose_at(along_m)).tolist()
-        beside_m = rng.normal(0.0, _BESIDE * described.off_track_m)
-        pose = x - beside_m * math.sin(yaw), y + beside_m * math.cos(yaw), yaw + rng.normal(0.0, _TURNED_RAD)
-        to_m = along_m + ahead_m
-        target = np.asarray(path.pose_at(to_m % path.length_m if path.closed else to_m))[:2]
-        towards = target - pose[:2]
-        angle = math.atan2(towards[1], towards[0]) - pose[2]
-        curvature_1pm = 2.0 * math.sin(angle) / float(np.hypot(*towards))
-        control = (
-            curvature_1pm * car.speed_mps
-            if car.wheelbase_m is None
-            else math.atan(curvature_1pm * car.wheelbase_m)
-        )
-        yield pose, control
+        beside_m, turn_rad = rng.normal(0.0, (_BESIDE * described.off_track_m, _TURNED_RAD)).tolist()
+        (pose,) = starts_beside(np.asarray(path.pose_at(along_m)).tolist(), [beside_m], [turn_rad])
+        x_m, y_m, _ = np.asarray(path.pose_at(along_m + ahead_m)).tolist()
+        target = invert_transform(planar_pose(*pose)) @ [x_m, y_m, 0.0, 1.0]
+        yield pose, float(pursuit.control(target[None, None, :2])[0])
 
 
 def record(world: World, name: str, file: Path) -> None:
@@ -91,17 +84,12 @@ def main() -> None:
         script = Path(__file__).parent / "strangers_victims" / f"train_{options.by}.py"
         subprocess.run([options.python, script, "data.npz", "policy.onnx"], cwd=folder, check=True)
         words = ["policy.onnx", "--world", named, "--limit", "off-lane", "--budget", options.budget]
-        words += ["--starts", str(options.starts), "-o", "audit"]
-        words += [word for each in options.set for word in ("--set", each)]
-        began = time.monotonic()
-        environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-        ended = subprocess.run(
-            [sys.executable, "-m", "nodes.cli", "audit", *words], cwd=folder, env=environment, check=False
-        )
-        minutes = (time.monotonic() - began) / 60.0
-        result = read_audit(folder / "audit" / "audit.json")
-        assert ended.returncode == result.exit_code, f"the command ended with {ended.returncode}"
-        print("\n".join(check_audit(folder / "audit")))
+        words += [
+            "--starts",
+            str(options.starts),
+            *(word for each in options.set for word in ("--set", each)),
+        ]
+        result, minutes = run_audit(folder, "audit", *words)
     driven = "nothing was driven" if result.judgement is None else (
         f"{result.judgement.off_track} of {len(result.judgement.starts)} fresh starts off the lane ({result.judgement.evidence})"
     )  # fmt: skip

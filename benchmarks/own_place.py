@@ -16,9 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from advnerf_core.data.posed_images import write_posed_images
 from advnerf_core.documents import read_json
-from advnerf_core.geometry import planar_pose
 from advnerf_core.policies.adapter import adapted
 from advnerf_core.policies.contract import PolicyContract
 from advnerf_core.policies.load import load_any_policy
@@ -34,16 +32,18 @@ from nodes.audit.learning import OTHER_HALF
 from nodes.audit.question import FILE, VICTIM
 from nodes.audit.verdict import effect_of
 from nodes.experiment.steps.run import load_experiment
+from tests.support.lab_photographs import photograph
 
 COMMAND = "python -m benchmarks.own_place"
 VICTIM_FILE = REPOSITORY / "docs/results/reference/policy_722ab9106e2fbad0/policy.safetensors"
 PHOTOGRAPHS, LIMIT_M, STARTS, SEED = 160, 0.4, 50, 30_000
 # How a person drives: off the line and turned by this much, several times a lap.
 _WOBBLE_M, _TURNED_RAD = 0.05, 0.08
+WORDS = ("my_policy.onnx", "--place", "photos", "--car", "my_car.yaml", "--limit", str(LIMIT_M))
 _CAR = "car: {speed_mps: 0.8, wheelbase_m: 0.25, max_steering_rad: 0.26}\ncamera_ahead_m: 0.3\ncamera_height_m: 0.2\n"
 
 
-def photograph(folder: Path) -> None:
+def make_folder(folder: Path) -> None:
     """A lap by hand, photographed by the driving camera."""
     with Lab(LabConfig()) as lab:
         path, states = lab.describe().paths["track"], []
@@ -53,48 +53,34 @@ def photograph(folder: Path) -> None:
             off_m = _WOBBLE_M * np.sin(18 * np.pi * share)
             turned = yaw + _TURNED_RAD * np.cos(14 * np.pi * share)
             states.append((x - off_m * np.sin(yaw), y + off_m * np.cos(yaw), turned))
-        write_posed_images(
-            folder / "photos",
-            [planar_pose(*state) @ lab.T_car_from_camera for state in states],
-            lab.camera_pinhole,
-            lambda index: lab.observe_at(*states[index], depth=False)[0],
-            "png",
-        )
+        photograph(lab, states, folder / "photos")
     loaded = load_any_policy(VICTIM_FILE)
     policy = adapted(loaded.policy, PolicyContract(loaded.view))
     export_onnx(policy.network, policy.contract, folder / "my_policy.onnx")
     (folder / "my_car.yaml").write_text(_CAR)
 
 
-def run_audit(folder: Path, budget: str) -> tuple[AuditResult, float]:
-    """The command, and how long it took [min]."""
-    words = ["my_policy.onnx", "--place", "photos", "--car", "my_car.yaml", "--limit", str(LIMIT_M)]
+def run_audit(folder: Path, output: str, *words: str) -> tuple[AuditResult, float]:
+    """``advnerf audit`` in a user's folder: its result, checked against its drives, and how long it took [min]."""
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
     began = time.monotonic()
-    command = [sys.executable, "-m", "nodes.cli", "audit", *words, "--budget", budget, "-o", "audit"]
+    command = [sys.executable, "-m", "nodes.cli", "audit", *words, "-o", output]
     ended = subprocess.run(command, cwd=folder, env=environment, check=False)
     minutes = (time.monotonic() - began) / 60.0
-    result = read_audit(folder / "audit" / "audit.json")
+    result = read_audit(folder / output / "audit.json")
     assert ended.returncode == result.exit_code, f"the command ended with {ended.returncode}"
-    print("\n".join(check_audit(folder / "audit")))
+    print("\n".join(check_audit(folder / output)))
     return result, minutes
 
 
 def run_small(folder: Path) -> None:
     """The setting for continuous integration, twice: how long it takes, and whether it says the same."""
-    words = ["my_policy.onnx", "--place", "photos", "--car", "my_car.yaml", "--limit", str(LIMIT_M), "--ci"]
-    environment, minutes, codes = {**os.environ, "PYTHONPATH": str(REPOSITORY)}, [], []
-    for name in ("one", "two"):
-        began = time.monotonic()
-        command = [sys.executable, "-m", "nodes.cli", "audit", *words, "-o", name]
-        codes.append(subprocess.run(command, cwd=folder, env=environment, check=False).returncode)
-        minutes.append((time.monotonic() - began) / 60.0)
-    result = read_audit(folder / "one" / "audit.json")
-    assert codes == [result.exit_code] * 2, f"the commands ended with {codes}"
+    (result, first), (_, second) = (run_audit(folder, name, *WORDS, "--ci") for name in ("one", "two"))
+    minutes = max(first, second)
     same = (folder / "one" / "audit.json").read_bytes() == (folder / "two" / "audit.json").read_bytes()
     record_row(
         "audit in the setting for continuous integration, learning the place included",
-        round(max(minutes), 1), "min", "<= 8 min on 2 cores; the same bytes again", max(minutes) <= 8.0 and same, f"{COMMAND} --ci",
+        round(minutes, 1), "min", "<= 8 min on 2 cores; the same bytes again", minutes <= 8.0 and same, f"{COMMAND} --ci",
         f"{result.verdict.outcome}, {PHOTOGRAPHS} pictures; the second run gave {'the same bytes' if same else 'OTHER bytes'}",
     )  # fmt: skip
 
@@ -138,11 +124,11 @@ def main() -> None:
     os.environ.setdefault("MUJOCO_GL", "egl")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        photograph(folder)
+        make_folder(folder)
         if options.ci:
             run_small(folder)
             return
-        result, minutes = run_audit(folder, options.budget)
+        result, minutes = run_audit(folder, "audit", *WORDS, "--budget", options.budget)
         there = drive_in_the_lab(folder)
     judged = result.judgement
     effect = (

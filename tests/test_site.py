@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.page_browser import CHROMIUM, available
+from benchmarks.page_browser import available
 
 ROOT = Path(__file__).parents[1]
 
@@ -56,14 +56,9 @@ def test_the_search_finds_what_a_page_says(site):
 @pytest.mark.browser
 @pytest.mark.skipif(not available(), reason="needs playwright and /usr/bin/chromium")
 @pytest.mark.parametrize("page", ["index.html", "results/room.html"])
-def test_the_search_works_in_pages_opened_as_files(site, page):
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=str(CHROMIUM), args=["--no-sandbox"])
-        tab = browser.new_context(offline=True).new_page()
-        tab.goto((site / page).as_uri())
-        tab.fill("input.md-search__input", "stall")
-        found = tab.wait_for_selector("a.md-search-result__link", state="attached").get_attribute("href")
-        browser.close()
+def test_the_search_works_in_pages_opened_as_files(site, page, browser):
+    tab = browser.new_context(offline=True).new_page()
+    tab.goto((site / page).as_uri())
+    tab.fill("input.md-search__input", "stall")
+    found = tab.wait_for_selector("a.md-search-result__link", state="attached").get_attribute("href")
     assert found.startswith(f"{site.as_uri()}/")

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from advnerf_core.data.posed_images import write_posed_images
-from advnerf_core.geometry import make_transform, planar_pose, rotation_z
+from advnerf_core.geometry import make_transform, rotation_z
 from hardware.worlds.lab.config import LabConfig
 from hardware.worlds.lab.lab import Lab
+from tests.support.lab_photographs import photograph
 
 ROOT = Path(__file__).parents[2]
 PHOTOGRAPHS, RADIUS_M, WHEELBASE_M, LIMIT_M = 48, 1.2, 0.25, 0.25
@@ -80,13 +80,7 @@ def make_folder(folder: Path) -> None:
     with Lab(LabConfig()) as lab:
         turns = 2.0 * np.pi * np.arange(PHOTOGRAPHS) / PHOTOGRAPHS
         states = [(RADIUS_M * math.sin(turn), -RADIUS_M * math.cos(turn), turn) for turn in turns.tolist()]
-        write_posed_images(
-            folder / "photos",
-            [_T_IMAGES_FROM_LAB @ planar_pose(*state) @ lab.T_car_from_camera for state in states],
-            lab.camera_pinhole,
-            lambda index: lab.observe_at(*states[index], depth=False)[0],
-            "png",
-        )
+        photograph(lab, states, folder / "photos", _T_IMAGES_FROM_LAB)
     (folder / "car.yaml").write_text(_CAR)
     (folder / "drivers.py").write_text(_POLICIES)
 

@@ -9,7 +9,7 @@ from advnerf_core.driving.path import Line
 from advnerf_core.driving.path import Path as DrivenPath
 from advnerf_core.report.result_page import render_page
 from advnerf_core.report.sections import page_sections
-from benchmarks.page_browser import CHROMIUM, PHONE, available
+from benchmarks.page_browser import PHONE, available
 from nodes.audit.judging import FOUND, NO_OBJECT, PLAIN_OBJECT
 from nodes.audit.page import write_page
 from nodes.audit.verdict import ArmDrives
@@ -37,16 +37,6 @@ PALE = """(least) => {
       return (high + 0.05) / (low + 0.05) < least;
     }).map((each) => each.outerHTML.slice(0, 120));
 }"""
-
-
-@pytest.fixture(scope="module")
-def browser():
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        made = playwright.chromium.launch(executable_path=str(CHROMIUM), args=["--no-sandbox"])
-        yield made
-        made.close()
 
 
 @pytest.fixture(scope="module")

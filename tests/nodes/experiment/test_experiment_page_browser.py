@@ -5,7 +5,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from benchmarks.experiment_page_pictures import watched_experiment
-from benchmarks.page_browser import CHROMIUM, PHONE, available
+from benchmarks.page_browser import PHONE, available
 from nodes.experiment_page.page import ExperimentPage
 from tests.support.experiment_page import CELLS, record_of, search_so_far
 
@@ -44,16 +44,6 @@ NO_ACCESSIBLE_NAME = """() => [...document.querySelectorAll('svg, img, video, se
   return !(each.getAttribute('aria-label') || each.getAttribute('alt') || each.ariaLabel || each.querySelector('caption')
     || (by && document.getElementById(by)) || (each.tagName === 'TABLE' && each.closest('[role=region]')));
 }).map((each) => each.outerHTML.slice(0, 200))"""
-
-
-@pytest.fixture(scope="module")
-def browser():
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        made = playwright.chromium.launch(executable_path=str(CHROMIUM), args=["--no-sandbox"])
-        yield made
-        made.close()
 
 
 class Watcher:

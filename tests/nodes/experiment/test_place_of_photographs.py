@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 import yaml
 
-from advnerf_core.data.posed_images import write_posed_images
 from advnerf_core.data.transforms import load_transforms
 from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
-from advnerf_core.geometry import make_transform, planar_pose, rotation_z
+from advnerf_core.geometry import make_transform, rotation_z
 from hardware.worlds.lab.config import LabConfig
 from hardware.worlds.lab.lab import Lab
 from nodes.experiment.plan.cell import Cell
@@ -21,6 +20,7 @@ from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps.keys import settings_hash
 from nodes.experiment.steps.run import load_experiment
 from tests.nodes.experiment.test_given_victims import MODULE
+from tests.support.lab_photographs import photograph
 
 PHOTOGRAPHS, TICKS = 24, 3
 T_IMAGES_FROM_LAB = make_transform(rotation_z(0.5), [3.0, -2.0, 1.2])
@@ -46,13 +46,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with Lab(LabConfig()) as lab:
         path = lab.describe().paths["track"]
         states = [path.pose_at(path.length_m * index / PHOTOGRAPHS) for index in range(PHOTOGRAPHS)]
-        write_posed_images(
-            found / "my_photos",
-            [T_IMAGES_FROM_LAB @ planar_pose(*state) @ lab.T_car_from_camera for state in states],
-            lab.camera_pinhole,
-            lambda index: lab.observe_at(*states[index], depth=False)[0],
-            "png",
-        )
+        photograph(lab, states, found / "my_photos", T_IMAGES_FROM_LAB)
     (found / "hall_driver.py").write_text(MODULE)
     (found / "hall.experiment.yaml").write_text(yaml.safe_dump(FILE))
     return found
