@@ -60,9 +60,11 @@ class Experiment(Variants):
 
     Attributes:
         kept: Digests of its stages' outputs when it was loaded, from the run folder, else from the ones stored with the code.
+        given_scene: The learned scene of the user's own, if that is the place; no stage is run then.
     """
 
     kept: Mapping[str, str] = field(default_factory=dict)
+    given_scene: FilePath | None = None
 
     @classmethod
     def resolved_in(cls, folder: FilePath) -> Experiment:
@@ -71,12 +73,11 @@ class Experiment(Variants):
         context = {"folder": FilePath(manifest["file"]).parent}
         search_folder_last(str(context["folder"]))  # may contain package.module:factory
         config = ExperimentConfig.model_validate(manifest["config"], context=context)
-        return cls(config, FilePath(manifest["file"]), folder, manifest["setting"])
+        return cls(config, FilePath(manifest["file"]), folder, manifest["setting"]).with_given_scene()
 
-    @property
-    def given_scene(self) -> FilePath | None:
-        """The learned scene of the user's own, if that is the place; no stage is run then."""
-        return self.named_world.config.file if self.config.own_scene else None
+    def with_given_scene(self) -> Experiment:
+        """The same, which knows the learned scene of the user's own if that is the place."""
+        return replace(self, given_scene=self.named_world.config.file) if self.config.own_scene else self
 
     @cached_property
     def named_world(self) -> NamedWorld:

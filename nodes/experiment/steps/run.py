@@ -62,6 +62,7 @@ def load_experiment(
 
 def _load(experiment: Experiment, document: Document) -> Experiment:
     """An experiment without variants, checked against its world, with the digests of its stages that are stored with the code."""
+    experiment = experiment.with_given_scene()
     if experiment.executes or not is_users(experiment.config.world):
         _check_world(experiment, document)
     if given_in(experiment.config):
