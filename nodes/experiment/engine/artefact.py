@@ -9,11 +9,12 @@ has the scene, victims and objects that the published cells were run with.
 
 from __future__ import annotations
 
+import filecmp
 import hashlib
 import json
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +96,7 @@ class Artefact:
         seconds: Time that making them took [s].
         settings: All settings, including defaults.
         kept: For a stage from a reference build, without intermediate files: digest of the files that it has.
-        files_in: For a stage in a reference build: folder beside it with the same files, which are stored once; empty if its own folder has them.
+        files_in: For a stage in a reference build: its files that are stored in the folder of another stage beside it, each with that folder's name.
     """
 
     key: str
@@ -103,7 +104,7 @@ class Artefact:
     seconds: float
     settings: Mapping[str, Any]
     kept: str | None = None
-    files_in: str = ""
+    files_in: Mapping[str, str] = field(default_factory=dict)
 
 
 def hash_of(value: Any) -> str:
@@ -113,10 +114,20 @@ def hash_of(value: Any) -> str:
 
 def digest_of(folder: Path) -> str:
     """SHA-256 over the names and contents of all files in a folder, except its own record."""
+    return _digest_of(_files_in(folder))
+
+
+def _files_in(folder: Path) -> dict[str, Path]:
+    """All files in a folder except its own record, by their names in it."""
+    found = (path for path in sorted(folder.rglob("*")) if path.is_file() and path != folder / RECORD)
+    return {path.relative_to(folder).as_posix(): path for path in found}
+
+
+def _digest_of(files: Mapping[str, Path]) -> str:
     digest = hashlib.sha256()
-    for path in sorted(p for p in folder.rglob("*") if p.is_file() and p != folder / RECORD):
-        digest.update(path.relative_to(folder).as_posix().encode() + b"\0")
-        with path.open("rb") as stream:
+    for name in sorted(files, key=Path):
+        digest.update(name.encode() + b"\0")
+        with files[name].open("rb") as stream:
             while block := stream.read(1 << 20):
                 digest.update(block)
     return digest.hexdigest()
@@ -135,7 +146,11 @@ def write_artefact(folder: Path, artefact: Artefact) -> None:
     known = asdict(replace(artefact, seconds=round(artefact.seconds, 3)))
     write_json(
         folder / RECORD,
-        {name: each for name, each in known.items() if name == "digest" or each not in (None, "")},
+        {
+            name: each
+            for name, each in known.items()
+            if name in ("digest", "settings") or each not in (None, {})
+        },
     )
 
 
@@ -206,16 +221,15 @@ class ReferenceBuild:
         return None
 
     def _take(self, source: Path, found: Artefact, folder: Path) -> Artefact:
-        if found.files_in:
-            source = source.with_name(found.files_in)
-            found = replace(found, files_in="")
-        if digest_of(source) != found.kept:
+        files = stored_files(source, found)
+        if any(not file.exists() for file in files.values()) or _digest_of(files) != found.kept:
             raise ReferenceBuildError(
-                f"expected the files in {source} as they were kept, got others; restore them (git checkout -- {source}), or remove the folder to "
+                f"expected the files in {source} as they were kept, got others; restore them (git checkout -- {source.parent}), or remove the folder to "
                 "have the stage made anew"
             )
-        _copy(source, folder, (), found)
-        return found
+        taken = replace(found, files_in={})
+        _copy(files, folder, taken)
+        return taken
 
     def keep(self, name: str, key: str, folder: Path, bulk: Sequence[str] = ()) -> Path | None:
         """Copy a finished stage from its folder in a run folder to here, without the files that match a pattern of ``bulk``.
@@ -226,24 +240,31 @@ class ReferenceBuild:
         found, target = read_artefact(folder), self._at(name, key)
         if found is None or found.key != key or found.digest is None or self.find(name, key) is not None:
             return None
-        _copy(folder, target, bulk, found)
+        left_out = {path for pattern in bulk for path in folder.glob(pattern)}
+        files = _files_in(folder).items()
+        _copy(
+            {name: file for name, file in files if left_out.isdisjoint([file, *file.parents])}, target, found
+        )
         self._share(target)
         return target
 
     def _share(self, target: Path) -> None:
-        """Store the files of a stage once if another folder of the same stage has the same ones."""
+        """Store the files of a stage once that another folder of the same stage has too."""
         ours = read_artefact(target)
         assert ours is not None, "it was kept"
-        for file in sorted(self.folder.glob(f"{target.name.rpartition('_')[0]}_*/{RECORD}")):
-            other = read_artefact(file.parent)
-            if (
-                file.parent != target
-                and other is not None
-                and (other.kept, other.files_in) == (ours.kept, "")
-            ):
-                shutil.rmtree(target)
-                write_artefact(target, replace(ours, files_in=file.parent.name))
-                return
+        files, shared = _files_in(target), {}
+        for record in sorted(self.folder.glob(f"{target.name.rpartition('_')[0]}_*/{RECORD}")):
+            other = record.parent
+            for name in files.keys() - shared.keys() if other != target else ():
+                if (other / name).is_file() and filecmp.cmp(files[name], other / name, shallow=False):
+                    shared[name] = other.name
+        # The record first: a file that is here twice is no damage.
+        write_artefact(target, replace(ours, files_in=dict(sorted(shared.items()))))
+        for name in shared:
+            files[name].unlink()
+        for folder in sorted((path for path in target.rglob("*") if path.is_dir()), reverse=True):
+            if not any(folder.iterdir()):
+                folder.rmdir()
 
     def _source(self, name: str, key: str) -> Path:
         at = self._at(name, key)
@@ -256,17 +277,23 @@ class ReferenceBuild:
 REFERENCE = ReferenceBuild(PUBLISHED / BUILD, shipped(str(PUBLISHED / BUILD)))
 
 
-def _copy(source: Path, target: Path, without: Sequence[str], artefact: Artefact) -> None:
-    """Copy files, all or none, with a record that lists them."""
+def stored_files(folder: Path, record: Artefact) -> dict[str, Path]:
+    """All files of a stage in a reference build, by their names in it, wherever they are stored."""
+    return {
+        **_files_in(folder),
+        **{name: folder.with_name(other) / name for name, other in record.files_in.items()},
+    }
+
+
+def _copy(files: Mapping[str, Path], target: Path, artefact: Artefact) -> None:
+    """Copy files, all or none, with a record that has their digest."""
     partial = target.with_name(f".{target.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
-    left_out = {path for pattern in without for path in source.glob(pattern)} | {source / RECORD}
     partial.mkdir(parents=True)
-    for path in sorted(source.rglob("*")):
-        if path.is_file() and left_out.isdisjoint([path, *path.parents]):
-            at = partial / path.relative_to(source)
-            at.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(path, at)
+    for name, file in files.items():
+        at = partial / name
+        at.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file, at)
     write_artefact(partial, replace(artefact, kept=digest_of(partial)))
     shutil.rmtree(target, ignore_errors=True)
     partial.rename(target)

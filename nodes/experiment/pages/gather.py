@@ -6,10 +6,8 @@ import os
 import platform
 from collections.abc import Iterator, Mapping
 from datetime import datetime, timezone
-from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,7 +22,7 @@ from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.faces import has_face, panel_of, wanted_face
 from nodes.experiment.show.given import victim_without_gradient
-from nodes.experiment.show.learned_scene import FIDELITY
+from nodes.experiment.show.learned_scene import FIDELITY, view_pictures
 from nodes.experiment.steps.attack import planned_evaluations
 from nodes.experiment.steps.deploy import DRIVES
 from nodes.experiment.steps.frozen import frozen_hashes
@@ -257,10 +255,7 @@ def _fidelity(experiment: Experiment) -> rd.Fidelity:
     shown = {int(i) for i in np.linspace(0, len(scene["views"]) - 1, SHOWN_VIEWS).round()}
     views = []
     for index, (view, angles) in enumerate(zip(scene["views"], steering, strict=True)):
-        images = {
-            name: _read_rgb(experiment.folder / view[f"{name}_image"]) if index in shown else None
-            for name in ("real", "surrogate")
-        }
+        images = view_pictures(experiment, index) if index in shown else {}
         views.append(
             rd.FidelityView(
                 view["label"],
@@ -313,7 +308,3 @@ def _manifest(experiment: Experiment) -> rd.Manifest:
         _settings(experiment),
         _timings(experiment),
     )
-
-
-def _read_rgb(path: Path) -> Any:
-    return np.ascontiguousarray(cv2.cvtColor(np.asarray(cv2.imread(str(path))), cv2.COLOR_BGR2RGB))

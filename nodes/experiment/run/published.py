@@ -133,7 +133,7 @@ def _prune_build(reference: ReferenceBuild, published: Path) -> list[Path]:
     kept = {
         stage: record for stage, record in records.items() if record is not None and record.digest in used
     }
-    shared = {record.files_in for record in kept.values()}
+    shared = {folder for record in kept.values() for folder in record.files_in.values()}
     removed = [stage for stage in records if stage not in kept and stage.name not in shared]
     for stage in removed:
         shutil.rmtree(stage)

@@ -6,9 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from advnerf_core.data.image_files import write_image
 from advnerf_core.data.transforms import load_transforms
+from advnerf_core.data.view_loading import load_image
+from advnerf_core.data.views import PosedImages
 from advnerf_core.files import write_json
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.baked import BakedScene
@@ -20,6 +23,7 @@ from nodes.runtime.progress import Report
 
 HELD_OUT = "held_out"  # the captured set that is held out from learning
 FIDELITY = "fidelity.json"  # comparison of the learned scene with it
+VIEWS = "views"  # folder of both, side by side
 
 
 def scene_file(experiment: Experiment) -> Path:
@@ -60,7 +64,7 @@ def compare_views(experiment: Experiment, view: PolicyView, begin: float, report
         report: Progress callback.
     """
     folder, renderer = experiment.stage_folder("scene"), load_field(experiment)
-    listed = load_transforms(experiment.stage_folder("capture") / HELD_OUT, require_all=True)
+    listed = _held_out(experiment)
     views, rows = listed.load(), []
     for index, (real, pose) in enumerate(zip(views.rgb, views.T_world_from_camera, strict=True)):
         report(begin + (1 - begin) * index / len(views.rgb), f"held-out view {index + 1}")
@@ -74,10 +78,24 @@ def compare_views(experiment: Experiment, view: PolicyView, begin: float, report
             "ssim_full": ssim(full, real / 255.0),
             "ssim_policy": ssim(small, seen / 255.0),
         }
-        for name, image in (("real", real), ("surrogate", np.round(255 * full).astype(np.uint8))):
-            path = folder / "views" / f"{index:03d}_{name}.png"
-            write_image(path, image)
-            row[f"{name}_image"] = str(path.relative_to(experiment.folder))
+        for name, image in (("real", real), ("surrogate", _pixels(full))):
+            write_image(folder / VIEWS / f"{index:03d}_{name}.png", image)
         rows.append(row)
     means = {key: float(np.mean([row[key] for row in rows])) for key in ("psnr_full_db", "psnr_policy_db")}
     write_json(folder / FIDELITY, {"mean": means, "views": rows})
+
+
+def view_pictures(experiment: Experiment, index: int) -> dict[str, NDArray[np.uint8]]:
+    """A held-out view at the camera's size, ``real`` and ``surrogate``, drawn again: a reference build stores no pictures of it."""
+    frame = _held_out(experiment).frames[index]
+    real, pinhole = load_image(frame)
+    full = load_field(experiment).render(frame.T_world_from_camera[None], pinhole)[0][0].numpy()
+    return {"real": real, "surrogate": _pixels(full)}
+
+
+def _held_out(experiment: Experiment) -> PosedImages:
+    return load_transforms(experiment.stage_folder("capture") / HELD_OUT, require_all=True)
+
+
+def _pixels(image: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
+    return np.round(255 * image).astype(np.uint8)

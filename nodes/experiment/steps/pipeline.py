@@ -16,6 +16,7 @@ from nodes.experiment.show import objects
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.faces import has_face
 from nodes.experiment.show.given import given_in, victim_sha256
+from nodes.experiment.show.learned_scene import VIEWS
 from nodes.experiment.steps import bake, capture, live, policy, retrain, scene
 from nodes.launching.launch_file import load_launch
 from nodes.runtime.progress import MeasuringReport
@@ -107,7 +108,9 @@ def _capture(experiment: Experiment) -> Stage:
 
 def _scene(experiment: Experiment) -> Stage:
     settings = Settings.of(experiment.config, READS["scene"], view=experiment.view_settings)
-    return _stage("scene", scene, experiment, settings, ("capture",), reads_bulk_of=("capture",))
+    return _stage(
+        "scene", scene, experiment, settings, ("capture",), bulk=(VIEWS,), reads_bulk_of=("capture",)
+    )
 
 
 def _bake(experiment: Experiment) -> Stage:

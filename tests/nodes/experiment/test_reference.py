@@ -1,42 +1,52 @@
 """The reference build that is kept with the code: whole, used, and small enough to be cloned."""
 
+import hashlib
 import json
+import shutil
 import subprocess
 from pathlib import Path
 
+import numpy as np
+import pytest
+
+from advnerf_core.data.image_files import read_stored
 from nodes.experiment.engine.artefact import (
     BUILD,
     PUBLISHED,
     RECORD,
     Artefact,
     ReferenceBuild,
+    ReferenceBuildError,
     digest_of,
     read_artefact,
     write_artefact,
 )
+from nodes.experiment.show.learned_scene import VIEWS, view_pictures
+from tests.support.stage_versions import tiny_experiment
 
 ROOT = Path(__file__).parents[3]
 KEPT = ROOT / PUBLISHED / BUILD
 MOST_BYTES = 40e6
 
 
-def test_it_is_whole_and_small_enough():
+def test_it_is_whole_without_second_copies_and_small_enough(tmp_path):
     stages = sorted(file.parent for file in KEPT.glob(f"*/{RECORD}"))
     assert stages
     assert sorted(KEPT.iterdir()) == stages
     for stage in stages:
-        record = read_artefact(stage)
-        files = stage.with_name(record.files_in or stage.name)
-        assert digest_of(files) == record.kept, f"{files} is not as it was kept"
-        assert not record.files_in or [file.name for file in stage.iterdir()] == [RECORD]
-    kept = [read_artefact(stage) for stage in stages]
-    large = [
-        (stage.name[:5], each.kept)
-        for stage, each in zip(stages, kept, strict=True)
-        if stage.name[:5] == "scene" and not each.files_in
-    ]
-    assert len(set(large)) == len(large), "a scene is kept twice"
+        taken = ReferenceBuild(KEPT).take_digest(
+            stage.name.rpartition("_")[0], read_artefact(stage).digest, "a key", tmp_path / stage.name
+        )
+        assert taken is not None, f"{stage} is not as it was kept"
+        for path in read_artefact(stage).files_in:
+            assert not (stage / path).exists(), "it is stored twice"
+    stored = [digest_of_file(file) for file in KEPT.rglob("*") if file.is_file() and file.name != RECORD]
+    assert len(set(stored)) == len(stored)
     assert sum(file.stat().st_size for file in KEPT.rglob("*")) < MOST_BYTES
+
+
+def digest_of_file(file):
+    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def test_git_ignores_none_of_it():
@@ -60,21 +70,57 @@ def test_published_cells_of_the_room_are_of_it(tmp_path):
     assert build.take_digest("scene", "0" * 64, "another key", tmp_path / "none") is None
 
 
-def test_two_stages_with_the_same_files_are_kept_once_and_both_are_taken(tmp_path):
+def made(work, key, **files):
+    shutil.rmtree(work, ignore_errors=True)
+    for name, content in files.items():
+        (work / name).parent.mkdir(parents=True, exist_ok=True)
+        (work / name).write_bytes(content)
+    write_artefact(work, Artefact(key, digest_of(work), 1.0, {}))
+    return work
+
+
+def test_files_of_two_stages_are_stored_once_and_both_are_taken(tmp_path):
     build, work = ReferenceBuild(tmp_path / "build"), tmp_path / "run" / "scene"
-    work.mkdir(parents=True)
-    (work / "scene.bin").write_bytes(b"the same")
-    for key in ("a" * 64, "b" * 64):
-        write_artefact(work, Artefact(key, digest_of(work), 1.0, {}))
-        assert build.keep("scene", key, work) == build.folder / f"scene_{key[:16]}"
-        assert build.keep("scene", key, work) is None
-    assert sorted(file.name for file in build.folder.rglob("*") if file.is_file()) == [
-        "scene.bin",
-        RECORD,
-        RECORD,
-    ]
-    for key in ("a" * 64, "b" * 64):
+    kept = {"b" * 64: b"its own", "a" * 64: b"another", "c" * 64: b"its own"}
+    for key, own in kept.items():
+        folder = made(
+            work,
+            key,
+            **{"scene.bin": b"the same", "views/0.png": b"drawn again", "views/own": own, "own": own},
+        )
+        assert build.keep("scene", key, folder, ("views",)) == build.folder / f"scene_{key[:16]}"
+        assert build.keep("scene", key, folder) is None
+    found = sorted(
+        file.relative_to(build.folder).as_posix()[6] + file.name
+        for file in build.folder.rglob("*")
+        if file.is_file()
+    )
+    assert found == ["a" + "own", "a" + RECORD, "b" + "own", "bscene.bin", "b" + RECORD, "c" + RECORD]
+    for key, own in kept.items():
         taken = build.take("scene", key, tmp_path / key)
-        assert (taken.key, taken.files_in) == (key, "")
+        assert (taken.key, taken.files_in) == (key, {})
         assert (tmp_path / key / "scene.bin").read_bytes() == b"the same"
+        assert (tmp_path / key / "own").read_bytes() == own
+        assert not (tmp_path / key / "views").exists()
         assert read_artefact(tmp_path / key).key == key
+
+
+@pytest.mark.parametrize("damage", ["changed", "gone"])
+def test_a_damaged_file_is_named_wherever_it_is_stored(tmp_path, damage):
+    build = ReferenceBuild(tmp_path / "build")
+    for key in ("a" * 64, "b" * 64):
+        build.keep("scene", key, made(tmp_path / "run", key, **{"scene.bin": b"the same"}))
+    (stored,) = build.folder.rglob("scene.bin")
+    stored.write_bytes(b"something else") if damage == "changed" else stored.unlink()
+    for key in ("a" * 64, "b" * 64):
+        with pytest.raises(ReferenceBuildError, match="as they were kept, got others"):
+            build.take("scene", key, tmp_path / "taken")
+    assert not (tmp_path / "taken").exists()
+
+
+def test_pictures_of_held_out_views_that_are_not_stored_are_drawn_again(tiny_room):
+    experiment = tiny_experiment(tiny_room[0])
+    for index in (0, 2):
+        for name, drawn in view_pictures(experiment, index).items():
+            file = experiment.stage_folder("scene") / VIEWS / f"{index:03d}_{name}.png"
+            np.testing.assert_array_equal(drawn, read_stored(file)[0])
