@@ -164,10 +164,10 @@ def install():
     """Stand for the modules of experiments in this process, before they are imported."""
     for name in REPLACED:
         sys.modules[f"nodes.experiment.{name}"] = sys.modules[__name__]
-    from nodes.experiment.run import cluster, worker
+    from nodes.experiment.run import run, worker
 
     worker.module_command = command
-    cluster.run_in_process = run_on_machine
+    run.run_in_process = run_on_machine
 
 
 def run_on_machine(job):

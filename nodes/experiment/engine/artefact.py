@@ -252,7 +252,7 @@ class ReferenceBuild:
         """Store the files of a stage once that another folder of the same stage has too."""
         ours = read_artefact(target)
         assert ours is not None, "it was kept"
-        files, shared = _files_in(target), {}
+        files, shared = _files_in(target), dict[str, str]()
         for record in sorted(self.folder.glob(f"{target.name.rpartition('_')[0]}_*/{RECORD}")):
             other = record.parent
             for name in files.keys() - shared.keys() if other != target else ():

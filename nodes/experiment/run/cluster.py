@@ -85,7 +85,9 @@ def run_on_ray(
     import ray
     from ray.exceptions import NodeDiedError, ObjectLostError, RayError, WorkerCrashedError
 
-    run = ray.remote(num_cpus=1, max_retries=0, scheduling_strategy="SPREAD")(work)
+    run: Any = ray.remote(num_cpus=1, max_retries=0, scheduling_strategy="SPREAD")(
+        lambda job: work(job)  # Ray takes a function, not any callable
+    )
     waiting = deque(jobs)
     running: dict[Any, Wanted] = {}
     while waiting or running:
