@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from rich.markup import escape
 from typer.core import TyperGroup
 
 
@@ -24,6 +25,16 @@ def in_panels(panels: Mapping[str, tuple[str, ...]]) -> type[TyperGroup]:
             command: Any = super().get_command(ctx, cmd_name)
             if command is not None:
                 command.rich_help_panel = title_of[cmd_name]
+                _escape(command)
             return command
 
     return PanelGroup
+
+
+def _escape(command: Any) -> None:
+    """Keep units such as ``[s]`` in the help of a command and of those below it: Rich takes them for markup, and drops them."""
+    for each in (command, *command.params):
+        if getattr(each, "help", None):
+            each.help = escape(each.help.replace("\\[", "["))  # groups in groups come here twice
+    for below in getattr(command, "commands", {}).values():
+        _escape(below)

@@ -54,6 +54,31 @@ def test_every_command_and_every_parameter_has_help() -> None:
     assert [f"{name} {each.name}" for name, each in parameters if not (each.help or "").strip()] == []
 
 
+def test_units_are_shown_in_the_help(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rich takes ``[m]`` for markup, and leaves it out without a word."""
+    monkeypatch.setattr("typer.rich_utils.MAX_WIDTH", 400)
+    checked = 0
+    for name, command in commands():
+        brackets = [
+            found
+            for each in (command, *command.params)
+            for found in re.findall(r"\[[a-zA-Z][^\]]*\]", each.help or "")
+        ]
+        if not brackets:
+            continue
+        with pytest.raises(SystemExit, match="0"):
+            app([*name.split(), "--help"], prog_name="advnerf")
+        shown = capsys.readouterr().out
+        assert {each: shown.count(each) for each in brackets} == {
+            each: brackets.count(each) for each in brackets
+        }, name
+        assert "\\[" not in shown
+        checked += len(brackets)
+    assert checked > 20
+
+
 def test_options_for_folders_have_two_names_and_one_name_means_one_thing() -> None:
     meanings: dict[str, set[str]] = {}
     folders = set()
