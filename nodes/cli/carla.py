@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from nodes.runtime.terminal import Overrides, print_table, table
+from nodes.runtime.terminal import Overrides, coloured, print_table, table
 from nodes.runtime.termination import ends_in_order
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def carla_check(
         checks = check_server(_config(config, overrides, host, port), pictures=pictures)
     for check in checks:
         colour = {"ok": "green", "warning": "yellow", "failure": "red"}[check.state]
-        rows.add_row(check.name, f"[{colour}]{check.state}[/]", check.text.replace("[", "\\["))
+        rows.add_row(check.name, coloured(check.state, colour), check.text)
         failed |= check.state == "failure"
     print_table(rows)
     if failed:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from nodes.cli.cell_choice import CellChoice, know_methods, load_cells
-from nodes.runtime.terminal import print_table, say_error, table
+from nodes.runtime.terminal import coloured, print_table, say_error, table
 
 if TYPE_CHECKING:
     from advnerf_core.report.result_table import ResultTable
@@ -47,7 +47,7 @@ def status(choice: CellChoice) -> None:
     rows = table("cell", "state", "")
     for each in found:
         colour = _COLOURS.get(each.state, "dim")
-        rows.add_row(each.cell.name, f"[{colour}]{each.state}[/]", each.text)
+        rows.add_row(each.cell.name, coloured(each.state, colour), each.text)
     print_table(rows)
     counts: Any = Counter(each.state for each in found)
     print(

@@ -10,7 +10,7 @@ import typer
 
 from nodes.cli import policy_train as cli_policy_train
 from nodes.runtime.paths import shipped
-from nodes.runtime.terminal import PolicyName, print_table, table
+from nodes.runtime.terminal import PolicyName, coloured, print_table, table
 from nodes.runtime.termination import ends_in_order
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ def policy_check(
     for finding in findings:
         rows.add_row(
             finding.name,
-            f"[{_COLOURS[finding.verdict]}]{finding.verdict}[/]",
+            coloured(finding.verdict, _COLOURS[finding.verdict]),
             finding.text.replace("[", r"\["),
         )
     print_table(rows)

@@ -288,7 +288,7 @@ def _require_clearance(least_m: float) -> None:
 def _print_fit(fit: PathFit) -> None:
     from advnerf_core.driving.path import Line
 
-    rows = table("piece", "length \\[m]", "radius \\[m]", "turn \\[deg]")
+    rows = table("piece", "length [m]", "radius [m]", "turn [deg]")
     for piece in fit.path.segments:
         if isinstance(piece, Line):
             rows.add_row("line", f"{piece.length_m:.3f}", "", "")

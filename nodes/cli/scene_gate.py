@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from nodes.cli.cell_choice import File, Folder, Setting
-from nodes.runtime.terminal import Overrides, print_table, table
+from nodes.runtime.terminal import Overrides, coloured, print_table, table
 
 _REFUSED_EXIT = 1
 
@@ -71,7 +71,7 @@ def gate(
                 f"{n['steering']:.4f}",
                 f"{n['steering_worst']:.4f}",
                 f"{n['correlation']:.4f}",
-                "[green]pass[/]" if verdict.passed else "[red]refused[/]",
+                coloured("pass", "green") if verdict.passed else coloured("refused", "red"),
             )
         print_table(rows)
         for reason in [reason for _, verdict in verdicts for reason in verdict.reasons]:

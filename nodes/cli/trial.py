@@ -102,9 +102,9 @@ def evaluate(
     rows = table(
         "bag",
         "attack",
-        "total CTE \\[m]",
-        "mean \\[m]",
-        "max \\[m]",
+        "total CTE [m]",
+        "mean [m]",
+        "max [m]",
         "off track",
         "left after",
         "attack adds",
@@ -174,7 +174,7 @@ def _print_summary(results: list[dict[str, Any]]) -> None:
     rows = table(
         "condition",
         "runs",
-        "total CTE \\[m]",
+        "total CTE [m]",
         "ratio",
         "off track",
         "stopped early",

@@ -75,13 +75,13 @@ class ProgressDisplay:
     def __init__(self, console: Console | None = None, watcher: StageDisplay | None = None) -> None:
         self._console, self._watcher = console or Console(), watcher
         columns = (
-            TextColumn("{task.fields[stage]:<8}"),
+            TextColumn("{task.fields[stage]:<8}", markup=False),
             BarColumn(bar_width=24),
             TextColumn("{task.percentage:>3.0f} %"),
             TimeElapsedColumn(),
             TextColumn("left"),
             TimeRemainingColumn(),
-            TextColumn("{task.fields[text]}"),
+            TextColumn("{task.fields[text]}", markup=False),
         )
         self._progress = Progress(*columns, console=self._console) if self._console.is_terminal else None
 
@@ -103,14 +103,14 @@ class ProgressDisplay:
 
     def _shown(self, stage: str) -> MeasuringReport:
         if self._progress is None:
-            self._console.print(f"{stage}: started", highlight=False, soft_wrap=True)
+            self._console.print(f"{stage}: started", highlight=False, markup=False, soft_wrap=True)
             return _LogReport(self._console, stage)
         return _BarReport(self._progress, self._progress.add_task("", total=1.0, stage=stage, text=""))
 
     def finish(self, stage: str, seconds: float, cached: bool) -> None:
         """Finish a stage, or report that its earlier result is reused."""
         text = "unchanged, reused" if cached else f"done in {seconds:.1f} s"
-        self._console.print(f"{stage}: {text}", highlight=False, soft_wrap=True)
+        self._console.print(f"{stage}: {text}", highlight=False, markup=False, soft_wrap=True)
         if self._watcher is not None:
             self._watcher.finish(stage, seconds, cached)
 
@@ -145,5 +145,8 @@ class _LogReport:
         left = (now_s - self._begin_s) * (1.0 / fraction - 1.0) if fraction > 0.01 else float("nan")
         remaining = "" if left != left else f", about {left:.0f} s left"
         self._console.print(
-            f"{self._stage}: {100 * fraction:.0f} % {text}{remaining}", highlight=False, soft_wrap=True
+            f"{self._stage}: {100 * fraction:.0f} % {text}{remaining}",
+            highlight=False,
+            markup=False,
+            soft_wrap=True,
         )

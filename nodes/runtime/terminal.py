@@ -15,6 +15,7 @@ from nodes.runtime.paths import named_file
 
 if TYPE_CHECKING:
     from rich.table import Table
+    from rich.text import Text
 
     from nodes.runtime.findings import ContractFinding
 
@@ -96,11 +97,18 @@ def table(*columns: str) -> Table:
     return empty
 
 
+def coloured(text: str, colour: str) -> Text:
+    """Make a cell of a table in a colour."""
+    from rich.text import Text
+
+    return Text(text, style=colour)
+
+
 def print_table(full: Table) -> None:
-    """Print a table. In a pipe, its lines are not wrapped."""
+    """Print a table as it is: nothing in brackets, such as a unit, is markup. In a pipe, its lines are not wrapped."""
     from rich.console import Console
 
-    Console(width=None if sys.stdout.isatty() else 240).print(full)
+    Console(width=None if sys.stdout.isatty() else 240, markup=False).print(full)
 
 
 def say_error(text: str) -> None:
@@ -112,6 +120,6 @@ def print_findings(findings: Sequence[ContractFinding]) -> None:
     """Print what a check of a plug-in found, a line for each part of its contract."""
     rows = table("part", "state", "found")
     for finding in findings:
-        state = "[green]met[/]" if finding.met else "[red]not met[/]"
-        rows.add_row(finding.name, state, finding.text.replace("[", r"\["))
+        state = coloured("met", "green") if finding.met else coloured("not met", "red")
+        rows.add_row(finding.name, state, finding.text)
     print_table(rows)

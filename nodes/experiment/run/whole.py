@@ -77,7 +77,9 @@ def run_experiment(
         ended = _run_cells(experiment, chosen, options, console, record)
         _write_report(experiment, console, record)
     console.print(
-        f"{experiment.config.name} ({experiment.setting}): {time.monotonic() - began:.0f} s", highlight=False
+        f"{experiment.config.name} ({experiment.setting}): {time.monotonic() - began:.0f} s",
+        highlight=False,
+        markup=False,
     )
     return ended
 
@@ -95,7 +97,7 @@ def _run_cells(
 
 
 def _say(console: Console, record: ProgressRecord | None, text: str) -> None:
-    console.print(text, highlight=False, soft_wrap=True)
+    console.print(text, highlight=False, markup=False, soft_wrap=True)
     if record is not None:
         record.say(text)
 

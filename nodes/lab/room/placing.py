@@ -41,7 +41,7 @@ def guide(
         The last displacement and the subject's pose ``[4, 4]``; None if the subject was never seen.
     """
     found, deadline = None, time.monotonic() + timeout_s
-    with Live(console=Console(stderr=True), refresh_per_second=4, transient=True) as live:
+    with Live(console=Console(stderr=True, markup=False), refresh_per_second=4, transient=True) as live:
         for T in standing_poses(run_dir, f"/vicon/{target.subject}", 0.5):
             if T is None:
                 live.update(f"{target.subject} is lost")
@@ -58,7 +58,8 @@ def guide(
 
 def _placement_table(off: Misplacement, limits: tuple[float, float]) -> Any:
     colour = "green" if off.within(*limits) else "red"
-    rows = table("", f"[{colour}]{in_short(off)} off[/]: move it")
+    rows = table("", f"{in_short(off)} off: move it")
+    rows.columns[1].header_style = colour
     for name, advice in off.advice():
         rows.add_row(name, advice)
     return rows

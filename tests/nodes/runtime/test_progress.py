@@ -5,6 +5,7 @@ from rich.console import Console
 
 from nodes.runtime import progress
 from nodes.runtime.progress import ProgressDisplay
+from nodes.runtime.terminal import coloured, print_table, table
 
 pytestmark = pytest.mark.live
 
@@ -42,3 +43,20 @@ def test_a_terminal_gets_a_bar_that_fills():
         report(1.5, "step 2")
     assert "100 %" in out.getvalue()
     assert "step 2" in out.getvalue()
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_brackets_are_no_markup(terminal, moments):
+    out = io.StringIO()
+    with ProgressDisplay(Console(file=out, force_terminal=terminal, width=120, no_color=True)) as display:
+        report = display.start("bake")
+        moments[0] = 20.0
+        report(0.25, "cell [m] of /data/[/room]")
+    assert "cell [m] of /data/[/room]" in out.getvalue()
+
+
+def test_tables_show_what_is_in_brackets(capsys):
+    rows = table("x [m]", "state")
+    rows.add_row("of [/room]", coloured("[met]", "green"))
+    print_table(rows)
+    assert capsys.readouterr().out.split() == ["x", "[m]", "state", "of", "[/room]", "[met]"]
