@@ -18,7 +18,7 @@ from nodes.audit.asking import answer
 from nodes.audit.cars import AuditedCar
 from nodes.audit.images import PosedPlace
 from nodes.audit.question import Place
-from nodes.lab.worlds.named import read_world
+from nodes.lab.worlds.named import NamedWorld, read_world
 from nodes.lab.worlds.photographs.config import DRIVEN
 from nodes.lab.worlds.photographs.world import PATH, Photographs
 from nodes.runtime.paths import shipped
@@ -127,16 +127,21 @@ def place_of_world(name: str, answers: Answers) -> Place:
     section = read_yaml(base).data["world"] if base is not None else {"kind": name}
     named = read_world(Document({**section, "kind": name}, f"--world {name}"), Path.cwd())
     world, panels = {**section, "kind": name}, isinstance(named.make(), NativePanels)
-    path = answers.path or ("" if base is not None else next(iter(named.describe().paths), ""))
+    path = answers.path or ("" if base is not None else next(iter(_described(named).paths), ""))
     return Place(named.kind, "world", name, "world", world, base, path, panels)
 
 
-def describe(place: Place) -> WorldDescription | None:
-    """A world's description; None if it must be open for that."""
+def describe(place: Place) -> WorldDescription:
+    """A world's description; it is opened if it must be open for that."""
+    return _described(read_world(Document(dict(place.world), f"--world {place.source}"), Path.cwd()))
+
+
+def _described(named: NamedWorld) -> WorldDescription:
     try:
-        return read_world(Document(dict(place.world), f"--world {place.source}"), Path.cwd()).describe()
+        return named.describe()
     except NotOpenError:
-        return None
+        with named.make() as world:
+            return world.describe()
 
 
 def _known_settings(name: str) -> Path | None:

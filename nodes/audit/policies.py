@@ -32,7 +32,7 @@ class NamedPolicy:
 
     Attributes:
         given: File, ``package.module:factory`` or address.
-        camera: The driving camera of the place, for a policy that names none; None if only the world knows it.
+        camera: The driving camera of the place, for a policy that names none.
         largest_rad: Largest wheel angle of the car, which equals a normalised output of 1 [rad].
         declared: ``key=value`` texts of a declaration.
         folder: Folder of the audit, for a copy of the file with its declaration, if it has none.
@@ -40,8 +40,8 @@ class NamedPolicy:
     """
 
     given: str
-    camera: Pinhole | None
-    largest_rad: float | None
+    camera: Pinhole
+    largest_rad: float
     declared: Sequence[str]
     folder: Path
     say: Say
@@ -78,10 +78,6 @@ class NamedPolicy:
                 values[question.key] = _answered(question, usual, self.say)
         values |= answers
         if values.get("output_unit") == "normalised" and values.get("full_steering_rad") is None:
-            if self.largest_rad is None:
-                raise ConfigError(
-                    "expected --declare full_steering_rad=RAD, the wheel angle at an output of 1, as the car is not known yet"
-                )
             values["full_steering_rad"] = self.largest_rad
         return PolicyContract.from_dict(values, "--declare")
 
@@ -103,10 +99,8 @@ def _read(declared: Sequence[str]) -> dict[str, Any]:
     return found
 
 
-def _whole_picture(view: Mapping[str, Any], camera: Pinhole | None) -> dict[str, Any]:
+def _whole_picture(view: Mapping[str, Any], camera: Pinhole) -> dict[str, Any]:
     """The view of a policy that sees the whole picture of the place's camera in the policy's image size."""
-    if camera is None:
-        return dict(view)
     whole = {"camera": asdict(camera), "crop_top_px": 0, "crop_height_px": camera.height}
     return {**view, **whole}
 

@@ -304,9 +304,8 @@ def _question(
         assert place.world is not None, "one of the two is given"
         where = place_of_world(place.world, answers)
         described = describe(where)
-        seen = None if described is None else described.camera
-        largest = None if described is None else described.car.largest_control
-        spec, _ = NamedPolicy(policy, seen, largest, declared, folder, _say).resolve()
+        largest = described.car.largest_control
+        spec, _ = NamedPolicy(policy, described.camera, largest, declared, folder, _say).resolve()
     question = AuditedQuestion(
         policy=spec,
         given=policy,

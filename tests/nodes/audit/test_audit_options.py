@@ -9,8 +9,12 @@ from pathlib import Path
 import pytest
 
 from advnerf_core.report.audit_result import audit_schema
+from hardware.worlds.lab.config import LabConfig
+from hardware.worlds.lab.lab import Lab
 from nodes.audit.cars import CARS, car_of
+from nodes.audit.places import Answers, describe, place_of_world
 from nodes.cli.audit import _minutes
+from nodes.experiment.show.context import as_json
 from nodes.runtime.errors import ConfigError
 
 
@@ -61,3 +65,31 @@ def test_a_car_is_a_name_or_a_file(tmp_path: Path) -> None:
     (tmp_path / "bad.yaml").write_text("car: {speed_mps: 1.0, wheelbase_m: 0.3, max_steering_rad: 1.7}\n")
     with pytest.raises(ConfigError, match=r"less than 1\.5 rad"):
         car_of(str(tmp_path / "bad.yaml"))
+
+
+SHUT = """
+from hardware.worlds.lab.lab import Lab
+from hardware.worlds.world import NotOpenError
+
+
+class Shut(Lab):
+    is_open = False
+
+    def __enter__(self):
+        self.is_open = True
+        return super().__enter__()
+
+    def describe(self):
+        if not self.is_open:
+            raise NotOpenError("only its simulator knows the road")
+        return super().describe()
+"""
+
+
+def test_a_world_that_describes_itself_once_it_is_open_is_opened_for_its_camera_and_car(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "shut.py").write_text(SHUT)
+    found = place_of_world(f"{tmp_path / 'shut.py'}:Shut", Answers())
+    assert found.path == "track"
+    assert as_json(describe(found)) == as_json(Lab(LabConfig()).describe())
