@@ -92,6 +92,11 @@ def _importer(given: Path) -> Callable[[Path, MetricOptions, Any], object]:
         raise ConfigError(
             f"--place: expected photographs, a video or a COLMAP model, got {given}, which is not there"
         )
+    if given.suffix == ".safetensors":
+        raise ConfigError(
+            f"--place {given}: expected the images that this scene was learned from, as a learned scene alone cannot be compared with its place; to "
+            "search in it without a verdict, see world: {kind: scene} in docs/experiments.md"
+        )
     if given.is_dir() and not any(
         each.suffix.lower() in (*SUFFIXES, *HEIF_SUFFIXES) for each in given.rglob("*")
     ):

@@ -43,7 +43,7 @@ class PlaceOptions:
             _PLACE,
             "--place",
             exists=True,
-            help="Posed photographs (transforms.json or its folder), or a COLMAP model's folder.",
+            help="Photographs or a video; posed photographs (transforms.json or its folder); or a COLMAP model's folder.",
         ),
     ] = None
     world: Annotated[

@@ -12,9 +12,11 @@ from advnerf_core.report.audit_result import audit_schema
 from hardware.worlds.lab.config import LabConfig
 from hardware.worlds.lab.lab import Lab
 from nodes.audit.cars import CARS, car_of
+from nodes.audit.images import posed
 from nodes.audit.places import Answers, describe, place_of_world
 from nodes.cli.audit import _minutes
 from nodes.experiment.show.context import as_json
+from nodes.lab.importing.metric_options import MetricOptions
 from nodes.runtime.errors import ConfigError
 
 
@@ -93,3 +95,9 @@ def test_a_world_that_describes_itself_once_it_is_open_is_opened_for_its_camera_
     found = place_of_world(f"{tmp_path / 'shut.py'}:Shut", Answers())
     assert found.path == "track"
     assert as_json(describe(found)) == as_json(Lab(LabConfig()).describe())
+
+
+def test_a_learned_scene_without_its_images_cannot_be_judged_in(tmp_path: Path) -> None:
+    (tmp_path / "scene.safetensors").touch()
+    with pytest.raises(ConfigError, match="expected the images that this scene was learned from"):
+        posed(tmp_path / "scene.safetensors", tmp_path / "audit", MetricOptions())
