@@ -35,4 +35,7 @@ def _digests_used(folder: Path, registration: Registration) -> list[str | None]:
     """Digests of scene and victim, of the first cell of every scenario: `verify` checks that the others are equal."""
     first = {(cell.scenario, cell.placement): cell.name for cell in reversed(registration.cells)}
     files = [file for name in first.values() if (file := folder / f"{name}.json").exists()]
-    return [read_json(file).get("stages", {}).get(stage) for file in files for stage in _NEEDED]
+    stages = [read_json(file).get("stages", {}) for file in files]
+    # A victim with a recipe of its own has a stage of its own, policy-NAME.
+    parts = [{name.partition("-")[0]: digest for name, digest in each.items()} for each in stages]
+    return [each.get(stage) for each in parts for stage in _NEEDED]

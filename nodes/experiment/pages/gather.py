@@ -284,7 +284,9 @@ def _latency(experiment: Experiment, results: list[dict[str, Any]]) -> rd.Latenc
 
 
 def _timings(experiment: Experiment) -> dict[str, float]:
-    names = ("capture", "scene", "bake", "policy", "object", "live")
+    config = experiment.config
+    policies = dict.fromkeys(map(config.policy_stage, config.attacked))
+    names = ("capture", "scene", "bake", *policies, "object", "live")
     records = {name: read_artefact(experiment.stage_folder(name)) for name in names}
     results = [experiment.cell_result(cell) for cell in experiment.cells]
     seconds = {name: record.seconds for name, record in records.items() if record is not None}

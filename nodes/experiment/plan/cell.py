@@ -9,7 +9,6 @@ from advnerf_core.plugins import name_in_results
 from advnerf_core.report.cells import cell_name
 from advnerf_core.report.conditions import CONTROLS, NONE
 from nodes.experiment.plan.config import ExperimentConfig
-from nodes.experiment.plan.victims import TRAINED_PLAIN
 from nodes.runtime.errors import ConfigError
 
 # Keys of --only.
@@ -83,7 +82,8 @@ def cells_of(config: ExperimentConfig, variant: str = "") -> list[Cell]:
     paths = config.cell_paths
 
     def seeds_of(victim: str) -> tuple[int, ...]:
-        beside = victim != config.main_victim and config.attacked.get(victim) == TRAINED_PLAIN
+        train = config.trained.get(victim)
+        beside = victim != config.main_victim and train is not None and train.textures == "none"
         return config.seeds[:1] if beside and config.over.victim is None else config.seeds
 
     def cell(path: str, victim: str, method: str, seed: int) -> Cell:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from advnerf_core.plugins import name_in_results
 from advnerf_core.report.conditions import CONTROLS, EMPTY
@@ -34,14 +34,14 @@ from nodes.experiment.plan.space_config import ColoursConfig, SpaceConfig
 from nodes.experiment.plan.victims import (
     HARDENED,
     NAIVE,
-    TRAINED,
-    TRAINED_PLAIN,
+    RETRAINED,
     TrainedVictim,
+    TrainingConfig,
     VictimConfig,
     VictimName,
 )
 
-SCENE = "scene"
+SCENE, POLICY = "scene", "policy"
 
 
 class ExperimentConfig(StrictModel):
@@ -68,13 +68,13 @@ class ExperimentConfig(StrictModel):
     capture: CaptureConfig = CaptureConfig()
     scene: SceneConfig = SceneConfig()
     view: ViewConfig = ViewConfig()
+    policy: PolicyConfig = PolicyConfig()  # before the victims, which take it over
     victims: dict[VictimName, VictimConfig] = Field(
         default={},
         description="Which policies are attacked, the main one first: mine: {policy: FILE, package.module:factory or grpc://HOST:PORT}, or "
-        "NAME: {train: {textures: random}}, which the section policy trains. None: hardened and, with policy.naive_steps, naive, trained "
-        "with and without random textures.",
+        "NAME: {train: {architecture: resnet, seed: 1}}, which is trained with these keys over those of the section policy. None: hardened and, "
+        "with policy.naive_steps, naive, trained with and without random textures.",
     )
-    policy: PolicyConfig = PolicyConfig()
     object: ObjectConfig = ObjectConfig()
     attack: AttackConfig = AttackConfig()
     measure: MeasureConfig = MeasureConfig()
@@ -121,10 +121,32 @@ class ExperimentConfig(StrictModel):
         """The attacked policies by name, the main one first, without the retrained one."""
         if self.victims:
             return self.victims
-        trained: dict[str, VictimConfig] = {HARDENED: TRAINED}
-        if self.policy.naive_steps:
-            trained[NAIVE] = TRAINED_PLAIN
-        return trained
+        textures = {HARDENED: "random"} | ({NAIVE: "none"} if self.policy.naive_steps else {})
+        keys = {
+            name: TrainingConfig.keys_over(self.policy, {"textures": each}) for name, each in textures.items()
+        }
+        return {
+            name: TrainedVictim(train=TrainingConfig.model_construct(**each)) for name, each in keys.items()
+        }
+
+    @property
+    def trained(self) -> dict[str, TrainingConfig]:
+        """The victims that are trained here, each with all keys of its training."""
+        return {name: each.train for name, each in self.attacked.items() if isinstance(each, TrainedVictim)}
+
+    def policy_stage(self, victim: str) -> str:
+        """The stage that trains a victim, or that the retrained one begins from: a recipe of its own has a stage of its own."""
+        name = self.main_victim if victim == RETRAINED else victim
+        found = self.trained.get(name)
+        return POLICY if found is None or found.is_of(self.policy) else f"{POLICY}-{name}"
+
+    def training(self, victim: str) -> ExperimentConfig:
+        """The same with the section ``policy`` that trains a victim."""
+        stage = self.policy_stage(victim)
+        if stage == POLICY:
+            return self
+        own = self.trained[stage.removeprefix(f"{POLICY}-")].as_section
+        return self.model_copy(update={"policy": own})
 
     @property
     def cell_paths(self) -> tuple[str, ...]:
@@ -162,9 +184,29 @@ class ExperimentConfig(StrictModel):
         return self.world.get("kind") == SCENE
 
     @property
-    def trains(self) -> bool:
-        """Whether a victim is trained here."""
-        return any(isinstance(each, TrainedVictim) for each in self.attacked.values())
+    def _recipes(self) -> dict[str, PolicyConfig]:
+        """The sections that train victims, by their keys."""
+        return {
+            POLICY if each.is_of(self.policy) else f"victims.{name}.train": each.as_section
+            for name, each in self.trained.items()
+        }
+
+    @field_validator("victims", mode="before")
+    @classmethod
+    def _trained_over_the_section(cls, victims: Any, info: ValidationInfo) -> Any:
+        shared = info.data.get(POLICY)
+        if not isinstance(victims, dict) or shared is None:
+            return victims
+
+        def over(victim: Any) -> Any:
+            own = victim.get("train") if isinstance(victim, dict) else None
+            return (
+                {**victim, "train": TrainingConfig.keys_over(shared, own)}
+                if isinstance(own, dict)
+                else victim
+            )
+
+        return {name: over(each) for name, each in victims.items()}
 
     @model_validator(mode="after")
     def _goes_over_keys(self) -> ExperimentConfig:
@@ -179,7 +221,7 @@ class ExperimentConfig(StrictModel):
     def _follows_the_rules(self) -> ExperimentConfig:
         carrier, objects, retrain = self.carrier, self.objects, self.retrain
         rules.check_names(self.paths, objects)
-        rules.check_victims(self.attacked, self.policy, retrain)
+        rules.check_victims(self.attacked, self.trained, retrain)
         if isinstance(carrier, FaceCarrier):
             empty = "no control empty in over.method (set deploy.empty_scene instead)"
             unwanted = {
@@ -189,14 +231,12 @@ class ExperimentConfig(StrictModel):
             rules.check_face(carrier, self.space, objects, self.deploy, unwanted)
         else:
             rules.check_objects(carrier, objects, self.deploy, retrain is not None)
-        rules.check_training(carrier, self.policy, objects)
+        rules.check_training(carrier, {POLICY: self.policy} | self._recipes, objects)
         if self.own_scene:
             rules.check_own_scene(self.space, objects, self.attack)
         else:
             rules.check_space(self.space, objects, self.attack, self.deploy)
         rules.check_searches(self.methods, self.seeds, self.measure.seed, retrain is not None)
         rules.check_methods(self.methods, self.attack, self.own_scene)
-        rules.check_drives(
-            self.attack, self.policy if self.trains else None, retrain, self.horizon, self.dt_s
-        )
+        rules.check_drives(self.attack, self._recipes, retrain, self.horizon, self.dt_s)
         return self

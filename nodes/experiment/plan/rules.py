@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 
 from advnerf_core.attack.methods import METHODS
 from nodes.experiment.plan.carriers import CarrierConfig, FaceCarrier
@@ -17,7 +18,7 @@ from nodes.experiment.plan.space_config import (
     PlacesConfig,
     SpaceConfig,
 )
-from nodes.experiment.plan.victims import RETRAINED, TRAINED, TRAINED_PLAIN, TrainedVictim, VictimConfig
+from nodes.experiment.plan.victims import RETRAINED, TrainingConfig, VictimConfig
 
 
 def _refuse(wrong: object, text: str) -> None:
@@ -37,25 +38,20 @@ def check_names(paths: Sequence[str], objects: Sequence[WantedObject]) -> None:
 
 
 def check_victims(
-    attacked: Mapping[str, VictimConfig], policy: PolicyConfig, retrain: RetrainConfig | None
+    attacked: Mapping[str, VictimConfig], trained: Mapping[str, TrainingConfig], retrain: RetrainConfig | None
 ) -> None:
     """Raise for victims that cannot be trained, or retrained: the first of ``attacked``."""
     main = next(iter(attacked))
-    trained = {name: each for name, each in attacked.items() if isinstance(each, TrainedVictim)}
     _refuse(
         RETRAINED in attacked,
         f"victims: expected other names than {RETRAINED}, which the section retrain makes, got it",
     )
     _refuse(
-        len({each.train.textures for each in trained.values()}) != len(trained),
+        any(one == other for one, other in combinations(trained.values(), 2)),
         f"victims: expected one victim for each way of training, got {', '.join(trained)}, of which two would be the same policy",
     )
     _refuse(
-        TRAINED_PLAIN in trained.values() and not policy.naive_steps,
-        "expected policy.naive_steps of at least 1 with a victim of train.textures none, got 0",
-    )
-    _refuse(
-        retrain is not None and attacked[main] != TRAINED,
+        retrain is not None and (main not in trained or trained[main].textures != "random"),
         f"expected the first of victims to be trained here with random textures where retrain is, got {main}",
     )
 
@@ -100,19 +96,22 @@ def check_objects(
     )
 
 
-def check_training(carrier: CarrierConfig, policy: PolicyConfig, objects: Sequence[WantedObject]) -> None:
+def check_training(
+    carrier: CarrierConfig, recipes: Mapping[str, PolicyConfig], objects: Sequence[WantedObject]
+) -> None:
     """Raise for frames that victims cannot learn from."""
-    _refuse(
-        carrier.training == "native" and policy.own_car and policy.naive_steps,
-        "expected policy.naive_steps 0 or policy.own_car off with carrier.training native, got "
-        f"{policy.naive_steps} and on: the world shows what was last put on a panel, so that the naive victim would learn from random textures",
-    )
     by_hand = [each.name for each in objects if isinstance(each, PlacedObject)]
-    _refuse(
-        policy.learns_in and (by_hand or not objects or policy.own_car),
-        "expected objects that all stand by a rule (stands), and policy.own_car off, with policy.learns_in; got "
-        f"{', '.join(by_hand) or f'{len(objects)} objects'} placed by hand, own_car {policy.own_car}",
-    )
+    for key, policy in recipes.items():
+        _refuse(
+            carrier.training == "native" and policy.own_car and policy.naive_steps,
+            f"expected {key}.naive_steps 0 or {key}.own_car off with carrier.training native, got "
+            f"{policy.naive_steps} and on: the world shows what was last put on a panel, so that the naive victim would learn from random textures",
+        )
+        _refuse(
+            policy.learns_in and (by_hand or not objects or policy.own_car),
+            f"expected objects that all stand by a rule (stands), and {key}.own_car off, with {key}.learns_in; got "
+            f"{', '.join(by_hand) or f'{len(objects)} objects'} placed by hand, own_car {policy.own_car}",
+        )
 
 
 def check_space(
@@ -205,19 +204,23 @@ def check_searches(methods: Sequence[str], seeds: Sequence[int], measured_seed: 
 
 def check_drives(
     attack: AttackConfig,
-    policy: PolicyConfig | None,
+    recipes: Mapping[str, PolicyConfig],
     retrain: RetrainConfig | None,
     horizon: int,
     dt_s: float,
 ) -> None:
-    """Refuse searched drives that are longer than the measured ones, and drives to learn from that end before the junction; ``policy`` if one learns."""
+    """Refuse searched drives that are longer than the measured ones, and drives to learn from that end before the junction."""
     _refuse(
         attack.horizon is not None and attack.horizon > horizon,
         f"expected attack.horizon to be at most horizon = {horizon} ticks, which are measured, got {attack.horizon}",
     )
     asked = {} if retrain is None else {"retrain.drive_steps": retrain.drive_steps}
-    if policy is not None and policy.learns_from_drives and policy.driven_m is not None:
-        asked["policy.drive_steps"] = policy.drive_steps  # of a closed path every part is passed
+    # Of a closed path every part is passed.
+    asked |= {
+        f"{key}.drive_steps": each.drive_steps
+        for key, each in recipes.items()
+        if each.learns_from_drives and each.driven_m is not None
+    }
     for key, ticks in asked.items():
         _refuse(
             2 * ticks < horizon,

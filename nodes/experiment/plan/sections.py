@@ -163,7 +163,7 @@ class PolicyConfig(StrictModel):
     def _fits_the_architecture(self) -> PolicyConfig:
         if self.architecture == PILOTNET and self.configuration:
             raise ValueError(
-                f"expected no policy.configuration with the architecture pilotnet, got {', '.join(self.configuration)}; set policy.hidden"
+                f"expected no configuration with the architecture pilotnet, got {', '.join(self.configuration)}; set hidden"
             )
         require_architecture(self.architecture, None, self.configuration)
         return self

@@ -5,12 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Discriminator, Field, StringConstraints, Tag, ValidationInfo
+from pydantic import (
+    AfterValidator,
+    Discriminator,
+    Field,
+    StringConstraints,
+    Tag,
+    ValidationInfo,
+    model_validator,
+)
 from pydantic_core import PydanticCustomError
 
 from advnerf_core.places import expanded
 from advnerf_core.policies.load import POLICY_SUFFIXES, is_code
 from advnerf_core.strict import COMPLETE, StrictModel
+from nodes.experiment.plan.sections import Count, PolicyConfig
 
 # Policies that the section policy trains, and the first one's retrained version; a user's victims have other names.
 HARDENED, NAIVE, RETRAINED = "hardened", "naive", "retrained"
@@ -39,18 +48,49 @@ class GivenVictim(StrictModel):
     )
 
 
-class TrainingConfig(StrictModel):
-    """Training of a victim of the section ``policy`` beyond that section."""
+class TrainingConfig(PolicyConfig):
+    """Training of one victim: the keys of the section ``policy``, which gives those that are missing here."""
 
     textures: Literal["random", "none"] = Field(
         default="random", description="Whether it sees objects in random textures while it learns."
     )
+    naive_steps: Count = Field(
+        default=0, description="Optimiser steps with textures none; with random textures 0."
+    )
+
+    @classmethod
+    def keys_over(cls, shared: PolicyConfig, own: dict[str, Any]) -> dict[str, Any]:
+        """All keys of a recipe, of which some are its own. Another architecture does not get the settings of the shared one."""
+        unread = {"naive_steps"} if own.get("textures", "random") == "random" else set()
+        unread |= {"configuration"} if "architecture" in own else set()
+        return {name: value for name, value in dict(shared).items() if name not in unread} | own
+
+    @model_validator(mode="after")
+    def _has_steps_for_its_textures(self) -> TrainingConfig:
+        if (self.textures == "none") != bool(self.naive_steps):
+            wanted = "naive_steps of at least 1, here or in the section policy, with textures none, got 0"
+            if self.naive_steps:
+                wanted = f"textures none with naive_steps, got {self.naive_steps} with textures random"
+            raise PydanticCustomError(COMPLETE, "{text}", {"text": f"expected {wanted}"})
+        return self
+
+    @property
+    def as_section(self) -> PolicyConfig:
+        """The section ``policy`` that trains this victim."""
+        return PolicyConfig.model_validate(self.model_dump(exclude={"textures"}))
+
+    def is_of(self, shared: PolicyConfig) -> bool:
+        """Whether the section ``policy`` trains this victim as it is."""
+        unread = {"naive_steps"} if self.textures == "random" else set()
+        return self.model_dump(exclude={"textures", *unread}) == shared.model_dump(exclude=unread)
 
 
 class TrainedVictim(StrictModel):
-    """A policy that the section ``policy`` trains."""
+    """A policy that is trained here."""
 
-    train: TrainingConfig = Field(description="How; {} for as the section policy says, with random textures.")
+    train: TrainingConfig = Field(
+        description="What differs from the section policy, by its keys, and textures; {} for nothing, with random textures."
+    )
 
 
 def _tag(value: Any) -> str:
@@ -62,5 +102,3 @@ VictimConfig = Annotated[
     Annotated[GivenVictim, Tag("a given policy")] | Annotated[TrainedVictim, Tag("a trained policy")],
     Discriminator(_tag),
 ]
-TRAINED = TrainedVictim(train=TrainingConfig())
-TRAINED_PLAIN = TrainedVictim(train=TrainingConfig(textures="none"))

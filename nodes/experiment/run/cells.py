@@ -12,7 +12,7 @@ from advnerf_core.attack.spaces.space import Space
 from advnerf_core.report.conditions import NONE
 from hardware.worlds.world import World
 from nodes.experiment.engine.artefact import ReferenceBuild
-from nodes.experiment.engine.stages import keep_stages
+from nodes.experiment.engine.stages import Stage, keep_stages
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.space_config import PlacesConfig
 from nodes.experiment.show.context import Experiment
@@ -23,10 +23,10 @@ from nodes.experiment.steps.deploy import Deployer, ThroughNodes, ThroughWorld, 
 from nodes.experiment.steps.films import film_cell, kept_film, with_film
 from nodes.experiment.steps.frozen import check_frozen, freeze
 from nodes.experiment.steps.keys import (
-    NEEDED,
     NoSuchCellError,
     clean_folder,
     require_known,
+    stages_needed,
 )
 from nodes.experiment.steps.pipeline import stages_of
 from nodes.experiment.steps.search_files import ATTACK
@@ -156,13 +156,19 @@ def draw_maps(experiment: Experiment, cell: Cell, number: int, folder: Path, rep
 
 def keep_build(experiment: Experiment, reference: ReferenceBuild) -> list[Path]:
     """Copy scene, objects and policies into a reference build, without files that only their training reads; returns the new folders there."""
-    needed = [stage for stage in stages_of(experiment) if stage.name in NEEDED]
-    return keep_stages(needed, experiment.folder, reference)
+    return keep_stages(_needed_stages(experiment), experiment.folder, reference)
 
 
 def needed_settings(experiment: Experiment) -> dict[str, Any]:
     """Settings of the stages that cells need, by name: two experiments in one run folder must agree on them."""
-    return {stage.name: stage.settings for stage in stages_of(experiment) if stage.name in NEEDED}
+    return {stage.name: stage.settings for stage in _needed_stages(experiment)}
+
+
+def _needed_stages(experiment: Experiment) -> list[Stage]:
+    names = {
+        name for victim in experiment.config.attacked for name in stages_needed(experiment.config, victim)
+    }
+    return [stage for stage in stages_of(experiment) if stage.name in names]
 
 
 def runs_alone(experiment: Experiment) -> bool:

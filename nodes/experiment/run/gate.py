@@ -15,7 +15,7 @@ from nodes.experiment.engine.artefact import digests_in, hash_of, read_current
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps import fidelity
-from nodes.experiment.steps.keys import NEEDED, clean_folder
+from nodes.experiment.steps.keys import clean_folder, stages_needed
 from nodes.lab.policy_data.evaluate import predict
 
 
@@ -66,7 +66,7 @@ def cached_verdict(
     """
     policy, goal = fidelity.policy_of(experiment, cell)
     which = [cell.scenario, cell.victim, *(["drive", cell.seed] if drive else [])]
-    stages = digests_in(experiment.folder, NEEDED)
+    stages = digests_in(experiment.folder, stages_needed(experiment.config, cell.victim))
     key = hash_of([stages, _weights_sha256(policy), limits.model_dump(mode="json"), *which])
     if (kept := read_current(file, key=key)) is not None:
         return Verdict(kept["passed"], tuple(kept["reasons"]), kept["numbers"])

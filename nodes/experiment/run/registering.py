@@ -35,7 +35,7 @@ from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.given import given
 from nodes.experiment.show.victims import look_at_given
 from nodes.experiment.steps.attack import planned_evaluations
-from nodes.experiment.steps.keys import registered_settings
+from nodes.experiment.steps.keys import own_recipes, registered_settings
 from nodes.experiment.steps.verdicts import TRAINED_ON, VALIDATED_ON, unseen
 
 
@@ -95,7 +95,7 @@ def registered_scenario(experiment: Experiment, name: str) -> RegisteredScenario
         name: Name of the path in the experiment.
     """
     config, limits, found = experiment.config, experiment.limits, given(experiment)
-    settings = registered_settings(experiment)
+    settings, own = registered_settings(experiment), own_recipes(config)
     starts = [(float(x), float(y), float(yaw)) for x, y, yaw in experiment.measured_starts(name).tolist()]
     deployed = 0 if config.deploy.through == "nothing" else len(starts[: config.deploy.starts])
     return RegisteredScenario(
@@ -111,7 +111,8 @@ def registered_scenario(experiment: Experiment, name: str) -> RegisteredScenario
         evaluations=planned_evaluations(experiment),
         space=config.space.model_dump(mode="json"),
         victims={
-            **(config.policy.recipe if config.trains else {}),
+            **(config.policy.recipe if len(own) < len(config.trained) else {}),
+            **({"recipes": own} if own else {}),
             **({"policies": {each: policy.sha256 for each, policy in found.items()}} if found else {}),
         },
         drives_well_mean_cte_m=mean_cte_limit_m(limits.off_track_m),

@@ -27,7 +27,7 @@ from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import Bench, run_cell, runs_alone, search_cell
 from nodes.experiment.run.store import LOG, Store
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.steps.keys import NEEDED, cell_settings, settings_hash
+from nodes.experiment.steps.keys import cell_settings, settings_hash, stages_needed
 from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import RuntimeFault
 from nodes.runtime.locks import HeldError, hold
@@ -261,7 +261,7 @@ def _run(
         "settings_hash": job.settings_hash,
         "settings": dict(cell_settings(experiment, job.cell.inside).resolved),
         "registration": job.registration,
-        "stages": digests_in(experiment.folder, NEEDED),
+        "stages": digests_in(experiment.folder, stages_needed(experiment.config, job.cell.victim)),
         "machine": found.get("machine") or machine_name(),
         "date": found.get("date") or datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }

@@ -89,7 +89,7 @@ def victim_spec(experiment: RunFolder[ExperimentConfig], victim: str) -> str:
     if isinstance(wanted, GivenVictim):
         return wanted.policy
     name = "policy" if wanted.train.textures == "random" else "naive"
-    return str(experiment.stage_folder("policy") / f"{name}.safetensors")
+    return str(experiment.stage_folder(experiment.config.policy_stage(victim)) / f"{name}.safetensors")
 
 
 def victim_sha256(experiment: RunFolder[ExperimentConfig], victim: str) -> str:

@@ -12,6 +12,7 @@ from advnerf_core.plugins import PluginError
 from advnerf_core.report.conditions import EMPTY, NONE
 from nodes.experiment.engine.artefact import Settings, digests_in, hash_of
 from nodes.experiment.plan.cell import Cell
+from nodes.experiment.plan.config import POLICY, ExperimentConfig
 from nodes.experiment.plan.sections import NETWORK
 from nodes.experiment.plan.victims import RETRAINED
 from nodes.experiment.show.context import Experiment
@@ -21,8 +22,6 @@ from nodes.experiment.show.spaces import named_objects
 from nodes.experiment.steps import bake
 from nodes.runtime.errors import RuntimeFault
 
-# The stages that cells need; later ones are the cells themselves.
-NEEDED = ("capture", "scene", "policy", "object")
 # Like a stage's version (`pipeline.VERSIONS`): raised when the result of a cell changes with the same settings.
 VERSION = 4  # 4: textures are rounded to half precision before they are driven past
 # Settings that a cell does not depend on: other cells, memory limits, and values that are separate inputs below.
@@ -54,6 +53,11 @@ class NoSuchCellError(RuntimeFault):
     """The experiment has no such cell."""
 
 
+def stages_needed(config: ExperimentConfig, victim: str) -> list[str]:
+    """Stages that the cells of a victim need; later ones are the cells themselves."""
+    return ["capture", "scene", config.policy_stage(victim), "object"]
+
+
 def cell_settings(experiment: Experiment, cell: Cell, deployed: bool = True) -> Settings:
     """Settings that a cell depends on: the resolved world (without a server's address), settings, and the outputs of the earlier stages.
 
@@ -75,16 +79,17 @@ def cell_settings(experiment: Experiment, cell: Cell, deployed: bool = True) -> 
         "seed": cell.seed,
         "code": method_digest(cell.code),
     }
-    stages = list(NEEDED)
+    config = experiment.config.training(cell.victim)
+    stages = stages_needed(experiment.config, cell.victim)
     if cell.searched:
-        inputs["objective"] = objective_key(experiment.config.attack.objective)
+        inputs["objective"] = objective_key(config.attack.objective)
     else:
         free["attack"] = FREE["attack"] | _SEARCHED_WITH
     if cell.victim in given_victims:
         free["policy"] = True
-        stages.remove("policy")
+        stages.remove(POLICY)
     else:
-        inputs["architecture"] = experiment.config.policy.network.described()
+        inputs["architecture"] = config.policy.network.described()
     if cell.victim in (*given_victims, RETRAINED):
         inputs["policy_sha256"] = _policy_sha256(experiment, cell.victim)
     if not deployed:
@@ -96,7 +101,7 @@ def cell_settings(experiment: Experiment, cell: Cell, deployed: bool = True) -> 
         inputs["geometry"] = hash_of([each.sha256 for each in named_objects(experiment)])
     kept = {name: digest for name, digest in experiment.kept.items() if name in stages}
     inputs["stages"] = {**kept, **digests_in(experiment.folder, stages)}
-    return Settings.of(experiment.config, None, free, **inputs, **_common_inputs(experiment, deployed))
+    return Settings.of(config, None, free, **inputs, **_common_inputs(experiment, deployed))
 
 
 def _policy_sha256(experiment: Experiment, victim: str) -> str | None:
@@ -127,7 +132,17 @@ def registered_settings(experiment: Experiment) -> Settings:
         "objective": objective_key(config.attack.objective),
         "architecture": config.policy.network.described(),
     }
-    return Settings.of(config, None, FREE, **code, **_common_inputs(experiment))
+    own = {"recipes": found} if (found := own_recipes(config)) else {}
+    return Settings.of(config, None, FREE, **code, **own, **_common_inputs(experiment))
+
+
+def own_recipes(config: ExperimentConfig) -> dict[str, dict[str, Any]]:
+    """Training settings of the victims with a recipe of their own, as JSON data."""
+    return {
+        name: config.training(name).policy.recipe
+        for name in config.trained
+        if config.policy_stage(name) != POLICY
+    }
 
 
 def settings_hash(experiment: Experiment, cell: Cell) -> str:

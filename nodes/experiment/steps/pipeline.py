@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -12,6 +13,7 @@ from nodes.experiment.engine.stages import Stage
 from nodes.experiment.plan.carriers import ScreenConfig
 from nodes.experiment.plan.object_kinds import files_of, name_of
 from nodes.experiment.plan.sections import NETWORK
+from nodes.experiment.plan.victims import RETRAINED
 from nodes.experiment.show import objects
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.faces import has_face
@@ -67,8 +69,10 @@ def stages_of(experiment: Experiment) -> list[Stage]:
     if config.own_scene:
         return []
     found = [_capture(experiment), _scene(experiment), _bake(experiment), _object(experiment)]
-    if config.trains:
-        found.append(_policy(experiment))
+    by_stage = {config.policy_stage(name): name for name in config.trained}
+    found += [
+        _policy(stage, replace(experiment, config=config.training(name))) for stage, name in by_stage.items()
+    ]
     if config.retrain is not None:
         found.append(_retrain(experiment, config.retrain.rounds))
     if config.deploy.live and (config.deploy.laps or config.deploy.empty_scene):
@@ -87,7 +91,7 @@ def _stage(
     def work(folder: Path, report: MeasuringReport) -> None:
         module.run(experiment, folder, report)
 
-    return Stage(name, work, settings, after, VERSIONS[name], **others)
+    return Stage(name, work, settings, after, VERSIONS[name.partition("-")[0]], **others)
 
 
 def _capture(experiment: Experiment) -> Stage:
@@ -139,7 +143,7 @@ def _learned_from(experiment: Experiment) -> dict[str, Any]:
     }
 
 
-def _policy(experiment: Experiment) -> Stage:
+def _policy(name: str, experiment: Experiment) -> Stage:
     config = experiment.config
     unread: dict[str, Any] = {"policy": NETWORK}
     unread |= dict.fromkeys(("objects", "object"), True) if has_face(experiment) else {"carrier": {"kind"}}
@@ -147,24 +151,23 @@ def _policy(experiment: Experiment) -> Stage:
     if not (isinstance(config.carrier, ScreenConfig) or config.policy.learns_in):
         unread["horizon"] = True
     settings = Settings.of(config, READS["policy"], unread, **_learned_from(experiment))
-    return _stage(
-        "policy", policy, experiment, settings, ("capture", "scene", "object"), bulk=_TRAINING_FILES
-    )
+    return _stage(name, policy, experiment, settings, ("capture", "scene", "object"), bulk=_TRAINING_FILES)
 
 
 def _retrain(experiment: Experiment, rounds: int) -> Stage:
-    attack = experiment.config.attack
+    config = experiment.config.training(RETRAINED)
+    trained_in = experiment.config.policy_stage(RETRAINED)
 
     def settings(count: int) -> Settings:
-        assert experiment.config.retrain is not None
-        fewer = experiment.config.retrain.model_copy(update={"rounds": count})
+        assert config.retrain is not None
+        fewer = config.retrain.model_copy(update={"rounds": count})
         return Settings.of(
-            experiment.config.model_copy(update={"retrain": fewer}),
+            config.model_copy(update={"retrain": fewer}),
             READS["retrain"],
             _UNREAD_BY_RETRAIN,
-            objective=objective_key(attack.objective),
-            attack_seed=experiment.config.seeds[0],
-            **_learned_from(experiment),
+            objective=objective_key(config.attack.objective),
+            attack_seed=config.seeds[0],
+            **_learned_from(replace(experiment, config=config)),
         )
 
     return _stage(
@@ -172,9 +175,9 @@ def _retrain(experiment: Experiment, rounds: int) -> Stage:
         retrain,
         experiment,
         settings(rounds),
-        ("scene", "object", "policy"),
+        ("scene", "object", trained_in),
         resumes_from=[settings(fewer) for fewer in range(1, rounds)],
-        reads_bulk_of=("policy",),
+        reads_bulk_of=(trained_in,),
     )
 
 
@@ -190,4 +193,5 @@ def _live(experiment: Experiment) -> Stage:
         graph=graph,
         victim=victim_sha256(experiment, main) if is_given else main,
     )
-    return _stage("live", live, experiment, settings, ("capture",) if is_given else ("capture", "policy"))
+    after = ("capture",) if is_given else ("capture", config.policy_stage(main))
+    return _stage("live", live, experiment, settings, after)

@@ -96,19 +96,21 @@ def run(experiment: Experiment, folder: Path, report: MeasuringReport) -> None:
         "validation_mae": trained.validation_mae_rad,
         "naive_validation_mae": trained.naive_validation_mae_rad,
         "control_unit": experiment.car.control_unit,
-        "on_held_out_views": agreement(experiment),
+        "on_held_out_views": agreement(experiment, load_policy(trained.path).policy),
     }
     write_json(folder / "policy.json", summary)
 
 
 def _telling(experiment: Experiment, report: MeasuringReport) -> ImitationProgress:
     """Converts progress of the training to progress of the stage, with the error as a curve for each victim."""
-    unit = experiment.car.control_unit
+    unit, config = experiment.car.control_unit, experiment.config
+    names = {"random": HARDENED, "none": NAIVE}
+    names |= {each.textures: name for name, each in config.trained.items() if each.is_of(config.policy)}
 
     def told(fraction: float, text: str, learned: Learned | None = None) -> None:
         point = None
         if learned is not None:
-            victim = NAIVE if learned.naive else HARDENED
+            victim = names["none" if learned.naive else "random"]
             point = Point(f"Error of the {victim} policy [{unit}]", learned.step, learned.error_rad)
         report(0.98 * fraction, text, point)
 
@@ -249,15 +251,9 @@ def _seen_face(experiment: Experiment) -> tuple[FaceSpace, Callable[[Array], Sho
     return space, seen
 
 
-def agreement(experiment: Experiment, policy: Policy | None = None) -> list[dict[str, float]]:
-    """Control of a policy on each held-out view and on the surrogate's image of it, with the first path's goal.
-
-    Args:
-        experiment: Experiment with photographs and a scene.
-        policy: The policy; by default the one trained with random textures.
-    """
+def agreement(experiment: Experiment, policy: Policy) -> list[dict[str, float]]:
+    """Control of a policy on each held-out view and on the surrogate's image of it, with the first path's goal."""
     views = load_transforms(experiment.stage_folder("capture") / capture.HELD_OUT / "transforms.json")
-    policy = policy or load_policy(experiment.stage_folder("policy") / "policy.safetensors").policy
     surrogate = surrogate_of(experiment, [])
     goal = told(experiment, policy, experiment.config.paths[0])
     goals = torch.tensor([goal], dtype=torch.float32) if goal else None

@@ -10,7 +10,7 @@ import hashlib
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ from advnerf_core.policies.policy_file import LoadedPolicy, load_policy
 from hardware.worlds.world import World
 from nodes.experiment.engine.artefact import hash_of
 from nodes.experiment.plan.cell import Cell
+from nodes.experiment.plan.victims import RETRAINED
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import Dressed
 from nodes.experiment.show.drives import deployed_drives
@@ -143,7 +144,8 @@ def _pays(found: Found, ratio: float) -> bool:
 
 
 def _old_frames(experiment: Experiment) -> list[Frames]:
-    store = FrameStore(experiment.stage_folder("policy") / "frames")
+    trained_in = experiment.config.policy_stage(RETRAINED)
+    store = FrameStore(experiment.stage_folder(trained_in) / "frames")
     return [store.load(name) for name in store.names()]
 
 
@@ -263,11 +265,12 @@ def _collect(
     """
     wanted, store = experiment.config.retrain, FrameStore(folder / "frames")
     assert wanted is not None
-    found = plans(experiment, scene, lambda rng: thetas[int(rng.integers(len(thetas)))])
+    learns = replace(experiment, config=experiment.config.training(RETRAINED))
+    found = plans(learns, scene, lambda rng: thetas[int(rng.integers(len(thetas)))])
     chosen = [(plan, wanted.stills, wanted.drives) for plan in found]
     places = random_placements(experiment, wanted.placements, seed=_PLACES_SEED + wanted.seed + len(thetas))
     for number, objects in enumerate(places):
-        moved = plans(experiment, scene, None, objects, f"-moved{number}")
+        moved = plans(learns, scene, None, objects, f"-moved{number}")
         chosen += [(plan, math.ceil(wanted.stills / len(places)), 0) for plan in moved]
     for number, (plan, stills, drives) in enumerate(chosen):
         if plan.source.name not in store.names():

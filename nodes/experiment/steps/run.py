@@ -150,7 +150,7 @@ def _check_undriven(experiment: Experiment, document: Document) -> None:
     config, what = experiment.config, "a learned scene" if experiment.config.own_scene else "photographs"
     refused: list[tuple[tuple[str, ...], bool, str]] = [
         (("deploy", "through"), config.deploy.through != "nothing", "deploy.through nothing"),
-        (("victims",), config.trains, "victims that exist ({policy: ...})"),
+        (("victims",), bool(config.trained), "victims that exist ({policy: ...})"),
         (
             ("objects",),
             experiment.has_rules,
@@ -189,8 +189,8 @@ def make_ready(
     require_own_folder(experiment)
     look_at_given(experiment)
     keep_worlds(experiment.folder, experiment.named_worlds)
-    if experiment.config.trains:
-        experiment.config.policy.network.check()
+    for each in experiment.config.trained.values():
+        each.network.check()
     stages = stages_of(experiment)
     return run_to_end(experiment, stages, _LIBRARIES, until if stages else None, console, reference, watcher)
 
@@ -202,7 +202,8 @@ def prepare_victims(experiment: Experiment) -> None:
     """
     wanted = experiment.config.retrain
     if wanted is None:
-        make_ready(experiment, until="policy" if experiment.config.trains else "object")
+        last = [experiment.config.policy_stage(name) for name in experiment.config.trained][-1:]
+        make_ready(experiment, until=last[0] if last else "object")
         return
     begun = begun_with(stages_of(experiment), experiment.folder, "retrain")
     if begun is not None and Path(victim_spec(experiment, RETRAINED)).exists():

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.documents import read_json
+from nodes.experiment.plan.config import POLICY
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.given import given_in
 from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.policy import agreement
 from nodes.runtime.errors import RuntimeFault
@@ -28,7 +28,7 @@ def require_same_steering(
 ) -> None:
     """Raise for a learned scene in which a victim steers differently from real pictures of the same places.
 
-    Of the victims that are trained here the main one is judged, of existing ones each.
+    Of the victims that the section policy trains as it is the first one is judged, of all others each.
 
     Args:
         experiment: Experiment with scene and victims; it is judged if its key ``gate`` is ``steering``, the default.
@@ -52,14 +52,16 @@ def require_same_steering(
 
 def steering_of_victims(experiment: Experiment) -> dict[str, list[dict[str, float]]]:
     """Control of the victims that `require_same_steering` judges on each held-out view, ``real``, and on the learned scene's image of it, ``surrogate``."""
+    config = experiment.config
+    alike = [name for name in config.trained if config.policy_stage(name) == POLICY]
     found = {
         name: agreement(experiment, load_victim(experiment, name).policy)
-        for name in given_in(experiment.config)
+        for name in config.attacked
+        if name not in alike
     }
-    if experiment.config.trains:
-        kept = read_json(experiment.stage_folder("policy") / "policy.json")
-        trained = next(name for name in experiment.config.attacked if name not in found)
-        found = {trained: kept["on_held_out_views"], **found}
+    if alike:
+        kept = read_json(experiment.stage_folder(POLICY) / "policy.json")
+        found = {alike[0]: kept["on_held_out_views"], **found}
     return found
 
 

@@ -52,7 +52,7 @@ def test_a_users_class_counts_by_its_code_and_not_by_its_place(tmp_path):
             r"a.yaml:1.*architecture: expected an architecture of pilotnet.*did you mean",
         ),
         ("architecture: none.py:Net", "expected a Python file at .*none.py"),
-        ("configuration: {hidden: [1, 2, 3]}", "set policy.hidden"),
+        ("configuration: {hidden: [1, 2, 3]}", "set hidden"),
         (
             "{architecture: resnet, configuration: {depth: 2}}",
             "configuration.depth: expected a setting of resnet",

@@ -34,6 +34,7 @@ def test_what_stages_and_cells_make_is_of_their_versions(tiny_room):
 # What stages ask to know what there is to do: which victims and objects there are. The network is an input of its own.
 _ASKED = {
     "victims",
+    "victims.train",
     "policy.naive_steps",
     "objects",
     "policy.architecture",
