@@ -134,8 +134,8 @@ class Phone:
         """Process of the browser."""
         return int(self._pid_file.read_text())
 
-    def open(self) -> Any:
-        """Open the page, with the one-time code where it asks for one. Returns it."""
+    def open(self, name: str = "") -> Any:
+        """Open the page, with the one-time code and a name where it asks for them. Returns it."""
         door = door_of(self._run_dir)
         self.page = self.context.new_page()
         self.page.on("console", lambda said: self.console.append(f"{said.type}: {said.text}"))
@@ -147,6 +147,7 @@ class Phone:
             door = door_of(self._run_dir, self._code)
             self._code = door["code"]
             self.page.fill("#code", door["code"])
+            self.page.fill("#who", name)
             self.page.click("#enter-form button")
         self.page.wait_for_selector("#main:not([hidden])")
         self.page.wait_for_selector("#picture-1[data-stamp]")

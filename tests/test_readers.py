@@ -27,8 +27,7 @@ WIRE = {
     "nodes/lab/doctor/check.py": 1,  # a probe's answer
     "nodes/lab/doctor/priority.py": 1,  # a child's answer
     "nodes/lab/doctor/probes.py": 1,  # a probe's arguments
-    "nodes/operator_page/responses.py": 1,  # a request of the page
-    "nodes/operator_page/said.py": 1,  # messages of the page
+    "nodes/operator_page/said.py": 2,  # messages of the page
     "benchmarks/adjoint_memory.py": 1,  # output of a child
     "benchmarks/bag_kill.py": 2,
     "benchmarks/baked_scene.py": 2,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, field
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,7 @@ _LATENCIES = 50
 _LIVE_NS = 60 * NS_PER_S
 _PATH_POINTS = 241
 _SILENT_S = 1.5
+_SLOW_SILENT_S = 5.0  # for topics of 1 Hz
 _LEVELS = {0: "ok", 1: "warning", 2: "error", 3: "stale"}
 
 
@@ -128,14 +130,14 @@ class ViewState:
             "car": self._car(now),
             "steering": self._steering(now),
             "attack": self._attack(now),
-            "search": self._search(),
+            "search": self._search(now),
             "nodes": [self._node(name, now) for name in self.nodes],
             "latency": {
                 "motor_ms": self._while_fresh(SENT, self._latency_ms, now),
                 "page_ms": _median(self._shown_ms),
             },
             "motor": self._motor(now),
-            "rows": self._rows(),
+            "rows": self._rows(now),
         }
 
     def _while_fresh(self, topic: str, values: deque[float], now: Now) -> float | None:
@@ -220,8 +222,8 @@ class ViewState:
             "age_s": age_s,
         }
 
-    def _search(self) -> str:
-        progress = self._message(PROGRESS)
+    def _search(self, now: Now) -> str:
+        progress = self._slow_message(PROGRESS, now)
         if progress is None or progress.state in ("idle", ""):
             return ""
         return f"{progress.request_id}: {progress.state} {progress.evaluation}/{progress.evaluations}"
@@ -250,8 +252,13 @@ class ViewState:
             "age_s": self._age_s(SENT, now),
         }
 
-    def _rows(self) -> list[dict[str, Any]]:
-        message = self._message(DIAGNOSTICS)
+    def _slow_message(self, topic: str, now: Now) -> Any:
+        """Newest message of a topic of 1 Hz; None once its sender is silent."""
+        age_s = self._age_s(topic, now)
+        return self._message(topic) if age_s is not None and age_s < _SLOW_SILENT_S else None
+
+    def _rows(self, now: Now) -> list[dict[str, Any]]:
+        message = self._slow_message(DIAGNOSTICS, now)
         if message is None:
             return []
         return [
@@ -275,7 +282,8 @@ def _finite(value: Any, digits: int = 4) -> float | None:
 
 
 def _median(values: deque[float]) -> float | None:
-    return round(float(np.median(values)), 1) if values else None
+    # NumPy's median imports a module at its first call, which a page without free descriptors cannot.
+    return round(median(values), 1) if values else None
 
 
 def _rounded(points: Any) -> list[list[float]]:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from nodes.operator_page.pictures import Picture
-from nodes.operator_page.said import STOPS, Act, Hold, PictureSeen, Stop, Wants, read_said
+from nodes.operator_page.said import STOPS, Act, Hold, PictureSeen, Stop, Take, Wants, read_said
 from nodes.runtime.errors import MessageError, SecurityError
 
 _CREDIT = 2
@@ -46,6 +46,7 @@ class ClientAct:
         frame_ns: Capture stamp of the newest picture on its screen [ns]; 0 without one.
         picture_ns: When the node received that picture, monotonic [ns]; 0 without one.
         session: Public name of the browser's session.
+        name: Name of the person of that session.
     """
 
     client: int
@@ -54,6 +55,7 @@ class ClientAct:
     frame_ns: int
     picture_ns: int
     session: str = ""
+    name: str = ""
 
 
 @dataclass(frozen=True)
@@ -93,10 +95,12 @@ class Client:
         number: Number of the connection.
         address: Address of the browser.
         session: Public name of the browser's session.
+        name: Name of its person. Taking control gives a new one.
     """
 
-    def __init__(self, number: int, address: str, socket: Socket, session: str = "") -> None:
+    def __init__(self, number: int, address: str, socket: Socket, session: str = "", name: str = "") -> None:
         self.number, self.address, self._socket, self.session = number, address, socket, session
+        self.name = name
         self.key = secrets.token_hex(16)
         self.wants: frozenset[int] = frozenset()
         self.malformed = 0
@@ -203,9 +207,10 @@ class Client:
     def _asked(self, act: Act) -> ClientAct:
         frame_ns = int(act.frame)
         received_ns = self._sent.get(frame_ns, 0)
-        return ClientAct(
-            self.number, self.address, act, frame_ns if received_ns else 0, received_ns, self.session
-        )
+        if isinstance(act, Take):
+            self.name = act.name
+        seen_ns = frame_ns if received_ns else 0
+        return ClientAct(self.number, self.address, act, seen_ns, received_ns, self.session, self.name)
 
 
 def _is_stop(data: str | bytes) -> bool:

@@ -39,6 +39,13 @@ class _Guesser:
 
 
 @dataclass
+class _Session:
+    address: str
+    since_ns: int
+    name: str
+
+
+@dataclass
 class Sessions:
     """Gives out codes and sessions.
 
@@ -55,7 +62,8 @@ class Sessions:
     _code_ns: int = 0
     _turn_ns: int = 0
     _guessers: dict[str, _Guesser] = field(default_factory=dict)
-    _sessions: dict[str, tuple[str, int]] = field(default_factory=dict)
+    _sessions: dict[str, _Session] = field(default_factory=dict)
+    _admitted: int = 0
 
     def renew(self, mono_ns: int) -> bool:
         """Make a new code if the current one is missing or has expired. Returns whether it is new."""
@@ -78,10 +86,10 @@ class Sessions:
         self._guesser(address).free_ns = self._turn_ns
         return (self._turn_ns - mono_ns) / NS_PER_S
 
-    def enter(self, code: str, address: str, mono_ns: int) -> str:
+    def enter(self, code: str, address: str, mono_ns: int, name: str = "") -> str:
         """Exchange a code for a session. Returns its token; empty if the code is wrong, used or expired.
 
-        A code is valid once. Wrong codes make their address wait, and do not void the code.
+        A code is valid once. Wrong codes make their address wait, and do not void the code. The name is that of the person.
         """
         given = code.strip().upper().replace("-", "").replace(" ", "").encode()
         fresh = bool(self.code) and mono_ns - self._code_ns <= self.code_s * NS_PER_S
@@ -96,15 +104,26 @@ class Sessions:
             return ""
         self._guessers.pop(_network(address), None)
         self.code = ""
-        return self.admit(address, mono_ns)
+        return self.admit(address, mono_ns, name)
 
-    def admit(self, address: str, mono_ns: int) -> str:
-        """Make a session for an address and return its token."""
+    def admit(self, address: str, mono_ns: int, name: str = "") -> str:
+        """Make a session for an address and return its token. Without a name of its person, the session is a numbered watcher."""
         while len(self._sessions) >= _SESSIONS:
             self._sessions.pop(next(iter(self._sessions)))
         token = secrets.token_hex(32)
-        self._sessions[token] = (address, mono_ns)
+        self._admitted += 1
+        self._sessions[token] = _Session(address, mono_ns, name or f"watcher {self._admitted}")
         return token
+
+    def name(self, token: str) -> str:
+        """Name of the person of a session; empty for an unknown token."""
+        session = self._sessions.get(token)
+        return session.name if session else ""
+
+    def rename(self, token: str, name: str) -> None:
+        """Note the name that the person of a session gave."""
+        if session := self._sessions.get(token):
+            session.name = name
 
     def _guesser(self, address: str) -> _Guesser:
         network = _network(address)
@@ -119,8 +138,7 @@ class Sessions:
         found = self._sessions.get(token)
         if found is None:
             return False
-        known_address, since_ns = found
-        return known_address == address and mono_ns - since_ns <= _SESSION_S * NS_PER_S
+        return found.address == address and mono_ns - found.since_ns <= _SESSION_S * NS_PER_S
 
 
 def _network(address: str) -> str:

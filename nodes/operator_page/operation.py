@@ -27,12 +27,7 @@ from nodes.runtime.requests import ESTOP_LATCHED
 from nodes.runtime.transfer import FileSender, chunk_messages
 from nodes.runtime.wire import MessageInfo
 
-ACT, RESET, SWITCH, FILE = (
-    "/operator/act",
-    "/twin/reset",
-    "/attack/switch",
-    "/attack/file",
-)
+ACT, RESET, SWITCH, FILE = "/operator/act", "/twin/reset", "/attack/switch", "/attack/file"
 _TELEOP_NS = NS_PER_S // 20
 _SWITCH_NS = NS_PER_S // 2
 # The e-stop's release and the request to re-arm travel on different topics, so the request waits.
@@ -42,6 +37,7 @@ _TAKEN_S = 8.0
 _FILE_ROUNDS = 3
 _IDLE, _AUTONOMY = "idle", "autonomy"
 _ONLY_WATCHES = "this page only watches"
+_RECORDING = "this page shows a recording, which has no car to stop"
 
 
 @dataclass
@@ -87,18 +83,20 @@ class Operation:
         self._rearm_ns: int | None = None
         self._refused_press = (0, 0)
         self._why_ended = ""
-        self._knows_latch = False
+        self._knows_latch = self._was_armed = False
         self.done = self.refused = 0
 
     def obey(self, asked: ClientAct, now: Now) -> list[Out]:
         """Decide an act, log it, and answer it."""
         act = asked.act
         if isinstance(act, Stop):
-            return [*self._stop(asked, act, now), *self._note(asked, act.t, "", "", now)]
+            refusal = "" if self._parts.operates or self._parts.launched.known else _RECORDING
+            outs = [] if refusal else self._stop(asked, act, now)
+            return [*outs, *self._note(asked, act.t, "", refusal, now)]
         if isinstance(act, Hold):
             return self._hold(asked, act, now)
         name, detail = act.t, ""
-        outs: list[Out] = []
+        outs = []
         if not self._parts.operates:
             refusal = _ONLY_WATCHES
         elif not isinstance(act, Take) and (found := self._parts.desk.refusal(asked.client)):
@@ -147,6 +145,7 @@ class Operation:
             self._rearm_ns = None
             self._asker.arm(now, "e-stop reset on the page")
         parts.recording.check()
+        outs += self._arming(now)
         return [*outs, *self._teleop(now), *self._asker.tick(now), *self._attack(now)]
 
     def state(self, now: Now) -> dict[str, Any]:
@@ -187,7 +186,7 @@ class Operation:
             else _ONLY_WATCHES
         )
         if refusal and was_held and not desk.held:
-            return self._ended(refusal, self._name(asked.client), now)
+            return self._ended(refusal, self._name(asked), now)
         if refusal:
             if (asked.client, act.press) == self._refused_press:
                 return []
@@ -208,7 +207,7 @@ class Operation:
             parts.desk.release(asked.client, act.press)
             return "", "", self._teleop(now)
         if isinstance(act, ChooseAttack):
-            return self._choose(act.id, asked.client, now), act.id, []
+            return self._choose(act.id, asked, now), act.id, []
         if isinstance(act, Label):
             return self._label_refusal(now), act.text, []
         do = {
@@ -231,7 +230,7 @@ class Operation:
         """Stop the car. Every admitted browser may do so; no rule of the desk applies. The e-stop stays latched."""
         self._parts.desk.acted(asked.client, now.mono_ns)
         self._rearm_ns = None
-        name = self._name(asked.client)
+        name = self._name(asked)
         if not self._parts.operates:
             return [self._asker.disarm(now, f"{act.t} on a page that watches, by {name}")]
         if act.t == "estop":
@@ -272,7 +271,7 @@ class Operation:
             return self._ended(why, lease.name if lease else "", now)
         return []
 
-    def _choose(self, attack_id: str, client: int, now: Now) -> str:
+    def _choose(self, attack_id: str, asked: ClientAct, now: Now) -> str:
         entry = self._parts.catalogue.get(attack_id)
         if entry is None:
             return f"no attack {attack_id} among the {len(self._parts.catalogue)} of this page"
@@ -282,15 +281,15 @@ class Operation:
             return f"cannot read {entry.file.name}: {error}"
         self._sender = FileSender(chunks, _FILE_ROUNDS, NS_PER_S)
         self._chosen, self._chosen_ns = attack_id, now.mono_ns
-        self._switch(True, client)
+        self._switch(True, asked)
         return ""
 
     def _attack_off(self, asked: ClientAct, now: Now) -> tuple[str, list[Out]]:
-        self._switch(False, asked.client)
+        self._switch(False, asked)
         return "", self._attack(now)
 
-    def _switch(self, show: bool, client: int) -> None:
-        self._show, self._switched_by, self._switched_ns = show, self._name(client), 0
+    def _switch(self, show: bool, asked: ClientAct) -> None:
+        self._show, self._switched_by, self._switched_ns = show, self._name(asked), 0
 
     def _record(self, asked: ClientAct, now: Now) -> tuple[str, list[Out]]:
         return self._parts.recording.start(), []
@@ -312,26 +311,28 @@ class Operation:
         if lease := self._parts.desk.lease:
             # Late answers to this press are not logged as separate acts.
             self._refused_press = (lease.client, self._parts.desk.last_press)
-        outs = self._teleop(now)
-        self._parts.diary.note(now, name, "", "let_go", why, 0, "")
-        return [*outs, self._act_out(now, name, "", "let_go", why, 0, "")]
+        return [*self._teleop(now), self._log(now, name, "let_go", why)]
+
+    def _arming(self, now: Now) -> list[Out]:
+        """Log who armed the car: the person whose held button the safety node has accepted."""
+        lease, was_armed = self._parts.desk.lease, self._was_armed
+        self._was_armed = self._parts.board.armed
+        if was_armed or not self._was_armed or lease is None or not self._parts.desk.held:
+            return []
+        return [self._log(now, lease.name, "armed", "")]
 
     def _note(self, asked: ClientAct, act: str, detail: str, refusal: str, now: Now) -> list[Out]:
-        name = self._name(asked.client)
-        if act == "take" and refusal:
-            name = detail
         self.done += not refusal
         self.refused += bool(refusal)
-        self._parts.diary.note(now, name, asked.address, act, detail, asked.frame_ns, refusal)
+        out = self._log(now, self._name(asked), act, detail, asked, refusal)
         self._answer(asked.client, {"t": "answer", "act": act, "n": asked.act.n, "refused": refusal})
-        if not self._parts.operates:
-            return []
-        return [self._act_out(now, name, asked.address, act, detail, asked.frame_ns, refusal)]
+        return [out] if self._parts.operates else []
 
-    @staticmethod
-    def _act_out(
-        now: Now, name: str, address: str, act: str, detail: str, frame_ns: int, refusal: str
+    def _log(
+        self, now: Now, name: str, act: str, detail: str, asked: ClientAct | None = None, refusal: str = ""
     ) -> Out:
+        address, frame_ns = (asked.address, asked.frame_ns) if asked else ("", 0)
+        self._parts.diary.note(now, name, address, act, detail, frame_ns, refusal)
         message = types.OperatorAct(
             header=header(now.real_ns),
             operator=name,
@@ -388,6 +389,6 @@ class Operation:
         )
         return f"not taken over: {said or 'no compositor or monitor node reports'}"
 
-    def _name(self, client: int) -> str:
+    def _name(self, asked: ClientAct) -> str:
         lease = self._parts.desk.lease
-        return lease.name if lease is not None and lease.client == client else f"watcher {client}"
+        return lease.name if lease is not None and lease.client == asked.client else asked.name

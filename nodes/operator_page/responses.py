@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from importlib.resources import files
 from typing import Any
 
 from advnerf_core.report.palette import look_css
 from nodes.operator_page.doors import host_is_ours
+from nodes.operator_page.said import LONGEST_BYTES
 
 _TYPES = {
     ".html": "text/html; charset=utf-8",
@@ -72,18 +72,14 @@ async def _refuse(scope: Any, send: Any) -> None:
     await send({"type": "http.response.body", "body": b"this computer has no such name\n"})
 
 
-async def code_in(request: Any) -> str:
-    """Read the code in a small JSON body; empty without one."""
+async def body_of(request: Any) -> bytes:
+    """Read a small body; of a larger one, a beginning that is longer than any small one."""
     body = b""
     async for part in request.stream():
         body += part
-        if len(body) > 256:
-            return ""
-    try:
-        code = json.loads(body)["code"]
-    except (ValueError, KeyError, TypeError, RecursionError):
-        return ""
-    return code if isinstance(code, str) and code.isascii() and len(code) <= 64 else ""
+        if len(body) > LONGEST_BYTES:
+            break
+    return body
 
 
 def web_file(name: str, package: str = "nodes.operator_page") -> Any:

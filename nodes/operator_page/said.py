@@ -17,12 +17,13 @@ from advnerf_core.strict import StrictModel
 from nodes.runtime.errors import MessageError
 
 LONGEST_BYTES = 2048
+# No control characters, and none that reverse the text after them: a line of the log shows what was typed, in its order.
+_PRINTED = r"^[^\p{Cc}\p{Zl}\p{Zp}\u{061c}\u{200e}\u{200f}\u{202a}-\u{202e}\u{2066}-\u{2069}]+$"
 _Name = Annotated[
-    str, StringConstraints(strip_whitespace=True, min_length=1, max_length=40, pattern=r"^[^\x00-\x1f\x7f]+$")
+    str, StringConstraints(strip_whitespace=True, min_length=1, max_length=40, pattern=_PRINTED)
 ]
 _Text = Annotated[
-    str,
-    StringConstraints(strip_whitespace=True, min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]+$"),
+    str, StringConstraints(strip_whitespace=True, min_length=1, max_length=200, pattern=_PRINTED)
 ]
 _Count = Annotated[int, Field(ge=0, lt=2**53, strict=True)]
 # A capture stamp in nanoseconds needs more digits than a number of JavaScript has, so it is sent as text.
@@ -40,6 +41,13 @@ def _stamp_or_zero(value: Any) -> str:
     return (
         value if isinstance(value, str) and value.isascii() and value.isdigit() and len(value) < 20 else "0"
     )
+
+
+class Entry(StrictModel):
+    """The one-time code, and the name of the person who enters it; empty for none."""
+
+    code: Annotated[str, StringConstraints(max_length=64, pattern=r"^[\x00-\x7f]+$")]
+    name: _Name | Literal[""] = ""
 
 
 class PictureSeen(StrictModel):
@@ -136,3 +144,13 @@ def read_said(data: str | bytes) -> Said:
         first = error.errors(include_url=False, include_input=False)[0]
         where = ".".join(map(str, first["loc"])) or "the message"
         raise MessageError(f"expected a message of the page: {where}: {first['msg']}") from None
+
+
+def read_entry(data: bytes) -> Entry | None:
+    """Read what a browser sends to get a session; None for anything else."""
+    if len(data) > LONGEST_BYTES:
+        return None
+    try:
+        return Entry.model_validate_json(data)
+    except ValidationError:
+        return None

@@ -23,8 +23,8 @@ from nodes.operator_page.client import Client, ClientAct, Gone, Misuse
 from nodes.operator_page.doors import COOKIE, Sessions, origin_is_ours, peer_is_same_user
 from nodes.operator_page.listening import bound_socket, require_packages
 from nodes.operator_page.pictures import Picture
-from nodes.operator_page.responses import Guard, code_in, web_file
-from nodes.operator_page.said import LONGEST_BYTES, STOPS, Stop
+from nodes.operator_page.responses import Guard, body_of, web_file
+from nodes.operator_page.said import LONGEST_BYTES, STOPS, Stop, Take, read_entry
 from nodes.runtime.errors import BusError
 from nodes.runtime.inbox import Inbox
 
@@ -245,12 +245,15 @@ class PageServer:
         """Exchange the one-time code for a session."""
         from starlette.responses import JSONResponse
 
-        code = await code_in(request)
+        entry = read_entry(await body_of(request))
         ours = origin_is_ours(
             request.headers.get("origin"), request.headers.get("host", ""), self.tls is not None
         )
         token, host = "", request.client.host
-        if ours and code:
+        if entry is None:
+            self.counts.refused += 1
+            return JSONResponse({"open": False}, status_code=400)
+        if ours:
             with self._door_lock:
                 wait_s = self.doors.wait_s(host, time.monotonic_ns())
                 turn_s = 0.0 if wait_s else self.doors.turn_s(host, time.monotonic_ns())
@@ -260,7 +263,7 @@ class PageServer:
                 return JSONResponse({"open": False, "wait_s": math.ceil(wait_s)}, 429, headers)
             await asyncio.sleep(turn_s)
             with self._door_lock:
-                token = self.doors.enter(code, host, time.monotonic_ns())
+                token = self.doors.enter(entry.code, host, time.monotonic_ns(), entry.name)
         if not token:
             self.counts.refused += 1
             await asyncio.sleep(_WRONG_CODE_S)
@@ -279,9 +282,8 @@ class PageServer:
             self.counts.refused += 1
             return JSONResponse({"confirmed": False}, status_code=403)
         before, _ = self.stops()
-        self.inbox.put(
-            ClientAct(0, request.client.host, Stop(t=kind), 0, 0, self._public(request)), urgent=True
-        )
+        session, name = self._public(request), self._name(request)
+        self.inbox.put(ClientAct(0, request.client.host, Stop(t=kind), 0, 0, session, name), urgent=True)
         deadline = time.monotonic() + _CONFIRM_S
         while not before < self.stops()[1] and time.monotonic() < deadline:
             await asyncio.sleep(_LOOK_S)
@@ -309,7 +311,7 @@ class PageServer:
         await websocket.accept()
         self._numbers += 1
         session = self._public(websocket)
-        client = Client(self._numbers, websocket.client.host, websocket, session)
+        client = Client(self._numbers, websocket.client.host, websocket, session, self._name(websocket))
         self._clients[client.number] = client
         client.answer(
             {"t": "welcome", "client": client.number, "session": session, "key": client.key, **self.welcome()}
@@ -341,12 +343,20 @@ class PageServer:
                 return
             finally:
                 self.counts.malformed += client.malformed - before
+            if asked is not None and isinstance(asked.act, Take):
+                with self._door_lock:
+                    self.doors.rename(websocket.cookies[self._cookie], asked.name)
             if asked is not None:
                 self.inbox.put(asked, urgent=isinstance(asked.act, Stop))
 
     def _public(self, connection: Any) -> str:
         """Public name of a session."""
         return hashlib.sha256(connection.cookies[self._cookie].encode()).hexdigest()[:12]
+
+    def _name(self, connection: Any) -> str:
+        """Name of the person of a session."""
+        with self._door_lock:
+            return self.doors.name(connection.cookies[self._cookie])
 
     def _admitted(self, connection: Any) -> bool:
         token = connection.cookies.get(self._cookie, "")

@@ -34,7 +34,7 @@ class Car(threading.Thread):
         super().__init__(daemon=True)
         self.folder, self.stopping = folder, False
         self.newest, self.acts, self.moves, self.heard = {}, [], [], {}
-        self.pictures = self.motor = True
+        self.pictures = self.motor = self.compositor = True
 
     def run(self):
         heard = (
@@ -75,7 +75,7 @@ class Car(threading.Thread):
             bus.publish("/motor/sent", motor_sent(self.moves[-1][1], now_ns))
         if tick % 5 == 0 and self.pictures:
             rgb = np.full((188, 336, 3), tick % 255, np.uint8)
-            for topic in ("/camera/image_raw", "/compositor/image"):
+            for topic in ("/camera/image_raw", *(["/compositor/image"] if self.compositor else ())):
                 bus.publish(topic, image_message(rgb, now_ns, "camera"))
 
     @property

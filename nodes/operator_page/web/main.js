@@ -2,19 +2,19 @@
 
 import { HoldButton } from "./hold.js";
 import { Link } from "./link.js";
-import { showAttacks, showState, text } from "./panels.js";
+import { EFFECTS, Messages, OBSTACLES, factsOf } from "./messages.js";
+import { allow, showAttacks, showState, text } from "./panels.js";
 import { CHANNELS, Pictures } from "./pictures.js";
 import { PlaceMap, SteeringPlot } from "./plots.js";
 import { wordsOf } from "./words.js";
 
 const element = (id) => document.getElementById(id);
 const DRAW_MS = 100;
-const SAID_MS = 10000; // an answer about the past does not stay under what is shown now
-const saidMs = new Map();
 
 let welcome = null;
 let state = null;
 let heldPress = 0; // the press that the node has confirmed
+const messages = new Messages();
 const pictures = new Pictures((channel, stamp) => link.tell({ t: "seen", c: channel, s: stamp }));
 const map = new PlaceMap(element("map"));
 const plot = new SteeringPlot(element("steering"));
@@ -28,20 +28,6 @@ const link = new Link({
 });
 const hold = new HoldButton(element("hold"), link, showHold);
 
-/** Say something that is true for a moment. */
-function say(id, value) {
-  text(id, value);
-  saidMs.set(id, performance.now());
-}
-
-function forgetOldAnswers() {
-  for (const [id, since] of saidMs) {
-    if (performance.now() - since < SAID_MS) continue;
-    text(id, "");
-    saidMs.delete(id);
-  }
-}
-
 function opened() {
   pictures.reset();
   element("enter").hidden = true;
@@ -53,7 +39,8 @@ function closed() {
   hold.release();
   state = null;
   heldPress = 0;
-  element("hold").disabled = true;
+  messages.clear();
+  allow(false); // only a stop also goes without a connection
   text("armed", "no connection");
   element("armed").classList.remove("armed");
   document.body.classList.remove("stopped");
@@ -74,7 +61,7 @@ function hear(message) {
   else if (message.t === "state") update(message);
   else if (message.t === "answer") answer(message);
   else if (message.t === "welcome") begin(message);
-  else if (message.t === "refused") say("answer", `Refused: ${message.text}`);
+  else if (message.t === "refused") messages.say("answer", `Refused: ${message.text}`);
 }
 
 function begin(message) {
@@ -82,6 +69,7 @@ function begin(message) {
   map.set(message);
   element("policy-figure").hidden = !message.policy_view;
   document.body.classList.toggle("watch", !message.operates);
+  document.body.classList.toggle("still", !message.stops); // a recording has no car
   showAttacks(message.attacks, (id) => link.act("attack", { id }));
   link.tell({ t: "wants", c: CHANNELS.filter((channel) => channel !== 2 || message.policy_view) });
 }
@@ -92,11 +80,12 @@ function update(message) {
   map.move(message.car);
   plot.add(message.steering);
   showState(message, me());
+  messages.look(factsOf(message, me().mine, pictures.old));
   showHold();
 }
 
 function me() {
-  return { operates: welcome.operates, stops: welcome.stops, session: welcome.session, mine: Boolean(state.lease) && state.lease.client === welcome.client };
+  return { operates: welcome.operates, session: welcome.session, mine: Boolean(state.lease) && state.lease.client === welcome.client };
 }
 
 /** Say what the button does now, and stop holding when the node has ended the hold. */
@@ -107,7 +96,7 @@ function showHold() {
   if (!state) return;
   if (held && heldPress === hold.press && state.press !== hold.press) {
     hold.release();
-    say("hold-answer", `Released: ${state.ended}. Hold the button again.`);
+    messages.say("hold-answer", `Released: ${state.ended}. Hold the button again.`, OBSTACLES.hold);
   }
   heldPress = hold.held && state.press === hold.press ? hold.press : 0;
   const armed = state.safety?.armed;
@@ -118,18 +107,19 @@ function answer(message) {
   const words = wordsOf(message.act);
   if (message.act === "hold") {
     if (message.refused) hold.release();
-    say("hold-answer", message.refused ? `Not held: ${message.refused}.` : "");
+    messages.say("hold-answer", message.refused ? `Not held: ${message.refused}.` : "", OBSTACLES.hold);
     return;
   }
   if (message.act === "release") return;
   // The node starts a recorder, and says when it records.
   const done = message.act === "record" ? "Asked to start recording." : `Done: ${words}.`;
-  say("answer", message.refused ? `Not done: ${words}: ${message.refused}.` : done);
+  const causes = (message.refused ? OBSTACLES : EFFECTS)[message.act];
+  messages.say("answer", message.refused ? `Not done: ${words}: ${message.refused}.` : done, causes);
 }
 
 function drawPlots() {
   pictures.showAges();
-  forgetOldAnswers();
+  messages.age();
   if (!document.hidden && welcome) {
     map.draw();
     plot.draw();
@@ -164,18 +154,20 @@ window.addEventListener("keydown", (event) => {
 });
 element("enter-form").addEventListener("submit", async (event) => {
   event.preventDefault();
-  const code = element("code").value;
+  const [code, name] = [element("code").value, element("who").value.trim()];
   text("enter-answer", "");
   let wrong = "This code is wrong, was used, or has expired. Run advnerf car page on the robot for a new one.";
   try {
     const response = await fetch("/enter", {
-      method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify({ code }),
+      method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify({ code, name }),
     });
     if (response.ok) {
       element("code").value = "";
+      element("name").value = name;
       link.connect();
       return;
     }
+    if (response.status === 400) wrong = "This is no code, or the name has characters that cannot be printed.";
     if (response.status === 429) wrong = `Too many wrong codes. Try again in ${(await response.json()).wait_s} s.`;
   } catch {
     text("enter-answer", "No answer from the robot.");
@@ -183,6 +175,8 @@ element("enter-form").addEventListener("submit", async (event) => {
   }
   text("enter-answer", wrong);
 });
+
+element("enter-form").addEventListener("input", () => text("enter-answer", ""));
 
 // What sticks below the header, and what is scrolled to, must know how high it is.
 new ResizeObserver(([entry]) => {

@@ -1,6 +1,6 @@
 // The texts of the page, from the state that the node sends.
 
-import { wordsOf } from "./words.js";
+import { sentenceOf } from "./words.js";
 
 const element = (id) => document.getElementById(id);
 const SILENT_S = 1.5;
@@ -137,8 +137,7 @@ function showActs(acts) {
   const list = element("acts");
   const rows = acts.map((act) => {
     const time = new Date(act.real_ms).toLocaleTimeString();
-    const refused = act.refused ? ` (refused: ${act.refused})` : "";
-    return `${time} ${act.operator || "-"}: ${wordsOf(act.act)} ${act.detail}${refused}`;
+    return `${time} ${sentenceOf(act)}`;
   });
   while (list.children.length > rows.length) list.lastElementChild.remove();
   rows.forEach((row, index) => {
@@ -147,7 +146,7 @@ function showActs(acts) {
   });
 }
 
-function showLease({ lease, viewers, estop }, { operates, stops, mine, session }) {
+function showLease({ lease, viewers, estop }, { operates, mine, session }) {
   const others = `${viewers} ${viewers === 1 ? "page is" : "pages are"} open.`;
   if (!operates) text("lease", `This page only watches. ${others}`);
   else if (mine) text("lease", `You operate as ${lease.name}. ${others}`);
@@ -158,9 +157,13 @@ function showLease({ lease, viewers, estop }, { operates, stops, mine, session }
   show("reset_estop", operates && estop);
   element("estop").classList.toggle("latched", estop);
   text("estop", estop ? "Stopped" : "Emergency stop");
-  for (const id of ["hold", "reset_estop", "trial", "trial_end", "attack_off", "record", "record_stop"]) element(id).disabled = !mine || (estop && (id === "hold" || id === "trial"));
-  for (const id of ["estop", "disarm"]) element(id).disabled = !stops;
-  for (const button of document.querySelectorAll("#attacks button, #label-form button")) button.disabled = !mine;
+  allow(mine, estop);
+}
+
+/** Disable what cannot be done now. The stops are never disabled. */
+export function allow(mine, estop = false) {
+  const acts = "#hold, #reset_estop, #trial, #trial_end, #attack_off, #record, #record_stop, #attacks button, #label-form button";
+  for (const button of document.querySelectorAll(acts)) button.disabled = !mine || (estop && ["hold", "trial"].includes(button.id));
 }
 
 export function showAttacks(attacks, onChoose) {

@@ -39,6 +39,11 @@ export class Pictures {
     return String(this.#stamp);
   }
 
+  /** Whether no picture on the screen shows what the car sees. */
+  get old() {
+    return this.canvases.every((canvas, channel) => !this.#drawn.has(channel) || canvas.classList.contains("old"));
+  }
+
   /** Forget what was shown on an earlier connection. */
   reset() {
     this.#stamp = 0n;
@@ -83,6 +88,7 @@ export class Pictures {
       canvas.getContext("2d").drawImage(bitmap, 0, 0);
       bitmap.close();
       canvas.dataset.stamp = String(stamp);
+      canvas.closest("figure").classList.add("seen");
       if (stamp > this.#stamp) this.#stamp = stamp;
       const age = this.#clockMs === null ? 0 : Math.max(0, Date.now() - this.#clockMs - Number(stamp / 1000000n));
       this.#drawn.set(channel, { drawnMs: performance.now(), ageMs: age < LIVE_MS ? age : null });

@@ -5,7 +5,6 @@ const WORDS = {
   leave: "give control back",
   hold: "hold to drive",
   release: "let go of the button",
-  let_go: "button let go",
   estop: "emergency stop",
   reset_estop: "release the emergency stop",
   disarm: "disarm",
@@ -17,5 +16,30 @@ const WORDS = {
   record_stop: "stop recording",
   label: "label",
 };
+// The same as a sentence of the log, after the name of the person.
+const DONE = {
+  take: () => "took control",
+  leave: () => "gave control back",
+  hold: () => "held the button",
+  armed: () => "armed the car",
+  release: () => "let go of the button",
+  let_go: (why) => `was made to let go: ${why}`,
+  estop: () => "pressed the emergency stop",
+  reset_estop: () => "released the emergency stop",
+  disarm: () => "disarmed the car",
+  trial: () => "started a trial",
+  trial_end: () => "ended the trial",
+  attack: (id) => `showed attack ${id}`,
+  attack_off: () => "switched the attack off",
+  record: () => "started recording",
+  record_stop: () => "stopped recording",
+  label: (words) => `labelled “${words}”`,
+};
 
 export const wordsOf = (act) => WORDS[act] ?? act.replaceAll("_", " ");
+
+/** One line of the log: who did what, or what this person was refused. */
+export function sentenceOf({ operator, act, detail, refused }) {
+  if (refused) return `${operator} was refused: ${wordsOf(act)}: ${refused}`;
+  return `${operator} ${DONE[act]?.(detail) ?? `${wordsOf(act)} ${detail}`}`;
+}

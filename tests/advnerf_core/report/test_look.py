@@ -47,6 +47,6 @@ def test_texts_can_be_read_in_both_themes(palette):
         for name in ("ink", "muted", "good", "bad", "warn", "accent")
         for ground in ("paper", "panel")
     ]
-    pairs += [("on-accent", "accent"), ("on-bad", "bad")]
+    pairs += [("on-accent", "accent"), ("on-stop", "stop")]
     poor = {pair: contrast(*(palette[name] for name in pair)) for pair in pairs}
     assert {pair: value for pair, value in poor.items() if value < LEAST_CONTRAST} == {}

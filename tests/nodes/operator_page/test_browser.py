@@ -81,14 +81,18 @@ def says(page, selector, words, timeout_ms=8000):
     )
 
 
-def drive(page, hold, let_go):
-    """Hold until the car drives. On a busy computer the safety node may stop it; a person lets go and holds again."""
+def drive(page, hold, let_go, *seen):
+    """Hold until the car drives, and until pages say what is to be seen then (page, selector, words).
+
+    On a busy computer the safety node may stop it; a person lets go and holds again.
+    """
     from playwright.sync_api import TimeoutError as NotYet
 
     for _ in range(20):
         hold()
         try:
-            says(page, "#armed", "ARMED", timeout_ms=2000)
+            for where, selector, words in ((page, "#armed", "ARMED"), *seen):
+                says(where, selector, words, timeout_ms=2000)
         except NotYet:
             let_go()
             page.wait_for_timeout(500)
@@ -115,9 +119,7 @@ def test_arm_drive_attack_on_disarm_while_another_watches(lab, phones, options):
     assert watcher.is_disabled("#hold")
     assert watcher.is_disabled("#trial")
     put_back(page)
-    drive(ann.page, ann.hold, ann.let_go)
-    says(watcher, "#armed", "ARMED")
-    says(page, "#hold", "Let go to stop")
+    drive(page, ann.hold, ann.let_go, (watcher, "#armed", "ARMED"), (page, "#hold", "Let go to stop"))
     page.wait_for_timeout(500)
     page.keyboard.press("Tab")  # the focus leaves the button, and with it the hand
     says(page, "#armed", "disarmed")
@@ -125,8 +127,7 @@ def test_arm_drive_attack_on_disarm_while_another_watches(lab, phones, options):
     put_back(page)
     page.locator(f"#attacks button[data-id='{lab.attack_id}']").click()
     page.locator("#hold").scroll_into_view_if_needed()
-    drive(ann.page, ann.hold, ann.let_go)
-    says(watcher, "#attack-text", f"Attack {lab.attack_id} is shown")
+    drive(page, ann.hold, ann.let_go, (watcher, "#attack-text", f"Attack {lab.attack_id} is shown"))
     ann.let_go()
     says(page, "#armed", "disarmed")
     page.click("#attack_off")

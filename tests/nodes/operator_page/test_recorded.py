@@ -78,6 +78,9 @@ def test_a_recording_plays_again_and_again_and_nobody_can_drive(bag, tmp_path):
         assert 0.0 <= min(seen) < 0.15 < max(seen) < 0.4
         assert any(later < earlier for earlier, later in pairwise(seen)), "it did not begin again"
         assert "only watches" in browser.do("take", name="Ann")
+        for stop in ("estop", "disarm"):
+            assert browser.do(stop) == "this page shows a recording, which has no car to stop"
+        assert "only watches" in browser.do("take", name="Ann"), "the page is still here"
     finally:
         if browser is not None:
             browser.close()

@@ -44,6 +44,8 @@ def test_what_a_page_says():
         json.dumps({"t": "hold", "beat": 1, "press": 0, **ACT}),
         json.dumps({"t": "label", "text": "two\nlines", **ACT}),
         json.dumps({"t": "label", "text": " ", **ACT}),
+        json.dumps({"t": "take", "name": "Ann\u202enna", **ACT}),
+        json.dumps({"t": "take", "name": "x" * 41, **ACT}),
         json.dumps({"t": "label", "text": "x" * 201, **ACT}),
         json.dumps({"t": "attack", "id": "../../etc/pa", **ACT}),
         json.dumps({"t": "take", "name": "", **ACT}),
