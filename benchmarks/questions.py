@@ -169,6 +169,12 @@ QUESTIONS = (
         ("repeat_tests",),
     ),
     Question(
+        "size",
+        "How much is there to read, to learn and to clone?",
+        "Counts of the code, of the pages, of the command line and of what git tracks.",
+        ("house",),
+    ),
+    Question(
         "nothing_is_lost",
         "Is anything lost when something breaks?",
         "Damaged and cut files, killed processes, and hostile input.",
