@@ -6,7 +6,7 @@ export MUJOCO_GL ?= egl
 # Kept byte code, whatever the shell asks for: the second run of pytest need not rewrite the assertions of 365 files again.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup demo experiment evidence world test test-timing test-slow test-gpu test-hardware test-browser setup-ros2 test-ros2 check bench bench-quick campaign rooms api docs fmt clean clean-runs
+.PHONY: help setup demo experiment evidence world test test-timing test-slow test-gpu test-hardware test-browser setup-ros2 test-ros2 check bench bench-quick bench-live campaign rooms api docs fmt clean clean-runs
 
 help:  ## Show this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -98,8 +98,17 @@ bench: setup  ## The benchmarks (about an hour); each writes its rows to docs/re
 bench-quick: setup  ## Compare the main rates with the recorded ones (a minute); fails where one is a fifth slower
 	@$(BIN)/python -m benchmarks.quick
 
-campaign: setup  ## What the live stack must bear: faults, strangers, kills, half an hour (hours; goes on where it was stopped)
-	@$(BIN)/python -m benchmarks.run_all --campaign
+bench-live: setup  ## The benchmarks of the live stack (hours)
+	@$(BIN)/python -m benchmarks.run_all --live
+
+# One of tests/campaigns/ by its name, and how often to try: a number, or nothing for a few minutes; neither writes rows.
+ONLY ?=
+SIZE ?= full
+PASSED := runs/campaign-$(SIZE).passed
+campaign: setup  ## What must hold: faults, strangers, kills, fuzzing, half an hour (hours; goes on where it was stopped)
+	@mkdir -p runs
+	@export ADVNERF_CAMPAIGN_SIZE=$(SIZE); \
+	$(BIN)/pytest -q -s -m campaign --timeout 0 $(if $(ONLY),tests/campaigns/test_$(ONLY).py,--passed $(PASSED) tests/campaigns && rm -f $(PASSED))
 
 rooms: setup  ## Draw the imports between sub-packages for docs/architecture.md
 	@$(BIN)/python docs/draw_rooms.py

@@ -16,8 +16,8 @@ from advnerf_core.attack.adjoint import AttackProblem, adjoint_gradient
 from advnerf_core.driving.rollout import Remembering, Rollout
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.scene.surrogate import PoseBatch, Surrogate
-from benchmarks.attack_toy import toy_problem
 from benchmarks.results import record_row
+from tests.support.attack_toy import toy_problem
 
 COMMAND = "python -m benchmarks.adjoint_gradient"
 

@@ -25,8 +25,8 @@ from torch.utils.checkpoint import checkpoint
 from advnerf_core.attack.adjoint import AttackProblem, adjoint_gradient, evaluate
 from advnerf_core.files import write_json
 from advnerf_core.memory import RETURNS_WHAT_IS_FREED, peak_mib, restart_peak
-from benchmarks.attack_toy import toy_problem
 from benchmarks.results import REPOSITORY, record_row
+from tests.support.attack_toy import toy_problem
 
 COMMAND = "python -m benchmarks.adjoint_memory"
 METHODS = ("adjoint", "backprop")

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import tempfile
 from pathlib import Path
 
-from benchmarks.fault_campaign import Graph
 from benchmarks.results import record_row
+from tests.support.live.graph import live_graph
 
 COMMAND = "python -m benchmarks.car_nodes"
 LIMITS_MB = {
@@ -18,7 +17,7 @@ LIMITS_MB = {
     "recorder": 80.0,
     "compositor": 100.0,
 }
-SETTINGS = ("record=true", "policy.module=benchmarks.straight_policy")
+SETTINGS = ("record=true", "policy.module=tests.support.live.straight_policy")
 DRIVE_S = 4.0
 
 
@@ -35,8 +34,7 @@ def maps_torch(pid: int) -> bool:
 
 def measure() -> dict[str, float]:
     """Resident memory of every node after some seconds of driving [MB]."""
-    graph = Graph(Path(tempfile.mkdtemp(prefix="advnerf-")), SETTINGS)
-    try:
+    with live_graph(SETTINGS) as graph:
         graph.operator.bus.subscribe("/status/recorder")
         graph.ready()
         graph.put_back()
@@ -46,8 +44,6 @@ def measure() -> dict[str, float]:
         if heavy := [name for name, pid in pids.items() if maps_torch(pid)]:
             raise RuntimeError(f"expected no torch in the car's nodes, found it in {heavy}")
         return {name: resident_mb(pid) for name, pid in pids.items()}
-    finally:
-        graph.close()
 
 
 def main() -> None:

@@ -12,10 +12,10 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from benchmarks.page_browser import CHROMIUM, PHONE, available
 from benchmarks.page_pictures import save
-from benchmarks.processes import end
 from benchmarks.results import REPOSITORY
+from tests.support.live.page_browser import CHROMIUM, PHONE, available
+from tests.support.live.processes import end
 
 EXPERIMENT = REPOSITORY / "launch" / "room.experiment.yaml"
 # The demo with a third method, and without what the pictures do not show.
@@ -27,8 +27,7 @@ _SETTINGS = [
 ]
 _DESK = {"viewport": {"width": 1400, "height": 1000}, "color_scheme": "light"}
 _PHONE = {**PHONE, "color_scheme": "dark"}
-# The command imports for a few seconds, beside busy neighbours for a minute.
-_START_S, _LONGEST_S = 600.0, 1800.0
+_START_S, _LONGEST_S = 60.0, 1800.0
 # The last of three searches, when more than half of it is done.
 _WORTH_A_LOOK = """() => document.querySelectorAll('#searches .card').length >= 3
   && /^[67]\\d %/.test(document.querySelector('tr.running .quiet')?.textContent)"""

@@ -14,15 +14,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.fault_stops import CONFIGURED, BrokenPromise
-from benchmarks.network import ADDRESSES, Cable
-from benchmarks.operator import LiveOperator
-from benchmarks.processes import end
 from benchmarks.results import REPOSITORY
 from hardware.emulators.vesc_emulator import read_wire_log
 from nodes.linking.keys import DRIVE, KeyFolder
 from nodes.runtime.bus import Bus
 from nodes.runtime.paths import bus_folder
+from tests.support.live.graph import CONFIGURED, BrokenPromise
+from tests.support.live.network import ADDRESSES, Cable
+from tests.support.live.operator import LiveOperator
+from tests.support.live.processes import end
 
 LAUNCH_FILE = REPOSITORY / "launch" / "two_hosts.launch.yaml"
 NODES = ("camera", "vicon", "compositor", "policy", "safety", "motor")

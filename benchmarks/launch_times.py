@@ -11,16 +11,15 @@ import os
 import shutil
 import signal
 import subprocess
-import tempfile
 import time
 from pathlib import Path
 
-from benchmarks.fault_campaign import VICTIMS, Graph
 from benchmarks.results import record_row
+from tests.support.live.graph import VICTIMS, Graph, live_graph
 
 COMMAND = "python -m benchmarks.launch_times"
 START_LIMIT_S, STOP_LIMIT_S = 5.0, 2.0
-SETTINGS = ("record=true", "policy.module=benchmarks.straight_policy")
+SETTINGS = ("record=true", "policy.module=tests.support.live.straight_policy")
 NODES = (*VICTIMS, "recorder")
 
 
@@ -75,8 +74,7 @@ def main() -> None:
     parser.add_argument("--times", type=int, default=5)
     parser.add_argument("--trial", action="store_true", help="nothing is recorded")
     options = parser.parse_args()
-    graph = Graph(Path(tempfile.mkdtemp(prefix="advnerf-")), SETTINGS)
-    try:
+    with live_graph(SETTINGS) as graph:
         graph.ready()
         starts, stops, orphans = [], [], 0
         stop_after_ctrl_c(graph)  # the first start read every file from the disk
@@ -90,8 +88,6 @@ def main() -> None:
                 f"driving after {starts[-1]:.2f} s, stopped after {took_s:.2f} s, {left} processes left",
                 flush=True,
             )
-    finally:
-        graph.close()
     if options.trial:
         return
     record_row(

@@ -35,7 +35,7 @@ CALIBRATION = REPOSITORY / "calibration" / "twin"
 START_NS = 1_800_000_000_000_000_000
 MS = 1_000_000
 REPLAYS, SPEED_TARGET = 10, 20.0
-CHOICE = Choice(("compositor", "policy"), {"policy": "benchmarks.straight_policy"})
+CHOICE = Choice(("compositor", "policy"), {"policy": "tests.support.live.straight_policy"})
 
 
 def make_bag(folder: Path, seconds: int) -> Path:

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import psutil
 
-from benchmarks.operator import LiveOperator
-from benchmarks.page_browser import Phone, available, live_page
 from benchmarks.results import record_row
 from nodes.runtime.messages import stamp_ns
+from tests.support.live.operator import LiveOperator
+from tests.support.live.page_browser import Phone, available, live_page
 
 COMMAND = "python -m benchmarks.page_latency"
 _RECORDED_S = 60.0

@@ -13,9 +13,9 @@ from typing import Any
 from PIL import Image
 
 from advnerf_core.files import write_atomically
-from benchmarks.operator import LiveOperator
-from benchmarks.page_browser import PHONE, Phone, available, live_page
 from benchmarks.results import REPOSITORY
+from tests.support.live.operator import LiveOperator
+from tests.support.live.page_browser import PHONE, Phone, available, live_page
 
 _DESK = {"viewport": {"width": 1360, "height": 1130}}
 _QUALITY, _WIDTH_PX = 78, {"desk": 1100, "phone": 420}

@@ -14,7 +14,7 @@ class Question:
         slug: Name of the page, ``docs/results/<slug>.md``.
         title: The question.
         answers: What it is about, in a sentence.
-        commands: Benchmarks (``python -m benchmarks.NAME``) and other commands, by their beginning, that measure its rows.
+        commands: Benchmarks and campaigns, by their names, and other commands, by their beginning, that measure its rows.
         picture: What stands first on the page, relative to it; empty for nothing.
         lost: Whether its rows are of the earlier build, whose victims are lost.
     """
@@ -187,7 +187,7 @@ OTHER = Question("other", "Other measurements", "Rows of commands that no questi
 
 def question_of(command: str) -> Question:
     """The question that a row measured by ``command`` answers; `OTHER` if none names it."""
-    benchmark = re.search(r"\bbenchmarks\.(\w+)", command)
+    benchmark = re.search(r"\b(?:benchmarks\.|make campaign ONLY=)(\w+)", command)
     for question in QUESTIONS:
         if any(benchmark[1] == name if benchmark else command.startswith(name) for name in question.commands):
             return question

@@ -165,7 +165,7 @@ def _index_page(answered: dict[Question, list[dict[str, Any]]], found: list[Answ
         + (_PICTURE if sets else "")
         + "Each figure was written by the command beside it, on the machine and day that its row names. `python -m benchmarks.results` makes these "
         "pages from `results.json`. `advnerf verify` computes rows of kept drives again; the others were measured once, and what they were "
-        "measured from is not kept. Commands stand as they were given; CHANGELOG.md says how those of `advnerf` were grouped since.\n\n## In short\n\n"
+        "measured from is not kept. Commands stand as they were given; CHANGELOG.md says how they changed since.\n\n## In short\n\n"
         + table(found)
         + (sets and f"\n{sets}")
         + "\n## All rows\n\nA row that misses its target stays, with the reason: [missed targets](results/missed.md).\n\n"

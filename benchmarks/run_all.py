@@ -1,8 +1,7 @@
 """``make bench``: every benchmark that needs no other data, one after the other.
 
 Those that look at a learned scene use the run folder of ``make experiment`` and are left out without one; ``--quick`` leaves out
-those that take more than a few minutes. ``make campaign`` (``--campaign``) is the live stack's turn instead: faults, strangers, killed
-recorders, half an hour of driving. They take hours together, and go on where they were stopped.
+those that take more than a few minutes. ``make bench-live`` (``--live``) measures the live stack instead.
 """
 
 from __future__ import annotations
@@ -16,14 +15,13 @@ from pathlib import Path
 from benchmarks.results import REPOSITORY
 
 QUICK = (
-    "hash_encoding", "adjoint_gradient", "adjoint_memory", "fault_stops", "hydrant", "structure_from_motion", "few_photographs",
+    "hash_encoding", "adjoint_gradient", "adjoint_memory", "hydrant", "structure_from_motion", "few_photographs",
     "training_step", "coverage", "floors",
 )  # fmt: skip
-LONG = ("attack_kill", "scene_kill", "adjoint_memory --compare", "newcomer")
-CAMPAIGN = (
-    "one_hop", "frame_age", "car_nodes", "launch_times", "calibrations", "lockstep_replay", "strangers", "ros2_strangers", "two_hosts", "bag_kill", "bag_kill --splits",
-    "requests", "fuzz", "page_strangers", "page_latency", "page_faults", "stops", "pose_jumps", "stalls", "policy_from_bags", "fault_campaign", "thirty_minutes",
-    "world_faults",
+LONG = ("adjoint_memory --compare", "newcomer")
+LIVE = (
+    "one_hop", "frame_age", "car_nodes", "launch_times", "calibrations", "lockstep_replay", "two_hosts", "page_latency", "stops",
+    "policy_from_bags",
 )  # fmt: skip
 OF_A_RUN = ("baked_scene", "gradient_pass", "objects", "phone_to_car", "closed_loop_cosine")
 
@@ -42,11 +40,11 @@ def main() -> int:
     """Run them all; the exit code is 1 if one failed."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--folder", type=Path, default=Path("runs/full"))
-    parser.add_argument("--campaign", action="store_true", help="what the live stack must bear, instead")
+    parser.add_argument("--live", action="store_true", help="those of the live stack instead")
     parser.add_argument("--quick", action="store_true", help="leave out what takes more than a few minutes")
     options = parser.parse_args()
     failed = []
-    for command in CAMPAIGN if options.campaign else commands(options.folder, options.quick):
+    for command in LIVE if options.live else commands(options.folder, options.quick):
         began = time.monotonic()
         module, *arguments = command.split()
         code = subprocess.run(

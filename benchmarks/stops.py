@@ -14,7 +14,6 @@ import os
 import pty
 import resource
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -28,9 +27,7 @@ import numpy as np
 
 from advnerf_core.documents import read_json
 from advnerf_core.geometry import planar_pose
-from benchmarks.page_client import Browser, cookie_of, request
-from benchmarks.processes import end
-from benchmarks.results import REPOSITORY, record_row
+from benchmarks.results import record_row
 from hardware.emulators.vesc_emulator import VescEmulator
 from hardware.emulators.vesc_firmware import VescEmulatorConfig
 from hardware.worlds.lab.vehicle import CarConfig, TwinVehicle
@@ -43,6 +40,8 @@ from nodes.runtime.errors import LaunchError
 from nodes.runtime.messages import drive_message, pose_message
 from nodes.runtime.process import run_node
 from nodes.runtime.requests import RequestIdentity
+from tests.support.live.page_client import Browser, cookie_of, request
+from tests.support.live.processes import REPOSITORY, end, free_ports
 
 COMMAND = "python -m benchmarks.stops"
 TWIN = REPOSITORY / "calibration" / "twin"
@@ -114,7 +113,7 @@ class Rig(threading.Thread):
         theirs.add("robot", ours.new("robot"))
         ours.add("desk", theirs.new("desk"))
         ours.allow("desk", DRIVE)
-        ports = dict(zip(("watch_port", "drive_port"), _free_ports(2), strict=True))
+        ports = dict(zip(("watch_port", "drive_port"), free_ports(2), strict=True))
         seen = ["/safety/state", "/motor/sent"]
         link: dict[str, Any] = {**ports, "exports": seen, "imports": ["/arm"], "keys": str(ours.path)}
         self._run_node("gateway", listen="127.0.0.1", key="robot", **link)
@@ -148,14 +147,6 @@ class Rig(threading.Thread):
         self.stopping = True
         self.join()
         self.car.close()
-
-
-def _free_ports(count: int) -> list[int]:
-    with contextlib.ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
-        for each in sockets:
-            each.bind(("127.0.0.1", 0))
-        return [each.getsockname()[1] for each in sockets]
 
 
 @contextlib.contextmanager

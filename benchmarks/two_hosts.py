@@ -1,6 +1,6 @@
 """Does the car drive when it should and stop when it must, with the policy on another host? ``python -m benchmarks.two_hosts``.
 
-Two network namespaces joined by a bad cable (`benchmarks.network`), ``launch/two_hosts.launch.yaml`` with keys in both of them, and
+Two network namespaces joined by a bad cable (`tests.support.live.network`), ``launch/two_hosts.launch.yaml`` with keys in both of them, and
 a trained policy that drives at 0.8 m/s. The conditions: a clean link, 5 % of the packets lost each way (with the kernel's TCP as
 docs/two_hosts.md sets it for wireless, and as delivered), 300 ms of delay each way, a stall of 2 s, and a workstation whose clock is
 50 ms ahead. What counts is what the motor controller reads at its end of the wire.
@@ -19,10 +19,10 @@ from typing import Any
 
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
-from benchmarks.fault_stops import BrokenPromise
 from benchmarks.host_pair import HostPair, Person, skewed_clock, stop_of
-from benchmarks.network import Cable, available, resend_early, two_hosts
 from benchmarks.results import REPOSITORY, record_row
+from tests.support.live.graph import BrokenPromise
+from tests.support.live.network import Cable, available, resend_early, two_hosts
 
 COMMAND = "python -m benchmarks.two_hosts"
 FOLDER = REPOSITORY / "runs" / "two_hosts"

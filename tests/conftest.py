@@ -142,7 +142,7 @@ def browser():
     """Chromium without a window."""
     from playwright.sync_api import sync_playwright
 
-    from benchmarks.page_browser import CHROMIUM
+    from tests.support.live.page_browser import CHROMIUM
 
     with sync_playwright() as playwright:
         made = playwright.chromium.launch(executable_path=str(CHROMIUM), args=["--no-sandbox"])

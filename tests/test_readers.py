@@ -29,12 +29,8 @@ WIRE = {
     "nodes/lab/doctor/probes.py": 1,  # a probe's arguments
     "nodes/operator_page/said.py": 2,  # messages of the page
     "benchmarks/adjoint_memory.py": 1,  # output of a child
-    "benchmarks/bag_kill.py": 2,
     "benchmarks/baked_scene.py": 2,
-    "benchmarks/dds_strangers.py": 1,
     "benchmarks/lockstep_replay.py": 1,
-    "benchmarks/page_client.py": 1,
-    "benchmarks/page_strangers.py": 2,
     "benchmarks/rclpy_peer.py": 1,
     "benchmarks/seeds_together.py": 1,
     "benchmarks/stops.py": 1,  # the page's answer
@@ -59,7 +55,7 @@ OWN = {  # text that the same function has just written, or already read as a wh
     "advnerf_core/report/evidence/verifying/numbers.py": 1,
     "benchmarks/retraining.py": 1,
     "nodes/experiment/run/published.py": 1,
-    "nodes/experiment/show/experiment_world.py": 1,
+    "nodes/experiment/show/context.py": 1,
     "nodes/experiment/engine/artefact.py": 1,
     "nodes/lab/carla/capture.py": 1,
     "nodes/lab/trials/plan.py": 1,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.page_browser import available
+from tests.support.live.page_browser import available
 
 ROOT = Path(__file__).parents[1]
 

@@ -3,7 +3,7 @@ import torch
 
 from advnerf_core.attack.adjoint import adjoint_gradient
 from benchmarks.adjoint_memory import gradient_by, measure, unrolled_gradient
-from benchmarks.attack_toy import toy_problem
+from tests.support.attack_toy import toy_problem
 
 
 def test_both_methods_compute_the_same_gradient():

@@ -10,9 +10,9 @@ from types import SimpleNamespace
 import pytest
 
 from benchmarks import host_pair, two_hosts
-from benchmarks.fault_stops import BrokenPromise
-from benchmarks.network import Cable, available
 from hardware.emulators.vesc_firmware import WireEvent
+from tests.support.live.graph import BrokenPromise
+from tests.support.live.network import Cable, available
 
 MS = 1_000_000
 
@@ -72,7 +72,11 @@ def test_what_is_finished_is_not_run_again(tmp_path, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.skipif(not available(), reason="needs root, TUN devices and iproute2")
 def test_a_stalled_link_stops_the_car():
-    circle = ("policy.module=benchmarks.straight_policy", "policy.speed_mps=0.8", "policy.steering_rad=0.2")
+    circle = (
+        "policy.module=tests.support.live.straight_policy",
+        "policy.speed_mps=0.8",
+        "policy.steering_rad=0.2",
+    )
     result = two_hosts.measure("stall", two_hosts.POLICY, circle)
     assert result["met"], result
 

@@ -1,6 +1,5 @@
 """Counterfactual steering as it is recorded: the green screen's graph on the twin, one process per node, one drive past an attack."""
 
-import socket
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from nodes.lab.trials.tries import drive_with_tries
 from nodes.runtime.messages import decode, ns_from_stamp
 from nodes.runtime.pictures import rgb_image
 from nodes.runtime.topics import topic as topic_row
+from tests.support.live.processes import free_udp_port
 
 ROOT = Path(__file__).parents[2]
 TWIN = ROOT / "calibration" / "twin"
@@ -99,12 +99,6 @@ def red_board(folder: Path) -> AttackFile:
     return attack
 
 
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     folder = tmp_path_factory.mktemp("counterfactual")
@@ -115,7 +109,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
         f"params.policy={policy}",
         "policy.speed_mps=0.5",
         f"params.attack={folder / 'red.attack.safetensors'}",
-        f"params.vicon_port={free_port()}",
+        f"params.vicon_port={free_udp_port()}",
     ]
     start = load_calibration(RoomCalibration, TWIN / "room.yaml").start_pose
     plan = TrialPlan(start, SECONDS, NODES)

@@ -50,7 +50,7 @@ def red_attack(folder):
 def test_the_lab_camera_sees_the_attack_while_armed_and_not_before(tmp_path):
     attack_id, attack = red_attack(tmp_path)
     overrides = [
-        "policy.module=benchmarks.straight_policy",
+        "policy.module=tests.support.live.straight_policy",
         "policy.speed_mps=0.5",
         f"params.calibration={ROOT / 'calibration' / 'twin'}",
         f"params.attack={attack}",

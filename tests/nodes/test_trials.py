@@ -1,6 +1,4 @@
-import contextlib
 import json
-import socket
 from collections import Counter
 from itertools import pairwise
 from pathlib import Path
@@ -23,6 +21,7 @@ from nodes.launching.launch import Launch
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError, ConfigError
 from nodes.runtime.messages import encode, header, pose_message, types
+from tests.support.live.processes import free_ports, free_udp_port
 
 ROOT = Path(__file__).parents[2]
 LOOPBACK = "127.0.0.1"
@@ -50,14 +49,6 @@ def test_the_order_is_seeded_balanced_and_complete():
     assert all(len({name for name, _ in block}) == 3 for block in blocks)
     first = Counter(block[0][0] for block in blocks)
     assert set(first.values()) == {2}
-
-
-def free_ports(count, kind=socket.SOCK_STREAM):
-    with contextlib.ExitStack() as stack:
-        probes = [stack.enter_context(socket.socket(socket.AF_INET, kind)) for _ in range(count)]
-        for probe in probes:
-            probe.bind((LOOPBACK, 0))
-        return [probe.getsockname()[1] for probe in probes]
 
 
 def attack_file(folder, seed):
@@ -303,7 +294,7 @@ def test_a_series_on_the_twin_counts_what_its_bags_say_and_goes_on(tmp_path):
     from nodes.lab.trials.series import drive_series
 
     calibration = [f"params.calibration={ROOT / 'calibration' / 'twin'}", "params.vicon_port=52871"]
-    stands_in = ["policy.module=benchmarks.straight_policy", "policy.speed_mps=0.5"]
+    stands_in = ["policy.module=tests.support.live.straight_policy", "policy.speed_mps=0.5"]
     made = prepare_series(
         ROOT / "launch" / "green_screen.launch.yaml",
         calibration + stands_in,
@@ -327,14 +318,14 @@ def test_a_series_on_the_twin_counts_what_its_bags_say_and_goes_on(tmp_path):
 
 @pytest.mark.slow  # two launches: the car with its lab, and the workstation from which it is driven
 def test_trials_from_the_workstation_drive_the_car_of_the_other_host(tmp_path):
-    file, vicon = ROOT / "launch" / "two_hosts.launch.yaml", free_ports(1, socket.SOCK_DGRAM)[0]
+    file, vicon = ROOT / "launch" / "two_hosts.launch.yaml", free_udp_port()
     watch, drive = free_ports(2)
     keys = {host: f"keys={folder}" for host, folder in exchange_keys(tmp_path).items()}
     shared = [
         f"params.calibration={ROOT / 'calibration' / 'twin'}",
         "params.image_topic=/camera/image_raw",
         f"params.vicon_port={vicon}",
-        "policy.module=benchmarks.straight_policy",
+        "policy.module=tests.support.live.straight_policy",
         "policy.speed_mps=0.6",
         f"hosts.robot.watch_port={watch}",
         f"hosts.robot.drive_port={drive}",

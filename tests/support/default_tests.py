@@ -18,7 +18,7 @@ from pathlib import Path
 import psutil
 
 ROOT = Path(__file__).parents[2]
-DEFAULT = "not slow and not gpu and not hardware and not data and not browser and not ros2 and not timing"
+DEFAULT = "not slow and not gpu and not hardware and not data and not browser and not ros2 and not timing and not campaign"
 _ENVIRONMENT = Path(sys.prefix)
 _KERNELS, _LOG = _ENVIRONMENT / ".kernels", _ENVIRONMENT / "computing-tests.log"
 _PYTEST = (sys.executable, "-m", "pytest", "-q")

@@ -11,9 +11,9 @@ import torch
 
 from advnerf_core.attack.adjoint import Totals
 from advnerf_core.attack.search.search import SearchState
-from benchmarks.page_client import request
 from nodes.experiment.engine.progress_record import ProgressRecord
 from nodes.experiment.plan.cell import Cell
+from tests.support.live.page_client import request
 
 CELLS = [Cell("track", "hardened", method, 0) for method in ("none", "random", "gradient")]
 ABOUT = {"name": "room", "setting": "demo", "planned": 5, "space": "colours"}

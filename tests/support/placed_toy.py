@@ -10,7 +10,7 @@ from advnerf_core.driving.path import Path
 from advnerf_core.fields.voxel_grid import cube_face_object
 from advnerf_core.geometry import make_transform, rotation_z
 from advnerf_core.scene.surrogate import Surrogate
-from benchmarks.attack_toy import MOUNT, VIEW, painted_room, toy_problem
+from tests.support.attack_toy import MOUNT, VIEW, painted_room, toy_problem
 
 SQUARE = Path.rounded_square(4.0, 1.1)
 BOUNDS = PoseBounds(x_m=(2.6, 3.4), y_m=(-2.2, -1.2), yaw_rad=(2.7, 3.3), scale=(0.7, 1.1))

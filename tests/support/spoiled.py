@@ -12,7 +12,7 @@ T = TypeVar("T")
 _DRIVES, _REST_S = 8, 1.0
 # What the safety node says of messages that are late, and of itself: it stops the car then, as it should.
 _LATE = re.compile(
-    r"\bno (command|camera image|pose|frame|message)\b.* for \d|silent for \d|held up for \d|image \d\S* s old"
+    r"\bno (fresh )?(command|camera image|pose|frame|message)\b.* for \d|silent for \d|held up for \d|image \d\S* s old"
 )
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -14,24 +13,18 @@ from pathlib import Path
 import yaml
 
 from advnerf_core.geometry import planar_pose
-from benchmarks.operator import LiveOperator
 from hardware.emulators.vesc_firmware import WireEvent
 from nodes.runtime.messages import pose_message
 from nodes.runtime.paths import bus_folder
+from tests.support.live.operator import LiveOperator
+from tests.support.live.processes import REPOSITORY, free_udp_port
 from tests.support.spoiled import Spoiled, unspoiled
 
-REPOSITORY = Path(__file__).parents[2]
 CALIBRATION = REPOSITORY / "calibration" / "twin"
 NODES = ("twin", "camera", "vicon", "compositor", "policy", "safety", "motor")
 BRAKES = ("SET_CURRENT_BRAKE", "TIMEOUT")
 START = (-1.1, -2.0, 0.0)
 TIMEOUT = {"timeout_ms": 250.0, "timeout_brake_current_a": 20.0}
-
-
-def free_udp_port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 class Stack(LiveOperator):
@@ -65,7 +58,7 @@ class Stack(LiveOperator):
         arguments = ["--folder", str(self.run_dir), "--name", name]
         config = self.run_dir / f"{name}.yaml"
         config.write_text(yaml.safe_dump(self.configs[name]))
-        module = "benchmarks.straight_policy" if name == "policy" else f"nodes.{name}"
+        module = "tests.support.live.straight_policy" if name == "policy" else f"nodes.{name}"
         command = [sys.executable, "-m", module, "--config", str(config), *arguments]
         log = open(self.run_dir / f"{name}.log", "ab")  # noqa: SIM115 - belongs to the child
         environment = {**os.environ, "MUJOCO_GL": "egl"}

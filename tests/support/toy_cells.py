@@ -122,7 +122,7 @@ def _searched(cell):
 
     from advnerf_core.attack.adjoint import evaluate
     from advnerf_core.attack.methods import SearchRun, SearchSettings, load_method
-    from benchmarks.attack_toy import toy_problem
+    from tests.support.attack_toy import toy_problem
 
     problem = toy_problem(2, dtype=torch.float32)
     plain = evaluate(problem, problem.sensor.plain_theta())[1].protocol_cte_m.tolist()

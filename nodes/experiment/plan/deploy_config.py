@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
 from advnerf_core.strict import StrictModel
 from hardware.cameras.effects import PRESETS, Effects
-from nodes.experiment.plan.numbers import Count, Positive, PositiveNumber
+
+Count = Annotated[int, Field(ge=0)]
+Positive = Annotated[int, Field(ge=1)]
 
 
 class DeployConfig(StrictModel):
@@ -43,7 +45,7 @@ class DeployConfig(StrictModel):
     )
     laps: Count = Field(default=0, description="Laps driven live without attack before the cells.")
     empty_scene: bool = Field(default=False, description="Also drive with the panel taken away.")
-    ready_timeout_s: PositiveNumber = Field(
+    ready_timeout_s: Annotated[float, Field(gt=0)] = Field(
         default=60.0, description="Time for the graph to become ready [s]."
     )
 

@@ -16,7 +16,7 @@ from advnerf_core.policies.pilotnet import PilotNet
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.surrogate import Rendered
 from benchmarks.adjoint_gradient import backpropagated_gradient, finite_difference, relative_error
-from benchmarks.attack_toy import painted_room, random_policy, toy_problem
+from tests.support.attack_toy import painted_room, random_policy, toy_problem
 
 
 def theta_for(problem: AttackProblem, seed: int = 0) -> Tensor:

@@ -14,7 +14,7 @@ from advnerf_core.attack.search.frame import CleanFrames, better_side
 from advnerf_core.attack.search.gradient_coarse import NoFinerFaceError
 from advnerf_core.attack.search.query_count import VictimError
 from advnerf_core.driving.rollout import drive
-from benchmarks.attack_toy import random_policy, toy_problem
+from tests.support.attack_toy import random_policy, toy_problem
 
 STEPS = 5
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from advnerf_core.attack.adjoint import AttackProblem, evaluate
 from advnerf_core.attack.methods import SearchRun
 from advnerf_core.attack.search.gradient import gradient_attack
-from benchmarks.attack_toy import toy_problem
+from tests.support.attack_toy import toy_problem
 
 STEPS, RESOLUTION, EVALUATIONS, SIGMA = 12, 16, 12, 5.0
 LEVELS = (

@@ -23,7 +23,7 @@ from advnerf_core.attack.search.visited import PreparingSensor, VisitedDrive
 from advnerf_core.driving.dynamics import Ackermann
 from advnerf_core.driving.path import Path
 from advnerf_core.scene.surrogate import Rendered
-from benchmarks.attack_toy import toy_problem
+from tests.support.attack_toy import toy_problem
 
 STEPS, EDGE = 8, 8
 SHAPE = (3, EDGE, EDGE)

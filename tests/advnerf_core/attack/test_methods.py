@@ -40,7 +40,7 @@ from advnerf_core.objects.mesh.surface import sphere, unwrapped
 from advnerf_core.plugins import PluginError, name_in_results
 from advnerf_core.report.conditions import order_of
 from advnerf_core.scene.surrogate import Surrogate
-from benchmarks.attack_toy import MOUNT, VIEW, painted_room, toy_problem
+from tests.support.attack_toy import MOUNT, VIEW, painted_room, toy_problem
 from tests.support.strangers import install_method, spiral_code, spiral_theta, write_spiral
 
 ROOT = Path(__file__).parents[3]

@@ -30,7 +30,7 @@ from advnerf_core.driving.path import Line, Path
 from advnerf_core.driving.solids import Rectangle, Solids
 from advnerf_core.plugins import PluginError, name_in_results
 from benchmarks.adjoint_gradient import backpropagated_gradient, finite_difference, relative_error
-from benchmarks.attack_toy import toy_problem
+from tests.support.attack_toy import toy_problem
 
 ROAD = Path.from_segments((0.0, 0.0, 0.0), [Line(50.0)], closed=False)  # its CTE is y
 TICKS, LIMITS = 40, Horizon(40, 0.1, 0.4, 1.5)

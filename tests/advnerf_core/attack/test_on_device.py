@@ -20,7 +20,7 @@ from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.search.together import gradient_attacks
 from advnerf_core.errors import DeviceError
 from advnerf_core.scene.surrogate import Surrogate
-from benchmarks.attack_toy import MOUNT, VIEW, painted_room, toy_problem
+from tests.support.attack_toy import MOUNT, VIEW, painted_room, toy_problem
 from tests.support.placed_toy import Leaning, moving
 
 here_only = pytest.mark.skipif(

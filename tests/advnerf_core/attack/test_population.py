@@ -13,7 +13,7 @@ from advnerf_core.attack.search.cem import CrossEntropy
 from advnerf_core.attack.search.evolution import Evolution, rank_utilities
 from advnerf_core.attack.search.population import Coarse, population_search
 from advnerf_core.attack.search.search import SearchStateError
-from benchmarks.attack_toy import random_policy, toy_problem
+from tests.support.attack_toy import random_policy, toy_problem
 
 STRATEGIES = [CrossEntropy(), Evolution()]
 

@@ -27,7 +27,7 @@ from advnerf_core.fields.soft_edges import with_soft_edges
 from advnerf_core.fields.voxel_grid import cube_face_object
 from advnerf_core.geometry import planar_pose
 from advnerf_core.render.soft_pose import placement_of
-from benchmarks.attack_toy import T_WORLD_FROM_FACE, toy_problem
+from tests.support.attack_toy import T_WORLD_FROM_FACE, toy_problem
 from tests.support.placed_toy import SQUARE, box, moving
 
 

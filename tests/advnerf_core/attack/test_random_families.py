@@ -19,7 +19,7 @@ from advnerf_core.objects.mesh.field import MeshField
 from advnerf_core.objects.mesh.shape import ShapeLimits, ShapeSensor
 from advnerf_core.objects.mesh.surface import sphere, unwrapped
 from advnerf_core.scene.surrogate import Surrogate
-from benchmarks.attack_toy import MOUNT, T_WORLD_FROM_FACE, VIEW, face, painted_room, toy_problem
+from tests.support.attack_toy import MOUNT, T_WORLD_FROM_FACE, VIEW, face, painted_room, toy_problem
 
 FAMILIES = ("random_coarse", "random_levels", "random_pink", "random_natural")
 SETTINGS = SearchSettings(4, sigma=5.0, cells=2)

@@ -18,7 +18,7 @@ from advnerf_core.attack.health import (
 from advnerf_core.attack.robustness import Disturbances, Smoothness
 from advnerf_core.driving.actuated import ActuatedAckermann
 from advnerf_core.fields.voxel_grid import VoxelGridObject, squash
-from benchmarks.attack_toy import face, toy_problem
+from tests.support.attack_toy import face, toy_problem
 
 EVERYTHING = Disturbances(noise=0.02, gain=0.1, brightness=0.02, jitter_m=0.01, jitter_rad=0.01, seed=3)
 

@@ -11,7 +11,7 @@ from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.search.random_search import random_search
 from advnerf_core.attack.search.search import SearchState, SearchStateError, draw_start_states, load_state
 from advnerf_core.scene.surrogate import Rendered
-from benchmarks.attack_toy import toy_problem
+from tests.support.attack_toy import toy_problem
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.search.search import SearchStateError
 from advnerf_core.attack.search.together import gradient_attacks
 from advnerf_core.scene.many_textures import ManyTextures
-from benchmarks.attack_toy import toy_problem
+from tests.support.attack_toy import toy_problem
 
 SEEDS = (3, 4, 5)
 

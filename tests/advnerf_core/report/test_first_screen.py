@@ -9,12 +9,12 @@ from advnerf_core.driving.path import Line
 from advnerf_core.driving.path import Path as DrivenPath
 from advnerf_core.report.result_page import render_page
 from advnerf_core.report.sections import page_sections
-from benchmarks.page_browser import PHONE, available
 from nodes.audit.judging import FOUND, NO_OBJECT, PLAIN_OBJECT
 from nodes.audit.page import write_page
 from nodes.audit.verdict import ArmDrives
 from nodes.experiment.pages.opening import Wording, first_screen
 from tests.support.audits import audit_result
+from tests.support.live.page_browser import PHONE, available
 
 pytestmark = [
     pytest.mark.browser,

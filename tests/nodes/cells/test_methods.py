@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from advnerf_core.report.result_page import text_table
-from benchmarks.attack_toy import toy_problem
 from nodes.experiment.plan.cell import select
 from nodes.experiment.run.plan import statuses
 from nodes.experiment.run.published import table_of
 from nodes.experiment.run.run import Options, run_cells
 from nodes.runtime.errors import ConfigError
+from tests.support.attack_toy import toy_problem
 from tests.support.strangers import install_method, spiral_code, spiral_theta, write_spiral
 
 

@@ -23,6 +23,7 @@ from hardware.worlds.lab.config import CarConfig
 from hardware.worlds.lab.vehicle import TwinVehicle
 from nodes.lab.doctor import mocap, motor
 from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, DoctorCheck, examine
+from tests.support.live.processes import free_udp_port
 
 TWIN = Path(__file__).parents[3] / "calibration" / "twin"
 GOOD = {"timeout_ms": 250.0, "timeout_brake_current_a": 20.0}
@@ -128,16 +129,11 @@ def test_a_program_is_found_by_its_name():
     assert motor._running(Path("/proc/self/comm").read_text().strip()) is not None
 
 
-def free_port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
 @contextmanager
 def tracker(names=("car", "board")):
     emulator = ViconEmulator(
-        ViconEmulatorConfig(port=free_port()), lambda ns: {name: np.eye(4) + np.eye(4, k=3) for name in names}
+        ViconEmulatorConfig(port=free_udp_port()),
+        lambda ns: {name: np.eye(4) + np.eye(4, k=3) for name in names},
     )
     try:
         yield emulator
@@ -174,7 +170,7 @@ def test_an_occluded_car_is_not_seen(form):
 
 
 def test_silence_a_stranger_and_a_taken_port():
-    port = free_port()
+    port = free_udp_port()
     (row,) = listen(port)
     assert row.state == FAILURE
     assert "UDP Object Stream to" in row.do

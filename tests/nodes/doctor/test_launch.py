@@ -22,6 +22,7 @@ from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, examine
 from nodes.lab.doctor.launch import checks_of, pictures_of
 from nodes.launching.launch_file import load_launch
 from nodes.linking.keys import DRIVE, KeyFolder
+from tests.support.live.processes import free_ports, free_udp_port
 
 ROOT = Path(__file__).parents[3]
 TWIN = ROOT / "calibration" / "twin"
@@ -44,16 +45,10 @@ def states(rows, check):
     return [row.state for row in rows if row.check == check]
 
 
-def free_port(kind=socket.SOCK_DGRAM):
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
 def test_the_twin_needs_its_files_a_port_and_a_disk(tmp_path):
     policy = tmp_path / "policy.safetensors"
     policy.touch()
-    plan = plan_of("green_screen", f"params.policy={policy}", f"params.vicon_port={free_port()}")
+    plan = plan_of("green_screen", f"params.policy={policy}", f"params.vicon_port={free_udp_port()}")
     assert [check.name for check in checks_of(plan, tmp_path)] == [
         "versions",
         "machine",
@@ -96,7 +91,7 @@ def test_files_that_are_missing_or_damaged_are_named(tmp_path):
 def car():
     """The car's controller on a pty and a tracker that sends where it is."""
     eye = np.eye(4) + np.eye(4, k=3)
-    tracker = ViconEmulator(ViconEmulatorConfig(port=free_port()), lambda ns: {"car": eye, "board": eye})
+    tracker = ViconEmulator(ViconEmulatorConfig(port=free_udp_port()), lambda ns: {"car": eye, "board": eye})
     with VescEmulator(VescEmulatorConfig(), TwinVehicle(CarConfig())) as vesc:
         yield vesc, tracker.config.port
     tracker.close()
@@ -128,7 +123,7 @@ def test_the_car_is_asked_for_what_its_launch_file_wants(car, tmp_path, monkeypa
 
 def test_devices_of_a_twin_that_is_switched_off_are_missed(tmp_path):
     # Not the usual port: the twin of another test may be sending there.
-    real = ["vicon.source=127.0.0.1", f"vicon.port={free_port(socket.SOCK_DGRAM)}"]
+    real = ["vicon.source=127.0.0.1", f"vicon.port={free_udp_port()}"]
     rows = findings(plan_of("green_screen", "twin.if=false", *real), tmp_path)
     for check in ("camera", "VESC"):
         (row,) = [row for row in rows if row.check == check]
@@ -138,7 +133,7 @@ def test_devices_of_a_twin_that_is_switched_off_are_missed(tmp_path):
 
 
 def test_each_host_has_its_own_needs(tmp_path):
-    watch, drive = free_port(socket.SOCK_STREAM), free_port(socket.SOCK_STREAM)
+    watch, drive = free_ports(2)
     keys = KeyFolder(tmp_path / "keys")
     keys.new("robot")
     shared = [f"hosts.robot.watch_port={watch}", f"hosts.robot.drive_port={drive}", f"keys={keys.path}"]
@@ -222,7 +217,9 @@ def test_a_computer_without_a_launch_file_in_mind(tmp_path, monkeypatch, capsys)
     for name in ("torch", "egl", "llvm", "screens"):  # processes that take seconds; tests of their own
         monkeypatch.setattr(graphics, name, lambda required=False: [])
     monkeypatch.setattr(machine, "clock", lambda: [])
-    code, output, _ = run(monkeypatch, capsys, "--folder", tmp_path, "--vicon-port", free_port(), "--json")
+    code, output, _ = run(
+        monkeypatch, capsys, "--folder", tmp_path, "--vicon-port", free_udp_port(), "--json"
+    )
     told = json.loads(output)["findings"]
     assert code == 0
     assert {
@@ -242,7 +239,7 @@ def test_a_computer_without_a_launch_file_in_mind(tmp_path, monkeypatch, capsys)
     assert ABSENT in {row["state"] for row in told if row["check"] == "VICON"}
     with VescEmulator(VescEmulatorConfig(), TwinVehicle(CarConfig())) as vesc:
         code, output, _ = run(
-            monkeypatch, capsys, "--folder", tmp_path, "--vesc", vesc.port, "--vicon-port", free_port()
+            monkeypatch, capsys, "--folder", tmp_path, "--vesc", vesc.port, "--vicon-port", free_udp_port()
         )
     assert code == 1
     assert f"-> advnerf car motor set-timeout --vesc {vesc.port}" in output

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from advnerf_core.attack.artifact import load_attack
-from benchmarks.page_client import request
 from nodes.experiment.engine.progress_record import read_progress
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run import whole
@@ -21,6 +20,7 @@ from nodes.experiment_page.page import ExperimentPage, run_with_page
 from nodes.experiment_page.time_left import all_left_s
 from nodes.runtime.errors import BusError
 from tests.support.experiment_page import CELLS, record_of, search_so_far, state_of
+from tests.support.live.page_client import request
 from tests.support.stage_versions import tiny_experiment
 
 OTHER_PATHS = [

@@ -5,9 +5,9 @@ from urllib.parse import urlsplit
 import pytest
 
 from benchmarks.experiment_page_pictures import watched_experiment
-from benchmarks.page_browser import PHONE, available
 from nodes.experiment_page.page import ExperimentPage
 from tests.support.experiment_page import CELLS, record_of, search_so_far
+from tests.support.live.page_browser import PHONE, available
 
 pytestmark = [
     pytest.mark.browser,
@@ -58,7 +58,7 @@ class Watcher:
         self.page.on("request", lambda request: self.asked.append(request.url))
         self.page.goto(url)
 
-    def sees(self, expression, timeout_s=600.0):
+    def sees(self, expression, timeout_s=120.0):
         self.page.wait_for_function(f"() => {expression}", timeout=1000 * timeout_s)
 
     def check(self):

@@ -9,8 +9,8 @@ import pytest
 
 from advnerf_core.attack.artifact import AttackFile, save_attack
 from advnerf_core.geometry import Pinhole, make_transform, rotation_z
-from benchmarks.page_browser import PHONE, Phone, available, live_page
 from calibration.schema import TargetCalibration, load_calibration
+from tests.support.live.page_browser import PHONE, Phone, available, live_page
 from tests.support.page import TWIN
 
 pytestmark = [

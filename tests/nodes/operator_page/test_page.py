@@ -11,7 +11,7 @@ pytest.importorskip("uvicorn")
 pytest.importorskip("starlette")
 pytest.importorskip("websockets")
 
-from benchmarks.page_client import Browser, cookie_of, request
+from tests.support.live.page_client import Browser, cookie_of, request
 from tests.support.page import IN_TIME, Run
 from tests.support.waiting import wait_for
 

@@ -14,10 +14,10 @@ import pytest
 pytest.importorskip("uvicorn")
 pytest.importorskip("websockets")
 
-from benchmarks.page_client import Browser
 from nodes.bags.writer import BagWriter
 from nodes.runtime.messages import encode, image_message, pose_message
 from tests.support.bag_samples import START_NS, sample
+from tests.support.live.page_client import Browser
 from tests.support.page import REPOSITORY, TWIN
 
 pytestmark = pytest.mark.live

@@ -107,7 +107,7 @@ def test_a_publisher_that_leaves_is_followed_by_another(participant_of, program,
     )
     cdr, writers = encode(image_message(PIXELS, time.time_ns(), "camera")), set()
     for _ in range(2):
-        policy = program("benchmarks.dds_strangers", "--honest")
+        policy = program("tests.support.live.dds_strangers", "--honest")
 
         def answered():
             participant.write(0, cdr)
@@ -135,7 +135,7 @@ def test_other_computers_cannot_reach_the_sockets(participant_of):
 def test_a_publisher_with_other_quality_of_service_is_named(participant_of, program):
     participant = participant_of(takes=[Endpoint("/cmd_vel", TWIST, True, 10)])
     assert participant.mismatch(0) == ""
-    ask(program("benchmarks.dds_strangers"), "unreliable")
+    ask(program("tests.support.live.dds_strangers"), "unreliable")
     wait_until(lambda: "does not offer reliable delivery" in participant.mismatch(0))
     assert participant.present(0) == ()
 
@@ -143,7 +143,7 @@ def test_a_publisher_with_other_quality_of_service_is_named(participant_of, prog
 def test_another_publisher_beside_ours_is_noticed(participant_of, program):
     participant = participant_of([Endpoint("/image_raw", IMAGE, False, 5)], watched=[0])
     assert participant.rivals(0) == ()
-    ask(program("benchmarks.dds_strangers"), "false_images")
+    ask(program("tests.support.live.dds_strangers"), "false_images")
     wait_until(lambda: len(participant.rivals(0)) == 1)
     wait_until(lambda: participant.rivals(0) == ())
 
@@ -166,7 +166,7 @@ def test_a_command_answers_an_image_through_the_whole_node(tmp_path, program):
     clock = SystemClock()
     node = Ros2Node.build(config, NodeContext("ros2", tmp_path, clock))
     try:
-        program("benchmarks.dds_strangers", "--honest")
+        program("tests.support.live.dds_strangers", "--honest")
         wait_until(lambda: node.counters()["readers /image_raw"] == 1.0)
         node.tick(clock.now())
         wait_until(lambda: (node.tick(clock.now()), "yet" not in node.status()[1])[1])

@@ -15,13 +15,13 @@ import pytest
 import yaml
 
 from advnerf_core.geometry import planar_pose
-from benchmarks.operator import LiveOperator
 from benchmarks.rclpy_peer import PEERS, ROOT, RclpyPeer, rclpy_python
-from benchmarks.ros2_strangers import free_port
 from nodes.bags import read_info, read_messages
 from nodes.runtime.bus import Bus
 from nodes.runtime.messages import decode, drive_message, image_message, pose_message, stamp_ns, types
 from nodes.runtime.messages import header as make_header
+from tests.support.live.operator import LiveOperator
+from tests.support.live.processes import free_udp_port
 
 pytestmark = [
     pytest.mark.ros2,
@@ -254,7 +254,7 @@ def test_a_car_in_ros_obeys_the_safety_node_only(tmp_path, peer_of):
         "launch/ros2_car.launch.yaml",
         run_dir,
         f"params.domain_id={domain}",
-        "policy.module=benchmarks.straight_policy",
+        "policy.module=tests.support.live.straight_policy",
         "policy.config.speed_mps=0.5",
         "ros2.send=[{topic: /safety/drive, ros: /safe_cmd, type: geometry_msgs/msg/TwistStamped}]",
         "record=false",
@@ -329,7 +329,7 @@ def test_a_policy_in_ros_drives_the_lab_and_the_drive_is_recorded(tmp_path, peer
     advnerf = [sys.executable, "-m", "nodes.cli.main"]
     subprocess.run([*advnerf, "policy", "export", str(REFERENCE), "--onnx", str(onnx)], cwd=ROOT, check=True)
     run_dir, domain = tmp_path / "run", DOMAIN + 1
-    settings = (f"params.domain_id={domain}", f"params.vicon_port={free_port()}")
+    settings = (f"params.domain_id={domain}", f"params.vicon_port={free_udp_port()}")
     launch = launch_of("launch/ros2.launch.yaml", run_dir, *settings)
     nodes = ("twin", "camera", "vicon", "compositor", "ros2", "safety", "motor")
     operator = LiveOperator(run_dir, nodes)

@@ -15,7 +15,14 @@ import yaml
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
-from benchmarks.bag_damage import (
+from nodes.bags.reader import read_attachments, read_info, read_messages
+from nodes.bags.repair import repair
+from nodes.bags.repair_parts import repair_bag
+from nodes.bags.writer import BagWriter, SplitLimits
+from nodes.cli.main import app
+from nodes.runtime.errors import BagError
+from nodes.runtime.messages import encode, pose_message
+from tests.support.bag_damage import (
     COVERED,
     KINDS,
     Numbers,
@@ -26,13 +33,6 @@ from benchmarks.bag_damage import (
     messages_of,
     reachable,
 )
-from nodes.bags.reader import read_attachments, read_info, read_messages
-from nodes.bags.repair import repair
-from nodes.bags.repair_parts import repair_bag
-from nodes.bags.writer import BagWriter, SplitLimits
-from nodes.cli.main import app
-from nodes.runtime.errors import BagError
-from nodes.runtime.messages import encode, pose_message
 from tests.support.bag_samples import START_NS, write_all_topics
 
 

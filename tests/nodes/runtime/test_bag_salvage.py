@@ -8,11 +8,11 @@ import lz4.frame
 import pytest
 import zstandard
 
-from benchmarks.bag_damage import make_bags, messages_of, reachable
 from nodes.bags.reader import read_info
 from nodes.bags.records import ChunkHead
 from nodes.bags.repair import repair
 from nodes.bags.salvage import good_records
+from tests.support.bag_damage import make_bags, messages_of, reachable
 
 START_NS = 1_800_000_000_000_000_000
 

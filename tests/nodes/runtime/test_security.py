@@ -18,19 +18,10 @@ from nodes.runtime.errors import SecurityError, TopicError
 from nodes.runtime.inbox import Inbox
 from nodes.runtime.messages import drive_message, encode, header, type_hash_prefix, types
 from nodes.runtime.wire import Meta, pack_meta
+from tests.support.live.processes import free_ports
 from tests.support.waiting import wait_for
 
 ACKERMANN = "ackermann_msgs/msg/AckermannDriveStamped"
-
-
-def free_ports(count):
-    probes = [socket.socket() for _ in range(count)]
-    for probe in probes:
-        probe.bind(("127.0.0.1", 0))
-    ports = [probe.getsockname()[1] for probe in probes]
-    for probe in probes:
-        probe.close()
-    return ports
 
 
 class Host:
