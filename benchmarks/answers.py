@@ -13,7 +13,6 @@ from advnerf_core.report.evidence.about import SetAbout, read_about
 from advnerf_core.report.evidence.families import GRADIENT
 from advnerf_core.report.evidence.hardness import with_titles
 from advnerf_core.report.evidence.page import groups_of_searches
-from advnerf_core.report.evidence.strongest import strongest_random
 from advnerf_core.report.evidence.words import (
     NOT_DRIVEN,
     ends,
@@ -24,6 +23,7 @@ from advnerf_core.report.evidence.words import (
     smaller_excess,
 )
 from advnerf_core.report.reference import DOMAINS
+from benchmarks.strongest import strongest_random
 
 # Worlds that this project did not write, or did not draw, by what the names of their sets contain.
 _FOREIGN = {

@@ -10,9 +10,9 @@ import argparse
 import os
 from pathlib import Path
 
-from advnerf_core.report.evidence.strongest import Strongest, strongest_random
 from advnerf_core.report.evidence.verify import sets_in
 from benchmarks.results import record_row
+from benchmarks.strongest import Strongest, strongest_random
 
 PUBLISHED = Path("docs/results")
 

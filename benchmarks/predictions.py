@@ -20,21 +20,21 @@ from advnerf_core.report.cells import read_cells
 from advnerf_core.report.evidence.prediction_score import (
     LEVEL,
     Score,
-    binomial_interval,
-    registered_bands,
     score_bands,
 )
 from advnerf_core.report.evidence.registration import read_registration
 from advnerf_core.report.evidence.results import Evidence
-from advnerf_core.report.evidence.transfer_factor import (
+from advnerf_core.report.evidence.verify import sets_in
+from benchmarks.results import REPOSITORY, LedgerRow
+from benchmarks.transfer_factor import (
     Transfer,
     belief,
+    binomial_interval,
     earlier_than,
+    registered_bands,
     rival_bands,
     transfer_of,
 )
-from advnerf_core.report.evidence.verify import sets_in
-from benchmarks.results import REPOSITORY, LedgerRow
 
 PUBLISHED = REPOSITORY / "docs" / "results"
 COMMAND = "python -m benchmarks.predictions"

@@ -55,7 +55,7 @@ OWN = {  # text that the same function has just written, or already read as a wh
     "advnerf_core/report/evidence/verifying/numbers.py": 1,
     "benchmarks/retraining.py": 1,
     "nodes/experiment/run/published.py": 1,
-    "nodes/experiment/show/context.py": 1,
+    "nodes/experiment/show/experiment_world.py": 1,
     "nodes/experiment/engine/artefact.py": 1,
     "nodes/lab/carla/capture.py": 1,
     "nodes/lab/trials/plan.py": 1,

@@ -30,7 +30,6 @@ class Run:
             see `conditions`.
         victim: Name of the policy: "hardened" was trained with random textures, "naive" was not, others are a user's.
         seed: Seed of the attack; 0 without randomness.
-        start: Number of the start.
         states: Pose of the rear axle at the control ticks, ``[T + 1, 3]``: x [m], y [m], yaw [rad], world.
         cte_m: Signed cross-track error at the control ticks, left positive, ``[T + 1]`` [m].
         total_cte_m: Sum of ``|CTE|`` over the horizon [m].
@@ -119,10 +118,8 @@ class Drives:
     """All drives of one scenario.
 
     Attributes:
-        scenario: Name of the scenario.
         scene: Contents of its maps.
         dt_s: Time between control ticks [s].
-        runs: The drives.
         curves: Loss curves of the searches.
         film: The driving camera's images past the plain, random and attacked object; None without a film.
         seen: Camera images of the objects, by method.
@@ -164,7 +161,6 @@ class FidelityView:
     """One held-out view of the driving camera: the real image against the surrogate's.
 
     Attributes:
-        label: Name of the view.
         psnr_full_db: PSNR at the camera's size [dB].
         psnr_policy_db: PSNR at the policy's size, 200x66 [dB].
         ssim_full: SSIM at the camera's size.

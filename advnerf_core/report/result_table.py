@@ -22,10 +22,7 @@ class Wanted:
     """A row that a table should have, with its seeds.
 
     Attributes:
-        scenario: Name of the scenario.
         placement: Name of the placement; empty for the scenario's own.
-        victim: Name of the victim.
-        method: Name of the method.
         seeds: Requested seeds.
         deployed: Whether deployed drives are requested.
     """
@@ -53,14 +50,9 @@ class TableRow:
     """One line of the table: all seeds of a scenario, victim and method in one domain. None for missing values.
 
     Attributes:
-        scenario: Name of the scenario.
-        placement: Name of the placement.
-        victim: Name of the victim.
-        method: Name of the method.
         domain: surrogate or deployed.
         seeds: Finished seeds.
         missing: Missing seeds.
-        drives: Number of drives.
         off_track: Drives that left the track.
         total_m: Mean total CTE [m].
         total_std_m: Standard deviation over seeds of their mean totals [m]; None for one seed.
@@ -117,7 +109,6 @@ class ResultTable:
 
     Attributes:
         rows: The lines, in the requested order.
-        cells: The cells, by name.
         name: Name of the experiment.
     """
 

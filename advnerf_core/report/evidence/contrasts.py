@@ -21,9 +21,6 @@ class ContrastRow:
     """One contrast of one method against one victim.
 
     Attributes:
-        name: Name of the contrast.
-        victim: Name of the victim.
-        method: Name of the method.
         before_m: Mean excess |CTE| per tick under the first condition [m].
         after_m: The same under the second, over the same searches and starts [m].
         difference_m: After minus before, paired by search and start [m].

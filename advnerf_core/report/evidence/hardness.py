@@ -81,7 +81,6 @@ class HardnessVerdict(StrictModel):
     """Effect of N textures of each validation family on one policy.
 
     Attributes:
-        victim: Name of the victim.
         policy_sha256: Content hash of its policy.
         recipe: Training settings of the victim.
         trained_on: Families of its training.
@@ -135,7 +134,6 @@ class HardnessRecord(StrictModel):
 
     Attributes:
         format: Format of the file.
-        verdicts: The verdicts.
     """
 
     format: Literal["advnerf-hardness-1"] = FORMAT

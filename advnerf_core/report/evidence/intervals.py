@@ -33,8 +33,6 @@ class ClusteredInterval:
         over: The population of the interval. ``"searches and starts"``: new searches driven from new
             starts. ``"searches"``: new searches driven from this one start. ``"starts"``: this one search
             driven from new starts.
-        searches: Number of searches.
-        drives: Number of drives.
     """
 
     mean: float

@@ -86,9 +86,7 @@ class RegisteredCell(StrictModel):
     """One cell.
 
     Attributes:
-        scenario: Name of the scenario.
         placement: Name of the placement; empty for the scenario's own.
-        victim: Name of the victim.
         method: Name of the method, or ``none``.
         seed: Seed of the search.
     """
@@ -109,10 +107,6 @@ class PrimaryTest(StrictModel):
     """A claimed test: the method's deployed excess against the baseline's that is strongest in the surrogate.
 
     Attributes:
-        scenario: Name of the scenario.
-        placement: Name of the placement.
-        victim: Name of the victim.
-        method: Name of the method.
         against: The baselines.
     """
 
@@ -153,7 +147,6 @@ class Registration(StrictModel):
         date: Date of the registration, ISO.
         software_version: Version of advnerf.
         scenarios: Scenarios by name, ``NAME`` or ``NAME.PLACEMENT``.
-        cells: All cells.
         primary: The claimed tests; Holm's adjustment is over these.
         contrasts: Comparisons of the same attacks under two conditions.
         level: Coverage of all intervals.

@@ -22,13 +22,8 @@ class Row:
     """One method against one victim in one domain, over its searches and their starts.
 
     Attributes:
-        scenario: Name of the scenario.
-        placement: Name of the placement.
-        victim: Name of the victim.
         method: Name of the method, or ``none``.
         domain: surrogate or deployed.
-        searches: Number of searches.
-        drives: Number of drives.
         excess_m: Mean excess |CTE| per tick over the plain object [m]; for ``none`` its mean |CTE|.
         low_m: Lower end of its interval [m]; None with too few drives.
         high_m: Upper end [m].
@@ -65,11 +60,7 @@ class Row:
 
 
 class CellDrives:
-    """Outcomes of the drives of cells, from their stored totals. `Evidence` computes them from published poses.
-
-    Args:
-        cells: The cells.
-    """
+    """Outcomes of the drives of cells, from their stored totals. `Evidence` computes them from published poses."""
 
     level = LEVEL
 

@@ -33,7 +33,6 @@ class Part:
 
     Attributes:
         name: Name of the stage or of the cell.
-        state: State of the part.
         text: The current step, or why it failed.
         fraction: Finished share, 0..1.
         first_fraction: Share that was finished at the start, if it was resumed.

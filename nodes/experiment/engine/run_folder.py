@@ -33,7 +33,6 @@ class RunFolder(Generic[Config]):
     Attributes:
         config: The resolved configuration.
         file: The experiment file.
-        folder: The run folder.
         setting: Name of the setting, e.g. ``demo``.
     """
 

@@ -54,7 +54,6 @@ class Check:
         float32_error: Relative difference of the gradient as the attack computes it to the one in float64.
         clean: The drive without an attack.
         closed: The cosine to the true closed loop, over steps of the finite differences; information only.
-        gradient_norm: Norm of the gradient.
         adjoint: Derivatives along the directions, by the adjoint.
         frozen: Derivatives along the directions, by finite differences with frozen poses.
         ticks: Adjoints, saturation and visibility over time.

@@ -8,34 +8,19 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
-import torch
-
-from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
-from advnerf_core.memory import peak_mib, restart_peak
 from advnerf_core.run_module import module_command
 from nodes.experiment.node.job import REQUEST
 from nodes.experiment.node.prepare import load_request, prepare, request_text
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.steps.memory import gradient_peak_mib
 
 
 def peak_above_idle_mib(request: Experiment, ticks: int, cache_mib: float) -> float:
-    """Measure in this process, which must be fresh; idle is after one tick, as libraries and compiled kernels are idle memory."""
+    """Measure in this process, which must be fresh."""
     prepared = prepare(request)
-    problem = replace(
-        prepared.problem,
-        start_states=prepared.problem.start_states[:1],
-        steps=ticks,
-        goals=None if prepared.problem.goals is None else prepared.problem.goals[:1],
-        cache_bytes=int(cache_mib * 2**20),
-    )
-    theta = prepared.space.surrogate.initial_theta(torch.Generator().manual_seed(0))
-    evaluate(replace(problem, steps=1), theta)
-    idle_mib = restart_peak()
-    adjoint_gradient(problem, theta)
-    return peak_mib() - idle_mib
+    return gradient_peak_mib(prepared.problem, prepared.space, ticks, cache_mib)
 
 
 def measured_mib(request: Experiment, ticks: int, cache_mib: float = 0.0) -> float:

@@ -7,8 +7,8 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from advnerf_core.strict import StrictModel
+from nodes.experiment.plan.numbers import Unit
 
-Unit = Annotated[float, Field(ge=0, le=1)]
 Way = Literal["composed", "native"]
 
 
@@ -19,7 +19,6 @@ class _FaceCarrier(StrictModel):
     training: ClassVar[None] = None
     response: ClassVar[Literal["identity"]] = "identity"
 
-    panel: str = Field(min_length=1, description="Which of the world's panels carries the face.")
     resolution: Annotated[int, Field(ge=2, le=128)] = Field(
         default=64, description="Grid cells along each side of the face."
     )

@@ -21,7 +21,6 @@ class Cell:
 
     Attributes:
         scenario: Name of variant and path in tables and file names: the path; for a variant its name, or PATH_VARIANT if it has several paths.
-        victim: Name of the victim.
         method: Name of the method of attack; ``none``: no attack, ``empty``: no object.
         seed: Seed of the search and its starts; 0 without attack.
         variant: Name of the experiment's variant; empty for an experiment without variants.

@@ -16,6 +16,7 @@ from nodes.experiment.plan import rules
 from nodes.experiment.plan.carriers import CarrierConfig, ComposedConfig, FaceCarrier
 from nodes.experiment.plan.deploy_config import DeployConfig
 from nodes.experiment.plan.maps_config import MapsConfig
+from nodes.experiment.plan.numbers import Positive, PositiveNumber
 from nodes.experiment.plan.over import OverConfig
 from nodes.experiment.plan.placed import WantedObject
 from nodes.experiment.plan.sections import (
@@ -24,8 +25,6 @@ from nodes.experiment.plan.sections import (
     MeasureConfig,
     ObjectConfig,
     PolicyConfig,
-    Positive,
-    PositiveNumber,
     RetrainConfig,
     SceneConfig,
     ViewConfig,

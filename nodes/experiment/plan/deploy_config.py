@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
 from advnerf_core.strict import StrictModel
 from hardware.cameras.effects import PRESETS, Effects
-
-Count = Annotated[int, Field(ge=0)]
-Positive = Annotated[int, Field(ge=1)]
+from nodes.experiment.plan.numbers import Count, Positive, PositiveNumber
 
 
 class DeployConfig(StrictModel):
@@ -45,7 +43,7 @@ class DeployConfig(StrictModel):
     )
     laps: Count = Field(default=0, description="Laps driven live without attack before the cells.")
     empty_scene: bool = Field(default=False, description="Also drive with the panel taken away.")
-    ready_timeout_s: Annotated[float, Field(gt=0)] = Field(
+    ready_timeout_s: PositiveNumber = Field(
         default=60.0, description="Time for the graph to become ready [s]."
     )
 

@@ -7,15 +7,15 @@ from typing import Annotated
 from pydantic import Field
 
 from advnerf_core.strict import StrictModel
+from nodes.experiment.plan.numbers import Count, Positive
 
-Count = Annotated[int, Field(ge=1)]
 Numbers = Annotated[tuple[float, ...], Field(min_length=1)]
 
 
 class LandscapeConfig(StrictModel):
     """A grid over the bounds of one object."""
 
-    points: tuple[Count, Count] = Field(default=(9, 9), description="Points along x and y.")
+    points: tuple[Positive, Positive] = Field(default=(9, 9), description="Points along x and y.")
     yaws_rad: tuple[float, ...] = Field(
         default=(), description="Headings [rad]; the found one if none is given."
     )
@@ -43,6 +43,6 @@ class RobustnessMapConfig(StrictModel):
 class MapsConfig(StrictModel):
     """Maps to make."""
 
-    object: Annotated[int, Field(ge=0)] = Field(default=0, description="Number of the object that is moved.")
+    object: Count = Field(default=0, description="Number of the object that is moved.")
     landscape: LandscapeConfig = LandscapeConfig()
     robustness: RobustnessMapConfig = RobustnessMapConfig()

@@ -37,14 +37,11 @@ def _checked_condition(name: str, info: ValidationInfo) -> str:
     return name if name in CONTROLS else _checked(require_method)(name, info)
 
 
-MethodReference = Annotated[str, AfterValidator(_checked(require_method))]
-"""A method as `advnerf_core.attack.methods.load_method` takes it; ``file.py:Name`` becomes absolute. Nothing is loaded."""
-
 ArchitectureReference = Annotated[str, AfterValidator(_checked(require_architecture))]
 """An architecture as `advnerf_core.policies.architecture.load_architecture` takes it; ``file.py:Class`` becomes absolute. Nothing is loaded."""
 
 ConditionReference = Annotated[str, AfterValidator(_checked_condition)]
-"""The same, or a control: ``none``, ``empty``."""
+"""A method as `advnerf_core.attack.methods.load_method` takes it, or a control: ``none``, ``empty``."""
 
 ObjectiveReference = Annotated[str, AfterValidator(_checked(require_objective))]
 """An objective as `advnerf_core.attack.objectives.load_objective` takes it; ``file.py:Class`` becomes absolute. Nothing is loaded."""

@@ -14,6 +14,7 @@ from advnerf_core.geometry import Array, make_transform, rotation_x, rotation_y,
 from advnerf_core.strict import StrictModel
 from hardware.worlds.paths import ReferencePath
 from hardware.worlds.world import WorldDescription
+from nodes.experiment.plan.numbers import PositiveNumber, Unit
 from nodes.experiment.plan.object_kinds import (
     BALL,
     CUBE,
@@ -28,8 +29,6 @@ from nodes.experiment.plan.object_kinds import (
 from nodes.lab.located import NamedFile
 
 Interval = tuple[float, float]
-PositiveNumber = Annotated[float, Field(gt=0.0)]
-Unit = Annotated[float, Field(ge=0.0, le=1.0)]
 FLAT = (PANEL, CUBE)
 _PLACE = {"name", "kind", "x_m", "y_m", "z_m", "yaw_rad", "scale"}
 _OF_OWN_SCENES = {"pitch_rad", "roll_rad", "face", "mesh", "levels"}

@@ -3,37 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 from pydantic import Field
 
 from advnerf_core.strict import StrictModel
+from nodes.experiment.plan.numbers import NotNegative, Positive
 
 if TYPE_CHECKING:
     from advnerf_core.attack.robustness import Disturbances, Smoothness
     from advnerf_core.fields.coloured import ColouredObject
 
-_NotNegative = Annotated[float, Field(ge=0)]
-
 
 class RobustnessConfig(StrictModel):
     """Disturbances that the attack must withstand: the loss is an expectation over these, with new draws in every evaluation."""
 
-    noise: _NotNegative = Field(default=0.0, description="Pixel noise, standard deviation in 0..1.")
-    gain: _NotNegative = Field(default=0.0, description="Spread of the logarithm of the exposure of a drive.")
-    brightness: _NotNegative = Field(
+    noise: NotNegative = Field(default=0.0, description="Pixel noise, standard deviation in 0..1.")
+    gain: NotNegative = Field(default=0.0, description="Spread of the logarithm of the exposure of a drive.")
+    brightness: NotNegative = Field(
         default=0.0, description="Spread of a drive's additive brightness, in 0..1."
     )
-    jitter_m: _NotNegative = Field(
+    jitter_m: NotNegative = Field(
         default=0.0, description="Spread of the camera's position in each frame [m]."
     )
-    jitter_rad: _NotNegative = Field(
+    jitter_rad: NotNegative = Field(
         default=0.0, description="Spread of the camera's rotation in each frame [rad]."
     )
-    draws: Annotated[int, Field(ge=1)] = Field(
+    draws: Positive = Field(
         default=1, description="Drives of each start pose per evaluation, each drawn by itself."
     )
-    smoothness: _NotNegative = Field(
+    smoothness: NotNegative = Field(
         default=0.0, description="Weight of the texture's total variation in the loss [m per unit of colour]."
     )
 

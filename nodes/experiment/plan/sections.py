@@ -6,18 +6,15 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
+from advnerf_core.attack.objectives import CTE
 from advnerf_core.policies.architecture import PILOTNET, Architecture, require_architecture
 from advnerf_core.strict import StrictModel
-from nodes.experiment.plan.method_names import ArchitectureReference
+from nodes.experiment.plan.method_names import ArchitectureReference, ObjectiveReference
+from nodes.experiment.plan.numbers import Count, NotNegative, Positive, PositiveNumber, Unit
 from nodes.experiment.plan.robustness_config import RobustnessConfig
-from nodes.experiment.plan.search_config import SearchBudget
 
-Count = Annotated[int, Field(ge=0)]
-Positive = Annotated[int, Field(ge=1)]
-PositiveNumber = Annotated[float, Field(gt=0)]
 # Fields of the section policy that define the network; its description replaces them in keys.
 NETWORK = {"architecture", "configuration", "hidden"}
-Unit = Annotated[float, Field(ge=0, le=1)]
 
 
 class CaptureConfig(StrictModel):
@@ -55,7 +52,7 @@ class SceneConfig(StrictModel):
     refine_depth: PositiveNumber = Field(
         default=0.005, description="Optical depth from which rendering looks into a cell; see TrainConfig."
     )
-    margin_m: Annotated[float, Field(ge=0)] = Field(
+    margin_m: NotNegative = Field(
         default=0.5,
         description="The learned box reaches so far beyond the world's, if that is not contracted [m].",
     )
@@ -96,10 +93,10 @@ class PolicyConfig(StrictModel):
     stiffness_1pm: PositiveNumber = Field(
         default=0.2, description="How firmly the expert returns to the path [1/m]; see ExpertConfig."
     )
-    feed_forward: Annotated[float, Field(ge=0, le=1)] = Field(
+    feed_forward: Unit = Field(
         default=1.0, description="Share of the path's curvature that the expert steers ahead."
     )
-    delay_s: Annotated[float, Field(ge=0)] = Field(
+    delay_s: NotNegative = Field(
         default=0.1,
         description="What the expert looks ahead by: half a tick and part of the deployed car's lag [s].",
     )
@@ -217,27 +214,37 @@ class MeasureConfig(StrictModel):
 class ResponseConfig(StrictModel):
     """Response of the searched car beyond its calibration; the car needs wheels that steer."""
 
-    delay_s: Annotated[float, Field(ge=0)] = Field(
+    delay_s: NotNegative = Field(
         default=0.0, description="From image to wheels, fractions of a tick allowed [s]."
     )
-    lag_s: Annotated[float, Field(ge=0)] = Field(
-        default=0.0, description="Time constant of the steering [s]."
-    )
+    lag_s: NotNegative = Field(default=0.0, description="Time constant of the steering [s].")
     slew_radps: PositiveNumber | None = Field(
         default=None, description="Limit of the wheels' rate [rad/s]; none: no limit."
     )
 
 
-class AttackConfig(SearchBudget):
-    """The adversary and its budget: all methods evaluate equally often."""
+class AttackConfig(StrictModel):
+    """The adversary, its objective and its budget: all methods evaluate equally often."""
 
+    objective: ObjectiveReference = Field(
+        default=CTE,
+        description="What is maximised: cte, peak, time_off_track, collision, or file.py:Class, relative to this file.",
+    )
+    evaluations: Positive = Field(
+        default=50, description="Closed-loop evaluations of each search; an iteration of the gradient is one."
+    )
+    population: Annotated[int, Field(ge=4)] = Field(default=10, description="Candidates of a generation.")
+    time_batch: Positive = Field(default=16, description="Frames per gradient batch.")
+    cache_mib: NotNegative = Field(
+        default=512.0, description="Budget of the frames kept for the gradient [MiB]."
+    )
     starts: Positive = Field(
         default=1, description="Start poses optimised together; the first of seed 0 is the nominal one."
     )
     nominal_start: bool = Field(
         default=False, description="The first start of every seed is the nominal one, not of seed 0 alone."
     )
-    start_sigma: Annotated[float, Field(ge=0)] = Field(
+    start_sigma: NotNegative = Field(
         default=0.1, description="Spread of starts [m and rad]; headings a quarter of it."
     )
     start_poses: tuple[tuple[float, float, float], ...] = Field(

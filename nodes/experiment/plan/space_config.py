@@ -7,13 +7,8 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from advnerf_core.strict import StrictModel
-from nodes.experiment.plan.search_config import PlacesBudget, ShapeSampling
+from nodes.experiment.plan.numbers import Count, NotNegative, Positive, PositiveNumber, Unit
 from nodes.lab.located import NamedFile
-
-Positive = Annotated[int, Field(ge=1)]
-PositiveNumber = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Unit = Annotated[float, Field(ge=0, le=1)]
 
 
 class ColoursConfig(StrictModel):
@@ -21,17 +16,20 @@ class ColoursConfig(StrictModel):
 
     kind: Literal["colours"]
     searched: ClassVar[str] = "The colours of {} are searched together in the learned scene"
-    cells: Annotated[int, Field(ge=0)] = Field(
+    cells: Count = Field(
         default=0,
         description="Cells along each edge of coarse random textures; 0: as many as the objects have colours.",
     )
 
 
-class PlacesConfig(PlacesBudget):
-    """Places of the objects, and their colours unless these are fixed."""
+class PlacesConfig(StrictModel):
+    """Places of the objects, and their colours unless these are fixed: ``samples * steps`` evaluations, for random places as well."""
 
     kind: Literal["places"]
     searched: ClassVar[str] = "The places of {} are searched together in the learned scene"
+    colours: bool = Field(default=True, description="Whether the colours are searched too.")
+    samples: Positive = Field(default=5, description="Placements that are drawn.")
+    steps: Positive = Field(default=10, description="Evaluations of each placement.")
     move_m: NotNegative = Field(default=1.5, description="An object's x and y may change by this [m].")
     turn_rad: NotNegative = Field(
         default=0.6,
@@ -53,6 +51,11 @@ class PlacesConfig(PlacesBudget):
     coloured_by: NamedFile | None = Field(
         default=None, description="Attack file whose colours the objects have where colours are not searched."
     )
+
+    @property
+    def evaluations(self) -> int:
+        """Closed-loop evaluations of a search."""
+        return self.samples * self.steps
 
     @model_validator(mode="after")
     def _coloured_once(self) -> PlacesConfig:
@@ -80,12 +83,21 @@ class MeshTextureConfig(_MeshConfig):
     searched: ClassVar[str] = "The textures of {} as meshes are searched over the world's own pictures"
 
 
-class MeshShapeConfig(_MeshConfig, ShapeSampling):
+class MeshShapeConfig(_MeshConfig):
     """The shapes of the objects as meshes, searched over the world's own pictures."""
 
     kind: Literal["mesh_shape"]
     searched: ClassVar[str] = "The shapes of {} as meshes are searched over the world's own pictures"
     bound_m: PositiveNumber = Field(default=0.4, description="No vertex moves farther [m].")
+    smoothness: NotNegative = Field(
+        default=19.0, description="Lambda of the large-steps preconditioner; 0: none."
+    )
+    samples: Annotated[int, Field(ge=1, le=256)] = Field(
+        default=4, description="Rays a pixel for the gradient inside the silhouettes."
+    )
+    boundary_samples: Annotated[int, Field(ge=1, le=256)] = Field(
+        default=1, description="Points a pixel for that of the silhouettes."
+    )
 
 
 SpaceConfig = Annotated[

@@ -19,7 +19,8 @@ from pydantic_core import PydanticCustomError
 from advnerf_core.places import expanded
 from advnerf_core.policies.load import POLICY_SUFFIXES, is_code
 from advnerf_core.strict import COMPLETE, StrictModel
-from nodes.experiment.plan.sections import Count, PolicyConfig
+from nodes.experiment.plan.numbers import Count
+from nodes.experiment.plan.sections import PolicyConfig
 
 # Policies that the section policy trains, and the first one's retrained version; a user's victims have other names.
 HARDENED, NAIVE, RETRAINED = "hardened", "naive", "retrained"

@@ -23,7 +23,6 @@ class Planned:
     """A cell with its current settings.
 
     Attributes:
-        cell: The cell.
         job: Job that runs it; without threads and phase.
         live: Whether it drives a live graph.
     """
@@ -34,12 +33,7 @@ class Planned:
 
 
 def plan_cells(experiment: Experiment, cells: Sequence[Cell]) -> list[Planned]:
-    """Current settings of every cell; reads variants and digests of their stages, and runs nothing.
-
-    Args:
-        experiment: The experiment.
-        cells: The cells to plan.
-    """
+    """Current settings of every cell; reads variants and digests of their stages, and runs nothing."""
     registration = read_registration(PUBLISHED / experiment.config.name)
     planned = []
     for cell in cells:

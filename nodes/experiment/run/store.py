@@ -27,7 +27,6 @@ class CellStatus:
     """State of one cell.
 
     Attributes:
-        cell: The cell.
         state: ``not driven live``: searched, but all its live tries were spoiled; ``changed``: a result exists, but with other settings;
             ``begun``: interrupted, and resumed by the next run.
         text: Error, or the last line of its log.

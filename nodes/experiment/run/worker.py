@@ -56,11 +56,8 @@ class Job:
     Attributes:
         folder: The run folder for results; the same folder on every machine.
         file: Experiment file.
-        setting: Name of its setting.
         overrides: Changes of the setting.
-        cell: The cell.
         settings_hash: Hash of everything that the result depends on, at planning time.
-        threads: Number of threads for it.
         phase: ``search``: only the part that may run beside others; ``whole``: all of it.
         registration: Digest of the registration that it is run under; empty without one.
     """

@@ -29,7 +29,6 @@ class GivenPolicy(StrictModel):
     """Stored facts about an existing policy.
 
     Attributes:
-        policy: Name of the policy.
         source_sha256: Hash of its file or code, which shows whether it has changed.
         sha256: Content hash from `load_any_policy`.
         contract: Declaration, from `PolicyContract.to_dict`.

@@ -41,7 +41,6 @@ class LiveRun:
 
     Attributes:
         name: Name of its folder and its result.
-        victim: Name of the victim.
         scenario: Name of the path.
         start: Start pose.
         attack: Shown attack; None for none.

@@ -14,7 +14,8 @@ from pathlib import Path
 
 import torch
 
-from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
+from advnerf_core.attack.adjoint import AttackProblem, adjoint_gradient, evaluate
+from advnerf_core.attack.spaces.space import Space
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.memory import RETURNS_WHAT_IS_FREED, peak_mib, restart_peak
@@ -52,9 +53,16 @@ def peak_above_idle_mib(experiment: Experiment, ticks: int) -> float:
     space = face_space(experiment, ideal=True)
     policy, scenario = load_victim(experiment, experiment.config.main_victim), experiment.config.paths[0]
     problem = attack_problem(experiment, space, policy, scenario, experiment.config.seeds[0])
+    return gradient_peak_mib(problem, space, ticks)
+
+
+def gradient_peak_mib(problem: AttackProblem, space: Space, ticks: int, cache_mib: float = 0.0) -> float:
+    """Peak above idle of one gradient of the first start over ``ticks`` ticks [MiB]; the process must be fresh."""
     goals = None if problem.goals is None else problem.goals[:1]
-    one = problem.start_states[:1]
-    problem = dataclasses.replace(problem, start_states=one, goals=goals, steps=ticks, cache_bytes=0)
+    one, cache_bytes = problem.start_states[:1], int(cache_mib * 2**20)
+    problem = dataclasses.replace(
+        problem, start_states=one, goals=goals, steps=ticks, cache_bytes=cache_bytes
+    )
     theta = space.surrogate.initial_theta(torch.Generator().manual_seed(0))
     # Libraries, compiled kernels and thread pools are idle memory.
     evaluate(dataclasses.replace(problem, steps=1), theta)

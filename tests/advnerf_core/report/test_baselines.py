@@ -9,7 +9,7 @@ from advnerf_core.report.evidence.families import families_note, lacking_baselin
 from advnerf_core.report.evidence.kept_build import LOST, is_kept, lost_note
 from advnerf_core.report.evidence.registration import PrimaryTest, RegisteredCell, read_registration
 from advnerf_core.report.evidence.results import Evidence
-from advnerf_core.report.evidence.strongest import strongest_random
+from benchmarks.strongest import strongest_random
 
 PUBLISHED = Path(__file__).parents[3] / "docs" / "results"
 

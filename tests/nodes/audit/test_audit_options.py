@@ -15,7 +15,7 @@ from nodes.audit.cars import CARS, car_of
 from nodes.audit.images import posed
 from nodes.audit.places import Answers, describe, place_of_world
 from nodes.cli.audit import _minutes
-from nodes.experiment.show.context import as_json
+from nodes.experiment.show.experiment_world import as_json
 from nodes.lab.importing.metric_options import MetricOptions
 from nodes.runtime.errors import ConfigError
 

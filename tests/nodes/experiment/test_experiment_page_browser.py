@@ -58,7 +58,7 @@ class Watcher:
         self.page.on("request", lambda request: self.asked.append(request.url))
         self.page.goto(url)
 
-    def sees(self, expression, timeout_s=120.0):
+    def sees(self, expression, timeout_s=600.0):
         self.page.wait_for_function(f"() => {expression}", timeout=1000 * timeout_s)
 
     def check(self):

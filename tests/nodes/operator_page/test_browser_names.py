@@ -4,7 +4,7 @@ import signal
 
 import pytest
 
-from benchmarks.page_browser import PHONE, Phone, available
+from tests.support.live.page_browser import PHONE, Phone, available
 from tests.support.page import Run
 
 pytestmark = [

@@ -10,15 +10,17 @@ from advnerf_core.report.cells import read_cells
 from advnerf_core.report.evidence.prediction_score import LEVEL, score_bands
 from advnerf_core.report.evidence.registration import read_registration
 from advnerf_core.report.evidence.results import Evidence
-from advnerf_core.report.evidence.transfer_factor import (
+from benchmarks.planted_changes import write_simulated_set
+from benchmarks.transfer_factor import (
     PRIOR_SPREAD,
     Transfer,
     belief,
+    binomial_interval,
     earlier_than,
+    registered_bands,
     rival_bands,
     transfer_of,
 )
-from benchmarks.planted_changes import write_simulated_set
 
 ENDS = np.array([0.1, 0.9])
 
@@ -144,3 +146,24 @@ def test_a_set_knows_only_sets_that_were_finished_before_its_first_cell(evidence
     done, overlapping, later = on(5, (6, 11)), on(4, (6, 13)), on(11, (11, 11))
     oldest = on(1, (2, 3))
     assert earlier_than(now, [later, done, now, overlapping, oldest]) == [oldest, done]
+
+
+def test_registered_bands_are_in_half_lanes_and_of_every_search() -> None:
+    drives = Transfer("set", ("one", "other"), np.ones((2, 3)), np.ones((2, 3)))
+    said = {
+        "one": {"excess_low_m": 0.1, "excess_high_m": 0.2},
+        "other": {"excess_low_m": 0.3, "excess_high_m": 0.4},
+    }
+    found = registered_bands(drives, said, 0.5)
+    assert found is not None
+    assert found.shape == (2, 3, 2)
+    assert found[1, 2] == pytest.approx([0.6, 0.8])
+    assert registered_bands(drives, {"one": said["one"]}, 0.5) is None
+
+
+@pytest.mark.parametrize(("held", "count"), [(0, 6), (5, 6), (6, 6), (27, 35)])
+def test_the_binomial_interval_is_that_of_clopper_and_pearson(held: int, count: int) -> None:
+    expected = stats.binomtest(held, count).proportion_ci(0.95, method="exact")
+    assert binomial_interval(held, count) == pytest.approx((expected.low, expected.high))
+    with pytest.raises(ValueError, match="expected some of at least one"):
+        binomial_interval(7, 6)

@@ -13,12 +13,13 @@ factor of 1.5 and residuals of 10 %.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri, stdtrit
+from scipy.special import betaincinv, ndtri, stdtrit
 
 from advnerf_core.report.evidence.results import Evidence
 
@@ -150,6 +151,38 @@ def earlier_than(evidence: Evidence, others: Sequence[Evidence]) -> list[Evidenc
         and max(cell.date for cell in other.cells.values()) < first
     ]
     return sorted(found, key=lambda other: other.registration.date)
+
+
+def registered_bands(
+    found: Transfer, predictions: Mapping[str, Mapping[str, Any]], half_lane_m: float
+) -> Floats | None:
+    """Bands ``[searches, starts, 2]`` that were registered before the drives, one for all drives of a search.
+
+    Args:
+        found: The drives of the set.
+        predictions: By name of the cell, with ``excess_low_m`` and ``excess_high_m``; see `TransferPrediction.record`.
+        half_lane_m: Length of half a lane [m].
+
+    Returns:
+        The bands; None if a search was not predicted.
+    """
+    if not all(name in predictions for name in found.cells):
+        return None
+    ends = [
+        [predictions[name][f"excess_{end}_m"] / half_lane_m for end in ("low", "high")]
+        for name in found.cells
+    ]
+    return np.repeat(np.array(ends)[:, None, :], found.surrogate.shape[1], axis=1)
+
+
+def binomial_interval(held: int, count: int, level: float = 0.95) -> tuple[float, float]:
+    """Interval of a share by Clopper and Pearson (1934): ``held`` of ``count`` independent observations."""
+    if not 0 <= held <= count or count < 1:
+        raise ValueError(f"expected some of at least one observation, got {held} of {count}")
+    tail = 0.5 * (1.0 - level)
+    low = 0.0 if held == 0 else float(betaincinv(held, count - held + 1, tail))
+    high = 1.0 if held == count else float(betaincinv(held + 1, count - held, 1.0 - tail))
+    return low, high
 
 
 def _transfer(evidence: Evidence, key: tuple[str, str, str, str]) -> Transfer | None:
