@@ -54,6 +54,9 @@ _NEAR_M, _TURNED_RAD, _GIVE_UP_M = 1.0, 0.15, 3.0  # metres for half a lane of 1
 _PLACES_SEED = 10_000  # far from the seeds of pose attacks, which must not find the training places
 
 
+Told = Callable[[float, str], None]
+
+
 @dataclass(frozen=True, eq=False)
 class Found:
     """Result of one round of attacks.
@@ -84,16 +87,17 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
             placed_objects(experiment),
             native=experiment.config.carrier.training == "native",
         )
+        attacks = _Attacks(experiment, space, dressed)
         told = _part(report, 0.0, 1.0 / (wanted.rounds + 1), "round 0")
-        first = _first_attacks(experiment, space, dressed, victim, folder / "round0", told)
+        first = attacks.first(victim, folder / "round0", told)
         old_attacks: dict[str, Any] = {}
         for number in range(wanted.rounds + 1):
             here = folder / f"round{number}"
             told = _part(report, number / (wanted.rounds + 1), 1.0 / (wanted.rounds + 1), f"round {number}")
-            found = first if number == 0 else _attack_again(experiment, space, dressed, victim, here, told)
+            found = first if number == 0 else attacks.again(victim, here, told)
             rounds.append({"victim": victim.sha256, **found.ratios})
             if number == 1:
-                old_attacks = _under_old_attacks(experiment, dressed, folder / "round0", first)
+                old_attacks = attacks.old(folder / "round0" / "policy.safetensors", first)
             summary = {
                 "rounds": rounds,
                 "old_attacks": old_attacks,
@@ -125,14 +129,14 @@ def unseen_start(experiment: Experiment, scenario: str) -> torch.Tensor:
     return torch.tensor([[place[0], place[1], yaw_rad]], dtype=torch.float64)
 
 
-def _part(report: Report, begin: float, share: float, name: str) -> Callable[[float, str], None]:
+def _part(report: Report, begin: float, share: float, name: str) -> Told:
     def told(part: float, text: str = "") -> None:
         report(min(begin + share * part, 1.0), f"{name}: {text}")
 
     return told
 
 
-def _stepping(told: Callable[[float, str], None], steps: int) -> Callable[[int, float], None]:
+def _stepping(told: Told, steps: int) -> Callable[[int, float], None]:
     def stepped(step: int, loss: float) -> None:
         told(0.7 + 0.3 * step / steps, f"fine-tuning: error {loss**0.5:.3f} rad/s")
 
@@ -149,106 +153,94 @@ def _old_frames(experiment: Experiment) -> list[Frames]:
     return [store.load(name) for name in store.names()]
 
 
-def _first_attacks(
-    experiment: Experiment,
-    space: ColourSpace,
-    dressed: Dressed,
-    victim: LoadedPolicy,
-    folder: Path,
-    report: Callable[[float, str], None],
-) -> Found:
-    """The results of the gradient's cells of the first seed; they are searched here if they are missing."""
-    thetas: dict[str, torch.Tensor] = {}
-    for index, name in enumerate(experiment.config.paths):
-        cell = Cell(name, experiment.config.main_victim, "gradient", experiment.config.seeds[0])
-        at = experiment.cell_folder(cell)
-        freeze(experiment, cell, at)
+@dataclass(frozen=True, eq=False)
+class _Attacks:
+    """Attacks of the first seed, searched in the surrogate and driven past in the deployment scene."""
 
-        def told(part: float, text: str = "", index: int = index, name: str = name) -> None:
-            done = (index + part) / len(experiment.config.paths)
-            report(0.4 * done, f"attacking, {name}: {text}")
+    experiment: Experiment
+    space: ColourSpace
+    dressed: Dressed
 
-        surrogate_part(experiment, space, cell, at, told)
-        thetas[name] = load_shown(space, at, cell).colours
-    return _judged(experiment, space, dressed, victim, thetas, folder)
+    def first(self, victim: LoadedPolicy, folder: Path, report: Told) -> Found:
+        """The results of the gradient's cells; they are searched here if they are missing."""
+        experiment, thetas = self.experiment, dict[str, torch.Tensor]()
+        for index, name in enumerate(experiment.config.paths):
+            cell = Cell(name, experiment.config.main_victim, "gradient", experiment.config.seeds[0])
+            at = experiment.cell_folder(cell)
+            freeze(experiment, cell, at)
 
+            def told(part: float, text: str = "", index: int = index, name: str = name) -> None:
+                done = (index + part) / len(experiment.config.paths)
+                report(0.4 * done, f"attacking, {name}: {text}")
 
-def _attack_again(
-    experiment: Experiment,
-    space: ColourSpace,
-    dressed: Dressed,
-    victim: LoadedPolicy,
-    folder: Path,
-    report: Callable[[float, str], None],
-) -> Found:
-    """The gradient attack of the first seed on a retrained victim, as long as the attack on the first one."""
-    attack = experiment.config.attack
-    thetas: dict[str, torch.Tensor] = {}
-    for index, scenario in enumerate(experiment.config.paths):
-        problem = attack_problem(experiment, space, victim, scenario, experiment.config.seeds[0])
+            surrogate_part(experiment, self.space, cell, at, told)
+            thetas[name] = load_shown(self.space, at, cell).colours
+        return self._judged(victim, thetas, folder)
 
-        def told(evaluation: Any, index: int = index, scenario: str = scenario) -> None:
-            done = (index + (evaluation.iteration + 1) / attack.evaluations) / len(experiment.config.paths)
-            report(
-                0.4 * done, f"attacking again, {scenario}: total CTE {evaluation.predicted_total_cte_m:.1f} m"
-            )
+    def again(self, victim: LoadedPolicy, folder: Path, report: Told) -> Found:
+        """The gradient attack on a retrained victim, as long as the attack on the first one."""
+        config, thetas = self.experiment.config, dict[str, torch.Tensor]()
+        for index, scenario in enumerate(config.paths):
+            problem = attack_problem(self.experiment, self.space, victim, scenario, config.seeds[0])
 
-        result = gradient_attack(
-            on_chosen_device(problem),
-            attack.evaluations,
-            attack.learning_rate,
-            SearchRun(
-                experiment.config.seeds[0],
+            def told(evaluation: Any, index: int = index, scenario: str = scenario) -> None:
+                done = (index + (evaluation.iteration + 1) / config.attack.evaluations) / len(config.paths)
+                total_m = evaluation.predicted_total_cte_m
+                report(0.4 * done, f"attacking again, {scenario}: total CTE {total_m:.1f} m")
+
+            state, key = (
                 folder / f"{scenario}.state.safetensors",
-                told,
-                hash_of({"victim": victim.sha256, "scenario": scenario}),
-            ),
-        )
-        thetas[scenario] = result.theta
-    return _judged(experiment, space, dressed, victim, thetas, folder)
+                {"victim": victim.sha256, "scenario": scenario},
+            )
+            result = gradient_attack(
+                on_chosen_device(problem),
+                config.attack.evaluations,
+                config.attack.learning_rate,
+                SearchRun(config.seeds[0], state, told, hash_of(key)),
+            )
+            thetas[scenario] = result.theta
+        return self._judged(victim, thetas, folder)
 
+    def _judged(self, policy: LoadedPolicy, thetas: dict[str, torch.Tensor], folder: Path) -> Found:
+        """Ratios to no attack for the same victim in both domains, from the attack's starts; stored in the folder of the round."""
+        seed, kept = self.experiment.config.seeds[0], folder / "ratios.json"
+        digests = [hashlib.sha256(theta.numpy().tobytes()).hexdigest() for theta in thetas.values()]
+        key = [policy.sha256, *digests]
+        if kept.exists() and (known := read_json(kept))["of"] == key:
+            return Found(thetas, known["ratios"])
+        ratios: dict[str, dict[str, float]] = {"surrogate": {}, "deployed": {}}
+        for scenario, theta in thetas.items():
+            problem = attack_problem(self.experiment, self.space, policy, scenario, seed)
+            colours = (theta, self.space.plain.colours)
+            learned = [float(evaluate(problem, each)[1].protocol_cte_m.mean()) for each in colours]
+            starts = self.experiment.start_states(scenario, seed)
+            driven = [self._total_cte_m(policy, scenario, starts, each) for each in (theta, None)]
+            ratios["surrogate"][scenario] = learned[0] / learned[1]
+            ratios["deployed"][scenario] = driven[0] / driven[1]
+        write_json(kept, {"of": key, "ratios": ratios})
+        return Found(thetas, ratios)
 
-def _judged(
-    experiment: Experiment,
-    space: ColourSpace,
-    dressed: Dressed,
-    policy: LoadedPolicy,
-    thetas: dict[str, torch.Tensor],
-    folder: Path,
-) -> Found:
-    """Ratios to no attack for the same victim in both domains, from the attack's starts; stored in the folder of the round."""
-    seed, kept = experiment.config.seeds[0], folder / "ratios.json"
-    key = [policy.sha256, *(hashlib.sha256(theta.numpy().tobytes()).hexdigest() for theta in thetas.values())]
-    if kept.exists() and (known := read_json(kept))["of"] == key:
-        return Found(thetas, known["ratios"])
-    ratios: dict[str, dict[str, float]] = {"surrogate": {}, "deployed": {}}
-    for scenario, theta in thetas.items():
-        problem = attack_problem(experiment, space, policy, scenario, seed)
-        learned = [
-            float(evaluate(problem, each)[1].protocol_cte_m.mean()) for each in (theta, space.plain.colours)
-        ]
-        starts = experiment.start_states(scenario, seed)
-        driven = [_total_cte_m(experiment, dressed, policy, scenario, starts, each) for each in (theta, None)]
-        ratios["surrogate"][scenario], ratios["deployed"][scenario] = (
-            learned[0] / learned[1],
-            driven[0] / driven[1],
-        )
-    write_json(kept, {"of": key, "ratios": ratios})
-    return Found(thetas, ratios)
+    def _total_cte_m(
+        self, policy: LoadedPolicy, scenario: str, starts: torch.Tensor, theta: torch.Tensor | None
+    ) -> float:
+        """Total CTE [m] of deployed drives, the mean over starts ``[B, 3]``; plain objects for None."""
+        shown = self.dressed.plain_theta() if theta is None else theta
+        drives = deployed_drives(self.experiment, self.dressed, policy.policy, scenario, starts, shown)
+        return float(np.mean([drive.metrics.total_cte_m for drive in drives]))
 
-
-def _total_cte_m(
-    experiment: Experiment,
-    dressed: Dressed,
-    policy: LoadedPolicy,
-    scenario: str,
-    starts: torch.Tensor,
-    theta: torch.Tensor | None,
-) -> float:
-    """Total CTE [m] of deployed drives, the mean over starts ``[B, 3]``; plain objects for None."""
-    shown = dressed.plain_theta() if theta is None else theta
-    drives = deployed_drives(experiment, dressed, policy.policy, scenario, starts, shown)
-    return float(np.mean([drive.metrics.total_cte_m for drive in drives]))
+    def old(self, file: Path, first: Found) -> dict[str, Any]:
+        """The retrained policy past its training attacks, from an unseen start, beside the original policy without attack."""
+        original = load_victim(self.experiment, self.experiment.config.main_victim)
+        policies, rows = {"original": original, "retrained": load_policy(file)}, {}
+        for scenario, theta in first.thetas.items():
+            start = unseen_start(self.experiment, scenario)
+            row = {
+                f"{name}_{how}_m": self._total_cte_m(policy, scenario, start, each)
+                for name, policy in policies.items()
+                for how, each in (("undisturbed", None), ("attacked", theta))
+            }
+            rows[scenario] = row | {"ratio": row["retrained_attacked_m"] / row["original_undisturbed_m"]}
+        return rows
 
 
 def _collect(
@@ -257,7 +249,7 @@ def _collect(
     victim: LoadedPolicy,
     thetas: Sequence[torch.Tensor],
     folder: Path,
-    report: Callable[[float, str], None],
+    report: Told,
 ) -> list[Frames]:
     """Frames of both domains with the attacked objects: stills around the paths, and drives of the victim, labelled by the teacher.
 
@@ -312,23 +304,3 @@ def _frames(
     labels = expert.steer_states(seen.states).astype(np.float32)
     goals = np.tile(np.array(plan.goal, np.float32), (len(labels), 1))
     return Frames(seen.images, seen.states, labels, goals, seen.textured)
-
-
-def _under_old_attacks(
-    experiment: Experiment, dressed: Dressed, folder: Path, first: Found
-) -> dict[str, Any]:
-    """The retrained policy past its training attacks, from an unseen start, beside the original policy without attack."""
-    original = load_victim(experiment, experiment.config.main_victim)
-    file = folder / "policy.safetensors"
-    retrained, rows = load_policy(file), {}
-    for scenario, theta in first.thetas.items():
-        start = unseen_start(experiment, scenario)
-        undisturbed = _total_cte_m(experiment, dressed, original, scenario, start, None)
-        rows[scenario] = {
-            "original_undisturbed_m": undisturbed,
-            "original_attacked_m": _total_cte_m(experiment, dressed, original, scenario, start, theta),
-            "retrained_undisturbed_m": _total_cte_m(experiment, dressed, retrained, scenario, start, None),
-            "retrained_attacked_m": _total_cte_m(experiment, dressed, retrained, scenario, start, theta),
-        }
-        rows[scenario]["ratio"] = rows[scenario]["retrained_attacked_m"] / undisturbed
-    return rows
