@@ -6,10 +6,11 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
+from advnerf_core.data.posed_images import write_posed_images
+from advnerf_core.geometry import planar_pose
 from advnerf_core.report.clips import read_clip
 from nodes.experiment.pages import report
 from nodes.experiment.run.cells import Bench, run_cell
@@ -27,9 +28,11 @@ def test_all_cells_and_the_report(trained: Experiment, tmp_path: Path) -> None:
     experiment = replace(trained, folder=folder)
     (folder / "report").mkdir()
     picture = np.full((188, 336, 3), 90, np.uint8)
-    for name in ("real", "surrogate"):
-        cv2.imwrite(str(folder / f"{name}.png"), picture)
-    view = {"label": "view", "real_image": "real.png", "surrogate_image": "surrogate.png"}
+    pose = planar_pose(*experiment.references["straight"].drive_start) @ experiment.mount
+    write_posed_images(
+        folder / "capture" / "held_out", [pose], experiment.camera, lambda index: picture, "png"
+    )
+    view = {"label": "view"}
     view |= {"psnr_full_db": 28.0, "psnr_policy_db": 27.5, "ssim_full": 0.9, "ssim_policy": 0.9}
     (folder / "scene" / "fidelity.json").write_text(json.dumps({"views": [view]}))
     rates = [{"real": 0.1, "surrogate": 0.12}]
