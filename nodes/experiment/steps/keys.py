@@ -14,7 +14,7 @@ from nodes.experiment.engine.artefact import Settings, digests_in, hash_of
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.config import POLICY, ExperimentConfig
 from nodes.experiment.plan.sections import NETWORK
-from nodes.experiment.plan.victims import RETRAINED
+from nodes.experiment.plan.victims import NAIVE, RETRAINED
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.faces import has_face
 from nodes.experiment.show.given import given, given_in, victim_sha256, victim_spec
@@ -90,6 +90,10 @@ def cell_settings(experiment: Experiment, cell: Cell, deployed: bool = True) -> 
         stages.remove(POLICY)
     else:
         inputs["architecture"] = config.policy.network.described()
+    trained = experiment.config.trained.get(cell.victim)
+    # Names of the default victims say it; the stage stores the weights by it, whatever the victim is called.
+    if trained is not None and trained.textures != ("none" if cell.victim == NAIVE else "random"):
+        inputs["textures"] = trained.textures
     if cell.victim in (*given_victims, RETRAINED):
         inputs["policy_sha256"] = _policy_sha256(experiment, cell.victim)
     if not deployed:

@@ -102,6 +102,20 @@ def test_a_recipe_changes_its_own_victim_alone(tiny_room):
     assert alone == registered_settings(tiny_experiment(tiny_room[0])).key
 
 
+def test_names_that_change_places_change_keys(tiny_room):
+    """Both victims are of the stage that the section policy describes, so their names alone would not tell them apart."""
+
+    def keys(one, other):
+        victims = f"victims={{a: {{train: {{textures: {one}}}}}, b: {{train: {{textures: {other}}}}}}}"
+        experiment = with_victims(tiny_room[0], victims, "policy.naive_steps=2")
+        return {cell.name: settings_hash(experiment, cell) for cell in experiment.cells}
+
+    first, second = keys("random", "none"), keys("none", "random")
+    both = first.keys() & second.keys()
+    assert {name.split("_")[1] for name in both} == {"a", "b"}
+    assert all(first[name] != second[name] for name in both)
+
+
 def test_another_architecture_does_not_take_over_the_settings_of_the_shared_one():
     config = ExperimentConfig.model_validate(
         {
