@@ -178,7 +178,7 @@ QUESTIONS = (
         "nothing_is_lost",
         "Is anything lost when something breaks?",
         "Damaged and cut files, killed processes, and hostile input.",
-        ("bag_damage", "bag_kill", "attack_kill", "scene_kill", "fuzz", "world_faults"),
+        ("bag_damage", "bag_kill", "attack_kill", "audit_kills", "scene_kill", "fuzz", "world_faults"),
     ),
 )
 

@@ -20,7 +20,7 @@ QUICK = (
 )  # fmt: skip
 LONG = ("adjoint_memory --compare", "newcomer")
 LIVE = (
-    "one_hop", "frame_age", "car_nodes", "launch_times", "calibrations", "lockstep_replay", "two_hosts", "page_latency", "stops",
+    "one_hop", "frame_age", "car_nodes", "launch_times", "calibrations", "lockstep_replay", "two_hosts", "page_latency",
     "policy_from_bags",
 )  # fmt: skip
 OF_A_RUN = ("baked_scene", "gradient_pass", "objects", "phone_to_car", "closed_loop_cosine")

@@ -33,7 +33,6 @@ WIRE = {
     "benchmarks/lockstep_replay.py": 1,
     "benchmarks/rclpy_peer.py": 1,
     "benchmarks/seeds_together.py": 1,
-    "benchmarks/stops.py": 1,  # the page's answer
 }
 HEADERS = {  # text in the header of a tensor file or archive that our own writer made
     "advnerf_core/attack/artifact.py": 2,

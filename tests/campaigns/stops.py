@@ -1,4 +1,4 @@
-"""Is a stop lost when something has run out? ``python -m benchmarks.stops [--repeats N] [--only ORIGIN]``.
+"""Is a stop lost when something has run out?
 
 Safety, motor, page and gateways are real processes, and the motor node drives the emulated controller of the twin. While the car
 drives, one resource runs out; then a stop is asked for. What counts is the brake that the controller reads on its wire, and what the
@@ -7,7 +7,6 @@ caller reads: CONFIRMED or NOT CONFIRMED.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
 import os
@@ -23,11 +22,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from advnerf_core.documents import read_json
 from advnerf_core.geometry import planar_pose
-from benchmarks.results import record_row
 from hardware.emulators.vesc_emulator import VescEmulator
 from hardware.emulators.vesc_firmware import VescEmulatorConfig
 from hardware.worlds.lab.vehicle import CarConfig, TwinVehicle
@@ -43,10 +39,8 @@ from nodes.runtime.requests import RequestIdentity
 from tests.support.live.page_client import Browser, cookie_of, request
 from tests.support.live.processes import REPOSITORY, end, free_ports
 
-COMMAND = "python -m benchmarks.stops"
 TWIN = REPOSITORY / "calibration" / "twin"
-BRAKE_LIMIT_MS, VERDICT_LIMIT_MS = 350.0, 1000.0
-_REPEATS, _HOLDERS, _TRIES = 20, 12, 20
+_HOLDERS, _TRIES = 12, 20
 _UNLIMITED = (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
 RESOURCES = ("nothing", "disk", "descriptors", "endpoints", "memory", "hung reader", "full queue")
 CELLS = (
@@ -169,7 +163,7 @@ def run_out(what: str, rig: Rig) -> Iterator[None]:
             for pid in pids:
                 resource.prlimit(pid, kind, before[pid])
     elif what in ("endpoints", "hung reader", "full queue"):
-        command = [sys.executable, "-m", "benchmarks.stops", "--as", what, "--folder", str(rig.folder)]
+        command = [sys.executable, "-m", "tests.campaigns.stops", what, str(rig.folder)]
         other = subprocess.Popen(command, cwd=REPOSITORY, stdout=subprocess.PIPE, text=True)
         try:
             assert other.stdout is not None
@@ -250,10 +244,12 @@ def ask(origin: str, kind: str, rig: Rig, browser: Browser | None, keys: int | N
         return lambda: _teleop_verdict(rig)
     folder = rig.desk if origin == "gateway" else rig.folder
     words = (
-        ["-m", "benchmarks.stops", "--as", "trial"] if origin == "trial" else ["-m", "nodes.cli", "disarm"]
+        ["-m", "tests.campaigns.stops", "trial"]
+        if origin == "trial"
+        else ["-m", "nodes.cli", "disarm", "--folder"]
     )
     process = subprocess.Popen(
-        [sys.executable, *words, "--folder", str(folder)],
+        [sys.executable, *words, str(folder)],
         cwd=REPOSITORY,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -309,8 +305,9 @@ def _port(rig: Rig) -> int:
 def measure(
     rig: Rig, origin: str, kind: str, what: str, browser: Browser | None, keys: int | None
 ) -> dict[str, Any]:
-    """One stop: time to the brake on the wire, the caller's word and when it came [ms]."""
+    """One stop: time to the brake on the wire, the caller's word and when it came [ms], and whether the car was stopped before."""
     rig.drive()
+    drove_ns = time.monotonic_ns()
     with run_out(what, rig):
         since_ns = time.monotonic_ns()
         word, word_ns = ask(origin, kind, rig, browser, keys)()
@@ -319,7 +316,9 @@ def measure(
             time.sleep(0.01)
     if kind == "estop":
         _reset(browser, keys)
+    first_ns = rig.wire(drove_ns, "SET_CURRENT_BRAKE")
     return {
+        "stopped_before": first_ns is not None and first_ns < since_ns,
         "brake_ms": None if brake_ns is None else (brake_ns - since_ns) / 1e6,
         "word": word,
         "word_ms": (word_ns - since_ns) / 1e6,
@@ -362,67 +361,8 @@ def rig_of(teleop: bool) -> Iterator[tuple[Rig, Browser | None, int | None]]:
                 os.close(keys)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--repeats", type=int, default=_REPEATS)
-    parser.add_argument("--only", choices=[origin for origin, _ in CELLS], action="append")
-    parser.add_argument("--resource", choices=RESOURCES, action="append")
-    parser.add_argument("--as", dest="role", help=argparse.SUPPRESS)
-    parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.role == "trial":
-        end_trial(options.folder)
-    elif options.role:
-        disturb(options.role, options.folder)
-    else:
-        _matrix(options.repeats, options.only, options.resource or RESOURCES)
-
-
-def _matrix(repeats: int, only: list[str] | None, resources: tuple[str, ...]) -> None:
-    rows: list[dict[str, Any]] = []
-    for teleop in (False, True):
-        cells = [(o, k) for o, k in CELLS if (o == "teleop") == teleop and (not only or o in only)]
-        if not cells:
-            continue
-        with rig_of(teleop) as (rig, browser, keys):
-            for origin, kind in cells:
-                for what in resources:
-                    for _ in range(repeats):
-                        row = measure(rig, origin, kind, what, browser, keys)
-                        rows.append({"origin": origin, "kind": kind, "resource": what, **row})
-                        print(json.dumps(rows[-1]), flush=True)
-    _report(rows, repeats >= _REPEATS and not only and resources == RESOURCES)
-
-
-def _report(rows: list[dict[str, Any]], record: bool) -> None:
-    lost = [row for row in rows if row["brake_ms"] is None]
-    brakes = [row["brake_ms"] for row in rows if row["brake_ms"] is not None]
-    # A command and a trial first start a Python process; their brake is counted from the start of that process.
-    nodes = [
-        r["brake_ms"]
-        for r in rows
-        if r["brake_ms"] is not None and r["origin"].startswith(("page", "teleop"))
-    ]
-    late = [row for row in rows if row["origin"] != "trial" and row["word_ms"] > VERDICT_LIMIT_MS]
-    text = (
-        f"brake p99 {np.percentile(brakes, 99):.0f} ms, worst {max(brakes):.0f} ms" if brakes else "no brake"
-    )
-    if nodes:
-        text += f"; from page and teleop p99 {np.percentile(nodes, 99):.0f} ms, worst {max(nodes):.0f} ms"
-    text += f"; {sum(row['word'] == 'CONFIRMED' for row in rows)} read CONFIRMED, {len(late)} read nothing within a second"
-    print(f"{len(rows) - len(lost)} of {len(rows)} stopped; {text}; lost: {lost}", flush=True)
-    if record:
-        cells = len({(row["origin"], row["kind"], row["resource"]) for row in rows})
-        record_row(
-            "stops with an exhausted resource, brake at the controller",
-            len(rows) - len(lost),
-            f"of {len(rows)}",
-            f"{len(rows)} of {len(rows)}, every caller answered within a second",
-            not lost and not late,
-            COMMAND,
-            f"{cells} cells of origin, kind and resource; {text}",
-        )
-
-
 if __name__ == "__main__":
-    main()
+    if sys.argv[1] == "trial":
+        end_trial(Path(sys.argv[2]))
+    else:
+        disturb(sys.argv[1], Path(sys.argv[2]))
