@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 
 from advnerf_core.display import DisplayModel
+from advnerf_core.report.audit_result import write_audit
 from calibration.by_construction import LAB_DATE, METHOD
 from calibration.display_colour import DisplayCalibration
 from calibration.schema import save_calibration
+from tests.support.audits import audit_result
 from tests.support.stage_versions import measured
 
 ROOT = Path(__file__).parents[1]
@@ -61,6 +63,7 @@ def home(tmp_path_factory):
     measured_display = DisplayCalibration(date=LAB_DATE, method=METHOD, model=display.to_dict())
     save_calibration(measured_display, folder / "calibration" / "my_car" / "display.yaml")
     shutil.copytree(run / "capture" / "photos", folder / "my_scene")
+    write_audit(folder / "my_audit" / "audit.json", audit_result())
     return folder
 
 
