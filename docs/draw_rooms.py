@@ -137,11 +137,14 @@ def _laid_out(arrows: Mapping[str, frozenset[str]]) -> tuple[list[list[str]], li
     for _ in range(_SWEEPS):
         for row in rows:
             place, _ = _places(rows)
-            row.sort(key=lambda name, p=place: _mean([p[o][0] for o in joined.get(name, [])], p[name][0]))
+            middle = {
+                name: _mean([place[o][0] for o in joined.get(name, [])], place[name][0]) for name in row
+            }
+            row.sort(key=middle.__getitem__)
     return rows, lines
 
 
-def _places(rows: list[list[str]]) -> tuple[dict[str, tuple[float, float]], float]:
+def _places(rows: list[list[str]]) -> tuple[dict[str, tuple[float, int]], int]:
     """Middle of the upper edge of everything [px], and the width of the picture [px]."""
     widths = [[_PASSAGE_W if ">" in name else _BOX_W for name in row] for row in rows]
     totals = [sum(found) + _GAP_X * (len(found) - 1) for found in widths]
