@@ -20,6 +20,8 @@ from nodes.runtime.errors import ConfigError
 def look_at_given(experiment: Experiment) -> None:
     """Load the existing policies and store their declarations; unchanged ones are not loaded again.
 
+    Their view is compared with the world's camera, so that a world which must be open for its description is opened.
+
     Raises:
         AdvnerfError: A policy cannot be loaded.
         ConfigError: The policies have different views.
@@ -27,6 +29,7 @@ def look_at_given(experiment: Experiment) -> None:
     wanted, known = given_in(experiment.config), read_kept(experiment.folder)
     if not wanted:
         return
+    experiment.ask_world()
     found = {name: _look_at(experiment, spec, known.get(name)) for name, spec in wanted.items()}
     views = {name: each.declared.view for name, each in found.items()}
     first, view = next(iter(views.items()))

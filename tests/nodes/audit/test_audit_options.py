@@ -18,6 +18,7 @@ from nodes.cli.audit import _minutes
 from nodes.experiment.show.experiment_world import as_json
 from nodes.lab.importing.metric_options import MetricOptions
 from nodes.runtime.errors import ConfigError
+from tests.support import shut_world
 
 
 @pytest.mark.parametrize(
@@ -69,30 +70,8 @@ def test_a_car_is_a_name_or_a_file(tmp_path: Path) -> None:
         car_of(str(tmp_path / "bad.yaml"))
 
 
-SHUT = """
-from hardware.worlds.lab.lab import Lab
-from hardware.worlds.world import NotOpenError
-
-
-class Shut(Lab):
-    is_open = False
-
-    def __enter__(self):
-        self.is_open = True
-        return super().__enter__()
-
-    def describe(self):
-        if not self.is_open:
-            raise NotOpenError("only its simulator knows the road")
-        return super().describe()
-"""
-
-
-def test_a_world_that_describes_itself_once_it_is_open_is_opened_for_its_camera_and_car(
-    tmp_path: Path,
-) -> None:
-    (tmp_path / "shut.py").write_text(SHUT)
-    found = place_of_world(f"{tmp_path / 'shut.py'}:Shut", Answers())
+def test_a_world_that_describes_itself_once_it_is_open_is_opened_for_its_camera_and_car() -> None:
+    found = place_of_world(shut_world.NAME, Answers())
     assert found.path == "track"
     assert as_json(describe(found)) == as_json(Lab(LabConfig()).describe())
 

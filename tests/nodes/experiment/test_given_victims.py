@@ -31,6 +31,7 @@ from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps.deploy import DRIVES
 from nodes.experiment.steps.keys import driven_folder
 from nodes.experiment.steps.run import load_experiment
+from tests.support import shut_world
 
 TICKS = 3
 MODULE = """
@@ -202,6 +203,19 @@ def test_a_registration_fixes_them_by_hash_before_anything_is_run(folder: Path, 
         }
     }
     assert not experiment.stage_folder("capture").exists()
+
+
+def test_their_camera_is_compared_with_a_world_that_must_be_open_to_be_described(
+    folder: Path, tmp_path: Path
+) -> None:
+    change = f"world={{kind: '{shut_world.NAME}'}}"
+    experiment = load_experiment(folder / "mine.experiment.yaml", "tiny", (change,), tmp_path / "run")
+    assert not experiment.is_described
+    run_experiment(experiment, until="capture")
+    assert (
+        load_experiment(folder / "mine.experiment.yaml", "tiny", (change,), tmp_path / "run").view.width
+        == 160
+    )
 
 
 def test_a_black_box_has_no_gradient(folder: Path) -> None:
