@@ -94,15 +94,12 @@ class PoseCheck:
         if not (np.abs(T) < _FARTHEST_M).all():  # also false for NaN
             return f"expected a pose of the car within {_FARTHEST_M:g} m, got {T[:3, 3].tolist()}"
         if not self._poses:
-            self._begin(stamp_ns, T)
+            self._begin_after_a_gap(stamp_ns, T)
             return ""
         last_ns, last = self._poses[-1]
         gap_s = (stamp_ns - last_ns) / NS_PER_S
         if gap_s > self.bounds.longest_gap_s:
-            self._begin(stamp_ns, T)
-            self._gaps.append(
-                (stamp_ns, self.bounds.longest_gap_s)
-            )  # for the poses that were delayed with it
+            self._begin_after_a_gap(stamp_ns, T)
             return ""
         if gap_s < -_GAP_WINDOW_S:
             self._begin(stamp_ns, T)
@@ -125,6 +122,11 @@ class PoseCheck:
         self._poses.clear()
         self._gaps.clear()
         self._poses.append((stamp_ns, T))
+
+    def _begin_after_a_gap(self, stamp_ns: int, T: NDArray[np.float64]) -> None:
+        """Begin with the first pose of a stream, or with the first after a long gap: poses that were delayed with it follow too closely."""
+        self._begin(stamp_ns, T)
+        self._gaps.append((stamp_ns, self.bounds.longest_gap_s))
 
     def _allowed_s(self, stamp_ns: int, gap_s: float) -> float:
         self._gaps.append((stamp_ns, gap_s))
