@@ -83,7 +83,7 @@ QUESTIONS = (
         "audits",
         "Does an audit of an own policy tell the truth?",
         "From an own policy and photographs to the verdict, what the place itself says of it, and audits whose truth is known.",
-        ("own_place", "audit_truth"),
+        ("own_place", "foreign_audit", "audit_truth"),
     ),
     Question(
         "statistics",
