@@ -14,7 +14,6 @@ from nodes.experiment.show.variants import Variants, resolve
 
 MODULE = "tests.support.toy_cells"
 REPLACED = ("run.cells", "steps.run", "steps.keys", "steps.steering_gate", "show.context")
-NEEDED = ("capture", "policy")
 FACTORS = {"none": 1.0, "random": 1.1, "cem": 2.0, "gradient": 3.0}
 Bench = nullcontext
 
@@ -37,6 +36,10 @@ def prepare_victims(experiment):
 
 def require_same_steering(experiment, may_go_on=False, say=print):
     pass
+
+
+def stages_needed(config, victim):
+    return ["capture", "policy"]
 
 
 def settings_hash(experiment, cell):
