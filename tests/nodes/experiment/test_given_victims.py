@@ -63,8 +63,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (found / "my_driver.py").write_text(MODULE)
     (found / "mine.experiment.yaml").write_text(yaml.safe_dump(FILE))
     with pytest.MonkeyPatch.context() as there:
-        there.chdir(found)
-        there.syspath_prepend(str(found))
+        _enter(found, there)
         policy, _ = load_adapted("my_driver:factory")
         export_onnx(policy.network, policy.contract, found / "my.onnx")
         run_experiment(loaded(found))
@@ -73,8 +72,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def _in_the_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(folder)
-    monkeypatch.syspath_prepend(str(folder))
+    _enter(folder, monkeypatch)
+
+
+def _enter(folder: Path, patch: pytest.MonkeyPatch) -> None:
+    """As a new process in a user's folder does: another folder's module of the same name is not there."""
+    patch.chdir(folder)
+    patch.syspath_prepend(str(folder))
+    patch.delitem(sys.modules, "my_driver", raising=False)
 
 
 def loaded(folder: Path, *overrides: str, run: str = "run") -> Experiment:
