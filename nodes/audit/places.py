@@ -124,10 +124,11 @@ def place_of_world(name: str, answers: Answers) -> Place:
         ConfigError: The world or its path is unknown.
     """
     base = _known_settings(name)
-    section = read_yaml(base).data["world"] if base is not None else {"kind": name}
+    shipped_file = {"world": {"kind": name}} if base is None else read_yaml(base).data
+    section = shipped_file["world"]
     named = read_world(Document({**section, "kind": name}, f"--world {name}"), Path.cwd())
     world, panels = {**section, "kind": name}, isinstance(named.make(), NativePanels)
-    path = answers.path or ("" if base is not None else next(iter(_described(named).paths), ""))
+    path = answers.path or next(iter(shipped_file.get("paths") or _described(named).paths), "")
     return Place(named.kind, "world", name, "world", world, base, path, panels)
 
 

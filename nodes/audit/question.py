@@ -36,7 +36,7 @@ class Place:
         scale: Source of the metre.
         world: The section ``world`` of the experiment.
         base: Experiment file whose settings fit the place; None for the defaults.
-        path: Name of the driven path of the world; empty for its first.
+        path: Name of the driven path of the world.
         shows_panels: Whether the world's own renderer shows panels.
     """
 

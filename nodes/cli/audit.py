@@ -74,7 +74,7 @@ class PlaceOptions:
         str | None,
         _option(
             _PLACE, "--path", help="driven, a CSV file with x_m and y_m, transforms.json of a drive, or the name of a world's path.",
-            show_default="driven; of a world its first",
+            show_default="driven; of a world that of its experiment file, or its first",
         ),
     ] = None  # fmt: skip
     declared: Annotated[

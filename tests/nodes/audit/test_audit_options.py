@@ -80,3 +80,9 @@ def test_a_learned_scene_without_its_images_cannot_be_judged_in(tmp_path: Path) 
     (tmp_path / "scene.safetensors").touch()
     with pytest.raises(ConfigError, match="expected the images that this scene was learned from"):
         posed(tmp_path / "scene.safetensors", tmp_path / "audit", MetricOptions())
+
+
+def test_a_world_with_an_experiment_file_is_driven_along_the_path_of_that_file() -> None:
+    """Duckietown's first path by name turns left, and its experiment drives right."""
+    assert place_of_world("duckietown", Answers()).path == "right"
+    assert place_of_world("duckietown", Answers(path="left")).path == "left"
