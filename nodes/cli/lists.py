@@ -31,7 +31,7 @@ def list_command(
     found = rows_of(TABLES[what])
     rows = table("name", "from", "what it is")
     for row in found:
-        rows.add_row(row.name, row.origin, row.line.replace("[", r"\["))
+        rows.add_row(row.name, row.origin, row.line)
     print_table(rows)
     problems = names_twice(found)
     for problem in problems:

@@ -100,7 +100,7 @@ def policy_check(
         rows.add_row(
             finding.name,
             coloured(finding.verdict, _COLOURS[finding.verdict]),
-            finding.text.replace("[", r"\["),
+            finding.text,
         )
     print_table(rows)
     if any(finding.verdict == FAILURE for finding in findings):
@@ -236,12 +236,12 @@ def policy_info(policy: PolicyName) -> None:
     contract = adapted.contract
     rows = table("what", "value")
     for name, value in adapted.described_tensors():
-        rows.add_row(name, value.replace("[", r"\["))
+        rows.add_row(name, value)
     for name, value in network.items():
-        rows.add_row(name, value.replace("[", r"\["))
+        rows.add_row(name, value)
     for name, value in contract.to_dict().items():
         if name != "view":
-            rows.add_row(name, str(value).replace("[", r"\["))
+            rows.add_row(name, str(value))
     view = contract.view
     rows.add_row("image", f"{view.width} x {view.height}")
     kept_rows, kept_columns = view.window

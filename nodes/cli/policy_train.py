@@ -189,7 +189,7 @@ def train(
     rows = table("recording", "frames", "left out")
     for name, count in done.frames.items():
         left_out = ", ".join(f"{n} {why}" for why, n in done.left_out.get(name, {}).items() if n)
-        rows.add_row(name.replace("[", r"\["), str(count), left_out)
+        rows.add_row(name, str(count), left_out)
     print_table(rows)
     print(
         f"{done.path} {done.sha256[:12]}, {1e3 * done.validation_mae_rad:.1f} mrad from the labels on held-out frames"

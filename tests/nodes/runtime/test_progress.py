@@ -1,9 +1,11 @@
 import io
+import re
+from pathlib import Path
 
 import pytest
 from rich.console import Console
 
-from nodes.runtime import progress
+from nodes.runtime import progress, terminal
 from nodes.runtime.progress import ProgressDisplay
 from nodes.runtime.terminal import coloured, print_table, table
 
@@ -60,3 +62,15 @@ def test_tables_show_what_is_in_brackets(capsys):
     rows.add_row("of [/room]", coloured("[met]", "green"))
     print_table(rows)
     assert capsys.readouterr().out.split() == ["x", "[m]", "state", "of", "[/room]", "[met]"]
+
+
+def test_no_command_escapes_what_tables_print_as_it_is():
+    """`print_table` reads no markup, so that an escape would be shown. Help alone is escaped, in one place."""
+    nodes = Path(terminal.__file__).parents[1]
+    escaping = [
+        file.name
+        for file in nodes.rglob("*.py")
+        if re.search(r"""["']\[["'], r?["']\\{1,2}\[["']""", file.read_text())
+    ]
+    assert escaping == []
+    assert re.search(r"""["']\[["'], r?["']\\{1,2}\[["']""", 'text.replace("[", r"\\[")'), "it would be found"
