@@ -93,7 +93,8 @@ def _refuse_numbers(value: Any) -> Any:
 class StrictModel(BaseModel):
     """Base of models that are read from files: unknown keys, other types and numbers that are not finite are errors."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    # Built when it is first used: a process uses a fraction of the models that it imports, and no node should start later for the others.
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -140,7 +141,9 @@ def strict_validator(model: Any) -> SchemaValidator:
 
 @lru_cache(maxsize=64)
 def _validator(model: Any) -> SchemaValidator:
-    schema = TypeAdapter(Annotated[model, Strict()]).core_schema
+    adapter = TypeAdapter(Annotated[model, Strict()])
+    adapter.rebuild()  # of a model that is not built yet
+    schema = adapter.core_schema
     # pydantic takes over the validators of complete models. A plug-in's model that does not derive from StrictModel is not strict, nor
     # are those that hold it.
     found = set(_models_in(schema))

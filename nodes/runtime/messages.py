@@ -10,38 +10,25 @@ from __future__ import annotations
 
 import struct
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from advnerf_core.geometry import Pinhole, make_transform, quaternion_from_rotation, rotation_from_quaternion
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import MessageError
+from nodes.runtime.message_types import MSG_FOLDER, MessageTypes
 
 ROS_DISTRO = "jazzy"
-MSG_FOLDER = Path(__file__).parent / "msg"
 # Far above every message of advnerf. A corrupt length field must not make a receiver allocate gigabytes.
 MAX_SEQUENCE_LENGTH = 64 * 1024 * 1024
 _RGB8, _MONO8, _BGR8 = "rgb8", "mono8", "bgr8"
 _CHANNELS = {_RGB8: 3, _BGR8: 3, _MONO8: 1}
 
 
-def _build_store() -> Any:
-    store = get_typestore(Stores.ROS2_JAZZY)
-    store.max_sequence_length = MAX_SEQUENCE_LENGTH
-    definitions: dict[str, Any] = {}
-    for path in sorted(MSG_FOLDER.glob("*/msg/*.msg")):
-        package = path.parent.parent.name
-        definitions.update(get_types_from_msg(path.read_text(encoding="utf-8"), f"{package}/msg/{path.stem}"))
-    store.register(definitions)
-    return store
-
-
-_STORE = _build_store()
+_TYPES = MessageTypes(MAX_SEQUENCE_LENGTH)
 _PACKAGES = (
     "builtin_interfaces",
     "std_msgs",
@@ -59,10 +46,10 @@ class _Types:
     """Message classes by short name, such as ``types.Image``. See ``nodes/runtime/msg`` for advnerf's own."""
 
     def __getattr__(self, name: str) -> Any:
-        for package in _PACKAGES:
-            if found := _STORE.types.get(f"{package}/msg/{name}"):
-                return found
-        raise AttributeError(f"no message type called {name} in {', '.join(_PACKAGES)}")
+        if (typename := _TYPES.find(name, _PACKAGES)) is None:
+            raise AttributeError(f"no message type called {name} in {', '.join(_PACKAGES)}")
+        setattr(self, name, found := _TYPES.types[typename])
+        return found
 
 
 types = _Types()
@@ -81,7 +68,7 @@ def type_name(message: Any) -> str:
 def type_hash(typename: str) -> str:
     """RIHS01 hash of a type, in the format of ``ros2 topic info -v``."""
     _require_type(typename)
-    return str(_STORE.hash_rihs01(typename))
+    return str(_TYPES.hash_rihs01(typename))
 
 
 @cache
@@ -94,14 +81,14 @@ def type_hash_prefix(typename: str) -> bytes:
 def type_definition(typename: str) -> str:
     """Definition text of a type and of all types in it, in the format of bags (``ros2msg``)."""
     _require_type(typename)
-    return str(_STORE.generate_msgdef(typename, ros_version=2)[0])
+    return str(_TYPES.generate_msgdef(typename, ros_version=2)[0])
 
 
 def encode(message: Any) -> bytes:
     """Encode a message to CDR bytes."""
     name = type_name(message)
     try:
-        return bytes(_STORE.serialize_cdr(message, name))
+        return bytes(_TYPES.serialize_cdr(message, name))
     except (SerdeError, struct.error, AttributeError, TypeError, ValueError) as error:
         raise MessageError(
             f"expected fields that fit {name}, got a wrong type or a value out of range: {error}"
@@ -112,7 +99,7 @@ def decode(typename: str, data: bytes | memoryview) -> Any:
     """Decode CDR bytes to a message whose arrays are read-only views of ``data``."""
     _require_type(typename)
     try:
-        return _STORE.deserialize_cdr(memoryview(data).toreadonly(), typename)
+        return _TYPES.deserialize_cdr(memoryview(data).toreadonly(), typename)
     except (SerdeError, struct.error, ValueError, IndexError, UnicodeDecodeError, AssertionError) as error:
         raise MessageError(
             f"expected CDR bytes of {typename}, got {len(data)} bytes that cannot be decoded: {error}"
@@ -121,14 +108,13 @@ def decode(typename: str, data: bytes | memoryview) -> Any:
 
 def fields_of(typename: str) -> list[tuple[str, Any]] | None:
     """Names and kinds of the fields of a type, as ``rosbags`` describes them; None for an unknown type."""
-    found = _STORE.fielddefs.get(typename)
-    return None if found is None else list(found[1])
+    return list(_TYPES.fielddefs[typename][1]) if _TYPES.has(typename) else None
 
 
 def message_class(typename: str) -> Any:
     """Message class of a type."""
     _require_type(typename)
-    return _STORE.types[typename]
+    return _TYPES.types[typename]
 
 
 def stamp_from_ns(stamp_ns: int) -> Any:
@@ -235,5 +221,5 @@ def pinhole_from_camera_info(message: Any) -> Pinhole:
 
 
 def _require_type(typename: str) -> None:
-    if typename not in _STORE.fielddefs:
+    if not _TYPES.has(typename):
         raise MessageError(f"expected a message type of ROS 2 or of {MSG_FOLDER}, got {typename!r}")
