@@ -24,7 +24,7 @@ from advnerf_core.policies.tracker import TrackedTrajectory
 from benchmarks.own_place import run_audit
 from benchmarks.results import record_row
 from hardware.worlds.world import World, WorldDescription
-from nodes.audit.places import Answers, place_of_world
+from nodes.audit.places import AuditedWorld
 from nodes.lab.worlds.expert_drive import as_path
 from nodes.lab.worlds.named import read_world
 
@@ -67,7 +67,7 @@ def main() -> None:
     parser.add_argument("world", help="metadrive, duckietown, lab or file.py:Class")
     parser.add_argument("--by", choices=("torch", "keras"), default="torch")
     parser.add_argument("--python", default=sys.executable, help="interpreter that trains, which has Keras")
-    parser.add_argument("--budget", default="4m")
+    parser.add_argument("--budget", default="15m")
     parser.add_argument("--starts", type=int, default=_STARTS)
     parser.add_argument("--set", action="append", default=[], help="handed on to the audit")
     parser.add_argument("--output", type=Path, help="keep the audit here")
@@ -78,7 +78,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as made:
         folder = options.output or Path(made)
         folder.mkdir(parents=True, exist_ok=True)
-        place = place_of_world(named, Answers())
+        place = AuditedWorld(named).place(None)
         with read_world(Document(dict(place.world), named), Path.cwd()).make() as world:
             record(world, place.path or next(iter(world.describe().paths)), folder / "data.npz")
         script = Path(__file__).parent / "strangers_victims" / f"train_{options.by}.py"

@@ -1,7 +1,7 @@
 """``advnerf audit`` as a new user runs it: an own ONNX policy, photographs of a drive, and what the place itself says of the verdict.
 
 The photographs are rendered in the simulated lab, which the command does not know: it is given their folder alone. What it finds in its learned
-copies is then driven past in the lab, by the lab's own car, from 50 starts of their own. ``python -m benchmarks.own_place [--budget 4m | --ci]``.
+copies is then driven past in the lab, by the lab's own car, from 50 starts of their own. ``python -m benchmarks.own_place [--budget 15m | --ci]``.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ def _stands_at(listed: dict[str, float], x_m: float, y_m: float) -> bool:
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("--budget", default="4m")
+    parser.add_argument("--budget", default="15m")
     parser.add_argument("--ci", action="store_true", help="measure the small setting instead")
     options = parser.parse_args()
     os.environ.setdefault("MUJOCO_GL", "egl")

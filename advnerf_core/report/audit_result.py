@@ -132,7 +132,7 @@ class AuditBudget(StrictModel):
     evaluations_planned: Count
     evaluations_spent: Count
     minutes: Positive | None = Field(
-        default=None, description="What the user gave; converted into evaluations once."
+        default=None, description="For the whole audit, as the user gave it; converted into evaluations once."
     )
     seconds: NotNegative | None = Field(
         description="Time that the audit took [s]; null where the same audit is to give the same bytes."

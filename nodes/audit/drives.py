@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -48,10 +48,12 @@ class Arm:
     Attributes:
         shown: The objects.
         attack: The attack file; None for a control.
+        disturbances: Effects of a worse camera in the learned scene; None for the ideal one.
     """
 
     shown: Shown
     attack: Path | None = None
+    disturbances: Disturbances | None = None
 
 
 def arm_of(experiment: Experiment, name: str, found: Path | None = None) -> Arm:
@@ -102,9 +104,7 @@ def camera_effects(limit_m: float, seed: int) -> Disturbances:
     return Disturbances(NOISE, GAIN, BRIGHTNESS, _JITTER * limit_m, JITTER_RAD, seed)
 
 
-def learned(
-    experiment: Experiment, victim: str, arm: Arm, disturbances: Disturbances | None = None
-) -> ArmDrives:
+def learned(experiment: Experiment, victim: str, arm: Arm) -> ArmDrives:
     """Drives in the learned scene, as searches render it, from the measured starts."""
     scenario = experiment.config.paths[0]
     policy = load_victim(experiment, victim)
@@ -113,21 +113,26 @@ def learned(
     there = replace(problem, sensor=arm.shown.seen_by(space.surrogate))
     measured = from_measured_starts(experiment, scenario, there)
     states, _, scores = learned_drives(
-        experiment, replace(measured, disturbances=disturbances), arm.shown.colours
+        experiment, replace(measured, disturbances=arm.disturbances), arm.shown.colours
     )
     return _drives(experiment, list(states), scores)
 
 
-def driven(experiment: Experiment, victim: str, arm: Arm, world: World) -> ArmDrives:
-    """Drives through an open world, by its own car, from the measured starts."""
+def driven(
+    experiment: Experiment,
+    victim: str,
+    arm: Arm,
+    world: World,
+    report: Callable[[int], None] = lambda done: None,
+) -> ArmDrives:
+    """Drives through an open world, by its own car, from the measured starts; ``report`` gets the number of finished ones."""
     scenario = experiment.config.paths[0]
     policy = load_victim(experiment, victim).policy
     attack = None if arm.attack is None else load_attack(arm.attack)
     there = dress(experiment, world, arm.shown)
     starts = experiment.measured_starts(scenario)
-    found = deployed_drives(
-        experiment, there, policy, scenario, starts, shown_there(experiment, arm.shown, attack)
-    )
+    colours = shown_there(experiment, arm.shown, attack)
+    found = deployed_drives(experiment, there, policy, scenario, starts, colours, report)
     return _drives(experiment, [each.states for each in found], [each.metrics for each in found])
 
 

@@ -56,22 +56,31 @@ def posed(given: Path, folder: Path, metric: MetricOptions) -> PosedPlace:
         return _known(poses, "images")
     imported = folder / IMPORTED
     kind: PlaceKind = "video" if given.is_file() else "images"
-    if not (imported / POSES).is_file():
+    if not (imported / POSES).is_file() or (metric.gives_metre and _scale_of(imported) is None):
         with ProgressDisplay() as display:
             _importer(given)(imported, metric, display.start("poses"))
     return _known(imported / POSES, kind)
 
 
 def _known(poses: Path, kind: PlaceKind) -> PosedPlace:
-    report = poses.parent / REPORT
-    facts: dict[str, Any] = read_json(report) if report.is_file() else {}
-    scale = facts.get("scale_from", "poses")
+    scale = _scale_of(poses.parent)
     if scale is None:
         raise UnansweredError(
-            f"expected a known length, as {poses} has none and an audit speaks of metres: --length A B METRES, --positions CSV or --marker SIDE, "
-            "with a new --output"
+            f"expected a known length, as {poses} has none and an audit speaks of metres: --length A B METRES (A and B: two of the images there, "
+            "METRES: between their cameras), --positions CSV or --marker SIDE"
         )
-    return PosedPlace(poses, kind, scale, bool(facts.get("ground_at_zero", False)))
+    return PosedPlace(poses, kind, scale, bool(_facts(poses.parent).get("ground_at_zero", False)))
+
+
+def _scale_of(folder: Path) -> Scale | None:
+    scale: Scale | None = _facts(folder).get("scale_from", "poses")
+    return scale
+
+
+def _facts(folder: Path) -> dict[str, Any]:
+    """The report of an import; empty without one."""
+    facts: dict[str, Any] = read_json(folder / REPORT) if (folder / REPORT).is_file() else {}
+    return facts
 
 
 def _importer(given: Path) -> Callable[[Path, MetricOptions, Any], object]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import get_args
 
@@ -40,8 +41,12 @@ from nodes.experiment.show.learned_scene import load_background
 from nodes.experiment.show.placing import clean_poses
 from nodes.experiment.show.spaces import dress, shown_there
 from nodes.experiment.steps.films import filmed
+from nodes.runtime.progress import Report
 
 CONTROLS: tuple[Control, ...] = ("no_object", "plain_object")
+WORLD_ARMS = (NO_OBJECT, PLAIN_OBJECT, PICTURE, FOUND)
+LEARNED_ARMS = (*WORLD_ARMS, PLAIN_DISTURBED, FOUND_DISTURBED)
+FILMED = (NO_OBJECT, PLAIN_OBJECT, FOUND)
 TITLES = {
     NO_OBJECT: "no object",
     PLAIN_OBJECT: "plain object",
@@ -154,6 +159,7 @@ def judge_found(
     seed: int,
     limit_m: float,
     evidence: Evidence,
+    report: Report,
 ) -> Judged:
     """Drive from the judging starts.
 
@@ -165,30 +171,38 @@ def judge_found(
         seed: Seed of these starts.
         limit_m: |CTE| beyond which the car has left its lane [m].
         evidence: ``surrogate``, or ``world``.
+        report: Progress callback.
     """
     with_them = with_starts(experiment, count, seed)
-    arms = {name: arm_of(with_them, name, found) for name in (NO_OBJECT, PLAIN_OBJECT, PICTURE, FOUND)}
-    drives = drive_arms(with_them, victim, arms, evidence)
+    arms = {name: arm_of(with_them, name, found) for name in WORLD_ARMS}
     if evidence == "surrogate":
         effects = camera_effects(limit_m, seed)
-        drives[PLAIN_DISTURBED] = learned(with_them, victim, arms[PLAIN_OBJECT], effects)
-        drives[FOUND_DISTURBED] = learned(with_them, victim, arms[FOUND], effects)
+        arms[PLAIN_DISTURBED] = replace(arms[PLAIN_OBJECT], disturbances=effects)
+        arms[FOUND_DISTURBED] = replace(arms[FOUND], disturbances=effects)
+    drives = drive_arms(with_them, victim, arms, evidence, report)
     controls = {name: drives[name] for name in CONTROLS}
     judgement = judge(drives[FOUND], controls, limit_m)
     return Judged(evidence, arms, drives, judgement, with_them, limit_m)
 
 
 def drive_arms(
-    experiment: Experiment, victim: str, arms: Mapping[str, Arm], evidence: Evidence
+    experiment: Experiment, victim: str, arms: Mapping[str, Arm], evidence: Evidence, report: Report
 ) -> dict[str, ArmDrives]:
-    """Drives of each arm from the measured starts."""
+    """Drives of each arm from the measured starts; in the learned scene those of an arm advance together."""
+    drives, count, total = {}, experiment.config.measure.starts, len(arms) * experiment.config.measure.starts
     with open_world(experiment, evidence) as world:
-        return {
-            name: learned(experiment, victim, arm)
-            if world is None
-            else driven(experiment, victim, arm, world)
-            for name, arm in arms.items()
-        }
+        for number, (name, arm) in enumerate(arms.items()):
+            told = partial(_tell, report, TITLES[name], number * count, total)
+            if world is None:
+                drives[name] = learned(experiment, victim, arm)
+                told(count)
+            else:
+                drives[name] = driven(experiment, victim, arm, world, told)
+    return drives
+
+
+def _tell(report: Report, title: str, before: int, total: int, done: int) -> None:
+    report((before + done) / total, f"{before + done} of {total} drives, {title}")
 
 
 @contextmanager
@@ -207,7 +221,7 @@ def film(judged: Judged, file: Path) -> Film:
     every, rate_hz = filmed(experiment.config.dt_s)
     path = experiment.paths[experiment.config.paths[0]]
     with open_world(experiment, judged.evidence) as world:
-        for name in (NO_OBJECT, PLAIN_OBJECT, FOUND):
+        for name in FILMED:
             states = judged.drives[name].states[judged.shown_start][::every]
             frames = seen_on(experiment, judged.arms[name], states, world)
             cte_m = path.project(states[:, :2]).cte_m

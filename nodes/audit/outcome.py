@@ -271,13 +271,8 @@ def _search_starts(known: Known) -> int:
 
 def _budget(known: Known) -> AuditBudget:
     searches = known.searches
-    planned = sum(
-        each.evaluations * wanted.starts
-        for wanted, row in (zip(searches.rounds, searches.planned, strict=True) if searches else ())
-        for each in row
-    )
     return AuditBudget(
-        evaluations_planned=planned,
+        evaluations_planned=searches.cost if searches else 0,
         evaluations_spent=sum(each.evaluations for each in searches.found) if searches else 0,
         minutes=known.minutes,
         seconds=None if known.seconds is None else round(known.seconds, 1),

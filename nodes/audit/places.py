@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from nodes.audit.asking import answer
 from nodes.audit.cars import AuditedCar
 from nodes.audit.images import PosedPlace
 from nodes.audit.question import Place
+from nodes.experiment.plan.sections import CaptureConfig
 from nodes.lab.worlds.named import NamedWorld, read_world
 from nodes.lab.worlds.photographs.config import DRIVEN
 from nodes.lab.worlds.photographs.world import PATH, Photographs
@@ -87,9 +89,11 @@ def place_of_photographs(
         world["ground_z_m"] = 0.0
     if camera is not None:
         world["camera"]["pinhole"] = asdict(camera)
-    world |= _found_out(world)
+    derived, held_out = _found_out(world)
+    world |= derived
     name = given.resolve().name if given.is_dir() else given.resolve().parent.name
-    return Place(f"the place of {name}", there.kind, str(given), there.scale, world, path=PATH), limit_m
+    title, source = f"the place of {name}", str(given)
+    return Place(title, there.kind, source, there.scale, world, path=PATH, held_out=held_out), limit_m
 
 
 def _height_m(poses: Path) -> float:
@@ -106,43 +110,64 @@ def camera_of(there: PosedPlace, path: str | None) -> Pinhole:
     return load_image(load_transforms(poses, require_all=True).frames[0])[1]
 
 
-def _found_out(world: dict[str, Any]) -> dict[str, Any]:
-    """Settings derived from the photographs: whether the driven path is closed, and the largest extent of the place."""
+def _found_out(world: dict[str, Any]) -> tuple[dict[str, Any], int | None]:
+    """Settings derived from the photographs: whether the driven path is closed, and the largest extent of the place; and `Place.held_out`."""
     settings = {key: value for key, value in world.items() if key != "kind"}
     document = Document({**settings, "closed": False}, "--place")
     there = Photographs(validate(Photographs.Config, document, Path.cwd()))
     points = there.path_points()
     steps_m = np.linalg.norm(np.diff(points, axis=0), axis=1)
     closed = bool(np.linalg.norm(points[-1] - points[0]) <= _ROUND * float(np.median(steps_m)))
-    return {"closed": closed, "reach_m": round(_REACH * there.extent_m, 2)}
+    usual, few = CaptureConfig().held_out, len(there.along) // 4
+    held_out = None if few >= usual else max(few, 3)
+    return {"closed": closed, "reach_m": round(_REACH * there.extent_m, 2)}, held_out
 
 
-def place_of_world(name: str, answers: Answers) -> Place:
-    """A world that can be driven: by its kind, or ``file.py:Class``.
+@dataclass(frozen=True)
+class AuditedWorld:
+    """A world that can be driven; it is asked for its description once, if that is needed at all.
 
-    Raises:
-        ConfigError: The world or its path is unknown.
+    Attributes:
+        name: Its kind, or ``file.py:Class``.
     """
-    base = _known_settings(name)
-    shipped_file = {"world": {"kind": name}} if base is None else read_yaml(base).data
-    section = shipped_file["world"]
-    named = read_world(Document({**section, "kind": name}, f"--world {name}"), Path.cwd())
-    world, panels = {**section, "kind": name}, isinstance(named.make(), NativePanels)
-    path = answers.path or next(iter(shipped_file.get("paths") or _described(named).paths), "")
-    return Place(named.kind, "world", name, "world", world, base, path, panels)
 
+    name: str
 
-def describe(place: Place) -> WorldDescription:
-    """A world's description; it is opened if it must be open for that."""
-    return _described(read_world(Document(dict(place.world), f"--world {place.source}"), Path.cwd()))
+    @cached_property
+    def description(self) -> WorldDescription:
+        """Its description; it is opened if it must be open for that.
 
+        Raises:
+            ConfigError: The world is unknown.
+        """
+        try:
+            return self._named.describe()
+        except NotOpenError:
+            with self._named.make() as world:
+                return world.describe()
 
-def _described(named: NamedWorld) -> WorldDescription:
-    try:
-        return named.describe()
-    except NotOpenError:
-        with named.make() as world:
-            return world.describe()
+    def place(self, path: str | None) -> Place:
+        """The place, driven along a path: the named one, that of its experiment file, or its first.
+
+        Raises:
+            ConfigError: The world is unknown.
+        """
+        data = self._shipped
+        panels = isinstance(self._named.make(), NativePanels)
+        path = path or next(iter(data.get("paths") or self.description.paths), "")
+        base = _known_settings(self.name)
+        world = {**data["world"], "kind": self.name}
+        return Place(self._named.kind, "world", self.name, "world", world, base, path, panels)
+
+    @cached_property
+    def _shipped(self) -> Any:
+        base = _known_settings(self.name)
+        return {"world": {}} if base is None else read_yaml(base).data
+
+    @cached_property
+    def _named(self) -> NamedWorld:
+        section = {**self._shipped["world"], "kind": self.name}
+        return read_world(Document(section, f"--world {self.name}"), Path.cwd())
 
 
 def _known_settings(name: str) -> Path | None:

@@ -32,16 +32,15 @@ class NamedPolicy:
 
     Attributes:
         given: File, ``package.module:factory`` or address.
-        camera: The driving camera of the place, for a policy that names none.
-        largest_rad: Largest wheel angle of the car, which equals a normalised output of 1 [rad].
+        driven: Asked only about a file without a declaration: gives the place's driving camera, which the file is taken to see, and the largest
+            wheel angle of the car, which a normalised output of 1 stands for [rad].
         declared: ``key=value`` texts of a declaration.
         folder: Folder of the audit, for a copy of the file with its declaration, if it has none.
         say: Called with each assumption.
     """
 
     given: str
-    camera: Pinhole
-    largest_rad: float
+    driven: Callable[[], tuple[Pinhole, float]]
     declared: Sequence[str]
     folder: Path
     say: Say
@@ -72,13 +71,13 @@ class NamedPolicy:
         values, answers = guessed.to_dict(), _read(self.declared)
         for question in questions:
             if question.key == "view":
-                values["view"] = _whole_picture(values["view"], self.camera)
+                values["view"] = _whole_picture(values["view"], self.driven()[0])
             elif question.key not in answers:
                 usual = _USUAL.get(question.key, values.get(question.key))
                 values[question.key] = _answered(question, usual, self.say)
         values |= answers
         if values.get("output_unit") == "normalised" and values.get("full_steering_rad") is None:
-            values["full_steering_rad"] = self.largest_rad
+            values["full_steering_rad"] = self.driven()[1]
         return PolicyContract.from_dict(values, "--declare")
 
     def _with_declaration(self, file: Path, contract: PolicyContract) -> tuple[str, Pinhole | None]:

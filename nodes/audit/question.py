@@ -38,6 +38,7 @@ class Place:
         base: Experiment file whose settings fit the place; None for the defaults.
         path: Name of the driven path of the world.
         shows_panels: Whether the world's own renderer shows panels.
+        held_out: Number of held-out photographs, of a place with few; None for the default.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Place:
     base: Path | None = None
     path: str = ""
     shows_panels: bool = False
+    held_out: int | None = None
 
     @property
     def is_driven(self) -> bool:
@@ -115,7 +117,9 @@ def experiment_data(question: AuditedQuestion) -> dict[str, Any]:
 
 def _of_photographs(question: AuditedQuestion) -> dict[str, Any]:
     assert question.limit_m is not None, "photographs declare no lane"
+    held_out = question.place.held_out
     return {
+        **({} if held_out is None else {"capture": {"held_out": held_out}}),
         "held_cap_m": 4.0 * question.limit_m,
         "attack": {"start_sigma": min(0.1, 0.25 * question.limit_m)},
         "policy": {"stiffness_1pm": 1.0 / (_RETURNS_IN * question.limit_m), "delay_s": 0.05},

@@ -14,6 +14,7 @@ from advnerf_core.data.image_files import write_image
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.report.audit_parts import Evidence
 from advnerf_core.report.audit_result import AuditComparison, AuditResult, PlantedControl
+from nodes.audit.budget import Costs
 from nodes.audit.comparing import ATTACK_KEPT, Before, is_worse
 from nodes.audit.drives import (
     FOUND,
@@ -40,13 +41,14 @@ from nodes.audit.question import (
     VICTIM,
     AuditedQuestion,
 )
-from nodes.audit.searching import FoundAttack, Searches, SearchesElsewhere, seconds_of_evaluation
+from nodes.audit.searching import FoundAttack, Searches, SearchesElsewhere
 from nodes.audit.spots import Spot, best_spots
 from nodes.experiment.plan.object_kinds import footprint_m
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.given import given
 from nodes.experiment.show.placing import clean_poses
 from nodes.experiment.show.victims import look_at_given
+from nodes.runtime.progress import ProgressDisplay
 
 # In half lanes: width of an object without a given one.
 _WIDTH = 0.8
@@ -58,6 +60,8 @@ _PLANTED_SHARE = 1.0
 # Settings with the plain object at the first spot, and at its place in an earlier audit; and the budget of an audit in continuous integration.
 _FIRST, _BEFORE = "first", "before"
 CI_EVALUATIONS = 40
+_JUDGING = {"surrogate": "judging in the learned place", "world": "judging in the world"}
+_OVER = 1.1
 Say = Callable[[str], None]
 
 
@@ -74,7 +78,7 @@ class AuditOptions:
     """Options of an audit.
 
     Attributes:
-        minutes: Time for the searches; converted once into evaluations.
+        minutes: Time for the whole audit; converted once into evaluations.
         evaluations: Number of evaluations, instead of the time.
         against: Result of an earlier audit to compare this policy with.
         harden: Whether to export frames for hardening.
@@ -108,6 +112,7 @@ class Audit:
     say: Say
     console: Console
     before: Before | None = field(default=None, init=False)
+    began_s: float = field(default_factory=time.monotonic, init=False)
 
     def run(self) -> AuditResult:
         """Run or resume the audit, and write its result; Ctrl-C ends the searches, and judges their best attack.
@@ -116,14 +121,14 @@ class Audit:
             AdvnerfError: The question is wrong, or a file cannot be read.
         """
         self.before = None if self.options.against is None else Before(self.options.against)
-        began, known = time.monotonic(), Known(self.question, self.options.minutes)
+        known = Known(self.question, self.options.minutes)
         try:
             self._run(known)
         except CannotJudgeError as ended:
             known.reasons = ended.reasons
         if self.options.timed:
             known.seconds, known.ended = (
-                time.monotonic() - began,
+                time.monotonic() - self.began_s,
                 datetime.now(timezone.utc).replace(microsecond=0),
             )
         result = result_of(known, self.folder)
@@ -153,7 +158,8 @@ class Audit:
         searches = self._searches(copies, plan, spots, VICTIM, known.limit_m)
         known.searches = searches
         try:
-            searches.run(self.say)
+            with ProgressDisplay(self.console) as display:
+                searches.run(self.say, display)
         except KeyboardInterrupt:
             known.interrupted = True
             self.say("interrupted: what was found is judged; Ctrl-C again ends at once")
@@ -205,24 +211,40 @@ class Audit:
         self, copies: Copies, plan: AuditPlan, spots: list[Spot], victim: str, limit_m: float
     ) -> Searches:
         declared = given(copies.experiment("place"))[VICTIM].declared
-        if plan.decided.evaluations is None:
-            seconds = seconds_of_evaluation(copies.ready(_FIRST), VICTIM, declared.differentiable)
-            plan.set_evaluations(
-                self.options.evaluations or max(1, round(60.0 * self.options.minutes / seconds))
-            )
-        evaluations = plan.decided.evaluations
-        assert evaluations is not None, "they were counted"
-        self.say(f"the budget buys {evaluations} evaluations")
-        return Searches(
+        searches = Searches(
             copies,
             plan,
             spots,
             victim,
-            evaluations,
+            plan.decided.evaluations or self.options.evaluations or 1,
             declared.differentiable,
             limit_m,
             self.options.cluster,
         )
+        if plan.decided.evaluations is None:
+            if self.options.evaluations is None:
+                searches.evaluations = self._bought(copies.ready(_FIRST), searches)
+            plan.set_evaluations(searches.evaluations)
+        self.say(f"searching {searches.cost} evaluations")
+        return searches
+
+    def _bought(self, experiment: Experiment, searches: Searches) -> int:
+        """The evaluations that the rest of the budget buys; at least those of the smallest schedule."""
+        question, minutes = self.question, self.options.minutes
+        costs = Costs.measured(experiment, question, searches.differentiable)
+        judging_s, used_s = costs.judging_s(question), time.monotonic() - self.began_s
+        count = sum(map(len, searches.planned))
+        searches.evaluations = costs.evaluations(60.0 * minutes - used_s, question, count)
+        search_s = searches.cost * costs.evaluation_s + costs.choosing_s(question, count)
+        self.say(
+            f"of {minutes:g} min, {used_s / 60.0:.1f} are used, and judging takes about {judging_s / 60.0:.1f}; searching takes about "
+            f"{search_s / 60.0:.1f}, and up to as long again for a planted weakness if nothing is found"
+        )
+        if used_s + judging_s + 2.0 * search_s > _OVER * 60.0 * minutes:
+            self.say(
+                "that is more than the budget: less cannot be searched, and the audit goes on to its verdict"
+            )
+        return searches.evaluations
 
     def _show(
         self, experiment: Experiment, spot: Spot, arm: str, name: str, found: Path | None = None
@@ -242,7 +264,10 @@ class Audit:
         self._show(copies.ready(best.setting), spot, FOUND, AFTER, best.attack)
         there = copies.ready(best.setting, judged=True)
         kinds: tuple[Evidence, ...] = ("surrogate", "world") if question.place.is_driven else ("surrogate",)
-        known.judged += [judge_found(there, VICTIM, best.attack, *starts, kind) for kind in kinds]
+        with ProgressDisplay(self.console) as display:
+            for kind in kinds:
+                report = display.start(_JUDGING[kind])
+                known.judged.append(judge_found(there, VICTIM, best.attack, *starts, kind, report))
         if self.options.harden:
             self.say(f"frames past the object: {export_frames(known.judged[-1], self.folder / HARDEN)}")
 
@@ -255,7 +280,9 @@ class Audit:
             name: arm_of(there, name, before.folder / ATTACK_KEPT)
             for name in (NO_OBJECT, PLAIN_OBJECT, FOUND)
         }
-        return before.compare(drive_arms(there, VICTIM, arms, evidence), evidence, limit_m)
+        with ProgressDisplay(self.console) as display:
+            drives = drive_arms(there, VICTIM, arms, evidence, display.start("driving as then"))
+        return before.compare(drives, evidence, limit_m)
 
     def _plant(self, copies: Copies, plan: AuditPlan, spots: list[Spot], limit_m: float) -> PlantedControl:
         """Search a planted weakness with the same schedule, until it is found."""
@@ -275,7 +302,8 @@ class Audit:
         copies = replace(copies, question=question)
         look_at_given(copies.experiment("place"))
         searches = self._searches(copies, with_it, spots, PLANTED, limit_m)
-        searches.run(self.say, enough=lambda found: found.left >= wanted)
+        with ProgressDisplay(self.console) as display:
+            searches.run(self.say, display, enough=lambda found: found.left >= wanted)
         best = searches.best
         return PlantedControl(
             name=name,

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
-from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
 from advnerf_core.documents import read_json
 from advnerf_core.driving.metrics import drive_metrics
 from nodes.audit.learning import Copies
@@ -22,11 +20,9 @@ from nodes.audit.spots import Spot
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import search_cell
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.spaces import colour_space
-from nodes.experiment.show.victims import load_victim
-from nodes.experiment.steps.attack import attack_problem
 from nodes.experiment.steps.run import load_experiment
 from nodes.experiment.steps.search_files import ATTACK, SEARCHED
+from nodes.runtime.progress import Report, StageDisplay
 
 SEARCHES = "searches"
 Say = Callable[[str], None]
@@ -136,6 +132,12 @@ class Searches:
         rounds = planned(self.rounds, self.evaluations, self._ticks)
         return [[each for each in row if each.spot < len(self.spots)] for row in rounds]
 
+    @property
+    def cost(self) -> int:
+        """Evaluations of the whole schedule, from one start each."""
+        rows = zip(self.rounds, self.planned, strict=True)
+        return sum(each.evaluations * wanted.starts for wanted, row in rows for each in row)
+
     @cached_property
     def _ticks(self) -> int:
         return self.copies.experiment("place").searched_ticks
@@ -145,7 +147,9 @@ class Searches:
         """The attack with the largest effect on the selection starts."""
         return max(self.found, key=lambda each: each.rank, default=None)
 
-    def run(self, say: Say, enough: Callable[[FoundAttack], bool] = lambda found: False) -> None:
+    def run(
+        self, say: Say, display: StageDisplay, enough: Callable[[FoundAttack], bool] = lambda found: False
+    ) -> None:
         """Search until the schedule ends, or a result is enough."""
         for wanted, row in zip(self.rounds, self.planned, strict=True):
             spots = self._spots(wanted.spots)
@@ -154,7 +158,10 @@ class Searches:
                 jobs = list(jobs)
                 self.elsewhere.search(jobs)
             for search, job in zip(row, jobs, strict=True):
-                found = self._search(wanted, search, spots[search.spot], job)
+                spot = spots[search.spot]
+                found = self._search(
+                    wanted, search, spot, job, display.start(f"{wanted.method} at spot {spot + 1}")
+                )
                 self.found.append(found)
                 say(
                     f"{found.method} at spot {found.spot + 1}, {found.evaluations} evaluations: largest deviation "
@@ -171,9 +178,11 @@ class Searches:
         ranked = sorted(best, key=lambda spot: best[spot], reverse=True)
         return [*ranked, *(spot for spot in range(len(self.spots)) if spot not in best)][:count]
 
-    def _search(self, wanted: Round, search: PlannedSearch, spot: int, job: SearchJob) -> FoundAttack:
+    def _search(
+        self, wanted: Round, search: PlannedSearch, spot: int, job: SearchJob, report: Report
+    ) -> FoundAttack:
         experiment, folder = job.experiment(), Path(job.folder)
-        clean = search_cell(experiment, job.cell, folder, lambda *told: None)
+        clean = search_cell(experiment, job.cell, folder, report)
         return FoundAttack(
             job.setting,
             folder,
@@ -225,21 +234,3 @@ def _effect(experiment: Experiment, folder: Path, clean: Path, limit_m: float) -
         for at in (folder, clean)
     )
     return float((attacked - without).mean()), int((attacked > limit_m).sum())
-
-
-def seconds_of_evaluation(experiment: Experiment, victim: str, differentiable: bool) -> float:
-    """Duration of an evaluation from one start here, with the gradient if there is one [s]."""
-    space, policy = colour_space(experiment), load_victim(experiment, victim)
-    one = experiment.config.attack.model_copy(update={"starts": 1})
-    alone = _with_attack(experiment, one)
-    problem = attack_problem(alone, space, policy, experiment.config.paths[0], 0)
-    seconds = []
-    for _ in range(2):  # the first compiles kernels
-        began = time.perf_counter()
-        (adjoint_gradient if differentiable else evaluate)(problem, space.plain.colours)
-        seconds.append(time.perf_counter() - began)
-    return seconds[-1]
-
-
-def _with_attack(experiment: Experiment, attack: Any) -> Experiment:
-    return replace(experiment, config=experiment.config.model_copy(update={"attack": attack}))

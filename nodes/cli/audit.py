@@ -110,9 +110,9 @@ class SearchOptions:
         _option(
             _SEARCH,
             "--budget",
-            help="Time for the searches, as 90s, 10m or 2h; it becomes a number of evaluations.",
+            help="Time for the whole audit, as 90s, 10m or 2h; a smallest schedule is always finished.",
         ),
-    ] = "6m"
+    ] = "15m"
     evaluations: Annotated[
         int | None,
         _option(
@@ -281,7 +281,7 @@ def _question(
     from nodes.audit.asking import answer
     from nodes.audit.cars import car_of
     from nodes.audit.images import posed
-    from nodes.audit.places import Answers, camera_of, describe, place_of_photographs, place_of_world
+    from nodes.audit.places import Answers, AuditedWorld, camera_of, place_of_photographs
     from nodes.audit.policies import NamedPolicy
     from nodes.audit.question import CI_SECTIONS, AuditedQuestion
     from nodes.audit.run import CI_EVALUATIONS, AuditOptions
@@ -297,15 +297,21 @@ def _question(
             place.car, "--car", "Which car: racecarj, roboracer, donkey, duckiebot, car, or a YAML file", str
         )
         car, there = car_of(named), posed(place.place, folder, metric)
-        camera = camera_of(there, place.path)
-        spec, wanted = NamedPolicy(policy, camera, car.car.max_steering_rad, declared, folder, _say).resolve()
+        spec, wanted = NamedPolicy(
+            policy, lambda: (camera_of(there, place.path), car.car.max_steering_rad), declared, folder, _say
+        ).resolve()
         where, limit_m = place_of_photographs(place.place, there, answers, car, wanted)
     else:
         assert place.world is not None, "one of the two is given"
-        where = place_of_world(place.world, answers)
-        described = describe(where)
-        largest = described.car.largest_control
-        spec, _ = NamedPolicy(policy, described.camera, largest, declared, folder, _say).resolve()
+        world = AuditedWorld(place.world)
+        where = world.place(place.path)
+        spec, _ = NamedPolicy(
+            policy,
+            lambda: (world.description.camera, world.description.car.largest_control),
+            declared,
+            folder,
+            _say,
+        ).resolve()
     question = AuditedQuestion(
         policy=spec,
         given=policy,

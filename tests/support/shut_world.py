@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+
 from hardware.worlds.lab.lab import Lab
 from hardware.worlds.world import NotOpenError, WorldDescription
+
+# Name of the environment variable with a file that gets a line for each opening.
+LOG = "SHUT_WORLD_LOG"
 
 
 class Shut(Lab):
@@ -13,6 +19,9 @@ class Shut(Lab):
 
     def __enter__(self) -> Shut:
         super().__enter__()
+        if LOG in os.environ:
+            with Path(os.environ[LOG]).open("a") as file:
+                file.write("opened\n")
         self.is_open = True
         return self
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -46,11 +46,12 @@ def deployed_drives(
     scenario: str,
     starts: Tensor,
     theta: Tensor | None,
+    report: Callable[[int], None] = lambda done: None,
 ) -> list[DeployedDrive]:
-    """Drives through the deployment scene from starts ``[B, 3]``, with its own car or an ideal one."""
-    effects, car = experiment.config.deploy.camera, _car(experiment, dressed)
-    return [
-        drive_deployed(
+    """Drives through the deployment scene from starts ``[B, 3]``, with its own car or an ideal one; ``report`` gets the number of finished ones."""
+    effects, car, found = experiment.config.deploy.camera, _car(experiment, dressed), []
+    for number, start in enumerate(starts.numpy()):
+        drive = drive_deployed(
             dressed,
             policy,
             told(experiment, policy, scenario),
@@ -61,8 +62,9 @@ def deployed_drives(
             theta,
             None if effects.ideal else ImperfectCamera(effects, experiment.camera, number),
         )
-        for number, start in enumerate(starts.numpy())
-    ]
+        found.append(drive)
+        report(len(found))
+    return found
 
 
 def _car(experiment: Experiment, dressed: Dressed) -> SelfDriving | IdealDriving:

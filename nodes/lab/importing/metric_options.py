@@ -39,9 +39,18 @@ class MetricOptions:
         typer.Option(help="What z is: the ground if it is found, or the cameras' up."),
     ] = "auto"
 
-    def __post_init__(self) -> None:
+    @property
+    def gives_metre(self) -> bool:
+        """Whether an option gives the metre."""
+        return bool(self._given)
+
+    @property
+    def _given(self) -> list[str]:
         options = {"--length": self.length, "--positions": self.positions, "--marker": self.marker_m}
-        given = [name for name, value in options.items() if value is not None]
+        return [name for name, value in options.items() if value is not None]
+
+    def __post_init__(self) -> None:
+        given = self._given
         if len(given) > 1:
             raise ImportRecordingError(
                 f"expected one source of the scale, got {' and '.join(given)}; give one of them"

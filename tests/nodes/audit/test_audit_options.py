@@ -13,7 +13,8 @@ from hardware.worlds.lab.config import LabConfig
 from hardware.worlds.lab.lab import Lab
 from nodes.audit.cars import CARS, car_of
 from nodes.audit.images import posed
-from nodes.audit.places import Answers, describe, place_of_world
+from nodes.audit.places import AuditedWorld
+from nodes.audit.policies import NamedPolicy
 from nodes.cli.audit import _minutes
 from nodes.experiment.show.experiment_world import as_json
 from nodes.lab.importing.metric_options import MetricOptions
@@ -70,10 +71,31 @@ def test_a_car_is_a_name_or_a_file(tmp_path: Path) -> None:
         car_of(str(tmp_path / "bad.yaml"))
 
 
-def test_a_world_that_describes_itself_once_it_is_open_is_opened_for_its_camera_and_car() -> None:
-    found = place_of_world(shut_world.NAME, Answers())
-    assert found.path == "track"
-    assert as_json(describe(found)) == as_json(Lab(LabConfig()).describe())
+@pytest.fixture
+def openings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file with a line for each time that the shut world was opened."""
+    monkeypatch.setenv(shut_world.LOG, str(tmp_path / "openings.txt"))
+    (tmp_path / "openings.txt").touch()
+    return tmp_path / "openings.txt"
+
+
+def test_a_world_that_describes_itself_once_it_is_open_is_opened_once_for_path_camera_and_car(
+    openings: Path,
+) -> None:
+    found = AuditedWorld(shut_world.NAME)
+    assert found.place(None).path == "track"
+    assert as_json(found.description) == as_json(Lab(LabConfig()).describe())
+    assert len(openings.read_text().splitlines()) == 1
+
+
+def test_a_world_is_not_opened_for_what_a_policy_and_the_path_declare(openings: Path, tmp_path: Path) -> None:
+    world = AuditedWorld(shut_world.NAME)
+    assert world.place("track").path == "track"
+    own = next(Path(__file__).parents[3].glob("docs/results/reference/policy_*/policy.safetensors"))
+    for given in ("grpc://127.0.0.1:1", str(own)):
+        policy = NamedPolicy(given, lambda: pytest.fail("the world was asked"), (), tmp_path, print)
+        assert policy.resolve()[0] == given
+    assert not openings.read_text()
 
 
 def test_a_learned_scene_without_its_images_cannot_be_judged_in(tmp_path: Path) -> None:
@@ -84,5 +106,5 @@ def test_a_learned_scene_without_its_images_cannot_be_judged_in(tmp_path: Path) 
 
 def test_a_world_with_an_experiment_file_is_driven_along_the_path_of_that_file() -> None:
     """Duckietown's first path by name turns left, and its experiment drives right."""
-    assert place_of_world("duckietown", Answers()).path == "right"
-    assert place_of_world("duckietown", Answers(path="left")).path == "left"
+    assert AuditedWorld("duckietown").place(None).path == "right"
+    assert AuditedWorld("duckietown").place("left").path == "left"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
@@ -20,6 +21,8 @@ from nodes.lab.worlds.undriven import Undriven
 PATH = "track"
 # The learned box reaches beyond cameras and path by this share of their extent; anything outside is learned with less detail.
 _BESIDE, _BELOW_M = 0.5, 0.1
+# Of a picture: estimated intrinsics differ from declared ones, so that so much beyond its border is taken from the border.
+_BEYOND = 0.01
 _HALF_PX = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
 
 
@@ -130,7 +133,7 @@ class Photographs(Undriven):
         Raises:
             WorldError: Too few photographs.
         """
-        along = self._driven if self.config.shows_path else self._nearest()
+        along = self.along
         if not 3 <= held_out <= len(along) // 3:
             raise WorldError(
                 f"expected capture.held_out from 3 to a third of the {len(along)} photographs along the path, got {held_out}"
@@ -143,6 +146,11 @@ class Photographs(Undriven):
         return [self._photograph(each, None) for each in learned], [
             self._photograph(each, self.camera_pinhole) for each in chosen
         ]
+
+    @property
+    def along(self) -> Sequence[PosedImage]:
+        """Photographs that views can be held out of: those taken while driving, or nearest to the path."""
+        return self._driven if self.config.shows_path else self._nearest()
 
     def _nearest(self) -> list[PosedImage]:
         """The half of the photographs whose cameras are nearest to the points of the path, in their order."""
@@ -182,7 +190,8 @@ def _through(pinhole: Pinhole, rgb: Rgb, own: Pinhole, file: Path) -> Rgb:
     own_from_wanted = own.matrix @ np.linalg.inv(pinhole.matrix)
     corners = np.array([[x, y, 1.0] for x in (0.5, pinhole.width - 0.5) for y in (0.5, pinhole.height - 0.5)])
     seen = corners @ own_from_wanted.T
-    if (seen < 0.0).any() or (seen[:, :2] > [own.width, own.height]).any():
+    size_px = np.array([own.width, own.height])
+    if (seen[:, :2] < -_BEYOND * size_px).any() or (seen[:, :2] > (1.0 + _BEYOND) * size_px).any():
         raise WorldError(
             f"expected photographs that show all that the driving camera {pinhole} sees, got {file.name} with {own}; take wider ones, or "
             "correct camera.pinhole"
