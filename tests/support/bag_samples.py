@@ -4,10 +4,10 @@ import numpy as np
 
 from nodes.bags.writer import BagWriter
 from nodes.runtime.messages import (
-    _STORE,
     camera_info_message,
     drive_message,
     encode,
+    fields_of,
     header,
     image_message,
     pose_message,
@@ -119,7 +119,7 @@ def sample(typename, stamp_ns):
 def nothing(typename):
     """A message of any type with zeros, empty texts and empty sequences."""
     values = {}
-    for name, (kind, what) in _STORE.fielddefs[typename][1]:
+    for name, (kind, what) in fields_of(typename):
         if kind.name == "BASE":
             values[name] = {"string": "", "bool": False}.get(what[0], 0.0 if "float" in what[0] else 0)
         elif kind.name == "NAME":
