@@ -20,6 +20,7 @@ from advnerf_core.attack.adjoint import adjoint_gradient
 from advnerf_core.attack.device import use_device
 from advnerf_core.attack.on_device import on_chosen_device
 from advnerf_core.attack.problem import AttackProblem
+from advnerf_core.scene.agreement import search_accelerator
 from advnerf_core.scene.surrogate import Surrogate
 from benchmarks.results import record_row
 from benchmarks.ticks import hydrants
@@ -50,7 +51,7 @@ def main() -> None:
                 "none",
                 None,
                 command,
-                "no GPU was there; the code is compared with the processor's in a simulator",
+                "no GPU was there; the same code is compared with the kernels on the processor",
             )
         return
     use_device("cuda")
@@ -61,7 +62,8 @@ def main() -> None:
     space = face_space(experiment, background)
     here = replace(attack_problem(experiment, space, policy, scenario, 0), sensor=surrogate, steps=_STEPS)
     there, theta = on_chosen_device(here), surrogate.plain_theta()
-    name = torch.cuda.get_device_name()
+    accelerator = search_accelerator()
+    name = f"{torch.cuda.get_device_name()} refused" if accelerator is None else accelerator.name
     path = experiment.paths[scenario]
     states = torch.tensor(np.array([path.pose_at(float(s)) for s in np.linspace(0.0, 3.0, 32)]))
     for count in _DRIVES:

@@ -34,7 +34,8 @@ def use_device(device: str | None) -> None:
     if device is not None:
         os.environ[VARIABLE] = device
     if searches_on_gpu():
-        # Imported here: torch and the compiler of GPU kernels take two seconds to load, and may be absent.
-        from advnerf_core.render.cuda_launch import cuda_device
+        # Imported here: torch takes two seconds to load, and may be absent.
+        from advnerf_core.scene.accelerator import gpu, is_simulated
 
-        cuda_device()
+        if not is_simulated():
+            gpu()

@@ -13,23 +13,53 @@ from torch import Tensor, nn
 from advnerf_core.attack.device import searches_on_gpu
 from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.attack.spaces.displayed import DisplayedSensor
+from advnerf_core.attack.spaces.placed_sensor import PlacedSensor
+from advnerf_core.errors import DeviceError
+from advnerf_core.scene.accelerator import Accelerator, use_exact_arithmetic
+from advnerf_core.scene.agreement import search_accelerator
+from advnerf_core.scene.device_surrogate import DeviceSurrogate
+from advnerf_core.scene.surrogate import Surrogate
 
 
 def on_chosen_device(problem: AttackProblem) -> AttackProblem:
     """The problem for a search on the device that `use_device` chose; unchanged on the CPU.
 
     Raises:
-        DeviceError: The device is not available, or it cannot render the searched objects.
+        DeviceError: There is no GPU, or it cannot render the searched objects.
     """
-    if not searches_on_gpu():
-        return problem
-    # Imported here: the compiler of GPU kernels takes a while to load, and may be absent.
-    from advnerf_core.scene.cuda_surrogate import on_cuda
+    accelerator = search_accelerator() if searches_on_gpu() else None
+    return problem if accelerator is None else on_device(problem, accelerator)
 
-    behind = problem.sensor.sensor if isinstance(problem.sensor, DisplayedSensor) else problem.sensor
-    there = on_cuda(behind)
-    sensor = replace(problem.sensor, sensor=there) if isinstance(problem.sensor, DisplayedSensor) else there
-    return replace(problem, sensor=sensor, policy=PolicyThere(problem.policy, there.device))
+
+def on_device(problem: AttackProblem, accelerator: Accelerator) -> AttackProblem:
+    """The problem with its sensor and its policy on a device.
+
+    Raises:
+        DeviceError: The device cannot render the sensor.
+    """
+    sensor = problem.sensor
+    there = (
+        replace(sensor, sensor=sensor_on(sensor.sensor, accelerator))
+        if isinstance(sensor, DisplayedSensor)
+        else sensor_on(sensor, accelerator)
+    )
+    return replace(problem, sensor=there, policy=PolicyThere(problem.policy, accelerator.device))
+
+
+def sensor_on(sensor: Any, accelerator: Accelerator) -> DeviceSurrogate | PlacedSensor:
+    """A sensor on a device.
+
+    Raises:
+        DeviceError: The sensor is neither a surrogate nor places objects, or has objects that a GPU cannot draw.
+    """
+    if isinstance(sensor, PlacedSensor):
+        return sensor.on(accelerator)
+    if not isinstance(sensor, Surrogate):
+        raise DeviceError(
+            f"expected a search for colours or places of objects on a GPU, got the sensor {type(sensor).__name__}; "
+            "leave --device out to search on the processor"
+        )
+    return DeviceSurrogate(sensor, accelerator)
 
 
 def all_on_chosen_device(problems: Sequence[AttackProblem]) -> list[AttackProblem]:
@@ -40,9 +70,8 @@ def all_on_chosen_device(problems: Sequence[AttackProblem]) -> list[AttackProble
 
 def said_of_device() -> dict[str, str]:
     """Device metadata for an attack file: empty on the CPU."""
-    if not searches_on_gpu():
-        return {}
-    return {"device": torch.cuda.get_device_name() if torch.cuda.is_available() else "simulated GPU"}
+    accelerator = search_accelerator() if searches_on_gpu() else None
+    return {} if accelerator is None else {"device": accelerator.name}
 
 
 class PolicyThere:
@@ -63,9 +92,7 @@ class PolicyThere:
         self.differentiable = bool(getattr(policy, "differentiable", True))
         self.training = bool(getattr(policy, "training", False))
         self.goal_size = int(getattr(policy, "goal_size", 0))
-        # Deterministic bits, and no convolutions in TF32: gradients keep their direction.
-        torch.backends.cudnn.deterministic, torch.backends.cudnn.benchmark = True, False
-        torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
+        use_exact_arithmetic()
 
     def initial_memory(self, batch: int) -> Tensor:
         """Memory ``[B, ...]`` of a policy that has one."""

@@ -1,4 +1,4 @@
-"""Voxel-grid objects in the memory of a GPU, drawn into images and differentiated there."""
+"""Voxel-grid objects in the memory of a GPU, drawn into images and differentiated there by numba-cuda's kernels."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from torch import Tensor
 
 from advnerf_core.errors import DeviceError
 from advnerf_core.fields.coloured import ColouredObject
-from advnerf_core.fields.voxel_grid import VoxelGridObject
-from advnerf_core.geometry import Array, Pinhole, invert_transform
+from advnerf_core.geometry import Array, Pinhole
 from advnerf_core.render.cast_cuda_kernels import (
     EDGES,
     FIRST_CELL,
@@ -30,26 +29,9 @@ from advnerf_core.render.cast_cuda_kernels import (
     draw_objects,
     pull_objects,
 )
-from advnerf_core.render.cast_object import prepared, windows
-from advnerf_core.render.cuda_launch import cuda_device, launch
-
-# 64-bit whole numbers hold the sum of all pixels' slopes with a bit to spare.
-_SUM_BITS = 62
-
-
-def check_drawable(objects: Sequence[ColouredObject]) -> list[VoxelGridObject]:
-    """The objects, if a GPU can draw all of them.
-
-    Raises:
-        DeviceError: An object is not a voxel grid, or there are too many.
-    """
-    grids = [field for field in objects if isinstance(field, VoxelGridObject)]
-    if len(grids) != len(objects):
-        other = next(type(field).__name__ for field in objects if not isinstance(field, VoxelGridObject))
-        raise DeviceError(f"expected objects made of voxels on a GPU, got a {other}; search on the processor")
-    if len(grids) > MOST_OBJECTS:
-        raise DeviceError(f"expected at most {MOST_OBJECTS} objects on a GPU, got {len(grids)}")
-    return grids
+from advnerf_core.render.cast_object import prepared
+from advnerf_core.render.cast_torch import object_places, sum_of_slopes, voxel_edges, voxel_objects
+from advnerf_core.render.cuda_launch import launch
 
 
 class CudaObjects:
@@ -63,7 +45,7 @@ class CudaObjects:
         tolerance_m: Distance behind the background at which an object is still visible [m].
 
     Raises:
-        DeviceError: No device is available; and see `check_drawable`.
+        DeviceError: An object is not a voxel grid, or there are too many.
     """
 
     def __init__(
@@ -73,8 +55,11 @@ class CudaObjects:
         supersample: int,
         dtype: torch.dtype,
         tolerance_m: float,
+        device: torch.device,
     ) -> None:
-        self.objects, self.device, self.dtype = check_drawable(objects), cuda_device(), dtype
+        self.objects, self.device, self.dtype = voxel_objects(objects), device, dtype
+        if len(objects) > MOST_OBJECTS:
+            raise DeviceError(f"expected at most {MOST_OBJECTS} objects on a GPU, got {len(objects)}")
         self._pinhole, self._supersample = pinhole, supersample
         self._tolerance_m = tolerance_m
         grids = [prepared(field, torch.empty(0, dtype=dtype).numpy().dtype) for field in self.objects]
@@ -87,7 +72,7 @@ class CudaObjects:
             row[VOXELS : VOXELS + 3] = grid.slots.shape
             row[[FIRST_VOXEL, FIRST_CELL, FIRST_COLOUR]] = voxels, cells, colours
             row[[FREE, SOLID, ONE_SIDED]] = field.free_count, solid, field.one_sided
-            edges[EDGES : EDGES + 3] = _edges(field)
+            edges[EDGES : EDGES + 3] = voxel_edges(field)
             edges[STEP] = field.step_units
             # One index serves for a voxel's colour and its density.
             densities.append(
@@ -112,15 +97,7 @@ class CudaObjects:
 
     def placed(self, T_world_from_camera: Array) -> tuple[Tensor, Tensor]:
         """Places of the objects for cameras ``[B, 4, 4]``: ``frames`` and ``windows`` of `draw_objects`."""
-        T_camera_from_world = invert_transform(T_world_from_camera)
-        frames = np.empty((len(self.objects), len(T_world_from_camera), 12))
-        seen = np.empty((*frames.shape[:2], 4), np.int32)
-        for k, field in enumerate(self.objects):
-            edges = _edges(field)
-            T = invert_transform(field.T_world_from_object) @ T_world_from_camera
-            frames[k, :, :9] = (T[:, :3, :3] / field.scale / edges[:, None]).reshape(-1, 9)
-            frames[k, :, 9:] = (T[:, :3, 3] / field.scale - field.box_min) / edges - 0.5
-            seen[k] = windows(field, T_camera_from_world, self._pinhole)
+        frames, seen = object_places(self.objects, T_world_from_camera, self._pinhole)
         return self._there(frames), self._there(seen)
 
     def draw(
@@ -155,21 +132,14 @@ class CudaObjects:
         slopes: Tensor,
     ) -> Tensor:
         """Gradient with respect to ``colours [N, V, 3]`` from one with respect to the images ``[B, 3, H, W]``; the same bits every time."""
-        largest = slopes.abs().max().double()
-        slopes = slopes.nan_to_num(0.0, 0.0, 0.0).contiguous()  # NaN is restored at the end
-        pixels = slopes.numel() // 3
-        # No sum over all pixels reaches the largest whole number, as a pixel's weights sum to at most one.
-        scale = (2.0 ** (_SUM_BITS - pixels.bit_length()) / largest.clamp(1e-200, 1e200)).reshape(1)
-        total = torch.zeros(colours.shape, dtype=torch.int64, device=self.device)
-        launch(pull_objects, pixels, *places, self._intrinsics, self._supersample, *self._grids, colours, texture_of, shares, slopes, scale,
-               total)  # fmt: skip
-        return torch.where(torch.isfinite(largest), total.double() / scale, torch.nan).to(colours.dtype)
+
+        def pull(slopes: Tensor, scale: Tensor) -> Tensor:
+            total = torch.zeros(colours.shape, dtype=torch.int64, device=self.device)
+            launch(pull_objects, slopes.numel() // 3, *places, self._intrinsics, self._supersample, *self._grids, colours, texture_of, shares,
+                   slopes, scale, total)  # fmt: skip
+            return total
+
+        return sum_of_slopes(slopes, pull)
 
     def _there(self, array: NDArray[Any]) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
-
-
-def _edges(field: VoxelGridObject) -> Array:
-    """Object units per voxel along each axis ``[3]``."""
-    edges: Array = (np.asarray(field.box_max, np.float64) - field.box_min) / field.slots.shape
-    return edges

@@ -12,31 +12,7 @@ import torch
 from numba import config, cuda
 from torch import Tensor
 
-from advnerf_core.errors import DeviceError
-
 _THREADS = 64  # per block: rays of a block end at different times, and a small block waits for fewer
-
-
-def is_simulated() -> bool:
-    """Whether kernels run in numba's simulator."""
-    return bool(config.ENABLE_CUDASIM)  # type: ignore[attr-defined]
-
-
-def cuda_device() -> torch.device:
-    """Device of tensors that the kernels can read.
-
-    Raises:
-        DeviceError: No device is available.
-    """
-    if is_simulated():
-        return torch.device("cpu")
-    for sees, what in ((torch.cuda.is_available, "torch"), (cuda.is_available, "numba")):
-        if not sees():
-            raise DeviceError(
-                f"expected an NVIDIA GPU that torch and numba can use, but {what} sees none; make nvidia-smi work, and install a torch "
-                "built for CUDA and the extra gpu (docs/performance.md); without --device cuda the processor searches"
-            )
-    return torch.device("cuda", torch.cuda.current_device())
 
 
 def launch(kernel: Any, threads: int, *arguments: Any) -> None:
@@ -45,12 +21,12 @@ def launch(kernel: Any, threads: int, *arguments: Any) -> None:
     Args:
         kernel: Kernel of ``numba.cuda.jit``; it returns at once if ``cuda.grid(1)`` is not below ``threads``.
         threads: Number of threads; 0 runs nothing.
-        arguments: Tensors on `cuda_device` without history, and numbers.
+        arguments: Tensors on the GPU without history, and numbers.
     """
     blocks = -(-threads // _THREADS)
     if blocks == 0:
         return
-    if is_simulated():
+    if config.ENABLE_CUDASIM:  # type: ignore[attr-defined]
         # One after the other: threads of Python would only wait for each other.
         kernel[threads, 1](*(each.numpy() if isinstance(each, Tensor) else each for each in arguments))
         return

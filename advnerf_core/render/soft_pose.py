@@ -22,6 +22,7 @@ from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.geometry import Array, Pinhole, invert_transform, rotation_z, yaw_of
 from advnerf_core.parallel import run_slots, slot_bounds
 from advnerf_core.render.cast_object import KernelGrids, prepared, windows
+from advnerf_core.render.cast_torch import TorchGrid, pixel_aims, pixel_parts, pixel_sums, voxel_edges
 from advnerf_core.render.pose_kernels import SUMS, pull_pixels, shade_pixels
 
 LEAST_TRANSMITTANCE = 1e-4
@@ -71,7 +72,7 @@ class SoftLayer:
     colour: Array
     alpha: Array
     depth_m: Array
-    _walk: _Walk
+    _walk: _Walk | _TorchWalk
 
     @property
     def nbytes(self) -> int:
@@ -100,6 +101,7 @@ def soft_layer(
     pinhole: Pinhole,
     supersample: int = 2,
     least_transmittance: float = LEAST_TRANSMITTANCE,
+    device: torch.device | None = None,
 ) -> SoftLayer:
     """The layer of one object at a placement, with the pixels that it covers.
 
@@ -110,6 +112,7 @@ def soft_layer(
         T_world_from_camera: ``[B, 4, 4]``.
         supersample: Rays along each side of a pixel.
         least_transmittance: A ray is followed until less light than this remains.
+        device: Compute there, in plain torch; None uses the CPU kernels.
 
     Raises:
         ValueError: The object has no density, or the placement is invalid.
@@ -125,15 +128,12 @@ def soft_layer(
         )
     poses = np.asarray(T_world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
     placed = placed_at(field, place)
-    walk = _Walk.of(
-        placed,
-        field,
-        np.ascontiguousarray(colours, np.float64),
-        poses,
-        pinhole,
-        supersample,
-        least_transmittance,
-    )
+    given = (placed, field, np.ascontiguousarray(colours, np.float64), poses, pinhole, supersample)
+    walk: _Walk | _TorchWalk
+    if device is None:
+        walk = _Walk.of(*given, least_transmittance)
+    else:
+        walk = _TorchWalk(*given, least_transmittance, device)
     pixels = _window_pixels(placed, poses, pinhole)
     shown = walk.shade(pixels)
     kept = shown[:, 3] > 0.0
@@ -287,6 +287,78 @@ class _Walk:
             np.empty(room),
             np.empty(room),
         )
+
+
+class _TorchWalk:
+    """Intersections of one object with the rays of a batch of images; a drop-in for the walk of `soft_layer`.
+
+    Args:
+        placed: The object at its placement; it has a density.
+        nominal: The object at its nominal placement.
+        colours: Colour vector ``[rows, 3]``.
+        poses: ``T_world_from_camera [B, 4, 4]``.
+        lens: Camera.
+        supersample: Rays along each side of a pixel.
+        least: A ray is followed until less light than this remains.
+        device: Where it is computed; arguments and results are on the CPU.
+    """
+
+    def __init__(self, placed: VoxelGridObject, nominal: VoxelGridObject, colours: Array, poses: Array, lens: Pinhole,
+                 supersample: int, least: float, device: torch.device) -> None:  # fmt: skip
+        self._field, self._lens, self._supersample, self._least = nominal, lens, supersample, least
+        self._grid = TorchGrid(nominal, torch.float64, device)
+        self._step_m = nominal.step_units * nominal.scale
+        self._step_units = self._step_m / placed.scale
+        there = (placement_of(placed), torch.from_numpy(colours), torch.from_numpy(poses))
+        self._placement, self._colours, self._cameras = (each.to(device) for each in there)
+
+    @torch.no_grad()
+    def shade(self, pixels: NDArray[np.int64]) -> Array:
+        """Red, green, blue, alpha and alpha-weighted depth of pixels, ``[P, 5]``."""
+        shown = [self._shown(part, self._placement, self._colours).cpu() for part in self._parts(pixels)]
+        return np.asarray(torch.cat([torch.zeros(0, 5, dtype=torch.float64), *shown]).numpy())
+
+    def pull(self, pixels: NDArray[np.int64], slopes: Array, with_colours: bool) -> tuple[Array, Array]:
+        """See `SoftLayer.pull`."""
+        wanted = (self._placement, self._colours) if with_colours else (self._placement,)
+        sums, parts = [torch.zeros_like(each) for each in wanted], self._parts(pixels)
+        given = torch.from_numpy(slopes).to(self._placement).split([len(part) for part in parts])
+        for part, slope in zip(parts, given, strict=True):
+            with torch.enable_grad():
+                leaves = [each.clone().requires_grad_() for each in wanted]
+                shown = self._shown(part, leaves[0], leaves[1] if with_colours else self._colours)
+                gradients = torch.autograd.grad((shown[:, :4] * slope).sum(), leaves)
+            sums = [total + gradient for total, gradient in zip(sums, gradients, strict=True)]
+        rows = sums[1].cpu().numpy() if with_colours else np.zeros((0, 3))
+        return sums[0].cpu().numpy(), rows
+
+    def _parts(self, pixels: NDArray[np.int64]) -> tuple[Tensor, ...]:
+        there = torch.from_numpy(pixels).to(self._placement.device)
+        return pixel_parts(there, self._field, self._step_units, self._supersample)
+
+    def _shown(self, pixels: Tensor, placement: Tensor, colours: Tensor) -> Tensor:
+        """``shade`` of a part, differentiable except in its depth."""
+        image, aims = pixel_aims(pixels, self._lens, self._supersample)
+        turn, position = pose_of(self._field, placement)
+        edges, low = (
+            torch.from_numpy(each).to(placement)
+            for each in (voxel_edges(self._field), np.asarray(self._field.box_min, np.float64))
+        )
+        unit = edges * placement[3]
+        o = ((self._cameras[:, :3, 3] - position) @ turn / unit - low / edges - 0.5)[image]
+        d = (self._cameras[:, :3, :3][image] @ aims[..., None])[..., 0] @ turn / unit
+        with torch.no_grad():
+            t_in, t_out, _ = self._grid.span(o, d)
+            first = (t_in / self._step_m - 0.5).ceil()
+            count = (t_out / self._step_m - 0.5).ceil() - first
+            count = torch.where((d[:, 0] >= 0.0) & self._field.one_sided, 0.0, count.clamp(min=0.0))
+        dt, begin = torch.full_like(first, self._step_m), (first + 0.5) * self._step_m
+        length = aims.norm(dim=1) * self._step_m / placement[3]
+        seen = self._grid.look(o, d, begin, dt, count, length, self._least, last_takes_rest=False)
+        colour = (seen.parts[..., None] * colours[self._grid.slots[seen.voxels]]).sum(1)
+        t = (begin[seen.ray] + seen.row * self._step_m)[:, None]
+        values = seen.weight[:, None] * torch.cat([colour, torch.ones_like(t), t], 1)
+        return pixel_sums(seen, values, len(pixels), self._supersample)
 
 
 def _window_pixels(field: VoxelGridObject, poses: Array, pinhole: Pinhole) -> NDArray[np.int64]:

@@ -11,7 +11,7 @@ from numba import cuda, float32
 from torch import Tensor
 
 from advnerf_core.geometry import Array, Pinhole
-from advnerf_core.render.cuda_launch import cuda_device, launch
+from advnerf_core.render.cuda_launch import launch
 from advnerf_core.render.march_kernels import span_in_box, step_size
 from advnerf_core.render.rays import intrinsics_row, poses_in_box, write_ray
 from advnerf_core.scene.baked import BakedScene
@@ -105,13 +105,10 @@ class CudaBaked:
 
     Args:
         scene: The scene, copied to the GPU once.
-
-    Raises:
-        DeviceError: No device is available.
     """
 
-    def __init__(self, scene: BakedScene) -> None:
-        self.device = cuda_device()
+    def __init__(self, scene: BakedScene, device: torch.device) -> None:
+        self.device = device
         self._scene = scene
         voxels, leaps = scene.voxels, scene.leaps
         self._grids = tuple(
@@ -128,7 +125,7 @@ class CudaBaked:
         self._high, self._steps = self._there(scene.config.box_high), self._there(scene.march.steps())
 
     def render(self, T_world_from_camera: Array, pinhole: Pinhole) -> tuple[Tensor, Tensor]:
-        """Colours ``[B, 3, H, W]`` in 0..1 and planar depth ``[B, H, W]`` [m] of views ``[B, 4, 4]``, float32, on the device."""
+        """Colours ``[B, H, W, 3]`` in 0..1 and planar depth ``[B, H, W]`` [m] of views ``[B, 4, 4]``, float32, on the device."""
         scene, config = self._scene, self._scene.config
         shape = (len(T_world_from_camera), pinhole.height, pinhole.width)
         depth_m = torch.empty(shape, device=self.device)
@@ -136,7 +133,7 @@ class CudaBaked:
         poses = self._there(poses_in_box(T_world_from_camera, config.origin_m, config.extent_m))
         launch(render_baked_cuda, depth_m.numel(), poses, self._there(intrinsics_row(pinhole)), self._high, scene.march.near_m, self._steps,
                *self._grids, scene.least_transmittance, scene.march.max_samples, rgb, depth_m)  # fmt: skip
-        return rgb, depth_m
+        return rgb.permute(0, 2, 3, 1), depth_m
 
     def _there(self, array: Any) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(array)).to(self.device)

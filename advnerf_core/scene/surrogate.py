@@ -221,7 +221,7 @@ class Surrogate:
         """
         poses = np.asarray(T_world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
         images, depths = (torch.as_tensor(part, device="cpu").to(self.dtype) for part in (rgb, depth_m))
-        self._check_background(images, depths, len(poses))
+        self.check_background(images, depths, len(poses))
         frames = self._composed(self._cast_work(poses).run(), images, depths)
         return frames.render(None if theta is None else theta.detach()).images
 
@@ -302,11 +302,12 @@ class Surrogate:
 
     def _checked(self, frames: Sequence[Any], count: int) -> tuple[Tensor, Tensor]:
         rgb, depth_m = frames[:2]
-        self._check_background(rgb, depth_m, count)
+        self.check_background(rgb, depth_m, count)
         rgb, depth_m = (torch.as_tensor(part, device="cpu").to(self.dtype) for part in (rgb, depth_m))
         return rgb, depth_m
 
-    def _check_background(self, rgb: Any, depth_m: Any, count: int) -> None:
+    def check_background(self, rgb: Any, depth_m: Any, count: int) -> None:
+        """Check the shapes of a background of ``count`` images."""
         size = (count, self.camera.height, self.camera.width)
         if tuple(rgb.shape) != (*size, 3) or tuple(depth_m.shape) != size:
             got = f"{tuple(rgb.shape)} and {tuple(depth_m.shape)}"

@@ -15,8 +15,7 @@ from advnerf_core.render.march import Samples
 from advnerf_core.render.volume_kernels import MIN_TRANSMITTANCE
 from advnerf_core.scene.exposure import RayGains
 from advnerf_core.scene.field import SceneField
-from advnerf_core.scene.train_config import TrainConfig
-from advnerf_core.scene.train_step import Array32, CpuStep, Matte, StepResult, distortion_distances
+from advnerf_core.scene.train_step import Array32, Matte, StepResult, distortion_distances
 
 _MEAN_DECAY, _SQUARE_DECAY, _TINY = 0.9, 0.99, 1e-15
 
@@ -158,15 +157,6 @@ class TorchStep:
     def _tensor(self, array: NDArray[np.float32] | NDArray[np.uint8]) -> Tensor:
         background = self.scene.background
         return torch.from_numpy(np.ascontiguousarray(array)).to(background.device, background.dtype)
-
-
-def stepper_for(scene: SceneField, config: TrainConfig) -> CpuStep | TorchStep:
-    """The training step of a configuration; the torch one runs on an accelerator, if there is one."""
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    opacity = config.opacity if scene.config.learned_background else 0.0
-    if config.backend == "torch" or (config.backend == "auto" and device != "cpu"):
-        return TorchStep(scene.to(device), config.huber, opacity=opacity)
-    return CpuStep(scene, config.huber, opacity=opacity)
 
 
 def render_rays(scene: SceneField, rays: Tensor, samples: Samples) -> tuple[Tensor, Tensor, Tensor]:

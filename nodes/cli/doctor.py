@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -39,6 +39,13 @@ def doctor(
     host: Annotated[
         str | None, typer.Option(help="Host of the launch file that this computer is, or all.")
     ] = None,
+    gpu: Annotated[
+        bool,
+        typer.Option(
+            "--gpu", help="Only compare the GPU with the processor; prints text to paste into an issue."
+        ),
+    ] = False,
+    gpu_device: Annotated[Literal["cuda", "cpu"], typer.Option(hidden=True)] = "cuda",
     as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
     overrides: Overrides = None,
 ) -> None:
@@ -46,6 +53,9 @@ def doctor(
 
     Exit code 0: no failure found. 1: something will not work. 2: the launch file or an option is wrong.
     """
+    if gpu:
+        _compare_gpu(gpu_device)
+        return
     from nodes.lab.doctor.check import FAILURE, examine, worst
 
     findings = []
@@ -60,6 +70,16 @@ def doctor(
         counts = {word: sum(finding.state == word for finding in findings) for word in ("failure", "warning")}
         print(", ".join(f"{count} {word}{'s' * (count != 1)}" for word, count in counts.items()))
     if state == FAILURE:
+        raise typer.Exit(_FAILURE_EXIT)
+
+
+def _compare_gpu(device: str) -> None:
+    from nodes.lab.doctor.gpu import GpuReport
+
+    report = GpuReport(device)
+    for line in report:
+        typer.echo(line)
+    if not report.works:
         raise typer.Exit(_FAILURE_EXIT)
 
 

@@ -7,6 +7,7 @@ gradients of these pictures, and drive past the true edges (`sharp`), as a deplo
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -19,6 +20,8 @@ from advnerf_core.fields.soft_edges import with_soft_edges
 from advnerf_core.geometry import Array
 from advnerf_core.render.composite import visible_shares
 from advnerf_core.render.soft_pose import SoftLayer, soft_layer
+from advnerf_core.scene.accelerator import Accelerator
+from advnerf_core.scene.device_surrogate import background_on
 from advnerf_core.scene.surrogate import Rendered, Surrogate, split_theta
 
 
@@ -70,6 +73,16 @@ class PlacedSensor:
             )
         self._soft = tuple(with_soft_edges(each, edge_width) for each in space.objects)
         self._last: tuple[Tensor, int, _Parts] | None = None
+        self._device: torch.device | None = None
+
+    def on(self, accelerator: Accelerator) -> PlacedSensor:
+        """The same, with background and objects computed on a device, in plain torch; images and gradients are on the CPU."""
+        other = copy.copy(self)
+        other._device = accelerator.device
+        other.surrogate = self.surrogate.with_background(
+            background_on(accelerator, self.surrogate.background)
+        )
+        return other
 
     @property
     def pose_count(self) -> int:
@@ -131,7 +144,7 @@ class PlacedSensor:
         rgb, depth_m = self.surrogate.scene_frames(T_world_from_camera)
         lens, supersample = self.surrogate.camera, self.surrogate.supersample
         layers = [
-            soft_layer(field, place, rows, T_world_from_camera, lens, supersample)
+            soft_layer(field, place, rows, T_world_from_camera, lens, supersample, device=self._device)
             for field, place, rows in zip(self._soft, parts.placements, parts.rows, strict=True)
         ]
         stack = _Stack.of(layers, rgb, depth_m, self.surrogate.depth_tolerance_m)

@@ -44,7 +44,11 @@ def egl(required: bool = False) -> list[CheckResult]:
 
 def torch(required: bool = False) -> list[CheckResult]:
     """Check the version of torch and its devices."""
-    answer = in_child("torch")
+    return torch_found(in_child("torch"), required)
+
+
+def torch_found(answer: ProbeResult, required: bool = False) -> list[CheckResult]:
+    """The result of the probe of torch."""
     if answer.data is None:
         text = (
             "is missing: no training, no attack, only ONNX policies" if _missing(answer) else answer.trouble

@@ -25,6 +25,32 @@ def torch() -> dict[str, Any]:
     return {"version": str(torch.__version__), "gpus": gpus, "built_for": torch.version.cuda}
 
 
+def gpu(device: str, compiled: bool) -> dict[str, Any]:
+    """Name of a device, and each part of a search and of a training on it and on the processor, as `agreement.Comparison`."""
+    from dataclasses import asdict
+
+    import advnerf_core as advnerf_core  # isort: skip  # before torch, as in the commands
+    import torch
+
+    from advnerf_core.geometry import Pinhole
+    from advnerf_core.scene.accelerator import Accelerator
+    from advnerf_core.scene.agreement import COMPILED_PARTS, PARTS, TEN_RAYS, compare
+
+    way = Accelerator(torch.device(device), compiled)
+    name, camera = str(way.device), Pinhole(200, 66, 160.0, 160.0, 100.0, 33.0)
+    if way.device.type == "cuda":
+        there = torch.cuda.get_device_properties(way.device)
+        name = f"{there.name}, {there.total_memory / 2**30:.0f} GiB, compute capability {there.major}.{there.minor}"
+    else:
+        camera = camera.resized(50, 16)
+    found = [
+        compare(part, way, lens)
+        for part in (COMPILED_PARTS if compiled else PARTS)
+        for lens in (TEN_RAYS, camera)
+    ]
+    return {"device": name, "rows": [{**asdict(each), "agrees": each.agrees} for each in found]}
+
+
 def egl() -> dict[str, Any]:
     """Version of MuJoCo and its renderer, tested by rendering without a window."""
     os.environ.setdefault("MUJOCO_GL", "egl")
@@ -91,7 +117,7 @@ def policy(spec: str, sha256: str) -> dict[str, Any]:
 
 
 PROBES: dict[str, Callable[..., Any]] = {
-    probe.__name__: probe for probe in (torch, egl, llvm, oaks, screens, policy)
+    probe.__name__: probe for probe in (torch, gpu, egl, llvm, oaks, screens, policy)
 }
 
 

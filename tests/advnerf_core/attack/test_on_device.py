@@ -1,4 +1,7 @@
-"""Searches on a GPU against those on the processor; without a device in numba's simulator, see ``test_cuda_simulated``."""
+"""Searches on a device against those on the processor: plain torch on the CPU and on a GPU, and numba-cuda.
+
+Numba's kernels run without a device in its simulator, see ``test_cuda_simulated``.
+"""
 
 import dataclasses
 
@@ -13,12 +16,14 @@ from advnerf_core.attack.on_device import (
     PolicyThere,
     all_on_chosen_device,
     on_chosen_device,
+    on_device,
     said_of_device,
 )
 from advnerf_core.attack.robustness import Disturbances
 from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.search.together import gradient_attacks
 from advnerf_core.errors import DeviceError
+from advnerf_core.scene.accelerator import Accelerator
 from advnerf_core.scene.surrogate import Surrogate
 from tests.support.attack_toy import MOUNT, VIEW, painted_room, toy_problem
 from tests.support.placed_toy import Leaning, moving
@@ -26,15 +31,23 @@ from tests.support.placed_toy import Leaning, moving
 here_only = pytest.mark.skipif(
     torch.cuda.is_available() or bool(config.ENABLE_CUDASIM), reason="there is a device"
 )
+SIMULATED = bool(config.ENABLE_CUDASIM)
 there_only = [
     pytest.mark.gpu,
     pytest.mark.skipif(
-        not (torch.cuda.is_available() or config.ENABLE_CUDASIM),
+        not (torch.cuda.is_available() or SIMULATED),
         reason="needs a CUDA device, or NUMBA_ENABLE_CUDASIM=1",
     ),
 ]
+CPU, GPU = torch.device("cpu"), torch.device("cuda")
+WAYS = [
+    pytest.param(Accelerator(CPU), id="torch, CPU"),
+    pytest.param(Accelerator(CPU if SIMULATED else GPU, compiled=True), id="numba-cuda", marks=there_only),
+    *([] if SIMULATED else [pytest.param(Accelerator(GPU), id="torch, GPU", marks=there_only)]),
+]
+every_way = pytest.mark.parametrize("way", WAYS)
 # As few pixels as the policy can look at, in the simulator: it starts a thread of Python for each.
-LENS = VIEW.resized(18, 6) if config.ENABLE_CUDASIM else VIEW.resized(33, 11)
+LENS = VIEW.resized(18, 6) if SIMULATED else VIEW.resized(33, 11)
 
 
 class Weighted(torch.nn.Module):
@@ -59,44 +72,51 @@ def small(policy=None, **changes):
     return dataclasses.replace(problem, sensor=surrogate, time_batch=2, **changes)
 
 
-@pytest.fixture
-def on_cuda(monkeypatch):
-    monkeypatch.setenv("ADVNERF_DEVICE", "cuda")
-
-
-@pytest.mark.parametrize("mark", [pytest.param(0, marks=there_only)])
+@every_way
 @pytest.mark.parametrize(
     "changes",
     [{}, {"cache_bytes": 0}, {"disturbances": Disturbances(0.02, 0.1, 0.02, 0.01, 0.01, seed=3)}],
     ids=["plain", "rendered again", "disturbed"],
 )
-def test_loss_and_gradient_are_those_of_the_processor(on_cuda, mark, changes):
+def test_loss_and_gradient_are_those_of_the_processor(way, changes):
     problem = small(**changes)
     theta = problem.sensor.initial_theta(torch.Generator().manual_seed(1))
-    ours, theirs = adjoint_gradient(problem, theta), adjoint_gradient(on_chosen_device(problem), theta)
+    ours, theirs = adjoint_gradient(problem, theta), adjoint_gradient(on_device(problem, way), theta)
     assert theirs.gradient.device == theta.device
     assert theirs.loss == pytest.approx(ours.loss, abs=1e-9)
     torch.testing.assert_close(theirs.gradient, ours.gradient, atol=1e-9, rtol=1e-7)
     assert float(ours.gradient.abs().max()) > 1e-6
 
 
-@pytest.mark.parametrize("mark", [pytest.param(0, marks=there_only)])
-def test_searches_alone_and_together_end_where_those_of_the_processor_do(on_cuda, mark):
+@every_way
+def test_searches_alone_and_together_end_where_those_of_the_processor_do(way):
     problem = small()
     wanted = gradient_attack(problem, 2, run=SearchRun(5))
-    alone = gradient_attack(on_chosen_device(problem), 2, run=SearchRun(5))
-    together = gradient_attacks(all_on_chosen_device([problem, problem]), [4, 5], 2)
+    there = on_device(problem, way)
+    alone = gradient_attack(there, 2, run=SearchRun(5))
+    together = gradient_attacks([there, there], [4, 5], 2)
     for found in (alone, together[1]):
         torch.testing.assert_close(found.theta, wanted.theta, atol=1e-8, rtol=0)
         assert found.best.predicted_total_cte_m == pytest.approx(wanted.best.predicted_total_cte_m, abs=1e-8)
 
 
-@pytest.mark.parametrize("mark", [pytest.param(0, marks=there_only)])
-def test_a_search_for_places_is_refused(on_cuda, mark):
-    with pytest.raises(
-        DeviceError, match="colours of objects where they stand on a GPU, got the sensor PlacedSensor"
-    ):
-        on_chosen_device(moving())
+@every_way
+def test_a_search_for_places_has_the_gradient_of_the_processor(way):
+    problem = moving(objects=2)
+    theta = problem.sensor.initial_theta(torch.Generator().manual_seed(1))
+    ours, theirs = adjoint_gradient(problem, theta), adjoint_gradient(on_device(problem, way), theta)
+    assert theirs.loss == pytest.approx(ours.loss, abs=1e-9)
+    torch.testing.assert_close(theirs.gradient, ours.gradient, atol=1e-9, rtol=1e-7)
+    assert float(ours.gradient[:8].abs().max()) > 1e-6
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not SIMULATED, reason="needs NUMBA_ENABLE_CUDASIM=1")
+def test_the_environment_chooses_the_device(monkeypatch):
+    monkeypatch.setenv("ADVNERF_DEVICE", "cuda")
+    first, second = all_on_chosen_device([small(), small()])
+    assert first.sensor is second.sensor
+    assert said_of_device() == {"device": "cpu, numba-cuda"}
 
 
 def test_a_policy_without_weights_stays_where_it_is():
@@ -123,5 +143,5 @@ def test_another_device_is_refused(monkeypatch):
 @here_only
 def test_a_missing_gpu_is_said_before_anything_begins(monkeypatch):
     monkeypatch.setenv("ADVNERF_DEVICE", "cpu")
-    with pytest.raises(DeviceError, match="expected an NVIDIA GPU that torch and numba can use"):
+    with pytest.raises(DeviceError, match="expected an NVIDIA GPU that torch can use"):
         use_device("cuda")

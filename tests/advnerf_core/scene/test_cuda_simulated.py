@@ -14,7 +14,7 @@ TESTS = Path(__file__).parents[1]
 @pytest.mark.parametrize(
     ("file", "least"),
     [
-        pytest.param("scene/test_cuda_surrogate.py", 11, id="pictures", marks=pytest.mark.slow),
+        pytest.param("scene/test_device_surrogate.py", 11, id="pictures", marks=pytest.mark.slow),
         pytest.param("attack/test_on_device.py", 5, id="searches", marks=pytest.mark.slow),
     ],
 )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -18,11 +18,15 @@ from torch import Tensor
 from advnerf_core.errors import DeviceError
 from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.geometry import Array
-from advnerf_core.render.cast_cuda import CudaObjects
-from advnerf_core.render.cuda_launch import cuda_device
+from advnerf_core.render.cast_torch import TorchObjects
+from advnerf_core.scene.accelerator import Accelerator
 from advnerf_core.scene.baked import BakedScene
-from advnerf_core.scene.baked_cuda import CudaBaked
-from advnerf_core.scene.surrogate import Rendered, Surrogate, split_theta
+from advnerf_core.scene.render_field import FieldRenderer
+from advnerf_core.scene.surrogate import BackgroundRenderer, Rendered, Surrogate, split_theta
+from advnerf_core.scene.torch_background import TorchBaked, TorchField
+
+if TYPE_CHECKING:
+    from advnerf_core.render.cast_cuda import CudaObjects
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +53,7 @@ class _Textures:
 
 
 @dataclass(frozen=True, eq=False)
-class CudaFrames:
+class DeviceFrames:
     """A batch of camera poses with everything that does not depend on ``theta``.
 
     Attributes:
@@ -59,7 +63,7 @@ class CudaFrames:
         places: Places of the objects, from `CudaObjects.placed`; None without objects.
     """
 
-    surrogate: CudaSurrogate
+    surrogate: DeviceSurrogate
     background: Tensor
     depth_m: Tensor
     places: tuple[Tensor, Tensor] | None
@@ -91,19 +95,20 @@ class CudaFrames:
         return Rendered(image, vjp, image.nbytes + shares.nbytes + self.weights_nbytes)
 
 
-class CudaSurrogate:
+class DeviceSurrogate:
     """A surrogate on a GPU; the images of its renders are tensors there, theta may be anywhere.
 
-    A baked scene is copied to the device. Another background is rendered on the CPU as before, and then copied.
+    Baked scenes and fields are copied to the device. Another background is rendered on the CPU, and then copied.
 
     Args:
         surrogate: The scene with its objects, all voxel grids.
+        accelerator: The device.
 
     Raises:
-        DeviceError: No device is available; or the objects are not all voxel grids, too many, or composed opaque.
+        DeviceError: The objects are not all voxel grids, too many for numba-cuda, or composed opaque.
     """
 
-    def __init__(self, surrogate: Surrogate) -> None:
+    def __init__(self, surrogate: Surrogate, accelerator: Accelerator) -> None:
         if surrogate.opaque:
             raise DeviceError(
                 "expected a surrogate that blends on a GPU, got one that composes opaque pixels as a deployment does"
@@ -113,21 +118,12 @@ class CudaSurrogate:
             None  # number of textures at once; None is one, with theta of the surrogate's own shape
         )
         self.starts = 1
-        self.device = cuda_device()
-        self.drawn = None
-        if surrogate.objects:
-            self.drawn = CudaObjects(
-                surrogate.objects,
-                surrogate.camera,
-                surrogate.supersample,
-                surrogate.dtype,
-                surrogate.depth_tolerance_m,
-            )
-        baked = surrogate.background
-        self._baked = CudaBaked(baked) if isinstance(baked, BakedScene) else None
+        self.device = accelerator.device
+        self.drawn = _drawn(surrogate, accelerator) if surrogate.objects else None
+        self._background = background_on(accelerator, surrogate.background)
         self._textures: _Textures | None = None
 
-    def many(self, count: int, starts: int) -> CudaSurrogate:
+    def many(self, count: int, starts: int) -> DeviceSurrogate:
         """The same for several textures at once, sharing data on the device; frames and theta as in `ManyTextures`."""
         if count < 1 or starts < 1:
             raise ValueError(f"expected at least one texture and one start, got {count} and {starts}")
@@ -164,18 +160,20 @@ class CudaSurrogate:
         return self.render(self.camera_poses(states), theta)
 
     def render(self, T_world_from_camera: ArrayLike, theta: Tensor | None) -> Rendered:
-        """Images at camera poses ``[B, 4, 4]`` and their vjp; see `CudaFrames.render`."""
+        """Images at camera poses ``[B, 4, 4]`` and their vjp; see `DeviceFrames.render`."""
         return self.prepare(T_world_from_camera).render(None if theta is None else theta.detach())
 
     @torch.no_grad()
-    def prepare(self, T_world_from_camera: ArrayLike) -> CudaFrames:
+    def prepare(self, T_world_from_camera: ArrayLike) -> DeviceFrames:
         """Render the background for camera poses ``[B, 4, 4]``, and compute the places of the objects."""
         poses = np.asarray(T_world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
         if self.count is not None and len(poses) % (self.count * self.starts):
             raise ValueError(f"expected poses in multiples of {self.count * self.starts}, got {len(poses)}")
-        background, depth_m = self._background(poses)
+        frames = self._background(poses, self.surrogate.camera)[:2]
+        rgb, depth_m = (torch.as_tensor(each).to(self.device, self.surrogate.dtype) for each in frames)
+        self.surrogate.check_background(rgb, depth_m, len(poses))
         places = None if self.drawn is None else self.drawn.placed(poses)
-        return CudaFrames(self, background.contiguous(), depth_m.contiguous(), places)
+        return DeviceFrames(self, rgb.permute(0, 3, 1, 2).contiguous(), depth_m.contiguous(), places)
 
     def texture_of(self, images: int) -> Tensor:
         """Index of the texture that each of a batch of images shows ``[B]`` int32."""
@@ -204,23 +202,32 @@ class CudaSurrogate:
             [field.colours(part) for field, part in zip(grids, split_theta(grids, theta), strict=True)]
         )
 
-    def _background(self, poses: Array) -> tuple[Tensor, Tensor]:
-        if self._baked is None:
-            rgb, depth_m = (each.to(self.device) for each in self.surrogate.scene_frames(poses))
-            return rgb.permute(0, 3, 1, 2), depth_m
-        rgb, depth_m = self._baked.render(poses, self.surrogate.camera)
-        return rgb.to(self.surrogate.dtype), depth_m.to(self.surrogate.dtype)
+
+def _drawn(surrogate: Surrogate, accelerator: Accelerator) -> TorchObjects | CudaObjects:
+    given = (
+        surrogate.objects,
+        surrogate.camera,
+        surrogate.supersample,
+        surrogate.dtype,
+        surrogate.depth_tolerance_m,
+    )
+    if accelerator.compiled:
+        from advnerf_core.render.cast_cuda import (
+            CudaObjects,
+        )  # here, as numba's compiler of GPU kernels may be absent
+
+        return CudaObjects(*given, accelerator.device)
+    return TorchObjects(*given, accelerator.device)
 
 
-def on_cuda(sensor: Any) -> CudaSurrogate:
-    """A sensor on a GPU.
+def background_on(accelerator: Accelerator, background: BackgroundRenderer) -> BackgroundRenderer:
+    """A renderer of backgrounds on a device; one that no device can render stays on the CPU."""
+    if isinstance(background, BakedScene) and accelerator.compiled:
+        from advnerf_core.scene.baked_cuda import CudaBaked
 
-    Raises:
-        DeviceError: No device is available; or the sensor is not a surrogate, or has objects that a GPU cannot draw.
-    """
-    if not isinstance(sensor, Surrogate):
-        raise DeviceError(
-            f"expected a search for colours of objects where they stand on a GPU, got the sensor {type(sensor).__name__}; "
-            "leave --device out to search on the processor"
-        )
-    return CudaSurrogate(sensor)
+        return CudaBaked(background, accelerator.device).render
+    if isinstance(background, BakedScene):
+        return TorchBaked(background, accelerator.device)
+    if isinstance(background, FieldRenderer) and not background.config.contraction:
+        return TorchField(background, accelerator.device)
+    return background
