@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from advnerf_core.fields.row_blocks import POINTS, gather_block, scatter_block
 from advnerf_core.parallel import KERNEL_OPTIONS
 
 Array32 = NDArray[np.float32]
@@ -29,6 +30,8 @@ _NEXT = np.uint32(1)
 _PRIME_Y, _PRIME_Z = np.uint32(PRIME_Y), np.uint32(PRIME_Z)
 _f = np.float32
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+_gather_two, _gather_four = gather_block(2, 8, CHUNK), gather_block(4, 8, CHUNK)
+_scatter_two, _scatter_four = scatter_block(2, 8, CHUNK), scatter_block(4, 8, CHUNK)
 
 
 @njit(**KERNEL_OPTIONS)
@@ -100,56 +103,42 @@ def _place(points, begin, count, level, rows, weights):  # type: ignore[no-untyp
     _trilinear(fraction, count, weights)
 
 
-# Rows are unsigned: numba wraps signed indices (a[-1]), and that check costs a third of the time here. Features are moved as pairs or
-# fours, which the compiler packs into one instruction.
+# Rows are unsigned: numba wraps signed indices (a[-1]), and that check costs a third of the time here.
 
 
 @njit(**KERNEL_OPTIONS)
-def _gather_pairs(table, rows, weights, count, out):  # type: ignore[no-untyped-def]
-    for n in range(count):
-        u, v = _ZERO, _ZERO
-        for k in range(8):
-            row, weight = np.uint64(rows[k * CHUNK + n]), weights[k * CHUNK + n]
-            u += table[row, 0] * weight
-            v += table[row, 1] * weight
-        out[0, n], out[1, n] = u, v
-
-
-@njit(**KERNEL_OPTIONS)
-def _gather_fours(table, rows, weights, count, out):  # type: ignore[no-untyped-def]
-    for j in range(0, table.shape[1], 4):
-        for n in range(count):
-            s, t, u, v = _ZERO, _ZERO, _ZERO, _ZERO
+def _gather(table, rows, weights, n, part, out, at, width):  # type: ignore[no-untyped-def]
+    """Features of points ``n..n + part`` of a chunk, to element ``at`` of ``out`` and those beside it."""
+    features, whole, flat = table.shape[1], part - part % POINTS, out.reshape(-1)
+    for i in range(0, whole, POINTS):
+        if features == 2:
+            _gather_two(table, 2, 0, rows, weights, n + i, out, at + i, width)
+        else:
+            for j in range(0, features, 4):
+                _gather_four(table, features, j, rows, weights, n + i, out, at + i + j * width, width)
+    for i in range(whole, part):
+        for j in range(features):
+            total = _ZERO
             for k in range(8):
-                row, weight = np.uint64(rows[k * CHUNK + n]), weights[k * CHUNK + n]
-                s += table[row, j] * weight
-                t += table[row, j + 1] * weight
-                u += table[row, j + 2] * weight
-                v += table[row, j + 3] * weight
-            out[j, n], out[j + 1, n], out[j + 2, n], out[j + 3, n] = s, t, u, v
+                total += table[np.uint64(rows[k * CHUNK + n + i]), j] * weights[k * CHUNK + n + i]
+            flat[at + i + j * width] = total
 
 
 @njit(**KERNEL_OPTIONS)
-def _scatter_pairs(grad_out, rows, weights, count, grad_table):  # type: ignore[no-untyped-def]
-    for n in range(count):
-        u, v = grad_out[0, n], grad_out[1, n]
-        for k in range(8):
-            row, weight = np.uint64(rows[k * CHUNK + n]), weights[k * CHUNK + n]
-            grad_table[row, 0] += u * weight
-            grad_table[row, 1] += v * weight
-
-
-@njit(**KERNEL_OPTIONS)
-def _scatter_fours(grad_out, rows, weights, count, grad_table):  # type: ignore[no-untyped-def]
-    for j in range(0, grad_table.shape[1], 4):
-        for n in range(count):
-            s, t, u, v = grad_out[j, n], grad_out[j + 1, n], grad_out[j + 2, n], grad_out[j + 3, n]
+def _scatter(table, rows, weights, n, part, grad, at, width):  # type: ignore[no-untyped-def]
+    """The transpose of ``_gather``, added to ``table``."""
+    features, whole, flat = table.shape[1], part - part % POINTS, grad.reshape(-1)
+    for i in range(0, whole, POINTS):
+        if features == 2:
+            _scatter_two(table, 2, 0, rows, weights, n + i, grad, at + i, width)
+        else:
+            for j in range(0, features, 4):
+                _scatter_four(table, features, j, rows, weights, n + i, grad, at + i + j * width, width)
+    for i in range(whole, part):
+        for j in range(features):
+            slope = flat[at + i + j * width]
             for k in range(8):
-                row, weight = np.uint64(rows[k * CHUNK + n]), weights[k * CHUNK + n]
-                grad_table[row, j] += s * weight
-                grad_table[row, j + 1] += t * weight
-                grad_table[row, j + 2] += u * weight
-                grad_table[row, j + 3] += v * weight
+                table[np.uint64(rows[k * CHUNK + n + i]), j] += slope * weights[k * CHUNK + n + i]
 
 
 @njit(**KERNEL_OPTIONS)
@@ -174,10 +163,8 @@ def encode_level(
         while n < here:  # tiles, or the part of one
             block, column = (begin + n) // tile, (begin + n) % tile
             part = min(tile - column, here - n)
-            if features == 2:
-                _gather_pairs(table, rows[n:], weights[n:], part, out[block, own:, column:])
-            else:
-                _gather_fours(table, rows[n:], weights[n:], part, out[block, own:, column:])
+            at = (block * out.shape[1] + own) * tile + column
+            _gather(table, rows, weights, n, part, out, at, tile)
             n += part
 
 
@@ -203,10 +190,8 @@ def scatter_level(
         while n < here:  # tiles, or the part of one
             block, column = (begin + n) // tile, (begin + n) % tile
             part = min(tile - column, here - n)
-            if features == 2:
-                _scatter_pairs(grad_out[block, own:, column:], rows[n:], weights[n:], part, grad_table)
-            else:
-                _scatter_fours(grad_out[block, own:, column:], rows[n:], weights[n:], part, grad_table)
+            at = (block * grad_out.shape[1] + own) * tile + column
+            _scatter(grad_table, rows, weights, n, part, grad_out, at, tile)
             n += part
 
 
