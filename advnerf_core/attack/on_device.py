@@ -16,7 +16,6 @@ from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.attack.spaces.placed_sensor import PlacedSensor
 from advnerf_core.errors import DeviceError
 from advnerf_core.scene.accelerator import Accelerator, use_exact_arithmetic
-from advnerf_core.scene.agreement import search_accelerator
 from advnerf_core.scene.device_surrogate import DeviceSurrogate
 from advnerf_core.scene.surrogate import Surrogate
 
@@ -27,7 +26,7 @@ def on_chosen_device(problem: AttackProblem) -> AttackProblem:
     Raises:
         DeviceError: There is no GPU, or it cannot render the searched objects.
     """
-    accelerator = search_accelerator() if searches_on_gpu() else None
+    accelerator = _chosen()
     return problem if accelerator is None else on_device(problem, accelerator)
 
 
@@ -70,8 +69,17 @@ def all_on_chosen_device(problems: Sequence[AttackProblem]) -> list[AttackProble
 
 def said_of_device() -> dict[str, str]:
     """Device metadata for an attack file: empty on the CPU."""
-    accelerator = search_accelerator() if searches_on_gpu() else None
+    accelerator = _chosen()
     return {} if accelerator is None else {"device": accelerator.name}
+
+
+def _chosen() -> Accelerator | None:
+    if not searches_on_gpu():
+        return None
+    # Imported here, as it loads every part that it checks.
+    from advnerf_core.scene.agreement import search_accelerator
+
+    return search_accelerator()
 
 
 class PolicyThere:

@@ -22,7 +22,6 @@ from advnerf_core.places import open_tensors
 from advnerf_core.render.march import Marcher, Samples
 from advnerf_core.render.occupancy import Leaps, OccupancyGrid, leap_distances, refine_occupied
 from advnerf_core.render.rays import intrinsics_row, pixel_rays, poses_in_box
-from advnerf_core.scene.agreement import training_device
 from advnerf_core.scene.exposure import Exposures, RayGains
 from advnerf_core.scene.field import SceneField, SceneFieldConfig
 from advnerf_core.scene.fingerprint import training_fingerprint
@@ -38,7 +37,12 @@ def stepper_for(scene: SceneField, config: TrainConfig) -> CpuStep | TorchStep:
     """The training step of a configuration; the torch one runs on an accelerator, if there is one."""
     opacity = config.opacity if scene.config.learned_background else 0.0
     if config.backend != "numba":
-        device = training_device()
+        device = torch.device("cpu")
+        if torch.cuda.is_available():
+            # Imported here, as it loads what searches need.
+            from advnerf_core.scene.agreement import training_device
+
+            device = training_device()
         if config.backend == "torch" or device.type != "cpu":
             return TorchStep(scene.to(device), config.huber, opacity=opacity)
     return CpuStep(scene, config.huber, opacity=opacity)
