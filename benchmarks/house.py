@@ -26,6 +26,20 @@ GENERATED = ("api.md", "results.md")
 # Sizes on 2026-11-25, of which 70 % are wanted [kB].
 _EXPERIMENT_KB, _REPORT_KB, _WANTED = 552, 219, 0.7
 _LINES, _WORDS, _PAGE_WORDS, _TRACKED_MB, _ENTRIES, _FOLDERS, _MEANINGS = 91_000, 35_000, 1_500, 45, 12, 2, 15
+_IDIOMS, _FRAGMENTS_PERCENT, _FILES_OF_A_TASK = 4, 8, 3
+_LEAST_WORDS = 300  # of a sub-package; with fewer, one idiom is a high rate
+# Words that a reader who is not a native speaker has to guess at, and descriptions of a parameter that are not sentences.
+_IDIOM = re.compile(
+    r"\b(anew|told|nobody|whoever|as (it|they) (is|are|was|were)|of (its|their) own|there is none|(goes?|gone|went) on|in words|"
+    r"so (many|much|far)|whatever|where it is|is that of|those of|that of|of which|thing|things|is there already|lies? there|give[ns]? up|"
+    r"elsewhere)\b",
+    re.IGNORECASE,
+)
+_DESCRIPTION = re.compile(r"^\s+`{0,2}\w[\w*, `]*`{0,2}: ", re.MULTILINE)
+_FRAGMENT = re.compile(
+    r"^\s+`{0,2}[\w*, `]+`{0,2}: (Which|Whose|Of|Told|What|Where|How|In|As|It|Its|There)\b[^.]*\.?\s*$",
+    re.MULTILINE,
+)
 
 
 def main() -> None:
@@ -38,6 +52,10 @@ def main() -> None:
         _row(f"Python of {folder}", size_kb, "kB", int(_WANTED * before_kb), f"it was {before_kb} kB")
     twice = [name for name, count in Counter(_classes(sources)).items() if count > 1]
     _row("class names that mean several classes", len(twice), "names", _MEANINGS, ", ".join(sorted(twice)))
+    idioms, fragments = _prose(sources)
+    _row("idioms per 1,000 words of docstrings and comments, worst sub-package", *idioms)
+    _row("descriptions of parameters that are fragments, worst sub-package", *fragments)
+    _row("files to open for one of five first tasks, most", *_first_tasks())
     pages = [file for file in (REPOSITORY / "docs").glob("*.md") if file.name not in GENERATED]
     words = {
         file.name: len(file.read_text(encoding="utf-8").split())
@@ -73,6 +91,43 @@ def main() -> None:
 
 def _row(line: str, value: float, unit: str, limit: float, note: str = "") -> None:
     record_row(f"size: {line}", value, unit, f"<= {limit:,}", value <= limit, COMMAND, note)
+
+
+def _prose(sources: list[Path]) -> list[tuple[float, str, float, str]]:
+    """Rates of idioms and of fragments of the sub-package with the most, each as value, unit, limit and note."""
+    pieces: dict[str, list[str]] = {}
+    for file in sources:
+        room = "/".join(file.relative_to(REPOSITORY).parts[:2])
+        pieces.setdefault(room, []).extend(_texts(file.read_text(encoding="utf-8")))
+    idioms, fragments = {}, {}
+    for room, texts in pieces.items():
+        words = sum(len(text.split()) for text in texts)
+        if words > _LEAST_WORDS:
+            idioms[room] = 1000 * sum(len(_IDIOM.findall(text)) for text in texts) / words
+            described = sum(len(_DESCRIPTION.findall(text)) for text in texts)
+            fragments[room] = 100 * sum(len(_FRAGMENT.findall(text)) for text in texts) / max(described, 1)
+    worst = [max(rates, key=rates.__getitem__) for rates in (idioms, fragments)]
+    return [
+        (round(idioms[worst[0]], 2), "per 1,000", _IDIOMS, worst[0]),
+        (round(fragments[worst[1]], 2), "%", _FRAGMENTS_PERCENT, worst[1]),
+    ]
+
+
+def _texts(source: str) -> Iterator[str]:
+    """Docstrings and comments of a file."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
+            yield ast.get_docstring(node) or ""
+    yield from re.findall(r"#\s(.*)", source)
+
+
+def _first_tasks() -> tuple[int, str, int, str]:
+    """Most files that a row of "Where to look" in docs/architecture.md names: value, unit, limit and note."""
+    page = (REPOSITORY / "docs/architecture.md").read_text(encoding="utf-8")
+    section = page.partition("## Where to look")[2].partition("\n## ")[0]
+    rows = [line for line in section.splitlines() if line.startswith("| ") and ".py`" in line]
+    files = [len(set(re.findall(r"`[\w/]+\.py`", row))) for row in rows]
+    return max(files), "files", _FILES_OF_A_TASK, f"{len(rows)} tasks in docs/architecture.md"
 
 
 def _classes(sources: list[Path]) -> Iterator[str]:
