@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, field, replace
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -98,7 +99,7 @@ class VoxelGridObject:
     @property
     def parameter_count(self) -> int:
         """Number of rows of ``theta``."""
-        return int(np.prod(self.theta_shape[:-1]))
+        return prod(self.theta_shape[:-1])
 
     @property
     def free_count(self) -> int:

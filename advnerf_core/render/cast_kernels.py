@@ -80,30 +80,53 @@ def box_windows(T: Any, box: Any, intrinsics: Any, width: int, height: int) -> A
         width: Width of the image [pixels].
         height: Height of the image [pixels].
     """
-    out = np.zeros((len(T), 4), np.int64)
+    out, corners, seen = np.zeros((len(T), 4), np.int64), np.empty((8, 3)), np.empty(6)
     for b in range(len(T)):
-        low_u = low_v = np.inf
-        high_u = high_v = -np.inf
-        ahead = 0
         for k in range(8):
             x, y, z = box[k & 1, 0], box[k >> 1 & 1, 1], box[k >> 2, 2]
-            depth = T[b, 2, 0] * x + T[b, 2, 1] * y + T[b, 2, 2] * z + T[b, 2, 3]
-            if depth > NEAR_M:
-                ahead += 1
-                u = (T[b, 0, 0] * x + T[b, 0, 1] * y + T[b, 0, 2] * z + T[b, 0, 3]) / depth
-                v = (T[b, 1, 0] * x + T[b, 1, 1] * y + T[b, 1, 2] * z + T[b, 1, 3]) / depth
-                low_u, high_u = min(low_u, u), max(high_u, u)
-                low_v, high_v = min(low_v, v), max(high_v, v)
-        if ahead == 8:
-            first, last = low_v * intrinsics[1] + intrinsics[3], high_v * intrinsics[1] + intrinsics[3]
-            left, right = low_u * intrinsics[0] + intrinsics[2], high_u * intrinsics[0] + intrinsics[2]
+            for axis in range(3):
+                corners[k, axis] = T[b, axis, 0] * x + T[b, axis, 1] * y + T[b, axis, 2] * z + T[b, axis, 3]
+        if _seen_part(corners, seen):
+            first, last = seen[2] * intrinsics[1] + intrinsics[3], seen[3] * intrinsics[1] + intrinsics[3]
+            left, right = seen[0] * intrinsics[0] + intrinsics[2], seen[1] * intrinsics[0] + intrinsics[2]
             out[b, 0] = min(max(np.floor(first) - 1.0, 0.0), height)
             out[b, 1] = min(max(np.ceil(last) + 1.0, 0.0), height)
             out[b, 2] = min(max(np.floor(left) - 1.0, 0.0), width)
             out[b, 3] = min(max(np.ceil(right) + 1.0, 0.0), width)
-        elif ahead > 0:  # partly behind the camera
-            out[b, 1], out[b, 3] = height, width
     return out
+
+
+@njit(**KERNEL_OPTIONS)
+def _seen_part(corners: Any, seen: Any) -> bool:
+    """Bounds of the part of a box that is further from the camera than `NEAR_M`; whether there is one.
+
+    Args:
+        corners: Its corners in the camera ``[8, 3]`` [m]; neighbours differ in one bit of their number.
+        seen: Lowest and highest ``x / z``, lowest and highest ``y / z``, lowest and highest ``z`` ``[6]``; written.
+    """
+    seen[0] = seen[2] = seen[4] = np.inf
+    seen[1] = seen[3] = seen[5] = -np.inf
+    for k in range(8):
+        depth = corners[k, 2]
+        if not depth > NEAR_M:  # also for a pose that is not finite
+            continue
+        _include(corners[k, 0] / depth, corners[k, 1] / depth, depth, seen)
+        for axis in range(3):
+            other = k ^ (1 << axis)
+            behind = corners[other, 2]
+            if behind <= NEAR_M:  # the edge between them crosses the nearest plane
+                share = (depth - NEAR_M) / (depth - behind)
+                x = corners[k, 0] + share * (corners[other, 0] - corners[k, 0])
+                y = corners[k, 1] + share * (corners[other, 1] - corners[k, 1])
+                _include(x / NEAR_M, y / NEAR_M, NEAR_M, seen)
+    return bool(seen[4] < np.inf)
+
+
+@njit(**KERNEL_OPTIONS)
+def _include(x: float, y: float, z: float, seen: Any) -> None:
+    seen[0], seen[1] = min(seen[0], x), max(seen[1], x)
+    seen[2], seen[3] = min(seen[2], y), max(seen[3], y)
+    seen[4], seen[5] = min(seen[4], z), max(seen[5], z)
 
 
 @njit(**KERNEL_OPTIONS)
@@ -121,24 +144,24 @@ def reach_of_bricks(
         nearest_m: ``[rows, columns]`` of the window, infinite; lowered.
         furthest_m: ``[rows, columns]`` of the window, minus infinite; raised.
     """
+    corners, seen = np.empty((8, 3)), np.empty(6)
     for n in range(len(bricks)):
-        low_u = low_v = near = np.inf
-        high_u = high_v = far = -np.inf
         for k in range(8):
             x, y, z = bricks[n, k & 1, 0] - o[0], bricks[n, k >> 1 & 1, 1] - o[1], bricks[n, k >> 2, 2] - o[2]
-            depth = C[2, 0] * x + C[2, 1] * y + C[2, 2] * z
-            if depth <= NEAR_M:  # the camera is next to the object, or within it
-                nearest_m[:] = 0.0
-                furthest_m[:] = np.inf
-                return
-            u = (C[0, 0] * x + C[0, 1] * y + C[0, 2] * z) / depth * intrinsics[0] + intrinsics[2]
-            v = (C[1, 0] * x + C[1, 1] * y + C[1, 2] * z) / depth * intrinsics[1] + intrinsics[3]
-            low_u, high_u, near = min(low_u, u), max(high_u, u), min(near, depth)
-            low_v, high_v, far = min(low_v, v), max(high_v, v), max(far, depth)
-        first = max(window[0], int(np.floor(low_v - _PIXEL_ROUNDING)))
-        left = max(window[2], int(np.floor(low_u - _PIXEL_ROUNDING)))
-        for row in range(first, min(window[1], int(np.floor(high_v + _PIXEL_ROUNDING)) + 1)):
-            for column in range(left, min(window[3], int(np.floor(high_u + _PIXEL_ROUNDING)) + 1)):
+            for axis in range(3):
+                corners[k, axis] = C[axis, 0] * x + C[axis, 1] * y + C[axis, 2] * z
+        if not _seen_part(corners, seen):
+            continue
+        low_u, high_u = seen[0] * intrinsics[0] + intrinsics[2], seen[1] * intrinsics[0] + intrinsics[2]
+        low_v, high_v = seen[2] * intrinsics[1] + intrinsics[3], seen[3] * intrinsics[1] + intrinsics[3]
+        near, far = seen[4], seen[5]
+        # Within the image first: a part next to the camera may reach further than an integer can say.
+        first = max(window[0], int(np.floor(max(low_v - _PIXEL_ROUNDING, -1.0))))
+        left = max(window[2], int(np.floor(max(low_u - _PIXEL_ROUNDING, -1.0))))
+        last = min(window[1] - 1, int(np.floor(min(high_v + _PIXEL_ROUNDING, window[1] * 1.0))))
+        right = min(window[3] - 1, int(np.floor(min(high_u + _PIXEL_ROUNDING, window[3] * 1.0))))
+        for row in range(first, last + 1):
+            for column in range(left, right + 1):
                 at = row - window[0], column - window[2]
                 nearest_m[at] = min(nearest_m[at], near)
                 furthest_m[at] = max(furthest_m[at], far)

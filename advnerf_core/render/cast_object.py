@@ -135,26 +135,42 @@ def _grid_parts(
 ) -> list[tuple[int, _ObjectCast]]:
     bands = max(1, -(-_LEAST_PARTS // max(1, len(poses) * len(fields))))
     T_camera_from_world = invert_transform(poses)
-    return [
-        (
-            k,
-            _ObjectCast(
-                prepared(field, dtype),
-                field,
-                T,
-                pinhole,
-                supersample,
-                window,
-                b * pinhole.width * pinhole.height,
-            ),
-        )
-        for k, field in fields.items()
-        for b, T, whole in zip(
-            range(len(poses)), poses, windows(field, T_camera_from_world, pinhole), strict=True
-        )
-        if whole[0] < whole[1] and whole[2] < whole[3]
-        for window in _bands(whole, bands)
-    ]
+    parts = []
+    for k, field in fields.items():
+        views = _views(prepared(field, dtype), field, poses)
+        for b, whole in enumerate(windows(field, T_camera_from_world, pinhole)):
+            if whole[0] < whole[1] and whole[2] < whole[3]:
+                offset = b * pinhole.width * pinhole.height
+                parts += [
+                    (k, _ObjectCast(field, views[b], pinhole, supersample, window, offset))
+                    for window in _bands(whole, bands)
+                ]
+    return parts
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """A camera in an object's voxel coordinates, and the object in the form of the kernel.
+
+    ``R [3, 3]`` takes camera axes [m] to voxels, ``o [3]`` is the camera's place, and ``edges [3]`` are the voxels' sides in object units.
+    """
+
+    grids: KernelGrids
+    R: Array
+    R_inverse: Array
+    o: Array
+    edges: Array
+
+
+def _views(grids: KernelGrids, field: VoxelGridObject, T_world_from_camera: Array) -> list[_View]:
+    """The cameras ``[B, 4, 4]`` in voxel coordinates."""
+    edges = (np.asarray(field.box_max, np.float64) - field.box_min) / grids.slots.shape
+    T = invert_transform(field.T_world_from_object) @ T_world_from_camera
+    R = T[:, :3, :3] / field.scale / edges[:, None]
+    o = (T[:, :3, 3] / field.scale - field.box_min) / edges - 0.5
+    # The rotation's inverse is its transpose, also of a pose that is not finite.
+    R_inverse = T[:, :3, :3].swapaxes(1, 2) * field.scale * edges
+    return [_View(grids, *each, edges) for each in zip(R, np.ascontiguousarray(R_inverse), o, strict=True)]
 
 
 def made_opaque(cast: ObjectCast) -> ObjectCast:
@@ -250,15 +266,14 @@ class _ObjectCast:
 
     def __init__(
         self,
-        grids: KernelGrids,
         field: VoxelGridObject,
-        T_world_from_camera: Array,
+        view: _View,
         pinhole: Pinhole,
         supersample: int,
         window: NDArray[np.int64],
         offset: int,
     ) -> None:
-        self._grids, self._field, self._T, self._pinhole = grids, field, T_world_from_camera, pinhole
+        self._field, self._view, self._pinhole = field, view, pinhole
         self._supersample, self._window, self._offset = supersample, window, offset
 
     @property
@@ -268,12 +283,8 @@ class _ObjectCast:
 
     def cast(self) -> None:
         """Fill ``pixels`` (of the batch), ``alpha``, ``depth_m``, ``ends``, ``indices`` and ``values``."""
-        field, grids, window, lens = self._field, self._grids, self._window, self._pinhole
-        area = self.area
-        edges = (np.asarray(field.box_max, np.float64) - field.box_min) / grids.slots.shape
-        T = invert_transform(field.T_world_from_object) @ self._T
-        R = np.ascontiguousarray(T[:3, :3] / field.scale / edges[:, None])
-        o = (T[:3, 3] / field.scale - field.box_min) / edges - 0.5
+        field, view, window, lens = self._field, self._view, self._window, self._pinhole
+        grids, area, slots = view.grids, self.area, self._field.slot_count
         pixels, alpha, depth_m, ends = (
             np.empty(area, np.int64),
             np.empty(area),
@@ -286,14 +297,14 @@ class _ObjectCast:
         shape = max(0, window[1] - window[0]), max(0, window[3] - window[2])
         nearest_m, furthest_m = np.full(shape, np.inf), np.full(shape, -np.inf)
         intrinsics = np.array([lens.fx, lens.fy, lens.cx, lens.cy])
-        reach_of_bricks(np.linalg.inv(R), o, grids.bricks, window, intrinsics, nearest_m, furthest_m)
-        row = scratch("row", field.slot_count, grids.density.dtype)
-        touched = scratch("touched", field.slot_count + 1, np.int32)
+        reach_of_bricks(view.R_inverse, view.o, grids.bricks, window, intrinsics, nearest_m, furthest_m)
+        row = scratch("row", slots, grids.density.dtype)
+        touched = scratch("touched", slots + 1, np.int32)
         progress = np.zeros(3, np.int64)
         while not cast_window(
-            R,
-            o,
-            edges,
+            view.R,
+            view.o,
+            view.edges,
             window,
             intrinsics,
             nearest_m,

@@ -20,7 +20,7 @@ from advnerf_core.geometry import Array, Pinhole
 from advnerf_core.parallel import Work, run_slots, slot_bounds, thread_count
 from advnerf_core.places import open_tensors
 from advnerf_core.render.march import MarchConfig
-from advnerf_core.render.occupancy import Leaps, leap_distances
+from advnerf_core.render.occupancy import Leaps, flat_boxes, leap_distances
 from advnerf_core.render.rays import intrinsics_row, poses_in_box
 from advnerf_core.scene.baked_kernels import HIGH, WIDE, render_baked
 from advnerf_core.scene.field import SceneFieldConfig, SceneFileError
@@ -78,6 +78,7 @@ class BakedScene:
     ) -> None:
         self.config, self.march, self.leaps = config, march, leaps
         self.least_transmittance, self.voxels = least_transmittance, voxels
+        self._boxes = flat_boxes(leaps.distance)
 
     def render(
         self, T_world_from_camera: ArrayLike | Tensor, pinhole: Pinhole
@@ -130,7 +131,7 @@ class BakedScene:
                 self.config.box_high,
                 np.float32(self.march.near_m),
                 self.march.steps(),
-                self.leaps.distance,
+                self._boxes,
                 self.leaps.cells,
                 self.voxels.brick_of.reshape(-1),
                 self.voxels.log_sides.reshape(-1),

@@ -14,6 +14,7 @@ from advnerf_core.fields.hash_grid_kernels import chunk_scratch, encode_level
 from advnerf_core.fields.mlp_kernels import TILE, dense
 from advnerf_core.parallel import KERNEL_OPTIONS
 from advnerf_core.render.march_kernels import span_in_box, step_size
+from advnerf_core.render.occupancy import FLAT, FLATNESS
 from advnerf_core.render.rays import write_ray
 from advnerf_core.render.volume_kernels import MAX_LOG_DENSITY, squash_features
 
@@ -137,12 +138,12 @@ def _interpolate(corners, places, used, mixed):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL_OPTIONS)
-def _leap_all(grids, t, end, distance, rays, count):  # type: ignore[no-untyped-def]
+def _leap_all(grids, t, end, boxes, rays, count):  # type: ignore[no-untyped-def]
     """Take the rays ``rays[:count]``, in cells ``grids [N, 9]``, to the first occupied place at or after ``t``, or to their end.
 
     All rays advance in turn by one leap each: a leap waits for the ray's last one, but not for those of other rays. ``rays`` is used up.
     """
-    nx, ny, nz = distance.shape
+    nx, ny, nz = boxes.shape
     while count > 0:
         going = 0
         for a in range(count):
@@ -152,9 +153,11 @@ def _leap_all(grids, t, end, distance, rays, count):  # type: ignore[no-untyped-
             i = min(max(np.int64(x), 0), nx - 1)
             j = min(max(np.int64(y), 0), ny - 1)
             k = min(max(np.int64(z), 0), nz - 1)
-            reach = np.int64(distance[np.uint64(i), np.uint64(j), np.uint64(k)])
-            u = (_f(i + reach if grid[3] > _ZERO else i - reach + 1) - x) * grid[6]
-            v = (_f(j + reach if grid[4] > _ZERO else j - reach + 1) - y) * grid[7]
+            box = np.int64(boxes[np.uint64(i), np.uint64(j), np.uint64(k)])
+            reach = box & (FLAT - 1)
+            across = reach * FLATNESS if box >= FLAT else reach
+            u = (_f(i + across if grid[3] > _ZERO else i - across + 1) - x) * grid[6]
+            v = (_f(j + across if grid[4] > _ZERO else j - across + 1) - y) * grid[7]
             w = (_f(k + reach if grid[5] > _ZERO else k - reach + 1) - z) * grid[8]
             further = s + max(min(min(u, v), w), _ZERO) + INTO_CELL
             goes = reach > 0 and s < end[n]
@@ -166,7 +169,7 @@ def _leap_all(grids, t, end, distance, rays, count):  # type: ignore[no-untyped-
 
 @njit(**KERNEL_OPTIONS)
 def render_baked(
-    poses: Array32, intrinsics: Array32, first: int, stop: int, high: Array32, near: np.float32, steps: Array32, distance: Array8,
+    poses: Array32, intrinsics: Array32, first: int, stop: int, high: Array32, near: np.float32, steps: Array32, boxes: Array8,
     cells: Array32, brick_of: NDArray[np.int32], log_sides: Array8, words: NDArray[np.int32], behind: Array32, least_through: np.float32,
     max_samples: int, rgb: Array32, depth_m: Array32, alpha: Array32, nearest_m: Array32,
 ) -> None:  # fmt: skip
@@ -183,7 +186,7 @@ def render_baked(
         high: High corner of the box ``[3]``.
         near: Nearest ray parameter [m].
         steps: Smallest and largest interval [m] and growth per metre ``[3]``.
-        distance: Leap distances ``[X, Y, Z]``.
+        boxes: Empty boxes ``[X, Y, Z]``, from ``flat_boxes``.
         cells: Cells per unit ``[3]``.
         brick_of: First value of the brick of each cell ``[X * Y * Z]``; negative without a brick, for which the corners of cells are used,
             which come first among the values.
@@ -197,7 +200,7 @@ def render_baked(
         alpha: ``[B, H, W]``, written.
         nearest_m: Per cell ``[X, Y, Z]``, the smallest distance from which it was seen, updated; empty to skip this.
     """
-    nx, ny, nz = distance.shape
+    nx, ny, nz = boxes.shape
     height, width = alpha.shape[1], alpha.shape[2]
     across_image, down = (width + WIDE - 1) // WIDE, (height + HIGH - 1) // HIGH
     row_stride, plane_stride = nz + 1, (ny + 1) * (nz + 1)
@@ -246,7 +249,7 @@ def render_baked(
             for _ in range(AHEAD if count * AHEAD <= WAVE else 1):
                 for a in range(count):
                     going[a] = active[a]
-                _leap_all(grids, t, end, distance, going, count)
+                _leap_all(grids, t, end, boxes, going, count)
                 for a in range(count):
                     n = active[a]
                     if t[n] >= end[n] or taken[n] >= max_samples:

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object, squash
-from advnerf_core.geometry import Pinhole, look_at, make_transform, rotation_z
-from advnerf_core.render.cast_object import cast_object, cast_objects, made_opaque
+from advnerf_core.geometry import Pinhole, invert_transform, look_at, make_transform, rotation_z
+from advnerf_core.render.cast_object import cast_object, cast_objects, made_opaque, windows
 
 PINHOLE = Pinhole(80, 60, 60.0, 61.0, 40.0, 29.0)
 
@@ -130,6 +130,8 @@ def test_windows_lose_nothing_when_the_object_straddles_the_camera_plane():
         hit = poses[b, :3, 3] + depth[:, None] * rays
         inside = (depth > 0.02) & (np.abs(hit[:, 1]) < 0.4) & (np.abs(hit[:, 2]) < 0.4)
         assert set(np.flatnonzero(inside)) == {p - b * 4800 for p in cast.pixels if p // 4800 == b}
+    first, last, left, right = windows(face, invert_transform(poses), PINHOLE)[1]
+    assert (last - first) * (right - left) < 4800 / 2  # the part behind the camera is not searched for
 
 
 def test_weights_sum_to_alpha_and_edges_are_antialiased():
