@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.results import record_row
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.steps.live import LiveRun, drive_live
+from nodes.experiment.steps.live import LiveNodes, LiveRun, drive_live
 from nodes.experiment.steps.run import load_experiment
 from nodes.experiment.steps.search_files import ATTACK
 from nodes.lab.trials.trial import SpoiledError
@@ -33,7 +33,8 @@ def drive(experiment: Experiment, folder: Path, compare: bool) -> dict[str, Any]
     start = experiment.references[CELL.scenario].drive_start
     live = LiveRun(CELL.name, CELL.victim, CELL.scenario, start, attack, compare=compare)
     try:
-        return drive_live(experiment, live, folder)
+        with LiveNodes(experiment) as nodes:
+            return drive_live(experiment, live, folder, nodes)
     except SpoiledError as error:
         raise SystemExit(f"the drive does not count: {error}; run it again on idle cores") from None
 

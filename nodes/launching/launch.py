@@ -6,11 +6,13 @@ required node that dies, hangs or does not start stops the whole launch. The sup
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import Any, TextIO
 
 from advnerf_core.documents import dump_yaml
@@ -62,6 +64,7 @@ class Launch:
         # Plain flags: an Event takes a lock, and a signal handler that sets it could deadlock with itself.
         self._stopping = self._impatient = False
         self._started, self._ready, self._done = threading.Event(), threading.Event(), threading.Event()
+        self._tasks: SimpleQueue[tuple[Callable[[], None], threading.Event]] = SimpleQueue()
         self._thread = threading.Thread(target=self._supervise, name="supervisor", daemon=True)
         self._lock: TextIO | None = None
         self._card: Path | None = None
@@ -78,6 +81,11 @@ class Launch:
     def pids(self) -> dict[str, int]:
         """Process id of every running node."""
         return {name: child.pid for name, child in self._children.items() if child.running}
+
+    @property
+    def ending(self) -> bool:
+        """Whether the launch has ended, or is about to."""
+        return self._stopping or self._done.is_set()
 
     @property
     def statuses(self) -> dict[str, Any]:
@@ -112,6 +120,26 @@ class Launch:
                     f"expected the launch to be ready within {timeout_s:g} s: {self._what_is_missing()}"
                 )
 
+    def finish(self, name: str) -> None:
+        """Stop one node, and wait until it has ended; the others keep running.
+
+        Raises:
+            LaunchError: The launch has ended.
+        """
+        self._by_supervisor(lambda: self._finish([name]))
+
+    def exchange(self, plan: Plan, names: Collection[str]) -> None:
+        """Start some nodes again with their configuration in another plan; the others keep running. `wait_ready` waits for all.
+
+        Args:
+            plan: A plan of the same launch file and run folder, in which only these nodes differ.
+            names: The nodes.
+
+        Raises:
+            LaunchError: The launch has ended.
+        """
+        self._by_supervisor(lambda: self._exchange(plan, names))
+
     def wait(self, timeout_s: float | None = None) -> int | None:
         """Wait until the launch ends. Returns the exit code, or None on timeout."""
         return self.exit_code if self._done.wait(timeout_s) else None
@@ -127,6 +155,32 @@ class Launch:
         """Start stopping without waiting. Safe in a signal handler. ``kill`` skips SIGINT and SIGTERM."""
         self._stopping = True
         self._impatient = self._impatient or kill
+
+    def _by_supervisor(self, task: Callable[[], None]) -> None:
+        """Have a task done by the supervisor's thread, from which all processes must be started."""
+        finished = threading.Event()
+        self._tasks.put((task, finished))
+        while not finished.wait(_POLL_S):
+            if self._done.is_set():
+                raise LaunchError(self.failure or "the launch was stopped")
+
+    def _finish(self, names: Collection[str]) -> None:
+        children = [self._children[name] for name in names]
+        for child in children:
+            child.given_up = True  # its end is no failure, and nothing waits for it
+        self._stop_children([child for child in children if child.running])
+
+    def _exchange(self, plan: Plan, names: Collection[str]) -> None:
+        self._finish(names)
+        self.plan = plan
+        self._write_configuration()
+        for child in self._children.values():
+            child.status = None  # the connections that it reported may be those of nodes that ended
+        self._ready.clear()
+        for child in (self._children[name] for name in plan.nodes if name in names):
+            child.given_up = False
+            child.start()
+            self._report(f"{child.name}: started again, process {child.pid}")
 
     def _write_configuration(self) -> None:
         resolved = dump_yaml(self.plan.resolved)
@@ -154,6 +208,10 @@ class Launch:
 
     def _watch(self, bus: Bus) -> None:
         bus.wait(_POLL_S)
+        with contextlib.suppress(Empty):
+            task, finished = self._tasks.get_nowait()
+            task()
+            finished.set()
         now = time.monotonic()
         for received in bus.receive():
             child = self._children[received.topic.rsplit("/", 1)[-1]]

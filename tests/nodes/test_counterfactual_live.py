@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from advnerf_core.attack.artifact import AttackFile, save_attack
-from advnerf_core.geometry import Pinhole
 from advnerf_core.policies.network import images_to_tensor
 from advnerf_core.policies.pilotnet import PilotNet
 from advnerf_core.policies.policy_file import load_policy, save_policy
 from advnerf_core.policies.view import PolicyView
-from calibration.schema import CameraCalibration, RoomCalibration, TargetCalibration, load_calibration
+from calibration.schema import CameraCalibration, RoomCalibration, load_calibration
 from nodes.bags.reader import read_messages
 from nodes.lab.trials.evaluation import counterfactual
 from nodes.lab.trials.trial import TrialOutcome, TrialPlan
@@ -23,6 +21,7 @@ from nodes.lab.trials.tries import drive_with_tries
 from nodes.runtime.messages import decode, ns_from_stamp
 from nodes.runtime.pictures import rgb_image
 from nodes.runtime.topics import topic as topic_row
+from tests.support.faces import red_attack
 from tests.support.live.processes import free_udp_port
 
 ROOT = Path(__file__).parents[2]
@@ -76,33 +75,10 @@ def untrained(folder: Path) -> Path:
     return folder / "policy.safetensors"
 
 
-def red_board(folder: Path) -> AttackFile:
-    """The attack: all of the board is red."""
-    target = load_calibration(TargetCalibration, TWIN / "board.yaml")
-    attack = AttackFile.of_face(
-        method="random",
-        theta=np.zeros((4, 4, 3), np.float32),
-        texture=np.full((64, 64, 3), (250, 0, 0), np.uint8),
-        size_m=(1.0, 1.0),
-        T_world_from_object=np.eye(4),
-        subject="board",
-        corners_in_subject=target.corners,
-        camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
-        scene_sha256="",
-        policy_sha256="",
-        config_sha256="",
-        seed=0,
-        predicted_total_cte_m=None,
-        software_version="0",
-    )
-    save_attack(folder / "red.attack.safetensors", attack)
-    return attack
-
-
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     folder = tmp_path_factory.mktemp("counterfactual")
-    policy, attack = untrained(folder), red_board(folder)
+    policy, attack = untrained(folder), red_attack(folder, "board")[0]
     overrides = [
         "params.counterfactual=true",
         f"params.calibration={TWIN}",

@@ -6,10 +6,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from advnerf_core.attack.artifact import AttackFile, save_attack
-from advnerf_core.geometry import Pinhole
-from calibration.panel import centre_square
-from calibration.schema import TargetCalibration, load_calibration
 from nodes.bags.reader import read_messages
 from nodes.lab.trials.evaluation import attack_ids
 from nodes.lab.trials.trial import TrialPlan
@@ -17,6 +13,7 @@ from nodes.lab.trials.trial_runner import run_trial
 from nodes.lab.trials.tries import drive_with_tries
 from nodes.runtime.messages import decode, ns_from_stamp
 from nodes.runtime.pictures import rgb_image
+from tests.support.faces import red_attack
 
 pytestmark = pytest.mark.live
 
@@ -24,31 +21,9 @@ ROOT = Path(__file__).parents[2]
 NODES = ("twin", "camera", "vicon", "compositor", "monitor", "policy", "safety", "motor")
 
 
-def red_attack(folder):
-    target = load_calibration(TargetCalibration, ROOT / "calibration" / "twin" / "monitor.yaml")
-    attack = AttackFile.of_face(
-        method="random",
-        theta=np.zeros((4, 4, 3), np.float32),
-        texture=np.full((64, 64, 3), (250, 0, 0), np.uint8),
-        size_m=(0.3362, 0.3362),
-        T_world_from_object=np.eye(4),
-        subject="monitor",
-        corners_in_subject=centre_square(target).corners,
-        camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
-        scene_sha256="",
-        policy_sha256="",
-        config_sha256="",
-        seed=0,
-        predicted_total_cte_m=None,
-        software_version="0",
-    )
-    save_attack(folder / "red.attack.safetensors", attack)
-    return attack.attack_id, folder / "red.attack.safetensors"
-
-
 @pytest.mark.slow
 def test_the_lab_camera_sees_the_attack_while_armed_and_not_before(tmp_path):
-    attack_id, attack = red_attack(tmp_path)
+    made, attack = red_attack(tmp_path, "monitor")
     overrides = [
         "policy.module=tests.support.live.straight_policy",
         "policy.speed_mps=0.5",
@@ -75,4 +50,4 @@ def test_the_lab_camera_sees_the_attack_while_armed_and_not_before(tmp_path):
     # The room has some red of its own; the face is 16 px wide from where the car stands.
     assert max(before) - min(before) < 20
     assert min(armed) > max(before) + 100
-    assert attack_ids(bag, ["/monitor/attack"]) == {attack_id}
+    assert attack_ids(bag, ["/monitor/attack"]) == {made.attack_id}

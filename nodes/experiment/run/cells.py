@@ -28,6 +28,7 @@ from nodes.experiment.steps.keys import (
     require_known,
     stages_needed,
 )
+from nodes.experiment.steps.live import LiveNodes
 from nodes.experiment.steps.pipeline import stages_of
 from nodes.experiment.steps.search_files import ATTACK
 from nodes.experiment.steps.shared_search import take_search
@@ -72,7 +73,7 @@ class Bench:
     def deployer(self) -> Deployer | None:
         """The deployer; None if nothing is deployed."""
         if self.experiment.config.deploy.live:
-            return ThroughNodes(self.experiment)
+            return ThroughNodes(self.experiment, self._stack.enter_context(LiveNodes(self.experiment)))
         if self.experiment.config.deploy.through == "nothing":
             return None
         assert self.scene is not None, "it is open where the world's own car drives"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from itertools import groupby
 from multiprocessing.pool import ThreadPool
@@ -17,18 +18,20 @@ from nodes.experiment.run.admission import past_the_gate
 from nodes.experiment.run.cells import Bench, needed_settings
 from nodes.experiment.run.plan import Planned, elsewhere, plan_cells
 from nodes.experiment.run.store import NOT_DRIVEN, Store
-from nodes.experiment.run.worker import Ended, Job, run_here, run_in_process
+from nodes.experiment.run.worker import Ended, Job, Phase, run_here, run_in_process, wait_for_live
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps.run import prepare_victims
 from nodes.experiment.steps.steering_gate import require_same_steering
 from nodes.lab.trials.tries import allow_more_tries
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.progress import ProgressDisplay, StageDisplay
+from nodes.runtime.progress import ProgressDisplay, Report, StageDisplay
 
 Backend = Literal["local", "ray"]
 Say = Callable[[str], None]
 # How often cells are resubmitted after a whole machine of a cluster was lost.
 _ROUNDS = 3
+# Share of a cell's work that is finished when only its live drives are left.
+_SEARCHED = 0.9
 
 
 @dataclass(frozen=True)
@@ -118,10 +121,11 @@ def run_cells(
     lost = {end.name for end in ended if end.how != "done"}
     searched = {job.name for job in beside if job.phase == "search"}
     ended = [end for end in ended if end.name not in searched or end.how != "done"]
-    # The live graphs have the machine to themselves, one after the other.
-    for each in wanted:
-        if each.live and each.cell.name not in lost:
-            ended.append(_tell(run_in_process(replace(each.job, threads=_cores())), say))
+    # The live graphs have the machine to themselves, one after the other; they share their nodes.
+    alone = [each for each in wanted if each.live and each.cell.name not in lost]
+    ended += _run_here(
+        store, alone, experiment, options, say, ProgressDisplay(console, watcher), searched=True
+    )
     # Their drives without attack exist now.
     past_the_gate(experiment, [each.cell for each in wanted if each.live], options.gate, say)
     return ended
@@ -134,20 +138,54 @@ def _run_here(
     options: Options,
     say: Say,
     display: ProgressDisplay,
+    searched: bool = False,
 ) -> list[Ended]:
     """Run one cell after another in this process; cells of one variant share its resources."""
-    ended = []
+    ended: list[Ended] = []
     for _, group in groupby(wanted, lambda each: each.cell.variant):
         cells = list(group)
         variant = experiment.of(cells[0].cell)
         with display, Bench(variant) as bench:
-            for each in cells:
-                job = replace(each.job, threads=_cores(), phase="search" if options.search_only else "whole")
-                ended.append(run_here(job, store, variant, bench, display))
+            ended += _run_on(variant, bench, store, cells, options, display, searched)
     for end in ended:
         if end.how != "done" or end.text:
             say(f"{end.name}: {end.how}: {end.text}")
     return ended
+
+
+def _run_on(
+    variant: Experiment,
+    bench: Bench,
+    store: Store,
+    cells: Sequence[Planned],
+    options: Options,
+    display: ProgressDisplay,
+    searched: bool,
+) -> list[Ended]:
+    """Run the cells of one variant. Those with live drives are all searched first, as nodes that wait take time from searches."""
+    reports: dict[str, Report] = {}
+    seconds: dict[str, float] = {}
+
+    def run(each: Planned, phase: Phase, last: bool = True) -> Ended:
+        name = each.cell.name
+        if name not in reports:
+            reports[name] = display.start(name)
+        job = replace(each.job, threads=_cores(), phase=phase)
+        end = run_here(job, store, variant, bench, reports[name])
+        seconds[name] = seconds.get(name, 0.0) + end.seconds
+        if end.how == "done" and last:
+            display.finish(name, seconds[name], cached=False)
+        elif end.how == "done":
+            reports[name](_SEARCHED, "searched")
+        return end
+
+    if options.search_only:
+        return [run(each, "search") for each in cells]
+    first = [] if searched else [each for each in cells if each.live]
+    lost = {each.cell.name: end for each in first if (end := run(each, "search", last=False)).how != "done"}
+    left = [each for each in cells if each.cell.name not in lost]
+    with wait_for_live() if any(each.live for each in left) else nullcontext():
+        return [*lost.values(), *(run(each, "whole") for each in left)]
 
 
 def _at_a_time(jobs: int, threads: int) -> str:

@@ -32,7 +32,7 @@ from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import RuntimeFault
 from nodes.runtime.locks import HeldError, hold
 from nodes.runtime.machine import machine_name
-from nodes.runtime.progress import Report, StageDisplay
+from nodes.runtime.progress import Report
 from nodes.runtime.termination import ends_in_order
 
 Phase = Literal["search", "whole"]
@@ -149,8 +149,8 @@ def run_in_process(job: Job) -> Ended:
     return Ended(job.name, "failed", said, seconds)
 
 
-def run_here(job: Job, store: Store, experiment: Experiment, bench: Bench, display: StageDisplay) -> Ended:
-    """Run a cell in this process; an error is stored, and other cells continue."""
+def run_here(job: Job, store: Store, experiment: Experiment, bench: Bench, report: Report) -> Ended:
+    """Run a cell in this process, which holds the lock of live graphs if it needs it; an error is stored, and other cells continue."""
     began = time.monotonic()
     store.lock_file(job.name).parent.mkdir(parents=True, exist_ok=True)
     try:
@@ -158,7 +158,7 @@ def run_here(job: Job, store: Store, experiment: Experiment, bench: Bench, displ
     except HeldError as held:
         return Ended(job.name, "elsewhere", f"{job.name} is being run by process {held.owner}", 0.0)
     with lock:
-        work, report = _begin(job, store, experiment), display.start(job.name)
+        work = _begin(job, store, experiment)
         try:
             _run(job, store, work, experiment, report, bench)
         except Exception as error:
@@ -166,9 +166,7 @@ def run_here(job: Job, store: Store, experiment: Experiment, bench: Bench, displ
             store.keep_error(job.name, job.settings_hash, text)
             (work / LOG).write_text(traceback.format_exc(), encoding="utf-8")
             return Ended(job.name, "failed", text, time.monotonic() - began)
-    seconds = time.monotonic() - began
-    display.finish(job.name, seconds, cached=False)
-    return Ended(job.name, "done", _not_driven(job, store), seconds)
+    return Ended(job.name, "done", _not_driven(job, store), time.monotonic() - began)
 
 
 def _begin(job: Job, store: Store, experiment: Experiment) -> Path:
@@ -248,7 +246,7 @@ def _run(
         search_cell(experiment, job.cell.inside, work, report, bench)
         _add_seconds(work, time.monotonic() - began)
         return
-    with _wait_for_live() if runs_alone(experiment) else nullcontext():
+    with wait_for_live() if bench is None and runs_alone(experiment) else nullcontext():
         found = run_cell(experiment, job.cell.inside, work, report, bench)
     ours = {
         "scenario": job.cell.scenario,
@@ -267,8 +265,8 @@ def _run(
     store.keep_result(job.name, {**found, **ours, "seconds": round(float(seconds), 1)})
 
 
-def _wait_for_live() -> TextIO:
-    """A live graph measures time: over all experiments on this machine only one cell at a time drives one."""
+def wait_for_live() -> TextIO:
+    """The lock of live graphs, which measure time: over all experiments on this machine only one drives at a time."""
     path = Path(tempfile.gettempdir()) / _LIVE_LOCK
     while True:
         try:

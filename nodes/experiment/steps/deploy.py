@@ -23,7 +23,7 @@ from nodes.experiment.show.drives import deployed_drives, totals
 from nodes.experiment.show.spaces import dress, shown_there
 from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.attack import load_found, load_shown
-from nodes.experiment.steps.live import LiveRun, as_drive, drive_until_it_counts
+from nodes.experiment.steps.live import LiveNodes, LiveRun, as_drive, drive_until_it_counts
 from nodes.experiment.steps.search_files import ATTACK, SEARCHED, THETA
 from nodes.lab.trials.tries import NotDrivenError
 
@@ -80,17 +80,19 @@ class ThroughNodes:
     """The live node graph; every drive leaves a bag."""
 
     experiment: Experiment
+    nodes: LiveNodes
     scene: None = None
 
     def drive(self, space: Space, cell: Cell, folder: Path, tell: Callable[[str], None]) -> Deployed:
-        """Launch the nodes once per start; see `Deployer.drive`."""
+        """Drive from each start; see `Deployer.drive`."""
         del space
         attack = None if cell.method == NONE else (folder / ATTACK).resolve()
         found = []
         for number, start in enumerate(deployed_starts(self.experiment, cell).tolist()):
             name = live_name(number)
             live = LiveRun(name, cell.victim, cell.scenario, (start[0], start[1], start[2]), attack)
-            found.append({"run": name, **drive_until_it_counts(self.experiment, live, folder, tell)})
+            driven = drive_until_it_counts(self.experiment, live, folder, tell, self.nodes)
+            found.append({"run": name, **driven})
         return Deployed([as_drive(self.experiment, each) for each in found], found)
 
 

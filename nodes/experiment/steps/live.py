@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -21,16 +21,20 @@ from nodes.control.stop_causes import is_stall
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import DeployedDrive
 from nodes.experiment.show.faces import on_screen, panel_of, wanted_face
-from nodes.experiment.show.given import victim_sha256, victim_spec
+from nodes.experiment.show.given import given_in, victim_sha256, victim_spec
 from nodes.lab.trials.evaluation import attack_ids, counterfactual, score, timing, trajectory
-from nodes.lab.trials.trial import TrialPlan
-from nodes.lab.trials.trial_runner import run_trial
+from nodes.lab.trials.trial import TrialOutcome, TrialPlan
+from nodes.lab.trials.trial_runner import TrialNodes
 from nodes.lab.trials.tries import NotDrivenError, drive_with_tries
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError, RuntimeFault
 from nodes.runtime.progress import Report
 
 Pose = tuple[float, float, float]
+# Folder of the nodes' sockets, logs and configurations in the run folder.
+NODES = "nodes"
+# Nodes that may remember images of the drive before.
+_REMEMBERING = ("policy", "counterfactual")
 # The absent panel of the empty scene stands outside the room, out of every camera's sight.
 _OUT_OF_SIGHT_M = 60.0
 
@@ -74,8 +78,49 @@ def lab_of(experiment: Experiment) -> LabConfig:
     return config
 
 
+class LiveNodes:
+    """The live nodes of an experiment, which are started for the first drive and kept for the next ones; see `TrialNodes`.
+
+    Args:
+        experiment: Experiment in the lab.
+    """
+
+    def __init__(self, experiment: Experiment) -> None:
+        self._experiment = experiment
+        ready_timeout_s = experiment.config.deploy.ready_timeout_s
+        self.graph = TrialNodes(experiment.launch_file, experiment.folder / NODES, ready_timeout_s)
+        self._vicon_port = 0
+
+    def __enter__(self) -> LiveNodes:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self.graph.close()
+
+    def drive(self, live: LiveRun, plan: TrialPlan, more: Sequence[str], folder: Path) -> TrialOutcome:
+        """Drive one run; see `TrialNodes.drive`.
+
+        Args:
+            live: The run.
+            plan: The plan of the drive.
+            more: Further overrides of the launch file.
+            folder: Folder for ``trial.json`` and the bag.
+        """
+        experiment = self._experiment
+        if not self.graph.pids:
+            self._vicon_port = _free_udp_port()
+        overrides = [f"params.vicon_port={self._vicon_port}", *live_overrides(experiment, live), *more]
+        # Nothing is known of the memory of a user's policy but what it declares.
+        again = _REMEMBERING if live.victim in given_in(experiment.config) else ()
+        return self.graph.drive(overrides, plan, folder, again)
+
+
 def drive_until_it_counts(
-    experiment: Experiment, live: LiveRun, folder: Path, tell: Callable[[str], None]
+    experiment: Experiment,
+    live: LiveRun,
+    folder: Path,
+    tell: Callable[[str], None],
+    nodes: LiveNodes,
 ) -> dict[str, Any]:
     """Drive one run until it counts; see `drive_with_tries` for its errors.
 
@@ -84,25 +129,25 @@ def drive_until_it_counts(
         live: The run.
         folder: Folder for its folder and its JSON; an existing run is read.
         tell: Called with a message for each try that does not count.
+        nodes: The nodes.
     """
-    return drive_with_tries(lambda: drive_live(experiment, live, folder), folder / f"{live.name}.json", tell)
+    file = folder / f"{live.name}.json"
+    return drive_with_tries(lambda: drive_live(experiment, live, folder, nodes), file, tell)
 
 
-def drive_live(experiment: Experiment, live: LiveRun, folder: Path) -> dict[str, Any]:
+def drive_live(experiment: Experiment, live: LiveRun, folder: Path, nodes: LiveNodes) -> dict[str, Any]:
     """Drive one run through the node graph, which records its bag, and measure it.
 
     Raises:
         SpoiledError: Load or a fault of the stack spoiled the drive. Nothing was measured.
     """
-    nodes, overrides = tuple(experiment.config.deploy.nodes), live_overrides(experiment, live)
+    needed, more = tuple(experiment.config.deploy.nodes), []
     if live.compare:
-        nodes, overrides = (*nodes, "counterfactual"), [*overrides, "params.counterfactual=true"]
+        needed, more = (*needed, "counterfactual"), ["params.counterfactual=true"]
     horizon = _horizon(experiment, live)
-    plan = TrialPlan(live.start, horizon.ticks * horizon.dt_s + 0.2, nodes)
+    plan = TrialPlan(live.start, horizon.ticks * horizon.dt_s + 0.2, needed)
     run_dir = folder / live.name
-    outcome = run_trial(
-        experiment.launch_file, overrides, run_dir, plan, experiment.config.deploy.ready_timeout_s
-    )
+    outcome = nodes.drive(live, plan, more, run_dir)
     bag, path = run_dir / "bag", experiment.paths[live.scenario]
     states = trajectory(bag, outcome.start_real_ns, horizon)
     stopped_s = (outcome.end_real_ns - outcome.start_real_ns) / NS_PER_S if outcome.stopped_early else None
@@ -160,10 +205,11 @@ def extra_runs(experiment: Experiment) -> dict[str, LiveRun]:
 def run(experiment: Experiment, folder: Path, report: Report) -> None:
     """Stage live: drive the missing runs of `extra_runs`. A run whose tries are all spoiled leaves no result."""
     runs = extra_runs(experiment)
-    for index, live in enumerate(runs.values()):
-        report(index / len(runs), live.name)
-        with suppress(NotDrivenError):  # the report shows it
-            drive_until_it_counts(experiment, live, folder, partial(report, index / len(runs)))
+    with LiveNodes(experiment) as nodes:
+        for index, live in enumerate(runs.values()):
+            report(index / len(runs), live.name)
+            with suppress(NotDrivenError):  # the report shows it
+                drive_until_it_counts(experiment, live, folder, partial(report, index / len(runs)), nodes)
 
 
 def live_overrides(experiment: Experiment, live: LiveRun) -> list[str]:
@@ -171,7 +217,6 @@ def live_overrides(experiment: Experiment, live: LiveRun) -> list[str]:
     overrides = [
         f"params.calibration={experiment.calibration_folder}",
         f"params.policy={victim_spec(experiment, live.victim)}",
-        f"params.vicon_port={_free_udp_port()}",
         f"policy.sha256={victim_sha256(experiment, live.victim)}",
         f"twin.lab={json.dumps(lab_of(experiment).model_dump(mode='json'))}",
     ]

@@ -44,18 +44,21 @@ def test_a_spoiled_drive_is_driven_again_and_its_reasons_are_kept(tmp_path, monk
     run = live.LiveRun("live0", "hardened", "track", (0.0, 0.0, 0.0))
     reasons, told = ["the stack stopped the car: no pose of the car for 0.21 s", "12 of 59 ticks"], []
 
-    def drive(experiment, run, folder):
+    def drive(experiment, run, folder, nodes):
         if reasons:
             raise SpoiledError(reasons.pop(0))
         return driven(stopped_early="the car is outside the fence")
 
     monkeypatch.setattr(live, "drive_live", drive)
-    found = live.drive_until_it_counts(experiment, run, tmp_path, told.append)
+    found = live.drive_until_it_counts(experiment, run, tmp_path, told.append, live.LiveNodes(experiment))
     assert found["spoiled"] == ["the stack stopped the car: no pose of the car for 0.21 s", "12 of 59 ticks"]
     assert len(told) == 2
     reasons[:] = ["late"]
     # It is there: nothing is driven, and nothing could be.
-    assert live.drive_until_it_counts(experiment, run, tmp_path, told.append) == found
+    assert (
+        live.drive_until_it_counts(experiment, run, tmp_path, told.append, live.LiveNodes(experiment))
+        == found
+    )
 
 
 def test_a_live_run_reads_as_any_deployed_drive(tmp_path):

@@ -60,7 +60,7 @@ def test_an_experiment_that_load_keeps_from_driving_live_ends_well_and_says_so(t
     os.environ.setdefault("MUJOCO_GL", "egl")
     tried = []
 
-    def spoiled(experiment, run, folder):
+    def spoiled(experiment, run, folder, nodes):
         tried.append(run.attack)
         gradient = run.attack is not None and "gradient" in str(run.attack)
         if gradient or tried.count(run.attack) == 1:

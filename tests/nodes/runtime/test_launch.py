@@ -181,6 +181,33 @@ def test_deaf_node_and_its_own_child_are_killed_when_asked_twice(probe, tmp_path
     assert_gone(family)
 
 
+def test_one_node_is_exchanged_while_the_others_keep_running(probe, tmp_path):
+    file = write(
+        tmp_path / "a.launch.yaml",
+        a={"config": {"sends": "/policy/drive"}},
+        b={"config": {"hears": "/policy/drive"}},
+        c={},
+    )
+    with Launch(file, run_dir=tmp_path / "run") as launch:
+        launch.wait_ready(60)
+        before = launch.pids
+        launch.finish("c")
+        assert set(launch.pids) == {"a", "b"}
+        plan = load_launch(file, ["b.rate_hz=10", "c.rate_hz=5"], launch.run_dir)
+        launch.exchange(plan, {"b", "c"})
+        launch.wait_ready(60)
+        after = launch.pids
+        assert after["a"] == before["a"]
+        assert after["b"] != before["b"]
+        assert set(after) == {"a", "b", "c"}
+        assert "rate_hz: 10" in (tmp_path / "run/launch.resolved.yaml").read_text()
+        # What was exchanged is watched again.
+        os.kill(after["c"], signal.SIGKILL)
+        assert launch.wait(120) == 1
+        with pytest.raises(LaunchError, match="required node c was killed by SIGKILL"):
+            launch.exchange(plan, {"b"})
+
+
 def test_kill_of_the_supervisor_leaves_no_process(probe, tmp_path):
     file = write(tmp_path / "a.launch.yaml", a={}, b={"config": {"then": "hang", "after_s": 0}}, c={})
     script = (

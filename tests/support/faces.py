@@ -1,0 +1,38 @@
+"""Attacks on the faces of the simulated lab that are one red square, which no picture of the room has."""
+
+from pathlib import Path
+
+import numpy as np
+
+from advnerf_core.attack.artifact import AttackFile, save_attack
+from advnerf_core.geometry import Pinhole
+from calibration.panel import centre_square
+from calibration.schema import TargetCalibration, load_calibration
+
+TWIN = Path(__file__).parents[2] / "calibration" / "twin"
+
+
+def red_attack(folder: Path, subject: str) -> tuple[AttackFile, Path]:
+    """The attack, and its file in a folder: all of the board, or the square in the middle of the monitor."""
+    target = load_calibration(TargetCalibration, TWIN / f"{subject}.yaml")
+    corners = target.corners if subject == "board" else centre_square(target).corners
+    side_m = 1.0 if subject == "board" else 0.3362
+    attack = AttackFile.of_face(
+        method="random",
+        theta=np.zeros((4, 4, 3), np.float32),
+        texture=np.full((64, 64, 3), (250, 0, 0), np.uint8),
+        size_m=(side_m, side_m),
+        T_world_from_object=np.eye(4),
+        subject=subject,
+        corners_in_subject=corners,
+        camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
+        scene_sha256="",
+        policy_sha256="",
+        config_sha256="",
+        seed=0,
+        predicted_total_cte_m=None,
+        software_version="0",
+    )
+    file = folder / "red.attack.safetensors"
+    save_attack(file, attack)
+    return attack, file
