@@ -29,10 +29,10 @@ $(VENV)/.installed-demo: pyproject.toml constraints.txt docker/system-packages.s
 	@echo "installing Python packages into $(VENV) (about a minute the first time)"
 	@# torch first and alone: pulled in by another package it would be the CUDA build of several GB.
 	@$(PIP) torch
-	@$(PIP) -e '.[core,twin]'
+	@$(PIP) -e '.[core,twin,page]'
 	@touch $@
 
-demo: $(VENV)/.installed-demo  ## The whole experiment, small setting, on the simulated lab (six to ten minutes on 2 cores)
+demo: $(VENV)/.installed-demo  ## The whole experiment, small setting, on the simulated lab (four to twelve minutes on 2 cores)
 	@$(BIN)/advnerf demo
 
 experiment: setup  ## The full experiment, 3 seeds (a quarter of an hour on 2 cores); writes its rows to docs/results.json

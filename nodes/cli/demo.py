@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import sys
+from contextlib import nullcontext
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from nodes.experiment.engine.progress_record import ProgressRecord
+    from nodes.experiment.run.worker import Ended
+
+_PORT = 8091
 
 
 def add_to(app: typer.Typer) -> None:
@@ -16,12 +25,64 @@ def add_to(app: typer.Typer) -> None:
 def demo(
     folder: Annotated[Path, typer.Option("--folder", help="Folder of all results.")] = Path("runs/demo"),
     page: Annotated[
-        bool, typer.Option("--page", help="Serve it to browsers on this computer while it runs.")
-    ] = False,
+        bool,
+        typer.Option(
+            "--page/--no-page", help="Serve it to browsers on this computer while it runs, and open one."
+        ),
+    ] = True,
+    recorded: Annotated[
+        bool,
+        typer.Option(
+            "--recorded/--no-recorded",
+            help="Show the drive of a recorded victim first, until this run has drives of its own.",
+        ),
+    ] = True,
 ) -> None:
-    """Run the whole experiment in its small setting on the simulated lab, from the photographs to the report (six to twelve minutes on 2 cores)."""
-    from nodes.cli.cell_choice import CellChoice
-    from nodes.cli.experiment import experiment
+    """Run the whole experiment in its small setting on the simulated lab, from the photographs to the report (four to twelve minutes on 2 cores)."""
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    from nodes.cli.cell_choice import CellChoice, load_cells
+    from nodes.cli.experiment import say_wrong
+    from nodes.experiment.pages.setting import setting_lines
+    from nodes.experiment.run.run import Options
+    from nodes.experiment.run.whole import run_experiment
+    from nodes.experiment_page.page import run_with_page
+    from nodes.lab.recorded_victim import RecordedDrive
     from nodes.runtime.paths import shipped
+    from nodes.runtime.termination import ends_in_order
 
-    experiment(CellChoice(shipped("launch/room.experiment.yaml"), "demo", folder), anew=True, page=page)
+    loaded, _ = load_cells(CellChoice(shipped("launch/room.experiment.yaml"), "demo", folder))
+
+    def run(record: ProgressRecord | None) -> list[Ended]:
+        ended = run_experiment(loaded, None, Options(here=True, ready=True), anew=True, record=record)
+        for line in setting_lines(loaded):
+            _say(line)
+        return ended
+
+    with ends_in_order(), RecordedDrive(folder, _say) if recorded else nullcontext():
+        port = _page_port() if page else None
+        if port is None:
+            ended = run(None)
+        else:
+            ended = run_with_page(loaded, port, run, _say, opens=True, stays=sys.stdout.isatty())
+    say_wrong(ended)
+
+
+def _page_port() -> int | None:
+    """The usual port of the page, or any free one; None, with a message, if its packages are not installed."""
+    from nodes.experiment_page.server import HOST, PACKAGES
+    from nodes.operator_page.listening import bound_socket, require_packages
+    from nodes.runtime.errors import BusError, ConfigError
+
+    try:
+        require_packages(PACKAGES)
+        bound_socket(HOST, _PORT).close()
+    except BusError:
+        return 0
+    except ConfigError as error:
+        _say(f"without a page: {error}")
+        return None
+    return _PORT
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)

@@ -146,7 +146,7 @@ def experiment(
             if until is not None or anew or page:
                 loaded.require_one()
             ended = _run_variants(loaded, cells, options)
-    _say_wrong(ended)
+    say_wrong(ended)
 
 
 def _allow(count: int, many: bool) -> None:
@@ -184,7 +184,8 @@ def _run_variants(loaded: Experiment, cells: Sequence[Cell], options: Options) -
     return ended
 
 
-def _say_wrong(ended: Sequence[Any]) -> None:
+def say_wrong(ended: Sequence[Any]) -> None:
+    """Print the cells that did not end well, and exit with an error if there are any."""
     wrong = [end for end in ended if end.how != "done"]
     for end in wrong:
         say_error(f"{end.name}: {end.text}")

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import subprocess
+import sys
+import webbrowser
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
@@ -82,7 +85,12 @@ class ExperimentPage:
 
 
 def run_with_page(
-    experiment: Experiment, port: int, run: Callable[[ProgressRecord], Result], say: Say
+    experiment: Experiment,
+    port: int,
+    run: Callable[[ProgressRecord], Result],
+    say: Say,
+    opens: bool = False,
+    stays: bool = True,
 ) -> Result:
     """Run an experiment while its page is served, then serve it until Ctrl-C.
 
@@ -90,6 +98,8 @@ def run_with_page(
         port: TCP port; 0 selects a free one.
         run: Runs the experiment with the given progress record.
         say: Callback for messages: the address, and what to do at the end.
+        opens: Whether the page is opened in the user's browser, if there is one.
+        stays: Whether the page is still served when the experiment has ended.
 
     Raises:
         BusError: The port is taken; nothing was run.
@@ -102,17 +112,30 @@ def run_with_page(
     }
     with ExperimentPage(experiment.folder, port) as page:
         say(f"page: {page.url}")
+        if opens and (browser := user_browser()) is not None:
+            browser.open(page.url)
         record = ProgressRecord(experiment.folder, about)
         try:
             result = run(record)
         except Exception as error:
             reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
             record.end(reason)
-            _serve_on(page, f"failed: {reason}", say)
+            if stays:
+                _serve_on(page, f"failed: {reason}", say)
             raise
         record.end()
-        _serve_on(page, "finished", say)
+        if stays:
+            _serve_on(page, "finished", say)
         return result
+
+
+def user_browser() -> webbrowser.BaseBrowser | None:
+    """The user's browser; None without a display to open it on."""
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        return None
+    with contextlib.suppress(webbrowser.Error):
+        return webbrowser.get()
+    return None
 
 
 def _serve_on(page: ExperimentPage, how: str, say: Say) -> None:

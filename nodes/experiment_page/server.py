@@ -96,7 +96,7 @@ class RequestHandler:
 
         name, record = request.path_params["path"], read_progress(self._folder)
         known = shown_files.pictures(self._folder) | shown_files.films(self._folder, cell_names(record))
-        known |= shown_files.report_files(self._folder)
+        known |= shown_files.report_files(self._folder) | shown_files.recorded_files(self._folder)
         if name not in known:
             return Response(status_code=404)
         file = known[name]

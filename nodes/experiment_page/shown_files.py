@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from nodes.lab import recorded_victim
+
 REPORT = "report/report.html"
 _TYPES = {
     ".html": "text/html; charset=utf-8",
@@ -36,6 +38,17 @@ def pictures(folder: Path) -> dict[str, Path]:
 def films(folder: Path, cells: Sequence[str]) -> dict[str, Path]:
     """Existing films of cells, by their path in the run folder."""
     return _named(folder, [folder / "cells" / name / "clip.mp4" for name in cells])
+
+
+def recorded_files(folder: Path) -> dict[str, Path]:
+    """Picture and film of the recorded victim, by their path in the run folder."""
+    return _named(
+        folder,
+        [
+            folder / recorded_victim.FOLDER / recorded_victim.NOW,
+            *sorted((folder / recorded_victim.FOLDER).glob(f"{recorded_victim.FILM}.*")),
+        ],
+    )
 
 
 def report_files(folder: Path) -> dict[str, Path]:

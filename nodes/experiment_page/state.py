@@ -13,6 +13,7 @@ from nodes.experiment_page import shown_files
 from nodes.experiment_page.cells import cell_part
 from nodes.experiment_page.searches import Search, has_texture, read_search
 from nodes.experiment_page.time_left import all_left_s, part_left_s
+from nodes.lab.recorded_victim import recorded_state
 
 _REPORT_STAGE, _CELLS = "report", "cells"
 _LINES = 40
@@ -31,6 +32,7 @@ def read_state(folder: Path, now_s: float) -> dict[str, Any]:
     stages, cells = _stages(record), _cells(folder, record)
     phase = _phase(record)
     left_s, known = all_left_s(stages, cells, now_s)
+    films = shown_files.films(folder, cell_names(record))
     parts = [*(each for each in stages if each["name"] != _REPORT_STAGE), *cells]
     parts += [each for each in stages if each["name"] == _REPORT_STAGE]
     return {
@@ -49,7 +51,9 @@ def read_state(folder: Path, now_s: float) -> dict[str, Any]:
         # Running parts come first.
         "searches": sorted(_searches(folder, record, cells), key=lambda search: search["finished"]),
         "pictures": list(shown_files.pictures(folder)),
-        "films": list(shown_files.films(folder, cell_names(record))),
+        "films": list(films),
+        # Until the run has films of its own.
+        "recorded": None if films else recorded_state(folder),
         "log": record["log"][-_LINES:],
     }
 

@@ -11,7 +11,6 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 import traceback
 from contextlib import nullcontext
@@ -29,6 +28,7 @@ from nodes.experiment.run.store import LOG, Store
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps.keys import cell_settings, settings_hash, stages_needed
 from nodes.experiment.steps.run import load_experiment
+from nodes.lab.trials.trial_runner import LIVE_LOCK
 from nodes.runtime.errors import RuntimeFault
 from nodes.runtime.locks import HeldError, hold
 from nodes.runtime.machine import machine_name
@@ -41,7 +41,6 @@ _PROGRESS_PERIOD_S = 5.0
 _LOOKED_AT_S = 1.0
 # Longer than CarlaScene waits for a server that is gone.
 _ENDING_S = 20.0
-_LIVE_LOCK = "advnerf-live.lock"
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
@@ -266,11 +265,10 @@ def _run(
 
 
 def wait_for_live() -> TextIO:
-    """The lock of live graphs, which measure time: over all experiments on this machine only one drives at a time."""
-    path = Path(tempfile.gettempdir()) / _LIVE_LOCK
+    """The lock of live graphs, once no other process has it."""
     while True:
         try:
-            return hold(path)
+            return hold(LIVE_LOCK)
         except HeldError:
             time.sleep(0.5)
 

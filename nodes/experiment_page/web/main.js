@@ -6,6 +6,7 @@ import { showParts, tick } from "./parts.js";
 
 const PERIOD_MS = 1000;
 const REPORT_MS = 1500;
+const PICTURE_MS = 250;
 const WORDS = { waiting: "waiting", running: "running", finished: "finished", failed: "failed" };
 const METADATA_OF = 12; // of more films only the shown ones are loaded
 
@@ -46,6 +47,7 @@ function update() {
   showParts(state, nowS());
   showCurves(state.curves);
   showSearches(state.searches);
+  showRecorded(state.recorded ?? null);
   showPictures();
   showLog(state.log ?? []);
   say();
@@ -62,6 +64,28 @@ function say() {
   if (state.phase === "running") text("said", running.length ? `${counts} Running: ${running.join(", ")}.` : counts);
   else if (state.report) text("said", `${counts} The report is ready.`);
   else text("said", state.phase === "finished" ? `${counts} There is no report yet.` : counts);
+}
+
+/** A drive that is not of this run, until there is one that is: its newest picture, then its film. */
+function showRecorded(recorded) {
+  show("recorded-section", Boolean(recorded));
+  text("recorded-label", recorded?.label ?? "");
+  listOf(element("recorded"), recorded ? [recorded] : [], ({ label, file, film, text: words }) => {
+    if (!file) return figure("", words);
+    const shown = document.createElement(film ? "video" : "img");
+    const autoplay = !matchMedia("(prefers-reduced-motion: reduce)").matches;
+    if (film) Object.assign(shown, { controls: true, muted: true, loop: true, autoplay });
+    else Object.assign(shown, { id: "recorded-now", alt: label });
+    shown.src = `/${file}`;
+    shown.setAttribute("aria-label", label);
+    return figure(shown, words);
+  });
+}
+
+/** The newest picture of a drive that goes on. */
+function refreshRecorded() {
+  const picture = element("recorded-now");
+  if (picture?.complete) picture.src = `/${state.recorded.file}?${Date.now()}`;
 }
 
 function showPictures() {
@@ -108,6 +132,7 @@ function showLog(lines) {
 }
 
 setInterval(ask, PERIOD_MS);
+setInterval(refreshRecorded, PICTURE_MS);
 setInterval(() => {
   if (state) tick(state, nowS());
 }, PERIOD_MS);

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+import tempfile
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
@@ -20,6 +21,8 @@ from nodes.runtime.loop import NodeLoop
 
 OPERATOR = "operator"
 TICK_S = 0.1
+# Lock of live graphs, which measure time: over all experiments on this machine only one drives at a time.
+LIVE_LOCK = Path(tempfile.gettempdir()) / "advnerf-live.lock"
 # Nodes that may be started again while the others keep running. The others hold a device, or decide about stopping.
 _EXCHANGEABLE = frozenset({RECORDER, "compositor", "monitor", "policy", "counterfactual"})
 

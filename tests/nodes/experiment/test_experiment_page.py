@@ -18,6 +18,7 @@ from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run import whole
 from nodes.experiment_page.page import ExperimentPage, run_with_page
 from nodes.experiment_page.time_left import all_left_s
+from nodes.lab.recorded_victim import LABEL
 from nodes.runtime.errors import BusError
 from tests.support.experiment_page import CELLS, record_of, search_so_far, state_of
 from tests.support.live.page_client import request
@@ -155,6 +156,25 @@ def test_the_report_takes_over_once_it_is_made(served):
     status, _, part = request(port, "/report/videos/a.mp4", headers={"range": "bytes=10-19"})
     assert (status, part) == (206, bytes(range(10, 20)))
     assert request(port, "/run")[0] == 200
+
+
+def test_the_recorded_victim_is_labelled_and_gives_way_to_the_films_of_this_run(served):
+    folder, record, port = served
+    assert state_of(port)["recorded"] is None
+    about = {"label": LABEL, "text": "It drives.", "file": "recorded/now.jpg", "film": False}
+    (folder / "recorded").mkdir()
+    (folder / "recorded" / "about.json").write_text(json.dumps(about))
+    assert state_of(port)["recorded"] == {**about, "file": ""}  # before its first picture
+    (folder / "recorded" / "now.jpg").write_bytes(b"a picture")
+    (folder / "recorded" / "log.txt").write_bytes(b"secret")
+    assert state_of(port)["recorded"] == about
+    assert request(port, "/recorded/now.jpg?1")[2] == b"a picture"
+    assert request(port, "/recorded/log.txt")[0] == 404
+    record.finish(RANDOM, 3.0, cached=False)
+    (folder / "cells" / RANDOM).mkdir(parents=True)
+    (folder / "cells" / RANDOM / "clip.mp4").write_bytes(b"a film")
+    state = state_of(port)
+    assert (state["recorded"], state["films"]) == (None, [f"cells/{RANDOM}/clip.mp4"])
 
 
 @pytest.mark.parametrize("path", OTHER_PATHS)
