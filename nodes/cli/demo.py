@@ -45,7 +45,7 @@ def demo(
     from nodes.experiment.pages.setting import setting_lines
     from nodes.experiment.run.run import Options
     from nodes.experiment.run.whole import run_experiment
-    from nodes.experiment_page.page import run_with_page
+    from nodes.experiment_page.page import run_with_page, user_browser
     from nodes.lab.recorded_victim import RecordedDrive
     from nodes.runtime.paths import shipped
     from nodes.runtime.termination import ends_in_order
@@ -63,7 +63,9 @@ def demo(
         if port is None:
             ended = run(None)
         else:
-            ended = run_with_page(loaded, port, run, _say, opens=True, stays=sys.stdout.isatty())
+            # Only somebody whom a browser shows the page is kept from the prompt by it.
+            stays = sys.stdout.isatty() and user_browser() is not None
+            ended = run_with_page(loaded, port, run, _say, opens=True, stays=stays)
     say_wrong(ended)
 
 

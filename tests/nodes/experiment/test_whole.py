@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections import Counter
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from nodes.experiment.steps.keys import driven_folder
 from nodes.experiment.steps.run import load_experiment, make_ready
 from nodes.lab.trials.evaluation import HOPS
 from nodes.lab.trials.trial import SpoiledError
+from nodes.launching.child import Child
 
 LAUNCH = Path(__file__).parents[3] / "launch"
 SMALL = [
@@ -32,8 +34,10 @@ SMALL = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize("file", ["room", "monitor"])
-def test_from_photographs_to_report_and_nothing_twice(tmp_path, file):
+def test_from_photographs_to_report_and_nothing_twice(tmp_path, file, monkeypatch):
     os.environ.setdefault("MUJOCO_GL", "egl")
+    started, start = Counter(), Child.start
+    monkeypatch.setattr(Child, "start", lambda child: (started.update([child.name]), start(child)))
     experiment = LAUNCH / f"{file}.experiment.yaml"
     first = run_experiment(load_experiment(experiment, "demo", SMALL, tmp_path))
     assert {end.how for end in first} == {"done"}
@@ -49,6 +53,12 @@ def test_from_photographs_to_report_and_nothing_twice(tmp_path, file):
         "live"
     ]
     assert live["attack_ids"] == [cell["attack_id"]]
+    # All drives share their nodes; only the recorder is started for each. A try that does not count ends them.
+    drives = [json.loads(file.read_text()) for file in (tmp_path / "cells").glob("**/live0.json")]
+    tries = sum(1 + len(drive["spoiled"]) for drive in drives)
+    assert len(drives) == 3
+    assert started["twin"] == 1 + tries - len(drives)
+    assert started["recorder"] == tries
     kept = (tmp_path / "report" / "report.html").stat().st_mtime_ns
     assert run_experiment(load_experiment(experiment, "demo", SMALL, tmp_path)) == []
     assert (tmp_path / "report" / "report.html").stat().st_mtime_ns == kept
