@@ -49,8 +49,8 @@ def computing_tests(passed: Path, idle: bool) -> int:
     if not _KERNELS.exists() or _KERNELS.stat().st_mtime < max(f.stat().st_mtime for f in sources):
         subprocess.run([sys.executable, "-m", "tests.support.warm_kernels"], cwd=ROOT, check=True)
         _KERNELS.touch()
-    # One worker more than processors, as some wait for a process of theirs.
-    workers = min(len(os.sched_getaffinity(0)) + 1, 4)
+    # A worker more than processors would import everything and make its set-ups too, for the little that the live tests leave.
+    workers = min(len(os.sched_getaffinity(0)), 4)
     options = ("-n", str(workers), "--dist", "worksteal", "-p", "no:cacheprovider", f"--passed={passed}")
     limit = ("--timeout", "0") if idle else ()
     # The folder is named: pytest must find our option in its conftest.py before it reads the options.

@@ -1,3 +1,5 @@
+import pickle
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +27,7 @@ from nodes.experiment.show.given import victim_spec
 from nodes.experiment.show.learned_scene import scene_file
 from nodes.experiment.show.objects import build, object_file
 from nodes.experiment.steps.run import load_experiment
+from tests.support.set_ups import folder_of_all_workers, made_once
 from tests.support.setting_reads import recording
 from tests.support.stage_versions import measured
 
@@ -76,10 +79,16 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
 @pytest.fixture(scope="session")
 def tiny_room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any], dict[str, set[str]]]:
     """The run folder of a tiny experiment in the lab, run whole, the numbers that sum it up, and the settings that its stages read."""
-    folder = tmp_path_factory.mktemp("room") / "run"
-    with recording() as reads:
-        found = measured(folder, reads)
-    return folder, found, reads.of
+    made = folder_of_all_workers(tmp_path_factory) / "tiny_room"
+    with made_once(made) as folder:
+        if folder is not None:
+            with recording() as reads:
+                found = measured(folder / "run", reads)
+            (folder / "found.pickle").write_bytes(pickle.dumps((found, reads.of)))
+    # Each worker has a copy, as tests write into it.
+    own = tmp_path_factory.mktemp("room") / "run"
+    shutil.copytree(made / "run", own)
+    return (own, *pickle.loads((made / "found.pickle").read_bytes()))
 
 
 @dataclass
