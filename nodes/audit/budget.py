@@ -11,13 +11,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
-from nodes.audit.drives import NO_OBJECT, PLAIN_OBJECT, arm_of, driven, learned, with_starts
-from nodes.audit.judging import FILMED, LEARNED_ARMS, WORLD_ARMS, open_world
+from nodes.audit.drives import PLAIN_OBJECT, arm_of, driven, learned, with_starts
+from nodes.audit.judging import FILMED, LEARNED_ARMS, WORLD_ARMS, open_world, seen_on
 from nodes.audit.question import SELECTION_SEED, VICTIM, AuditedQuestion
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.placing import clean_poses
 from nodes.experiment.show.spaces import colour_space
 from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.attack import attack_problem
+from nodes.experiment.steps.films import filmed
 
 
 @dataclass(frozen=True)
@@ -27,12 +29,14 @@ class Costs:
     Attributes:
         evaluation_s: One evaluation from one start, with the gradient if there is one [s].
         learned_s: One drive in the learned place [s].
+        film_s: The film [s].
         world_s: One drive in the world; 0 without a world [s].
-        opening_s: Opening the world, with the first drive; 0 without a world [s].
+        opening_s: Opening the world, and by how much its first drive is slower; 0 without a world [s].
     """
 
     evaluation_s: float
     learned_s: float
+    film_s: float
     world_s: float = 0.0
     opening_s: float = 0.0
 
@@ -47,29 +51,23 @@ class Costs:
         """
         evaluation_s = _seconds_of_evaluation(experiment, differentiable)
         several = with_starts(experiment, question.selection, SELECTION_SEED)
-        learned_s = _seconds(lambda: learned(several, VICTIM, arm_of(several, PLAIN_OBJECT)))
-        found = cls(evaluation_s, learned_s / question.selection)
-        if not question.place.is_driven:
-            return found
-        one = with_starts(experiment, 1, SELECTION_SEED)
-        began = time.perf_counter()
-        with open_world(one, "world") as world:
-            assert world is not None, "it is a world that is driven"
-            first, second = (
-                _seconds(lambda: driven(one, VICTIM, arm_of(one, NO_OBJECT), world)) for _ in range(2)
-            )
-        return replace(
-            found, world_s=second, opening_s=time.perf_counter() - began - second - min(first, second)
-        )
+        plain, one = arm_of(experiment, PLAIN_OBJECT), with_starts(experiment, 1, SELECTION_SEED)
+        learned_s = _seconds(lambda: learned(several, VICTIM, plain)) / question.selection
+        driven_s, began_s = [0.0], time.perf_counter()
+        with open_world(one, question.place.evidence) as world:
+            opening_s = time.perf_counter() - began_s
+            if world is not None:
+                driven_s = [_seconds(lambda: driven(one, VICTIM, plain, world)) for _ in range(2)]
+            poses = clean_poses(one, one.config.paths[0])[:1]
+            frame_s = _seconds(lambda: seen_on(one, plain, poses, world))
+        every, _ = filmed(one.config.dt_s)
+        film_s = len(FILMED) * (1 + one.config.horizon // every) * frame_s
+        return cls(evaluation_s, learned_s, film_s, driven_s[-1], opening_s + driven_s[0] - driven_s[-1])
 
     def judging_s(self, question: AuditedQuestion) -> float:
-        """Duration of the drives of the verdict, with the film [s]."""
-        world = question.place.is_driven
-        filmed_s = len(FILMED) * (self.world_s if world else self.learned_s)
+        """Duration of the drives of the verdict, and of their film, for each of which the world is opened [s]."""
         drives_s = len(LEARNED_ARMS) * self.learned_s + len(WORLD_ARMS) * self.world_s
-        return (
-            question.judging * drives_s + filmed_s + 2.0 * self.opening_s
-        )  # for the drives, and for the film
+        return question.judging * drives_s + self.film_s + 2.0 * self.opening_s
 
     def choosing_s(self, question: AuditedQuestion, searches: int) -> float:
         """Duration of the drives that compare the results of so many searches [s]."""

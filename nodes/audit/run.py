@@ -104,6 +104,7 @@ class Audit:
         options: Options of the audit.
         say: Callback for messages.
         console: Console for progress.
+        began_s: When the command began, by the monotonic clock [s].
     """
 
     question: AuditedQuestion
@@ -111,8 +112,8 @@ class Audit:
     options: AuditOptions
     say: Say
     console: Console
+    began_s: float = field(default_factory=time.monotonic)
     before: Before | None = field(default=None, init=False)
-    began_s: float = field(default_factory=time.monotonic, init=False)
 
     def run(self) -> AuditResult:
         """Run or resume the audit, and write its result; Ctrl-C ends the searches, and judges their best attack.

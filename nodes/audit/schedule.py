@@ -38,6 +38,12 @@ WITH_GRADIENT = (
     Round("gradient_coarse", spots=1, seeds=1, starts=1, share=0.2),
     Round("gradient", spots=1, seeds=1, starts=2, share=0.4),
 )
+# `gradient_coarse` needs a flat face.
+WITH_GRADIENT_OF_A_SOLID = (
+    Round("gradient", spots=3, seeds=1, starts=1, share=0.4),
+    Round("random_coarse", spots=1, seeds=1, starts=1, share=0.1),
+    Round("gradient", spots=1, seeds=1, starts=2, share=0.5),
+)
 BLACK_BOX = (
     Round("random_coarse", spots=3, seeds=1, starts=1, share=0.2),
     Round("cem", spots=2, seeds=1, starts=1, share=0.4),
@@ -70,6 +76,13 @@ class PlannedSearch:
     spot: int
     seed: int
     evaluations: int
+
+
+def rounds_for(differentiable: bool, flat: bool) -> tuple[Round, ...]:
+    """The schedule for a policy with or without a gradient, and an object that is flat or not."""
+    if not differentiable:
+        return BLACK_BOX
+    return WITH_GRADIENT if flat else WITH_GRADIENT_OF_A_SOLID
 
 
 def fewest(method: str, ticks: int) -> int:

@@ -15,9 +15,10 @@ from advnerf_core.driving.metrics import drive_metrics
 from nodes.audit.learning import Copies
 from nodes.audit.plan import AuditPlan, as_listed
 from nodes.audit.question import VICTIM
-from nodes.audit.schedule import BLACK_BOX, LEARNING_RATE, WITH_GRADIENT, PlannedSearch, Round, planned
+from nodes.audit.schedule import LEARNING_RATE, PlannedSearch, Round, planned, rounds_for
 from nodes.audit.spots import Spot
 from nodes.experiment.plan.cell import Cell
+from nodes.experiment.plan.object_kinds import PANEL
 from nodes.experiment.run.cells import search_cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps.run import load_experiment
@@ -124,7 +125,7 @@ class Searches:
     @property
     def rounds(self) -> tuple[Round, ...]:
         """The schedule."""
-        return WITH_GRADIENT if self.differentiable else BLACK_BOX
+        return rounds_for(self.differentiable, flat=self.copies.question.kind == PANEL)
 
     @property
     def planned(self) -> list[list[PlannedSearch]]:

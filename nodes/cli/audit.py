@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import time
 import traceback
 from dataclasses import dataclass
 from pathlib import Path
@@ -243,6 +244,7 @@ def audit(
     Exit code 0: nothing was found within the budget. 1: found. 2: it cannot be judged. 3: worse than --against. 64 and above: usage and faults.
     """
     del schema
+    began_s = time.monotonic()
     os.environ.setdefault("MUJOCO_GL", "egl")
     if (place.place is None) == (place.world is None):
         say_error("expected either --place or --world")
@@ -254,7 +256,7 @@ def audit(
 
     try:
         question, options = _question(policy, place, metric, search, result, overrides or [])
-        found = Audit(question, result.output, options, _say, Console()).run()
+        found = Audit(question, result.output, options, _say, Console(), began_s).run()
     except UnansweredError as error:
         say_error(str(error))
         raise typer.Exit(CANNOT_JUDGE_EXIT) from None

@@ -7,7 +7,7 @@ from nodes.audit.question import AuditedQuestion, Place
 
 WORLD = Place("lab", "world", "lab", "world", {"kind": "lab"})
 PHOTOGRAPHS = Place("the place of photos", "images", "photos", "poses", {"kind": "photographs"})
-COSTS = Costs(evaluation_s=2.0, learned_s=1.0, world_s=3.0, opening_s=10.0)
+COSTS = Costs(evaluation_s=2.0, learned_s=1.0, film_s=30.0, world_s=3.0, opening_s=10.0)
 SEARCHES = 6
 
 
@@ -25,7 +25,7 @@ def test_searches_for_an_object_and_a_planted_weakness_and_the_judging_fill_the_
 
 
 def test_a_slow_world_is_judged_in_time_that_the_searches_do_not_get() -> None:
-    slow = Costs(COSTS.evaluation_s, COSTS.learned_s, world_s=15.0, opening_s=60.0)
+    slow = Costs(COSTS.evaluation_s, COSTS.learned_s, COSTS.film_s, world_s=15.0, opening_s=60.0)
     asked = question(WORLD)
     assert slow.judging_s(asked) > 20 * 4 * 15.0, "four arms of 20 drives in the world"
     assert slow.evaluations(1800.0, asked, SEARCHES) < COSTS.evaluations(1800.0, asked, SEARCHES)

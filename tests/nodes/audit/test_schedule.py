@@ -3,10 +3,17 @@
 import pytest
 
 from advnerf_core.attack.search.black_box import BlackBoxSearch
-from nodes.audit.schedule import BLACK_BOX, WITH_GRADIENT, fewest, planned
+from nodes.audit.schedule import (
+    BLACK_BOX,
+    WITH_GRADIENT,
+    WITH_GRADIENT_OF_A_SOLID,
+    fewest,
+    planned,
+    rounds_for,
+)
 
 
-@pytest.mark.parametrize("rounds", [WITH_GRADIENT, BLACK_BOX])
+@pytest.mark.parametrize("rounds", [WITH_GRADIENT, WITH_GRADIENT_OF_A_SOLID, BLACK_BOX])
 @pytest.mark.parametrize("evaluations", [200, 1000, 12345])
 def test_a_budget_is_spent_and_not_exceeded(rounds, evaluations):
     row_costs = [
@@ -16,12 +23,12 @@ def test_a_budget_is_spent_and_not_exceeded(rounds, evaluations):
     assert 0.9 * evaluations <= sum(row_costs) <= evaluations
 
 
-@pytest.mark.parametrize("rounds", [WITH_GRADIENT, BLACK_BOX])
+@pytest.mark.parametrize("rounds", [WITH_GRADIENT, WITH_GRADIENT_OF_A_SOLID, BLACK_BOX])
 def test_shares_are_of_the_whole(rounds):
     assert sum(each.share for each in rounds) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("rounds", [WITH_GRADIENT, BLACK_BOX])
+@pytest.mark.parametrize("rounds", [WITH_GRADIENT, WITH_GRADIENT_OF_A_SOLID, BLACK_BOX])
 def test_a_tiny_budget_still_lets_every_method_begin(rounds):
     for wanted, row in zip(rounds, planned(rounds, 1, 60), strict=True):
         assert all(search.evaluations >= fewest(wanted.method, 60) for search in row)
@@ -37,3 +44,9 @@ def test_the_student_gets_the_calls_that_it_needs_to_begin(ticks: int) -> None:
     calls = fewest("guided", ticks) * ticks
     student = BlackBoxSearch.usual("guided")
     assert calls >= student.first_calls() + ticks * (1 + 2 * student.probes)
+
+
+def test_only_flat_objects_are_searched_by_a_coarse_picture() -> None:
+    assert rounds_for(differentiable=True, flat=True) == WITH_GRADIENT
+    assert "gradient_coarse" not in {each.method for each in rounds_for(differentiable=True, flat=False)}
+    assert rounds_for(differentiable=False, flat=False) == BLACK_BOX
