@@ -86,7 +86,7 @@ def make_folder(folder: Path) -> None:
 
 
 def command(policy: str, *options: str, output: str = "") -> list[str]:
-    """The command that audits one of the policies, or the driver at an address, run in their folder."""
+    """The command that audits one of the policies, a file, or the driver at an address, run in their folder."""
     words = ["--place", "photos", "-o", output or policy, "--car", "car.yaml", "--limit", str(LIMIT_M)]
     words += ["--evaluations", "60", "--starts", "8", "--object-size", "0.5"]
     changes = [word for each in CHANGES for word in ("--set", each)]
@@ -95,7 +95,7 @@ def command(policy: str, *options: str, output: str = "") -> list[str]:
         "-m",
         "nodes.cli",
         "audit",
-        policy if "://" in policy else f"drivers:{policy}",
+        policy if {".", "/"} & set(policy) else f"drivers:{policy}",
         *words,
         *changes,
         *options,
