@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from advnerf_core.documents import read_json
 from nodes.runtime.terminal import RunDir
 
 if TYPE_CHECKING:
@@ -40,6 +39,7 @@ def page(
 
 
 def _say_address(run_dir: Path | None) -> None:
+    from advnerf_core.documents import read_json
     from nodes.launching.watching import find_run_dir
     from nodes.page import DOOR
     from nodes.runtime.errors import LaunchError

@@ -10,7 +10,6 @@ from typing import Annotated
 
 import typer
 
-from advnerf_core.documents import parse_json
 from advnerf_core.errors import ConfigError
 from advnerf_core.run_module import module_command
 from nodes.cli.cell_choice import CellChoice, load_cells
@@ -109,6 +108,8 @@ def _history(published: Path) -> int:
 
 def _ledger(published: Path) -> int:
     """Let the benchmarks of the checkout that this is run in check rows and pages; how many problems there are."""
+    from advnerf_core.documents import parse_json
+
     root = published.resolve().parents[1]
     if root != Path.cwd() or not (root / "benchmarks" / "published_check.py").exists():
         print("rows and pages not checked: run it in the checkout, whose benchmarks compute them again")
