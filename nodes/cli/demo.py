@@ -40,15 +40,22 @@ def demo(
 ) -> None:
     """Run the whole experiment in its small setting on the simulated lab, from the photographs to the report (four to twelve minutes on 2 cores)."""
     os.environ.setdefault("MUJOCO_GL", "egl")
+    from nodes.lab.recorded_victim import RecordedDrive
+    from nodes.runtime.termination import ends_in_order
+
+    # It is on its way while this process imports what searches need.
+    with ends_in_order(), RecordedDrive(folder, _say) if recorded else nullcontext():
+        _run(folder, _page_port() if page else None)
+
+
+def _run(folder: Path, port: int | None) -> None:
     from nodes.cli.cell_choice import CellChoice, load_cells
     from nodes.cli.experiment import say_wrong
     from nodes.experiment.pages.setting import setting_lines
     from nodes.experiment.run.run import Options
     from nodes.experiment.run.whole import run_experiment
     from nodes.experiment_page.page import run_with_page, user_browser
-    from nodes.lab.recorded_victim import RecordedDrive
     from nodes.runtime.paths import shipped
-    from nodes.runtime.termination import ends_in_order
 
     loaded, _ = load_cells(CellChoice(shipped("launch/room.experiment.yaml"), "demo", folder))
 
@@ -58,14 +65,12 @@ def demo(
             _say(line)
         return ended
 
-    with ends_in_order(), RecordedDrive(folder, _say) if recorded else nullcontext():
-        port = _page_port() if page else None
-        if port is None:
-            ended = run(None)
-        else:
-            # Only somebody whom a browser shows the page is kept from the prompt by it.
-            stays = sys.stdout.isatty() and user_browser() is not None
-            ended = run_with_page(loaded, port, run, _say, opens=True, stays=stays)
+    if port is None:
+        ended = run(None)
+    else:
+        # Only somebody whom a browser shows the page is kept from the prompt by it.
+        stays = sys.stdout.isatty() and user_browser() is not None
+        ended = run_with_page(loaded, port, run, _say, opens=True, stays=stays)
     say_wrong(ended)
 
 
