@@ -237,8 +237,9 @@ class RenderedSource:
 
 
 def _as_uint8(images: Tensor) -> Image:
-    array = (images.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).permute(0, 2, 3, 1)
-    return np.ascontiguousarray(array.numpy())
+    # NumPy: torch would wake its threads for each of these small steps.
+    levels = np.clip(images.numpy(), 0.0, 1.0) * np.float32(255.0)
+    return np.ascontiguousarray(np.rint(levels, out=levels).astype(np.uint8).transpose(0, 2, 3, 1))
 
 
 def steer_with(policy: Any, goals: Tensor | None = None) -> Steer:
