@@ -2,11 +2,14 @@
 
 Everything random in step ``t`` is drawn from a generator seeded by ``(seed, t)``, so a checkpoint needs no generator state:
 weights, optimiser moments and the step number are its whole state.
+
+Two threads each take half of a batch from its frames to its gradient, without waiting for each other. The halves are the same on any
+number of cores, and their gradients are added in order. Machines of other types differ in the last bits, or in the number type.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from math import cos, pi
 from pathlib import Path
@@ -20,12 +23,16 @@ from torch import Tensor
 
 from advnerf_core.adam import Adam
 from advnerf_core.files import with_sorted_header, write_atomically
-from advnerf_core.learning.augment import AugmentConfig, augment
-from advnerf_core.learning.frames import FrameSet, FrameStoreError
+from advnerf_core.learning.augment import AugmentConfig, Changes
+from advnerf_core.learning.frames import Batch, FrameSet, FrameStoreError
+from advnerf_core.learning.precision import training_type
+from advnerf_core.memory import freed_blocks_kept
+from advnerf_core.parallel import run_slots, slot_bounds
 from advnerf_core.places import open_tensors
 from advnerf_core.policies.network import SteeringNetwork, images_to_tensor
 
 EVALUATION_BATCH = 128
+_PARTS = 2  # of a batch: smaller ones cost more than a third and fourth core would save
 
 
 @dataclass(frozen=True)
@@ -59,6 +66,7 @@ def fit(
     config: FitConfig,
     checkpoint: Path | None = None,
     report: Callable[[int, float], None] | None = None,
+    number_type: torch.dtype | None = None,
 ) -> None:
     """Train ``policy`` in place on ``frames.training``.
 
@@ -67,6 +75,8 @@ def fit(
         frames: Training frames.
         checkpoint: File to continue from and to write every ``checkpoint_every`` steps and at the end.
         report: Called with the step and the running mean square error [rad^2].
+        number_type: float32 or bfloat16, of the layers of a network with ``rows_independent``; None for the machine's
+            (`training_type`). Other networks are trained in float32.
     """
     if len(frames.training) == 0:
         raise FrameStoreError(
@@ -75,16 +85,20 @@ def fit(
     policy.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     done, moments = (0, {}) if checkpoint is None else _resume(checkpoint, policy, config)
     optimiser = Adam(dict(policy.named_parameters()), moments, config.weight_decay, fused=True)
+    gradients = Gradients(policy, config, number_type or training_type())
     policy.train()
     running = 0.0
-    for step in range(done, config.steps):
-        error = _train_step(policy, optimiser, frames, config, step)
-        running = error if step == done else 0.95 * running + 0.05 * error
-        finished = step + 1
-        if checkpoint is not None and (finished % config.checkpoint_every == 0 or finished == config.steps):
-            _write(checkpoint, policy, optimiser, finished, config)
-        if report is not None and (finished % 10 == 0 or finished == config.steps):
-            report(finished, running)
+    with freed_blocks_kept():
+        for step in range(done, config.steps):
+            error, found = gradients.of_step(frames, step)
+            optimiser.step(_learning_rate(config, step), found)
+            running = error if step == done else 0.95 * running + 0.05 * error
+            finished = step + 1
+            last = finished == config.steps
+            if checkpoint is not None and (finished % config.checkpoint_every == 0 or last):
+                _write(checkpoint, policy, optimiser, finished, config)
+            if report is not None and (finished % 10 == 0 or last):
+                report(finished, running)
     policy.eval()
 
 
@@ -100,21 +114,64 @@ def mean_absolute_error(policy: SteeringNetwork, frames: FrameSet) -> float:
     return total / len(rows)
 
 
-def _train_step(
-    policy: SteeringNetwork, optimiser: Adam, frames: FrameSet, config: FitConfig, step: int
-) -> float:
-    rng = np.random.default_rng([config.seed, step])
-    rows = frames.training[rng.integers(0, len(frames.training), config.batch_size)]
-    images, labels, goals = frames.batch(rows)
-    inputs = torch.from_numpy(augment(images, config.augment, rng)).permute(0, 3, 1, 2)  # stays channels-last
-    target = torch.from_numpy(labels)
-    with torch.random.fork_rng(devices=[]):  # for dropout's draws; later draws do not depend on them
-        torch.manual_seed(int(np.random.default_rng([config.seed, step, 1]).integers(2**31)))
-        output: Tensor = policy(inputs, torch.from_numpy(goals) if policy.goal_size else None)
-    loss = F.huber_loss(output, target, delta=config.huber_rad) / config.huber_rad**2
-    loss.backward()
-    optimiser.step(_learning_rate(config, step))
-    return float((output.detach() - target).square().mean())
+class Gradients:
+    """The gradients of a network's loss on the batches of a training.
+
+    Args:
+        policy: The network.
+        config: Settings of the training.
+        number_type: Number type of its layers, if its rows are independent.
+    """
+
+    def __init__(self, policy: SteeringNetwork, config: FitConfig, number_type: torch.dtype) -> None:
+        self._policy, self._config = policy, config
+        self._trained = {name: each for name, each in policy.named_parameters() if each.requires_grad}
+        self._reduced = policy.rows_independent and number_type == torch.bfloat16
+        self._parts = _PARTS if policy.rows_independent else 1
+
+    def of_step(self, frames: FrameSet, step: int) -> tuple[float, dict[str, Tensor]]:
+        """Mean square error [rad^2] on a step's batch, and the gradient of each parameter that has one."""
+        rng = np.random.default_rng([self._config.seed, step])
+        rows = frames.training[rng.integers(0, len(frames.training), self._config.batch_size)]
+        images, labels, goals = frames.batch(rows)
+        changes = Changes.drawn(len(rows), self._config.augment, rng)
+        parts: list[tuple[float, Sequence[Tensor | None]]] = [(0.0, ())] * self._parts
+        bounds = slot_bounds(len(rows), self._parts)
+        threads = torch.get_num_threads()
+
+        def work(slot: int) -> None:
+            torch.set_num_threads(max(1, threads // self._parts))  # of this thread
+            some = slice(*bounds[slot])
+            parts[slot] = self._of_part((images[some], labels[some], goals[some]), changes[some])
+
+        with torch.random.fork_rng(devices=[]):  # for dropout's draws; later draws do not depend on them
+            torch.manual_seed(int(np.random.default_rng([self._config.seed, step, 1]).integers(2**31)))
+            try:
+                run_slots(work, self._parts)
+            finally:
+                torch.set_num_threads(threads)
+        found = zip(self._trained, *(gradients for _, gradients in parts), strict=True)
+        sums = {name: _sum(each) for name, *each in found if each[0] is not None}
+        return sum(squares for squares, _ in parts) / len(rows), sums
+
+    def _of_part(self, batch: Batch, changes: Changes) -> tuple[float, Sequence[Tensor | None]]:
+        """Sum of squared errors [rad^2], and the part's share of the gradients."""
+        images, labels, goals = batch
+        inputs = torch.from_numpy(changes.applied(images)).permute(0, 3, 1, 2)  # stays channels-last
+        told, target = torch.from_numpy(goals) if self._policy.goal_size else None, torch.from_numpy(labels)
+        with torch.autocast("cpu", torch.bfloat16, enabled=self._reduced):
+            output: Tensor = self._policy(inputs, told).float()
+        huber = F.huber_loss(output, target, delta=self._config.huber_rad, reduction="sum")
+        loss = huber / (self._config.batch_size * self._config.huber_rad**2)
+        gradients = torch.autograd.grad(loss, list(self._trained.values()), allow_unused=True)
+        return float((output.detach() - target).square().sum()), gradients
+
+
+def _sum(parts: Sequence[Tensor]) -> Tensor:
+    total = parts[0]
+    for part in parts[1:]:
+        total.add_(part)
+    return total
 
 
 def _learning_rate(config: FitConfig, step: int) -> float:

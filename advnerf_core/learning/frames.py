@@ -15,6 +15,9 @@ from advnerf_core.errors import AdvnerfError
 
 HOLDOUT_BLOCK = 16
 
+Batch = tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]
+"""Images ``[B, 66, 200, 3]``, labels ``[B]`` and goals ``[B, G]``."""
+
 
 class FrameStoreError(AdvnerfError, ValueError):
     """Training frames on disk cannot be used."""
@@ -146,11 +149,16 @@ class FrameSet:
         self.held_out = np.array(held_out, dtype=np.int64).reshape(-1, 2)
         self.goal_size = int(shards[0].goals.shape[1])
 
-    def batch(
-        self, rows: NDArray[np.int64]
-    ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]:
+    def batch(self, rows: NDArray[np.int64]) -> Batch:
         """Images ``[B, 66, 200, 3]``, labels ``[B]`` and goals ``[B, G]`` of rows of ``training`` or ``held_out``."""
-        images = np.stack([self._shards[shard].images[row] for shard, row in rows])
-        labels = np.array([self._shards[shard].steering_rad[row] for shard, row in rows], dtype=np.float32)
-        goals = np.stack([self._shards[shard].goals[row] for shard, row in rows]).astype(np.float32)
+        images = np.empty((len(rows), *self._shards[0].images.shape[1:]), np.uint8)
+        labels, goals = np.empty(len(rows), np.float32), np.empty((len(rows), self.goal_size), np.float32)
+        for index, shard in enumerate(self._shards):
+            chosen = rows[:, 0] == index
+            row = rows[chosen, 1]
+            images[chosen], labels[chosen], goals[chosen] = (
+                shard.images[row],
+                shard.steering_rad[row],
+                shard.goals[row],
+            )
         return images, labels, goals

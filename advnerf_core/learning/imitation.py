@@ -58,6 +58,7 @@ def train_policy(
     view: PolicyView,
     out_dir: FilePath,
     progress: ImitationProgress | None = None,
+    number_type: torch.dtype | None = None,
 ) -> TrainedPolicy:
     """Collect, clone, and improve by DAgger; writes ``policy.safetensors`` (and ``naive.safetensors``) into ``out_dir``.
 
@@ -69,8 +70,9 @@ def train_policy(
         out_dir: Also keeps frames and checkpoints. Calling again with the same settings continues or returns at once; with
             other settings it is an error.
         progress: Progress callback.
+        number_type: See `fit`.
     """
-    return _Recipe(config, plans, expert, view, out_dir, progress).run()
+    return _Recipe(config, plans, expert, view, out_dir, progress, number_type).run()
 
 
 class _Recipe:
@@ -82,6 +84,7 @@ class _Recipe:
         view: PolicyView,
         out_dir: FilePath,
         progress: ImitationProgress | None,
+        number_type: torch.dtype | None,
     ) -> None:
         names = [plan.source.name for plan in plans]
         if not names or len(set(names)) != len(names):
@@ -92,7 +95,7 @@ class _Recipe:
         self.store = FrameStore(out_dir / "frames")
         self.seconds = {"collect": 0.0, "train": 0.0}
         self._goal_size = len(plans[0].goal)
-        self._progress = progress
+        self._progress, self._number_type = progress, number_type
         # Rough seconds per still or driven tick, and per optimiser step; only for an even progress bar.
         looks = sum(p.stills + config.dagger_rounds * p.drives * p.drive_steps for p in plans)
         steps = config.first_steps + config.dagger_rounds * config.round_steps + config.naive_steps
@@ -241,7 +244,8 @@ class _Recipe:
         # Later shards must not change the data of an earlier stage, so a resumed stage reads the shards it began with.
         shard_names = self._claim_shards(stage)
         frames = FrameSet([self.store.load(name) for name in shard_names], textured, config.holdout_every)
-        fit(policy, frames, settings, self.out_dir / f"{stage}.checkpoint.safetensors", report)
+        checkpoint = self.out_dir / f"{stage}.checkpoint.safetensors"
+        fit(policy, frames, settings, checkpoint, report, self._number_type)
         self._done_work = before + work * steps
         self._steps += steps
         self.seconds["train"] += time.perf_counter() - start

@@ -40,6 +40,8 @@ class SteeringNetwork(nn.Module):
         Configuration: Dataclass or pydantic model of the architecture's own settings, all with defaults and of values that JSON can hold;
             None if it has no settings.
         stateless: True: the steering depends on the current image and goal only.
+        rows_independent: Whether the steering of an image depends on nothing else in its batch and on no random draw, in train mode,
+            too. Training then splits batches between threads, and runs the layers in bfloat16 where the machine has it.
         reference: Name of the architecture, or ``file.py:Class`` with an absolute path; empty if the class was called directly.
         code_sha256: Hash of the code behind a user's architecture, when it was loaded; empty for a built-in one.
         code_files: Python files of ``file.py:Class`` when it was loaded: the file, and the modules beside it that it imports.
@@ -47,6 +49,7 @@ class SteeringNetwork(nn.Module):
 
     Configuration: ClassVar[type[Any] | None] = None
     stateless = True
+    rows_independent: ClassVar[bool] = False
 
     def __init__(self, goal_size: int = 0, max_steering_rad: float = 0.30, configuration: Any = None) -> None:
         super().__init__()

@@ -27,6 +27,7 @@ class PilotNet(FeaturesAndHead):
     """
 
     Configuration = PilotNetConfiguration
+    rows_independent = True
 
     def __init__(
         self,

@@ -56,8 +56,17 @@ _TRAINING_TEXTURE_PX = 128
 Sample = Callable[[np.random.Generator], torch.Tensor]
 
 
-def run(experiment: Experiment, folder: Path, report: MeasuringReport) -> None:
-    """Train the victims, then compare their controls on held-out views and on the surrogate's image of them."""
+def run(
+    experiment: Experiment, folder: Path, report: MeasuringReport, number_type: torch.dtype | None = None
+) -> None:
+    """Train the victims, then compare their controls on held-out views and on the surrogate's image of them.
+
+    Args:
+        experiment: Experiment with a learned scene.
+        folder: Folder of the stage.
+        report: Progress callback.
+        number_type: See `advnerf_core.learning.fit.fit`.
+    """
     config = experiment.config.policy
     settings = ImitationConfig(
         seed=config.seed,
@@ -87,6 +96,7 @@ def run(experiment: Experiment, folder: Path, report: MeasuringReport) -> None:
             experiment.view,
             folder,
             _telling(experiment, report),
+            number_type,
         )
     report(0.98, "comparing controls on true and learned views")
     summary = {

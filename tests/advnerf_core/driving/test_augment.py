@@ -1,10 +1,16 @@
+import cv2
 import numpy as np
+import pytest
 
-from advnerf_core.learning.augment import AugmentConfig, augment
+from advnerf_core.learning.augment import AugmentConfig, Changes, noise_bank
 
 OFF = AugmentConfig(
     brightness=0.0, contrast=0.0, gamma=0.0, colour=0.0, noise=0.0, blur_share=0.0, shift_px=0
 )
+
+
+def augment(images: np.ndarray, config: AugmentConfig, rng: np.random.Generator) -> np.ndarray:
+    return Changes.drawn(len(images), config, rng).applied(images)
 
 
 def _images() -> np.ndarray:
@@ -56,3 +62,30 @@ def test_shift_moves_by_whole_pixels() -> None:
     ]
     assert all(sum(row) == 1 for row in found)
     assert len({row.index(True) for row in found}) > 3
+
+
+@pytest.mark.parametrize("shift_px", [0, 1, 3])
+def test_the_kernel_equals_opencv_to_rounding(shift_px: int) -> None:
+    images = _images()
+    changes = Changes.drawn(len(images), AugmentConfig(shift_px=shift_px), np.random.default_rng(shift_px))
+    assert 0 < changes.blurred.sum() < len(images)
+    expected = np.stack([_with_opencv(image, changes[i : i + 1]) for i, image in enumerate(images)])
+    np.testing.assert_allclose(changes.applied(images), expected, atol=2e-7)
+
+
+def _with_opencv(image: np.ndarray, change: Changes) -> np.ndarray:
+    height, width, _ = image.shape
+    matrix = np.array([[1.0, 0.0, change.shifts[0, 0]], [0.0, 1.0, change.shifts[0, 1]]])
+    moved = cv2.warpAffine(
+        image, matrix, (width, height), flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
+    )
+    if change.blurred[0]:
+        moved = cv2.GaussianBlur(moved, (3, 3), 0.0, borderType=cv2.BORDER_REPLICATE)
+    start = change.noise_starts[0]
+    noise = change.noise[0] * noise_bank(image.size)[start : start + image.size].reshape(image.shape)
+    return np.clip(cv2.LUT(moved, change.tables[0][None]) + noise, 0.0, 1.0)
+
+
+def test_a_slice_of_the_changes_belongs_to_the_same_images() -> None:
+    images, changes = _images(), Changes.drawn(16, AugmentConfig(), np.random.default_rng(4))
+    np.testing.assert_array_equal(changes.applied(images)[5:9], changes[5:9].applied(images[5:9]))

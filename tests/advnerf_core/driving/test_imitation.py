@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 
 from advnerf_core.driving.dynamics import Ackermann
 from advnerf_core.driving.expert import Expert
@@ -14,11 +15,14 @@ from advnerf_core.driving.path import Path as Track
 from advnerf_core.driving.rollout import drive
 from advnerf_core.geometry import Pinhole, VehicleState, camera_mount, planar_pose
 from advnerf_core.learning import imitation
-from advnerf_core.learning.fit import FitConfig, fit, mean_absolute_error
+from advnerf_core.learning.augment import Changes
+from advnerf_core.learning.fit import FitConfig, Gradients, fit, mean_absolute_error
 from advnerf_core.learning.frames import Frames, FrameSet, FrameStore, FrameStoreError
 from advnerf_core.learning.imitation import train_policy
+from advnerf_core.learning.precision import training_type
 from advnerf_core.learning.recipe import ImitationConfig, SourcePlan, recovery_states
 from advnerf_core.learning.sources import RenderedSource, SceneSource, steer_with
+from advnerf_core.parallel import set_thread_count
 from advnerf_core.policies.architecture import Architecture
 from advnerf_core.policies.pilotnet import PilotNet
 from advnerf_core.policies.policy_file import load_policy
@@ -178,10 +182,12 @@ def test_killed_recipe_goes_on_to_the_same_policy(
             raise KeyboardInterrupt
         append(self, name, frames)
 
-    def dying_fit(policy, frames, config, checkpoint, report):
+    def dying_fit(policy, frames, config, checkpoint, report, number_type):
         if checkpoint.name.startswith(killed_in):
-            original_fit(policy, frames, replace(config, checkpoint_every=1), None, _die_after(2))
-        original_fit(policy, frames, config, checkpoint, report)
+            original_fit(
+                policy, frames, replace(config, checkpoint_every=1), None, _die_after(2), number_type
+            )
+        original_fit(policy, frames, config, checkpoint, report, number_type)
 
     def _die_after(steps: int):
         def report(step: int, loss: float) -> None:
@@ -206,11 +212,12 @@ def _small_set() -> FrameSet:
     return FrameSet([Frames(images, states, labels, np.zeros((24, 0), np.float32), np.zeros(24, bool))])
 
 
-def test_fit_resumes_to_the_bit(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number_type", [torch.float32, torch.bfloat16])
+def test_fit_resumes_to_the_bit(tmp_path: Path, number_type: torch.dtype) -> None:
     frames, config = _small_set(), FitConfig(steps=6, batch_size=8, checkpoint_every=3)
     torch.manual_seed(0)
     whole = PilotNet()
-    fit(whole, frames, config, tmp_path / "whole.safetensors")
+    fit(whole, frames, config, tmp_path / "whole.safetensors", number_type=number_type)
     torch.manual_seed(0)
     interrupted = PilotNet()
     calls = 0
@@ -225,10 +232,10 @@ def test_fit_resumes_to_the_bit(tmp_path: Path) -> None:
 
     frames.batch = failing_batch  # type: ignore[method-assign]
     with pytest.raises(OSError, match="went away"):
-        fit(interrupted, frames, config, tmp_path / "part.safetensors")
+        fit(interrupted, frames, config, tmp_path / "part.safetensors", number_type=number_type)
     frames.batch = batch  # type: ignore[method-assign]
     resumed = PilotNet()  # other weights: all must come from the checkpoint
-    fit(resumed, frames, config, tmp_path / "part.safetensors")
+    fit(resumed, frames, config, tmp_path / "part.safetensors", number_type=number_type)
     for a, b in zip(whole.parameters(), resumed.parameters(), strict=True):
         assert torch.equal(a, b)
     with pytest.raises(FrameStoreError, match="same settings"):
@@ -238,13 +245,52 @@ def test_fit_resumes_to_the_bit(tmp_path: Path) -> None:
         fit(resumed, frames, config, tmp_path / "part.safetensors")
 
 
-def test_fit_learns() -> None:
+def test_fit_learns_in_either_number_type() -> None:
     frames = _small_set()
+    for number_type in (torch.float32, torch.bfloat16):
+        torch.manual_seed(0)
+        policy = PilotNet()
+        before = mean_absolute_error(policy, frames)
+        fit(policy, frames, FitConfig(steps=60, batch_size=16), number_type=number_type)
+        assert all(each.dtype == torch.float32 for each in policy.parameters())
+        assert mean_absolute_error(policy, frames) < 0.5 * before
+
+
+def test_halves_of_a_batch_have_the_gradient_of_the_whole() -> None:
+    frames, config = _small_set(), FitConfig(steps=1, batch_size=10)
     torch.manual_seed(0)
-    policy = PilotNet()
-    before = mean_absolute_error(policy, frames)
-    fit(policy, frames, FitConfig(steps=60, batch_size=16))
-    assert mean_absolute_error(policy, frames) < 0.5 * before
+    policy = PilotNet().to(torch.float64)
+    rng = np.random.default_rng([config.seed, 0])
+    images, labels, _ = frames.batch(frames.training[rng.integers(0, len(frames.training), 10)])
+    inputs = (
+        torch.from_numpy(Changes.drawn(10, config.augment, rng).applied(images)).permute(0, 3, 1, 2).double()
+    )
+    output = policy(inputs)
+    loss = F.huber_loss(output, torch.from_numpy(labels).double(), delta=config.huber_rad)
+    expected = torch.autograd.grad(loss / config.huber_rad**2, list(policy.parameters()))
+    squares = (output.detach() - torch.from_numpy(labels)).square()
+    gradients = Gradients(policy.float(), config, torch.float32)
+    for threads in (1, 2):
+        set_thread_count(threads)
+        try:
+            error, found = gradients.of_step(frames, 0)
+        finally:
+            set_thread_count(0)
+        assert error == pytest.approx(float(squares.mean()), rel=1e-4)
+        for one, other in zip(found.values(), expected, strict=True):
+            torch.testing.assert_close(one.double(), other, rtol=1e-3, atol=1e-5)
+
+
+def test_the_machine_says_which_number_type_it_multiplies(tmp_path: Path) -> None:
+    for flags, expected in (
+        ("fpu avx512f", torch.float32),
+        ("fpu avx512_bf16", torch.bfloat16),
+        ("amx_bf16", torch.bfloat16),
+    ):
+        processor = tmp_path / flags.replace(" ", "_")
+        processor.write_text(f"model name\t: A\nflags\t\t: {flags}\n\nflags\t\t: other\n")
+        assert training_type(processor) == expected
+    assert training_type(tmp_path / "absent") == torch.float32
 
 
 @pytest.mark.slow
