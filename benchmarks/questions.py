@@ -69,6 +69,7 @@ QUESTIONS = (
             "sample_intervals",
             "exposure",
             "training_step",
+            "victim_training",
             "hash_encoding",
         ),
     ),
