@@ -70,6 +70,7 @@ QUESTIONS = (
             "exposure",
             "training_step",
             "victim_training",
+            "scene_stage",
             "hash_encoding",
         ),
     ),

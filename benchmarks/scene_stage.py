@@ -1,8 +1,8 @@
 """What does the demo's learned scene cost? ``python -m benchmarks.scene_stage --before FOLDER``: stages scene and bake, against other code.
 
 ``FOLDER`` is another checkout, for example ``git worktree add ../before af4e442``. Both take the same photographs of the simulated room
-with their own demo setting, in turns, each in a process of its own whose kernels are compiled already. User time counts, which
-other processes change little; the smallest of each.
+with their own demo setting, in turns, each in a process of its own. User time counts, which other processes change little; the smallest
+of each, as kernels are compiled in the first turn.
 """
 
 from __future__ import annotations
@@ -73,18 +73,18 @@ def main() -> None:
     )
     parser.add_argument("--before", type=Path, required=True, help="checkout of the code to compare with")
     parser.add_argument("--commit", required=True, help="its commit, for the row")
-    parser.add_argument("--turns", type=int, default=1)
+    parser.add_argument("--turns", type=int, default=2)
     parser.add_argument("--dry-run", action="store_true", help="print, but record nothing")
     arguments = parser.parse_args()
+    found: dict[str, list[Build]] = {}
     with tempfile.TemporaryDirectory() as name:
-        photographs, found = Path(name, "photographs"), {}
-        _run(REPOSITORY, photographs, "capture")
-        for way, code in (("before", arguments.before.resolve()), ("now", REPOSITORY)):
-            _build(code, photographs, Path(name, "compile"), "--set", "scene.steps=2")
-            found[way] = [_build(code, photographs, Path(name, way))]
-        for _ in range(arguments.turns - 1):
-            found["before"].append(_build(arguments.before.resolve(), photographs, Path(name, "before")))
-            found["now"].append(_build(REPOSITORY, photographs, Path(name, "now")))
+        codes = {"before": arguments.before.resolve(), "now": REPOSITORY}
+        for way, code in codes.items():
+            _run(code, Path(name, f"{way}_photographs"), "capture")
+        for _ in range(arguments.turns):
+            for way, code in codes.items():
+                photographs = Path(name, f"{way}_photographs")
+                found.setdefault(way, []).append(_build(code, photographs, Path(name, way)))
     before, now = (min(found[way], key=lambda build: build.user_s) for way in ("before", "now"))
     ratio, lost_db = now.user_s / before.user_s, before.full_db - now.full_db
     note = f"now {now}; {arguments.commit} {before}; shortest of {arguments.turns} in turns"
@@ -104,11 +104,11 @@ def main() -> None:
         )
 
 
-def _build(code: Path, photographs: Path, folder: Path, *settings: str) -> Build:
+def _build(code: Path, photographs: Path, folder: Path) -> Build:
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(photographs, folder)
     counts, before_s = folder / "counts.json", resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
-    _run(code, folder, "bake", *settings, counts=counts)
+    _run(code, folder, "bake", counts)
     user_s = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before_s
     mean, baked = (
         read_json(folder / "scene" / "fidelity.json")["mean"],
@@ -125,17 +125,25 @@ def _build(code: Path, photographs: Path, folder: Path, *settings: str) -> Build
     return build
 
 
-def _run(code: Path, folder: Path, until: str, *settings: str, counts: Path | None = None) -> None:
+def _run(code: Path, folder: Path, until: str, counts: Path | None = None) -> None:
     """Run the demo up to a stage with the code of a checkout."""
-    environment = {**os.environ, "PYTHONPATH": str(code), "COUNTS": str(counts or os.devnull)}
-    command = ["experiment", "run", str(code / _LAUNCH), "--setting", "demo", "--folder", str(folder)]
+    environment = {**os.environ, "PYTHONPATH": _path(code), "COUNTS": str(counts or os.devnull)}
+    # The command's names before they were put into groups.
+    is_old = not (code / "nodes" / "experiment" / "show").exists()
+    command = ["experiment", *([] if is_old else ["run"]), str(code / _LAUNCH), "--setting", "demo"]
+    command += ["--run-folder" if is_old else "--folder", str(folder)]
     subprocess.run(
-        [sys.executable, "-c", _COUNTING, *command, "--until", until, *settings],
+        [sys.executable, "-c", _COUNTING, *command, "--until", until],
         cwd=folder.parent,
         env=environment,
         check=True,
         stdout=subprocess.DEVNULL,
     )
+
+
+def _path(code: Path) -> str:
+    """Where modules are looked for; what only the other code depends on may stand in the caller's own path."""
+    return os.pathsep.join([str(code), *filter(None, [os.environ.get("PYTHONPATH")])])
 
 
 if __name__ == "__main__":

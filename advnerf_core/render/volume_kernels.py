@@ -69,10 +69,20 @@ def squash_features(field: Array32) -> None:
 @njit(**KERNEL_OPTIONS)
 def gather_columns(tiles: Array32, columns: Array64i, first: int, stop: int, out: Array32) -> None:
     """Copy columns of ``tiles [*, K, TILE]`` to columns ``first..stop`` of ``out [*, K, TILE]``."""
-    for n in range(first, stop):
-        source = columns[n]
+    rows, begin = np.uint64(tiles.shape[1] * TILE), first
+    flat, found = tiles.reshape(-1), np.empty(TILE, np.uint64)
+    while begin < stop:
+        # One tile of results at a time, of which neighbours are written in a row.
+        block, column = begin // TILE, begin % TILE
+        count = min(TILE - column, stop - begin)
+        for n in range(count):
+            source = np.uint64(columns[begin + n])
+            found[n] = source // np.uint64(TILE) * rows + source % np.uint64(TILE)
         for k in range(tiles.shape[1]):
-            out[n // TILE, k, n % TILE] = tiles[source // TILE, k, source % TILE]
+            row = np.uint64(k * TILE)
+            for n in range(count):
+                out[block, k, column + n] = flat[found[n] + row]
+        begin += count
 
 
 @njit(**KERNEL_OPTIONS)
