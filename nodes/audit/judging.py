@@ -215,7 +215,7 @@ def open_world(experiment: Experiment, evidence: Evidence) -> Iterator[World | N
         yield world
 
 
-def film(judged: Judged, file: Path) -> Film:
+def film(judged: Judged, file: Path, report: Report) -> Film:
     """The drives past no object, the plain one and the attacked one, side by side, from the shown start."""
     experiment, tracks = judged.experiment, []
     every, rate_hz = filmed(experiment.config.dt_s)
@@ -226,6 +226,7 @@ def film(judged: Judged, file: Path) -> Film:
             frames = seen_on(experiment, judged.arms[name], states, world)
             cte_m = path.project(states[:, :2]).cte_m
             tracks.append(ClipTrack(TITLES[name], CONDITIONS[name], frames, cte_m))
+            report(len(tracks) / len(FILMED), f"filmed past {TITLES[name]}")
     return write_film(file, tracks, rate_hz, judged.limit_m)
 
 

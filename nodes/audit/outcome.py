@@ -45,6 +45,7 @@ from nodes.audit.searching import FoundAttack, Searches
 from nodes.audit.spots import Spot
 from nodes.experiment.plan.object_kinds import footprint_m, name_of
 from nodes.experiment.show.context import Experiment
+from nodes.runtime.progress import Report
 
 TEXTURE, BEFORE, AFTER, FILM = "object.png", "before.png", "after.png", "drives.mp4"
 PICTURES = {
@@ -120,12 +121,12 @@ def result_of(known: Known, folder: Path) -> AuditResult:
     )
 
 
-def write_result(known: Known, result: AuditResult, folder: Path) -> str:
+def write_result(known: Known, result: AuditResult, folder: Path, report: Report) -> str:
     """Write the result and its derived files: the drives, the film, the page; returns failed files, and why."""
     keep_drives(folder, known.judged)
     if known.best is not None:
         write_atomically(folder / ATTACK_KEPT, known.best.attack.read_bytes())
-    shown = film(known.judged[-1], folder / FILM) if known.judged else None
+    shown = film(known.judged[-1], folder / FILM, report) if known.judged else None
     path = None
     if known.experiment is not None and known.judged:
         path = known.experiment.paths[known.experiment.config.paths[0]]

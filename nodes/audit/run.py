@@ -133,7 +133,9 @@ class Audit:
                 datetime.now(timezone.utc).replace(microsecond=0),
             )
         result = result_of(known, self.folder)
-        if missing := write_result(known, result, self.folder):
+        with ProgressDisplay(self.console) as display:
+            missing = write_result(known, result, self.folder, display.start("film and page"))
+        if missing:
             self.say(missing)
         return result
 
