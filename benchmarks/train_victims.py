@@ -17,20 +17,21 @@ LAUNCH_FILE = Path("launch/room.experiment.yaml")
 
 
 def main() -> None:
-    """Train into an empty folder."""
+    """Train into the folder ``policy`` of a run."""
     parser = argparse.ArgumentParser()
     parser.add_argument("run_folder", type=Path, help="a run whose scene is learned and baked")
-    parser.add_argument("output", type=Path)
+    parser.add_argument("--set", action="append", default=[])
     parser.add_argument("--number-type", choices=["float32", "bfloat16"])
     arguments = parser.parse_args()
     stages, policy = _modules()
     options = {}
     if arguments.number_type:
         options["number_type"] = getattr(import_module("torch"), arguments.number_type)
-    experiment = stages.load_experiment(LAUNCH_FILE.resolve(), "demo", [], arguments.run_folder)
-    arguments.output.mkdir(parents=True)
+    experiment = stages.load_experiment(LAUNCH_FILE.resolve(), "demo", arguments.set, arguments.run_folder)
+    output = arguments.run_folder / "policy"
+    output.mkdir()
     began, began_s = resource.getrusage(resource.RUSAGE_SELF).ru_utime, time.perf_counter()
-    policy.run(experiment, arguments.output, lambda *_, **__: None, **options)
+    policy.run(experiment, output, lambda *_, **__: None, **options)
     user_s, wall_s = resource.getrusage(resource.RUSAGE_SELF).ru_utime - began, time.perf_counter() - began_s
     print(json.dumps({"user_s": user_s, "wall_s": wall_s}))
 

@@ -13,6 +13,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -32,6 +33,19 @@ from nodes.experiment.steps.run import load_experiment
 COMMAND = "python -m benchmarks.victim_training RUN --before WORKTREE"
 TARGET = 0.5
 _ROOT = Path(__file__).parents[1]
+_STAGES = ("capture", "scene", "bake", "object")
+# Compiles the kernels, which is not counted.
+_SHORT = [
+    f"--set=policy.{each}"
+    for each in (
+        "deployed_stills=32",
+        "surrogate_stills=32",
+        "drive_steps=2",
+        "first_steps=2",
+        "round_steps=2",
+        "naive_steps=2",
+    )
+]
 _FILES = {"hardened": "policy.safetensors", "naive": "naive.safetensors"}
 
 
@@ -44,18 +58,25 @@ def main() -> None:
     parser.add_argument(
         "--number-type", choices=["float32", "bfloat16"], help="of this build; by default the machine's"
     )
+    parser.add_argument(
+        "--set", action="append", default=[], help="change of the demo's settings, for a trial"
+    )
     parser.add_argument("--trial", action="store_true", help="print, but record nothing")
     arguments = parser.parse_args()
     roots = {"before": arguments.before.resolve(), "now": _ROOT}
     costs: dict[str, list[dict[str, float]]] = {name: [] for name in roots}
     errors: dict[str, dict[str, Any]] = {}
     with tempfile.TemporaryDirectory() as folder:
+        for name, root in roots.items():
+            train(root, arguments.run.resolve(), Path(folder) / name, _SHORT)
         for turn in range(arguments.turns):
             for name, root in roots.items():
                 out = Path(folder) / f"{name}{turn}"
-                chosen = arguments.number_type if name == "now" else None
-                costs[name].append(train(root, arguments.run.resolve(), out, chosen))
-                errors[name] = quality(arguments.run.resolve(), out)
+                options = [f"--set={each}" for each in arguments.set]
+                if name == "now" and arguments.number_type:
+                    options.append(f"--number-type={arguments.number_type}")
+                costs[name].append(train(root, arguments.run.resolve(), out, options))
+                errors[name] = quality(arguments.run.resolve(), out / "policy")
                 print(f"{name}: {costs[name][-1]}, {errors[name]}", flush=True)
     note = (
         "; ".join(f"{name} {_text(errors[name])}" for name in roots)
@@ -68,16 +89,17 @@ def main() -> None:
             f"{best['now']:.0f} s against {best['before']:.0f} s, best of {arguments.turns} in turns; {note}"
         )
         print(f"{unit}: {ratio:.2f}: {said}")
-        if not arguments.trial:
+        if not (arguments.trial or arguments.set):
             line = f"training the demo's victims, {unit} against af4e442" + _suffix(arguments.number_type)
             record_row(line, ratio, "", f"<= {TARGET}", ratio <= TARGET, COMMAND, said)
 
 
-def train(root: Path, run: Path, out: Path, number_type: str | None) -> dict[str, float]:
-    """User core-seconds and seconds of the stage with the code of a worktree."""
-    source = Path(train_victims.__file__).read_text()
-    command = [sys.executable, "-c", source, str(run), str(out)]
-    command += ["--number-type", number_type] if number_type else []
+def train(root: Path, run: Path, folder: Path, options: Sequence[str]) -> dict[str, float]:
+    """User core-seconds and seconds of the stage with the code of a worktree, in a new run folder with the stages of a run."""
+    folder.mkdir()
+    for stage in _STAGES:
+        (folder / stage).symlink_to(run / stage)
+    command = [sys.executable, "-c", Path(train_victims.__file__).read_text(), str(folder), *options]
     environment = {**os.environ, "PYTHONPATH": str(root)}
     done = subprocess.run(command, cwd=root, env=environment, stdout=subprocess.PIPE, text=True, check=True)
     cost: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
