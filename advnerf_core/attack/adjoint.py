@@ -23,6 +23,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from advnerf_core.attack.image_gradients import image_gradients
 from advnerf_core.attack.objective import loss_slopes
 from advnerf_core.attack.problem import (
     AttackProblem,
@@ -202,12 +203,10 @@ def _batched_terms(
         last = min(first + problem.time_batch, steps)
         pieces, again = _renders(problem, theta, rollout, range(first, last), cache)
         goals = None if problem.goals is None else problem.goals.repeat(last - first, 1)
-        with torch.enable_grad():
-            images = torch.cat([piece.images for piece in pieces]).requires_grad_()
-            controls = problem.policy(images, goals)
-            seed = control_slopes[first:last].reshape(-1).to(controls.dtype)
-            (grad_images,) = torch.autograd.grad(controls, images, seed)
-        del controls, images
+        images = torch.cat([piece.images for piece in pieces])
+        slopes = control_slopes[first:last].reshape(-1)
+        grad_images = image_gradients(problem.policy, images, goals, slopes, problem.reduced)
+        del images
         sizes = [len(piece.images) for piece in pieces]
         assert sum(sizes) == (last - first) * starts
         # One sum, not a stack: a dense object's gradient is as large as its grid.

@@ -116,6 +116,7 @@ class AttackProblem:
         regulariser: Added to the loss, for example `Smoothness`; None adds nothing.
         objective: The objective that the attack maximises.
         solids: Obstacles, for objectives that need them.
+        reduced: Compute the policy's gradients in bfloat16; see `image_gradients.agrees_in_bfloat16`.
     """
 
     policy: Any
@@ -135,6 +136,7 @@ class AttackProblem:
     regulariser: Regulariser | None = None
     objective: Objective = field(default_factory=CrossTrackError)
     solids: Solids | None = None
+    reduced: bool = False
 
     def __post_init__(self) -> None:
         """Reject combinations that would give a wrong gradient silently."""

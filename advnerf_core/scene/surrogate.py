@@ -81,7 +81,9 @@ class PoseBatch:
         ]
         for rows, W, pixels, value in zip(self.seen, self.weights, self.pixels, values, strict=True):
             W.add_product(rows.colours(value).numpy(), pixels.numpy(), image.reshape(-1, 3))
-        images = torch.from_numpy(np.ascontiguousarray(image.transpose(0, 3, 1, 2)))
+        images = torch.from_numpy(image).permute(
+            0, 3, 1, 2
+        )  # in memory a pixel's channels stay together, as convolutions take them
         own = sum(rows.nbytes for rows in self.seen) + sum(value.nbytes for value in values)
         return Rendered(images, self._vjp(theta, values), images.nbytes + self.weights_nbytes + own)
 

@@ -14,6 +14,7 @@ import torch
 from advnerf_core.attack.adjoint import AttackProblem, evaluate
 from advnerf_core.attack.artifact import AttackFile, load_attack, save_attack
 from advnerf_core.attack.clean import clean_drive
+from advnerf_core.attack.image_gradients import agrees_in_bfloat16
 from advnerf_core.attack.methods import Method, SearchRun, SearchSettings, load_method
 from advnerf_core.attack.objectives import CTE, load_objective, objective_entry, objective_key
 from advnerf_core.attack.on_device import on_chosen_device, said_of_device
@@ -145,6 +146,7 @@ def attack_problem(
         regulariser=robustness.regulariser(space.surrogate.objects),
         objective=objective,
         solids=experiment.solids if objective.needs_solids else None,
+        reduced=agrees_in_bfloat16(policy.policy, experiment.view.pinhole, int(policy.policy.goal_size)),
     )
 
 

@@ -1,0 +1,82 @@
+"""Gradients of a policy's control with respect to its images, in bfloat16 where the processor multiplies it and the direction stays."""
+
+from __future__ import annotations
+
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from advnerf_core.errors import AdvnerfError
+from advnerf_core.geometry import Pinhole
+from advnerf_core.learning.precision import training_type
+
+LEAST_COSINE = 0.9999
+"""Least cosine of a gradient in bfloat16 with the one in float32."""
+
+_PROBES = 4  # images on which both are compared
+_decided: WeakKeyDictionary[Any, dict[Pinhole, bool]] = WeakKeyDictionary()
+
+
+def image_gradients(
+    policy: Any, images: Tensor, goals: Tensor | None, slopes: Tensor, reduced: bool = False
+) -> Tensor:
+    """Gradient of ``sum(slopes * policy(images))`` with respect to the images.
+
+    Args:
+        policy: A stateless policy.
+        images: ``[N, 3, H, W]``, without history.
+        goals: ``[N, G]`` or None.
+        slopes: ``[N]``.
+        reduced: Compute layers in bfloat16; see `agrees_in_bfloat16`.
+
+    Returns:
+        ``[N, 3, H, W]``, in the type of the images.
+    """
+    if reduced:
+        # The layout that convolutions in bfloat16 take without a copy for each layer.
+        images = images.contiguous(memory_format=torch.channels_last)
+    images = images.detach().requires_grad_()
+    with torch.enable_grad(), torch.autocast("cpu", torch.bfloat16, enabled=reduced):
+        controls: Tensor = policy(images, goals)
+    (gradient,) = torch.autograd.grad(controls, images, slopes.to(controls.dtype))
+    return gradient
+
+
+def agrees_in_bfloat16(policy: Any, camera: Pinhole, goal_size: int = 0) -> bool:
+    """Whether gradients of this policy may be computed in bfloat16 on this machine.
+
+    They may for a differentiable stateless network in float32 whose gradients in both types have a cosine of at least `LEAST_COSINE`
+    on smooth random images. The images depend on nothing else, so that a resumed search decides as it did before.
+
+    Args:
+        policy: The policy.
+        camera: Size of its images.
+        goal_size: Length of its goals; 0 for none.
+    """
+    network = isinstance(policy, torch.nn.Module) and {each.dtype for each in policy.parameters()} == {
+        torch.float32
+    }
+    if not (network and policy.stateless and training_type() == torch.bfloat16):
+        return False
+    decided = _decided.setdefault(policy, {})
+    if camera not in decided:
+        decided[camera] = _least_cosine(policy, camera, goal_size) >= LEAST_COSINE
+    return decided[camera]
+
+
+def _least_cosine(policy: Any, camera: Pinhole, goal_size: int) -> float:
+    generator = torch.Generator().manual_seed(0)
+    coarse = torch.rand(_PROBES, 3, camera.height // 8 + 2, camera.width // 8 + 2, generator=generator)
+    images = functional.interpolate(coarse, (camera.height, camera.width), mode="bilinear")
+    goals = torch.rand(_PROBES, goal_size, generator=generator) if goal_size else None
+    slopes = torch.ones(_PROBES)
+    try:
+        exact, rounded = (
+            image_gradients(policy, images, goals, slopes, kind).double().flatten(1) for kind in (False, True)
+        )
+    except (RuntimeError, AdvnerfError):  # no gradient, or an operation that bfloat16 lacks
+        return -1.0
+    return float(functional.cosine_similarity(exact, rounded).min())
