@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from advnerf_core.attack.image_gradients import agrees_in_bfloat16, image_gradients
 from advnerf_core.fields.hash_grid import HashGrid, HashGridConfig, encode, scatter
 from advnerf_core.fields.mlp_kernels import TILE
 from advnerf_core.geometry import Array, Pinhole, make_transform, planar_poses
@@ -30,6 +31,8 @@ from benchmarks.gradient_pass import dense_object
 from benchmarks.least_work import Work
 from benchmarks.training_step import Batch
 from hardware.worlds.lab.config import LabConfig
+
+WHOLE, WHOLE_TICKS = "tick with gradient", 8
 
 
 @dataclass(frozen=True)
@@ -110,15 +113,19 @@ def training_parts(batch: Batch, stepper: CpuStep) -> list[Part]:
 
 
 def tick_parts(batch: Batch, resolution: int) -> list[Part]:
-    """One tick of the surrogate: background, casting of one object, composing, and the policy, for one frame."""
+    """One tick of the surrogate: background, casting of one object, composing, and the policy, for one frame; and `WHOLE_TICKS` of them."""
     trained, config = batch.trainer.run(), LabConfig()
     view, mount = PolicyView(config.camera.pinhole).pinhole, config.camera.T_car_from_camera
-    states = np.stack([np.linspace(-1.0, 1.0, 8), np.zeros(8), np.linspace(-0.3, 0.3, 8)], axis=1)
+    states = np.stack(
+        [np.linspace(-1.0, 1.0, WHOLE_TICKS), np.zeros(WHOLE_TICKS), np.linspace(-0.3, 0.3, WHOLE_TICKS)],
+        axis=1,
+    )
     field = FieldRenderer(trained.scene, trained.occupied, trained.march)
     baked = bake(field, planar_poses(states) @ mount, view)
     thing = dense_object(make_transform(np.eye(3), [2.0, 0.0, 0.5]), resolution)
     surrogate, pose = Surrogate(baked, view, mount, [thing]), planar_poses(states[4:5]) @ mount
     theta, policy = surrogate.plain_theta(), PilotNet(0, 0.4).eval().requires_grad_(False)
+    poses = planar_poses(states) @ mount
     rgb, depth_m = surrogate.scene_frames(pose)
     image = surrogate.render(pose, theta).images
     casts = cast_objects([thing], pose, view)
@@ -143,7 +150,22 @@ def tick_parts(batch: Batch, resolution: int) -> list[Part]:
             least_work.composing(weights, view.width * view.height),
         ),
         Part("tick, policy", lambda: policy(image), least_work.network(policy, image)),
+        Part(WHOLE, lambda: with_gradient(surrogate, view, poses, theta, policy), Work(0.0, {}, 0.0)),
     ]
+
+
+def with_gradient(
+    surrogate: Surrogate, view: Pinhole, poses: Array, theta: torch.Tensor, policy: PilotNet
+) -> torch.Tensor:
+    """Ticks as an iteration of an attack has them: each frame and its control, then the gradients of all controls together."""
+    frames = [surrogate.render(pose[None], theta) for pose in poses]
+    for frame in frames:
+        policy(frame.images)
+    images, slopes = torch.cat([frame.images for frame in frames]), torch.ones(len(frames))
+    slope = image_gradients(policy, images, None, slopes, agrees_in_bfloat16(policy, view))
+    return sum(
+        (frame.vjp(part[None]) for frame, part in zip(frames, slope, strict=True)), torch.zeros_like(theta)
+    )
 
 
 def frame_samples(
