@@ -1,11 +1,8 @@
-"""Audits of what people bring besides a file and photographs: a served driver, a mesh. Each goes on to its verdict and its page."""
+"""Audits of what people bring besides a file and photographs: a mesh. It goes on to its verdict and its page."""
 
 from __future__ import annotations
 
-import contextlib
 import subprocess
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +12,6 @@ import trimesh
 from advnerf_core.report.audit_result import AuditResult, read_audit
 from nodes.audit.kept import check_audit
 from tests.support import circle_place
-from tests.support.circle_place import WHEELBASE_M
 
 pytestmark = pytest.mark.slow  # a learned place and its searches each
 
@@ -35,30 +31,6 @@ def result_of(folder: Path, ended: subprocess.CompletedProcess[str]) -> AuditRes
     page = (folder / "audit.html").read_text()
     assert page.index(result.verdict.sentence) < page.index("<video") < page.index("<svg")
     return result
-
-
-@contextlib.contextmanager
-def served(folder: Path, policy: str) -> Iterator[str]:
-    """Address of a policy that ``advnerf policy serve`` offers."""
-    words = ["--listen", "127.0.0.1:0", "--wheelbase", str(WHEELBASE_M), "--speed", "0.8"]
-    with subprocess.Popen(
-        [sys.executable, "-m", "nodes.cli", "policy", "serve", f"drivers:{policy}", *words],
-        cwd=folder, env=circle_place.environment(folder), stdout=subprocess.PIPE, text=True,
-    ) as process:  # fmt: skip
-        try:
-            assert process.stdout is not None
-            yield process.stdout.readline().split()[3].rstrip(";")
-        finally:
-            process.terminate()
-
-
-def test_a_served_driver_is_judged_by_the_schedule_of_black_boxes(folder: Path) -> None:
-    pytest.importorskip("grpc")
-    with served(folder, "seduced") as address:
-        ended = circle_place.audit(folder, address, "--evaluations", "120", output="served")
-    result = result_of(folder / "served", ended)
-    assert (result.verdict.outcome, result.policy.path) == ("found", address), result.verdict.sentence
-    assert {each.method for each in result.tried} == {"random_coarse", "cem", "guided"}
 
 
 def test_a_mesh_of_a_users_own_stands_beside_the_lane_and_is_found(folder: Path) -> None:
