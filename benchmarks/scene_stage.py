@@ -8,7 +8,6 @@ of each, as kernels are compiled in the first turn.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import resource
 import shutil
@@ -119,7 +118,7 @@ def _build(code: Path, photographs: Path, folder: Path) -> Build:
         mean["psnr_full_db"],
         mean["psnr_policy_db"],
         baked.get("psnr_baked_db", float("nan")),
-        **json.loads(counts.read_text()),
+        **read_json(counts),
     )
     print(f"{code.name}: {build}", flush=True)
     return build

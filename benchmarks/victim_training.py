@@ -8,7 +8,6 @@ steps, checkpoints and errors, all of the stage ``policy``. Then each victim dri
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import subprocess
 import sys
@@ -20,7 +19,7 @@ from typing import Any
 
 import torch
 
-from advnerf_core.documents import read_json
+from advnerf_core.documents import parse_json, read_json
 from advnerf_core.learning.precision import training_type
 from advnerf_core.policies.policy_file import load_policy
 from benchmarks import train_victims
@@ -102,7 +101,7 @@ def train(root: Path, run: Path, folder: Path, options: Sequence[str]) -> dict[s
     command = [sys.executable, "-c", Path(train_victims.__file__).read_text(), str(folder), *options]
     environment = {**os.environ, "PYTHONPATH": str(root)}
     done = subprocess.run(command, cwd=root, env=environment, stdout=subprocess.PIPE, text=True, check=True)
-    cost: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+    cost: dict[str, float] = parse_json(done.stdout.splitlines()[-1], "the training process")
     return cost
 
 

@@ -45,7 +45,12 @@ def doctor(
             "--gpu", help="Only compare the GPU with the processor; prints text to paste into an issue."
         ),
     ] = False,
-    gpu_device: Annotated[Literal["cuda", "cpu"], typer.Option(hidden=True)] = "cuda",
+    gpu_device: Annotated[
+        Literal["cuda", "cpu"],
+        typer.Option(
+            hidden=True, help="What --gpu compares with the processor; cpu tries the comparison itself."
+        ),
+    ] = "cuda",
     as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
     overrides: Overrides = None,
 ) -> None:
