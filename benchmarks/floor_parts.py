@@ -9,7 +9,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from advnerf_core.attack.image_gradients import agrees_in_bfloat16, image_gradients
+from advnerf_core.attack.adjoint import AttackProblem, adjoint_gradient
+from advnerf_core.attack.image_gradients import agrees_in_bfloat16
+from advnerf_core.driving.dynamics import Dubins
+from advnerf_core.driving.path import Line, Path
 from advnerf_core.fields.hash_grid import HashGrid, HashGridConfig, encode, scatter
 from advnerf_core.fields.mlp_kernels import TILE
 from advnerf_core.geometry import Array, Pinhole, make_transform, planar_poses
@@ -113,7 +116,7 @@ def training_parts(batch: Batch, stepper: CpuStep) -> list[Part]:
 
 
 def tick_parts(batch: Batch, resolution: int) -> list[Part]:
-    """One tick of the surrogate: background, casting of one object, composing, and the policy, for one frame; and `WHOLE_TICKS` of them."""
+    """One tick of the surrogate: background, casting of one object, composing, and the policy, for one frame; and a drive of `WHOLE_TICKS` with its gradient."""
     trained, config = batch.trainer.run(), LabConfig()
     view, mount = PolicyView(config.camera.pinhole).pinhole, config.camera.T_car_from_camera
     states = np.stack(
@@ -125,7 +128,15 @@ def tick_parts(batch: Batch, resolution: int) -> list[Part]:
     thing = dense_object(make_transform(np.eye(3), [2.0, 0.0, 0.5]), resolution)
     surrogate, pose = Surrogate(baked, view, mount, [thing]), planar_poses(states[4:5]) @ mount
     theta, policy = surrogate.plain_theta(), PilotNet(0, 0.4).eval().requires_grad_(False)
-    poses = planar_poses(states) @ mount
+    problem = AttackProblem(
+        policy,
+        surrogate,
+        Dubins(0.8, 0.1),
+        Path((-1.0, 0.0, 0.0), [Line(6.0)], closed=False),
+        torch.tensor([[-1.0, 0.0, 0.0]], dtype=torch.float64),
+        WHOLE_TICKS,
+        reduced=agrees_in_bfloat16(policy, view),
+    )
     rgb, depth_m = surrogate.scene_frames(pose)
     image = surrogate.render(pose, theta).images
     casts = cast_objects([thing], pose, view)
@@ -150,22 +161,8 @@ def tick_parts(batch: Batch, resolution: int) -> list[Part]:
             least_work.composing(weights, view.width * view.height),
         ),
         Part("tick, policy", lambda: policy(image), least_work.network(policy, image)),
-        Part(WHOLE, lambda: with_gradient(surrogate, view, poses, theta, policy), Work(0.0, {}, 0.0)),
+        Part(WHOLE, lambda: adjoint_gradient(problem, theta), Work(0.0, {}, 0.0)),
     ]
-
-
-def with_gradient(
-    surrogate: Surrogate, view: Pinhole, poses: Array, theta: torch.Tensor, policy: PilotNet
-) -> torch.Tensor:
-    """Ticks as an iteration of an attack has them: each frame and its control, then the gradients of all controls together."""
-    frames = [surrogate.render(pose[None], theta) for pose in poses]
-    for frame in frames:
-        policy(frame.images)
-    images, slopes = torch.cat([frame.images for frame in frames]), torch.ones(len(frames))
-    slope = image_gradients(policy, images, None, slopes, agrees_in_bfloat16(policy, view))
-    return sum(
-        (frame.vjp(part[None]) for frame, part in zip(frames, slope, strict=True)), torch.zeros_like(theta)
-    )
 
 
 def frame_samples(
