@@ -51,11 +51,11 @@ def use_own_folder(package: Path = _PACKAGE) -> Path:
 
 
 def sources_digest(package: Path) -> str:
-    """Hash of all Python files below a folder that hold kernels."""
+    """Hash of all Python files below a folder that hold kernels, or what kernels are made of."""
     digest = hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
         content = path.read_bytes()
-        if b"njit" in content:
+        if b"numba" in content or b"llvmlite" in content:
             digest.update(f"{path.relative_to(package).as_posix()}\0{len(content)}\0".encode() + content)
     return digest.hexdigest()[:16]
 

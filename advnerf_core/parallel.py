@@ -22,13 +22,15 @@ from advnerf_core.kernel_cache import use_own_folder
 
 use_own_folder()
 
-# Kernels may reorder and contract float sums, but must honour NaN and infinity: trainers test for them.
+# Kernels may reorder and contract float sums, but must honour NaN and infinity: trainers test for them. They are inlined where they are called:
+# of a function that several kernels contain, the process would use the copy that was loaded first, and copies differ in their rounding.
 KERNEL_OPTIONS: dict[str, Any] = {
     "nogil": True,
     "cache": True,
     "fastmath": {"reassoc", "contract", "nsz", "arcp", "afn"},
     "error_model": "numpy",
     "boundscheck": False,
+    "forceinline": True,
 }
 
 T = TypeVar("T")

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import importlib
 import os
+import pkgutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from numba.core.dispatcher import Dispatcher
 
+import advnerf_core
 from advnerf_core.kernel_cache import sources_digest, use_own_folder
 
 CALLED = "from numba import njit\n\n@njit(cache=True)\ndef number():\n    return {value}\n"
@@ -75,3 +80,49 @@ def test_the_kernels_of_this_package_use_it() -> None:
     code = "import numba, advnerf_core.render.march_kernels; print(numba.config.CACHE_DIR)"
     done = subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.PIPE, text=True)
     assert Path(done.stdout.strip()).name.startswith("advnerf-")
+
+
+def kernels() -> Iterator[tuple[str, Dispatcher]]:
+    """All kernels of the package for the processor, by name."""
+    for each in pkgutil.walk_packages(advnerf_core.__path__, "advnerf_core."):
+        module = sys.modules.get(each.name)
+        for name, value in vars(module).items() if module is not None else ():
+            if isinstance(value, Dispatcher) and value.py_func.__module__ == each.name:
+                yield f"{each.name}.{name}", value
+
+
+def test_kernels_are_inlined_where_they_are_called() -> None:
+    for name in ("fields.hash_grid", "render.cast_object", "render.soft_pose", "scene.baked", "scene.train"):
+        importlib.import_module(f"advnerf_core.{name}")
+    found = dict(kernels())
+    assert len(found) > 60
+    assert [name for name, kernel in found.items() if not kernel.targetoptions.get("forceinline")] == []
+
+
+TRAIN = """
+import hashlib
+import advnerf_core
+from advnerf_core.fields.hash_grid import HashGridConfig
+from advnerf_core.scene.field import SceneFieldConfig
+from advnerf_core.scene.train import TrainConfig, Trainer
+from tests.support.colour_room import room_images
+grid = HashGridConfig(levels=4, features=4, log2_entries=10, coarsest=8, finest=32)
+trainer = Trainer(room_images(), SceneFieldConfig((-1.05, -1.05, -0.55), (1.05, 1.05, 0.55), grid), TrainConfig(steps=4))
+for _ in range(4):
+    trainer.train_step()
+state = trainer.stepper.state()
+print(hashlib.sha256(b"".join(state[name].tobytes() for name in sorted(state))).hexdigest())
+"""
+
+
+@pytest.mark.slow
+def test_a_process_that_compiles_computes_what_later_ones_do(tmp_path: Path) -> None:
+    root = str(Path(__file__).parents[2])
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": root}
+    seen = [
+        subprocess.run(
+            [sys.executable, "-c", TRAIN], env=environment, check=True, stdout=subprocess.PIPE
+        ).stdout
+        for _ in range(2)
+    ]
+    assert seen[0] == seen[1]
