@@ -72,12 +72,12 @@ def _atlas(mesh: SurfaceMesh) -> tuple[Any, Any, Any]:
     return np.concatenate([part.texture.reshape(-1, 3) for part in mesh.parts]), shapes, firsts
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _edge(a: Any, b: Any, x: float, y: float) -> float:
     return (b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
 def _draw_band(
     corners: Any,
     uv: Any,

@@ -122,7 +122,7 @@ def _spread_colours(sums: Array, hits: Array) -> NDArray[np.float32]:
     return np.asarray(mean[tuple(nearest)], dtype=np.float32)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _draw(
     triangles: Any,
     uv: Any,
