@@ -194,33 +194,28 @@ def flat_boxes(distance: NDArray[np.uint8]) -> NDArray[np.uint8]:
         ``[X, Y, Z]`` uint8: 0 occupied; ``d < FLAT``: the cells nearer than ``d`` along each axis are empty; ``FLAT + h``: those nearer than
         ``FLATNESS * h`` along x and y, and nearer than ``h`` along z.
     """
-    occupied = distance == 0
-    height = np.where(occupied, np.uint8(0), np.uint8(MAX_HEIGHT))
-    for k in range(1, height.shape[2]):
-        np.minimum(height[..., k], height[..., k - 1] + 1, out=height[..., k])
-    for k in range(height.shape[2] - 2, -1, -1):
-        np.minimum(height[..., k], height[..., k + 1] + 1, out=height[..., k])
-    for axis in (1, 0):
-        height = _least_around(height.swapaxes(0, 1 - axis), np.empty_like(height.swapaxes(0, 1 - axis)))
-        height = height.swapaxes(0, 1 - axis)
-    return np.ascontiguousarray(np.where(FLATNESS * height > distance, FLAT + height, distance))
+    height = np.where(distance == 0, np.uint8(0), np.uint8(MAX_HEIGHT))
+    for axis, across in ((2, 1), (1, FLATNESS), (0, FLATNESS)):
+        height = _least_around(height, axis, across)
+    return np.where(FLATNESS * height > distance, FLAT + height, distance)
 
 
-@njit(**KERNEL_OPTIONS)
-def _least_around(height: NDArray[np.uint8], least: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The smallest of ``max(height, distance // FLATNESS)`` over the cells along the first axis, a row at a time."""
-    nx, ny, _ = height.shape
-    reach = FLATNESS * MAX_HEIGHT - 1
-    for i in range(nx):
-        for j in range(ny):
-            row = least[i, j]
-            row[:] = MAX_HEIGHT
-            for other in range(max(0, i - reach), min(nx, i + reach + 1)):
-                _lower_to(row, height[other, j], np.uint8(abs(other - i) // FLATNESS))
+def _least_around(height: NDArray[np.uint8], axis: int, across: int) -> NDArray[np.uint8]:
+    """The smallest of ``max(height, cells // across)`` over the cells along an axis, which are so many ``cells`` away."""
+    near = height  # the least among those nearer than a multiple of `across`
+    for _ in range(across - 1):
+        near = _spread(near, axis, 1)
+    least = near.copy()
+    for away in range(1, MAX_HEIGHT):
+        near = _spread(near, axis, across)
+        np.minimum(least, np.maximum(near, np.uint8(away)), out=least)
     return least
 
 
-@njit(**KERNEL_OPTIONS)
-def _lower_to(least: NDArray[np.uint8], row: NDArray[np.uint8], at_least: np.uint8) -> None:
-    for k in range(len(least)):
-        least[k] = min(least[k], max(row[k], at_least))
+def _spread(values: NDArray[np.uint8], axis: int, by: int) -> NDArray[np.uint8]:
+    """The least of each cell and of the two that lie ``by`` cells before and behind it."""
+    spread = values.copy()
+    there, here = spread.swapaxes(0, axis), values.swapaxes(0, axis)
+    np.minimum(there[by:], here[:-by], out=there[by:])
+    np.minimum(there[:-by], here[by:], out=there[:-by])
+    return spread
