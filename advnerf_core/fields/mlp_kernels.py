@@ -24,6 +24,7 @@ Array32 = NDArray[np.float32]
 
 TILE = 256  # samples: 64 hidden features are 64 KiB, which stays in the second-level cache
 _ZERO = np.float32(0.0)
+_PLAIN, _RECTIFIED, _MASKED = 0, 1, 2  # endings of a product
 
 _product, _product_pair = product_block(ROWS), product_block(2)
 _rectified, _rectified_pair = product_block(ROWS, "rectified"), product_block(2, "rectified")
@@ -42,19 +43,7 @@ def dense(weight: Array32, bias: Array32, x: Array32, y: Array32, relu: bool) ->
         y: ``[J, TILE]``.
         relu: Whether negative results become 0.
     """
-    rows, length = weight.shape
-    whole = rows - rows % ROWS
-    for n in range(0, TILE, LANES):
-        for j in range(0, whole, ROWS):
-            if relu:
-                _rectified(weight, bias, x, y, y, j, n, length, TILE)
-            else:
-                _product(weight, bias, x, y, y, j, n, length, TILE)
-        for j in range(whole, rows, 2):
-            if relu:
-                _rectified_pair(weight, bias, x, y, y, j, n, length, TILE)
-            else:
-                _product_pair(weight, bias, x, y, y, j, n, length, TILE)
+    _multiply(weight, bias, x, y, y, _RECTIFIED if relu else _PLAIN)
 
 
 @njit(**KERNEL_OPTIONS)
@@ -68,19 +57,30 @@ def dense_transposed(weight_t: Array32, grad: Array32, mask: Array32, grad_x: Ar
         grad_x: ``[K, TILE]``.
         relu: Whether the input came out of a rectifier.
     """
-    rows, length = weight_t.shape
-    whole, bias = rows - rows % ROWS, np.zeros(rows, np.float32)
+    bias = np.zeros(len(weight_t), np.float32)
+    _multiply(weight_t, bias, grad, grad_x, mask, _MASKED if relu else _PLAIN)
+
+
+@njit(**KERNEL_OPTIONS)
+def _multiply(weight, bias, x, y, mask, ending):  # type: ignore[no-untyped-def]
+    """``y = weight @ x + bias`` in blocks, with an ending of `product_block`."""
+    rows, length = weight.shape
+    whole = rows - rows % ROWS
     for n in range(0, TILE, LANES):
-        for k in range(0, whole, ROWS):
-            if relu:
-                _masked(weight_t, bias, grad, grad_x, mask, k, n, length, TILE)
+        for j in range(0, whole, ROWS):
+            if ending == _RECTIFIED:
+                _rectified(weight, bias, x, y, mask, j, n, length, TILE)
+            elif ending == _MASKED:
+                _masked(weight, bias, x, y, mask, j, n, length, TILE)
             else:
-                _product(weight_t, bias, grad, grad_x, mask, k, n, length, TILE)
-        for k in range(whole, rows, 2):
-            if relu:
-                _masked_pair(weight_t, bias, grad, grad_x, mask, k, n, length, TILE)
+                _product(weight, bias, x, y, mask, j, n, length, TILE)
+        for j in range(whole, rows, 2):
+            if ending == _RECTIFIED:
+                _rectified_pair(weight, bias, x, y, mask, j, n, length, TILE)
+            elif ending == _MASKED:
+                _masked_pair(weight, bias, x, y, mask, j, n, length, TILE)
             else:
-                _product_pair(weight_t, bias, grad, grad_x, mask, k, n, length, TILE)
+                _product_pair(weight, bias, x, y, mask, j, n, length, TILE)
 
 
 @njit(**KERNEL_OPTIONS)
