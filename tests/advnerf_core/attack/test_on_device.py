@@ -7,7 +7,6 @@ import dataclasses
 
 import pytest
 import torch
-from numba import config
 
 from advnerf_core.attack.adjoint import adjoint_gradient
 from advnerf_core.attack.device import use_device
@@ -23,28 +22,12 @@ from advnerf_core.attack.robustness import Disturbances
 from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.search.together import gradient_attacks
 from advnerf_core.errors import DeviceError
-from advnerf_core.scene.accelerator import Accelerator
 from advnerf_core.scene.surrogate import Surrogate
+from tests.support.accelerators import SIMULATED, WAYS
 from tests.support.attack_toy import MOUNT, VIEW, painted_room, toy_problem
 from tests.support.placed_toy import Leaning, moving
 
-here_only = pytest.mark.skipif(
-    torch.cuda.is_available() or bool(config.ENABLE_CUDASIM), reason="there is a device"
-)
-SIMULATED = bool(config.ENABLE_CUDASIM)
-there_only = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(
-        not (torch.cuda.is_available() or SIMULATED),
-        reason="needs a CUDA device, or NUMBA_ENABLE_CUDASIM=1",
-    ),
-]
-CPU, GPU = torch.device("cpu"), torch.device("cuda")
-WAYS = [
-    pytest.param(Accelerator(CPU), id="torch, CPU"),
-    pytest.param(Accelerator(CPU if SIMULATED else GPU, compiled=True), id="numba-cuda", marks=there_only),
-    *([] if SIMULATED else [pytest.param(Accelerator(GPU), id="torch, GPU", marks=there_only)]),
-]
+here_only = pytest.mark.skipif(torch.cuda.is_available() or SIMULATED, reason="there is a device")
 every_way = pytest.mark.parametrize("way", WAYS)
 # As few pixels as the policy can look at, in the simulator: it starts a thread of Python for each.
 LENS = VIEW.resized(18, 6) if SIMULATED else VIEW.resized(33, 11)

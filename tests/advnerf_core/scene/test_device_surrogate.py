@@ -17,7 +17,6 @@ from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object
 from advnerf_core.geometry import Pinhole, camera_mount, make_transform, rotation_z
 from advnerf_core.render.cast_cuda_kernels import MOST_OBJECTS
 from advnerf_core.render.march import MarchConfig
-from advnerf_core.scene.accelerator import Accelerator
 from advnerf_core.scene.bake import bake
 from advnerf_core.scene.colour import ColourMap
 from advnerf_core.scene.device_surrogate import DeviceSurrogate, background_on
@@ -27,22 +26,8 @@ from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.surrogate import Surrogate
 from advnerf_core.scene.train import Trainer
 from tests.advnerf_core.scene.test_scene_field import FIELD, TRAIN
+from tests.support.accelerators import WAYS
 from tests.support.colour_room import CAMERA, room_images, room_poses
-
-CPU, GPU = torch.device("cpu"), torch.device("cuda")
-SIMULATED = bool(config.ENABLE_CUDASIM)
-with_gpu = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(
-        not (torch.cuda.is_available() or SIMULATED),
-        reason="needs a CUDA device, or NUMBA_ENABLE_CUDASIM=1",
-    ),
-]
-WAYS = [
-    pytest.param(Accelerator(CPU), id="torch, CPU"),
-    pytest.param(Accelerator(CPU if SIMULATED else GPU, compiled=True), id="numba-cuda", marks=with_gpu),
-    *([] if SIMULATED else [pytest.param(Accelerator(GPU), id="torch, GPU", marks=with_gpu)]),
-]
 
 
 @pytest.fixture(params=WAYS)
