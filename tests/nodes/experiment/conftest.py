@@ -1,4 +1,4 @@
-import pickle
+import json
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -84,11 +84,13 @@ def tiny_room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str,
         if folder is not None:
             with recording() as reads:
                 found = measured(folder / "run", reads)
-            (folder / "found.pickle").write_bytes(pickle.dumps((found, reads.of)))
+            listed = {stage: sorted(names) for stage, names in reads.of.items()}
+            (folder / "found.json").write_text(json.dumps([found, listed]))
     # Each worker has a copy, as tests write into it.
     own = tmp_path_factory.mktemp("room") / "run"
     shutil.copytree(made / "run", own)
-    return (own, *pickle.loads((made / "found.pickle").read_bytes()))
+    found, listed = json.loads((made / "found.json").read_text())
+    return own, found, {stage: set(names) for stage, names in listed.items()}
 
 
 @dataclass
