@@ -40,11 +40,11 @@ def demo(
 ) -> None:
     """Run the whole experiment in its small setting on the simulated lab, from the photographs to the report (four to twelve minutes on 2 cores)."""
     os.environ.setdefault("MUJOCO_GL", "egl")
-    from nodes.lab.recorded_victim import RecordedDrive
+    from nodes.lab.recorded_victim import FirstPicture
     from nodes.runtime.termination import ends_in_order
 
     # It is on its way while this process imports what searches need.
-    with ends_in_order(), RecordedDrive(folder, _say) if recorded else nullcontext():
+    with ends_in_order(), FirstPicture(folder, _say) if recorded else nullcontext():
         _run(folder, _page_port() if page else None)
 
 

@@ -68,7 +68,7 @@ def recorded_state(run_folder: Path) -> dict[str, Any] | None:
         return None
 
 
-class RecordedDrive:
+class FirstPicture:
     """Drives the recorded victim in a process of its own. Leaving the context ends it.
 
     Args:
@@ -80,7 +80,7 @@ class RecordedDrive:
         self._folder, self._say = run_folder / FOLDER, say
         self._process: subprocess.Popen[str] | None = None
 
-    def __enter__(self) -> RecordedDrive:
+    def __enter__(self) -> FirstPicture:
         if film := next(self._folder.glob(f"{FILM}.*"), None):
             self._say(f"{LABEL} Film of an earlier start: {film}")
             return self

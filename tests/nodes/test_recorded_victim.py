@@ -14,7 +14,7 @@ from nodes.lab.recorded_victim import (
     LABEL,
     MISSING,
     NOW,
-    RecordedDrive,
+    FirstPicture,
     find_recorded,
     recorded_state,
 )
@@ -34,7 +34,7 @@ def test_an_installation_without_one_says_so_in_a_line(tmp_path, monkeypatch):
     said = []
     assert find_recorded(tmp_path) is None
     monkeypatch.setattr("nodes.lab.recorded_victim.find_recorded", lambda: None)
-    with RecordedDrive(tmp_path, said.append) as drive:
+    with FirstPicture(tmp_path, said.append) as drive:
         assert drive.wait(0.0) is None
     assert said == [MISSING]
     assert recorded_state(tmp_path) is None
@@ -61,7 +61,7 @@ def test_a_drive_that_does_not_count_live_is_driven_in_the_lab_and_labelled(tmp_
     assert "In the simulated lab" in state["text"]
     # A second start of the experiment drives nothing again.
     again = []
-    with RecordedDrive(tmp_path, again.append) as drive:
+    with FirstPicture(tmp_path, again.append) as drive:
         assert drive.wait(0.0) is None
     assert again == [f"{LABEL} Film of an earlier start: {film}"]
 
@@ -70,7 +70,7 @@ def test_a_drive_that_does_not_count_live_is_driven_in_the_lab_and_labelled(tmp_
 @pytest.mark.live
 def test_the_first_picture_and_the_film_come_beside_an_experiment(tmp_path):
     said = []
-    with RecordedDrive(tmp_path, said.append) as drive:
+    with FirstPicture(tmp_path, said.append) as drive:
         assert drive.wait(600.0) == 0
     (film,) = (tmp_path / FOLDER).glob("clip.*")
     assert film.stat().st_size > 10_000
