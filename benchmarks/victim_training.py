@@ -20,7 +20,7 @@ from typing import Any
 import torch
 
 from advnerf_core.documents import parse_json, read_json
-from advnerf_core.learning.precision import training_type
+from advnerf_core.policies.number_type import layer_type
 from advnerf_core.policies.policy_file import load_policy
 from benchmarks import train_victims
 from benchmarks.results import record_row
@@ -136,7 +136,7 @@ def _text(found: dict[str, Any]) -> str:
 
 
 def _type_text(number_type: str | None) -> str:
-    return f"numbers: {number_type or str(training_type()).removeprefix('torch.')}"
+    return f"numbers: {number_type or str(layer_type()).removeprefix('torch.')}"
 
 
 def _suffix(number_type: str | None) -> str:

@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Pinhole
-from advnerf_core.learning.precision import training_type
+from advnerf_core.policies.number_type import layer_type
 
 LEAST_COSINE = 0.9999
 """Least cosine of a gradient in bfloat16 with the one in float32."""
@@ -59,7 +59,7 @@ def agrees_in_bfloat16(policy: Any, camera: Pinhole, goal_size: int = 0) -> bool
     network = isinstance(policy, torch.nn.Module) and {each.dtype for each in policy.parameters()} == {
         torch.float32
     }
-    if not (network and policy.stateless and training_type() == torch.bfloat16):
+    if not (network and policy.stateless and layer_type() == torch.bfloat16):
         return False
     decided = _decided.setdefault(policy, {})
     if camera not in decided:

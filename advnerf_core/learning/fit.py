@@ -25,11 +25,11 @@ from advnerf_core.adam import Adam
 from advnerf_core.files import with_sorted_header, write_atomically
 from advnerf_core.learning.augment import AugmentConfig, Changes
 from advnerf_core.learning.frames import Batch, FrameSet, FrameStoreError
-from advnerf_core.learning.precision import training_type
 from advnerf_core.memory import freed_blocks_kept
 from advnerf_core.parallel import run_slots, slot_bounds
 from advnerf_core.places import open_tensors
 from advnerf_core.policies.network import SteeringNetwork, images_to_tensor
+from advnerf_core.policies.number_type import layer_type
 
 EVALUATION_BATCH = 128
 _PARTS = 2  # of a batch: smaller ones cost more than a third and fourth core would save
@@ -76,7 +76,7 @@ def fit(
         checkpoint: File to continue from and to write every ``checkpoint_every`` steps and at the end.
         report: Called with the step and the running mean square error [rad^2].
         number_type: float32 or bfloat16, of the layers of a network with ``rows_independent``; None for the machine's
-            (`training_type`). Other networks are trained in float32.
+            (`layer_type`). Other networks are trained in float32.
     """
     if len(frames.training) == 0:
         raise FrameStoreError(
@@ -85,7 +85,7 @@ def fit(
     policy.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     done, moments = (0, {}) if checkpoint is None else _resume(checkpoint, policy, config)
     optimiser = Adam(dict(policy.named_parameters()), moments, config.weight_decay, fused=True)
-    gradients = Gradients(policy, config, number_type or training_type())
+    gradients = Gradients(policy, config, number_type or layer_type())
     policy.train()
     running = 0.0
     with freed_blocks_kept():

@@ -6,7 +6,7 @@ from torch.nn.functional import cosine_similarity
 
 from advnerf_core.attack.image_gradients import LEAST_COSINE, agrees_in_bfloat16, image_gradients
 from advnerf_core.geometry import Pinhole
-from advnerf_core.learning.precision import training_type
+from advnerf_core.policies.number_type import layer_type
 from advnerf_core.policies.pilotnet import PilotNet
 
 CAMERA = Pinhole(200, 66, 100.0, 100.0, 100.0, 33.0)
@@ -53,7 +53,7 @@ def test_in_bfloat16_the_direction_stays():
 
 
 def test_only_a_network_whose_direction_stays_is_computed_in_bfloat16():
-    multiplies = training_type() == torch.bfloat16
+    multiplies = layer_type() == torch.bfloat16
     assert agrees_in_bfloat16(network(), CAMERA) == multiplies
     assert not agrees_in_bfloat16(network().double(), CAMERA)
     assert not agrees_in_bfloat16(Brittle().eval(), CAMERA)

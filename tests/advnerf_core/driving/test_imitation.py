@@ -19,11 +19,11 @@ from advnerf_core.learning.augment import Changes
 from advnerf_core.learning.fit import FitConfig, Gradients, fit, mean_absolute_error
 from advnerf_core.learning.frames import Frames, FrameSet, FrameStore, FrameStoreError
 from advnerf_core.learning.imitation import train_policy
-from advnerf_core.learning.precision import training_type
 from advnerf_core.learning.recipe import ImitationConfig, SourcePlan, recovery_states
 from advnerf_core.learning.sources import RenderedSource, SceneSource, steer_with
 from advnerf_core.parallel import set_thread_count
 from advnerf_core.policies.architecture import Architecture
+from advnerf_core.policies.number_type import layer_type
 from advnerf_core.policies.pilotnet import PilotNet
 from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.policies.view import PolicyView
@@ -289,8 +289,8 @@ def test_the_machine_says_which_number_type_it_multiplies(tmp_path: Path) -> Non
     ):
         processor = tmp_path / flags.replace(" ", "_")
         processor.write_text(f"model name\t: A\nflags\t\t: {flags}\n\nflags\t\t: other\n")
-        assert training_type(processor) == expected
-    assert training_type(tmp_path / "absent") == torch.float32
+        assert layer_type(processor) == expected
+    assert layer_type(tmp_path / "absent") == torch.float32
 
 
 @pytest.mark.slow
