@@ -20,7 +20,7 @@ from advnerf_core.attack.adjoint import adjoint_gradient
 from advnerf_core.attack.device import use_device
 from advnerf_core.attack.on_device import on_chosen_device
 from advnerf_core.attack.problem import AttackProblem
-from advnerf_core.scene.agreement import search_accelerator
+from advnerf_core.scene.agreement import search_device
 from advnerf_core.scene.surrogate import Surrogate
 from benchmarks.results import record_row
 from benchmarks.ticks import hydrants
@@ -62,8 +62,8 @@ def main() -> None:
     space = face_space(experiment, background)
     here = replace(attack_problem(experiment, space, policy, scenario, 0), sensor=surrogate, steps=_STEPS)
     there, theta = on_chosen_device(here), surrogate.plain_theta()
-    accelerator = search_accelerator()
-    name = f"{torch.cuda.get_device_name()} refused" if accelerator is None else accelerator.name
+    device = search_device()
+    name = torch.cuda.get_device_name() + " refused" * (device is None)
     path = experiment.paths[scenario]
     states = torch.tensor(np.array([path.pose_at(float(s)) for s in np.linspace(0.0, 3.0, 32)]))
     for count in _DRIVES:

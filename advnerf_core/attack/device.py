@@ -35,7 +35,6 @@ def use_device(device: str | None) -> None:
         os.environ[VARIABLE] = device
     if searches_on_gpu():
         # Imported here: torch takes two seconds to load, and may be absent.
-        from advnerf_core.scene.accelerator import gpu, is_simulated
+        from advnerf_core.scene.device import gpu
 
-        if not is_simulated():
-            gpu()
+        gpu()

@@ -15,7 +15,7 @@ from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.attack.spaces.placed_sensor import PlacedSensor
 from advnerf_core.errors import DeviceError
-from advnerf_core.scene.accelerator import Accelerator, use_exact_arithmetic
+from advnerf_core.scene.device import device_name, use_exact_arithmetic
 from advnerf_core.scene.device_surrogate import DeviceSurrogate
 from advnerf_core.scene.surrogate import Surrogate
 
@@ -26,11 +26,11 @@ def on_chosen_device(problem: AttackProblem) -> AttackProblem:
     Raises:
         DeviceError: There is no GPU, or it cannot render the searched objects.
     """
-    accelerator = _chosen()
-    return problem if accelerator is None else on_device(problem, accelerator)
+    device = _chosen()
+    return problem if device is None else on_device(problem, device)
 
 
-def on_device(problem: AttackProblem, accelerator: Accelerator) -> AttackProblem:
+def on_device(problem: AttackProblem, device: torch.device) -> AttackProblem:
     """The problem with its sensor and its policy on a device.
 
     Raises:
@@ -38,27 +38,27 @@ def on_device(problem: AttackProblem, accelerator: Accelerator) -> AttackProblem
     """
     sensor = problem.sensor
     there = (
-        replace(sensor, sensor=sensor_on(sensor.sensor, accelerator))
+        replace(sensor, sensor=sensor_on(sensor.sensor, device))
         if isinstance(sensor, DisplayedSensor)
-        else sensor_on(sensor, accelerator)
+        else sensor_on(sensor, device)
     )
-    return replace(problem, sensor=there, policy=PolicyThere(problem.policy, accelerator.device))
+    return replace(problem, sensor=there, policy=PolicyThere(problem.policy, device))
 
 
-def sensor_on(sensor: Any, accelerator: Accelerator) -> DeviceSurrogate | PlacedSensor:
+def sensor_on(sensor: Any, device: torch.device) -> DeviceSurrogate | PlacedSensor:
     """A sensor on a device.
 
     Raises:
         DeviceError: The sensor is neither a surrogate nor places objects, or has objects that a GPU cannot draw.
     """
     if isinstance(sensor, PlacedSensor):
-        return sensor.on(accelerator)
+        return sensor.on(device)
     if not isinstance(sensor, Surrogate):
         raise DeviceError(
             f"expected a search for colours or places of objects on a GPU, got the sensor {type(sensor).__name__}; "
             "leave --device out to search on the processor"
         )
-    return DeviceSurrogate(sensor, accelerator)
+    return DeviceSurrogate(sensor, device)
 
 
 def all_on_chosen_device(problems: Sequence[AttackProblem]) -> list[AttackProblem]:
@@ -69,17 +69,17 @@ def all_on_chosen_device(problems: Sequence[AttackProblem]) -> list[AttackProble
 
 def said_of_device() -> dict[str, str]:
     """Device metadata for an attack file: empty on the CPU."""
-    accelerator = _chosen()
-    return {} if accelerator is None else {"device": accelerator.name}
+    device = _chosen()
+    return {} if device is None else {"device": device_name(device)}
 
 
-def _chosen() -> Accelerator | None:
+def _chosen() -> torch.device | None:
     if not searches_on_gpu():
         return None
     # Imported here, as it loads every part that it checks.
-    from advnerf_core.scene.agreement import search_accelerator
+    from advnerf_core.scene.agreement import search_device
 
-    return search_accelerator()
+    return search_device()
 
 
 class PolicyThere:

@@ -201,7 +201,7 @@ def pixel_parts(
 
 
 class TorchObjects:
-    """Objects at fixed places; a drop-in for `CudaObjects` on any device.
+    """Objects at fixed places, drawn and differentiated on any device.
 
     Args:
         objects: At least one, all voxel grids.
@@ -228,7 +228,18 @@ class TorchObjects:
 
     def draw(self, places: tuple[Tensor, Tensor], colours: Tensor, texture_of: Tensor, behind_m: Tensor,
              image: Tensor) -> Tensor:  # fmt: skip
-        """Draw into an image; arguments and result as in `CudaObjects.draw`."""
+        """Draw into ``image [B, 3, H, W]``, a background of planar depth ``behind_m [B, H, W]``.
+
+        Args:
+            places: From `placed`.
+            colours: All objects' colour vectors in their order, for each texture ``[N, V, 3]``.
+            texture_of: Index of each image's texture ``[B]`` int32.
+            behind_m: Planar depth of the background ``[B, H, W]`` [m].
+            image: Background, which is drawn into.
+
+        Returns:
+            Share of each object in each pixel ``[K, B, H, W]``.
+        """
         count, area = len(self._grids), behind_m[0].numel()
         layers = torch.zeros(count, behind_m.numel(), 5, dtype=torch.float64, device=self.device)
         v, u = (torch.arange(n, device=self.device) for n in behind_m.shape[1:])
@@ -253,7 +264,7 @@ class TorchObjects:
 
     def pull(self, places: tuple[Tensor, Tensor], colours: Tensor, texture_of: Tensor, shares: Tensor,
              slopes: Tensor) -> Tensor:  # fmt: skip
-        """Gradient with respect to colours; arguments and result as in `CudaObjects.pull`."""
+        """Gradient with respect to ``colours [N, V, 3]`` from one with respect to the images ``[B, 3, H, W]``; the same bits every time."""
         return sum_of_slopes(slopes, partial(self._pull, places[0], colours, texture_of, shares))
 
     def _pull(self, frames: Tensor, colours: Tensor, texture_of: Tensor, shares: Tensor, slopes: Tensor,

@@ -1,6 +1,6 @@
-"""The choice of what computes: numba-cuda kernels on a GPU, plain torch on it, or the processor. This is the only place that chooses.
+"""The choice of what computes: plain torch on a GPU, or the processor's kernels. This is the only place that chooses.
 
-A way is used if it gives the processor's numbers for ten rays and one gradient of each part, on a small scene with fixed random values.
+A GPU is used if it gives the processor's numbers for ten rays and one gradient of each part, on a small scene with fixed random values.
 A difference is relative to the largest value. Of a thousand values one may differ more: a sample at the edge of a cell falls to either side.
 """
 
@@ -24,8 +24,8 @@ from advnerf_core.geometry import Pinhole, make_transform, rotation_z
 from advnerf_core.render.march import MarchConfig, Marcher
 from advnerf_core.render.occupancy import leap_distances
 from advnerf_core.render.soft_pose import placement_of, soft_layer
-from advnerf_core.scene.accelerator import Accelerator, gpu, use_exact_arithmetic, ways
 from advnerf_core.scene.baked import BakedScene, Voxels
+from advnerf_core.scene.device import device_name, gpu, use_exact_arithmetic
 from advnerf_core.scene.device_surrogate import DeviceSurrogate, background_on
 from advnerf_core.scene.field import SceneField, SceneFieldConfig
 from advnerf_core.scene.render_field import FieldRenderer
@@ -82,12 +82,12 @@ def _random(seed: int, *shape: int) -> Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
 
 
-def _encoding(way: Accelerator | None, lens: Pinhole) -> Run:
+def _encoding(device: torch.device | None, lens: Pinhole) -> Run:
     grid = HashGrid(_FIELD.grid, torch.Generator().manual_seed(1))
     points = _random(2, lens.width * lens.height, 3).sigmoid()
-    if way is None:
+    if device is None:
         return lambda: {"features": grid(points)}
-    table, there = grid.table.to(way.device), points.to(way.device)
+    table, there = grid.table.to(device), points.to(device)
     return lambda: {"features": encode_reference(there, table, grid.levels)}
 
 
@@ -103,22 +103,22 @@ def _leaps() -> Any:
     return leap_distances(_random(4, 16, 16, 16).numpy() > 0.3, np.full(3, 16.0, np.float32))
 
 
-def _background(way: Accelerator | None, lens: Pinhole, here: Any) -> Run:
-    render = here if way is None else background_on(way, here)
+def _background(device: torch.device | None, lens: Pinhole, here: Any) -> Run:
+    render = here if device is None else background_on(device, here)
     return lambda: dict(zip(("colours", "depths"), render(_CAMERA[None], lens)[:2], strict=True))
 
 
-def _field(way: Accelerator | None, lens: Pinhole) -> Run:
-    return _background(way, lens, FieldRenderer(_some_field(), _leaps().distance == 0, _MARCH))
+def _field(device: torch.device | None, lens: Pinhole) -> Run:
+    return _background(device, lens, FieldRenderer(_some_field(), _leaps().distance == 0, _MARCH))
 
 
-def _baked(way: Accelerator | None, lens: Pinhole) -> Run:
+def _baked(device: torch.device | None, lens: Pinhole) -> Run:
     leaps, rng = _leaps(), np.random.default_rng(5)
     bricks = np.full((16, 16, 16), -1, np.int32)
     bricks[8, 4:12, 4:12] = 17**3 + 27 * np.arange(64).reshape(8, 8)
     values = rng.integers(60, 130, (17**3 + 27 * 64, 4)).astype(np.uint8)
     voxels = Voxels(values, bricks, (bricks >= 0).astype(np.uint8), rng.random(3, np.float32))
-    return _background(way, lens, BakedScene(_FIELD, _MARCH, leaps, 5e-3, voxels))
+    return _background(device, lens, BakedScene(_FIELD, _MARCH, leaps, 5e-3, voxels))
 
 
 def _objects() -> list[Any]:
@@ -135,9 +135,9 @@ def _wall(poses: Any, lens: Pinhole) -> tuple[Tensor, Tensor]:
     return torch.full((*shape, 3), 0.4), torch.full(shape, 3.0)
 
 
-def _drawn(way: Accelerator | None, lens: Pinhole) -> Run:
+def _drawn(device: torch.device | None, lens: Pinhole) -> Run:
     here = Surrogate(_wall, lens, np.eye(4), _objects())
-    sensor = here if way is None else DeviceSurrogate(here, way)
+    sensor = here if device is None else DeviceSurrogate(here, device)
     theta, slopes = _random(6, *here.theta_shape), _random(7, 1, 3, lens.height, lens.width)
 
     def run() -> Values:
@@ -147,8 +147,8 @@ def _drawn(way: Accelerator | None, lens: Pinhole) -> Run:
     return run
 
 
-def _placed(way: Accelerator | None, lens: Pinhole) -> Run:
-    cloud, device = _objects()[0], None if way is None else way.device
+def _placed(device: torch.device | None, lens: Pinhole) -> Run:
+    cloud = _objects()[0]
     colours = _random(8, cloud.slot_count, 3).sigmoid().double().numpy()
 
     def run() -> Values:
@@ -160,7 +160,7 @@ def _placed(way: Accelerator | None, lens: Pinhole) -> Run:
     return run
 
 
-def _training(way: Accelerator | None, lens: Pinhole) -> Run:
+def _training(device: torch.device | None, lens: Pinhole) -> Run:
     count = lens.width * lens.height
     directions = torch.nn.functional.normalize(_random(9, count, 3), dim=1) / _FIELD.extent_m
     rays = torch.cat([_random(10, count, 3).sigmoid(), directions], 1).numpy()
@@ -168,7 +168,7 @@ def _training(way: Accelerator | None, lens: Pinhole) -> Run:
     targets = np.random.default_rng(11).integers(0, 256, (len(kept), 3)).astype(np.uint8)
 
     def run() -> Values:
-        step = CpuStep(_some_field()) if way is None else TorchStep(_some_field().to(way.device))
+        step = CpuStep(_some_field()) if device is None else TorchStep(_some_field().to(device))
         loss = step.step(rays[kept], targets, samples).loss
         grads = {name: torch.as_tensor(grad) for name, grad in step.grads.items()}
         return {"loss": torch.tensor([loss]), **grads}
@@ -176,12 +176,9 @@ def _training(way: Accelerator | None, lens: Pinhole) -> Run:
     return run
 
 
-def _policy(way: Accelerator | None, lens: Pinhole) -> Run:
-    device = torch.device("cpu") if way is None else way.device
-    weights, images = (
-        _random(12, 4, 3, 2, 2).to(device),
-        _random(13, 4, 3, lens.height, lens.width).to(device),
-    )
+def _policy(device: torch.device | None, lens: Pinhole) -> Run:
+    weights = _random(12, 4, 3, 2, 2).to(device or "cpu")
+    images = _random(13, 4, 3, lens.height, lens.width).to(device or "cpu")
 
     def run() -> Values:
         with torch.enable_grad():
@@ -193,7 +190,7 @@ def _policy(way: Accelerator | None, lens: Pinhole) -> Run:
 
 
 # Sums of single precision in other orders, and in a training step the samples whose weight is at the threshold of what counts.
-_PARTS: dict[str, tuple[Callable[[Accelerator | None, Pinhole], Run], float]] = {
+_PARTS: dict[str, tuple[Callable[[torch.device | None, Pinhole], Run], float]] = {
     "hash encoding": (_encoding, 1e-5),
     "field": (_field, 1e-3),
     "baked scene": (_baked, 1e-3),
@@ -205,18 +202,16 @@ _PARTS: dict[str, tuple[Callable[[Accelerator | None, Pinhole], Run], float]] = 
 PARTS = tuple(_PARTS)
 TRAINING_PARTS = ("hash encoding", "training step")
 SEARCH_PARTS = tuple(part for part in PARTS if part != "training step")
-COMPILED_PARTS = ("baked scene", "objects and colours")
-"""What numba-cuda computes; the other parts are plain torch in any case."""
 
 
 @torch.no_grad()
-def compare(part: str, way: Accelerator, lens: Pinhole = TEN_RAYS) -> Comparison:
+def compare(part: str, device: torch.device, lens: Pinhole = TEN_RAYS) -> Comparison:
     """Run a part on a device and on the processor, twice each: the second run is timed."""
     make, tolerance = _PARTS[part]
     use_exact_arithmetic()
     try:
         with torch.random.fork_rng(devices=[]):  # what follows must not depend on this check
-            theirs, seconds = _timed(make(way, lens))
+            theirs, seconds = _timed(make(device, lens))
             ours, processor_seconds = _timed(make(None, lens))
     except Exception as error:  # whatever a driver, a compiler or a library raises
         trouble = f"{type(error).__name__}: {' '.join(str(error).split())}"
@@ -225,10 +220,10 @@ def compare(part: str, way: Accelerator, lens: Pinhole = TEN_RAYS) -> Comparison
     return Comparison(part, difference, tolerance, seconds, processor_seconds)
 
 
-def disagreement(way: Accelerator, parts: Sequence[str]) -> str:
+def disagreement(device: torch.device, parts: Sequence[str]) -> str:
     """Why a device is not used, in words; empty if all parts give the processor's numbers."""
     for part in parts:
-        found = compare(part, way)
+        found = compare(part, device)
         if found.trouble:
             return f"{part} failed, {found.trouble}"
         if not found.agrees:
@@ -237,42 +232,29 @@ def disagreement(way: Accelerator, parts: Sequence[str]) -> str:
 
 
 @functools.cache
-def search_accelerator() -> Accelerator | None:
-    """What searches on a GPU use in this process; None is the processor, as no way gives its numbers.
+def search_device() -> torch.device | None:
+    """The GPU that searches use in this process; None is the processor, as the GPU does not give its numbers.
 
     Raises:
         DeviceError: There is no GPU.
     """
-    return first_that_agrees(ways())
+    return gpu() if is_right(gpu()) else None
 
 
 @functools.cache
 def training_device() -> torch.device:
     """Where scenes are trained in this process: a GPU, if there is one and its training step gives the processor's numbers."""
-    if not torch.cuda.is_available():
-        return torch.device("cpu")
-    agreed = first_that_agrees([Accelerator(gpu())], TRAINING_PARTS, quiet=True)
-    return torch.device("cpu") if agreed is None else agreed.device
+    there = torch.cuda.is_available() and is_right(gpu(), TRAINING_PARTS)
+    return gpu() if there else torch.device("cpu")
 
 
-def first_that_agrees(
-    candidates: Sequence[Accelerator], parts: Sequence[str] = SEARCH_PARTS, quiet: bool = False
-) -> Accelerator | None:
-    """The first candidate that gives the processor's numbers; prints one line for each that does not, and for plain torch.
-
-    Args:
-        parts: Names of the parts that must agree.
-        quiet: Print nothing if the first candidate agrees.
-    """
-    for candidate in candidates:
-        trouble = disagreement(candidate, parts)
-        if not trouble:
-            if not candidate.compiled and not quiet:
-                _print(f"computing with {candidate.name}; pip install 'advnerf[gpu]' adds compiled kernels")
-            return candidate
-        _print(f"not computing with {candidate.name}: {trouble}")
-    _print("computing with the processor; `advnerf doctor --gpu` prints a report to send us")
-    return None
+def is_right(device: torch.device, parts: Sequence[str] = SEARCH_PARTS) -> bool:
+    """Whether a device gives the processor's numbers for the named parts; if not, it prints why."""
+    trouble = disagreement(device, parts)
+    if trouble:
+        _print(f"not computing with {device_name(device)}: {trouble}")
+        _print("computing with the processor; `advnerf doctor --gpu` prints a report to send us")
+    return not trouble
 
 
 def _print(line: str) -> None:

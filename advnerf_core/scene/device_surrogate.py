@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -19,14 +18,10 @@ from advnerf_core.errors import DeviceError
 from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.geometry import Array
 from advnerf_core.render.cast_torch import TorchObjects
-from advnerf_core.scene.accelerator import Accelerator
 from advnerf_core.scene.baked import BakedScene
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.surrogate import BackgroundRenderer, Rendered, Surrogate, split_theta
 from advnerf_core.scene.torch_background import TorchBaked, TorchField
-
-if TYPE_CHECKING:
-    from advnerf_core.render.cast_cuda import CudaObjects
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +55,7 @@ class DeviceFrames:
         surrogate: The surrogate that renders them.
         background: Background ``[B, 3, H, W]`` on the device.
         depth_m: Planar depth of the background ``[B, H, W]`` [m].
-        places: Places of the objects, from `CudaObjects.placed`; None without objects.
+        places: Places of the objects, from `TorchObjects.placed`; None without objects.
     """
 
     surrogate: DeviceSurrogate
@@ -102,13 +97,13 @@ class DeviceSurrogate:
 
     Args:
         surrogate: The scene with its objects, all voxel grids.
-        accelerator: The device.
+        device: Where it computes.
 
     Raises:
-        DeviceError: The objects are not all voxel grids, too many for numba-cuda, or composed opaque.
+        DeviceError: The objects are not all voxel grids, or composed opaque.
     """
 
-    def __init__(self, surrogate: Surrogate, accelerator: Accelerator) -> None:
+    def __init__(self, surrogate: Surrogate, device: torch.device) -> None:
         if surrogate.opaque:
             raise DeviceError(
                 "expected a surrogate that blends on a GPU, got one that composes opaque pixels as a deployment does"
@@ -118,9 +113,20 @@ class DeviceSurrogate:
             None  # number of textures at once; None is one, with theta of the surrogate's own shape
         )
         self.starts = 1
-        self.device = accelerator.device
-        self.drawn = _drawn(surrogate, accelerator) if surrogate.objects else None
-        self._background = background_on(accelerator, surrogate.background)
+        self.device = device
+        self.drawn = (
+            TorchObjects(
+                surrogate.objects,
+                surrogate.camera,
+                surrogate.supersample,
+                surrogate.dtype,
+                surrogate.depth_tolerance_m,
+                device,
+            )
+            if surrogate.objects
+            else None
+        )
+        self._background = background_on(device, surrogate.background)
         self._textures: _Textures | None = None
 
     def many(self, count: int, starts: int) -> DeviceSurrogate:
@@ -203,31 +209,10 @@ class DeviceSurrogate:
         )
 
 
-def _drawn(surrogate: Surrogate, accelerator: Accelerator) -> TorchObjects | CudaObjects:
-    given = (
-        surrogate.objects,
-        surrogate.camera,
-        surrogate.supersample,
-        surrogate.dtype,
-        surrogate.depth_tolerance_m,
-    )
-    if accelerator.compiled:
-        from advnerf_core.render.cast_cuda import (
-            CudaObjects,
-        )  # here, as numba's compiler of GPU kernels may be absent
-
-        return CudaObjects(*given, accelerator.device)
-    return TorchObjects(*given, accelerator.device)
-
-
-def background_on(accelerator: Accelerator, background: BackgroundRenderer) -> BackgroundRenderer:
+def background_on(device: torch.device, background: BackgroundRenderer) -> BackgroundRenderer:
     """A renderer of backgrounds on a device; one that no device can render stays on the CPU."""
-    if isinstance(background, BakedScene) and accelerator.compiled:
-        from advnerf_core.scene.baked_cuda import CudaBaked
-
-        return CudaBaked(background, accelerator.device).render
     if isinstance(background, BakedScene):
-        return TorchBaked(background, accelerator.device)
+        return TorchBaked(background, device)
     if isinstance(background, FieldRenderer) and not background.config.contraction:
-        return TorchField(background, accelerator.device)
+        return TorchField(background, device)
     return background

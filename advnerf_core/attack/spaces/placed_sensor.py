@@ -20,7 +20,6 @@ from advnerf_core.fields.soft_edges import with_soft_edges
 from advnerf_core.geometry import Array
 from advnerf_core.render.composite import visible_shares
 from advnerf_core.render.soft_pose import SoftLayer, soft_layer
-from advnerf_core.scene.accelerator import Accelerator
 from advnerf_core.scene.device_surrogate import background_on
 from advnerf_core.scene.surrogate import Rendered, Surrogate, split_theta
 
@@ -75,13 +74,11 @@ class PlacedSensor:
         self._last: tuple[Tensor, int, _Parts] | None = None
         self._device: torch.device | None = None
 
-    def on(self, accelerator: Accelerator) -> PlacedSensor:
+    def on(self, device: torch.device) -> PlacedSensor:
         """The same, with background and objects computed on a device, in plain torch; images and gradients are on the CPU."""
         other = copy.copy(self)
-        other._device = accelerator.device
-        other.surrogate = self.surrogate.with_background(
-            background_on(accelerator, self.surrogate.background)
-        )
+        other._device = device
+        other.surrogate = self.surrogate.with_background(background_on(device, self.surrogate.background))
         return other
 
     @property

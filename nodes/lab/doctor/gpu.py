@@ -13,7 +13,7 @@ from nodes.lab.doctor import graphics
 from nodes.lab.doctor.check import ProbeResult, in_child
 from nodes.runtime.machine import processor_name
 
-_LIMIT_S = 300.0  # numba-cuda compiles its kernels
+_LIMIT_S = 300.0  # the processor's kernels may have to be compiled first
 _SMI_S = 10.0
 
 
@@ -40,17 +40,12 @@ class GpuReport:
         yield "```"
         yield f"advnerf {_version('advnerf')}, Python {platform.python_version()}, Linux {platform.release()}, {processor_name()}"
         build = f"{torch.data['version']}, CUDA {torch.data['built_for']}" if torch.data else torch.trouble
-        yield f"torch {build}, numba {_version('numba')}, numba-cuda {_version('numba-cuda')}"
+        yield f"torch {build}, numba {_version('numba')}"
         yield f"driver {_driver()}; GPUs: {', '.join(torch.data['gpus'] if torch.data else []) or 'none'}"
-        plain = in_child("gpu", self._device, False, timeout_s=_LIMIT_S)
-        yield from _table("plain torch", plain)
-        use = "plain torch" if _agrees(plain) else "the processor"
-        if self._device != "cpu" and _version("numba-cuda") != "absent":
-            compiled = in_child("gpu", self._device, True, timeout_s=_LIMIT_S)
-            yield from _table("numba-cuda", compiled)
-            use = "numba-cuda" if _agrees(compiled) else use
-        self.works = use != "the processor"
-        yield f"searches with --device cuda use {use}"
+        compared = in_child("gpu", self._device, timeout_s=_LIMIT_S)
+        yield from _table(compared)
+        self.works = _agrees(compared)
+        yield f"searches with --device cuda use {'the GPU' if self.works else 'the processor'}"
         yield "```"
 
 
@@ -78,11 +73,11 @@ def _agrees(answer: ProbeResult) -> bool:
     return bool(rows) and all(row["agrees"] for row in rows if row["part"] != "training step")
 
 
-def _table(title: str, answer: ProbeResult) -> Iterator[str]:
+def _table(answer: ProbeResult) -> Iterator[str]:
     if answer.data is None:
-        yield f"{title}: {answer.trouble}"
+        yield f"comparison failed: {answer.trouble}"
         return
-    yield f"{title} on {answer.data['device']}; ten rays, then a picture"
+    yield f"plain torch on {answer.data['device']}; ten rays, then a picture"
     yield f"{'part':20} {'difference':>10} {'tolerance':>9} {'device ms':>10} {'processor ms':>12}"
     yield from (_row(row) for row in answer.data["rows"])
 

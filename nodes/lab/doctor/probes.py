@@ -25,7 +25,7 @@ def torch() -> dict[str, Any]:
     return {"version": str(torch.__version__), "gpus": gpus, "built_for": torch.version.cuda}
 
 
-def gpu(device: str, compiled: bool) -> dict[str, Any]:
+def gpu(device_type: str) -> dict[str, Any]:
     """Name of a device, and each part of a search and of a training on it and on the processor, as `agreement.Comparison`."""
     from dataclasses import asdict
 
@@ -33,21 +33,16 @@ def gpu(device: str, compiled: bool) -> dict[str, Any]:
     import torch
 
     from advnerf_core.geometry import Pinhole
-    from advnerf_core.scene.accelerator import Accelerator
-    from advnerf_core.scene.agreement import COMPILED_PARTS, PARTS, TEN_RAYS, compare
+    from advnerf_core.scene.agreement import PARTS, TEN_RAYS, compare
 
-    way = Accelerator(torch.device(device), compiled)
-    name, camera = str(way.device), Pinhole(200, 66, 160.0, 160.0, 100.0, 33.0)
-    if way.device.type == "cuda":
-        there = torch.cuda.get_device_properties(way.device)
+    device = torch.device(device_type)
+    name, camera = str(device), Pinhole(200, 66, 160.0, 160.0, 100.0, 33.0)
+    if device.type == "cuda":
+        there = torch.cuda.get_device_properties(device)
         name = f"{there.name}, {there.total_memory / 2**30:.0f} GiB, compute capability {there.major}.{there.minor}"
     else:
         camera = camera.resized(50, 16)
-    found = [
-        compare(part, way, lens)
-        for part in (COMPILED_PARTS if compiled else PARTS)
-        for lens in (TEN_RAYS, camera)
-    ]
+    found = [compare(part, device, lens) for part in PARTS for lens in (TEN_RAYS, camera)]
     return {"device": name, "rows": [{**asdict(each), "agrees": each.agrees} for each in found]}
 
 

@@ -1,7 +1,4 @@
-"""Searches on a device against those on the processor: plain torch on the CPU and on a GPU, and numba-cuda.
-
-Numba's kernels run without a device in its simulator, see ``test_cuda_simulated``.
-"""
+"""Searches in plain torch, on the CPU and on a GPU, against those with the processor's kernels."""
 
 import dataclasses
 
@@ -23,14 +20,13 @@ from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.search.together import gradient_attacks
 from advnerf_core.errors import DeviceError
 from advnerf_core.scene.surrogate import Surrogate
-from tests.support.accelerators import SIMULATED, WAYS
 from tests.support.attack_toy import MOUNT, VIEW, painted_room, toy_problem
+from tests.support.devices import DEVICES
 from tests.support.placed_toy import Leaning, moving
 
-here_only = pytest.mark.skipif(torch.cuda.is_available() or SIMULATED, reason="there is a device")
-every_way = pytest.mark.parametrize("way", WAYS)
-# As few pixels as the policy can look at, in the simulator: it starts a thread of Python for each.
-LENS = VIEW.resized(18, 6) if SIMULATED else VIEW.resized(33, 11)
+here_only = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a device")
+every_device = pytest.mark.parametrize("device", DEVICES)
+LENS = VIEW.resized(33, 11)
 
 
 class Weighted(torch.nn.Module):
@@ -55,27 +51,27 @@ def small(policy=None, **changes):
     return dataclasses.replace(problem, sensor=surrogate, time_batch=2, **changes)
 
 
-@every_way
+@every_device
 @pytest.mark.parametrize(
     "changes",
     [{}, {"cache_bytes": 0}, {"disturbances": Disturbances(0.02, 0.1, 0.02, 0.01, 0.01, seed=3)}],
     ids=["plain", "rendered again", "disturbed"],
 )
-def test_loss_and_gradient_are_those_of_the_processor(way, changes):
+def test_loss_and_gradient_are_those_of_the_processor(device, changes):
     problem = small(**changes)
     theta = problem.sensor.initial_theta(torch.Generator().manual_seed(1))
-    ours, theirs = adjoint_gradient(problem, theta), adjoint_gradient(on_device(problem, way), theta)
+    ours, theirs = adjoint_gradient(problem, theta), adjoint_gradient(on_device(problem, device), theta)
     assert theirs.gradient.device == theta.device
     assert theirs.loss == pytest.approx(ours.loss, abs=1e-9)
     torch.testing.assert_close(theirs.gradient, ours.gradient, atol=1e-9, rtol=1e-7)
     assert float(ours.gradient.abs().max()) > 1e-6
 
 
-@every_way
-def test_searches_alone_and_together_end_where_those_of_the_processor_do(way):
+@every_device
+def test_searches_alone_and_together_end_where_those_of_the_processor_do(device):
     problem = small()
     wanted = gradient_attack(problem, 2, run=SearchRun(5))
-    there = on_device(problem, way)
+    there = on_device(problem, device)
     alone = gradient_attack(there, 2, run=SearchRun(5))
     together = gradient_attacks([there, there], [4, 5], 2)
     for found in (alone, together[1]):
@@ -83,23 +79,23 @@ def test_searches_alone_and_together_end_where_those_of_the_processor_do(way):
         assert found.best.predicted_total_cte_m == pytest.approx(wanted.best.predicted_total_cte_m, abs=1e-8)
 
 
-@every_way
-def test_a_search_for_places_has_the_gradient_of_the_processor(way):
+@every_device
+def test_a_search_for_places_has_the_gradient_of_the_processor(device):
     problem = moving(objects=2)
     theta = problem.sensor.initial_theta(torch.Generator().manual_seed(1))
-    ours, theirs = adjoint_gradient(problem, theta), adjoint_gradient(on_device(problem, way), theta)
+    ours, theirs = adjoint_gradient(problem, theta), adjoint_gradient(on_device(problem, device), theta)
     assert theirs.loss == pytest.approx(ours.loss, abs=1e-9)
     torch.testing.assert_close(theirs.gradient, ours.gradient, atol=1e-9, rtol=1e-7)
     assert float(ours.gradient[:8].abs().max()) > 1e-6
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not SIMULATED, reason="needs NUMBA_ENABLE_CUDASIM=1")
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_the_environment_chooses_the_device(monkeypatch):
     monkeypatch.setenv("ADVNERF_DEVICE", "cuda")
     first, second = all_on_chosen_device([small(), small()])
     assert first.sensor is second.sensor
-    assert said_of_device() == {"device": "cpu, numba-cuda"}
+    assert said_of_device() == {"device": torch.cuda.get_device_name()}
 
 
 def test_a_policy_without_weights_stays_where_it_is():

@@ -1,21 +1,16 @@
-"""The surrogate on a device against the one on the processor: plain torch on the CPU and on a GPU, and numba-cuda.
-
-Numba's kernels run without a device in its simulator, see ``test_cuda_simulated``.
-"""
+"""The surrogate in plain torch, on the CPU and on a GPU, against the processor's kernels."""
 
 import dataclasses
 
 import numpy as np
 import pytest
 import torch
-from numba import config
 
 from advnerf_core.attack.on_device import sensor_on
 from advnerf_core.errors import DeviceError
 from advnerf_core.fields.summed_levels import with_summed_levels
 from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object
 from advnerf_core.geometry import Pinhole, camera_mount, make_transform, rotation_z
-from advnerf_core.render.cast_cuda_kernels import MOST_OBJECTS
 from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.bake import bake
 from advnerf_core.scene.colour import ColourMap
@@ -26,19 +21,16 @@ from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.surrogate import Surrogate
 from advnerf_core.scene.train import Trainer
 from tests.advnerf_core.scene.test_scene_field import FIELD, TRAIN
-from tests.support.accelerators import WAYS
 from tests.support.colour_room import CAMERA, room_images, room_poses
+from tests.support.devices import DEVICES
 
 
-@pytest.fixture(params=WAYS)
-def way(request):
+@pytest.fixture(params=DEVICES)
+def device(request):
     return request.param
 
 
-# The simulator starts a thread of Python for every pixel: a tenth of the pixels see the same there.
 PINHOLE = Pinhole(20, 12, 13.0, 13.0, 10.0, 5.0)
-if config.ENABLE_CUDASIM:
-    PINHOLE = PINHOLE.resized(6, 4)
 HIGH, WIDE = PINHOLE.height, PINHOLE.width
 MOUNT = camera_mount(0.3, 0.0, 0.2, 0.17)
 STATES = torch.tensor([[0.0, 0.0, 0.0], [0.2, 0.1, 0.15]], dtype=torch.float64)
@@ -96,9 +88,9 @@ def noise(shape, seed=0, dtype=torch.float64):
     ("scene", "dtype", "close"),
     [*((scene, torch.float64, 1e-11) for scene in SCENES), (list(SCENES)[-1], torch.float32, 2e-6)],
 )
-def test_images_and_gradients_are_those_of_the_processor(scene, dtype, close, way):
+def test_images_and_gradients_are_those_of_the_processor(scene, dtype, close, device):
     here = surrogate(SCENES[scene](), dtype=dtype)
-    there, poses = DeviceSurrogate(here, way), here.camera_poses(STATES)
+    there, poses = DeviceSurrogate(here, device), here.camera_poses(STATES)
     theta, slopes = noise(here.theta_shape, dtype=dtype), noise((2, 3, HIGH, WIDE), 1, dtype)
     ours, theirs = here.render(poses, theta), there.render(poses, theta)
     assert float((ours.images - here.render(poses, theta + 1.0).images).abs().max()) > 0.05  # it is seen
@@ -109,8 +101,8 @@ def test_images_and_gradients_are_those_of_the_processor(scene, dtype, close, wa
     assert torch.equal(found, theirs.vjp(slopes.to(there.device)))  # whatever the order of the threads
 
 
-def test_the_gradient_is_that_of_finite_differences(way):
-    there = DeviceSurrogate(surrogate([cloud(1.6, 0.1), face()]), way)
+def test_the_gradient_is_that_of_finite_differences(device):
+    there = DeviceSurrogate(surrogate([cloud(1.6, 0.1), face()]), device)
     theta, direction, slopes = (
         noise(there.theta_shape),
         noise(there.theta_shape, 1),
@@ -124,9 +116,9 @@ def test_the_gradient_is_that_of_finite_differences(way):
     )
 
 
-def test_several_textures_are_shown_at_once(way):
+def test_several_textures_are_shown_at_once(device):
     here = surrogate([cloud(1.6, 0.1), face()])
-    many, there = ManyTextures(here, 2, 1), DeviceSurrogate(here, way).many(2, 1)
+    many, there = ManyTextures(here, 2, 1), DeviceSurrogate(here, device).many(2, 1)
     assert there.theta_shape == many.theta_shape
     drawn, again = (each.initial_theta(torch.Generator().manual_seed(3)) for each in (many, there))
     assert torch.equal(drawn, again)
@@ -138,9 +130,9 @@ def test_several_textures_are_shown_at_once(way):
         there.render(poses[:3], drawn)
 
 
-def test_frames_serve_other_textures_and_a_theta_that_changed_in_place(way):
+def test_frames_serve_other_textures_and_a_theta_that_changed_in_place(device):
     here = surrogate([face()])
-    there, poses = DeviceSurrogate(here, way), here.camera_poses(STATES)
+    there, poses = DeviceSurrogate(here, device), here.camera_poses(STATES)
     frames, theta = there.prepare(poses), noise(here.theta_shape)
     before = frames.render(theta).images
     theta += 1.0
@@ -151,8 +143,8 @@ def test_frames_serve_other_textures_and_a_theta_that_changed_in_place(way):
     torch.testing.assert_close(frames.render(theta).images, before, atol=1e-12, rtol=0)
 
 
-def test_slopes_that_are_not_finite_make_the_gradient_so(way):
-    there = DeviceSurrogate(surrogate([face()]), way)
+def test_slopes_that_are_not_finite_make_the_gradient_so(device):
+    there = DeviceSurrogate(surrogate([face()]), device)
     rendered = there.render(there.camera_poses(STATES), noise(there.theta_shape))
     slopes = torch.zeros(2, 3, HIGH, WIDE, dtype=torch.float64, device=there.device)
     assert not rendered.vjp(slopes).any()
@@ -160,9 +152,9 @@ def test_slopes_that_are_not_finite_make_the_gradient_so(way):
     assert torch.isnan(rendered.vjp(slopes)).all()
 
 
-def test_a_scene_without_objects_is_its_background(way):
+def test_a_scene_without_objects_is_its_background(device):
     here = surrogate(None)
-    there, poses = DeviceSurrogate(here, way), here.camera_poses(STATES)
+    there, poses = DeviceSurrogate(here, device), here.camera_poses(STATES)
     rendered = there.render(poses, None)
     assert torch.equal(rendered.images.cpu(), here.render(poses, None).images)
     assert rendered.vjp(rendered.images).shape == (0, 3)
@@ -174,26 +166,26 @@ def learned():
     return FieldRenderer(trained.scene, trained.occupied, trained.march)
 
 
-@pytest.mark.slow  # trains; `test_accelerator` has random voxels
-def test_a_baked_scene_is_drawn_as_on_the_processor(way, learned):
+@pytest.mark.slow  # trains; `test_agreement` has random voxels
+def test_a_baked_scene_is_drawn_as_on_the_processor(device, learned):
     poses = room_poses(2, seed=5)
     baked = bake(learned, room_poses(60, seed=8), CAMERA, 0.7)
     assert (baked.voxels.brick_of >= 0).any()
     assert (baked.voxels.brick_of < 0).any()
-    check_background(way, baked, poses)
+    check_background(device, baked, poses)
     objects = [
         cube_face_object(
             0.4, 4, T_world_from_object=make_transform(rotation_z(0.3), [0.0, 0.0, 0.0]), one_sided=False
         )
     ]
     here = Surrogate(baked, PINHOLE, np.eye(4), objects)
-    images = DeviceSurrogate(here, way).render(poses, here.plain_theta()).images.cpu()
+    images = DeviceSurrogate(here, device).render(poses, here.plain_theta()).images.cpu()
     assert float((images - here.render(poses, here.plain_theta()).images).abs().mean()) < 1e-5
 
 
 @pytest.mark.slow
-def test_a_field_is_rendered_as_on_the_processor(way, learned):
-    check_background(way, learned, room_poses(2, seed=5))
+def test_a_field_is_rendered_as_on_the_processor(device, learned):
+    check_background(device, learned, room_poses(2, seed=5))
 
 
 @pytest.mark.parametrize(
@@ -201,7 +193,7 @@ def test_a_field_is_rendered_as_on_the_processor(way, learned):
     [(2.0, {"learned_background": False}, TINTED), (4000.0, {"direction_bands": 3}, None)],
     ids=["transparent, mapped colours", "glossy, of a large unit"],
 )
-def test_fields_of_all_kinds_are_rendered_as_on_the_processor(way, side_m, changes, colour_map):
+def test_fields_of_all_kinds_are_rendered_as_on_the_processor(device, side_m, changes, colour_map):
     config = dataclasses.replace(FIELD, box_low_m=(-side_m / 2,) * 3, box_high_m=(side_m / 2,) * 3, **changes)
     scene, generator = SceneField(config), torch.Generator().manual_seed(1)
     with torch.no_grad():
@@ -212,18 +204,18 @@ def test_fields_of_all_kinds_are_rendered_as_on_the_processor(way, side_m, chang
     here = FieldRenderer(scene, occupied, march, colour_map, behind=(0.2, 0.4, 0.9))
     poses = room_poses(2, seed=5)
     poses[:, :3, 3] *= side_m / 10.0
-    check_background(way, here, poses)
+    check_background(device, here, poses)
 
 
-def test_a_contracted_field_stays_on_the_processor(way):
+def test_a_contracted_field_stays_on_the_processor(device):
     config = dataclasses.replace(FIELD, contraction=True)
     here = FieldRenderer(SceneField(config), np.ones((16, 16, 16), np.bool_), MarchConfig())
-    assert background_on(way, here) is here
+    assert background_on(device, here) is here
 
 
-def check_background(way, here, poses):
+def check_background(device, here, poses):
     rgb, depth_m, _ = here.render(poses, PINHOLE)
-    theirs, their_depth_m = (each.cpu() for each in background_on(way, here)(poses, PINHOLE)[:2])
+    theirs, their_depth_m = (each.cpu() for each in background_on(device, here)(poses, PINHOLE)[:2])
     difference = (theirs - rgb).abs()
     # A sample on the edge of a cell may fall to either side.
     assert float((difference > 1e-4).double().mean()) < 0.01
@@ -233,17 +225,12 @@ def check_background(way, here, poses):
     assert float((their_depth_m - depth_m)[same].abs().median()) < 1e-5 * here.config.ray_unit_m
 
 
-def test_what_a_gpu_cannot_show_is_refused(way):
+def test_what_a_gpu_cannot_show_is_refused(device):
     with pytest.raises(DeviceError, match="blends"):
-        DeviceSurrogate(surrogate([face()], opaque=True), way)
-    if way.compiled:
-        with pytest.raises(
-            DeviceError, match=f"at most {MOST_OBJECTS} objects on a GPU, got {MOST_OBJECTS + 1}"
-        ):
-            DeviceSurrogate(surrogate([face()] * (MOST_OBJECTS + 1)), way)
+        DeviceSurrogate(surrogate([face()], opaque=True), device)
     with pytest.raises(DeviceError, match="the sensor ManyTextures"):
-        sensor_on(ManyTextures(surrogate([face()]), 2, 1), way)
+        sensor_on(ManyTextures(surrogate([face()]), 2, 1), device)
     with pytest.raises(ValueError, match=r"expected theta \[4, 4, 3\], got \[3, 3, 3\]"):
-        DeviceSurrogate(surrogate([face()]), way).sense(STATES, torch.zeros(3, 3, 3))
+        DeviceSurrogate(surrogate([face()]), device).sense(STATES, torch.zeros(3, 3, 3))
     with pytest.raises(ValueError, match=r"expected theta for 1 object\(s\), got None"):
-        DeviceSurrogate(surrogate([face()]), way).sense(STATES, None)
+        DeviceSurrogate(surrogate([face()]), device).sense(STATES, None)

@@ -22,7 +22,7 @@ def test_all_parts_are_compared_and_the_text_can_be_pasted():
         rows = [line for line in lines if line.startswith(part)]
         assert len(rows) == 2, part
         assert not [row for row in rows if "DIFFERS" in row or "FAILED" in row]
-    assert lines[-2] == "searches with --device cuda use plain torch"
+    assert lines[-2] == "searches with --device cuda use the GPU"
     assert max(map(len, lines)) < 120
 
 

@@ -7,20 +7,18 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from advnerf_core.errors import DeviceError
 from advnerf_core.fields.hash_grid import HashGrid, encode_reference
 from advnerf_core.geometry import Pinhole
-from advnerf_core.scene.accelerator import Accelerator
 from advnerf_core.scene.agreement import (
-    COMPILED_PARTS,
     PARTS,
     SEARCH_PARTS,
     TEN_RAYS,
     compare,
-    first_that_agrees,
-    search_accelerator,
+    is_right,
+    search_device,
     training_device,
 )
 
-PLAIN = Accelerator(torch.device("cpu"))
-NOTHING = Accelerator(torch.device("meta"))  # has shapes, and no values
+HERE = torch.device("cpu")
+NOTHING = torch.device("meta")  # has shapes, and no values
 without_gpu = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a device")
 
 
@@ -37,7 +35,7 @@ class Imprecise(TorchDispatchMode):
 def test_plain_torch_gives_the_numbers_of_the_kernels(part):
     assert TEN_RAYS.width * TEN_RAYS.height == 10
     for lens in (TEN_RAYS, Pinhole(24, 10, 20.0, 20.0, 12.0, 5.0)):
-        found = compare(part, PLAIN, lens)
+        found = compare(part, HERE, lens)
         assert found.agrees, found
         # In single precision far below the tolerance, which leaves room for a device's own functions.
         assert found.difference < 0.1 * found.tolerance
@@ -49,39 +47,38 @@ def test_plain_torch_gives_the_numbers_of_the_kernels(part):
 @pytest.mark.parametrize("part", [part for part in PARTS if part != "policy"])
 def test_a_device_that_computes_badly_is_noticed_in_every_part(part):
     with Imprecise():
-        found = compare(part, PLAIN)
+        found = compare(part, HERE)
     assert not found.trouble
     assert not found.agrees
     assert found.difference > 2.0 * found.tolerance
 
 
-def test_the_first_way_that_agrees_is_used_and_each_step_down_is_one_line(capsys):
-    assert first_that_agrees([NOTHING, PLAIN]) is PLAIN
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 2
-    assert lines[0].startswith("advnerf: not computing with meta, plain torch: hash encoding failed, ")
-    assert lines[1].startswith("advnerf: computing with cpu, plain torch; ")
+@pytest.mark.parametrize(
+    ("device", "trouble"),
+    [
+        (NOTHING, "not computing with meta: hash encoding failed, "),
+        (HERE, "hash encoding differ from the processor's by "),
+    ],
+    ids=["without values", "imprecise"],
+)
+def test_a_device_that_is_wrong_is_refused_in_two_lines(device, trouble, capsys):
     with Imprecise():
-        assert first_that_agrees([PLAIN]) is None
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 2
-    assert "hash encoding differ from the processor's by " in lines[0]
-    assert lines[0].endswith(", at most 1e-05 is expected")
-    assert lines[1].startswith("advnerf: computing with the processor")
+        assert not is_right(device)
+    refused, instead = capsys.readouterr().err.splitlines()
+    assert trouble in refused
+    assert refused.endswith(", at most 1e-05 is expected") == (device == HERE)
+    assert instead.startswith("advnerf: computing with the processor")
 
 
-@without_gpu
-def test_kernels_that_cannot_be_compiled_give_way_to_plain_torch(capsys):
-    compiled = Accelerator(torch.device("cpu"), compiled=True)
-    assert first_that_agrees([compiled, PLAIN], COMPILED_PARTS, quiet=True) is PLAIN
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "not computing with cpu, numba-cuda: baked scene failed" in line
+def test_a_device_that_is_right_is_used_without_a_word(capsys):
+    assert is_right(HERE)
+    assert capsys.readouterr().err == ""
 
 
 @without_gpu
 def test_without_a_gpu_searches_say_so_and_trainings_use_the_processor(capsys):
     with pytest.raises(DeviceError, match="expected an NVIDIA GPU that torch can use"):
-        search_accelerator()
+        search_device()
     assert training_device() == torch.device("cpu")
     assert capsys.readouterr().err == ""
 
@@ -89,17 +86,17 @@ def test_without_a_gpu_searches_say_so_and_trainings_use_the_processor(capsys):
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_a_gpu_agrees_in_plain_torch_and_the_answer_is_kept():
-    there = Accelerator(torch.device("cuda"))
+    there = torch.device("cuda")
     for part in PARTS:
         assert compare(part, there, Pinhole(200, 66, 160.0, 160.0, 100.0, 33.0)).agrees, part
-    assert search_accelerator() is search_accelerator() is not None
+    assert search_device() is search_device() is not None
     assert training_device().type == "cuda"
 
 
 def test_the_check_leaves_the_random_numbers_of_the_process_alone():
     before = torch.get_rng_state()
     for part in SEARCH_PARTS:
-        compare(part, PLAIN)
+        compare(part, HERE)
     assert torch.equal(torch.get_rng_state(), before)
 
 
