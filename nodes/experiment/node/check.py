@@ -158,9 +158,10 @@ def _difference(got: Tensor, expected: Tensor) -> float:
 def _memory(request: Experiment, report: Report) -> dict[int, float]:
     # Below two time batches the batch itself is not full yet.
     found, shortest = {}, max(request.searched_ticks, 2 * request.config.attack.time_batch)
-    for index, ticks in enumerate((shortest, 2 * shortest, 4 * shortest)):
-        report(0.7 + index / 10, f"memory at T = {ticks}")
-        found[ticks] = measured_mib(request, ticks)
+    report(0.7, "memory")
+    for ticks, mib in measured_mib(request, (shortest, 2 * shortest, 4 * shortest)):
+        found[ticks] = mib
+        report(0.7 + len(found) / 10, f"memory at T = {ticks}")
     return found
 
 

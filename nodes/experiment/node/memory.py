@@ -1,42 +1,36 @@
-"""Peak memory of one gradient of a request, each horizon in a fresh process.
+"""Peak memory of one gradient of a request against the horizon, in a process of its own.
 
-``python -m nodes.experiment.node.memory REQUEST_FILE TICKS CACHE_MIB`` prints the peak above idle [MiB].
+``python -m nodes.experiment.node.memory REQUEST_FILE CACHE_MIB TICKS...`` prints each horizon and its peak above idle [MiB].
 """
 
 from __future__ import annotations
 
-import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from advnerf_core.run_module import module_command
 from nodes.experiment.node.job import REQUEST
 from nodes.experiment.node.prepare import load_request, prepare, request_text
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.steps.memory import gradient_peak_mib
+from nodes.experiment.steps.memory import in_a_child, print_peaks
 
 
-def peak_above_idle_mib(request: Experiment, ticks: int, cache_mib: float) -> float:
-    """Measure in this process, which must be fresh."""
-    prepared = prepare(request)
-    return gradient_peak_mib(prepared.problem, prepared.space, ticks, cache_mib)
-
-
-def measured_mib(request: Experiment, ticks: int, cache_mib: float = 0.0) -> float:
-    """The same in a fresh process."""
+def measured_mib(
+    request: Experiment, horizons: Sequence[int], cache_mib: float = 0.0
+) -> Iterator[tuple[int, float]]:
+    """Horizons [ticks] and their peaks above idle [MiB], one after the other."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / REQUEST
         file.write_text(request_text(request))
-        command = module_command("nodes.experiment.node.memory", str(file), str(ticks), str(cache_mib))
-        done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
-    return float(done.stdout.split()[-1])
+        yield from in_a_child("nodes.experiment.node.memory", file, horizons, str(cache_mib))
 
 
 def main() -> None:
-    """Measure one horizon."""
-    file = Path(sys.argv[1])
-    print(peak_above_idle_mib(load_request(file, folder=file.parent), int(sys.argv[2]), float(sys.argv[3])))
+    """Measure horizons of a request."""
+    file, cache_mib, *horizons = sys.argv[1:]
+    prepared = prepare(load_request(Path(file), folder=Path(file).parent))
+    print_peaks(prepared.problem, prepared.space, [int(ticks) for ticks in horizons], float(cache_mib))
 
 
 if __name__ == "__main__":

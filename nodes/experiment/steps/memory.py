@@ -1,6 +1,7 @@
 """Peak memory of one adjoint gradient against the horizon, in this experiment's own scene, with an empty cache.
 
-Each horizon is measured in a fresh process: ``python -m nodes.experiment.steps.memory RUN_FOLDER TICKS`` prints the peak above idle.
+``python -m nodes.experiment.steps.memory RUN_FOLDER TICKS...`` prints each horizon and its peak above idle [MiB]. The first gradient of a
+process also brings libraries and buffers into memory, so that one is computed before the horizons.
 """
 
 from __future__ import annotations
@@ -10,11 +11,12 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import torch
 
-from advnerf_core.attack.adjoint import AttackProblem, adjoint_gradient, evaluate
+from advnerf_core.attack.adjoint import AttackProblem, adjoint_gradient
 from advnerf_core.attack.spaces.space import Space
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
@@ -29,6 +31,7 @@ from nodes.experiment.steps.attack import attack_problem
 from nodes.runtime.progress import Report
 
 HORIZONS = (50, 200, 400)
+_BEFORE_TICKS = 16
 
 
 def measure(experiment: Experiment, folder: Path, report: Report) -> tuple[MemoryRow, ...]:
@@ -37,44 +40,55 @@ def measure(experiment: Experiment, folder: Path, report: Report) -> tuple[Memor
         return ()
     kept = folder / "memory.json"
     rows: dict[str, float] = read_json(kept) if kept.exists() else {}
-    for index, ticks in enumerate(HORIZONS):
-        report(index / len(HORIZONS), f"memory of the adjoint at T = {ticks}")
-        if str(ticks) not in rows:
-            command = module_command("nodes.experiment.steps.memory", str(experiment.folder), str(ticks))
-            environment = {**os.environ, **RETURNS_WHAT_IS_FREED}
-            done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=environment)
-            rows[str(ticks)] = float(done.stdout.split()[-1])
+    missing = [ticks for ticks in HORIZONS if str(ticks) not in rows]
+    report(0.0, "memory of the adjoint")
+    if missing:
+        for ticks, mib in in_a_child("nodes.experiment.steps.memory", experiment.folder, missing):
+            rows[str(ticks)] = mib
             write_atomically(kept, json.dumps(rows) + "\n")
+            report(len(rows) / len(HORIZONS), f"memory of the adjoint at T = {ticks}")
     return tuple(MemoryRow(int(ticks), mib) for ticks, mib in rows.items())
 
 
-def peak_above_idle_mib(experiment: Experiment, ticks: int) -> float:
-    """Peak above idle of one gradient over ``ticks`` ticks [MiB]; the process must be fresh."""
-    space = face_space(experiment, ideal=True)
-    policy, scenario = load_victim(experiment, experiment.config.main_victim), experiment.config.paths[0]
-    problem = attack_problem(experiment, space, policy, scenario, experiment.config.seeds[0])
-    return gradient_peak_mib(problem, space, ticks)
+def in_a_child(module: str, path: Path, horizons: Sequence[int], *more: str) -> Iterator[tuple[int, float]]:
+    """Horizons and their peaks [MiB] as a module's command measures them, in a process that returns freed memory.
+
+    Raises:
+        subprocess.CalledProcessError: The process failed.
+    """
+    command = module_command(module, str(path), *more, *map(str, horizons))
+    environment = {**os.environ, **RETURNS_WHAT_IS_FREED}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as child:
+        assert child.stdout is not None
+        for line in child.stdout:
+            ticks, mib = line.split()
+            yield int(ticks), float(mib)
+    if child.returncode:
+        raise subprocess.CalledProcessError(child.returncode, command)
 
 
-def gradient_peak_mib(problem: AttackProblem, space: Space, ticks: int, cache_mib: float = 0.0) -> float:
-    """Peak above idle of one gradient of the first start over ``ticks`` ticks [MiB]; the process must be fresh."""
+def print_peaks(
+    problem: AttackProblem, space: Space, horizons: Sequence[int], cache_mib: float = 0.0
+) -> None:
+    """Print each horizon and the peak above idle of one gradient of the first start over it [MiB]."""
     goals = None if problem.goals is None else problem.goals[:1]
     one, cache_bytes = problem.start_states[:1], int(cache_mib * 2**20)
-    problem = dataclasses.replace(
-        problem, start_states=one, goals=goals, steps=ticks, cache_bytes=cache_bytes
-    )
+    problem = dataclasses.replace(problem, start_states=one, goals=goals, cache_bytes=cache_bytes)
     theta = space.surrogate.initial_theta(torch.Generator().manual_seed(0))
-    # Libraries, compiled kernels and thread pools are idle memory.
-    evaluate(dataclasses.replace(problem, steps=1), theta)
-    idle_mib = restart_peak()
-    adjoint_gradient(problem, theta)
-    return peak_mib() - idle_mib
+    adjoint_gradient(dataclasses.replace(problem, steps=min(_BEFORE_TICKS, *horizons)), theta)
+    for ticks in horizons:
+        idle_mib = restart_peak()
+        adjoint_gradient(dataclasses.replace(problem, steps=ticks), theta)
+        print(ticks, peak_mib() - idle_mib, flush=True)
 
 
 def main() -> None:
-    """Measure one horizon of a run folder."""
-    folder, ticks = Path(sys.argv[1]), int(sys.argv[2])
-    print(peak_above_idle_mib(Experiment.resolved_in(folder), ticks))
+    """Measure horizons of a run folder."""
+    experiment = Experiment.resolved_in(Path(sys.argv[1]))
+    space = face_space(experiment, ideal=True)
+    policy, scenario = load_victim(experiment, experiment.config.main_victim), experiment.config.paths[0]
+    problem = attack_problem(experiment, space, policy, scenario, experiment.config.seeds[0])
+    print_peaks(problem, space, [int(ticks) for ticks in sys.argv[2:]])
 
 
 if __name__ == "__main__":

@@ -15,4 +15,6 @@ def test_it_is_that_of_one_start_however_many_are_attacked(tiny_room, tmp_path):
     command = [sys.executable, "-m", "nodes.experiment.steps.memory", str(tmp_path), "2"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert 0.0 <= float(done.stdout.split()[-1]) < 200.0
+    ticks, mib = done.stdout.split()
+    assert int(ticks) == 2
+    assert 0.0 <= float(mib) < 200.0
