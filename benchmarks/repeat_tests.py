@@ -1,7 +1,7 @@
 """Are tests green every time? ``python -m benchmarks.repeat_tests TEST ... --times 100 [--busy 4] [--cores 1]``.
 
 ``make test`` and ``make demo`` in place of tests repeat that target. Runs a selection of tests again and again, if asked beside endless loops of other sessions or on fewer cores, and counts the runs that
-are green. What a red run printed is shown. Arguments after ``--`` are pytest's own, e.g. ``-- -m live``.
+are green; the row of results is written after each run. What a red run printed is shown. Arguments after ``--`` are pytest's own, e.g. ``-- -m live``.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 
-from benchmarks.results import REPOSITORY, record_row
+from benchmarks.results import REPOSITORY, read_rows, record_row
 
 _LOOP = "while True: pass"
 _AGAIN = "; again"
@@ -37,31 +38,60 @@ def busy(count: int) -> Iterator[None]:
             loop.wait()
 
 
-def repeat(command: list[str], times: int) -> tuple[int, list[float], int, str]:
-    """Run a command again and again.
+@dataclass
+class Runs:
+    """Runs of one command.
 
-    Returns:
-        How often it succeeded, its times [s], how many tests were run again for want of time, and pytest's last summary.
+    Attributes:
+        green: How many succeeded.
+        seconds: Their times [s].
+        again: How many tests were run again for want of time.
+        summary: Pytest's last one.
     """
-    green, seconds, again, summary = 0, [], 0, ""
-    for number in range(1, times + 1):
+
+    green: int = 0
+    seconds: list[float] = field(default_factory=list)
+    again: int = 0
+    summary: str = ""
+
+    def add(self, command: list[str]) -> None:
+        """Run the command once more, and print whether it was green; of a red run all that it printed."""
         if command == _MAKE_DEMO and _DEMO.exists():
             shutil.rmtree(_DEMO)  # of the run before: a finished demo is only shown again
         began_s = time.monotonic()
         done = subprocess.run(
             command, cwd=REPOSITORY, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
         )
-        seconds.append(time.monotonic() - began_s)
-        again += done.stdout.count(_AGAIN)
-        summary = "; ".join(re.findall(r"^\d+ passed[^\n]*(?= in )", done.stdout, re.M)) or summary
-        green += done.returncode == 0
-        print(
-            f"{number:3d} {'green' if done.returncode == 0 else 'RED'} {seconds[-1]:.0f} s, {green} green",
-            flush=True,
-        )
+        self.seconds.append(time.monotonic() - began_s)
+        self.again += done.stdout.count(_AGAIN)
+        self.summary = "; ".join(re.findall(r"^\d+ passed[^\n]*(?= in )", done.stdout, re.M)) or self.summary
+        self.green += done.returncode == 0
+        word = "green" if done.returncode == 0 else "RED"
+        print(f"{len(self.seconds):3d} {word} {self.seconds[-1]:.0f} s, {self.green} green", flush=True)
         if done.returncode != 0:
             print(done.stdout, flush=True)
-    return green, seconds, again, summary
+
+    def record(self, line: str, before: tuple[int, int], wanted: int) -> None:
+        """Write the row, with the green runs and all runs that were counted before."""
+        green, count = before[0] + self.green, before[1] + len(self.seconds)
+        record_row(
+            line,
+            green,
+            f"of {count}",
+            f"{wanted} of {wanted}",
+            green == count >= wanted,
+            f"python -m benchmarks.repeat_tests {' '.join(map(shlex.quote, sys.argv[1:]))}",
+            f"{self.summary}{'; ' * bool(self.summary)}median {statistics.median(self.seconds):.0f} s, longest {max(self.seconds):.0f} s"
+            + f"; {before[1]} of the runs were made before, on other commits" * bool(before[1])
+            + f"; {self.again} live tests were run again, as the processors had no time to spare"
+            * bool(self.again),
+        )
+
+
+def _counted(line: str) -> tuple[int, int]:
+    """Green runs, and runs, that the row of results counts."""
+    found = next((row for row in read_rows() if row["line"] == line), None)
+    return (0, 0) if found is None else (int(found["value"]), int(found["unit"].removeprefix("of ")))
 
 
 def main() -> int:
@@ -79,33 +109,29 @@ def main() -> int:
     parser.add_argument("--cores", type=int, default=0, help="on so many cores; 0: all")
     parser.add_argument("--line", default="", help="what the tests show, as the row of results calls it")
     parser.add_argument("--trial", action="store_true", help="record nothing")
+    parser.add_argument(
+        "--add", action="store_true", help="add these runs to those that the row of results counts already"
+    )
     options = parser.parse_args(shlex.split(given))
     if options.tests == _MAKE_DEMO and _DEMO.exists():
         parser.error(f"expected no {_DEMO}, as each run begins without one; move it away")
     cores = sorted(os.sched_getaffinity(0))[: options.cores or None]
     os.sched_setaffinity(0, cores)
-    with busy(options.busy):
-        pytest = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
-        command = [*([] if options.tests[0] == "make" else pytest), *options.tests]
-        green, seconds, again, summary = repeat([*command, *shlex.split(extra)], options.times)
     beside = (
         f", beside {options.busy} busy loops" * bool(options.busy)
         + f", on {len(cores)} cores" * bool(options.cores)
     ).replace("on 1 cores", "on one core")
-    print(f"{green} of {options.times} green{beside}; {again} tests run again")
-    wanted = options.wanted or options.times
-    if not options.trial:
-        record_row(
-            f"{options.line or ' '.join([*options.tests, extra]).strip()}: green runs{beside}",
-            green,
-            f"of {options.times}",
-            f"{wanted} of {wanted}",
-            green == options.times >= wanted,
-            f"python -m benchmarks.repeat_tests {' '.join(map(shlex.quote, sys.argv[1:]))}",
-            f"{summary}{'; ' * bool(summary)}median {statistics.median(seconds):.0f} s, longest {max(seconds):.0f} s"
-            + f"; {again} live tests were run again, as the processors had no time to spare" * bool(again),
-        )
-    return int(green != options.times)
+    line = f"{options.line or ' '.join([*options.tests, extra]).strip()}: green runs{beside}"
+    before, runs = _counted(line) if options.add else (0, 0), Runs()
+    pytest = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
+    command = [*([] if options.tests[0] == "make" else pytest), *options.tests, *shlex.split(extra)]
+    with busy(options.busy):
+        for _ in range(options.times):
+            runs.add(command)
+            if not options.trial:
+                runs.record(line, before, options.wanted or before[1] + options.times)
+    print(f"{runs.green} of {options.times} green{beside}; {runs.again} tests run again")
+    return int(runs.green != options.times)
 
 
 if __name__ == "__main__":
