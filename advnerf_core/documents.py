@@ -10,6 +10,7 @@ import codecs
 import copy
 import csv
 import io
+import itertools
 import json
 import math
 import re
@@ -318,8 +319,18 @@ def read_json(path: Path) -> Any:
     return parse_json(read_text(path), str(path))
 
 
-def parse_json(text: str | bytes, source: str) -> Any:
-    """Parse JSON text; a key that an object has twice is an error."""
+def read_json_lines(path: Path) -> list[tuple[str, Any]]:
+    """Values of a file with one JSON value on each line, each with its ``file:line``; empty lines are skipped."""
+    lines = read_text(path).split("\n")
+    return [
+        (f"{path}:{number}", parse_json(line, str(path), number))
+        for number, line in enumerate(lines, 1)
+        if line.strip()
+    ]
+
+
+def parse_json(text: str | bytes, source: str, first_line: int = 1) -> Any:
+    """Parse JSON text; a key that an object has twice is an error. Errors count lines from ``first_line``."""
     text = decode_text(text, source) if isinstance(text, bytes) else text.removeprefix("\ufeff")
     repeated = False
 
@@ -333,16 +344,16 @@ def parse_json(text: str | bytes, source: str) -> Any:
         data = json.loads(text, object_pairs_hook=unique)
     except json.JSONDecodeError as error:
         raise ConfigError(
-            f"{source}:{error.lineno}: expected valid JSON: {error.msg}, column {error.colno}"
+            f"{source}:{error.lineno + first_line - 1}: expected valid JSON: {error.msg}, column {error.colno}"
         ) from error
     except (RecursionError, ValueError) as error:
         raise ConfigError(f"{source}: expected valid JSON: {error or 'nested too deeply'}") from error
     if repeated:
-        raise_problems(_repeated_keys(text, source))
+        raise_problems(_repeated_keys(text, source, first_line))
     return data
 
 
-def _repeated_keys(text: str, source: str) -> list[str]:
+def _repeated_keys(text: str, source: str, first_line: int) -> list[str]:
     """A problem for each repeated key of valid JSON text, with its line."""
     problems: list[str] = []
     keys: list[set[str]] = []
@@ -355,7 +366,7 @@ def _repeated_keys(text: str, source: str) -> list[str]:
         elif token[0][0] == '"' and after is not None and after[0] == ":":
             name = json.loads(token[0], strict=False)
             if name in keys[-1]:
-                line = text.count("\n", 0, token.start()) + 1
+                line = text.count("\n", 0, token.start()) + first_line
                 problems.append(f"{source}:{line}: {name} is given twice; remove one of them")
             keys[-1].add(name)
     return problems
@@ -390,15 +401,22 @@ class CsvRow:
         return value
 
 
-def read_csv(path: Path, columns: Sequence[str] = ()) -> list[CsvRow]:
-    """Rows of a CSV file whose header has some columns. Rows whose length differs from the header's are refused."""
+def read_csv(path: Path, columns: Sequence[str] = (), bare: Sequence[str] = ()) -> list[CsvRow]:
+    """Rows of a CSV file whose header has some columns. Rows whose length differs from the header's are refused.
+
+    Args:
+        columns: Columns that the header must have.
+        bare: Columns of a file without a header: one whose first row has this length, and a number in the last field.
+    """
     reader = csv.reader(io.StringIO(read_text(path), newline=""), strict=True)
     rows: list[CsvRow] = []
     problems: list[str] = []
     try:
-        names = [name.strip() for name in next(reader, [])]
+        first = next(reader, [])
+        is_bare = bool(bare) and len(first) == len(bare) and _is_real(first[-1].strip())
+        names = list(bare) if is_bare else [name.strip() for name in first]
         problems += _header_problems(path, names, columns)
-        for values in reader:
+        for values in itertools.chain([first] if is_bare else [], reader):
             place = f"{path}:{reader.line_num}"
             if len(values) not in (0, len(names)):
                 problems.append(

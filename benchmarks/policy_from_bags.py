@@ -13,9 +13,9 @@ import json
 import os
 import shutil
 import socket
-from functools import partial
 from pathlib import Path
 
+from advnerf_core.data.logs.choice import LogChoice, LogRequest
 from advnerf_core.documents import read_json
 from advnerf_core.driving.expert import Expert, ExpertConfig
 from advnerf_core.driving.metrics import Horizon
@@ -24,9 +24,9 @@ from advnerf_core.learning.recipe import ImitationConfig
 from advnerf_core.policies.view import PolicyView
 from benchmarks.results import record_row
 from calibration.schema import CameraCalibration, RoomCalibration, load_calibration
-from nodes.bags.reader import read_info
-from nodes.lab.policy_data.frames import frames_of_bag
-from nodes.lab.policy_data.train import Training, TrainingRecording, train_from_recordings
+from nodes.lab.policy_data.logs import open_logs
+from nodes.lab.policy_data.recordings import training_recording
+from nodes.lab.policy_data.train import Training, train_from_recordings
 from nodes.lab.trials.evaluation import score, trajectory
 from nodes.lab.trials.trial import TrialOutcome, TrialPlan
 from nodes.lab.trials.trial_runner import run_trial
@@ -63,10 +63,8 @@ def train(bags: list[Path], out: Path, steps: int) -> Training:
     room = load_calibration(RoomCalibration, _CALIBRATION / "room.yaml")
     view = PolicyView(camera.pinhole, distortion=camera.distortion)
     expert = Expert(room.reference_path, ExpertConfig(speed_mps=_SPEED_MPS))
-    parts = [
-        TrainingRecording(str(bag), read_info(bag).parts, {}, partial(frames_of_bag, bag, view, expert))
-        for bag in bags
-    ]
+    logs = open_logs(map(LogRequest, bags), LogChoice(), "expert")
+    parts = [training_recording(log, view, expert) for log in logs]
     return train_from_recordings(parts, view, expert, ImitationConfig(first_steps=steps), out, progress=_say)
 
 

@@ -13,7 +13,7 @@ from advnerf_core.policies.declaration import declaration_beside
 from advnerf_core.strict import validate
 from calibration.schema import CalibrationError, RoomCalibration, VehicleCalibration, load_calibration
 from nodes.experiment.node.request import parse_request
-from nodes.lab.policy_data.frames import frames_of_log
+from nodes.lab.policy_data.logs import open_log
 from nodes.policy import PolicyNodeConfig
 
 ROOT = Path(__file__).parents[1]
@@ -39,7 +39,7 @@ def test_a_log_with_decimal_commas_is_refused_with_its_lines():
     with pytest.raises(
         ConfigError, match=r"drive\.csv:2: expected 2 fields .* got 3.*\n.*drive\.csv:3: "
     ) as caught:
-        frames_of_log(case("log_decimal_comma") / "drive.csv", None, "image", "steering")
+        open_log(case("log_decimal_comma") / "drive.csv")
     assert len(str(caught.value).split("\n")) >= 6
 
 

@@ -48,6 +48,11 @@ def encoded(rgb: Rgb, suffix: str, alpha: Grey | None = None) -> bytes:
     return data.tobytes()
 
 
+def decode_stored(data: bytes, source: str) -> Rgb:
+    """Colours ``[H, W, 3]`` of the content of an image file, as `read_stored` reads it; errors call it ``source``."""
+    return _decoded(Path(source), data)[0]
+
+
 def read_stored(path: Path) -> tuple[Rgb, Grey | None]:
     """Colours ``[H, W, 3]`` and, if the file has it, opacity ``[H, W]``, of the pixels in stored orientation.
 

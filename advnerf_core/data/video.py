@@ -34,7 +34,7 @@ def read_video(path: Path) -> Iterator[tuple[int, float, float, Rgb]]:
 
     number = 0
     try:
-        with av.open(str(path)) as container:
+        with av.open(str(path), metadata_errors="replace") as container:
             if not container.streams.video:
                 raise DatasetError(f"expected a video, got {path} without a picture; give another file")
             stream = container.streams.video[0]

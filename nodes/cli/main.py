@@ -25,6 +25,7 @@ from nodes.cli import car as cli_car
 from nodes.cli import demo as cli_demo
 from nodes.cli import doctor as cli_doctor
 from nodes.cli import experiment as cli_experiment
+from nodes.cli import log as cli_log
 from nodes.cli import method as cli_method
 from nodes.cli import policy as cli_policy
 from nodes.cli import scene as cli_scene
@@ -52,7 +53,7 @@ _POLICY = "nodes.policy"
 PANELS = {
     "Audit and experiments": ("audit", "demo", "experiment", "verify"),
     "Places and objects": ("scene",),
-    "Policies": ("policy", "attack"),
+    "Policies": ("policy", "log", "attack"),
     "The car": ("launch", "car", "disarm"),
     "Bags and tools": ("bag", "doctor"),
 }
@@ -70,6 +71,7 @@ cli_verify.add_to(app)
 app.add_typer(cli_experiment.app, name="experiment")
 app.add_typer(cli_scene.app, name="scene")
 app.add_typer(cli_policy.app, name="policy")
+app.add_typer(cli_log.app, name="log")
 cli_attack_node.add_to(cli_attack.app)
 cli_attack_poses.add_to(cli_attack.app)
 cli_attack.app.add_typer(cli_method.app, name="method")

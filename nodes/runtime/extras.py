@@ -17,6 +17,7 @@ _EXTRA_OF = dict.fromkeys(("torch", "numba", "scipy", "matplotlib", "jinja2", "a
     "drjit": "mesh",
     "ray": "cluster",
     "carla": "carla",
+    "pyarrow": "lerobot",
     "carla_driver_interface": "egodriver",
     "scenariogeneration": "audit",
     "sarif_pydantic": "audit",

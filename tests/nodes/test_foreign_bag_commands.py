@@ -15,7 +15,8 @@ from advnerf_core.policies.view import PolicyView
 from calibration.schema import CameraCalibration, RoomCalibration, load_calibration
 from nodes.bags.reader import read_info
 from nodes.cli import main as cli
-from nodes.lab.policy_data.frames import frames_of_bag
+from nodes.lab.policy_data.frames import frames_of
+from nodes.lab.policy_data.logs import open_log
 from nodes.lab.policy_reference import from_bag
 from nodes.lab.wizards.bags import read_pictures, read_poses
 from nodes.replaying.nodes import Choice
@@ -47,7 +48,7 @@ def advnerf(*arguments):
 
 @pytest.mark.parametrize(("writer", "options"), FORMS)
 def test_a_policy_learns_from_foreign_pictures_in_their_colours(tmp_path, writer, options):
-    recording = frames_of_bag(WRITERS[writer](tmp_path / "drive", **options), VIEW, EXPERT)
+    recording = frames_of(open_log(WRITERS[writer](tmp_path / "drive", **options)), VIEW, EXPERT, "expert")
     assert len(recording.frames.images) == COUNT
     for index, image in enumerate(recording.frames.images):
         np.testing.assert_array_equal(image, VIEW.image(rgb_at(index)))
@@ -59,11 +60,11 @@ def test_a_policy_learns_from_foreign_pictures_in_their_colours(tmp_path, writer
 
 def test_grey_pictures_train_and_other_encodings_are_one_line(tmp_path):
     grey = WRITERS["mcap"](tmp_path / "grey", encoding="mono8")
-    (image, *_) = frames_of_bag(grey, VIEW, EXPERT).frames.images
+    (image, *_) = frames_of(open_log(grey), VIEW, EXPERT, "expert").frames.images
     np.testing.assert_array_equal(image, VIEW.image(np.repeat(rgb_at(0)[..., 1:2], 3, axis=2)))
     depth = WRITERS["rosbags-sqlite3"](tmp_path / "depth", encoding="32FC1")
     with pytest.raises(MessageError) as caught:
-        frames_of_bag(depth, VIEW, EXPERT)
+        frames_of(open_log(depth), VIEW, EXPERT, "expert")
     text = str(caught.value)
     assert text.startswith(
         f"/camera/image_raw in {depth}: expected a supported image encoding, got '32FC1'; supported are rgb8"
@@ -76,7 +77,6 @@ def test_the_commands_to_train_and_to_make_a_data_set_take_a_foreign_bag(tmp_pat
     trained = advnerf(
         "policy",
         "train",
-        "--bags",
         bag,
         "--camera",
         CAMERA,

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from advnerf_core.driving.rollout import Remembering
 from advnerf_core.files import write_atomically
-from nodes.lab.policy_data.frames import RecordedFrames
+from advnerf_core.learning.frames import HOLDOUT_BLOCK
+from nodes.lab.policy_data.frames import HOLDOUT_EVERY, RecordedFrames, held_out
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError
 
@@ -63,6 +64,28 @@ def compare(predicted_rad: NDArray[np.floating[Any]], true_rad: NDArray[np.float
         float(np.corrcoef(predicted, true)[0, 1]) if varies else float("nan"),
         float(np.abs(true).mean()),
     )
+
+
+def compared(
+    recording: RecordedFrames, predicted_rad: NDArray[np.float64], labels: str, only_held_out: bool
+) -> dict[str, Errors]:
+    """Errors against the labels, and against the recorded steering if that is something else and there is any.
+
+    Args:
+        predicted_rad: Steering ``[N]`` for all frames [rad].
+        labels: Name of the labels, for the result.
+        only_held_out: Compare only the frames that a training on this log keeps out.
+    """
+    rows = held_out(recording) if only_held_out else np.arange(len(predicted_rad))
+    if not len(rows):
+        raise ConfigError(
+            f"expected frames of {recording.name} that are held out, got none of {len(predicted_rad)}: "
+            f"every {HOLDOUT_EVERY}th block of {HOLDOUT_BLOCK} frames is; use a longer log, or remove --held-out"
+        )
+    found = {labels: compare(predicted_rad[rows], np.asarray(recording.frames.steering_rad)[rows])}
+    if labels == "expert" and np.isfinite(recording.recorded_rad[rows]).any():
+        found["recorded"] = compare(predicted_rad[rows], recording.recorded_rad[rows])
+    return found
 
 
 def predict(policy: Any, images: NDArray[np.uint8], goal: tuple[float, ...] = ()) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.image_bytes import is_damaged
 from advnerf_core.data.image_files import image_size, read_mask, read_stored, read_upright
 from advnerf_core.data.transforms import load_transforms
-from nodes.lab.policy_data.frames import frames_of_log
+from nodes.lab.policy_data.logs import open_log
 from nodes.lab.wizards.bags import read_picture
 
 CASE = Path(__file__).parents[4] / "shared/data/cases/exif_transforms"
@@ -52,10 +52,9 @@ def test_calibration_pictures_and_logs_are_read_as_stored(tmp_path, orientation)
     assert np.abs(read_picture(path).astype(int) - square).max() <= 6
     log = tmp_path / "log.csv"
     log.write_text("image,steering\n" + "a.jpg,0.1\n" * 4)
-    turned, _ = frames_of_log(log, None, "image", "steering")
+    turned = open_log(log).first_image()
     Image.fromarray(square).save(path, quality=100, subsampling=0)
-    plain, _ = frames_of_log(log, None, "image", "steering")
-    np.testing.assert_array_equal(np.asarray(turned.frames.images), np.asarray(plain.frames.images))
+    np.testing.assert_array_equal(turned, open_log(log).first_image())
 
 
 @pytest.mark.skipif(not CASE.exists(), reason="the shared cases are not here")

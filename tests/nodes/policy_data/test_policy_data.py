@@ -5,15 +5,18 @@ import numpy as np
 import pytest
 import torch
 
+from advnerf_core.data.logs.choice import LogChoice, LogError
 from advnerf_core.driving.expert import Expert
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.learning.recipe import ImitationConfig
 from advnerf_core.policies.policy_file import load_policy
 from nodes.lab.policy_data.evaluate import compare, predict, saliency
-from nodes.lab.policy_data.frames import frames_of_log, view_for_size
+from nodes.lab.policy_data.frames import frames_of, view_for_size, view_of
+from nodes.lab.policy_data.logs import open_log
 from nodes.lab.policy_data.train import TrainingRecording, train_from_recordings
 from nodes.runtime.errors import ConfigError
 
+CHOICE = LogChoice("frame", "angle", 0.5, "right")
 EXPERT = Expert(DrivingPath.rounded_square(4.0, 1.1))
 
 
@@ -28,7 +31,9 @@ def write_log(folder, rows=8, unit=0.5, name="drive.csv"):
 
 
 def test_a_foreign_log_becomes_frames_with_its_own_view(tmp_path):
-    recording, view = frames_of_log(write_log(tmp_path), None, "frame", "angle", rad_per_unit=-0.5)
+    log = open_log(write_log(tmp_path), CHOICE)
+    view = view_of(log, view_for_size(336, 188))
+    recording = frames_of(log, view, None, "recorded")
     assert (view.camera.width, view.camera.height) == (168, 94)
     assert recording.frames.images.shape == (8, 66, 200, 3)
     assert recording.frames.images[:, 30, 100, 0].tolist() == [20 * n for n in range(8)]
@@ -45,11 +50,14 @@ def test_a_foreign_log_becomes_frames_with_its_own_view(tmp_path):
         ),
         (
             lambda t: t.replace("3.png", "no.png"),
-            r"csv:5: expected a readable image, got .*no\.png: No such file",
+            r"csv:5: frame: expected an image, found no file 'no\.png'",
         ),
         (lambda t: t.replace("2.png, -0.25", "2.png, left"), r"csv:4: angle: expected a number, got 'left'"),
-        (lambda t: t.replace("2.png, -0.25", "2.png, 25"), "--log-scale"),
-        (lambda t: "\n".join(t.split("\n")[:3]), "at least 4 rows"),
+        (
+            lambda t: t.replace("2.png, -0.25", "2.png, 25"),
+            "csv:4: expected a steering angle below 1 rad, got 25 times 0.5",
+        ),
+        (lambda t: "\n".join(t.split("\n")[:3]), "at least 4 usable frames"),
         (lambda t: "", "an empty file"),
         (
             lambda t: t.replace("2.png, -0.25", "2.png, -0,25"),
@@ -64,16 +72,16 @@ def test_a_foreign_log_becomes_frames_with_its_own_view(tmp_path):
             "csv:1: the column angle is given twice",
         ),
         (
-            lambda t: t.replace("2.png, -0.25", "2.png, left").replace("5.png", "no.png"),
-            r"csv:4: angle.*\n.*csv:7: .*no\.png",
+            lambda t: t.replace("2.png, -0.25", "2.png, left").replace("5.png, 0.125", "5.png, 9"),
+            r"csv:4: angle.*\n.*csv:7: expected a steering angle",
         ),
     ],
 )
 def test_what_is_wrong_with_a_log_is_said(tmp_path, change, reason):
     log = write_log(tmp_path)
     log.write_text(change(log.read_text()))
-    with pytest.raises(ConfigError, match=reason):
-        frames_of_log(log, None, "frame", "angle")
+    with pytest.raises((ConfigError, LogError), match=reason):
+        frames_of(open_log(log, CHOICE), view_for_size(168, 94), None, "recorded")
 
 
 def test_errors_against_numpy():
@@ -128,7 +136,7 @@ def test_training_learns_is_kept_and_begins_anew_for_other_recordings(tmp_path):
     def train(steps=8):
         def cut():
             cuts.append(1)
-            return frames_of_log(log, view, "frame", "angle", 0.5)[0]
+            return frames_of(open_log(log, CHOICE), view, None, "recorded")
 
         parts = [TrainingRecording("log", (log,), {}, cut)]
         config = ImitationConfig(first_steps=steps, batch_size=16, dagger_rounds=0)

@@ -1,0 +1,94 @@
+"""What a user says about a log that its format leaves open."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, get_args
+
+from advnerf_core.errors import AdvnerfError
+
+Side = Literal["left", "right"]
+_SETTINGS = re.compile(r"(?P<path>.+?),(?P<settings>[a-z-]+=.*)")
+
+
+class LogError(AdvnerfError, ValueError):
+    """A log of a drive cannot be used; the message names the file and, where there is one, the line."""
+
+
+@dataclass(frozen=True)
+class LogChoice:
+    """Answers about one log; None leaves an answer to its format.
+
+    Attributes:
+        images: Topic, column, feature or camera with the images.
+        steering: Topic, column or feature with the steering.
+        steering_full_rad: Wheel angle at a recorded steering of 1 [rad], without sign.
+        steering_positive: Side to which positive values steer.
+        steering_offset_rad: Added to the steering, left positive [rad]: for a camera that looks at the lane from one side.
+    """
+
+    images: str | None = None
+    steering: str | None = None
+    steering_full_rad: float | None = None
+    steering_positive: Side | None = None
+    steering_offset_rad: float | None = None
+
+    def __post_init__(self) -> None:
+        full_rad, positive = self.steering_full_rad, self.steering_positive
+        if full_rad is not None and not 0.0 < full_rad < 1e3:
+            raise LogError(
+                f"steering-full-rad: expected a positive wheel angle [rad], got {full_rad:g}; "
+                "give the side with steering-positive"
+            )
+        if positive is not None and positive not in get_args(Side):
+            raise LogError(f"steering-positive: expected left or right, got {positive!r}")
+
+    def with_settings(self, text: str) -> LogChoice:
+        """A copy with settings such as ``images=left,steering-full-rad=0.3``."""
+        found: dict[str, str | float] = {}
+        for part in text.split(","):
+            name, _, value = part.partition("=")
+            key = name.strip().replace("-", "_")
+            if key not in self.__dataclass_fields__:
+                known = ", ".join(field.replace("_", "-") for field in self.__dataclass_fields__)
+                raise LogError(f"expected settings of a log among {known}, got {part!r}")
+            found[key] = _number(name, value) if key.endswith("_rad") else value
+        return replace(self, **found)  # type: ignore[arg-type]
+
+
+def _number(name: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise LogError(f"{name}: expected a number, got {text!r}") from None
+
+
+@dataclass(frozen=True)
+class LogRequest:
+    """A log that a user named: ``PATH``, or ``PATH,setting=value,...`` with answers about this log only."""
+
+    path: Path
+    settings: str = ""
+
+    @classmethod
+    def parsed(cls, text: str) -> LogRequest:
+        """Read an argument of the command line.
+
+        Raises:
+            LogError: The path does not exist, or a setting is unknown.
+        """
+        found = None if Path(text).exists() else _SETTINGS.fullmatch(text)
+        request = cls(Path(text)) if found is None else cls(Path(found["path"]), found["settings"])
+        if not request.path.exists():
+            raise LogError(f"expected a log at {request.path}, found none; correct the path")
+        request.choice(LogChoice())
+        return request
+
+    def choice(self, common: LogChoice) -> LogChoice:
+        """The answers about all logs, with those about this one."""
+        return common.with_settings(self.settings) if self.settings else common
+
+    def __str__(self) -> str:
+        return f"{self.path},{self.settings}" if self.settings else str(self.path)

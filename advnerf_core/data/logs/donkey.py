@@ -1,0 +1,161 @@
+"""Reads tubs of Donkeycar: version 2 (``manifest.json``, catalogs of JSON lines) and version 1 (one JSON file per record).
+
+``user/angle`` is -1 at full left and 1 at full right (``donkeycar/parts/actuator.py``, PWMSteering). Which wheel angle that is depends
+on the car. Donkeycar 5 writes version 2 with ``parts/tub_v2.py``; version 1 is its ``parts/datastore.py``.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.data.errors import DatasetError
+from advnerf_core.data.image_files import read_stored
+from advnerf_core.data.logs.choice import LogChoice, LogError
+from advnerf_core.data.logs.drive_log import DriveLog, LogFrame, SteeringUnit, chosen_name
+from advnerf_core.documents import raise_problems, read_json, read_json_lines
+
+MANIFEST = "manifest.json"
+META = "meta.json"
+_STEERING, _MODE = "user/angle", "user/mode"
+_RECORD = re.compile(r"record_(\d+)\.json")
+_NS_PER_MS = 1_000_000
+_DELETED, _PILOT = "deleted", "not driven by the user"
+
+
+class _Record(NamedTuple):
+    place: str
+    values: dict[str, Any]
+    folder: Path
+    time_ms: float
+
+
+def read_tub(path: Path, choice: LogChoice) -> DriveLog:
+    """Describe a tub.
+
+    Args:
+        path: Folder of the tub.
+        choice: Answers of the user.
+
+    Raises:
+        ConfigError: A record is no JSON, or lacks a value.
+        LogError: The tub has no images, or not those that were chosen.
+    """
+    version = 2 if (path / MANIFEST).is_file() else 1
+    found, left_out = _version_2(path) if version == 2 else _version_1(path)
+    records, files = found
+    cameras = tuple(
+        sorted({key for each in records for key in each.values if key.startswith("cam/")}, key=_camera_order)
+    )
+    images = chosen_name(choice.images, cameras, "images", path)
+    name = choice.steering or _STEERING
+    driven = [each for each in records if each.values.get(_MODE, "user") == "user"]
+    left_out |= {_PILOT: len(records) - len(driven)} if len(driven) < len(records) else {}
+    values = _values(driven, name, images)
+    times_ms = [each.time_ms for each in driven]
+
+    def frames() -> Iterator[LogFrame]:
+        for number, (each, value) in enumerate(zip(driven, values, strict=True)):
+            stamp_ns = number if math.isnan(each.time_ms) else round(each.time_ms * _NS_PER_MS)
+            try:
+                rgb, _ = read_stored(each.folder / each.values[images])
+            except DatasetError as error:
+                raise LogError(f"{each.place}: {error}, or delete the record") from error
+            yield LogFrame(rgb, stamp_ns, float(value), each.place)
+
+    return DriveLog(
+        path,
+        f"Donkeycar tub, version {version}",
+        files,
+        images,
+        cameras,
+        tuple(
+            sorted({key for each in driven for key, value in each.values.items() if _is_control(key, value)})
+        ),
+        SteeringUnit(name, None, "right").chosen(choice) if np.isfinite(values).any() else None,
+        len(driven),
+        1e-3 * (times_ms[-1] - times_ms[0]) if driven else math.nan,
+        0,
+        lambda: values,
+        frames,
+        left_out=left_out,
+    )
+
+
+def _version_2(path: Path) -> tuple[tuple[list[_Record], tuple[Path, ...]], dict[str, int]]:
+    manifest = path / MANIFEST
+    lines = read_json_lines(manifest)
+    state = lines[-1][1] if len(lines) > 1 else None
+    if not isinstance(state, dict) or not isinstance(state.get("paths"), list):
+        raise LogError(
+            f"{manifest}: expected the catalogs ('paths') in its last line, got none; copy the tub again, "
+            "or repair it with Donkeycar"
+        )
+    deleted = {index for index in state.get("deleted_indexes", ()) if isinstance(index, int)}
+    catalogs = [path / str(name) for name in state["paths"]]
+    counts: Counter[str] = Counter()
+    records = []
+    for place, values in (row for catalog in catalogs for row in read_json_lines(catalog)):
+        values = _object(place, values)
+        if values.get("_index") in deleted:
+            counts[_DELETED] += 1
+            continue
+        records.append(_Record(place, values, path / "images", _time_ms(values.get("_timestamp_ms"))))
+    return (records, (manifest, *catalogs)), dict(counts)
+
+
+def _version_1(path: Path) -> tuple[tuple[list[_Record], tuple[Path, ...]], dict[str, int]]:
+    numbered = sorted(
+        (int(match[1]), file) for file in path.iterdir() if (match := _RECORD.fullmatch(file.name))
+    )
+    exclude = path / "exclude.json"
+    excluded = set(read_json(exclude)) if exclude.is_file() else set()
+    kept = [file for number, file in numbered if number not in excluded]
+    records = [
+        _Record(str(file), values, path, _time_ms(values.get("milliseconds")))
+        for file in kept
+        for values in [_object(str(file), read_json(file))]
+    ]
+    files = tuple(file for _, file in numbered)
+    return (records, files), ({_DELETED: len(files) - len(kept)} if len(kept) < len(files) else {})
+
+
+def _object(place: str, values: Any) -> dict[str, Any]:
+    if not isinstance(values, dict):
+        raise LogError(f"{place}: expected a record with keys and values, got {values!r:.40}")
+    return values
+
+
+def _values(records: list[_Record], name: str, images: str) -> NDArray[np.float64]:
+    """Steering of each record; NaN in a tub without any."""
+    values, problems = [], []
+    is_recorded = name != _STEERING or any(name in each.values for each in records)
+    for each in records:
+        value = each.values.get(name)
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        values.append(float(value) if isinstance(value, int | float) else math.nan)
+        if is_recorded and not is_number:
+            problems.append(f"{each.place}: {name}: expected a number, got {value!r:.40}; delete the record")
+        if not isinstance(each.values.get(images), str):
+            problems.append(f"{each.place}: expected the image {images}, got none; delete the record")
+    raise_problems(problems)
+    return np.array(values, np.float64)
+
+
+def _is_control(key: str, value: Any) -> bool:
+    return "/" in key and isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _time_ms(value: Any) -> float:
+    return float(value) if isinstance(value, int | float) else math.nan
+
+
+def _camera_order(name: str) -> tuple[bool, str]:
+    return name != "cam/image_array", name

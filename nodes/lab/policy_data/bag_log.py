@@ -1,0 +1,172 @@
+"""Reads a bag as a log of a drive: images joined by capture stamp with what was sent to the motor, and with poses.
+
+The wheel angle is that of ``/motor/sent``. A bag of other software has it in an ``AckermannDriveStamped``, whose ``steering_angle`` is in
+radians, left positive, by definition of the message. The velocities of a ``Twist`` are no wheel angle.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.data.logs.choice import LogChoice
+from advnerf_core.data.logs.drive_log import NOWHERE, DriveLog, LogFrame, SteeringUnit, chosen_name
+from advnerf_core.geometry import yaw_of
+from nodes.bags.images import CAMERA_TOPICS, image_messages
+from nodes.bags.reader import BagInfo, read_attachments, read_info, read_messages
+from nodes.control.pose_buffer import PoseBuffer
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.image_parts import IMAGE_TYPE
+from nodes.runtime.messages import decode, ns_from_stamp, pose_matrix
+from nodes.runtime.pictures import COMPRESSED_TYPE, rgb_image
+from nodes.runtime.topics import topic as topic_row
+
+CAR_TOPIC = "/vicon/car"
+_SAFETY, _SENT, _EXPERT = "/safety/state", "/motor/sent", "/expert/state"
+_IMAGES = ("/compositor/image", *CAMERA_TOPICS)
+_ACKERMANN = "ackermann_msgs/msg/AckermannDriveStamped"
+_JOIN_S = 0.12
+
+
+@dataclass
+class _Track:
+    """Data of a bag with which images are joined."""
+
+    poses: PoseBuffer = field(default_factory=lambda: PoseBuffer(keep_s=1e6))
+    armed: list[tuple[int, bool]] = field(default_factory=list)
+    sent: list[tuple[int, float, float]] = field(default_factory=list)
+    disturbed: list[tuple[int, bool]] = field(default_factory=list)
+
+    def is_armed(self, stamp_ns: int) -> bool:
+        """Whether the car was armed. A bag without states of the safety node counts as armed throughout."""
+        return not self.armed or bool(_last(self.armed, stamp_ns))
+
+    def is_disturbed(self, stamp_ns: int) -> bool:
+        return bool(self.disturbed) and bool(_last(self.disturbed, stamp_ns))
+
+    def command(self, stamp_ns: int) -> tuple[float, float]:
+        """Steering [rad] and speed [m/s] that were sent for an image, found by its stamp, or else the first command after it."""
+        index = bisect_left(self.sent, (stamp_ns, -math.inf, -math.inf))
+        if index == len(self.sent) or self.sent[index][0] - stamp_ns > _JOIN_S * NS_PER_S:
+            return math.nan, math.nan
+        return self.sent[index][1:]
+
+    def state(self, stamp_ns: int) -> tuple[float, float, float]:
+        """x [m], y [m], yaw [rad] of the car; NaN without a pose."""
+        pose = self.poses.at(stamp_ns, 0.0)
+        return NOWHERE if pose is None else (float(pose.T[0, 3]), float(pose.T[1, 3]), yaw_of(pose.T))
+
+
+def read_bag_log(bag: Path, choice: LogChoice) -> DriveLog:
+    """Describe a bag.
+
+    Args:
+        bag: Bag folder or file, of any software.
+        choice: Answers of the user; images and steering are topics.
+
+    Raises:
+        BagError: The bag cannot be read.
+        LogError: It lacks the chosen topics, or any images.
+    """
+    info = read_info(bag)
+    counts = {topic.name: topic.count for topic in info.topics if topic.count}
+    typed = {topic.name: topic.type for topic in info.topics if topic.count}
+    found = [name for name, kind in typed.items() if kind in (IMAGE_TYPE, COMPRESSED_TYPE)]
+    cameras = tuple(
+        sorted(found, key=lambda name: (_IMAGES.index(name) if name in _IMAGES else len(_IMAGES), name))
+    )
+    images = chosen_name(choice.images, cameras, "images", bag)
+    controls = tuple(name for name, kind in typed.items() if name == _SENT or kind == _ACKERMANN)
+    controls = tuple(sorted(controls, key=lambda name: (name != _SENT, name)))
+    steering = _steering_topic(choice.steering, controls, bag)
+    read = partial(
+        _read_track, bag, steering, [name for name in (CAR_TOPIC, _SAFETY, _EXPERT) if name in counts]
+    )
+    return DriveLog(
+        bag,
+        _format(info),
+        info.parts,
+        images,
+        cameras,
+        controls,
+        SteeringUnit(steering, 1.0, "left").chosen(choice) if steering else None,
+        counts[images],
+        info.duration_s,
+        counts.get(CAR_TOPIC, 0),
+        lambda: _steering_values(bag, steering),
+        lambda: _frames(bag, images, read()),
+        labels="expert",
+        attached=lambda: read_attachments(bag) if info.attachments else {},
+        unchecked=info.unchecked,
+    )
+
+
+def _format(info: BagInfo) -> str:
+    return f"bag ({info.parts[0].suffix[1:]})"
+
+
+def _steering_topic(wanted: str | None, controls: tuple[str, ...], bag: Path) -> str | None:
+    if wanted is not None or _SENT in controls or len(controls) == 1:
+        return chosen_name(wanted, controls, "a topic with wheel angles", bag)
+    return None
+
+
+def _frames(bag: Path, images: str, track: _Track) -> Iterator[LogFrame]:
+    for number, image in enumerate(image_messages(bag, images)):
+        stamp_ns = ns_from_stamp(image.header.stamp)
+        steering_rad, speed_mps = track.command(stamp_ns)
+        yield LogFrame(
+            rgb_image(image, f"{images} in {bag}"),
+            stamp_ns,
+            steering_rad,
+            f"{bag}, image {number}",
+            speed_mps,
+            track.state(stamp_ns),
+            "" if track.is_armed(stamp_ns) else "not armed",
+            track.is_disturbed(stamp_ns),
+        )
+
+
+def _steering_values(bag: Path, steering: str | None) -> NDArray[np.float64]:
+    sent = _read_track(bag, steering, []).sent if steering else []
+    return np.array([each[1] for each in sent], np.float64)
+
+
+def _read_track(bag: Path, steering: str | None, topics: list[str]) -> _Track:
+    track = _Track()
+    wanted = [*topics, *([steering] if steering else [])]
+    types = {steering: _ACKERMANN} if steering and steering != _SENT else {}
+    for message in read_messages(bag, wanted, types=types) if wanted else ():
+        kind = types.get(message.topic) or topic_row(message.topic).type
+        _add(track, message.topic, kind, decode(kind, message.cdr))
+    for stream in (track.armed, track.sent, track.disturbed):
+        stream.sort()
+    return track
+
+
+def _add(track: _Track, topic: str, kind: str, message: Any) -> None:
+    stamp_ns = ns_from_stamp(message.header.stamp)
+    if topic == CAR_TOPIC:
+        track.poses.add(stamp_ns, pose_matrix(message))
+    elif topic == _SAFETY:
+        track.armed.append((stamp_ns, bool(message.armed)))
+    elif topic == _EXPERT:
+        track.disturbed.append((stamp_ns, message.disturbance_rad != 0.0))
+    elif kind == _ACKERMANN:
+        track.sent.append((stamp_ns, float(message.drive.steering_angle), float(message.drive.speed)))
+    elif not message.braking:
+        # A policy's drive has the image's stamp. An expert's drive has the stamp of a pose just after it.
+        track.sent.append((stamp_ns, float(message.steering_rad), float(message.speed_mps)))
+
+
+def _last(stream: list[tuple[int, bool]], stamp_ns: int) -> bool:
+    index = bisect_left(stream, (stamp_ns + 1,)) - 1
+    return stream[index][1] if index >= 0 else False

@@ -1,0 +1,102 @@
+"""Opens a recorded drive of any format, and says which format it is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from advnerf_core.data.logs.choice import LogChoice, LogError, LogRequest
+from advnerf_core.data.logs.csv_log import UDACITY_FILE, read_csv_log
+from advnerf_core.data.logs.donkey import MANIFEST, META, read_tub
+from advnerf_core.data.logs.drive_log import DriveLog, Labels
+from advnerf_core.data.logs.lerobot import INFO, read_lerobot
+from nodes.bags.parts import METADATA_FILE, SUFFIXES, holds_bag
+from nodes.lab.policy_data.bag_log import read_bag_log
+
+_FORMATS = (
+    "a bag (.mcap, .db3, .bag, or its folder), a Donkeycar tub, a CSV file, a folder with Udacity's driving_log.csv, "
+    "or a LeRobot data set"
+)
+_COMMA = (
+    "rlog",
+    "rlog.bz2",
+    "rlog.zst",
+    "raw_log.bz2",
+    "video.hevc",
+    "fcamera.hevc",
+    "processed_log",
+    "global_pose",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class OpenLog:
+    """A log that a user named.
+
+    Attributes:
+        name: What the user wrote.
+        choice: Answers about it.
+        log: Its description.
+        labels: Source of its labels.
+    """
+
+    name: str
+    choice: LogChoice
+    log: DriveLog
+    labels: Labels
+
+
+def open_logs(
+    requests: Iterable[LogRequest], common: LogChoice, labels: Labels | None = None
+) -> list[OpenLog]:
+    """Describe the logs that a user named.
+
+    Args:
+        requests: The logs, each with answers of its own.
+        common: Answers about all logs.
+        labels: Source of the labels; None leaves it to the format.
+    """
+    opened = []
+    for request in requests:
+        choice = request.choice(common)
+        log = open_log(request.path, choice)
+        opened.append(OpenLog(str(request), choice, log, labels or log.labels))
+    return opened
+
+
+def open_log(path: Path, choice: LogChoice | None = None) -> DriveLog:
+    """Describe a recorded drive.
+
+    Args:
+        path: File or folder.
+        choice: Answers of the user; None leaves everything to the format.
+
+    Raises:
+        AdvnerfError: The format is unknown, or the log is damaged.
+    """
+    choice = choice or LogChoice()
+    if path.suffix == ".csv":
+        return read_csv_log(path, choice)
+    if path.suffix in SUFFIXES or path.name == METADATA_FILE:
+        return read_bag_log(path, choice)
+    if path.is_dir():
+        if (path / INFO).is_file():
+            return read_lerobot(path, choice)
+        if (path / MANIFEST).is_file() or (path / META).is_file() or any(path.glob("record_*.json")):
+            return read_tub(path, choice)
+        if (path / UDACITY_FILE).is_file():
+            return read_csv_log(path / UDACITY_FILE, choice)
+        if holds_bag(path):
+            return read_bag_log(path, choice)
+    raise LogError(_unknown(path))
+
+
+def _unknown(path: Path) -> str:
+    if path.name in _COMMA or any((path / name).exists() for name in _COMMA):
+        return (
+            f"{path} is a segment of comma.ai's logs, for which no maintained reader is known; "
+            "convert it to a LeRobot data set (with lerobot), or to images and a CSV file"
+        )
+    inside = ", ".join(sorted(each.name for each in path.iterdir())[:5]) if path.is_dir() else "one file"
+    return f"expected {_FORMATS}, got {path} ({inside or 'empty'}); name the folder of one log"

@@ -1,0 +1,71 @@
+"""Prepares several logs for one training: the camera, the room, the labels of each, and the range of the steering."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from advnerf_core.driving.expert import Expert
+from advnerf_core.policies.view import PolicyView
+from calibration.schema import Calibration, CameraCalibration, load_calibration
+from nodes.lab.policy_data.frames import RecordedFrames, frames_of, view_for_size, view_of
+from nodes.lab.policy_data.logs import OpenLog
+from nodes.lab.policy_data.train import TrainingRecording
+
+_LEAST_BOUND_RAD = 0.30
+_BOUND_OVER_LABEL = 1.1  # the bound of a network is where its tanh never arrives
+
+Model = TypeVar("Model", bound=Calibration)
+
+
+def training_recording(opened: OpenLog, view: PolicyView, expert: Expert | None) -> TrainingRecording:
+    """A log as a part of a training; images of another size than the view's are cropped at the same fraction."""
+    log, options = opened.log, {**asdict(opened.choice), "labels": opened.labels}
+    return TrainingRecording(
+        opened.name, log.files, options, lambda: recorded_frames(opened, view, expert), log.unchecked
+    )
+
+
+def recorded_frames(opened: OpenLog, view: PolicyView, expert: Expert | None) -> RecordedFrames:
+    """The usable frames of a log with its labels."""
+    return frames_of(opened.log, view_of(opened.log, view), expert, opened.labels)
+
+
+def attached_calibration(
+    model: type[Model], given: Path | None, logs: Sequence[OpenLog], name: str
+) -> Model | None:
+    """Load the given calibration file, or else the one attached to the first log that has it; None without any."""
+    if given is not None:
+        return load_calibration(model, given)
+    for each in logs:
+        if (content := each.log.attached().get(f"{name}.yaml")) is not None:
+            with tempfile.TemporaryDirectory() as folder:
+                file = Path(folder) / f"{name}.yaml of {each.log.path.name}"
+                file.write_bytes(content)
+                return load_calibration(model, file)
+    return None
+
+
+def policy_view(camera: Path | None, logs: Sequence[OpenLog]) -> PolicyView:
+    """The policy's view: of the camera's calibration if there is one, or else for the size of the first log's images."""
+    calibration: Any = attached_calibration(CameraCalibration, camera, logs, "camera")
+    if calibration is not None:
+        return PolicyView(calibration.pinhole, distortion=calibration.distortion)
+    height, width = logs[0].log.first_image().shape[:2]
+    return view_for_size(width, height)
+
+
+def steering_bound_rad(logs: Iterable[OpenLog]) -> float:
+    """Bound of a policy's steering that all recorded labels are within [rad]."""
+    largest_rad = 0.0
+    for each in logs:
+        values = each.log.steering() if each.labels == "recorded" and each.log.unit else np.zeros(0)
+        for value in (np.nanmin(values), np.nanmax(values)) if np.isfinite(values).any() else ():
+            if each.log.unit is not None:
+                largest_rad = max(largest_rad, abs(each.log.unit.wheel_rad(float(value), each.name)))
+    return max(_LEAST_BOUND_RAD, _BOUND_OVER_LABEL * largest_rad)

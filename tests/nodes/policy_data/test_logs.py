@@ -1,0 +1,308 @@
+"""Logs of other software: what their frames are, what is left out, what must be asked, and one line for what is damaged."""
+
+import contextlib
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from advnerf_core.data.logs.choice import LogChoice, LogError, LogRequest
+from advnerf_core.errors import AdvnerfError
+from nodes.lab.policy_data.frames import frames_of, view_for_size
+from nodes.lab.policy_data.log_facts import read_facts
+from nodes.lab.policy_data.logs import open_log, open_logs
+from nodes.lab.policy_data.recordings import steering_bound_rad
+from tests.support.commands import advnerf
+from tests.support.foreign_samples import WRITERS
+from tests.support.logs import (
+    CAMERA,
+    COUNT,
+    FPS,
+    GREY,
+    value,
+    write_lerobot_2,
+    write_lerobot_3,
+    write_tub_1,
+    write_tub_2,
+    write_udacity,
+)
+
+SHARED = Path(__file__).parents[4] / "shared/data/logs"
+FORMATS = {
+    "tub 2": write_tub_2,
+    "tub 1": write_tub_1,
+    "udacity": lambda folder: write_udacity(folder, True, "IMG/"),
+    "lerobot 2": write_lerobot_2,
+    "lerobot 3": write_lerobot_3,
+    "lerobot images": lambda folder: write_lerobot_3(folder, images="image"),
+}
+
+
+@pytest.fixture(autouse=True)
+def _lerobot_is_an_extra(request):
+    if (
+        "lerobot"
+        in str(getattr(request.node, "callspec", None) and request.node.callspec.params) + request.node.name
+    ):
+        pytest.importorskip("pyarrow")
+        pytest.importorskip("av")
+
+
+def greys(log):
+    return [round(float(frame.image.mean()) / GREY, 1) for frame in log.frames()]
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_frames_have_their_image_their_steering_and_their_time(tmp_path, form):
+    log = open_log(FORMATS[form](tmp_path / "log"))
+    frames = list(log.frames())
+    assert (log.count, len(frames)) == (COUNT, COUNT)
+    assert greys(log) == pytest.approx(range(COUNT), abs=0.2)
+    assert [frame.steering for frame in frames] == pytest.approx([value(k) for k in range(COUNT)], abs=1e-6)
+    assert log.steering() == pytest.approx([value(k) for k in range(COUNT)], abs=1e-6)
+    if form != "udacity":
+        times_s = [1e-9 * (frame.stamp_ns - frames[0].stamp_ns) for frame in frames]
+        assert times_s == pytest.approx(np.arange(COUNT) / FPS)
+        assert log.span_s == pytest.approx((COUNT - 1) / FPS)
+
+
+def test_deleted_records_and_those_of_a_pilot_are_left_out(tmp_path):
+    log = open_log(write_tub_2(tmp_path / "two", deleted=(2, 11), piloted=(5,)))
+    assert greys(log) == pytest.approx([0, 1, 3, 4, 6, 7, 8, 9, 10], abs=0.2)
+    assert log.left_out == {"deleted": 2, "not driven by the user": 1}
+    log = open_log(write_tub_1(tmp_path / "one", removed=(3,), excluded=(5,)))
+    assert greys(log) == pytest.approx([0, 1, 3, 5, 6, 7, 8, 9, 10, 11], abs=0.2)
+    assert log.left_out == {"deleted": 1}
+
+
+@pytest.mark.parametrize("header", [True, False])
+@pytest.mark.parametrize(
+    "prefix", ["IMG/", r"C:\Users\Ann\Desktop\run 1\IMG\\"[:-1], "/Users/ann/Desktop/IMG/", " IMG/", ""]
+)
+def test_a_udacity_log_is_read_as_it_was_downloaded(tmp_path, header, prefix):
+    log = open_log(write_udacity(tmp_path / "log", header, prefix))
+    assert (log.images, log.cameras, log.count) == ("center", ("center", "left", "right"), COUNT)
+    assert greys(log) == pytest.approx(range(COUNT), abs=0.2)
+    # 25 degrees at 1, to the right.
+    assert log.unit.wheel_rad(0.5, "here") == pytest.approx(-math.radians(12.5))
+
+
+def test_a_camera_at_the_side_needs_an_offset(tmp_path):
+    folder = write_udacity(tmp_path / "log", False)
+    with pytest.raises(LogError, match=r"steering belongs to the center camera.*steering-offset-rad"):
+        open_log(folder, LogChoice(images="left"))
+    log = open_log(folder, LogChoice(images="left", steering_offset_rad=-0.1))
+    assert log.unit.wheel_rad(0.0, "here") == pytest.approx(-0.1)
+    assert next(iter(log.frames())).image.max() == 1
+
+
+@pytest.mark.parametrize(
+    ("form", "needed"),
+    [
+        ("tub 2", "--steering-full-rad"),
+        ("lerobot 3", "--steering-full-rad and --steering-positive"),
+        ("udacity", ""),
+    ],
+)
+def test_the_unit_of_steering_is_asked_where_the_format_does_not_state_it(tmp_path, form, needed):
+    folder = FORMATS[form](tmp_path / "log")
+    log = open_log(folder)
+    assert log.unit.unknown == needed
+    if needed:
+        with pytest.raises(LogError, match=f"expected the unit of .*give {needed}"):
+            frames_of(log, view_for_size(64, 48), None, "recorded")
+    known = open_log(folder, LogChoice(steering_full_rad=0.4, steering_positive="left"))
+    labels = frames_of(known, view_for_size(64, 48), None, "recorded").frames.steering_rad
+    assert labels == pytest.approx([0.4 * value(k) for k in range(COUNT)], abs=1e-6)
+
+
+def test_which_number_of_a_lerobot_data_set_is_the_steering_is_not_guessed(tmp_path):
+    folder = write_lerobot_3(tmp_path / "log", names=("curvature", "speed"))
+    log = open_log(folder)
+    assert (log.unit, log.controls) == (None, ("action:curvature", "action:speed"))
+    with pytest.raises(LogError, match="name it with --steering, it has action:curvature, action:speed"):
+        frames_of(log, view_for_size(64, 48), None, "recorded")
+    assert open_log(folder, LogChoice(steering="action:curvature")).steering()[0] == pytest.approx(value(0))
+    with pytest.raises(LogError, match="expected steering action:7"):
+        open_log(folder, LogChoice(steering="action:7"))
+    radians = open_log(write_lerobot_3(tmp_path / "radians", names=("steering_rad", "speed")))
+    assert radians.unit.unknown == "--steering-positive"
+
+
+def cut(file, share=0.5):
+    content = file.read_bytes()
+    file.write_bytes(content[: int(share * len(content))])
+
+
+DAMAGED = {
+    "a catalog that was cut": ("tub 2", lambda f: cut(f / "catalog_1.catalog"), r"catalog_1\.catalog:\d: expected valid JSON"),
+    "a missing catalog": ("tub 2", lambda f: (f / "catalog_1.catalog").unlink(), r"catalog_1\.catalog: expected a file, found none"),
+    "a manifest without catalogs": ("tub 2", lambda f: (f / "manifest.json").write_text("[]\n[]\n"), "expected the catalogs"),
+    "a missing image": ("tub 2", lambda f: (f / "images/3_cam_image_array_.jpg").unlink(), r"catalog_0\.catalog:4: .*No such file.*delete the record"),
+    "a damaged image": ("tub 2", lambda f: cut(f / "images/3_cam_image_array_.jpg"), r"catalog_0\.catalog:4: expected a readable image"),
+    "a record that was cut": ("tub 1", lambda f: cut(f / "record_4.json"), r"record_4\.json:1: expected valid JSON"),
+    "a record without an angle": ("tub 1", lambda f: (f / "record_4.json").write_text('{"cam/image_array": "4_cam-image_array_.jpg"}'), "user/angle: expected a number, got None"),
+    "a row that was cut": ("udacity", lambda f: cut(f / "driving_log.csv", 0.97), r"driving_log\.csv:13: "),
+    "rows without images": ("udacity", lambda f: [each.unlink() for each in (f / "IMG").glob("*")], r"driving_log\.csv:2: center: expected an image, found no file"),
+    "a table that was cut": ("lerobot 3", lambda f: cut(f / "data/chunk-000/file-000.parquet"), r"file-000\.parquet: expected a Parquet file"),
+    "no table": ("lerobot 3", lambda f: (f / "data/chunk-000/file-000.parquet").unlink(), "expected tables data"),
+    "a video that was cut": ("lerobot 3", lambda f: cut(f / f"videos/{CAMERA}/chunk-000/file-000.mp4"), r"file-000\.mp4"),
+    "a missing video": ("lerobot 2", lambda f: (f / f"videos/chunk-000/{CAMERA}/episode_000001.mp4").unlink(), r"episode_000001\.mp4: No such file"),
+    "a description that was cut": ("lerobot 2", lambda f: cut(f / "meta/info.json"), r"info\.json:1: expected valid JSON"),
+    "another version": ("lerobot 2", lambda f: (f / "meta/info.json").write_text('{"codebase_version": "v1.6", "features": {}}'), "expected codebase_version v2 or v3, got v1.6"),
+    "missing episodes": ("lerobot 3", lambda f: (f / "meta/episodes/chunk-000/file-000.parquet").unlink(), "expected episode 0, found none"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", DAMAGED)
+def test_what_is_damaged_is_one_line(tmp_path, case):
+    form, damage, said = DAMAGED[case]
+    if "lerobot" in form:
+        pytest.importorskip("pyarrow")
+    folder = FORMATS[form](tmp_path / "log")
+    damage(folder)
+    with pytest.raises(AdvnerfError, match=said) as caught:
+        list(open_log(folder, LogChoice(steering_full_rad=0.4)).frames())
+    assert "\n" not in str(caught.value).split("\n", 1)[0]
+    assert len(str(caught.value).split("\n")[0]) < 500
+
+
+def test_random_damage_never_escapes_as_another_error(tmp_path):
+    rng = np.random.default_rng(0)
+    for form, name in (
+        ("tub 2", "manifest.json"),
+        ("tub 1", "record_4.json"),
+        ("udacity", "driving_log.csv"),
+    ):
+        folder = FORMATS[form](tmp_path / name)
+        content = (folder / name).read_bytes()
+        for _ in range(100):
+            spoiled = bytearray(content)
+            for place in rng.integers(0, len(spoiled), 3):
+                spoiled[place] = rng.integers(256)
+            (folder / name).write_bytes(bytes(spoiled))
+            with contextlib.suppress(AdvnerfError):
+                list(open_log(folder, LogChoice(steering_full_rad=0.4)).frames())
+
+
+def test_random_damage_of_a_lerobot_data_set_never_escapes_as_another_error(tmp_path):
+    rng = np.random.default_rng(0)
+    folder = write_lerobot_3(tmp_path / "log")
+    for name in (
+        "meta/info.json",
+        "data/chunk-000/file-000.parquet",
+        "meta/episodes/chunk-000/file-000.parquet",
+    ):
+        content = (folder / name).read_bytes()
+        for _ in range(60):
+            spoiled = bytearray(content)
+            for place in rng.integers(0, len(spoiled), 3):
+                spoiled[place] = rng.integers(256)
+            (folder / name).write_bytes(bytes(spoiled))
+            with contextlib.suppress(AdvnerfError):
+                list(open_log(folder).frames())
+        (folder / name).write_bytes(content)
+
+
+def test_what_is_no_log_is_told_apart(tmp_path):
+    (tmp_path / "segment").mkdir()
+    (tmp_path / "segment" / "video.hevc").write_bytes(b"x")
+    with pytest.raises(LogError, match=r"segment of comma\.ai's logs.*convert it to a LeRobot data set"):
+        open_log(tmp_path / "segment")
+    with pytest.raises(LogError, match=r"expected a bag .*, got .*\(segment\); name the folder of one log"):
+        open_log(tmp_path)
+
+
+def test_a_log_has_settings_of_its_own(tmp_path):
+    tub, drive = write_tub_2(tmp_path / "a,b=c"), write_udacity(tmp_path / "drive", False)
+    requests = [
+        LogRequest.parsed(f"{tub}"),
+        LogRequest.parsed(f"{drive},images=right,steering-offset-rad=0.1"),
+    ]
+    one, other = open_logs(requests, LogChoice(steering_full_rad=0.4))
+    assert (one.log.unit.full_rad, one.log.images) == (0.4, "cam/image_array")
+    assert (other.log.unit.offset_rad, other.log.images) == (0.1, "right")
+    assert steering_bound_rad([one, other]) == pytest.approx(1.1 * (0.6 * 0.4 + 0.1))
+    for text, said in [
+        (f"{drive},image=left", "expected settings of a log among images, steering"),
+        (f"{drive},steering-full-rad=-1", "expected a positive wheel angle"),
+        (f"{drive},steering-full-rad=wide", "steering-full-rad: expected a number"),
+        (f"{drive},steering-positive=up", "expected left or right, got 'up'"),
+        (f"{tmp_path / 'nope'}", "expected a log at .*nope, found none"),
+    ]:
+        with pytest.raises(LogError, match=said):
+            LogRequest.parsed(text)
+
+
+@pytest.mark.parametrize(
+    ("form", "change", "policy", "scene", "evaluation"),
+    [
+        ("tub 2", {}, "no: give --steering-full-rad", "no: 12 images are too few", "no: give --steering-full-rad"),
+        ("tub 2", {"steering_full_rad": 0.4}, "yes: labels are the recorded steering; 12 images are few, expect a weak policy", "no: 12 images are too few", "yes: against the recorded steering; too short for --held-out"),
+        ("tub 2", {"steering": "user/throttle", "steering_full_rad": 0.4}, "no: the steering is always 0.4", "no: 12 images are too few", "no: the steering is always 0.4"),
+        ("lerobot 3", {"steering": "action:throttle"}, "no: the steering is always 0.4", "no: 12 images are too few", "no: the steering is always 0.4"),
+    ],
+)  # fmt: skip
+def test_what_a_log_allows_is_said(tmp_path, form, change, policy, scene, evaluation):
+    facts = read_facts(open_log(FORMATS[form](tmp_path / "log"), LogChoice(**change)))
+    said = [f"{'yes' if each.possible else 'no'}: {each.why}" for each in facts.verdicts()]
+    assert said == [policy, scene, evaluation]
+
+
+def test_a_log_of_one_image_allows_nothing(tmp_path):
+    folder = write_tub_2(tmp_path / "log")
+    first = (folder / "images/0_cam_image_array_.jpg").read_bytes()
+    for file in (folder / "images").iterdir():
+        file.write_bytes(first)
+    facts = read_facts(open_log(folder, LogChoice(steering_full_rad=0.4)))
+    assert [(each.possible, each.why) for each in facts.verdicts()] == [
+        (False, "the images are all the same")
+    ] * 3
+
+
+def test_a_bag_says_what_it_lacks(tmp_path):
+    bag = WRITERS["mcap"](tmp_path / "drive")
+    facts = read_facts(open_log(bag))
+    assert facts.log.poses == facts.log.count > 0
+    policy, scene, evaluation = facts.verdicts()
+    assert (policy.possible, scene.possible, evaluation.possible) == (True, False, False)
+    assert "no steering found; name it with --steering: the log has no numbers" in evaluation.why
+
+
+def test_the_commands_train_on_several_logs_and_evaluate_held_out_frames(tmp_path, monkeypatch, capsys):
+    drive = str(write_udacity(tmp_path / "drive", False, "IMG/"))
+    tub = str(write_tub_2(tmp_path / "tub"))
+    logs = [drive, f"{tub},steering-full-rad=0.4"]
+    assert advnerf(monkeypatch, "policy", "train", *logs, "--steps", "2", "-o", str(tmp_path / "policy")) == 0
+    shown = capsys.readouterr().out
+    assert "recorded: steering, 1 is 0.436 rad to the right" in shown
+    assert "recorded: user/angle, 1 is 0.4 rad to the right" in shown
+    policy = str(tmp_path / "policy/policy.safetensors")
+    about = json.loads((tmp_path / "policy/policy.json").read_text())
+    assert about["frames"] == dict.fromkeys(logs, COUNT)
+    assert (
+        advnerf(monkeypatch, "policy", "eval", policy, *logs, "--saliency", "0", "-o", str(tmp_path / "eval"))
+        == 0
+    )
+    assert len(list((tmp_path / "eval").glob("*/steering.png"))) == 2
+    assert (
+        advnerf(monkeypatch, "policy", "eval", policy, drive, "--held-out", "-o", str(tmp_path / "eval")) == 2
+    )
+    assert "expected frames of" in capsys.readouterr().err
+    assert advnerf(monkeypatch, "policy", "train", tub, "-o", str(tmp_path / "none")) == 2
+    assert "give --steering-full-rad" in capsys.readouterr().err
+    assert advnerf(monkeypatch, "log", "info", *logs) == 0
+    assert "CSV file of Udacity's simulator" in capsys.readouterr().out
+
+
+@pytest.mark.skipif(not SHARED.exists(), reason="the shared logs are not here")
+def test_the_tub_of_donkeycar_s_tests_is_read_and_a_bag_without_images_refused():
+    log = open_log(SHARED / "donkey_tub", LogChoice(steering_full_rad=0.3))
+    frames = frames_of(log, view_for_size(160, 120), None, "recorded").frames
+    assert len(frames) == log.count == 80
+    assert frames.steering_rad[0] == pytest.approx(-0.3 * 0.2986039775370604)
+    for name in ("talker.mcap", "talker.db3", "split", "topics_and_services.db3"):
+        with pytest.raises(LogError, match=r"expected images in .*, it has none"):
+            open_log(SHARED / "rosbag2" / name)
