@@ -11,7 +11,7 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
-from advnerf_core.data.colmap_folder import model_suffix
+from advnerf_core.data.scan_folder import model_suffix
 from calibration.photo_model import ReconstructionError
 
 _SHOWN = 6

@@ -156,7 +156,7 @@ class Model(PlainData):
         images: Images with poses, in the order they were given.
         left_out: Images without a pose, and why.
         points: Points of the scene ``[M, 3]``, seen from three images or more.
-        reprojection_error_px: Mean distance of a point's projection from where it was seen [px].
+        reprojection_error_px: Mean distance of a point's projection from where it was seen [px]; None if unknown.
         parts: Number of separate models; this is the largest.
         cameras: The cameras of the images with poses.
     """
@@ -164,7 +164,7 @@ class Model(PlainData):
     images: tuple[Registered, ...]
     left_out: tuple[LeftOut, ...]
     points: Numbers
-    reprojection_error_px: float
+    reprojection_error_px: float | None
     parts: int
     cameras: tuple[FoundCamera, ...] = ()
 

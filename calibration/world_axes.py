@@ -49,9 +49,13 @@ def cameras_up(poses: Array) -> Array:
     return up / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
 
 
-def find_ground(poses: Array, points: Array, seed: int = 0) -> Ground | None:
-    """The plane of most points ``[M, 3]`` below the cameras and nearly level; None if no plane has enough points."""
-    up, positions = cameras_up(poses), poses[:, :3, 3]
+def find_ground(poses: Array, points: Array, seed: int = 0, up: Array | None = None) -> Ground | None:
+    """The plane of most points ``[M, 3]`` below the cameras and nearly level; None if no plane has enough points.
+
+    Args:
+        up: Up ``[3]``; None takes the cameras'.
+    """
+    up, positions = cameras_up(poses) if up is None else up, poses[:, :3, 3]
     below = points[points @ up < np.median(positions @ up)]
     if len(below) < _MIN_POINTS:
         return None
@@ -122,3 +126,12 @@ def on_ground(model: Model, ground: Ground | None, scale: float) -> Similarity:
     if ground is not None:
         middle = middle - (middle @ up - ground.height) * up
     return Similarity(scale, make_transform(R, -scale * R @ middle))
+
+
+def upright(R_upright_from_model: Array, model: Model, ground: Ground | None, scale: float) -> Similarity:
+    """Similarity for a model whose rotation ``[3, 3]`` to z up is known: its origin is kept, but for a ground, which comes to z = 0."""
+    up, height = R_upright_from_model[2], 0.0
+    if ground is not None:  # below the middle of the cameras
+        middle = model.poses[:, :3, 3].mean(axis=0)
+        height = float(up @ middle - (ground.up @ middle - ground.height) / (ground.up @ up))
+    return Similarity(scale, make_transform(R_upright_from_model, [0.0, 0.0, -scale * height]))

@@ -14,11 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from advnerf_core.data.colmap_folder import from_colmap_advice
 from advnerf_core.data.errors import DatasetError, raise_all
 from advnerf_core.data.image_files import SUFFIXES, image_size
 from advnerf_core.data.lens import Lens
 from advnerf_core.data.posed_image import PosedImage
+from advnerf_core.data.rigid import rigid_pose
+from advnerf_core.data.scan_folder import from_scan_advice
 from advnerf_core.data.views import HELD_OUT_SPLITS, NGP_OFFSET, NGP_SCALE, TRAIN, PosedImages
 from advnerf_core.documents import read_json
 from advnerf_core.errors import ConfigError, MissingFileError
@@ -50,7 +51,6 @@ _OTHER_KEYS = (
     "timestamp", "time",
 )  # fmt: skip
 _SPLITS = (TRAIN, *HELD_OUT_SPLITS)
-_RIGID_TOLERANCE = 0.01
 # Relative to the spread of the cameras, in any unit: single precision resolves a thousandth of the spread there. Anything farther has
 # a map's origin, not a scene's.
 _FARTHEST = 1e4
@@ -128,7 +128,7 @@ def _read_json(path: Path) -> _Values:
     try:
         content = read_json(path)
     except MissingFileError as error:
-        advice = from_colmap_advice(path.parent, "correct the path")
+        advice = from_scan_advice(path.parent, "correct the path")
         raise DatasetError(f"expected a transforms.json at {path}, found none; {advice}") from error
     except ConfigError as error:
         raise DatasetError(str(error)) from error
@@ -210,32 +210,9 @@ def _pose(values: _Values) -> Array:
     if "transform_matrix" not in values:
         raise _FieldError("transform_matrix: expected the camera's pose, it is missing")
     try:
-        matrix = np.array(values["transform_matrix"], np.float64)
-    except (ValueError, TypeError):
-        raise _FieldError(
-            f"transform_matrix: expected 4 x 4 numbers, got {values['transform_matrix']!r:.80}"
-        ) from None
-    if matrix.shape == (3, 4):
-        matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
-    if matrix.shape != (4, 4):
-        raise _FieldError(f"transform_matrix: expected 4 x 4 numbers, got shape {list(matrix.shape)}")
-    if not np.isfinite(matrix).all():
-        raise _FieldError(
-            "transform_matrix: expected finite numbers, got NaN or infinity; leave this frame out"
-        )
-    if np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > _RIGID_TOLERANCE:
-        raise _FieldError(
-            f"transform_matrix: expected the last row 0 0 0 1, got {matrix[3].tolist()}; is it transposed?"
-        )
-    u, stretch, vt = np.linalg.svd(matrix[:3, :3])
-    if np.abs(stretch - 1.0).max() > _RIGID_TOLERANCE or np.linalg.det(matrix[:3, :3]) < 0.0:
-        kind = "a mirror image" if np.linalg.det(matrix[:3, :3]) < 0.0 else "a stretch"
-        raise _FieldError(
-            f"transform_matrix: expected a rotation and a translation, got {kind} by {', '.join(f'{s:.4g}' for s in stretch)} in "
-            "its rotation part; remove the scale of the camera (or of its parent) and export again"
-        )
-    # Files often have rotations rounded to a few digits; the nearest rotation keeps rays of unit length.
-    matrix[:3, :3] = u @ vt
+        matrix = rigid_pose(values["transform_matrix"])
+    except ValueError as error:
+        raise _FieldError(f"transform_matrix: {error}") from None
     return np.asarray(matrix @ OPENGL_FROM_OPENCV, np.float64)
 
 

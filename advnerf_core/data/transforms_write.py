@@ -26,6 +26,7 @@ def write_transforms(
     *,
     lens: Lens | Sequence[Lens] | None = None,
     camera_ids: Sequence[str] | None = None,
+    masks: Sequence[str | Path | None] | None = None,
     extra: Mapping[str, Any] | None = None,
 ) -> None:
     """Write a ``transforms.json``, whole or not at all; images are written by the caller.
@@ -37,6 +38,7 @@ def write_transforms(
         aabb_scale: Instant-NGP's box size.
         lens: Distortion of all images, or one each; None for none.
         camera_ids: Id of each image's camera.
+        masks: Mask of each image, or None; as ``image_paths``.
         extra: Further data for the top of the file (JSON types).
     """
     path, poses, count = Path(path), np.asarray(T_world_from_camera, np.float64), len(image_paths)
@@ -48,6 +50,9 @@ def write_transforms(
     ids = [None] * count if camera_ids is None else list(camera_ids)
     if len(ids) != count:
         raise ValueError(f"expected {count} camera ids, one per image, got {len(ids)}")
+    masked = [None] * count if masks is None else list(masks)
+    if len(masked) != count:
+        raise ValueError(f"expected {count} masks or Nones, one per image, got {len(masked)}")
     intrinsics = [_intrinsics(p, each) for p, each in zip(pinholes, lenses, strict=True)]
     shared = intrinsics[0] if intrinsics and all(values == intrinsics[0] for values in intrinsics) else {}
     content = {"camera_model": "OPENCV", **shared, **dict(extra or {})}
@@ -58,6 +63,8 @@ def write_transforms(
         frame: dict[str, Any] = {"file_path": _relative(Path(image), path.parent)}
         if ids[index] is not None:
             frame["camera_id"] = ids[index]
+        if (mask := masked[index]) is not None:
+            frame["mask_path"] = _relative(Path(mask), path.parent)
         frame["transform_matrix"] = (poses[index] @ OPENGL_FROM_OPENCV).tolist()
         frames.append({**frame, **({} if shared else intrinsics[index])})
     write_json(path, {**content, "frames": frames})

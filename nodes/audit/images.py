@@ -1,4 +1,4 @@
-"""The posed photographs of a place, from the user's input: ``transforms.json``, a COLMAP model beside its images, photographs, or videos."""
+"""The posed photographs of a place, from the user's input: ``transforms.json``, any other scan, photographs, or videos."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from advnerf_core.data.colmap_folder import model_suffix
 from advnerf_core.data.image_files import HEIF_SUFFIXES, SUFFIXES
+from advnerf_core.data.scan_folder import DATA_SET, SCANS, ScanFolder, scan_of
 from advnerf_core.documents import read_json
 from nodes.audit.asking import UnansweredError
 from nodes.audit.question import PlaceKind, Scale
@@ -17,6 +17,8 @@ from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
 
 POSES, IMPORTED, REPORT = "transforms.json", "photos", "import.json"
+# nerfstudio writes this key for poses from structure from motion, whose unit is arbitrary.
+_OF_COLMAP = "applied_transform"
 _EXTENT_M = 1.0  # of a set without a known metre, which is then rejected
 _MOVEMENT, _MOST = 0.06, 300  # as in ``advnerf scene from-video``
 
@@ -52,18 +54,21 @@ def posed(given: Path, folder: Path, metric: MetricOptions) -> PosedPlace:
         AdvnerfError: The input cannot be read, or poses cannot be estimated.
     """
     poses = given / POSES if given.is_dir() else given
-    if poses.is_file() and poses.suffix == ".json":
-        return _known(poses, "images")
+    found = scan_of(given)
+    if found is not None and found.name == DATA_SET and poses.is_file():
+        ours = bool(_facts(poses.parent))
+        if not metric.gives_metre or (ours and _scale_of(poses) is not None):
+            return _known(poses, "images")
     imported = folder / IMPORTED
-    kind: PlaceKind = "video" if given.is_file() else "images"
-    if not (imported / POSES).is_file() or (metric.gives_metre and _scale_of(imported) is None):
+    kind: PlaceKind = "images" if given.is_dir() or found is not None else "video"
+    if not (imported / POSES).is_file() or (metric.gives_metre and _scale_of(imported / POSES) is None):
         with ProgressDisplay() as display:
-            _importer(given)(imported, metric, display.start("poses"))
+            _importer(given, found)(imported, metric, display.start("poses"))
     return _known(imported / POSES, kind)
 
 
 def _known(poses: Path, kind: PlaceKind) -> PosedPlace:
-    scale = _scale_of(poses.parent)
+    scale = _scale_of(poses)
     if scale is None:
         raise UnansweredError(
             f"expected a known length, as {poses} has none and an audit speaks of metres: --length A B METRES (A and B: two of the images there, "
@@ -72,8 +77,12 @@ def _known(poses: Path, kind: PlaceKind) -> PosedPlace:
     return PosedPlace(poses, kind, scale, bool(_facts(poses.parent).get("ground_at_zero", False)))
 
 
-def _scale_of(folder: Path) -> Scale | None:
-    scale: Scale | None = _facts(folder).get("scale_from", "poses")
+def _scale_of(poses: Path) -> Scale | None:
+    facts = _facts(poses.parent)
+    content = {} if facts else read_json(poses)
+    if isinstance(content, dict) and _OF_COLMAP in content:
+        return None
+    scale: Scale | None = facts.get("scale_from", "poses")
     return scale
 
 
@@ -83,23 +92,16 @@ def _facts(folder: Path) -> dict[str, Any]:
     return facts
 
 
-def _importer(given: Path) -> Callable[[Path, MetricOptions, Any], object]:
-    """The function that estimates the poses of some input."""
-    models = next(
-        (each for each in (given, given / "sparse", given / "colmap" / "sparse") if _holds_model(each)), None
-    )
-    if models is not None:
-        from nodes.lab.importing.colmap import from_colmap
+def _importer(given: Path, found: ScanFolder | None) -> Callable[[Path, MetricOptions, Any], object]:
+    """The function that makes a data set of some input."""
+    if found is not None:
+        from calibration.scans.scan import ScanOptions
+        from nodes.lab.importing.scan import from_scan
 
-        images = given / "images"
-        if not images.is_dir():
-            raise ConfigError(
-                f"--place {given}: expected the folder images beside the COLMAP model, which is not there"
-            )
-        return lambda output, metric, report: from_colmap(models, images, output, None, metric, report)
+        return lambda output, metric, report: from_scan(given, output, ScanOptions(), metric, report)
     if not given.exists():
         raise ConfigError(
-            f"--place: expected photographs, a video or a COLMAP model, got {given}, which is not there"
+            f"--place: expected photographs, a video or a scan, got {given}, which is not there"
         )
     if given.suffix == ".safetensors":
         raise ConfigError(
@@ -109,15 +111,11 @@ def _importer(given: Path) -> Callable[[Path, MetricOptions, Any], object]:
     if given.is_dir() and not any(
         each.suffix.lower() in (*SUFFIXES, *HEIF_SUFFIXES) for each in given.rglob("*")
     ):
+        known = ", ".join(each.shown_by for each in SCANS)
         raise ConfigError(
-            f"--place {given}: expected photographs, {POSES} or a COLMAP model in it, got a folder without"
+            f"--place {given}: expected photographs or a scan in it ({known}), got a folder without; give the folder that holds them"
         )
     return _from_media(given)
-
-
-def _holds_model(folder: Path) -> bool:
-    inside = folder.iterdir() if folder.is_dir() else ()
-    return model_suffix(folder) is not None or any(model_suffix(each) for each in inside if each.is_dir())
 
 
 def _from_media(given: Path) -> Callable[[Path, MetricOptions, Any], object]:

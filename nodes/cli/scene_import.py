@@ -180,31 +180,49 @@ def from_phone_and_car(
     )
 
 
-@app.command("from-colmap")
+@app.command("from-scan")
 @with_groups
-def from_colmap(
-    model: Annotated[
+def from_scan(
+    scan: Annotated[
         Path,
         typer.Argument(
-            help="Folder of a COLMAP model, or of several (sparse).", exists=True, file_okay=False
+            help="Folder or file of Polycam, Record3D, nerfstudio, COLMAP, LLFF, EuRoC or TUM.", exists=True
         ),
-    ],
-    images: Annotated[
-        Path, typer.Argument(help="Folder of the images that COLMAP used.", exists=True, file_okay=False)
     ],
     output: Output,
     metric: MetricOptions,
+    images: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of the images, if it is not where the format has it.", exists=True, file_okay=False
+        ),
+    ] = None,
     number: Annotated[
-        str | None, typer.Option("--model", help="Which of several models.", show_default="the largest")
+        str | None,
+        typer.Option("--model", help="Which of several COLMAP models.", show_default="the largest"),
+    ] = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            help="Camera calibration (camera.yaml), if the scan has no lens.", exists=True, dir_okay=False
+        ),
+    ] = None,
+    most: Annotated[
+        int | None,
+        typer.Option(
+            min=3, help="Use at most this many images, evenly spread.", show_default="all; 300 of a recording"
+        ),
     ] = None,
 ) -> None:
-    """Use the poses and lenses of a COLMAP model. No pose is estimated.
+    """Use the poses and lenses that scanning software found. No pose is estimated.
 
-    Without --length, --positions or --marker the data set is in COLMAP's unit instead of metres.
+    If the scan has no metre, the data set has its unit, unless --length, --positions or --marker gives one.
     """
-    from nodes.lab.importing.colmap import from_colmap as run
+    from calibration.scans.scan import ScanOptions
+    from nodes.lab.importing.scan import from_scan as run
 
-    _run("from-colmap", output, lambda report: run(model, images, output, number, metric, report))
+    options = ScanOptions(images, number, calibration, most)
+    _run("from-scan", output, lambda report: run(scan, output, options, metric, report))
 
 
 @app.command("match-colours")
@@ -287,10 +305,12 @@ def _print_report(imported: Imported) -> None:
             f"{facts['taken_frames']} of {facts['recorded_frames']} frames used, {facts['without_pose']} had no motion-capture pose"
             + (f"; unchecked: {facts['unchecked']}" if facts.get("unchecked") else "")
         )
-    if colmap := facts.get("colmap"):
+    if scan := facts.get("scan"):
+        print(f"format: {scan['format']}")
+    if colmap := facts.get("scan", {}).get("colmap"):
         sizes = ", ".join(f"{name} ({size} images)" for name, size in colmap["images_by_model"].items())
         print(f"model {colmap['model']}" + (f" of {sizes}; --model uses another" if "," in sizes else ""))
-    if model := facts.get("structure_from_motion"):
+    if model := facts.get("structure_from_motion") or facts.get("model"):
         _print_model(model)
     if placing := facts.get("placing"):
         print(
@@ -314,9 +334,9 @@ def _print_model(model: dict[str, Any]) -> None:
     for camera, found in model["cameras"].items():
         print(f"{camera}: {found['model']}: {found['why']}")
     total = model["registered"] + len(model["left_out"])
-    print(
-        f"{model['registered']} of {total} images placed, {model['points']} points, reprojection error {model['reprojection_error_px']:.2f} px"
-    )
+    error_px = model["reprojection_error_px"]
+    error = "" if error_px is None else f", reprojection error {error_px:.2f} px"
+    print(f"{model['registered']} of {total} images placed, {model['points']} points{error}")
     for image in model["left_out"][:_SHOWN]:
         print(f"left out: {image['name']}: {image['why']}")
     if (more := len(model["left_out"]) - _SHOWN) > 0:

@@ -15,15 +15,17 @@ from advnerf_core.files import write_json
 from advnerf_core.geometry import Array, Pinhole
 from calibration.phone_and_car import Placed, place_in_mocap
 from calibration.photo_model import Model, PhotoSource, SfmConfig
+from calibration.scans.scan import Picture
 from calibration.structure_from_motion import reconstruct
 from calibration.world_axes import extent_scale
 from nodes.lab.importing.driven_bag import CAR_CAMERA, BagConfig, DrivenFrames, take_frames
 from nodes.lab.importing.errors import ImportRecordingError
 from nodes.lab.importing.media import IMAGES, MediaConfig, gather
-from nodes.lab.importing.metric import Unscaled, place, undistorted_views
+from nodes.lab.importing.metric import OwnScale, place, undistorted_views
 from nodes.lab.importing.metric_options import MetricOptions
 from nodes.lab.importing.staging import (
     COLMAP,
+    MASKS,
     REPORT_FILE,
     TRANSFORMS,
     TRANSFORMS_CAR,
@@ -34,6 +36,8 @@ from nodes.runtime.progress import Report
 
 _MEDIA_SHARE = 0.3
 _BOX_PERCENT, _BOX_MARGIN = 0.5, 0.05
+# Without points nobody knows where the walls are: beyond this margin the scene is contracted. Any number above 1 says so.
+_OPEN_MARGIN, _UNBOUNDED = 0.5, 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +82,8 @@ def from_media(
             media, folder, media_config, lambda share, text="": report(_MEDIA_SHARE * share, text)
         )
         model = _reconstruct(folder, sources, sfm, report)
-        assumed = Unscaled(
-            extent_scale(model, extent_m), f"not metric: an extent of {extent_m:g} m was assumed"
+        assumed = OwnScale(
+            extent_scale(model, extent_m), None, f"not metric: an extent of {extent_m:g} m was assumed"
         )
         similarity, placing = place(model, {}, lambda: undistorted_views(model, folder), metric, assumed)
         poses, points = similarity.poses(model.poses), similarity.points(model.points)
@@ -184,7 +188,13 @@ def _reconstruct(output: Path, sources: Sequence[PhotoSource], sfm: SfmConfig, r
 
 
 def write_model_set(
-    output: Path, model: Model, poses: Array, points: Array, facts: dict[str, Any]
+    output: Path,
+    model: Model,
+    poses: Array,
+    points: Array,
+    facts: dict[str, Any],
+    pictures: Sequence[Picture] = (),
+    reached: Array | None = None,
 ) -> Imported:
     """Write ``transforms.json`` for images that are in a folder, and the report.
 
@@ -193,9 +203,13 @@ def write_model_set(
         poses: ``T_world_from_camera [N, 4, 4]`` of the images.
         points: Points of the scene ``[M, 3]``.
         facts: Content of the report.
+        pictures: Masks and splits of the images; empty for none.
+        reached: Points ``[M, 3]`` around the content, for a scene without points.
     """
     path = output / TRANSFORMS
-    _write_model(path, output, model, poses, range(len(model.images)), _box_of(points, poses))
+    box = _box_of(points, poses) if len(points) else _open_box(poses, reached)
+    masks = [output / MASKS / f"{each.name}.png" if each.mask else None for each in pictures]
+    _write_model(path, output, model, poses, range(len(model.images)), {**box, **_splits(pictures)}, masks)
     return _finish(output, (path,), facts)
 
 
@@ -217,7 +231,13 @@ def _write_joint(
 
 
 def _write_model(
-    path: Path, output: Path, model: Model, poses: Array, chosen: Sequence[int], extra: dict[str, Any]
+    path: Path,
+    output: Path,
+    model: Model,
+    poses: Array,
+    chosen: Sequence[int],
+    extra: dict[str, Any],
+    masks: Sequence[Path | None] = (),
 ) -> None:
     images = [model.images[index] for index in chosen]
     write_transforms(
@@ -227,8 +247,18 @@ def _write_model(
         [image.pinhole for image in images],
         lens=[image.lens for image in images],
         camera_ids=[image.camera_id for image in images],
+        masks=masks or None,
         extra=extra,
     )
+
+
+def _splits(pictures: Sequence[Picture]) -> dict[str, list[str]]:
+    """nerfstudio's lists of files by split."""
+    splits: dict[str, list[str]] = {}
+    for each in pictures:
+        if each.split is not None:
+            splits.setdefault(f"{each.split}_filenames", []).append(f"{IMAGES}/{each.name}")
+    return splits
 
 
 def _write_car(path: Path, frames: DrivenFrames, extra: dict[str, Any]) -> None:
@@ -262,6 +292,13 @@ def _box_of(points: Array, poses: Array) -> dict[str, Any]:
         else np.zeros((0, 3))
     )
     return _box(np.concatenate([ends, poses[:, :3, 3]]), _BOX_MARGIN)
+
+
+def _open_box(poses: Array, reached: Array | None) -> dict[str, Any]:
+    """Inner box of an unbounded scene around the cameras and what they reach, as far as that is known."""
+    places = poses[:, :3, 3]
+    known = places if reached is None or not len(reached) else np.concatenate([places, reached])
+    return {**_box(known, _OPEN_MARGIN), "aabb_scale": _UNBOUNDED}
 
 
 def _box(corners: Array, margin: float) -> dict[str, Any]:

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from advnerf_core.data import image_bytes, image_files, video
-from advnerf_core.data.colmap_folder import from_colmap_advice
 from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.keyframes import KeyframeConfig
+from advnerf_core.data.scan_folder import from_scan_advice
 from advnerf_core.files import write_atomically
 from calibration.photo_model import PhotoSource
 from nodes.lab.importing.errors import ImportRecordingError
@@ -93,7 +93,7 @@ def photographs_in(folder: Path) -> list[Path]:
         elif path.is_file() and not path.name.startswith("."):
             others[path.suffix.lower() or "(no suffix)"] += 1
     if not files:
-        advice = from_colmap_advice(folder, "give the folder that holds them")
+        advice = from_scan_advice(folder, "give the folder that holds them")
         raise ImportRecordingError(
             f"expected photographs ({', '.join(_SUFFIXES)}) in {folder}, got none; {advice}"
         )

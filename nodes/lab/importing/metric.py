@@ -17,21 +17,23 @@ from advnerf_core.errors import ConfigError
 from advnerf_core.geometry import Array
 from calibration.known_scale import View, fit_known_positions, length_scale, marker_scale
 from calibration.photo_model import Model
-from calibration.world_axes import Ground, find_ground, on_ground
+from calibration.world_axes import Ground, find_ground, on_ground, upright
 from nodes.lab.importing.errors import ImportRecordingError
 from nodes.lab.importing.metric_options import MetricOptions
 
 
 @dataclass(frozen=True)
-class Unscaled:
+class OwnScale:
     """Scale of a model without a known length.
 
     Attributes:
         scale: Factor of its lengths.
+        source: Source of the metre: ``poses``, or None if lengths are not metric.
         why: The report's explanation.
     """
 
     scale: float
+    source: str | None
     why: str
 
 
@@ -40,7 +42,8 @@ def place(
     points_by_id: Mapping[int, Array],
     views: Callable[[], Iterable[View]],
     options: MetricOptions,
-    otherwise: Unscaled,
+    otherwise: OwnScale,
+    R_upright_from_model: Array | None = None,
 ) -> tuple[Similarity, dict[str, Any]]:
     """Similarity from a model into an upright world, and the report's description of it.
 
@@ -48,14 +51,17 @@ def place(
         points_by_id: Points ``[3]`` of the model by COLMAP's number.
         views: Returns the undistorted images, for markers.
         otherwise: The scale if no option gives it.
+        R_upright_from_model: Rotation ``[3, 3]`` to z up, if the model knows gravity.
     """
-    ground = _ground(model, options)
+    known = R_upright_from_model if options.up == "auto" else None
+    ground = _ground(model, options, known)
     if options.positions is not None:
         return _at_positions(model, options.positions, ground)
-    up = "the cameras' up"
+    up = "the cameras' up" if known is None else "that of the scan"
     if ground is not None:
-        up = f"normal of the ground, a plane of {ground.points} points at z = 0"
-    scale, scale_from, said = otherwise.scale, None, otherwise.why
+        plane = f"a plane of {ground.points} points at z = 0"
+        up = f"normal of the ground, {plane}" if known is None else f"{up}; the ground is {plane}"
+    scale, scale_from, said = otherwise.scale, otherwise.source, otherwise.why
     if options.length is not None:
         one, other, length_m = options.length
         scale, scale_from = length_scale(model, points_by_id, one, other, length_m), "length"
@@ -64,11 +70,13 @@ def place(
         found = marker_scale(views(), options.marker_m, options.dictionary)
         scale, scale_from = found.scale, "fiducials"
         said = f"metric: {found.markers} markers of {options.marker_m:g} m, whose sides differ by {100 * found.spread:.2g} %"
-    return on_ground(model, ground, scale), _facts(said, scale_from, up, ground is not None)
+    similarity = on_ground(model, ground, scale) if known is None else upright(known, model, ground, scale)
+    return similarity, _facts(said, scale_from, up, ground is not None)
 
 
-def _ground(model: Model, options: MetricOptions) -> Ground | None:
-    ground = None if options.up == "cameras" else find_ground(model.poses, model.points)
+def _ground(model: Model, options: MetricOptions, known: Array | None) -> Ground | None:
+    up = None if known is None else known[2]
+    ground = None if options.up == "cameras" else find_ground(model.poses, model.points, up=up)
     if ground is None and options.up == "ground":
         raise ImportRecordingError(
             "expected a ground plane among the points below the cameras, found none; take photographs that show more of the ground, "

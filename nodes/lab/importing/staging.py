@@ -14,10 +14,10 @@ from nodes.lab.importing.errors import ImportRecordingError
 from nodes.lab.importing.media import IMAGES
 from nodes.runtime.locks import HeldError, hold
 
-TRANSFORMS, REPORT_FILE, COLMAP = "transforms.json", "import.json", "colmap"
+TRANSFORMS, REPORT_FILE, COLMAP, MASKS = "transforms.json", "import.json", "colmap", "masks"
 TRANSFORMS_PHONE, TRANSFORMS_CAR = "transforms_phone.json", "transforms_car.json"
 # In the order in which they are moved. After the last one, the folder is a data set.
-_ENTRIES = (IMAGES, COLMAP, REPORT_FILE, TRANSFORMS_PHONE, TRANSFORMS_CAR, TRANSFORMS)
+_ENTRIES = (IMAGES, MASKS, COLMAP, REPORT_FILE, TRANSFORMS_PHONE, TRANSFORMS_CAR, TRANSFORMS)
 _CLAIM, _LOCK = ".made_by_advnerf", ".lock"
 
 Built = TypeVar("Built")
@@ -82,7 +82,7 @@ def build_beside(
 
 def _require_ours(output: Path, work: Path, media: Sequence[Path]) -> None:
     """Check that the images in a folder are from an earlier import, because they are replaced. A user's photographs are never touched."""
-    for images in (output / IMAGES, output / COLMAP, work):
+    for images in (output / IMAGES, output / MASKS, output / COLMAP, work):
         inside = [path for path in media if path.resolve().is_relative_to(images.resolve())]
         if inside:
             raise ImportRecordingError(

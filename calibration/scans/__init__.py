@@ -1,0 +1,1 @@
+"""Readers of posed images from scanning software, one module for each format."""

@@ -1,0 +1,118 @@
+"""Reads data sets of nerfstudio, Instant-NGP and blender as scans, so that they can be put upright and get metres.
+
+Format: https://docs.nerf.studio/quickstart/data_conventions.html. ``applied_transform`` took COLMAP's world to the file's; ``dataparser_transforms.json`` takes COLMAP's world to that
+of a trained model: ``scale * (transform x)``.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from advnerf_core.data.image_files import read_bytes
+from advnerf_core.data.posed_image import PosedImage
+from advnerf_core.data.transforms import load_transforms
+from advnerf_core.documents import read_json
+from advnerf_core.geometry import Array, invert_transform
+from calibration.photo_model import LeftOut, Registered
+from calibration.scans.scan import (
+    Picture,
+    Scan,
+    ScanError,
+    ScanOptions,
+    lens_of,
+    model_of,
+    number,
+    pose_of,
+    spread,
+)
+
+_DATAPARSER = "dataparser_transforms.json"
+_UNKNOWN = "unknown: lengths are in the file's unit; if that is not the metre, give --length, --positions or --marker"
+
+
+def read(path: Path, options: ScanOptions) -> Scan:
+    """Read a data set, or the file of one.
+
+    Raises:
+        DatasetError: The file cannot be used.
+        ScanError: There are too few images, or a lens cannot be undone.
+    """
+    if options.images is not None:
+        raise ScanError(
+            f"{path}: expected no --images, as the file says where its images are; leave the option out"
+        )
+    listed = load_transforms(path)
+    found, pictures = list[Registered](), dict[str, Picture]()
+    for index in spread(len(listed.frames), options.most):
+        frame = listed.frames[index]
+        name = _name(frame.path, listed.file.parent if listed.file else path, pictures)
+        lens = lens_of(frame.pinhole, frame.lens, str(frame.path))
+        camera = frame.camera_id or "camera"
+        found.append(Registered(name, camera, frame.T_world_from_camera, frame.pinhole, lens, 0))
+        pictures[name] = _picture(name, frame)
+    left_out = [LeftOut(each.name, f"{each} is not there") for each in listed.missing]
+    content = read_json(listed.file) if listed.file else {}
+    folder = listed.file.parent if listed.file else path
+    model = model_of(found, left_out, path, _points(folder, content))
+    return Scan(model, pictures, _UNKNOWN, facts=_facts(folder, content))
+
+
+def _picture(name: str, frame: PosedImage) -> Picture:
+    content = partial(read_bytes, frame.path)
+    return Picture(name, content, frame.pinhole.width, frame.pinhole.height, None, frame.mask, frame.split)
+
+
+def _name(file: Path, folder: Path, taken: dict[str, Picture]) -> str:
+    """Name of an image in the data set: relative to the folder, if it lies there."""
+    inside = file.resolve().is_relative_to(folder.resolve())
+    name = (
+        file.resolve().relative_to(folder.resolve()).as_posix()
+        if inside
+        else f"{file.parent.name}/{file.name}"
+    )
+    name = name.removeprefix("images/")
+    if name in taken:
+        raise ScanError(f"{file}: expected images of different names, got {name} twice; rename one of them")
+    return name
+
+
+def _points(folder: Path, content: dict[str, Any]) -> Array:
+    """Points ``[M, 3]`` of the file that the data set names; none if there is none, or trimesh is not installed."""
+    name = content.get("ply_file_path")
+    file = folder / name if isinstance(name, str) else None
+    if file is None or not file.is_file():
+        return np.zeros((0, 3))
+    try:
+        import trimesh
+
+        points = np.asarray(trimesh.load(file, process=False).vertices, np.float64).reshape(-1, 3)
+    except (ImportError, ValueError, AttributeError, IndexError, KeyError, TypeError, OSError):
+        return np.zeros((0, 3))
+    return points[np.isfinite(points).all(axis=1)]
+
+
+def _facts(folder: Path, content: dict[str, Any]) -> dict[str, Any]:
+    """Relations to the worlds of COLMAP and of a trained model, from coordinates there to those of the file."""
+    applied = content.get("applied_transform")
+    T_file_from_colmap = np.eye(4) if applied is None else pose_of(applied, f"{folder}: applied_transform")
+    facts: dict[str, Any] = {} if applied is None else {"T_scan_from_colmap": T_file_from_colmap.tolist()}
+    file = folder / _DATAPARSER
+    if file.is_file():
+        values = read_json(file)
+        if not isinstance(values, dict) or "transform" not in values:
+            raise ScanError(
+                f"{file}: expected the keys transform and scale; copy the file from the training's folder again"
+            )
+        scale = number(values.get("scale"), f"{file}: scale")
+        if scale <= 0.0:
+            raise ScanError(f"{file}: scale: expected a number above 0, got {scale:g}; copy the file again")
+        T_model_from_colmap = pose_of(values["transform"], f"{file}: transform")
+        facts["T_scan_from_dataparser"] = (
+            T_file_from_colmap @ invert_transform(T_model_from_colmap)
+        ).tolist()
+        facts["scan_units_per_dataparser_unit"] = 1.0 / scale
+    return facts

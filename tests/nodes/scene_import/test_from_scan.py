@@ -1,0 +1,265 @@
+"""``scene from-scan``: data sets from samples of each format, compared with the cameras that they were written from."""
+
+import json
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from advnerf_core.data.image_files import read_stored
+from advnerf_core.data.lens import Lens
+from advnerf_core.data.scan_folder import SCANS, scan_of
+from advnerf_core.data.similarity import align_poses
+from advnerf_core.data.transforms import load_transforms
+from advnerf_core.data.views import HELD_OUT_SPLITS
+from advnerf_core.errors import AdvnerfError
+from calibration.scans.reading import READERS
+from calibration.scans.scan import ScanOptions
+from nodes.lab.importing.metric_options import MetricOptions
+from nodes.lab.importing.scan import from_scan
+from tests.support import scan_samples
+from tests.support.scan_samples import BROWN, FISHEYE, HEIGHT, KINDS, TRUTH, WIDTH, K
+
+ORIGIN = TRUTH[0][:3, 3]
+POINTS = np.random.default_rng(3).uniform([-0.5, -0.5, 0.2], [0.5, 0.5, 1.0], (50, 3))
+
+
+def run(tmp_path, path, options=None, **known):
+    def report(share, text=""):
+        assert 0.0 <= share <= 1.0
+
+    from_scan(path, tmp_path / "out", options or ScanOptions(), MetricOptions(**known), report)
+    frames = load_transforms(tmp_path / "out", require_all=True).frames
+    return frames, json.loads((tmp_path / "out" / "import.json").read_text())
+
+
+def pixels_of(T, k=(), fisheye=False):
+    """Where a true camera sees the points, by OpenCV."""
+    matrix = K.copy()
+    matrix[:2, 2] -= 0.5
+    w2c = np.linalg.inv(T)
+    rvec, tvec = cv2.Rodrigues(w2c[:3, :3])[0], w2c[:3, 3]
+    project = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
+    return project(POINTS.reshape(-1, 1, 3), rvec, tvec, matrix, np.array(k))[0].reshape(-1, 2) + 0.5
+
+
+def assert_same_pixels(frames, poses, k=(), fisheye=False, offset=(0.0, 0.0), world=lambda points: points):
+    """Images show known points where the true cameras see them, to 0.1 % of the width."""
+    assert len(frames) == len(poses)
+    for frame, T in zip(sorted(frames, key=lambda each: each.path.as_posix()), poses, strict=True):
+        local = (np.linalg.inv(frame.T_world_from_camera) @ np.c_[world(POINTS), np.ones(len(POINTS))].T)[
+            :3
+        ].T
+        seen = frame.lens.distort(local, frame.pinhole) + np.array(offset)
+        np.testing.assert_allclose(seen, pixels_of(T, k, fisheye), atol=0.001 * WIDTH)
+
+
+def moved_to(origin):
+    return lambda points: points - np.array(origin)
+
+
+def aligned(frames):
+    """The similarity that takes the frames to the truth, in the order of their names; all agree to 0.1 %."""
+    found = np.stack([each.T_world_from_camera for each in sorted(frames, key=lambda each: each.path.name)])
+    fit = align_poses(found, np.stack(TRUTH), np.inf, np.inf)
+    assert fit.position_error_m.max() < 0.001 * fit.extent_m
+    assert fit.rotation_error_rad.max() < 0.001
+    return fit.similarity
+
+
+def in_scan(similarity):
+    back = np.linalg.inv(similarity.T_target_from_source)
+    return lambda points: (
+        (points - similarity.T_target_from_source[:3, 3]) @ back[:3, :3].T / similarity.scale
+    )
+
+
+def test_every_format_that_is_recognised_has_a_reader(tmp_path):
+    assert [each.name for each in SCANS] == list(READERS)
+    for kind in KINDS:
+        assert scan_of(scan_samples.write(kind, tmp_path / kind)).name == kind
+    assert scan_of(tmp_path) is None
+
+
+def test_polycam(tmp_path):
+    frames, report = run(tmp_path, scan_samples.polycam(tmp_path / "scan"))
+    # The floor, which the depth images show, is z = 0; x and y begin at the first camera.
+    assert_same_pixels(frames, TRUTH, offset=(1.0, 1.0), world=moved_to([*ORIGIN[:2], 0.0]))
+    assert (frames[0].pinhole.width, frames[0].pinhole.height) == (WIDTH - 2, HEIGHT - 2), "no border"
+    assert report["ground_at_zero"]
+    assert report["scale_from"] == "poses"
+    assert report["up"].startswith("that of the scan; the ground is a plane of")
+
+
+def test_polycam_without_correction_and_depth(tmp_path):
+    frames, report = run(tmp_path, scan_samples.polycam(tmp_path / "scan", corrected=False, depth=False))
+    assert_same_pixels(frames, TRUTH, world=moved_to(ORIGIN))
+    assert not report["ground_at_zero"]
+    assert "not corrected" in next(iter(report["model"]["cameras"].values()))["why"]
+
+
+@pytest.mark.parametrize("packed", [True, False])
+def test_record3d(tmp_path, packed):
+    frames, report = run(
+        tmp_path, scan_samples.record3d(tmp_path / ("scan.r3d" if packed else "scan"), packed)
+    )
+    similarity = aligned(frames)
+    assert similarity.scale == pytest.approx(1.0, abs=1e-6)
+    assert_same_pixels(frames, TRUTH, world=in_scan(similarity))
+    assert report["scale_from"] == "poses"
+    assert report["up"] == "the cameras' up"
+    np.testing.assert_allclose(similarity.T_target_from_source[2, :3], [0.0, 0.0, 1.0], atol=0.05)
+
+
+def test_each_image_of_record3d_has_its_focal_length(tmp_path):
+    frames, report = run(tmp_path, scan_samples.record3d(tmp_path / "folder" / "a.r3d", each=True).parent)
+    assert sorted(each.pinhole.fx for each in frames) == [50.0 + n for n in range(8)]
+    assert report["model"]["cameras"]["phone"]["why"].endswith("the median is shown")
+
+
+@pytest.mark.parametrize("factor", [1, 2])
+def test_llff(tmp_path, factor):
+    frames, report = run(tmp_path, scan_samples.llff(tmp_path / "scan", factor))
+    assert aligned(frames).scale == pytest.approx(5.0, rel=1e-6)
+    pinhole = frames[0].pinhole
+    assert (pinhole.width, pinhole.fx, pinhole.cx, pinhole.cy) == (
+        64 // factor,
+        50 / factor,
+        32 / factor,
+        24 / factor,
+    )
+    assert report["scale_from"] is None
+    assert report["scale"].startswith("unknown: lengths are in COLMAP's unit")
+    listed = load_transforms(tmp_path / "out")
+    assert listed.aabb_scale > 1.0, "unbounded"
+    low, high = listed.inner_box()
+    assert all(
+        (low < each.T_world_from_camera[:3, 3]).all() and (each.T_world_from_camera[:3, 3] < high).all()
+        for each in frames
+    )
+
+
+@pytest.mark.parametrize(("fisheye", "k"), [(False, BROWN), (True, FISHEYE)])
+def test_euroc(tmp_path, fisheye, k):
+    frames, report = run(tmp_path, scan_samples.euroc(tmp_path / "scan", fisheye))
+    first = [each for each in frames if each.camera_id == "cam0"]
+    assert_same_pixels(first, TRUTH, k, fisheye)
+    right = [T @ np.array([*np.eye(4)[:3], [0.11, 0.0, 0.0, 1.0]]).T for T in TRUTH]
+    assert_same_pixels([each for each in frames if each.camera_id == "cam1"], right, k, fisheye)
+    assert report["scale_from"] == "poses"
+
+
+@pytest.mark.parametrize("listed", [True, False])
+def test_tum(tmp_path, listed):
+    frames, report = run(tmp_path, scan_samples.tum(tmp_path / "scan", listed))
+    assert_same_pixels(frames, TRUTH)
+    assert report["scan"] == {"format": "TUM", "rows_without_pose": 0}
+
+
+def test_depth_images_of_tum_show_the_ground(tmp_path):
+    frames, report = run(tmp_path, scan_samples.tum(tmp_path / "scan", depth=True))
+    assert report["ground_at_zero"]
+    assert report["T_world_from_scan"][2][3] == pytest.approx(0.0, abs=0.002)
+    assert_same_pixels(frames, TRUTH)
+
+
+def test_kinects_of_the_benchmark_are_known(tmp_path):
+    scan = scan_samples.tum(tmp_path / "rgbd_dataset_freiburg1_desk")
+    (scan / "calibration.txt").unlink()
+    for number, file in enumerate(sorted((scan / "rgb").iterdir())):
+        scan_samples.write_image(file, number, (640, 480))
+    frames, _ = run(tmp_path, scan)
+    assert (frames[0].pinhole.fx, frames[0].pinhole.cx) == (517.3, 319.1)
+    assert frames[0].lens == Lens((0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
+
+
+@pytest.mark.parametrize(("fisheye", "k"), [(False, BROWN), (True, FISHEYE)])
+def test_nerfstudio(tmp_path, fisheye, k):
+    frames, report = run(tmp_path, scan_samples.nerfstudio(tmp_path / "scan", fisheye))
+    similarity = aligned(frames)
+    assert similarity.scale == pytest.approx(5.0, rel=1e-6)
+    assert_same_pixels(frames, TRUTH, k, fisheye, world=in_scan(similarity))
+    assert report["ground_at_zero"], "sparse_pc.ply shows the floor"
+    assert report["scale_from"] is None
+    assert [each.split for each in frames] == ["train"] * 6 + ["val"] * 2
+    assert len(load_transforms(tmp_path / "out").of_split(*HELD_OUT_SPLITS).frames) == 2
+
+
+def test_masks_go_along(tmp_path):
+    frames, _ = run(tmp_path, scan_samples.nerfstudio(tmp_path / "scan", masks=True))
+    assert all(
+        (read_stored(each.mask)[0][:10] == 0).all() and each.mask.is_relative_to(tmp_path / "out" / "masks")
+        for each in frames
+    )
+
+
+def test_the_world_of_a_trained_model_is_found_again(tmp_path):
+    scan = scan_samples.nerfstudio(tmp_path / "scan")
+    content = json.loads((scan / "transforms.json").read_text())
+    applied = np.vstack([content["applied_transform"], [0, 0, 0, 1]])
+    transform = np.array([[0.0, 0.0, 1.0, 0.3], [1.0, 0.0, 0.0, -0.2], [0.0, 1.0, 0.0, 0.1]])
+    (scan / "dataparser_transforms.json").write_text(
+        json.dumps({"transform": transform.tolist(), "scale": 0.7})
+    )
+    _, report = run(tmp_path, scan)
+    in_colmap = np.array([0.3, -0.1, 0.5, 1.0])
+    in_model = 0.7 * transform @ in_colmap
+    facts = report["scan"]
+    unscaled = np.append(facts["scan_units_per_dataparser_unit"] * in_model, 1.0)
+    np.testing.assert_allclose(
+        np.array(facts["T_scan_from_dataparser"]) @ unscaled, applied @ in_colmap, atol=1e-12
+    )
+
+
+def test_a_known_length_gives_metres(tmp_path):
+    length_m = float(np.linalg.norm(TRUTH[0][:3, 3] - TRUTH[5][:3, 3]))
+    frames, report = run(
+        tmp_path, scan_samples.llff(tmp_path / "scan"), length=("IMG_000.png", "IMG_005.png", length_m)
+    )
+    assert aligned(frames).scale == pytest.approx(1.0, rel=1e-6)
+    assert report["scale_from"] == "length"
+
+
+def test_recordings_are_thinned(tmp_path):
+    frames, _ = run(tmp_path, scan_samples.tum(tmp_path / "scan"), ScanOptions(most=4))
+    assert len(frames) == 4
+
+
+def test_a_lens_and_images_may_be_given(tmp_path):
+    scan = scan_samples.euroc(tmp_path / "scan", cameras=("cam0",))
+    (scan / "mav0" / "cam0" / "sensor.yaml").unlink()
+    (scan / "mav0" / "cam0" / "data").rename(tmp_path / "pictures")
+    with pytest.raises(AdvnerfError, match=r"give their folder with --images"):
+        run(tmp_path, scan, ScanOptions(calibration=calibration(tmp_path)))
+    frames, _ = run(
+        tmp_path, scan, ScanOptions(calibration=calibration(tmp_path), images=tmp_path / "pictures")
+    )
+    assert frames[0].lens == Lens((*BROWN, 0.0))
+    assert frames[0].pinhole.cx == K[0, 2]
+
+
+def calibration(folder):
+    rows = "\n".join(f"- {row}" for row in np.eye(4).tolist())
+    file = folder / "camera.yaml"
+    file.write_text(
+        f"kind: camera\ndate: 2026-01-01\nmethod: known\nwidth: {WIDTH}\nheight: {HEIGHT}\nfx: {K[0, 0]}\nfy: {K[1, 1]}\ncx: {K[0, 2]}\ncy: {K[1, 2]}\n"
+        f"distortion: {[*BROWN, 0.0]}\nT_car_from_camera:\n{rows}\n"
+    )
+    return file
+
+
+def test_the_command_takes_all_formats(tmp_path):
+    command = [
+        sys.executable,
+        "-m",
+        "nodes.cli",
+        "scene",
+        "from-scan",
+        scan_samples.write("Record3D", tmp_path),
+    ]
+    done = subprocess.run([*command, "-o", tmp_path / "out"], capture_output=True, text=True, check=True)
+    assert "format: Record3D" in done.stdout
+    assert "8 of 8 images placed, 0 points\n" in done.stdout
+    assert "scale: metric: lengths of ARKit" in done.stdout
