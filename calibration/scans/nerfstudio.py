@@ -6,6 +6,7 @@ of a trained model: ``scale * (transform x)``.
 
 from __future__ import annotations
 
+import warnings
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -57,8 +58,9 @@ def read(path: Path, options: ScanOptions) -> Scan:
     left_out = [LeftOut(each.name, f"{each} is not there") for each in listed.missing]
     content = read_json(listed.file) if listed.file else {}
     folder = listed.file.parent if listed.file else path
-    model = model_of(found, left_out, path, _points(folder, content))
-    return Scan(model, pictures, _UNKNOWN, facts=_facts(folder, content))
+    points, remark = _points(folder, content)
+    model = model_of(found, left_out, path, points)
+    return Scan(model, pictures, _UNKNOWN, facts={**_facts(folder, content), **remark})
 
 
 def _picture(name: str, frame: PosedImage) -> Picture:
@@ -80,19 +82,22 @@ def _name(file: Path, folder: Path, taken: dict[str, Picture]) -> str:
     return name
 
 
-def _points(folder: Path, content: dict[str, Any]) -> Array:
-    """Points ``[M, 3]`` of the file that the data set names; none if there is none, or trimesh is not installed."""
-    name = content.get("ply_file_path")
-    file = folder / name if isinstance(name, str) else None
-    if file is None or not file.is_file():
-        return np.zeros((0, 3))
+def _points(folder: Path, content: dict[str, Any]) -> tuple[Array, dict[str, Any]]:
+    """Points ``[M, 3]`` of the file that the data set names, and a remark for the report if it cannot be read."""
+    name, none = content.get("ply_file_path"), np.zeros((0, 3))
+    if not isinstance(name, str):
+        return none, {}
     try:
         import trimesh
 
-        points = np.asarray(trimesh.load(file, process=False).vertices, np.float64).reshape(-1, 3)
-    except (ImportError, ValueError, AttributeError, IndexError, KeyError, TypeError, OSError):
-        return np.zeros((0, 3))
-    return points[np.isfinite(points).all(axis=1)]
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", DeprecationWarning)
+            cloud = trimesh.load(folder / name, file_type="ply", process=False)
+        points = np.asarray(cloud.vertices, np.float64).reshape(-1, 3)
+    except Exception as error:  # trimesh is not installed, or meets a damaged file; points are a help only
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        return none, {"points": f"{name} cannot be read ({reason:.80}); ground and box come without it"}
+    return points[np.isfinite(points).all(axis=1)], {}
 
 
 def _facts(folder: Path, content: dict[str, Any]) -> dict[str, Any]:

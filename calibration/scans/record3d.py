@@ -32,7 +32,7 @@ from calibration.scans.scan import (
 )
 
 _METADATA, _FOLDERS = ("metadata", "metadata.json"), ("rgbd", "rgb")
-_LARGEST_BYTES = 2**28
+_LARGEST_BYTES = 2**26
 _DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError, ValueError)
 
 

@@ -69,8 +69,9 @@ def _trajectory(path: Path) -> Trajectory:
 
 def _numbers(file: Path) -> Array:
     """Rows of numbers ``[N, M]`` of a text file."""
+    text = read_text(file)
     try:
-        return np.loadtxt(io.StringIO(read_text(file)), dtype=np.float64, ndmin=2)
+        return np.loadtxt(io.StringIO(text), dtype=np.float64, ndmin=2)
     except ValueError as error:
         raise ScanError(
             f"{file}: expected rows of numbers, got: {str(error).splitlines()[0]}; export the file again"

@@ -19,6 +19,7 @@ from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.files import write_atomically, write_json
 from advnerf_core.geometry import Array
 from advnerf_core.render.march import MarchConfig
+from advnerf_core.scene.auto_box import box_around_cameras, box_of_silhouettes
 from advnerf_core.scene.field import SceneFieldConfig, save_scene
 from advnerf_core.scene.intervals import pixel_intervals
 from advnerf_core.scene.learning_check import LearningCheck
@@ -50,7 +51,7 @@ def train(request: TrainingRequest, report: Report) -> dict[str, Any]:
     for remark in training.remarks:
         print(remark)
     images = training.load(request.size)
-    field = scene_field(request, training, transparent=_transparent(images))
+    field = scene_field(request, training, images)
     march = sample_intervals(request, field, images)
     print(_described(request, field, march))
 
@@ -164,30 +165,20 @@ def write_video(path: Path, frames: Sequence[NDArray[np.uint8]]) -> None:
         partial.unlink(missing_ok=True)
 
 
-def scene_field(request: TrainingRequest, listed: PosedImages, transparent: bool = False) -> SceneFieldConfig:
+def scene_field(
+    request: TrainingRequest, listed: PosedImages, images: ImageSet | None = None
+) -> SceneFieldConfig:
     """Make the field configuration of a request.
 
     Args:
-        transparent: Whether the images have alpha.
+        images: The loaded images; their alpha may be learned, and gives a box.
 
     Raises:
-        ConfigError: No box was given, and the file has none that contains its cameras.
+        ConfigError: The scene should be bounded, and no box contains its cameras.
     """
     aabb_scale = listed.aabb_scale or 1.0
-    unbounded = aabb_scale > 1.0 if request.unbounded is None else request.unbounded
-    if request.box_m is not None:
-        low, high = (np.array(corner) for corner in request.box_m)
-    else:
-        low, high = listed.inner_box() if unbounded else listed.box()
-    inside = [
-        np.all((low <= f.T_world_from_camera[:3, 3]) & (f.T_world_from_camera[:3, 3] <= high))
-        for f in listed.frames
-    ]
-    if request.box_m is None and listed.aabb_scale is None and not all(inside):
-        raise ConfigError(
-            f"expected a box: {request.transforms} has no aabb_scale, and {len(inside) - sum(inside)} of {len(inside)} cameras "
-            f"are outside its unit cube; give --box-low and --box-high (cameras are at {_span(listed)}) or --unbounded"
-        )
+    transparent = images is not None and _transparent(images)
+    low, high, unbounded = _box(request, listed, images if transparent else None)
     common = {"contraction": unbounded, "learned_background": not transparent}
     if request.preset == "instant-ngp":
         # Müller et al. 2022, table 1 and section 5.4, and the sizes of its configs/nerf/base.json.
@@ -202,6 +193,31 @@ def scene_field(request: TrainingRequest, listed: PosedImages, transparent: bool
     grid = HashGridConfig(levels=8, features=4, finest=4096 if unbounded else 2048)
     bands = 3 if request.open_scene or unbounded else 1
     return SceneFieldConfig(_corner(low), _corner(high), grid, direction_bands=bands, **common)
+
+
+def _box(
+    request: TrainingRequest, listed: PosedImages, silhouettes: ImageSet | None
+) -> tuple[Array, Array, bool]:
+    """Corners ``[3]`` of the box, and whether the scene goes on beyond it."""
+    of_file = (listed.aabb_scale or 1.0) > 1.0
+    unbounded = of_file if request.unbounded is None else request.unbounded
+    if request.box_m is not None:
+        return np.array(request.box_m[0]), np.array(request.box_m[1]), unbounded
+    if unbounded:
+        return *listed.inner_box(), True
+    low, high = listed.box()
+    poses = np.stack([frame.T_world_from_camera for frame in listed.frames])
+    inside = np.all((low <= poses[:, :3, 3]) & (poses[:, :3, 3] <= high), axis=1)
+    if listed.aabb_scale is not None or inside.all():
+        return low, high, False
+    if silhouettes is not None and (found := box_of_silhouettes(silhouettes)) is not None:
+        return *found, False
+    if request.unbounded is None:
+        return *box_around_cameras(poses), True
+    raise ConfigError(
+        f"expected a box: {request.transforms} has no aabb_scale, and {int((~inside).sum())} of {len(inside)} cameras "
+        f"are outside its unit cube; give --box-low and --box-high (cameras are at {_span(listed)}), or leave out --bounded"
+    )
 
 
 def sample_intervals(request: TrainingRequest, field: SceneFieldConfig, images: ImageSet) -> MarchConfig:
@@ -248,11 +264,8 @@ def _described(request: TrainingRequest, field: SceneFieldConfig, march: MarchCo
     low, high = (_short(corner) for corner in (field.box_low_m, field.box_high_m))
     text = f"{inside} {low} .. {high}"
     if field.contraction:
-        why = (
-            ""
-            if request.unbounded is not None
-            else " because the file's aabb_scale is more than 1 (--bounded overrides)"
-        )
+        why = "the file's aabb_scale is more than 1, or it has no box (--bounded and --box-low override)"
+        why = "" if request.unbounded is not None else f" because {why}"
         text += f", unbounded{why}"
     if not field.learned_background:
         text += "; images have alpha: trained over random colours, transparent areas stay transparent"

@@ -10,7 +10,6 @@ from __future__ import annotations
 import random
 import resource
 import signal
-import struct
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -41,6 +40,8 @@ from nodes.runtime.messages import (
 from nodes.runtime.topics import topic
 from nodes.runtime.wire import Meta, pack_meta, unpack
 from tests.campaigns.campaign import Campaign
+from tests.support.damaged_bytes import mutate
+from tests.support.scan_damage import ScanFiles
 
 SHARES = {
     "vesc": 300_000,
@@ -49,6 +50,7 @@ SHARES = {
     "config": 40_000,
     "attack": 80_000,
     "bag": 10_000,
+    "scan": 20_000,
 }
 _INPUT_LIMIT_S = 2
 _GROWTH_LIMIT_MIB = 200.0
@@ -67,29 +69,6 @@ class Outcome:
     inputs: int
     refused: int
     worst_s: float
-
-
-def mutate(random_: random.Random, good: bytes) -> bytes:
-    """A damaged copy of a good input, or random bytes."""
-    if random_.random() < 0.05:
-        return random_.randbytes(random_.randrange(300))
-    data = bytearray(good)
-    for _ in range(random_.choice((1, 1, 1, 2, 4, 16))):
-        at = random_.randrange(len(data) + 1)
-        kind = random_.randrange(6)
-        if kind == 0 and data:
-            data[at % len(data)] ^= 1 << random_.randrange(8)
-        elif kind == 1 and data:
-            data[at % len(data)] = random_.choice((0, 1, 0x7F, 0x80, 0xFF))
-        elif kind == 2:
-            del data[at : at + random_.randrange(1, 20)]
-        elif kind == 3:
-            data[at:at] = data[at : at + random_.randrange(1, 40)]
-        elif kind == 4:
-            data[at : at + 4] = struct.pack("<I", random_.choice((0, 1, 2**16, 2**31 - 1, 2**31, 2**32 - 1)))
-        else:
-            data[at:at] = random_.randbytes(random_.randrange(1, 9))
-    return bytes(data)
 
 
 def vesc_reader() -> tuple[Sequence[bytes], Callable[[bytes], None]]:
@@ -203,6 +182,12 @@ def bag_reader(folder: Path) -> tuple[Sequence[bytes], Callable[[bytes], None]]:
     return [path.read_bytes()], read
 
 
+def scan_reader(folder: Path) -> tuple[Sequence[bytes], Callable[[bytes], None]]:
+    """Files of scans of every format."""
+    files = ScanFiles(folder / "scans")
+    return files.good, files.read
+
+
 def void(result: object) -> None:
     """Nothing: only whether it comes back counts."""
     del result
@@ -217,6 +202,7 @@ def run(name: str, count: int, seed: int, folder: Path) -> Outcome:
         "config": config_reader,
         "attack": lambda: attack_reader(folder),
         "bag": lambda: bag_reader(folder),
+        "scan": lambda: scan_reader(folder),
     }
     good, read = makers[name]()
     for data in good:  # a reader that refuses everything would be tested by nothing
@@ -273,7 +259,7 @@ def test_no_input_crashes_or_hangs_a_reader(campaign: Campaign, tmp_path: Path) 
         )
     growth_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 - before_mib
     campaign.record(
-        "fuzz: VESC, VICON, bus, config, attack file, bag",
+        "fuzz: VESC, VICON, bus, config, attack file, bag, scan",
         total,
         "inputs",
         "10^6: no crash, hang or memory growth",

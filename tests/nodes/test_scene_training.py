@@ -90,8 +90,13 @@ def test_a_box_larger_than_the_unit_cube_means_unbounded_unless_told_otherwise(t
 
 def test_unbounded_needs_no_box(tmp_path: Path) -> None:
     listed = load_transforms(write_set(tmp_path, 4, scale=1.0))
-    with pytest.raises(ConfigError, match="or --unbounded"):
-        scene_field(request_for(tmp_path), listed)
+    with pytest.raises(ConfigError, match="or leave out --bounded"):
+        scene_field(request_for(tmp_path, unbounded=False), listed)
+    places = np.stack([frame.T_world_from_camera[:3, 3] for frame in listed.frames])
+    around = scene_field(request_for(tmp_path), listed)
+    assert around.contraction
+    assert (places > around.box_low_m).all()
+    assert (places < around.box_high_m).all()
     field = scene_field(request_for(tmp_path, unbounded=True), listed)
     np.testing.assert_allclose(field.box_high_m, 0.5 + 1.45 - 0.5)
     own = ((-2.0, -2.0, -1.0), (2.0, 2.0, 1.0))
@@ -114,7 +119,7 @@ def test_presets_have_their_sizes_train_and_render(
 ) -> None:
     listed = dataclasses.replace(load_transforms(pictures), aabb_scale=float(aabb_scale))
     images = listed.with_frames(listed.frames[:3]).load()
-    field = scene_field(request_for(pictures, preset=preset), listed, transparent=True)
+    field = scene_field(request_for(pictures, preset=preset), listed, images)
     grid = field.grid
     got = (grid.levels, grid.features, grid.log2_entries, grid.coarsest, grid.finest, field.direction_bands)
     assert got == sizes
@@ -242,7 +247,7 @@ def test_intervals_follow_the_images_unless_the_user_says_otherwise(pictures: Pa
 
     def chosen(**changes: object) -> MarchConfig:
         request = request_for(pictures, box_low=(-0.8,) * 3, box_high=(0.8,) * 3, **changes)
-        return sample_intervals(request, scene_field(request, listed, transparent=True), images)
+        return sample_intervals(request, scene_field(request, listed, images), images)
 
     rule = chosen()
     assert rule == MarchConfig(1.6 * (1 / 80), 1.6 / 1024, 1.6 / 64, INTERVAL_PX_FROM_OUTSIDE / 50.0, 1024)

@@ -136,7 +136,7 @@ def euroc(folder, fisheye=False, cameras=("cam0", "cam1")):
     T_BS[:3, 3] = [-0.02, -0.06, 0.01]
     truth = folder / "mav0" / "state_groundtruth_estimate0"
     truth.mkdir(parents=True)
-    stamps = range(START_NS, START_NS + round(1e9 * TIMES_S[-1]) + 1, 5_000_000)
+    stamps = range(START_NS, START_NS + round(1e9 * TIMES_S[-1]) + 1, 10_000_000)
     lines = [
         "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v_RS_R_x [m s^-1]"
     ]

@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from advnerf_core.data.image_files import read_stored
 from advnerf_core.data.lens import Lens
 from advnerf_core.data.transforms_write import write_transforms
 from advnerf_core.files import write_json
 from advnerf_core.geometry import Array, Pinhole
+from advnerf_core.scene.auto_box import CAMERA_MARGIN
 from calibration.phone_and_car import Placed, place_in_mocap
 from calibration.photo_model import Model, PhotoSource, SfmConfig
 from calibration.scans.scan import Picture
@@ -36,8 +38,8 @@ from nodes.runtime.progress import Report
 
 _MEDIA_SHARE = 0.3
 _BOX_PERCENT, _BOX_MARGIN = 0.5, 0.05
-# Without points nobody knows where the walls are: beyond this margin the scene is contracted. Any number above 1 says so.
-_OPEN_MARGIN, _UNBOUNDED = 0.5, 16
+# Without points the walls may be anywhere: beyond the cameras the scene is contracted. Any aabb_scale above 1 says so.
+_UNBOUNDED = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,6 +210,8 @@ def write_model_set(
     """
     path = output / TRANSFORMS
     box = _box_of(points, poses) if len(points) else _open_box(poses, reached)
+    if not len(points) and read_stored(output / model.images[0].name)[1] is not None:
+        box = {}  # training finds that of the silhouettes
     masks = [output / MASKS / f"{each.name}.png" if each.mask else None for each in pictures]
     _write_model(path, output, model, poses, range(len(model.images)), {**box, **_splits(pictures)}, masks)
     return _finish(output, (path,), facts)
@@ -298,7 +302,7 @@ def _open_box(poses: Array, reached: Array | None) -> dict[str, Any]:
     """Inner box of an unbounded scene around the cameras and what they reach, as far as that is known."""
     places = poses[:, :3, 3]
     known = places if reached is None or not len(reached) else np.concatenate([places, reached])
-    return {**_box(known, _OPEN_MARGIN), "aabb_scale": _UNBOUNDED}
+    return {**_box(known, CAMERA_MARGIN), "aabb_scale": _UNBOUNDED}
 
 
 def _box(corners: Array, margin: float) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Pinhole
 from calibration.photo_model import MIN_IMAGES, LeftOut, Model, Registered
 from calibration.scans.reading import read_scan
-from calibration.scans.scan import Picture, Scan, ScanOptions
+from calibration.scans.scan import Picture, Scan, ScanError, ScanOptions
 from nodes.lab.importing.data_set import Imported, write_model_set
 from nodes.lab.importing.errors import ImportRecordingError
 from nodes.lab.importing.media import IMAGES
@@ -85,7 +85,7 @@ def _copy_images(
         picture = scan.pictures[image.name]
         try:
             copied = _copied(image, picture, folder)
-        except DatasetError as error:
+        except (DatasetError, ScanError) as error:
             left_out.append(LeftOut(image.name, str(error)))
         else:
             kept.append(copied)
