@@ -44,7 +44,7 @@ class PlaceOptions:
             _PLACE,
             "--place",
             exists=True,
-            help="Photographs or a video; posed photographs (transforms.json or its folder); or a COLMAP model's folder.",
+            help="Photographs, a video, posed photographs (transforms.json), or a scan (Polycam, Record3D, COLMAP, ...).",
         ),
     ] = None
     world: Annotated[

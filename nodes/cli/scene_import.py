@@ -194,7 +194,9 @@ def from_scan(
     images: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of the images, if it is not where the format has it.", exists=True, file_okay=False
+            help="Images of the scan, if they are not where its format has them.",
+            exists=True,
+            file_okay=False,
         ),
     ] = None,
     number: Annotated[

@@ -152,7 +152,7 @@ def test_eval_and_render(command, trained, pictures, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--steps", "5"], "has no aabb_scale"),
+        (["--steps", "5", "--bounded"], "has no aabb_scale"),
         (["--steps", "5", "--minutes", "1", *BOX], "either --steps or --minutes"),
         (["--steps", "5", *BOX[:4]], "both --box-low and --box-high"),
         (["--steps", "5", *BOX[:5], "-5", "-5", "-5"], "low < high"),
