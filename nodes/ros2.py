@@ -1,7 +1,7 @@
-"""The ROS 2 node: carries chosen topics to and from ROS 2 over DDS. ROS itself is not needed.
+"""The ROS 2 node: carries chosen topics to and from ROS 2 over DDS or Zenoh. ROS itself is not needed.
 
 What comes in can only ask, as any policy does. A command counts if it answers a message that this node has just sent, and if its
-publisher is the only one; then the safety node decides. No message from DDS can arm the car, or stand for the operator's hand.
+publisher is the only one; then the safety node decides. No message from ROS can arm the car, or stand for the operator's hand.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import hashlib
 import secrets
 from collections import Counter, defaultdict
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from pydantic import Field, model_validator
 
@@ -22,7 +22,9 @@ from nodes.linking.ros2.answers import stamp_of_cdr
 from nodes.linking.ros2.carried import Rate, SentTopic, Taken
 from nodes.linking.ros2.conversions import Setting
 from nodes.linking.ros2.routes import SAFETY_DRIVE, SendRoute, TakeRoute, check_routes, needs_wheelbase
-from nodes.linking.ros2.samples import Heard
+from nodes.linking.ros2.samples import Heard, Side
+from nodes.linking.ros2.transports import Transport, is_loopback_interface, open_transport
+from nodes.linking.ros2.zenoh_settings import ZenohSettings
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError, MessageError, SecurityError
 from nodes.runtime.messages import decode, drive_message, encode, stamp_ns
@@ -43,14 +45,18 @@ class Ros2Config(StrictModel):
     """Configuration of the ROS 2 node.
 
     Attributes:
-        domain_id: DDS domain, ``ROS_DOMAIN_ID`` of the ROS programs.
+        transport: ``dds``, ``zenoh``, or ``auto``: DDS where it is installed, else Zenoh. The ROS programs must use the same.
+        zenoh: How to find the ROS programs over Zenoh.
+        domain_id: ``ROS_DOMAIN_ID`` of the ROS programs.
         interface: Network interface. On any but the loopback, every computer of that network can read what is sent, and answer.
-        open_to_network: Must be true for an interface other than the loopback, because this DDS has no keys.
+        open_to_network: Must be true for an interface other than the loopback, because ROS 2 has no keys here.
         vehicle: Vehicle calibration file with the wheelbase, for routes with ``geometry_msgs/msg/TwistStamped``.
         send: Topics that ROS 2 gets.
         take: Topics that ROS 2 supplies.
     """
 
+    transport: Transport = "auto"
+    zenoh: ZenohSettings = ZenohSettings()
     domain_id: int = Field(default=0, ge=0, le=232)
     interface: str = Field(default="lo", pattern=r"^[A-Za-z0-9_.\-]{1,15}$")
     open_to_network: bool = False
@@ -70,40 +76,12 @@ class Ros2Config(StrictModel):
         return self
 
 
-class Side(Protocol):
-    """The DDS end, which `nodes.linking.ros2.dds.Participant` implements. Routes are numbered as in the configuration."""
-
-    def write(self, number: int, cdr: bytes) -> bool:
-        """Write CDR bytes without blocking; False if the queue is full."""
-        ...
-
-    def present(self, number: int) -> tuple[str, ...]:
-        """Identities of the publishers of a taken topic."""
-        ...
-
-    def mismatch(self, number: int) -> str:
-        """Why publishers of a taken topic are not heard; empty if there are none of these."""
-        ...
-
-    def rivals(self, number: int) -> tuple[str, ...]:
-        """Identities of the other publishers of a sent topic that commands answer."""
-        ...
-
-    def readers_of(self, number: int) -> int:
-        """Number of subscribers of a sent topic."""
-        ...
-
-    def close(self) -> None:
-        """Leave the domain."""
-        ...
-
-
 class Ros2Node(Node):
-    """Carries messages between the bus of this host and DDS.
+    """Carries messages between the bus of this host and ROS 2.
 
     Args:
         config: Configuration.
-        inbox: Queue of batches from the DDS end.
+        inbox: Queue of batches from the transport.
         wheelbase_m: Distance of the axles [m].
         on_this_host: Whether every publisher runs on this computer, so that its clock is ours.
         instance: Random text of this process. A restart of this node counts as a restart of the publishers.
@@ -145,23 +123,19 @@ class Ros2Node(Node):
 
     @classmethod
     def build(cls, config: Ros2Config, context: NodeContext) -> Ros2Node:
-        """Build the node and join the DDS domain."""
+        """Build the node and join the ROS programs."""
         del context  # not needed
-        try:
-            from nodes.linking.ros2.dds import Participant, is_loopback_interface
-        except ImportError as error:
-            raise ConfigError(
-                f"the ROS 2 node needs Cyclone DDS, which cannot be imported ({error}): pip install 'advnerf[ros2]' (x86-64 only)"
-            ) from error
         local = is_loopback_interface(config.interface)
         require_local(config, local)
         wheelbase_m = (
             load_calibration(VehicleCalibration, config.vehicle).wheelbase_m if config.vehicle else 0.0
         )
         inbox: Inbox[list[Heard]] = Inbox(_INBOX)
-        side = Participant(
+        side = open_transport(
+            config.transport,
             config.domain_id,
             config.interface,
+            config.zenoh,
             [route.endpoint for route in config.send],
             [route.endpoint for route in config.take],
             inbox,
@@ -312,7 +286,7 @@ def require_local(config: Ros2Config, local: bool) -> None:
         return
     if not config.open_to_network:
         raise SecurityError(
-            f"{config.interface} opens DDS to every computer on that network, without keys; use interface lo, or set"
+            f"{config.interface} opens ROS 2 to every computer on that network, without keys; use interface lo, or set"
             " open_to_network: true"
         )
     if foreign := [route.topic for route in config.take if not route.commands]:

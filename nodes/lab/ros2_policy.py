@@ -1,4 +1,4 @@
-"""A policy that runs in ROS 2, queried over DDS: for black-box attacks, ``advnerf policy check``, and drives in a world.
+"""A policy that runs in ROS 2, queried over DDS or Zenoh: for black-box attacks, ``advnerf policy check``, and drives in a world.
 
 The ROS program gets whole camera images, as it does on the car, and answers each with a command that carries the image's stamp.
 """
@@ -19,9 +19,10 @@ from advnerf_core.policies.view import PolicyView
 from calibration.schema import CameraCalibration, VehicleCalibration, load_calibration
 from nodes.linking.ros2.answers import OneWriter, stamp_of_cdr
 from nodes.linking.ros2.conversions import ACKERMANN, IMAGE, TWIST, Setting, conversion
-from nodes.linking.ros2.dds import Participant, is_loopback_interface
 from nodes.linking.ros2.routes import Endpoint
 from nodes.linking.ros2.samples import Heard
+from nodes.linking.ros2.transports import Transport, is_loopback_interface, open_transport
+from nodes.linking.ros2.zenoh_settings import ZenohSettings
 from nodes.runtime.errors import BusError, ConfigError
 from nodes.runtime.inbox import Inbox
 from nodes.runtime.messages import decode, encode, image_message
@@ -33,12 +34,13 @@ class Ros2Network(nn.Module):
     """Queries a ROS 2 program for the steering of images, one after the other.
 
     Args:
-        domain_id: DDS domain, ``ROS_DOMAIN_ID`` of the program.
+        domain_id: ``ROS_DOMAIN_ID`` of the program.
         images: ROS name of the images.
         commands: ROS name of its commands.
         command_type: ``geometry_msgs/msg/TwistStamped`` or ``ackermann_msgs/msg/AckermannDriveStamped``.
         wheelbase_m: Distance of the axles, which turns yaw rates into wheel angles [m].
         interface: A loopback interface: a search sends thousands of queries and needs no network.
+        transport: ``dds``, ``zenoh`` or ``auto``, as in the configuration of the ROS 2 node.
     """
 
     def __init__(
@@ -49,15 +51,18 @@ class Ros2Network(nn.Module):
         command_type: str,
         wheelbase_m: float,
         interface: str = "lo",
+        transport: Transport = "auto",
     ) -> None:
         super().__init__()
         if not is_loopback_interface(interface):
             raise ConfigError(f"expected a loopback interface to ask a ROS 2 policy, got {interface}; use lo")
         self._names, self._type, self._setting = (images, commands), command_type, Setting(wheelbase_m)
         self._inbox: Inbox[list[Heard]] = Inbox(100)
-        self._side = Participant(
+        self._side = open_transport(
+            transport,
             domain_id,
             interface,
+            ZenohSettings(),
             [Endpoint(images, IMAGE, reliable=True, depth=5)],
             [Endpoint(commands, command_type, reliable=True, depth=10)],
             self._inbox,
@@ -118,23 +123,25 @@ def ros2_policy(
     commands: str = "/cmd_vel",
     command_type: str = TWIST,
     view: PolicyView | None = None,
+    transport: Transport = "auto",
 ) -> AdaptedPolicy:
     """A running ROS 2 program as a policy: a black box that sees the whole camera image.
 
     Args:
         camera: Camera calibration file, for the size of the images.
         vehicle: Vehicle calibration file, for the wheelbase.
-        domain_id: DDS domain, ``ROS_DOMAIN_ID`` of the program.
+        domain_id: ``ROS_DOMAIN_ID`` of the program.
         images: ROS name of the images.
         commands: ROS name of its commands.
         command_type: Type of its commands.
         view: View of the sent images; None sends whole camera images. A program that takes its network's own input size answers faster,
             because the scene is rendered at that size.
+        transport: ``dds``, ``zenoh`` or ``auto``, as in the configuration of the ROS 2 node.
     """
     found = load_calibration(CameraCalibration, Path(camera)).pinhole
     whole = PolicyView(
         found, crop_top_px=0, crop_height_px=found.height, width=found.width, height=found.height
     )
     wheelbase_m = load_calibration(VehicleCalibration, Path(vehicle)).wheelbase_m
-    network = Ros2Network(domain_id, images, commands, command_type, wheelbase_m)
+    network = Ros2Network(domain_id, images, commands, command_type, wheelbase_m, transport=transport)
     return adapt(network, PolicyContract(view or whole, differentiable=False))

@@ -1,7 +1,7 @@
-"""Can a stranger on the DDS domain make the car do what its operator did not allow? 20 minutes in full.
+"""Can a stranger among the ROS programs make the car do what its operator did not allow? 40 minutes in full.
 
-The shipped ROS 2 launch drives the simulated lab; an honest policy, a DDS program of its own, answers each image with one fixed command.
-Strangers act, one at a time (`tests.support.live.dds_strangers`): half of the time beside the honest policy while the car drives, the other
+The shipped ROS 2 launch drives the simulated lab; an honest policy, a program of its own, answers each image with one fixed command.
+Strangers act, one at a time (`tests.support.live.ros2_strangers`): half of the time beside the honest policy while the car drives, the other
 half alone while it is disarmed and must stay where it is. What may reach the motor is known: the honest command while the operator's arming lasts, and stops. Anything
 else that moves, and any arming that the operator did not ask for, is a failure. To stop is always allowed.
 """
@@ -26,9 +26,15 @@ import pytest
 from advnerf_core.geometry import planar_pose
 from nodes.runtime.messages import encode, pose_message
 from tests.campaigns.campaign import Campaign
-from tests.support.live.dds_strangers import HONEST_SPEED_MPS, HONEST_STEERING_RAD, STRANGERS
 from tests.support.live.operator import LiveOperator
 from tests.support.live.processes import REPOSITORY, free_udp_port
+from tests.support.live.ros2_strangers import (
+    HONEST_SPEED_MPS,
+    HONEST_STEERING_RAD,
+    STRANGERS,
+    ZENOH_STRANGERS,
+)
+from tests.support.live.zenoh_router import zenoh_router
 
 NODES = ("twin", "camera", "vicon", "compositor", "ros2", "safety", "motor")
 # A circle on free floor; the honest policy drives it for ever.
@@ -42,9 +48,13 @@ _ATTEMPTS, _DOMAIN = 20, 61
 class Programs:
     """The launch, the honest policy and the strangers' process."""
 
-    def __init__(self, folder: Path, domain: int) -> None:
-        self.run_dir, self._domain = folder / "run", domain
+    def __init__(self, folder: Path, domain: int, transport: str) -> None:
+        self.run_dir, self._domain, self._transport = folder / "run", domain, transport
+        self._router = contextlib.ExitStack()
+        zenoh = [self._router.enter_context(zenoh_router())] if transport == "zenoh" else []
         settings = (
+            f"params.transport={transport}",
+            *(f"ros2.zenoh.connect=[{endpoint}]" for endpoint in zenoh),
             f"params.domain_id={domain}",
             f"params.vicon_port={free_udp_port()}",
             f"twin.start_pose={list(START)}",
@@ -86,7 +96,7 @@ class Programs:
     def acting(self) -> bool:
         """Whether the stranger still acts."""
         if self._stranger.poll() is not None:
-            raise RuntimeError("the strangers' process ended; run tests.support.live.dds_strangers by hand")
+            raise RuntimeError("the strangers' process ended; run tests.support.live.ros2_strangers by hand")
         with contextlib.suppress(BlockingIOError):
             return b"done" not in os.read(self._pipe(), 4096)
         return True
@@ -108,13 +118,15 @@ class Programs:
         except subprocess.TimeoutExpired:
             self._launch.kill()
         self._log.close()
+        self._router.close()
 
     def _pipe(self) -> int:
         assert self._stranger.stdout is not None
         return self._stranger.stdout.fileno()
 
     def _start(self, *options: str) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "tests.support.live.dds_strangers", str(self._domain), *options]
+        command = [sys.executable, "-m", "tests.support.live.ros2_strangers", str(self._domain)]
+        command += ["--transport", self._transport, *options]
         process = subprocess.Popen(
             command,
             cwd=REPOSITORY,
@@ -220,14 +232,15 @@ def run_case(
     return list(watcher.failures), stopped
 
 
-def run(count: int, domain: int) -> tuple[list[str], Counter[str], Counter[str]]:
+def run(count: int, domain: int, transport: str) -> tuple[list[str], Counter[str], Counter[str]]:
     """All cases: what failed, how many of each kind there were while driving, and how many of these stopped the car."""
     failed: list[str] = []
     driven: Counter[str] = Counter()
     stops: Counter[str] = Counter()
-    rng, kinds = random.Random(0), list(STRANGERS)
-    with tempfile.TemporaryDirectory(prefix="advnerf-dds-") as folder:
-        programs = Programs(Path(folder), domain)
+    rng = random.Random(0)
+    kinds = [*STRANGERS, *(ZENOH_STRANGERS if transport == "zenoh" else ())]
+    with tempfile.TemporaryDirectory(prefix="advnerf-ros2-") as folder:
+        programs = Programs(Path(folder), domain, transport)
         watcher = Watcher(programs)
         try:
             watcher.wait_ready(90.0)
@@ -249,13 +262,16 @@ def run(count: int, domain: int) -> tuple[list[str], Counter[str], Counter[str]]
 
 
 @pytest.mark.campaign
-def test_no_stranger_makes_the_car_do_what_its_operator_did_not_allow(campaign: Campaign) -> None:
+@pytest.mark.parametrize(("transport", "name"), [("dds", "DDS"), ("zenoh", "Zenoh")])
+def test_no_stranger_makes_the_car_do_what_its_operator_did_not_allow(
+    campaign: Campaign, transport: str, name: str
+) -> None:
     cases = campaign.size(6, 200)
-    failed, driven, stops = run(cases, _DOMAIN)
+    failed, driven, stops = run(cases, _DOMAIN, transport)
     kept = [kind for kind in driven if driven[kind] and not stops[kind]]
     always = [kind for kind in driven if driven[kind] and stops[kind] == driven[kind]]
     campaign.record(
-        "DDS strangers and floods: cases in which the car did nothing that its operator did not allow",
+        f"{name} strangers and floods: cases in which the car did nothing that its operator did not allow",
         cases - len(failed),
         f"of {cases}",
         f"{cases}",

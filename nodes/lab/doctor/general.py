@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 
 from hardware.mocap.vicon import ViconConfig
-from nodes.lab.doctor import cameras, graphics, machine, mocap, motor, priority
+from nodes.lab.doctor import cameras, graphics, machine, mocap, motor, priority, ros2
 from nodes.lab.doctor.check import CHILD_S, DoctorCheck
 from nodes.lab.doctor.recording import ImageFormat, bytes_per_s
 
@@ -43,6 +43,7 @@ def checks(folder: Path, vicon_port: int, vesc_port: str | None = None) -> list[
         DoctorCheck("camera", cameras.video_devices),
         DoctorCheck("OAK", cameras.oaks, 30.0),
         DoctorCheck("screens", graphics.screens, _CHILD_DEADLINE_S),
+        DoctorCheck("ROS 2", ros2.installed),
         DoctorCheck("gamepad", partial(motor.gamepads, False)),
         DoctorCheck("launches", machine.launches),
     ]

@@ -18,7 +18,7 @@ from hardware.mocap.vicon import ViconConfig
 from hardware.motor.vesc_settings import TimeoutSettings
 from nodes.camera import CameraNodeConfig
 from nodes.gateway import GatewayConfig
-from nodes.lab.doctor import cameras, files, graphics, machine, mocap, motor, network
+from nodes.lab.doctor import cameras, files, graphics, machine, mocap, motor, network, ros2
 from nodes.lab.doctor.check import CHILD_S, FAILURE, OK, CheckResult, DoctorCheck, in_child
 from nodes.lab.doctor.recording import ImageFormat, bytes_per_s
 from nodes.launching.launch_check import check_nodes
@@ -28,6 +28,7 @@ from nodes.monitor import MonitorConfig, MonitorOutputConfig
 from nodes.motor import MotorConfig
 from nodes.policy import PolicyNodeConfig
 from nodes.recorder import RecorderConfig
+from nodes.ros2 import Ros2Config
 from nodes.runtime.errors import ConfigError
 from nodes.safety import SafetyConfig
 from nodes.vicon import ViconNodeConfig
@@ -288,6 +289,10 @@ def _gateway(asked: _Asked) -> list[DoctorCheck]:
     return [DoctorCheck("clock", machine.clock), DoctorCheck("network", partial(network.gateway, config))]
 
 
+def _ros2(asked: _Asked) -> list[DoctorCheck]:
+    return [DoctorCheck("ROS 2", partial(ros2.node, asked.config(Ros2Config)))]
+
+
 def _viewer(asked: _Asked) -> list[DoctorCheck]:
     config = asked.config(ViewerConfig)
     return [DoctorCheck("viewer", partial(network.viewer, config.host, config.port))]
@@ -321,4 +326,5 @@ def pictures_of(plan: Plan) -> ImageFormat:
 _BY_MODULE: dict[str, Callable[[_Asked], list[DoctorCheck]]] = {
     "nodes.camera": _camera, "nodes.vicon": _vicon, "nodes.motor": _motor, "nodes.safety": _safety, "nodes.policy": _policy,
     "nodes.twin": _twin, "nodes.attack": _attack, "nodes.monitor": _monitor, "nodes.gateway": _gateway, "nodes.viewer": _viewer,
+    "nodes.ros2": _ros2,
 }  # fmt: skip

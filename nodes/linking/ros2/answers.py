@@ -1,6 +1,6 @@
 """Decides which commands from ROS 2 count. Pure: time and messages come as arguments.
 
-DDS has no keys, and the clock of another host is unknown. So a command counts only as the answer to a message that this node itself
+ROS 2 has no keys here, and the clock of another host is unknown. So a command counts only as the answer to a message that this node itself
 sent a moment ago: it must carry that message's stamp. Its age is then measured by this host's clock alone, a recording or a flood
 cannot forge it without reading along, and each message is answered at most once.
 """
@@ -77,7 +77,7 @@ class OneWriter:
 
     Attributes:
         shared: Accept any number of publishers instead.
-        present: Publishers that exist, by their DDS identity.
+        present: Publishers that exist, by their identity.
     """
 
     shared: bool = False
@@ -94,4 +94,4 @@ class OneWriter:
         """Return why a message does not count; empty if it does."""
         if self.problem:
             return self.problem
-        return "" if writer in self.present else "its publisher is already gone"
+        return "" if writer in self.present else "its publisher is not announced, or already gone"

@@ -12,7 +12,6 @@ import socket
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from cyclonedds.core import DDSException, ReadCondition, WaitSet
@@ -38,7 +37,6 @@ _WAIT_MS = 100
 _ATTEMPTS = 10
 # A flood may not keep the interpreter busy: after a full batch the reader rests, and the middleware keeps the newest samples.
 _REST_S = 0.002
-_LOOPBACK_FLAG = 0x8
 _TYPE_HASH = re.compile(r"typehash=(RIHS01_[0-9a-f]{64});")
 _ANY = Views.Any | Instances.Alive | Samples.NotRead
 # Type information of Fast DDS (1.15) is refused by Cyclone DDS, and then nothing matches. Types are compared by name and ROS type hash.
@@ -57,24 +55,13 @@ _LOCAL_DISCOVERY = (
 )
 
 
-def is_loopback_interface(name: str) -> bool:
-    """Whether a network interface is the loopback of this computer. An interface that does not exist is a `BusError`."""
-    try:
-        flags = int((Path("/sys/class/net") / name / "flags").read_text(), 16)
-    except (OSError, ValueError):
-        known = ", ".join(sorted(found for _, found in socket.if_nameindex()))
-        raise BusError(
-            f"expected a network interface of this computer ({known}), got {name!r}; set 'interface'"
-        ) from None
-    return bool(flags & _LOOPBACK_FLAG)
-
-
 class Participant:
     """One DDS participant, which reads in a separate thread.
 
     Args:
         domain_id: DDS domain (``ROS_DOMAIN_ID``).
         interface: Network interface.
+        local: Whether that is the loopback of this computer.
         sends: Topics to write.
         takes: Topics to read.
         inbox: Receives batches of samples.
@@ -85,12 +72,12 @@ class Participant:
         self,
         domain_id: int,
         interface: str,
+        local: bool,
         sends: Sequence[Endpoint],
         takes: Sequence[Endpoint],
         inbox: Inbox[list[Heard]],
         watched: Sequence[int] = (),
     ) -> None:
-        local = is_loopback_interface(interface)
         before = _udp_sockets()
         try:
             self._domain = Domain(domain_id, domain_config(interface, local))

@@ -13,6 +13,7 @@ from cyclonedds.idl import IdlStruct, make_idl_struct
 from cyclonedds.idl import types as idl
 from rosbags.interfaces import Nodetype
 
+from nodes.linking.ros2.routes import dds_name
 from nodes.runtime.errors import MessageError
 from nodes.runtime.messages import fields_of
 
@@ -32,12 +33,6 @@ _BASE = {
     "float64": idl.float64,
     "string": str,
 }
-
-
-def dds_name(typename: str) -> str:
-    """Name of a ROS 2 type in DDS."""
-    package, kind, name = typename.split("/")
-    return f"{package}::{kind}::dds_::{name}_"
 
 
 def dds_topic(ros_name: str) -> str:

@@ -43,7 +43,7 @@ _SENSOR_DEPTH, _DEPTH = 5, 10
 
 @dataclass(frozen=True)
 class Endpoint:
-    """One DDS reader or writer.
+    """One reader or writer in ROS 2.
 
     Attributes:
         ros: ROS name, with a leading slash.
@@ -119,7 +119,7 @@ class _Route(StrictModel):
 
     @property
     def endpoint(self) -> Endpoint:
-        """The DDS end of the route."""
+        """The ROS end of the route."""
         camera = self.ros_type in _SENSOR_DATA
         reliable = not camera if self.reliability is None else self.reliability == "reliable"
         return Endpoint(
@@ -192,6 +192,12 @@ class TakeRoute(_Route):
     def commands(self) -> bool:
         """Whether its messages ask to move the car."""
         return self.topic in COMMANDS
+
+
+def dds_name(typename: str) -> str:
+    """Name of a ROS 2 type in DDS; ``rmw_zenoh`` uses the same."""
+    package, kind, name = typename.split("/")
+    return f"{package}::{kind}::dds_::{name}_"
 
 
 def check_routes(send: tuple[SendRoute, ...], take: tuple[TakeRoute, ...]) -> None:

@@ -51,7 +51,7 @@ def test_memory_is_bounded(answers):
 
 def test_of_two_publishers_none_counts():
     one = OneWriter()
-    assert one.refusal("a") == "its publisher is already gone"
+    assert one.refusal("a") == "its publisher is not announced, or already gone"
     one.present = ("a",)
     assert one.refusal("a") == one.problem == ""
     assert one.refusal("b")

@@ -1,6 +1,6 @@
-"""Programs on a DDS domain that are not ours: an honest policy, and strangers. Started by the campaign of strangers and by tests.
+"""ROS programs that are not ours: an honest policy, and strangers. Started by the campaign of strangers and by tests.
 
-Each is a process of its own that uses Cyclone DDS directly. It reads one request per line (JSON) from its standard input, acts, and
+Each is a process of its own that uses Cyclone DDS or Zenoh directly. It reads one request per line (JSON) from its standard input, acts, and
 answers ``done``. What it says is checked by nobody here: that is the business of the ROS 2 node.
 """
 
@@ -14,29 +14,16 @@ import signal
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Any
-
-from cyclonedds.core import DDSException
-from cyclonedds.domain import Domain, DomainParticipant
-from cyclonedds.idl import make_idl_struct
-from cyclonedds.idl import types as idl
-from cyclonedds.pub import DataWriter
-from cyclonedds.qos import Policy, Qos
-from cyclonedds.sub import DataReader
-from cyclonedds.topic import Topic
 
 from advnerf_core.geometry import planar_pose
 from nodes.linking.ros2.answers import stamp_of_cdr
-from nodes.linking.ros2.dds import domain_config
-from nodes.linking.ros2.idl import bytes_type, dds_name, dds_topic
 from nodes.runtime.messages import (
     decode,
     drive_message,
     encode,
     header,
     pose_message,
-    type_hash,
     type_name,
     types,
 )
@@ -57,62 +44,43 @@ def twist(stamp_ns: int, speed_mps: float, steering_rad: float) -> bytes:
     return encode(message)
 
 
-@dataclass
-class Dds:
-    """A participant of a stranger; everything it opened leaves with it."""
+class Programs:
+    """The places of this process among the ROS programs."""
 
-    domain_id: int
-    participant: Any = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.participant = DomainParticipant(self.domain_id)
-
-    def writer(self, ros: str, typename: str, reliable: bool = True, stated_hash: str | None = None) -> Any:
-        """Open a writer with ROS 2's conventions."""
-        stated = type_hash(typename) if stated_hash is None else stated_hash
-        return DataWriter(self.participant, self._topic(ros, typename), qos=self.qos(reliable, stated))
-
-    def reader(self, ros: str, typename: str, reliable: bool = False) -> Any:
-        """Open a reader with ROS 2's conventions."""
-        return DataReader(
-            self.participant, self._topic(ros, typename), qos=self.qos(reliable, type_hash(typename))
-        )
-
-    def _topic(self, ros: str, typename: str) -> Any:
-        return Topic(self.participant, dds_topic(ros), bytes_type(typename))
-
-    def qos(self, reliable: bool, stated: str) -> Any:
-        """QoS of a ROS 2 program that states the hash of its type."""
-        reliability = Policy.Reliability.Reliable(0) if reliable else Policy.Reliability.BestEffort
-        return Qos(
-            reliability,
-            Policy.Durability.Volatile,
-            Policy.History.KeepLast(5),
-            Policy.DataRepresentation(use_cdrv0_representation=True),
-            Policy.Userdata(f"typehash={stated};".encode()),
-        )
+    transport = "dds"
+    joined: list[Any] = []  # noqa: RUF012 - one list for the process
 
 
-def put(writer: Any, cdr: bytes) -> None:
-    """Write bytes; a full queue is no reason to stop."""
-    try:
-        writer.write(writer.data_type(cdr))
-    except DDSException as error:
-        if error.code != DDSException.DDS_RETCODE_TIMEOUT:
-            raise
+def join(domain_id: int) -> Any:
+    """Join the ROS programs."""
+    if Programs.transport == "zenoh":
+        from tests.support.live.strange_zenoh import StrangeZenoh
+
+        Programs.joined.append(StrangeZenoh(domain_id))
+    else:
+        from tests.support.live.strange_dds import StrangeDds
+
+        Programs.joined.append(StrangeDds(domain_id))
+    return Programs.joined[-1]
+
+
+def leave(network: Any) -> None:
+    """Leave them again."""
+    Programs.joined.remove(network)
+    network.close()
 
 
 def answer(
-    dds: Dds, seconds: float, command: Callable[[int], bytes], late_s: float = 0.0, **how: Any
+    network: Any, seconds: float, command: Callable[[int], bytes], late_s: float = 0.0, **how: Any
 ) -> None:
     """Answer every image for a while with what ``command`` makes of its stamp."""
-    images, commands = dds.reader(IMAGES, IMAGE), dds.writer(COMMANDS, TWIST, **how)
+    images, commands = network.reader(IMAGES, IMAGE), network.writer(COMMANDS, TWIST, **how)
     waiting: list[tuple[float, int]] = []
     deadline = time.monotonic() + seconds
     while (now := time.monotonic()) < deadline:
-        waiting += [(now + late_s, stamp_of_cdr(sample.cdr)) for sample in images.take(5)]
+        waiting += [(now + late_s, stamp_of_cdr(cdr)) for cdr in images.take(5)]
         while waiting and waiting[0][0] <= now:
-            put(commands, command(waiting.pop(0)[1]))
+            commands.put(command(waiting.pop(0)[1]))
         time.sleep(0.001)
 
 
@@ -124,7 +92,7 @@ def flood(
     while time.monotonic() < deadline:
         for writer in writers:
             for cdr in messages():
-                put(writer, cdr)
+                writer.put(cdr)
         if pause_s:
             time.sleep(pause_s)
 
@@ -132,76 +100,55 @@ def flood(
 def second_publisher(domain: int, seconds: float, rng: random.Random) -> None:
     """It reads along and answers every image, but with other values."""
     speed, steering = rng.uniform(0.2, 1.0), rng.uniform(-0.3, 0.2)
-    answer(Dds(domain), seconds, lambda stamp: twist(stamp, speed, steering))
+    answer(join(domain), seconds, lambda stamp: twist(stamp, speed, steering))
 
 
 def blind_flood(domain: int, seconds: float, rng: random.Random) -> None:
     """Commands with the time of day as stamp, as fast as possible."""
     speed = rng.uniform(0.2, 1.0)
-    flood([Dds(domain).writer(COMMANDS, TWIST)], lambda: [twist(time.time_ns(), speed, -0.2)], seconds)
+    flood([join(domain).writer(COMMANDS, TWIST)], lambda: [twist(time.time_ns(), speed, -0.2)], seconds)
 
 
 def old_stamps(domain: int, seconds: float, rng: random.Random) -> None:
     """Answers to images of half a second ago and more."""
-    answer(Dds(domain), seconds, lambda stamp: twist(stamp, 0.5, -0.2), late_s=rng.uniform(0.3, 0.8))
+    answer(join(domain), seconds, lambda stamp: twist(stamp, 0.5, -0.2), late_s=rng.uniform(0.3, 0.8))
 
 
 def not_finite(domain: int, seconds: float, rng: random.Random) -> None:
     """Answers that are no numbers, or larger than any float."""
     wrong = rng.choice([math.nan, math.inf, -math.inf, 1e300])
-    answer(Dds(domain), seconds, lambda stamp: twist(stamp, wrong, 0.0))
+    answer(join(domain), seconds, lambda stamp: twist(stamp, wrong, 0.0))
 
 
 def wrong_type(domain: int, seconds: float, rng: random.Random) -> None:
     """The name of the command topic with other types."""
-    dds, pose = Dds(domain), pose_message(planar_pose(rng.random(), 0.0, 0.0), time.time_ns())
+    network, pose = join(domain), pose_message(planar_pose(rng.random(), 0.0, 0.0), time.time_ns())
     for message in (drive_message(0.5, -0.2, time.time_ns()), pose):
         messages = [encode(message)]
-        flood([dds.writer(COMMANDS, type_name(message))], messages.copy, seconds / 2, 0.002)
+        flood([network.writer(COMMANDS, type_name(message))], messages.copy, seconds / 2, 0.002)
 
 
 def wrong_bytes(domain: int, seconds: float, rng: random.Random) -> None:
     """The right name of the type, and bytes that are none of it; and a megabyte of frame name."""
-    dds = Dds(domain)
+    network = join(domain)
     sizes = [rng.randrange(1, 40), 60, 68, 72, rng.randrange(100, 5000)]
-    junk = [
-        DataWriter(
-            dds.participant,
-            Topic(dds.participant, dds_topic(COMMANDS), _junk_type(size)),
-            qos=dds.qos(True, ""),
-        )
-        for size in sizes
-    ]
+    junk = [network.junk_writer(COMMANDS, TWIST, size) for size in sizes]
     long = types.TwistStamped(
         header=header(time.time_ns(), "x" * 2**20), twist=decode(TWIST, twist(0, 0.5, -0.2)).twist
     )
-    large, cdr = dds.writer(COMMANDS, TWIST), encode(long)
+    large, cdr = network.writer(COMMANDS, TWIST), encode(long)
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
         for writer, size in zip(junk, sizes, strict=True):
-            put(writer, b"\x00\x01\x00\x00" + rng.randbytes(size))
-        put(large, cdr)
+            writer.put(b"\x00\x01\x00\x00" + rng.randbytes(size))
+        large.put(cdr)
         time.sleep(0.005)
-
-
-def _junk_type(size: int) -> Any:
-    """A type with the DDS name of a command whose content is any bytes."""
-    made: Any = make_idl_struct(
-        "Junk", dds_name(TWIST), {"junk": idl.array.__class_getitem__((idl.byte, size))}, dataclassify=False
-    )
-
-    def take_bytes(sample: Any, cdr: bytes) -> None:
-        sample.cdr = cdr
-
-    made.__init__ = take_bytes
-    made.serialize = lambda sample, *_, **__: sample.cdr
-    return made
 
 
 def wrong_definition(domain: int, seconds: float, rng: random.Random) -> None:
     """The type's name with the ROS hash of another definition."""
     answer(
-        Dds(domain),
+        join(domain),
         seconds,
         lambda stamp: twist(stamp, 0.5, -0.2),
         stated_hash="RIHS01_" + f"{rng.getrandbits(256):064x}",
@@ -210,23 +157,23 @@ def wrong_definition(domain: int, seconds: float, rng: random.Random) -> None:
 
 def unreliable(domain: int, seconds: float, rng: random.Random) -> None:
     """A publisher whose QoS does not match."""
-    answer(Dds(domain), seconds, lambda stamp: twist(stamp, rng.uniform(0.2, 1.0), -0.2), reliable=False)
+    answer(join(domain), seconds, lambda stamp: twist(stamp, rng.uniform(0.2, 1.0), -0.2), reliable=False)
 
 
 def other_domain(domain: int, seconds: float, rng: random.Random) -> None:
     """Commands on another domain."""
     other = (domain + rng.randint(1, 5)) % 100
-    flood([Dds(other).writer(COMMANDS, TWIST)], lambda: [twist(time.time_ns(), 0.5, -0.2)], seconds, 0.002)
+    flood([join(other).writer(COMMANDS, TWIST)], lambda: [twist(time.time_ns(), 0.5, -0.2)], seconds, 0.002)
 
 
 def tries_to_arm(domain: int, seconds: float, rng: random.Random) -> None:
     """Requests to arm, a held button and commands of the safety node, under our own names."""
-    dds = Dds(domain)
+    network = join(domain)
     writers = {
-        "/arm": dds.writer("/arm", ARM),
-        "/teleop/state": dds.writer("/teleop/state", TELEOP),
-        "/policy/drive": dds.writer("/policy/drive", ACKERMANN),
-        "/motor/drive": dds.writer("/motor/drive", ACKERMANN),
+        "/arm": network.writer("/arm", ARM),
+        "/teleop/state": network.writer("/teleop/state", TELEOP),
+        "/policy/drive": network.writer("/policy/drive", ACKERMANN),
+        "/motor/drive": network.writer("/motor/drive", ACKERMANN),
     }
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
@@ -245,18 +192,18 @@ def tries_to_arm(domain: int, seconds: float, rng: random.Random) -> None:
             ("/policy/drive", drive),
             ("/motor/drive", drive),
         ):
-            put(writers[name], encode(message))
+            writers[name].put(encode(message))
         time.sleep(0.005)
 
 
 def false_images(domain: int, seconds: float, rng: random.Random) -> None:
     """Pictures of its own under the name of ours, with our stamps."""
-    dds = Dds(domain)
-    images, false = dds.reader(IMAGES, IMAGE), dds.writer(IMAGES, IMAGE, reliable=False)
+    network = join(domain)
+    images, false = network.reader(IMAGES, IMAGE), network.writer(IMAGES, IMAGE, reliable=False)
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
-        for sample in images.take(5):
-            put(false, sample.cdr[:64] + rng.randbytes(len(sample.cdr) - 64))
+        for cdr in images.take(5):
+            false.put(cdr[:64] + rng.randbytes(len(cdr) - 64))
         time.sleep(0.001)
 
 
@@ -264,26 +211,51 @@ def comes_and_goes(domain: int, seconds: float, rng: random.Random) -> None:
     """Participants that join and leave, some of them with a command."""
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
-        dds = Dds(domain)
+        network = join(domain)
         if rng.random() < 0.5:
-            put(dds.writer(COMMANDS, TWIST), twist(time.time_ns(), 0.5, -0.2))
+            network.writer(COMMANDS, TWIST).put(twist(time.time_ns(), 0.5, -0.2))
         time.sleep(rng.uniform(0.0, 0.05))
+        leave(network)
 
 
 def slow_subscriber(domain: int, seconds: float, rng: random.Random) -> None:
     """Subscribers that ask for everything and take nothing."""
     del rng
-    dds = Dds(domain)
+    network = join(domain)
     readers = [
-        dds.reader(name, typename, reliable=True)
+        network.reader(name, typename, reliable=True)
         for name, typename in (
             ("/pose", "geometry_msgs/msg/PoseStamped"),
             ("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"),
         )
     ]
-    readers += [dds.reader(IMAGES, IMAGE) for _ in range(8)]
+    readers += [network.reader(IMAGES, IMAGE) for _ in range(8)]
     time.sleep(seconds)
     del readers
+
+
+def unannounced(domain: int, seconds: float, rng: random.Random) -> None:
+    """Only over Zenoh: it reads along and answers every image, without a liveliness token."""
+    answer(join(domain), seconds, lambda stamp: twist(stamp, rng.uniform(0.2, 1.0), -0.2), announced=False)
+
+
+def without_attachment(domain: int, seconds: float, rng: random.Random) -> None:
+    """Only over Zenoh: the same with attachments of no or other bytes."""
+    junk = [b"", rng.randbytes(33), rng.randbytes(7)]
+    answer(
+        join(domain),
+        seconds,
+        lambda stamp: twist(stamp, 0.5, -0.2),
+        announced=False,
+        attachment=lambda count: junk[count % len(junk)],
+    )
+
+
+def unannounced_images(domain: int, seconds: float, rng: random.Random) -> None:
+    """Only over Zenoh: pictures of its own under the name of ours, without a liveliness token."""
+    network = join(domain)
+    false = network.writer(IMAGES, IMAGE, announced=False)
+    flood([false], lambda: [rng.randbytes(1000)], seconds, 0.02)
 
 
 STRANGERS: dict[str, Callable[[int, float, random.Random], None]] = {
@@ -306,24 +278,30 @@ STRANGERS: dict[str, Callable[[int, float, random.Random], None]] = {
 }
 
 
+ZENOH_STRANGERS = {each.__name__: each for each in (unannounced, without_attachment, unannounced_images)}
+
+
 def main() -> None:
     """Act as asked until the standard input ends."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("domain", type=int)
     parser.add_argument("--honest", action="store_true", help="be the operator's own policy, for ever")
+    parser.add_argument("--transport", default="dds", choices=("dds", "zenoh"))
     options = parser.parse_args()
-    domain = Domain(options.domain, domain_config("lo", local=True))
+    Programs.transport = options.transport
     if options.honest:
         signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # the interpreter's end leaves the domain
         print("ready", flush=True)
         command = lambda stamp: twist(stamp, HONEST_SPEED_MPS, HONEST_STEERING_RAD)  # noqa: E731 - one line
-        answer(Dds(options.domain), math.inf, command)
+        answer(join(options.domain), math.inf, command)
     print("ready", flush=True)
     for line in sys.stdin:
         asked = json.loads(line)
-        STRANGERS[asked["kind"]](options.domain, asked["seconds"], random.Random(asked["seed"]))
+        act = {**STRANGERS, **ZENOH_STRANGERS}[asked["kind"]]
+        act(options.domain, asked["seconds"], random.Random(asked["seed"]))
+        for network in list(Programs.joined):
+            leave(network)
         print("done", flush=True)
-    del domain
 
 
 if __name__ == "__main__":
