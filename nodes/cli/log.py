@@ -39,7 +39,7 @@ def log_export(
     log_options: LogOptions,
     rate_hz: Annotated[
         int | None,
-        typer.Option("--rate", min=1, help="Images per second.", show_default="the mean of the log"),
+        typer.Option("--rate", min=1, help="Images per second.", show_default="the log's"),
     ] = None,
 ) -> None:
     """Write a log, for example a bag, as a LeRobot data set (version 3). Steering is in radians, left positive."""
@@ -61,7 +61,7 @@ def log_export(
 def _print_facts(name: str, facts: LogFacts) -> None:
     log, (width, height) = facts.log, facts.size
     rows = table("", "")
-    rate = f", {facts.rate_hz:.1f} Hz" if facts.rate_hz == facts.rate_hz else ", no times"
+    rate = f", {log.rate_hz:.1f} Hz" if log.rate_hz > 0.0 else ", no times"
     rows.add_row("format", log.format)
     rows.add_row("images", f"{log.count} of {width} x {height}{rate}, {log.images}")
     if len(log.cameras) > 1:

@@ -17,13 +17,13 @@ def picture(k, height=48, width=64):
     return np.full((height, width, 3), GREY * k, np.uint8)
 
 
-def write_tub_2(folder, deleted=(), piloted=()):
+def write_tub_2(folder, deleted=(), piloted=(), size=(48, 64)):
     """As ``donkeycar/parts/tub_v2.py`` writes it, five records to a catalog."""
     (folder / "images").mkdir(parents=True)
     catalogs = {}
     for k in range(COUNT):
         name = f"{k}_cam_image_array_.jpg"
-        cv2.imwrite(str(folder / "images" / name), picture(k))
+        cv2.imwrite(str(folder / "images" / name), picture(k, *size))
         record = {"cam/image_array": name, "user/angle": value(k), "user/throttle": 0.4}
         record |= {"user/mode": "local" if k in piloted else "user", "_timestamp_ms": 1700000000000 + 100 * k}
         catalogs.setdefault(f"catalog_{k // 5}.catalog", []).append(

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.image_files import read_stored
 from advnerf_core.data.logs.choice import LogChoice, LogError
-from advnerf_core.data.logs.drive_log import DriveLog, LogFrame, SteeringUnit, chosen_name
+from advnerf_core.data.logs.drive_log import DriveLog, LogFrame, SteeringUnit, chosen_name, median_rate_hz
 from advnerf_core.documents import raise_problems, read_json, read_json_lines
 
 MANIFEST = "manifest.json"
@@ -27,6 +27,7 @@ META = "meta.json"
 _STEERING, _MODE = "user/angle", "user/mode"
 _RECORD = re.compile(r"record_(\d+)\.json")
 _NS_PER_MS = 1_000_000
+_LATEST_MS = 9e12  # in nanoseconds it has 64 bits
 _DELETED, _PILOT = "deleted", "not driven by the user"
 
 
@@ -59,7 +60,7 @@ def read_tub(path: Path, choice: LogChoice) -> DriveLog:
     driven = [each for each in records if each.values.get(_MODE, "user") == "user"]
     left_out |= {_PILOT: len(records) - len(driven)} if len(driven) < len(records) else {}
     values = _values(driven, name, images)
-    times_ms = [each.time_ms for each in driven]
+    times_s = [1e-3 * each.time_ms for each in driven]
 
     def frames() -> Iterator[LogFrame]:
         for number, (each, value) in enumerate(zip(driven, values, strict=True)):
@@ -81,7 +82,7 @@ def read_tub(path: Path, choice: LogChoice) -> DriveLog:
         ),
         SteeringUnit(name, None, "right").chosen(choice) if np.isfinite(values).any() else None,
         len(driven),
-        1e-3 * (times_ms[-1] - times_ms[0]) if driven else math.nan,
+        median_rate_hz(times_s),
         0,
         lambda: values,
         frames,
@@ -154,7 +155,8 @@ def _is_control(key: str, value: Any) -> bool:
 
 
 def _time_ms(value: Any) -> float:
-    return float(value) if isinstance(value, int | float) else math.nan
+    """A time [ms]; NaN without one, or for a number that is no time."""
+    return float(value) if isinstance(value, int | float) and abs(value) < _LATEST_MS else math.nan
 
 
 def _camera_order(name: str) -> tuple[bool, str]:

@@ -114,7 +114,7 @@ class DriveLog:
         controls: All numbers that could be chosen as steering.
         unit: Unit of the steering; None for a log without controls.
         count: Number of images.
-        span_s: Time from the first to the last image [s]; NaN in a log without times.
+        rate_hz: Images per second while recording; NaN in a log without times.
         poses: Number of measured poses.
         steering: Reads the steering values ``[K]`` in the log's unit.
         frames: Reads the frames in order.
@@ -132,7 +132,7 @@ class DriveLog:
     controls: tuple[str, ...]
     unit: SteeringUnit | None
     count: int
-    span_s: float
+    rate_hz: float
     poses: int
     steering: Callable[[], NDArray[np.float64]]
     frames: Callable[[], Iterator[LogFrame]]
@@ -150,6 +150,13 @@ class DriveLog:
         for frame in self.frames():
             return frame.image
         raise LogError(f"expected images in {self.path}, got none; record more")
+
+
+def median_rate_hz(times_s: Sequence[float]) -> float:
+    """Images per second without the pauses between drives; NaN without times."""
+    timed = len(times_s) > 1 and bool(np.isfinite(times_s).all())
+    interval_s = float(np.median(np.diff(times_s))) if timed else math.nan
+    return 1.0 / interval_s if interval_s > 0.0 else math.nan
 
 
 def chosen_name(wanted: str | None, known: Sequence[str], what: str, path: Path) -> str:

@@ -35,6 +35,7 @@ STAMP, DISTURBED = "stamp_ns", "disturbed"
 _ACTION, _STATE = "action", "observation.state"
 _VERSIONS = ("v2", "v3")
 _BATCH = 64
+_LARGEST = 2**53
 # Exceptions that PyArrow raises for a damaged file beside its own.
 _NONSENSE = (OSError, ValueError, KeyError, IndexError, TypeError, OverflowError, MemoryError)
 
@@ -105,7 +106,7 @@ def read_lerobot(path: Path, choice: LogChoice) -> DriveLog:
     state = _STATE if data.is_ours and _STATE in data.features else None
     columns = ["episode_index", "timestamp"]
     columns += [name for name in (_ACTION, _STATE) if name in data.features]
-    columns += [name for name in (STAMP, DISTURBED) if data.is_ours and name in data.features]
+    columns += [DISTURBED] if data.is_ours and DISTURBED in data.features else []
     table = data.rows(columns)
     count = len(table["timestamp"])
     values = _values(data, table, steering) if steering else np.full(count, math.nan)
@@ -137,7 +138,7 @@ def read_lerobot(path: Path, choice: LogChoice) -> DriveLog:
         controls,
         _unit(data, steering).chosen(choice) if steering else None,
         count,
-        (count - 1) / data.fps,
+        data.fps,
         int(np.isfinite(states).all(axis=1).sum()),
         lambda: values,
         frames,
@@ -192,10 +193,13 @@ def _stamps(data: _DataSet, count: int) -> NDArray[np.int64]:
     """Capture times [ns]. Numbers of nanoseconds since 1970 are no ``float64``, so they are read as they are."""
     if not (data.is_ours and STAMP in data.features):
         return np.round(np.arange(count) * (1e9 / data.fps)).astype(np.int64)
-    parts = [read_table(file, [STAMP])[STAMP].to_pylist() for file in data.tables]
-    return np.array(
-        [value[0] if isinstance(value, list) else value for part in parts for value in part], np.int64
-    )
+    values = [value for file in data.tables for value in read_table(file, [STAMP])[STAMP].to_pylist()]
+    try:
+        return np.array(values, np.int64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise LogError(
+            f"{data.path}: {STAMP}: expected times [ns], got something else; export the log again"
+        ) from error
 
 
 def _images(data: _DataSet, name: str, table: dict[str, NDArray[np.float64]]) -> Iterator[Rgb]:
@@ -229,7 +233,7 @@ def _video_places(
     data: _DataSet, name: str, table: dict[str, NDArray[np.float64]]
 ) -> list[tuple[Path, float]]:
     """Video and time in it [s] of each row."""
-    episodes = table["episode_index"][:, 0].astype(int)
+    episodes = np.nan_to_num(table["episode_index"][:, 0], nan=-1.0).astype(int)
     times_s = table["timestamp"][:, 0]
     found = _episode_videos(data, name, sorted(set(episodes.tolist())))
     return [
@@ -257,9 +261,15 @@ def _episode_videos(data: _DataSet, name: str, episodes: Sequence[int]) -> dict[
     starts: dict[int, tuple[Path, float]] = {}
     for file in files:
         columns = read_table(file, ["episode_index", *keys])
-        for number, chunk_index, file_index, start_s in zip(
-            *(columns[key].to_pylist() for key in ("episode_index", *keys)), strict=True
-        ):
+        rows = zip(*(columns[key].to_pylist() for key in ("episode_index", *keys)), strict=True)
+        for number, chunk_index, file_index, start_s in rows:
+            if not all(
+                isinstance(each, int | float) and abs(each) < _LARGEST
+                for each in (number, chunk_index, file_index, start_s)
+            ):
+                raise LogError(
+                    f"{file}: expected numbers of the episodes' videos, got something else; copy the data set again"
+                )
             video = _filled(
                 data, pattern, video_key=name, chunk_index=int(chunk_index), file_index=int(file_index)
             )
@@ -342,4 +352,4 @@ def _numbers(file: Path, table: Any, name: str) -> NDArray[np.float64]:
         raise LogError(
             f"{file}: {name}: expected numbers in every row, got something else; copy the data set again"
         ) from error
-    return found.reshape(len(found), -1)
+    return np.where(np.abs(found) < _LARGEST, found, math.nan).reshape(len(found), -1)

@@ -72,7 +72,7 @@ def write_lerobot(
     Args:
         log: The log; the unit of its steering must be known.
         folder: New folder of the data set.
-        rate_hz: Images per second; None for the mean of the log.
+        rate_hz: Images per second; None for the log's.
         report: Called with the number of frames written.
 
     Raises:
@@ -96,12 +96,11 @@ def write_lerobot(
 
 
 def _rate_of(log: DriveLog) -> int:
-    rate_hz = (log.count - 1) / log.span_s if log.span_s > 0.0 else math.nan
-    if not rate_hz >= 0.5:
+    if not log.rate_hz >= 0.5:
         raise LogError(
             f"expected the times of the images in {log.path}, it has none; give the images per second with --rate"
         )
-    return round(rate_hz)
+    return round(log.rate_hz)
 
 
 def _write(log: DriveLog, folder: Path, rate_hz: int, report: Report) -> Exported:
@@ -146,7 +145,7 @@ def _usable(log: DriveLog, rate_hz: int) -> Iterator[tuple[_Row, LogFrame]]:
     assert log.unit is not None
     episode = number = -1
     last_ns: float = -math.inf
-    timed = log.span_s > 0.0
+    timed = log.rate_hz > 0.0
     skipped = True
     for frame in log.frames():
         if frame.unusable or math.isnan(frame.steering):

@@ -11,6 +11,7 @@ from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.data.logs.choice import LogChoice
-from advnerf_core.data.logs.drive_log import NOWHERE, DriveLog, LogFrame, SteeringUnit, chosen_name
+from advnerf_core.data.logs.drive_log import (
+    NOWHERE,
+    DriveLog,
+    LogFrame,
+    SteeringUnit,
+    chosen_name,
+    median_rate_hz,
+)
 from advnerf_core.geometry import yaw_of
 from nodes.bags.images import CAMERA_TOPICS, image_messages
 from nodes.bags.reader import BagInfo, read_attachments, read_info, read_messages
@@ -34,6 +42,7 @@ _SAFETY, _SENT, _EXPERT = "/safety/state", "/motor/sent", "/expert/state"
 _IMAGES = ("/compositor/image", *CAMERA_TOPICS)
 _ACKERMANN = "ackermann_msgs/msg/AckermannDriveStamped"
 _JOIN_S = 0.12
+_TIMED = 200  # images from which the rate is determined
 
 
 @dataclass
@@ -99,7 +108,7 @@ def read_bag_log(bag: Path, choice: LogChoice) -> DriveLog:
         controls,
         SteeringUnit(steering, 1.0, "left").chosen(choice) if steering else None,
         counts[images],
-        info.duration_s,
+        _rate_hz(bag, images),
         counts.get(CAR_TOPIC, 0),
         lambda: _steering_values(bag, steering),
         lambda: _frames(bag, images, read()),
@@ -107,6 +116,11 @@ def read_bag_log(bag: Path, choice: LogChoice) -> DriveLog:
         attached=lambda: read_attachments(bag) if info.attachments else {},
         unchecked=info.unchecked,
     )
+
+
+def _rate_hz(bag: Path, images: str) -> float:
+    messages = islice(read_messages(bag, [images], as_recorded=True), _TIMED)
+    return median_rate_hz([message.log_ns / NS_PER_S for message in messages])
 
 
 def _format(info: BagInfo) -> str:

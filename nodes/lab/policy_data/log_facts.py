@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from itertools import islice
 
@@ -45,11 +44,6 @@ class LogFacts:
     missing: int
     same_image: bool
     has_camera: bool
-
-    @property
-    def rate_hz(self) -> float:
-        """Mean number of images per second; NaN in a log without times."""
-        return (self.log.count - 1) / self.log.span_s if self.log.span_s > 0.0 else math.nan
 
     def verdicts(self) -> list[Verdict]:
         """What the log allows."""
