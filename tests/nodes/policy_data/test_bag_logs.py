@@ -1,0 +1,164 @@
+"""Bags as logs: ours exported and read again, and those of other software with Ackermann commands."""
+
+import numpy as np
+import pytest
+from rosbags import rosbag1, rosbag2
+from rosbags.rosbag2.writer import StoragePlugin
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from advnerf_core.data.logs.choice import LogChoice, LogError
+from advnerf_core.driving.expert import Expert
+from advnerf_core.driving.path import Path as DrivingPath
+from advnerf_core.geometry import Pinhole
+from advnerf_core.policies.view import PolicyView
+from nodes.bags.writer import BagWriter
+from nodes.lab.policy_data.frames import frames_of
+from nodes.lab.policy_data.logs import open_log
+from nodes.runtime.messages import encode, header, image_message, pose_message, types
+from tests.support.commands import advnerf
+from tests.support.foreign_samples import IMAGE, Make
+
+START_NS, STEP_NS, COUNT = 1_800_000_000_000_000_000, 100_000_000, 24
+ACKERMANN, DRIVE = "ackermann_msgs/msg/AckermannDriveStamped", "ackermann_msgs/msg/AckermannDrive"
+DEFINITIONS = {
+    DRIVE: "float32 steering_angle\nfloat32 steering_angle_velocity\nfloat32 speed\nfloat32 acceleration\nfloat32 jerk\n",
+    ACKERMANN: "std_msgs/Header header\nackermann_msgs/AckermannDrive drive\n",
+}
+VIEW = PolicyView(Pinhole(64, 48, 33.0, 33.0, 32.0, 24.0), 6, 28)
+EXPERT = Expert(DrivingPath.rounded_square(4.0, 1.1))
+
+
+def picture(k):
+    rows, columns = np.mgrid[0:48, 0:64]
+    return np.stack([columns * 3 + k, rows * 4, 200 - columns - k], axis=2).astype(np.uint8)
+
+
+def pose(k):
+    T = np.eye(4)
+    T[:2, 3] = EXPERT.path.pose_at(np.array([0.08 * k]))[0, :2]
+    return T
+
+
+def write_bag(folder, pause_after=12, braking=(5, 6), disturbed=(15,)):
+    """Ours: a pause, the car brakes during two frames (the second has the next command), and one in which the expert disturbs itself."""
+    with BagWriter(folder, {"room.yaml": b"x: 1\n"}) as bag:
+        for k in range(COUNT):
+            t = START_NS + k * STEP_NS + (k > pause_after) * 3_000_000_000
+            numbers = {
+                "speed_mps": 0.8,
+                "steering_rad": 0.01 * k - 0.1,
+                "erpm": 0.0,
+                "servo": 0.5,
+                "brake_current_a": 0.0,
+            }
+            times = {"serial_write_mono_ns": t, "serial_write_real_ns": t}
+            sent = types.MotorSent(
+                header=header(t, "car"), braking=k in braking, reason="", peer="", **numbers, **times
+            )
+            zeros = dict.fromkeys(
+                ("cte_m", "heading_error_rad", "s_m", "driven_m", "speed_mps", "steering_rad"), 0.0
+            )
+            wish = types.ExpertState(header=header(t, "car"), disturbance_rad=0.1 * (k in disturbed), **zeros)
+            rows = {
+                "/camera/image_raw": image_message(picture(k), t, "camera"),
+                "/vicon/car": pose_message(pose(k), t),
+            }
+            for topic, message in {**rows, "/motor/sent": sent, "/expert/state": wish}.items():
+                bag.write(topic, encode(message), t, t, k)
+    return folder
+
+
+@pytest.mark.parametrize("labels", ["recorded", "expert"])
+def test_a_bag_that_was_exported_gives_the_same_frames(tmp_path, monkeypatch, labels):
+    pytest.importorskip("pyarrow")
+    bag = write_bag(tmp_path / "bag")
+    assert advnerf(monkeypatch, "log", "export", str(bag), "-o", str(tmp_path / "set")) == 0
+    exported = open_log(tmp_path / "set")
+    assert (exported.count, exported.labels, exported.unit.unknown) == (COUNT - 1, "expert", "")
+    assert exported.attached() == {"room.yaml": b"x: 1\n"}
+    first, again = (frames_of(log, VIEW, EXPERT, labels) for log in (open_log(bag), exported))
+    kept = np.isfinite(first.recorded_rad)  # what the car did while it braked is not exported
+    assert again.stamps_ns.tolist() == first.stamps_ns[kept].tolist()
+    assert again.recorded_rad == pytest.approx(first.recorded_rad[kept])
+    assert again.frames.states == pytest.approx(first.frames.states[kept], abs=1e-6)
+    assert again.frames.steering_rad == pytest.approx(first.frames.steering_rad[kept], abs=1e-5)
+    error = np.abs(again.frames.images.astype(int) - first.frames.images[kept])
+    assert (error.mean() < 2.0, error.max() < 24) == (True, True)
+    assert first.counts["disturbed"] == again.counts["disturbed"] == (1 if labels == "recorded" else 0)
+
+
+def test_an_export_has_an_episode_for_each_drive_and_never_replaces_one(tmp_path):
+    pq = pytest.importorskip("pyarrow.parquet")
+    from advnerf_core.data.logs.lerobot_write import write_lerobot
+
+    log = open_log(write_bag(tmp_path / "bag"))
+    done = write_lerobot(log, tmp_path / "set")
+    assert (done.frames, done.episodes, done.rate_hz, done.left_out) == (COUNT - 1, 3, 10, 1)
+    rows = pq.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    assert [row["length"] for row in rows] == [5, 7, 11]
+    with pytest.raises(LogError, match="set exists; remove it or choose another folder"):
+        write_lerobot(log, tmp_path / "set")
+    with pytest.raises(LogError, match="expected steering in"):
+        write_lerobot(open_log(write_ackermann(tmp_path / "two", "ros2", ("/a", "/b"))), tmp_path / "other")
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["bag", "set", "two"]
+
+
+def write_ackermann(path, form, topics=("/drive",)):
+    """A bag of other software: images, and commands of a car."""
+    store = get_typestore(Stores.ROS1_NOETIC if form == "ros1" else Stores.ROS2_HUMBLE)
+    for name, text in DEFINITIONS.items():
+        store.register(get_types_from_msg(text, name))
+    make = Make(store)
+    make.ros1 = form == "ros1"
+    if form == "ros1":
+        path = path.with_suffix(".bag")
+        writer, pack = rosbag1.Writer(path), store.serialize_ros1
+    else:
+        writer, pack = (
+            rosbag2.Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3),
+            store.serialize_cdr,
+        )
+    with writer:
+        images = writer.add_connection("/front/image", IMAGE, typestore=store)
+        drives = [writer.add_connection(topic, ACKERMANN, typestore=store) for topic in topics]
+        for k in range(6):
+            image = make.image(k)
+            t = image.header.stamp.sec * 10**9 + image.header.stamp.nanosec
+            writer.write(images, t, pack(image, IMAGE))
+            for drive in drives:
+                command = store.types[DRIVE](0.02 * k, 0.0, 1.5, 0.0, 0.0)
+                message = store.types[ACKERMANN](header=make.header(k, "car"), drive=command)
+                writer.write(drive, t + 1000, pack(message, ACKERMANN))
+    return path
+
+
+@pytest.mark.parametrize("form", ["ros1", "ros2"])
+def test_ackermann_commands_of_other_software_are_wheel_angles(tmp_path, form):
+    log = open_log(write_ackermann(tmp_path / "drive", form))
+    assert (log.images, log.controls, str(log.unit)) == (
+        "/front/image",
+        ("/drive",),
+        "/drive [rad], left positive",
+    )
+    assert log.rate_hz == pytest.approx(10.0)
+    assert [frame.steering for frame in log.frames()] == pytest.approx([0.02 * k for k in range(6)])
+    assert [frame.speed_mps for frame in log.frames()] == pytest.approx([1.5] * 6)
+    assert log.steering() == pytest.approx([0.02 * k for k in range(6)])
+
+
+def test_of_two_topics_with_commands_none_is_taken_unasked(tmp_path):
+    bag = write_ackermann(tmp_path / "drive", "ros2", ("/a", "/b"))
+    assert (open_log(bag).unit, open_log(bag).controls) == (None, ("/a", "/b"))
+    assert open_log(bag, LogChoice(steering="/b")).unit.name == "/b"
+    with pytest.raises(LogError, match=r"expected a topic with wheel angles /c in .*, it has /a, /b"):
+        open_log(bag, LogChoice(steering="/c"))
+
+
+def test_a_damaged_bag_is_one_line(tmp_path, monkeypatch, capsys):
+    for form in ("ros1", "ros2"):
+        bag = write_ackermann(tmp_path / f"drive_{form}", form)
+        file = bag if bag.is_file() else next(bag.glob("*.db3"))
+        file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+        assert advnerf(monkeypatch, "log", "info", str(bag)) == 2
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert file.name in line
