@@ -27,8 +27,9 @@ def log_info(logs: Logs, log_options: LogOptions) -> None:
     from nodes.lab.policy_data.log_facts import read_facts
     from nodes.lab.policy_data.logs import open_logs
 
-    for each in open_logs(logs, log_options.choice()):
-        _print_facts(each.name, read_facts(each.log))
+    for request in logs:
+        (opened,) = open_logs([request], log_options.choice())
+        _print_facts(opened.name, read_facts(opened.log))
 
 
 @app.command("export")

@@ -129,7 +129,12 @@ def train(
     from advnerf_core.learning.recipe import ImitationConfig
     from nodes.lab.policy_data.frames import HOLDOUT_EVERY
     from nodes.lab.policy_data.logs import open_logs
-    from nodes.lab.policy_data.recordings import policy_view, steering_bound_rad, training_recording
+    from nodes.lab.policy_data.recordings import (
+        crop_notes,
+        policy_view,
+        steering_bound_rad,
+        training_recording,
+    )
     from nodes.lab.policy_data.train import train_from_recordings
     from nodes.runtime.progress import ProgressDisplay
 
@@ -159,6 +164,7 @@ def train(
         left_out = ", ".join(f"{n} {why}" for why, n in done.left_out.get(name, {}).items() if n)
         rows.add_row(name, labels_of.get(name, "expert"), str(count), left_out)
     print_table(rows)
+    print("".join(f"{note}\n" for note in crop_notes(opened, view)), end="")
     print(
         f"{done.path} {done.sha256[:12]}, {1e3 * done.validation_mae_rad:.1f} mrad from the labels on held-out frames"
         + "".join(f"; {name} unchecked: {reason}" for name, reason in done.unchecked.items())
@@ -201,7 +207,7 @@ def evaluate(
     from advnerf_core.policies.load import load_any_policy
     from nodes.lab.policy_data import evaluate as measure
     from nodes.lab.policy_data.logs import open_logs
-    from nodes.lab.policy_data.recordings import recorded_frames
+    from nodes.lab.policy_data.recordings import crop_notes, recorded_frames
 
     loaded = load_any_policy(policy)
     opened = open_logs(logs, log_options.choice(), labels)
@@ -223,7 +229,7 @@ def evaluate(
         files = measure.write_saliency(loaded.policy, found, folder, maps, video, goals)
         written.append(f"{folder / 'steering.png'}, {len(files)} saliency files in {folder}")
     print_table(rows)
-    print("\n".join(written))
+    print("\n".join([*crop_notes(opened, loaded.view), *written]))
 
 
 def _error_cells(e: Errors) -> list[str]:

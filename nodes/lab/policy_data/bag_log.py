@@ -10,13 +10,12 @@ import math
 from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from advnerf_core.data.logs.choice import LogChoice
 from advnerf_core.data.logs.drive_log import (
@@ -96,9 +95,8 @@ def read_bag_log(bag: Path, choice: LogChoice) -> DriveLog:
     controls = tuple(name for name, kind in typed.items() if name == _SENT or kind == _ACKERMANN)
     controls = tuple(sorted(controls, key=lambda name: (name != _SENT, name)))
     steering = _steering_topic(choice.steering, controls, bag)
-    read = partial(
-        _read_track, bag, steering, [name for name in (CAR_TOPIC, _SAFETY, _EXPERT) if name in counts]
-    )
+    joined = [name for name in (CAR_TOPIC, _SAFETY, _EXPERT) if name in counts]
+    track = cache(partial(_read_track, bag, steering, joined))
     return DriveLog(
         bag,
         _format(info),
@@ -110,8 +108,8 @@ def read_bag_log(bag: Path, choice: LogChoice) -> DriveLog:
         counts[images],
         _rate_hz(bag, images),
         counts.get(CAR_TOPIC, 0),
-        lambda: _steering_values(bag, steering),
-        lambda: _frames(bag, images, read()),
+        lambda: np.array([each[1] for each in track().sent], np.float64),
+        lambda: _frames(bag, images, track()),
         labels="expert",
         attached=lambda: read_attachments(bag) if info.attachments else {},
         unchecked=info.unchecked,
@@ -147,11 +145,6 @@ def _frames(bag: Path, images: str, track: _Track) -> Iterator[LogFrame]:
             "" if track.is_armed(stamp_ns) else "not armed",
             track.is_disturbed(stamp_ns),
         )
-
-
-def _steering_values(bag: Path, steering: str | None) -> NDArray[np.float64]:
-    sent = _read_track(bag, steering, []).sent if steering else []
-    return np.array([each[1] for each in sent], np.float64)
 
 
 def _read_track(bag: Path, steering: str | None, topics: list[str]) -> _Track:

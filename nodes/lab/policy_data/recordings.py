@@ -60,6 +60,17 @@ def policy_view(camera: Path | None, logs: Sequence[OpenLog]) -> PolicyView:
     return view_for_size(width, height)
 
 
+def crop_notes(logs: Iterable[OpenLog], view: PolicyView) -> list[str]:
+    """A line for each log whose images have another size than the view's camera."""
+    wanted = (view.camera.width, view.camera.height)
+    found = [(each.name, each.log.first_image().shape) for each in logs]
+    return [
+        f"{name}: images of {width} x {height} are cropped at the same fraction as the policy's of {wanted[0]} x {wanted[1]}"
+        for name, (height, width, _) in found
+        if (width, height) != wanted
+    ]
+
+
 def steering_bound_rad(logs: Iterable[OpenLog]) -> float:
     """Bound of a policy's steering that all recorded labels are within [rad]."""
     largest_rad = 0.0

@@ -273,12 +273,13 @@ def test_a_bag_says_what_it_lacks(tmp_path):
 
 def test_the_commands_train_on_several_logs_and_evaluate_held_out_frames(tmp_path, monkeypatch, capsys):
     drive = str(write_udacity(tmp_path / "drive", False, "IMG/"))
-    tub = str(write_tub_2(tmp_path / "tub"))
+    tub = str(write_tub_2(tmp_path / "tub", size=(60, 80)))
     logs = [drive, f"{tub},steering-full-rad=0.4"]
     assert advnerf(monkeypatch, "policy", "train", *logs, "--steps", "2", "-o", str(tmp_path / "policy")) == 0
     shown = capsys.readouterr().out
     assert "recorded: steering, 1 is 0.436 rad to the right" in shown
     assert "recorded: user/angle, 1 is 0.4 rad to the right" in shown
+    assert "images of 80 x 60 are cropped at the same fraction as the policy's of 64 x 48" in shown
     policy = str(tmp_path / "policy/policy.safetensors")
     about = json.loads((tmp_path / "policy/policy.json").read_text())
     assert about["frames"] == dict.fromkeys(logs, COUNT)
