@@ -45,7 +45,8 @@ def write_drives(folder: Path, drives: int, ticks: int, seed: int = 0) -> Path:
     stamp_ns = _START_NS
     with BagWriter(folder, attached, compressed=True) as bag, Lab() as lab:
         for start in starts:
-            state = lab.reset(*start, speed_mps=_SPEED_MPS)
+            x_m, y_m, yaw_rad = (float(value) for value in start)
+            state = lab.reset(x_m, y_m, yaw_rad, _SPEED_MPS)
             for _ in range(ticks):
                 steering_rad = float(expert.steer(state.x_m, state.y_m, state.yaw_rad))
                 _write(bag, stamp_ns, lab.observe(depth=False)[0], state.T_world_from_car, steering_rad)
