@@ -76,13 +76,13 @@ test-browser: setup  ## The tests that drive the operator page in Chromium (apt-
 
 # rclpy cannot share our environment: it has packages of ROS in the versions of one distribution.
 ROS2_VENV ?= .venv-ros2
-setup-ros2: $(ROS2_VENV)/.installed  ## Install rclpy from PyPI into .venv-ros2 (x86-64 Linux, Python 3.10 to 3.12)
+setup-ros2: $(ROS2_VENV)/.installed  ## Install rclpy (x86-64 only) and zenoh_ros2_sdk from PyPI into .venv-ros2
 $(ROS2_VENV)/.installed: benchmarks/rclpy_peers/requirements.txt
 	@test -x $(ROS2_VENV)/bin/python || $(PYTHON) -m venv $(ROS2_VENV)
 	@$(ROS2_VENV)/bin/pip install -q --disable-pip-version-check -r $<
 	@touch $@
 
-test-ros2: setup setup-ros2  ## The tests with real rclpy programs as peers (two minutes)
+test-ros2: setup setup-ros2  ## The tests with real ROS 2 programs as peers (two minutes)
 	@ADVNERF_RCLPY_PYTHON=$(ROS2_VENV)/bin/python $(BIN)/pytest -q -m 'ros2'
 
 check: setup  ## Lint, types (also of the Python in the pages), import contracts

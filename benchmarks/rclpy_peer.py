@@ -1,4 +1,4 @@
-"""Starts plain rclpy programs, whose environment is not ours: ``make setup-ros2`` installs it."""
+"""Starts plain ROS 2 programs (rclpy, zenoh_ros2_sdk), whose environment is not ours: ``make setup-ros2`` installs it."""
 
 from __future__ import annotations
 
@@ -17,6 +17,13 @@ def rclpy_python() -> Path | None:
     # The link itself, as what it points to is the Python without the environment.
     python = Path(os.environ.get("ADVNERF_RCLPY_PYTHON", ROOT / ".venv-ros2" / "bin" / "python")).absolute()
     return python if python.exists() else None
+
+
+def peers_have(module: str) -> bool:
+    """Whether that environment has a module. rclpy has no wheels for arm64."""
+    python = rclpy_python()
+    command = [str(python), "-c", f"import {module}"]
+    return python is not None and subprocess.run(command, capture_output=True, check=False).returncode == 0
 
 
 class RclpyPeer:
