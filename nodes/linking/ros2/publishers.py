@@ -59,21 +59,11 @@ class Publishers:
             gid: Identity in the sample's attachment, in hexadecimal; empty if there is no attachment.
             mono_ns: When the sample arrived, monotonic clock [ns].
         """
-        for token in self._tokens.values():
-            if token.gid == gid:
-                if (taken_for_it := self._gids.get(token.key, gid)) != gid:
-                    self._unannounced[taken_for_it] = mono_ns
-                self._gids[token.key] = gid
-                return _identity(token)
-        for key, known in self._gids.items():
-            if known == gid:
-                return _identity(self._tokens[key])
+        if (token := self._of(gid, mono_ns)) is not None:
+            self._unannounced.pop(gid, None)  # its first sample may come before its token
+            return _identity(token)
         if gid in self._former:
             return gid
-        if gid and len(self._tokens) == 1 and not self._gids:
-            (token,) = self._tokens.values()
-            self._gids[token.key] = gid
-            return _identity(token)
         self._expire(mono_ns)
         if gid in self._unannounced or len(self._unannounced) < _MOST_UNANNOUNCED:
             self._unannounced[gid] = mono_ns
@@ -101,6 +91,23 @@ class Publishers:
             f"the publisher of {name} has another definition of {ours} ({other.type_hash[:80]}, expected {self._hash});"
             " use the same version of the message package (ROS 2 Humble states none)"
         )
+
+    def _of(self, gid: str, mono_ns: int) -> Token | None:
+        """The token to which an identity belongs."""
+        for token in self._tokens.values():
+            if token.gid == gid:
+                if (taken_for_it := self._gids.get(token.key, gid)) != gid:
+                    self._unannounced[taken_for_it] = mono_ns
+                self._gids[token.key] = gid
+                return token
+        for key, known in self._gids.items():
+            if known == gid:
+                return self._tokens[key]
+        if gid and gid not in self._former and len(self._tokens) == 1 and not self._gids:
+            (token,) = self._tokens.values()
+            self._gids[token.key] = gid
+            return token
+        return None
 
     def _expire(self, mono_ns: int) -> None:
         oldest_ns = mono_ns - round(_REMEMBERED_S * NS_PER_S)

@@ -189,6 +189,15 @@ def test_what_is_not_announced_never_counts_alone():
     assert publishers.heard("", S).endswith("without identity")  # no attachment: never the announced one
 
 
+@pytest.mark.parametrize("gid", ["aa", tokens()[0].gid])
+def test_a_first_sample_may_come_before_its_token(gid):
+    publishers = known()
+    publishers.heard(gid, S)
+    publishers.announce(*tokens())
+    writer = publishers.heard(gid, S)
+    assert publishers.present(S) == (writer,)
+
+
 def test_a_late_sample_of_a_publisher_that_left_is_not_of_the_next():
     one, two = tokens(2)
     publishers = known(one)
