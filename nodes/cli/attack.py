@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -132,40 +132,6 @@ def attack_show(
         print(clean.warning)
     for path in export_attack(attack, output or file.parent, file.name.partition(".")[0]):
         print(f"written: {path}")
-
-
-@app.command("print")
-def attack_print(
-    file: Annotated[Path, typer.Argument(help="An attack file.", exists=True, dir_okay=False)],
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output", "-o", help="A .pdf or .png file.", show_default="FILE's name with .poster.pdf"
-        ),
-    ] = None,
-    paper: Annotated[
-        Literal["a4", "a3", "a2", "a1", "a0", "letter", "tabloid", "none"],
-        typer.Option(help="Paper of the PDF's tiles; none: one page as large as the poster."),
-    ] = "a4",
-    dpi: Annotated[float, typer.Option(min=10, max=2400, help="Pixels per inch.")] = 200.0,
-    margin_mm: Annotated[float, typer.Option(help="White on every side of a page.")] = 8.0,
-    overlap_mm: Annotated[float, typer.Option(help="Strip that neighbouring tiles share, for glue.")] = 5.0,
-    name: Annotated[str | None, typer.Option("--object", help="Name or number of the object.")] = None,
-    size_m: Annotated[
-        float | None,
-        typer.Option(
-            "--object-size", min=0.01, help="Edge of a panel [m], for attack files that do not hold it."
-        ),
-    ] = None,
-) -> None:
-    """Write a face's or panel's texture at its true size: a PDF in tiles with marks to cut and glue, or one PNG."""
-    from advnerf_core.attack.artifact import load_attack
-    from advnerf_core.attack.printing.poster import poster_of
-    from nodes.experiment.node.printed import write_poster
-
-    poster = poster_of(load_attack(file), name, size_m)
-    target = output or file.with_name(f"{file.name.partition('.')[0]}.poster.pdf")
-    print(write_poster(poster, target, paper, dpi, margin_mm, overlap_mm))
 
 
 @app.command("check")

@@ -19,6 +19,7 @@ from nodes.cli import arm as cli_arm
 from nodes.cli import attack as cli_attack
 from nodes.cli import attack_node as cli_attack_node
 from nodes.cli import attack_poses as cli_attack_poses
+from nodes.cli import attack_print as cli_attack_print
 from nodes.cli import audit as cli_audit
 from nodes.cli import bag as cli_bag
 from nodes.cli import car as cli_car
@@ -74,6 +75,7 @@ app.add_typer(cli_policy.app, name="policy")
 app.add_typer(cli_log.app, name="log")
 cli_attack_node.add_to(cli_attack.app)
 cli_attack_poses.add_to(cli_attack.app)
+cli_attack_print.add_to(cli_attack.app)
 cli_attack.app.add_typer(cli_method.app, name="method")
 app.add_typer(cli_attack.app, name="attack")
 app.add_typer(cli_car.app, name="car")

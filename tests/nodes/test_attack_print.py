@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from advnerf_core.attack.artifact import AttackFile, save_attack
+from advnerf_core.attack.artifact import AttackFile, load_attack, save_attack
+from advnerf_core.attack.printing.record import load_record
 from advnerf_core.fields.voxel_grid import face_corners_in_object
 from advnerf_core.geometry import Pinhole
 from nodes.cli import main as cli
@@ -50,18 +51,36 @@ def printed(monkeypatch, capsys, file):
 
 
 def test_the_pdf_lies_beside_the_file(printed, file):
-    code, said = printed("--dpi", 40)
+    code, said = printed("--dpi", 40, "--no-markers")
     assert (code, said.split(", ", 1)[1]) == (
         0,
         "0.400 x 0.400 m, 6 pages of A4 and an overview; print at 100 %, no fit to page",
     )
     assert (file.parent / "seed_0.poster.pdf").read_bytes().count(b"/MediaBox") == 7
+    assert list(file.parent.glob("*.json")) == []
+
+
+def test_markers_and_their_record_lie_beside_the_print(printed, file):
+    code, said = printed("-o", file.parent / "poster.png", "--dpi", 100, "--marker-mm", 50)
+    assert code == 0
+    assert "0.400 x 0.400 m, 0.538 x 0.538 m with its markers; print at 100 %" in said
+    record = load_record(file.parent / "poster.print.json")
+    assert (record.picture_m, record.attack_id) == ((0.4, 0.4), load_attack(file).attack_id)
+    assert file.parent / record.attack_file == file
+    picture = cv2.imread(str(file.parent / "poster.png"))
+    assert picture.shape == (2116, 2116, 3)
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    corners, numbers, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(picture)
+    assert sorted(numbers.ravel()) == sorted(record.markers)
+    for number, pixels in zip(numbers.ravel(), corners, strict=True):
+        place_m = (pixels[0] + 0.5 - 2116 / 2) * 0.0254 / 100 * [1, -1]
+        assert place_m == pytest.approx(record.markers[number][:, 1:], abs=3e-4)
 
 
 def test_a_png_and_a_page_of_the_posters_size(printed, tmp_path):
-    assert printed("-o", tmp_path / "poster.png", "--dpi", 127)[0] == 0
+    assert printed("-o", tmp_path / "poster.png", "--dpi", 127, "--no-markers")[0] == 0
     assert cv2.imread(str(tmp_path / "poster.png")).shape == (2000, 2000, 3)
-    assert printed("-o", tmp_path / "shop.pdf", "--paper", "none", "--dpi", 40)[0] == 0
+    assert printed("-o", tmp_path / "shop.pdf", "--paper", "none", "--dpi", 40, "--no-markers")[0] == 0
     assert b"/MediaBox [0 0 1133.858268 1133.858268]" in (tmp_path / "shop.pdf").read_bytes()
 
 
@@ -69,6 +88,7 @@ def test_a_png_and_a_page_of_the_posters_size(printed, tmp_path):
     ("arguments", "message"),
     [
         (["-o", "poster.jpg"], "expected a .pdf or .png file to write, got poster.jpg; correct --output"),
+        (["--marker-mm", 5], "should be greater than or equal to 8"),
         (["--margin-mm", 1], "expected a margin of 4 to 40 mm"),
         (["--object", "car"], "expected an object of face; got 'car'"),
         (["--object-size", 1], "whose attack file says 0.4 x 0.4 m"),

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import struct
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.attack.artifact import AttackedObject, AttackFile, face_texture
+from advnerf_core.attack.printing.frame import CHART_SET, MarkerFrame, frame_around
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Array
 from advnerf_core.plugins import unknown
@@ -27,42 +28,71 @@ class PrintError(AdvnerfError, ValueError):
 
 
 @dataclass(frozen=True, eq=False)
-class Poster:
-    """A flat texture and its true size.
+class Printable:
+    """A picture at its true size, alone or with markers around it.
+
+    Attributes:
+        texture: The picture, ``[H, W, 3]`` uint8 sRGB; row 0 on top, column 0 left for the viewer.
+        size_m: Width and height of the picture [m].
+        frame: Markers around it; None for the picture alone.
+    """
+
+    texture: Rgb
+    size_m: tuple[float, float]
+    frame: MarkerFrame | None = None
+
+    @property
+    def sheet_mm(self) -> tuple[float, float]:
+        """Width and height of all that is printed [mm]."""
+        width, height = self.size_m if self.frame is None else self.frame.sheet_m
+        return width * MM_PER_M, height * MM_PER_M
+
+    def pixels(self, box_mm: tuple[float, float, float, float], size_px: tuple[int, int]) -> Rgb:
+        """A part of the sheet; the texture is interpolated bilinearly between its pixel centres.
+
+        Args:
+            box_mm: Left, top, width and height of the part, from the sheet's upper left corner [mm].
+            size_px: Width and height of the part [px].
+
+        Returns:
+            The part ``[height, width, 3]``.
+        """
+        left, top, width, height = box_mm
+        across_m = (left + width * _centres(size_px[0])) / MM_PER_M
+        down_m = (top + height * _centres(size_px[1])) / MM_PER_M
+        border_m = 0.0 if self.frame is None else self.frame.border_m
+        columns, rows = (across_m - border_m) / self.size_m[0], (down_m - border_m) / self.size_m[1]
+        if self.frame is None:
+            return _bilinear(self.texture, rows, columns)
+        found = self.frame.drawn(across_m, down_m)
+        inside = tuple(np.flatnonzero((share >= 0.0) & (share < 1.0)) for share in (rows, columns))
+        if all(map(len, inside)):
+            found[np.ix_(*inside)] = _bilinear(self.texture, rows[inside[0]], columns[inside[1]])
+        return found
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Poster(Printable):
+    """The flat texture of an attack.
 
     Attributes:
         attack: The attack of this texture.
         name: The object that carries it.
-        texture: The displayed texture, ``[H, W, 3]`` uint8 sRGB; row 0 on top, column 0 left for the viewer.
-        size_m: Width and height [m].
         T_world_from_face: Frame ``[4, 4]`` at its centre: x out of it towards a viewer, z up.
     """
 
     attack: AttackFile
     name: str
-    texture: Rgb
-    size_m: tuple[float, float]
     T_world_from_face: Array
 
-    @property
-    def size_mm(self) -> tuple[float, float]:
-        """Width and height [mm]."""
-        return self.size_m[0] * MM_PER_M, self.size_m[1] * MM_PER_M
-
-    def pixels(self, box_mm: tuple[float, float, float, float], size_px: tuple[int, int]) -> Rgb:
-        """A part of the poster, interpolated bilinearly between the texture's pixel centres.
+    def with_markers(self, marker_m: float | None = None) -> Poster:
+        """The same poster with markers around it, whose numbers come from the attack's id.
 
         Args:
-            box_mm: Left, top, width and height of the part, from the poster's upper left corner [mm].
-            size_px: Width and height of the picture [px].
-
-        Returns:
-            The picture ``[height, width, 3]``.
+            marker_m: Side of a marker [m]; None for a share of the picture.
         """
-        left, top, width, height = box_mm
-        columns = (left + width * _centres(size_px[0])) / self.size_mm[0]
-        rows = (top + height * _centres(size_px[1])) / self.size_mm[1]
-        return _bilinear(self.texture, rows, columns)
+        number = int(self.attack.attack_id, 16) % CHART_SET
+        return replace(self, frame=frame_around(self.size_m, number, marker_m))
 
 
 def poster_of(attack: AttackFile, name: str | None = None, edge_m: float | None = None) -> Poster:
@@ -83,7 +113,9 @@ def poster_of(attack: AttackFile, name: str | None = None, edge_m: float | None 
         if face is not None and face.carried_by == number
         else (face_texture(chosen.theta), chosen.size_m)
     )
-    return Poster(attack, chosen.name, texture, _size(chosen, held_m, edge_m), chosen.T_world_from_object)
+    size_m = _size(chosen, held_m, edge_m)
+    T_world_from_face = np.asarray(chosen.T_world_from_object)
+    return Poster(texture, size_m, attack=attack, name=chosen.name, T_world_from_face=T_world_from_face)
 
 
 def pixels_of(size_mm: tuple[float, float], dpi: float) -> tuple[int, int]:
@@ -101,14 +133,14 @@ def pixels_of(size_mm: tuple[float, float], dpi: float) -> tuple[int, int]:
     return width, height
 
 
-def png_bytes(poster: Poster, dpi: float) -> bytes:
-    """The whole poster as a PNG with its physical size.
+def png_bytes(sheet: Printable, dpi: float) -> bytes:
+    """The whole sheet as a PNG with its physical size.
 
     Source: PNG specification, second edition, 11.3.5.3: ``pHYs`` holds whole pixels per metre, anywhere before the image data.
     """
     per_m = round(dpi * MM_PER_M / MM_PER_INCH)
-    size_px = pixels_of(poster.size_mm, per_m * MM_PER_INCH / MM_PER_M)
-    picture = poster.pixels((0.0, 0.0, *poster.size_mm), size_px)
+    size_px = pixels_of(sheet.sheet_mm, per_m * MM_PER_INCH / MM_PER_M)
+    picture = sheet.pixels((0.0, 0.0, *sheet.sheet_mm), size_px)
     data = cv2.imencode(".png", picture[..., ::-1])[1].tobytes()
     chunk = b"pHYs" + struct.pack(">IIB", per_m, per_m, 1)
     after_header = 33  # signature, and the chunk IHDR

@@ -33,7 +33,7 @@ def overview(poster: Poster, layout: Layout, paper: Paper) -> Page:
     """The sheet, on A4 or Letter."""
     page = Page(PAPERS_MM["letter" if paper in ("letter", "tabloid") else "a4"])
     page.text((_LEFT_MM, 20.0), f"Attack {poster.attack.attack_id}: {poster.name}", 15.0, bold=True)
-    page.text((_LEFT_MM, 26.5), f"{_metres(poster.size_m)} at true size, {_victim(poster)}", 10.0)
+    page.text((_LEFT_MM, 26.5), f"{_sizes(poster)} at true size, {_victim(poster)}", 10.0)
     top = 32.0 + _picture(page, poster, layout, 32.0)
     for title, lines in (
         ("Print", _print_lines(layout, paper)),
@@ -57,7 +57,7 @@ def ruler(page: Page, start: tuple[float, float]) -> None:
 
 def _picture(page: Page, poster: Poster, layout: Layout, top_mm: float) -> float:
     """The poster with the grid of its tiles; its height [mm]."""
-    width, height = poster.size_mm
+    width, height = poster.sheet_mm
     scale = _PICTURE_MM / max(width, height)
     pixels = tuple(max(1, round(_PICTURE_PX * each / max(width, height))) for each in (width, height))
     shown = (scale * width, scale * height)
@@ -107,9 +107,10 @@ def _mount_lines(poster: Poster) -> list[str]:
     x, y, z = T[:3, 3]
     half = 0.5 * poster.size_m[1] * T[2, 2]
     lower, upper = (round(float(edge), 3) + 0.0 for edge in (z - half, z + half))  # no minus before a zero
+    edge = "Lower edge" if poster.frame is None else "The picture's lower edge, without its markers,"
     lines = [
         f"Centre at x = {x:.3f} m, y = {y:.3f} m in the scene's frame, {z:.3f} m above its floor (z = 0).",
-        f"Lower edge at {lower:.3f} m, upper edge at {upper:.3f} m.",
+        f"{edge} at {lower:.3f} m, upper edge at {upper:.3f} m.",
     ]
     if abs(math.asin(np.clip(T[2, 0], -1.0, 1.0))) < _UPRIGHT_RAD and T[2, 2] > math.cos(_UPRIGHT_RAD):
         heading = round(math.degrees(yaw_of(T)), 1) + 0.0
@@ -142,7 +143,13 @@ def _paragraph(page: Page, top_mm: float, title: str, lines: list[str]) -> float
     return top_mm + 10.5 + len(lines) * _LINE_MM - 3.0
 
 
-def _metres(size_m: tuple[float, float]) -> str:
+def _sizes(poster: Poster) -> str:
+    picture = metres(poster.size_m)
+    return picture if poster.frame is None else f"{picture}, {metres(poster.frame.sheet_m)} with markers,"
+
+
+def metres(size_m: tuple[float, float]) -> str:
+    """Width and height as text."""
     return f"{size_m[0]:.3f} x {size_m[1]:.3f} m"
 
 

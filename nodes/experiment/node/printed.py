@@ -8,6 +8,8 @@ from pathlib import Path
 from advnerf_core.attack.artifact import AttackFile, load_attack
 from advnerf_core.attack.printing.pages import pdf_bytes
 from advnerf_core.attack.printing.poster import Poster, PrintError, png_bytes
+from advnerf_core.attack.printing.record import SUFFIX, poster_record, save_record
+from advnerf_core.attack.printing.sheet import metres
 from advnerf_core.attack.printing.tiles import Paper, layout_of
 from advnerf_core.files import write_atomically
 
@@ -45,13 +47,15 @@ def write_poster(
     Raises:
         PrintError: The file is of another kind, or the measures do not fit together.
     """
-    size = f"{poster.size_m[0]:.3f} x {poster.size_m[1]:.3f} m"
+    size = metres(poster.size_m)
+    if poster.frame is not None:
+        size += f", {metres(poster.frame.sheet_m)} with its markers"
     if target.suffix.lower() == ".png":
         write_atomically(target, png_bytes(poster, dpi))
         return f"written: {target}, {size}; print at 100 %"
     if target.suffix.lower() != ".pdf":
         raise PrintError(f"expected a .pdf or .png file to write, got {target}; correct --output")
-    layout = layout_of(poster.size_mm, paper, margin_mm, overlap_mm)
+    layout = layout_of(poster.sheet_mm, paper, margin_mm, overlap_mm)
     write_atomically(target, pdf_bytes(poster, layout, paper, dpi))
     pages = (
         "1 page of this size"
@@ -59,6 +63,13 @@ def write_poster(
         else f"{layout.rows * layout.columns} pages of {paper.title()}"
     )
     return f"written: {target}, {size}, {pages} and an overview; print at 100 %, no fit to page"
+
+
+def write_record(poster: Poster, attack_file: Path, printed: Path, dpi: float) -> Path:
+    """Write the sizes and markers of a printed poster beside its file; the record's path."""
+    path = printed.with_suffix(SUFFIX)
+    save_record(poster_record(poster, attack_file, path.parent, dpi), path)
+    return path
 
 
 def print_attacks(files: Sequence[Path]) -> None:

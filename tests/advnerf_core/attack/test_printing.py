@@ -57,7 +57,7 @@ def of(*objects: AttackedObject) -> AttackFile:
 
 
 def written(folder: Path, poster: Poster, paper="a4", dpi=100.0, margin_mm=8.0, overlap_mm=5.0) -> Path:
-    layout = layout_of(poster.size_mm, paper, margin_mm, overlap_mm)
+    layout = layout_of(poster.sheet_mm, paper, margin_mm, overlap_mm)
     (folder / "poster.pdf").write_bytes(pdf_bytes(poster, layout, paper, dpi))
     return folder / "poster.pdf"
 
@@ -106,7 +106,7 @@ def between_crop_marks(page: np.ndarray, mm: float, margin_mm: float = 8.0) -> n
 def test_pages_are_of_the_paper_and_tiles_add_up(tmp_path, paper):
     poster = poster_of(attack())
     file = written(tmp_path, poster, paper, dpi=30)
-    layout = layout_of(poster.size_mm, paper, 8.0, 5.0)
+    layout = layout_of(poster.sheet_mm, paper, 8.0, 5.0)
     *pages, overview = boxes_mm(file, "MediaBox")
     *tiles, _ = boxes_mm(file, "TrimBox")
     assert len(pages) == layout.rows * layout.columns == len(tiles)
@@ -126,7 +126,7 @@ def test_pages_are_of_the_paper_and_tiles_add_up(tmp_path, paper):
 @pytest.mark.parametrize("overlap_mm", [0.0, 12.0])
 def test_tiles_cut_at_their_marks_and_put_together_are_the_texture(tmp_path, overlap_mm):
     poster, dpi = poster_of(attack()), 127
-    mm, layout = dpi / 25.4, layout_of(poster.size_mm, "a4", 8.0, overlap_mm)
+    mm, layout = dpi / 25.4, layout_of(poster.sheet_mm, "a4", 8.0, overlap_mm)
     pages = rasterised(written(tmp_path, poster, dpi=150.0, overlap_mm=overlap_mm), dpi)
     together = np.zeros((round(350 * mm), round(500 * mm), 3), np.uint8)
     for number, page in enumerate(pages[:-1]):
