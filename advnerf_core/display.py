@@ -1,13 +1,15 @@
-"""Seen colours of a monitor's shown colours, and the inverse: colours to show for given seen ones. Numpy only.
+"""Seen colours of a monitor's shown colours, or of a printer's, and the inverse: colours to show for given seen ones. Numpy only.
 
 ``seen = (ambient + cos(angle)^falloff  M curve(shown)) ^ (1 / response)``: each channel of the monitor has its own monotone curve (its gamma), the
 camera mixes the channels' light by ``M``, the room reflects in the glass, the panel dims to the side, and the camera's response is a
-power. All colours are in 0..1. `advnerf_core.attack.spaces.displayed` is the same in torch, with gradients.
+power. The inks of a printer filter each other's light: products of the channels' light are added, ``M c + P products(c)``, which is the
+Neugebauer equation of three inks under the Yule-Nielsen power. All colours are in 0..1. `advnerf_core.attack.spaces.displayed` is the same in
+torch, with gradients.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,6 +21,9 @@ from advnerf_core.plain import Numbers, PlainData
 # Below this the camera's power has no finite slope.
 DARKEST = 1e-6
 _LEAST_DETERMINANT = 1e-3
+# Red with green, green with blue, red with blue, all three.
+PAIRS = ((0, 1), (1, 2), (0, 2))
+_NEWTON_STEPS, _SOLVED = 30, 1e-4
 
 
 class DisplayModelError(AdvnerfError, ValueError):
@@ -27,7 +32,7 @@ class DisplayModelError(AdvnerfError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class DisplayModel(PlainData):
-    """A monitor before a camera.
+    """A monitor, or a print, before a camera.
 
     Attributes:
         curves: Light of each channel at evenly spread levels ``[3, K]``, from 0 to 1, increasing.
@@ -35,6 +40,7 @@ class DisplayModel(PlainData):
         ambient: Reflected light by camera channel ``[3]``.
         response: Power of the camera.
         falloff: Power of the cosine of the angle to the panel's normal.
+        products: ``P`` ``[3, 4]``: light by camera channel of two or three channels together, see `products_of`; 0 for a monitor.
     """
 
     _refusal = DisplayModelError
@@ -43,20 +49,27 @@ class DisplayModel(PlainData):
     ambient: Numbers
     response: float = 1.0
     falloff: float = 0.0
+    products: Numbers = field(default_factory=lambda: np.zeros((3, 4)))
 
     def __post_init__(self) -> None:
-        curves, mixing, ambient = (np.array(v, np.float64) for v in (self.curves, self.mixing, self.ambient))
+        curves, mixing, ambient, products = (
+            np.array(v, np.float64) for v in (self.curves, self.mixing, self.ambient, self.products)
+        )
         if (
             curves.ndim != 2
             or curves.shape[0] != 3
             or curves.shape[1] < 2
             or mixing.shape != (3, 3)
             or ambient.shape != (3,)
+            or products.shape != (3, 4)
         ):
             raise DisplayModelError(
-                f"expected curves [3, K >= 2], mixing [3, 3] and ambient [3], got {curves.shape}, {mixing.shape} and {ambient.shape}"
+                f"expected curves [3, K >= 2], mixing [3, 3], ambient [3] and products [3, 4], got {curves.shape}, {mixing.shape}, "
+                f"{ambient.shape} and {products.shape}"
             )
-        everything = np.concatenate([curves.ravel(), mixing.ravel(), ambient, [self.response, self.falloff]])
+        everything = np.concatenate(
+            [curves.ravel(), mixing.ravel(), ambient, products.ravel(), [self.response, self.falloff]]
+        )
         if (
             not np.isfinite(everything).all()
             or ambient.min() < 0.0
@@ -73,7 +86,12 @@ class DisplayModel(PlainData):
             raise DisplayModelError(
                 "expected a mixing matrix that can be inverted, got channels that look alike to the camera"
             )
-        for name, value in (("curves", curves), ("mixing", mixing), ("ambient", ambient)):
+        for name, value in (
+            ("curves", curves),
+            ("mixing", mixing),
+            ("ambient", ambient),
+            ("products", products),
+        ):
             value.setflags(write=False)
             object.__setattr__(self, name, value)
 
@@ -96,8 +114,11 @@ class DisplayModel(PlainData):
             cos_angle: Cosine of the angle between the panel's normal and the direction to the camera ``[...]``.
         """
         gain = np.asarray(cos_angle, np.float64)[..., None] ** self.falloff
-        light = self.ambient + gain * (self.light(shown) @ self.mixing.T)
+        light = self.ambient + gain * self._mixed(self.light(shown))
         return np.clip(np.maximum(light, DARKEST) ** (1.0 / self.response), 0.0, 1.0)
+
+    def _mixed(self, light: Array) -> Array:
+        return np.asarray(light @ self.mixing.T + products_of(light) @ self.products.T)
 
     def inverse(self, wanted: ArrayLike, cos_angle: ArrayLike = 1.0) -> tuple[Array, float]:
         """Colours to show so that the camera sees wanted colours.
@@ -113,6 +134,32 @@ class DisplayModel(PlainData):
         gain = np.asarray(cos_angle, np.float64)[..., None] ** self.falloff
         light = (target / gain) @ np.linalg.inv(self.mixing).T
         outside = ((light < -1e-6) | (light > 1.0 + 1e-6)).any(axis=-1)
+        if self.products.any():
+            light = self._solved(target / gain, np.clip(light, 0.0, 1.0))
+            outside = np.abs(self._mixed(light) - target / gain).max(axis=-1) > _SOLVED
         levels = np.linspace(0.0, 1.0, self.curves.shape[1])
         shown = np.stack([np.interp(light[..., c], self.curves[c], levels) for c in range(3)], axis=-1)
         return shown, float(np.mean(outside)) if outside.size else 0.0
+
+    def _solved(self, target: Array, light: Array) -> Array:
+        """Light ``[..., 3]`` in 0..1 whose mixture is nearly the target, by Newton's method within these bounds."""
+        for _ in range(_NEWTON_STEPS):
+            slopes = self.mixing + np.einsum("kp,...pc->...kc", self.products, _slopes_of(light))
+            regular = slopes + 1e-9 * np.eye(3)
+            step = np.linalg.solve(regular, (target - self._mixed(light))[..., None])[..., 0]
+            light = np.clip(light + np.clip(step, -0.3, 0.3), 0.0, 1.0)
+        return light
+
+
+def products_of(light: Array) -> Array:
+    """Products ``[..., 4]`` of the channels' light ``[..., 3]``: red green, green blue, red blue, and all three."""
+    pairs = [light[..., a] * light[..., b] for a, b in PAIRS]
+    return np.stack([*pairs, light[..., 0] * light[..., 1] * light[..., 2]], axis=-1)
+
+
+def _slopes_of(light: Array) -> Array:
+    """Derivatives ``[..., 4, 3]`` of `products_of`."""
+    r, g, b = np.moveaxis(light, -1, 0)
+    zero = np.zeros_like(r)
+    rows = [(g, r, zero), (zero, b, g), (b, zero, r), (g * b, r * b, r * g)]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)

@@ -97,6 +97,7 @@ class DisplayFit:
             np.round(model.ambient, 8),
             round(model.response, 6),
             round(model.falloff, 6),
+            np.round(model.products, 8),
         )
         return DisplayCalibration(
             date=datetime.date.today(),
@@ -145,14 +146,20 @@ def mean_colour(frames: Sequence[NDArray[np.uint8]], region: NDArray[np.bool_]) 
 
 
 def fit_display(
-    shown: Array, seen: Array, cos_angle: Array | float = 1.0, least_free: float = 0.6
+    shown: Array,
+    seen: Array,
+    cos_angle: Array | float = 1.0,
+    least_free: float = 0.6,
+    inks: bool = False,
 ) -> DisplayFit:
-    """Fit a monitor.
+    """Fit a monitor, or a printer.
 
     Args:
         shown: Colours in 0..1 ``[N, 3]``.
         seen: Camera means of them in 0..1 ``[N, 3]``.
         cos_angle: Cosine of the viewing angle of each, or of all; with a spread of it the falloff is fitted too.
+        least_free: Smallest share of colours without a saturated channel.
+        inks: Fit the products of channels too, as a printer's inks filter each other's light.
 
     Raises:
         DegenerateDataError: Too few colours, too many saturated, no change from black to white, a drift.
@@ -170,7 +177,7 @@ def fit_display(
     drift = _require_usable(shown, seen, angles, least_free)
     held_out = _choose_held_out(shown)
     fitted = ~held_out
-    model = _fit(shown[fitted], seen[fitted], angles[fitted])
+    model = _fit(shown[fitted], seen[fitted], angles[fitted], inks)
     fit = DisplayFit(model, shown, seen, angles, held_out, drift)
     if fit.rmse(True) > _MOST_RMSE:
         raise PoorFitError(
@@ -232,7 +239,7 @@ def _choose_held_out(shown: Array) -> NDArray[np.bool_]:
     return held_out
 
 
-def _fit(shown: Array, seen: Array, angles: Array) -> DisplayModel:
+def _fit(shown: Array, seen: Array, angles: Array, inks: bool) -> DisplayModel:
     with_falloff = bool(np.ptp(angles) >= 0.1)
     steps = LEVELS - 1
     start_curve = np.log(np.diff(np.linspace(0.0, 1.0, LEVELS) ** 2.2) + 1e-4)
@@ -247,6 +254,7 @@ def _fit(shown: Array, seen: Array, angles: Array) -> DisplayModel:
             np.sqrt(np.maximum(linear[3], 1e-4)),
             [np.log(response)],
             [0.5] if with_falloff else [],
+            np.zeros(12 if inks else 0),
         ]
     )
 
@@ -282,4 +290,5 @@ def _unpack(p: Array, with_falloff: bool) -> DisplayModel:
         p[at + 9 : at + 12] ** 2,
         float(np.exp(p[at + 12])),
         float(p[at + 13]) if with_falloff else 0.0,
+        p[-12:].reshape(3, 4) if len(p) > at + 13 + with_falloff else np.zeros((3, 4)),
     )

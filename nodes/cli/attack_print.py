@@ -1,11 +1,18 @@
-"""The commands of ``advnerf attack`` about paper: ``print``."""
+"""The commands of ``advnerf attack`` about paper: ``print`` and ``measure``."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
+
+from nodes.runtime.terminal import print_table, table
+
+if TYPE_CHECKING:
+    from advnerf_core.attack.artifact import AttackFile
+    from nodes.experiment.node.print_effect import PrintEffect
+    from nodes.lab.wizards.prints import MeasuredPrint
 
 
 def attack_print(
@@ -57,6 +64,120 @@ def attack_print(
         print(f"written: {write_record(poster, file, target, dpi)}, the sizes for 'advnerf attack measure'")
 
 
+def attack_measure(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="PHOTO|BAG", help="Photograph of the print, or bag of a drive past it.", exists=True
+        ),
+    ],
+    printed: Annotated[
+        Path,
+        typer.Option(
+            "--print", help="The .print.json file beside what was printed.", exists=True, dir_okay=False
+        ),
+    ],
+    camera: Annotated[
+        Path,
+        typer.Option(help="Lens or camera file of the photograph; camera file of the bag.", exists=True),
+    ],
+    card: Annotated[
+        Path | None,
+        typer.Option(
+            exists=True,
+            dir_okay=False,
+            help="Gives the size: the .print.json of a chart of true size that hangs flat beside the print, in the same photograph.",
+        ),
+    ] = None,
+    distance_m: Annotated[
+        float | None,
+        typer.Option("--distance", min=0.01, help="Gives the size: from the lens to the print's middle [m]."),
+    ] = None,
+    width_m: Annotated[
+        float | None,
+        typer.Option("--width", min=0.01, help="Gives the size: width of the texture, by ruler [m]."),
+    ] = None,
+    car: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y,YAW",
+            help="Pose of the car that took the photograph, m and rad: gives the pose in the world.",
+        ),
+    ] = None,
+    attack_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--attack",
+            exists=True,
+            dir_okay=False,
+            help="The attack file that was printed.",
+            show_default="the one that --print names",
+        ),
+    ] = None,
+    request: Annotated[
+        Path | None,
+        typer.Option(
+            exists=True, dir_okay=False, help="The attack's *.experiment.yaml: predicts the print's effect."
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            help="JSON file to write; the print's picture goes beside it.",
+            show_default="beside PHOTO or BAG",
+        ),
+    ] = None,
+) -> None:
+    """Measure a print where it hangs: true size, pose, flatness, colours, and what it does to the victim."""
+    from advnerf_core.attack.artifact import load_attack
+    from advnerf_core.attack.printing.record import load_record
+    from nodes.lab.wizards.prints import KnownLength, measure, write_measured
+
+    record = load_record(printed)
+    attack = load_attack(attack_file or printed.parent / record.attack_file)
+    known = KnownLength(None if card is None else load_record(card), distance_m, width_m, _pose(car))
+    found = measure(source, record, attack, camera, known)
+    rows = table("of the print", "measured")
+    for name, text in found.measurement.lines:
+        rows.add_row(name, text)
+    print_table(rows)
+    effect = None
+    if request is not None:
+        effect = _effect(request, attack, record.object, found)
+        print(effect.text)
+    target = output or source.with_name(f"{source.stem}.measured.json")
+    print(f"written: {', '.join(map(str, write_measured(found, effect, target)))}")
+
+
+def _pose(text: str | None) -> tuple[float, float, float] | None:
+    from calibration.schema import CalibrationError
+
+    if text is None:
+        return None
+    try:
+        x_m, y_m, yaw_rad = map(float, text.split(","))
+    except ValueError:
+        raise CalibrationError(
+            f"expected --car X,Y,YAW in m and rad, such as 1.2,-0.4,3.1; got {text!r}"
+        ) from None
+    return x_m, y_m, yaw_rad
+
+
+def _effect(request: Path, attack: AttackFile, name: str, found: MeasuredPrint) -> PrintEffect:
+    from nodes.experiment.node.prepare import load_request
+    from nodes.experiment.node.print_effect import print_effect
+    from nodes.lab.plugin_tables import say_code
+
+    experiment = load_request(request)
+    say_code(experiment.config.model_dump(mode="json"), request.parent)
+    measurement = found.measurement
+    pose = measurement.T_world_from_face
+    return print_effect(experiment, attack, name, found.texture, measurement.scale, pose)
+
+
 def add_to(app: typer.Typer) -> None:
     """Register the commands."""
     app.command("print")(attack_print)
+    app.command("measure")(attack_measure)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from nodes.cli import calibrate_display as cli_calibrate_display
+from nodes.cli import calibrate_printer as cli_calibrate_printer
 from nodes.lab.wizards.output import save_and_print
 from nodes.runtime.options import with_groups
 from nodes.runtime.terminal import RunDir
@@ -17,14 +18,14 @@ from nodes.runtime.terminal import RunDir
 if TYPE_CHECKING:
     from advnerf_core.geometry import Array
     from calibration.charuco import Board
-    from calibration.measured import LensCalibration
 
 app = typer.Typer(
     no_args_is_help=True,
-    help="Calibrate camera, car, room, monitor and clocks. Poor data are rejected with the reason.",
+    help="Calibrate camera, car, room, monitor, printer and clocks. Poor data are rejected with the reason.",
 )
 
 cli_calibrate_display.add_to(app)
+cli_calibrate_printer.add_to(app)
 
 Output = Annotated[
     Path, typer.Option("--output", "-o", help="YAML file to write. The plot is saved next to it.")
@@ -170,11 +171,12 @@ def camera_to_car(
     from calibration.charuco import BoardDetector
     from calibration.plots import mount_plot
     from nodes.lab.wizards.bags import CAR, IMAGES, still_views
+    from nodes.lab.wizards.lens import load_lens
 
     detector = BoardDetector(options.board())
     tracked = None if untracked else board_topic
     bag = _source(source, live, tuple(t for t in (IMAGES, CAR, tracked) if t), output)
-    camera = _lens(lens)
+    camera = load_lens(lens)
     views, frames = still_views(bag, detector, tracked)
     print(f"{len(views)} stops with the board in view among {frames} frames")
     fit = calibrate_mount(views, camera, None if pattern is None else _transform(pattern))
@@ -303,22 +305,6 @@ def _source(source: Path | None, live: LiveOptions, topics: tuple[str, ...], out
     bag = output.with_name(f"{output.stem}-{time.strftime('%Y%m%d-%H%M%S')}")
     print(f"recording {', '.join(topics)} for {live.live_s:g} s into {bag}", flush=True)
     return record_live(find_run_dir(live.run_dir), topics, live.live_s, bag)
-
-
-def _lens(file: Path) -> LensCalibration:
-    """Load a lens from a lens file or from a camera file."""
-    from calibration.measured import LensCalibration
-    from calibration.schema import CalibrationError, CameraCalibration, load_calibration
-
-    try:
-        return load_calibration(LensCalibration, file)
-    except CalibrationError as error:
-        try:
-            camera = load_calibration(CameraCalibration, file)
-        except CalibrationError:
-            raise error from None
-    fields = ("date", "method", "width", "height", "fx", "fy", "cx", "cy", "distortion", "rms_px")
-    return LensCalibration(**{key: getattr(camera, key) for key in fields})
 
 
 def _transform(file: Path) -> Array:

@@ -9,6 +9,7 @@ import torch
 from advnerf_core.attack.spaces.displayed import DisplayedSensor, displayed
 from advnerf_core.display import DisplayModel, DisplayModelError
 from advnerf_core.scene.surrogate import Rendered
+from tests.support.printers import printed, printer_model
 
 LEVELS = np.linspace(0.0, 1.0, 17)
 MODEL = DisplayModel(
@@ -18,6 +19,7 @@ MODEL = DisplayModel(
     2.1,
     1.3,
 )
+PRINTER = printer_model()
 
 
 def test_at_the_levels_it_is_the_closed_form():
@@ -28,28 +30,36 @@ def test_at_the_levels_it_is_the_closed_form():
     np.testing.assert_allclose(MODEL.forward([0.0, 0.0, 0.0]), MODEL.ambient ** (1.0 / 2.1), rtol=1e-12)
 
 
-def test_inverse_undoes_forward_and_counts_what_cannot_be_shown():
+def test_with_products_it_is_the_equation_of_three_inks():
+    shown = LEVELS[np.random.default_rng(4).integers(0, 17, (100, 3))]
+    np.testing.assert_allclose(PRINTER.forward(shown), printed(shown), atol=1e-12)
+
+
+@pytest.mark.parametrize("model", [MODEL, PRINTER], ids=["monitor", "printer"])
+def test_inverse_undoes_forward(model):
     shown = np.random.default_rng(0).uniform(0.0, 1.0, (50, 3))
-    back, clipped = MODEL.inverse(MODEL.forward(shown, 0.9), 0.9)
-    np.testing.assert_allclose(back, shown, atol=1e-9)
+    back, clipped = model.inverse(model.forward(shown, 0.9), 0.9)
+    np.testing.assert_allclose(back, shown, atol=1e-6)
     assert clipped == 0.0
-    wanted = np.array([[0.0, 0.0, 0.0], *MODEL.forward(shown[:3])])
-    assert MODEL.inverse(wanted)[1] == 0.25
+    wanted = np.array([[0.0, 1.0, 0.0], *model.forward(shown[:3])])
+    assert model.inverse(wanted)[1] == 0.25
 
 
-def test_the_torch_twin_is_equal():
+@pytest.mark.parametrize("model", [MODEL, PRINTER], ids=["monitor", "printer"])
+def test_the_torch_twin_is_equal(model):
     rng = np.random.default_rng(1)
     shown = np.concatenate([rng.uniform(0.0, 1.0, (200, 3)), np.array([[0.0, 1.0, 0.5], [-0.1, 1.1, 0.0]])])
     cos_angle = rng.uniform(0.3, 1.0, len(shown))
-    ours = displayed(MODEL, torch.tensor(shown), torch.tensor(cos_angle)).numpy()
-    np.testing.assert_allclose(ours, MODEL.forward(shown, cos_angle), atol=1e-12)
-    single = displayed(MODEL, torch.tensor(shown, dtype=torch.float32)).numpy()
-    np.testing.assert_allclose(single, MODEL.forward(shown), atol=2e-6)
+    ours = displayed(model, torch.tensor(shown), torch.tensor(cos_angle)).numpy()
+    np.testing.assert_allclose(ours, model.forward(shown, cos_angle), atol=1e-12)
+    single = displayed(model, torch.tensor(shown, dtype=torch.float32)).numpy()
+    np.testing.assert_allclose(single, model.forward(shown), atol=2e-6)
 
 
-def test_gradients_by_finite_differences():
+@pytest.mark.parametrize("model", [MODEL, PRINTER], ids=["monitor", "printer"])
+def test_gradients_by_finite_differences(model):
     shown = torch.tensor(np.random.default_rng(2).uniform(0.03, 0.97, (20, 3)), requires_grad=True)
-    assert torch.autograd.gradcheck(lambda x: displayed(MODEL, x, 0.7), (shown,), eps=1e-7, atol=1e-5)
+    assert torch.autograd.gradcheck(lambda x: displayed(model, x, 0.7), (shown,), eps=1e-7, atol=1e-5)
 
 
 @dataclass

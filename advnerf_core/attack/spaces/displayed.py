@@ -1,4 +1,4 @@
-"""An attack on a monitor's picture, seen by the camera through monitor and room optics: `advnerf_core.display` with gradients.
+"""An attack on a monitor's picture, or on a print, as the camera sees it: `advnerf_core.display` with gradients.
 
 ``DisplayedSensor`` stands before any sensor whose ``theta`` is the squash-inverse of colours. The attack then searches the colours that are
 *shown*; the renderer gets the colours that are *seen*. Nothing else changes, and the result goes to the monitor unchanged.
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from advnerf_core.attack.problem import ColouringSensor, Sensor
 from advnerf_core.attack.robustness import PosedSensor
-from advnerf_core.display import DARKEST, DisplayModel
+from advnerf_core.display import DARKEST, PAIRS, DisplayModel
 from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.geometry import Array
 from advnerf_core.scene.surrogate import Rendered
@@ -25,7 +25,9 @@ _MARGIN = 1e-4
 
 def displayed(model: DisplayModel, shown: Tensor, cos_angle: float | Tensor = 1.0) -> Tensor:
     """Seen colours ``[..., 3]`` of shown colours ``[..., 3]`` in 0..1; differentiable. See `DisplayModel.forward`."""
-    curves, mixing, ambient = (torch.tensor(v).to(shown) for v in (model.curves, model.mixing, model.ambient))
+    curves, mixing, ambient, products = (
+        torch.tensor(v).to(shown) for v in (model.curves, model.mixing, model.ambient, model.products)
+    )
     last = curves.shape[1] - 1
     position = shown.clamp(0.0, 1.0) * last
     below = position.detach().floor().clamp(0, last - 1)
@@ -34,17 +36,21 @@ def displayed(model: DisplayModel, shown: Tensor, cos_angle: float | Tensor = 1.
     low, high = curves[channel, index], curves[channel, index + 1]
     light = low + (position - below) * (high - low)
     gain = torch.as_tensor(cos_angle, dtype=shown.dtype, device=shown.device)[..., None] ** model.falloff
-    seen = ambient + gain * (light @ mixing.T)
+    mixed = light @ mixing.T
+    if model.products.any():
+        pairs = [light[..., a] * light[..., b] for a, b in PAIRS]
+        mixed = mixed + torch.stack([*pairs, light.prod(dim=-1)], dim=-1) @ products.T
+    seen = ambient + gain * mixed
     return (seen.clamp_min(DARKEST) ** (1.0 / model.response)).clamp(0.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class DisplayedSensor:
-    """A sensor whose colours are shown on a monitor.
+    """A sensor whose colours are shown on a monitor, or printed.
 
     Attributes:
         sensor: Renders ``theta`` with the last axis red, green, blue before squashing.
-        model: The monitor before the camera.
+        model: The monitor, or the print, before the camera.
         cos_angle: Cosine of the camera's viewing angle to the panel, averaged over a drive.
     """
 

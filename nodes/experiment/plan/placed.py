@@ -67,7 +67,7 @@ class FaceConfig(StrictModel):
         rgb: Colour of faces that are not attacked; None: the value for all panels (object.panel_rgb).
         target: Calibration of the board that shows it: motion-capture subject and corners.
         subject: Motion-capture subject of the board if there is no target; None: no board shows it.
-        display: File of 'advnerf car calibrate display' if a monitor shows the face: the monitor's colours are part of the search.
+        display: File of 'advnerf car calibrate display' or 'printer': the colours of the monitor, or of the print, are part of the search.
         display_cos: Mean cosine, over a drive, of the angle at which the camera sees the monitor.
     """
 

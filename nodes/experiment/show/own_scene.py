@@ -12,6 +12,7 @@ from advnerf_core.attack.spaces.space import FaceMount, NamedObject
 from advnerf_core.display import DisplayModel
 from advnerf_core.fields.summed_levels import with_summed_levels
 from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object, face_corners_in_object
+from advnerf_core.geometry import Array
 from advnerf_core.objects.mesh.field import MeshField
 from advnerf_core.objects.mesh.surface import sphere, unwrapped
 from advnerf_core.objects.voxel.generators import GENERATORS
@@ -48,7 +49,7 @@ def own_objects(experiment: Experiment) -> list[OwnObject]:
 
 def _own_object(experiment: Experiment, thing: PlacedObject) -> OwnObject:
     if thing.kind in FLAT:
-        field: VoxelGridObject | MeshField = _flat(experiment, thing)
+        field: VoxelGridObject | MeshField = flat_object(experiment, thing)
     elif (wanted := _as_mesh(experiment, thing)) is not None:
         field, file_sha256 = _mesh(thing, wanted)
         if file_sha256:
@@ -60,13 +61,26 @@ def _own_object(experiment: Experiment, thing: PlacedObject) -> OwnObject:
     return OwnObject(field, NamedObject(thing.name, field.sha256))
 
 
-def _flat(experiment: Experiment, thing: PlacedObject) -> VoxelGridObject:
+def flat_object(
+    experiment: Experiment,
+    thing: PlacedObject,
+    T_world_from_face: Array | None = None,
+    resolution: int | None = None,
+) -> VoxelGridObject:
+    """A panel or cube with a face.
+
+    Args:
+        experiment: The experiment, for what its panels have in common.
+        thing: The panel or cube.
+        T_world_from_face: Another pose ``[4, 4]`` of its face than its own.
+        resolution: Another number of colours along an edge than its own.
+    """
     of_all, face = experiment.config.object, thing.face or FaceConfig()
     field = cube_face_object(
         face.size_m,
-        face.resolution or of_all.panel_resolution,
+        resolution or face.resolution or of_all.panel_resolution,
         face.rgb or of_all.panel_rgb,
-        thing.T_world_from_face,
+        thing.T_world_from_face if T_world_from_face is None else T_world_from_face,
         one_sided=thing.kind != CUBE,
         depth_m=face.size_m if thing.kind == CUBE else _SLAB_M,
     )
@@ -111,7 +125,7 @@ def mount_of(experiment: Experiment) -> FaceMount | None:
 
 
 def display_of(experiment: Experiment) -> tuple[DisplayModel | None, float]:
-    """The measured monitor that shows the only object, and the cosine of its viewing angle; None without a monitor."""
+    """The measured monitor or printer that shows the only object, and the cosine of a monitor's viewing angle; None without one."""
     face = experiment.objects[0].face
     if face is None or face.display is None:
         return None, 1.0

@@ -1,0 +1,273 @@
+"""Colours of a print in a photograph: its picture seen straight on, and the light on it, from the white paper around the markers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.attack.printing.frame import CELLS
+from advnerf_core.geometry import Array, transform_points
+from calibration.degeneracy import DegenerateDataError
+from calibration.print_markers import linear
+from calibration.schema import Intrinsics
+
+Rgb = NDArray[np.uint8]
+_OUTSIDE, _INSIDE = (
+    1.0 + 2.0 * 0.75 / CELLS,
+    1.0 - 2.0 * 0.5 / CELLS,
+)  # middles of white and of black, in half sides
+_PER_SIDE = 4
+_CURVED_FROM = 6  # markers: fewer give a slope of the light, and no curvature
+_CLIPPED, _MOST_CLIPPED = 252, 0.2
+_LEAST_WHITE, _LEAST_RATIO = 0.02, 2.0  # of linear light; of white to black
+_MOST_UNEVEN = 0.5
+_MOST_HIDDEN, _FAR = 0.5, 64.0
+_LONGEST_ROW = 2**14  # of OpenCV's remap
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """The light on a print.
+
+    Attributes:
+        white: Coefficients ``[k, 3]`` of white paper's linear light over 1, y, z and, with ``k`` of 6, y^2, y z, z^2 [m].
+        black: Linear light ``[3]`` of black ink, as a share of white paper's.
+        uneven: Largest change of white over the markers, as a share of its mean.
+    """
+
+    white: Array
+    black: Array
+    uneven: float
+
+    def white_at(self, points_m: Array) -> Array:
+        """Linear light ``[..., 3]`` of white paper at points ``[..., 3]`` of the print."""
+        return np.asarray(_terms(points_m, len(self.white)) @ self.white)
+
+
+def sampled(rgb: Rgb, lens: Intrinsics, T_camera_from_face: Array, points_m: Array) -> Array:
+    """Colours ``[..., 3]`` in 0..255 of a photograph ``[H, W, 3]`` at points ``[..., 3]`` of a print; NaN outside of it."""
+    pixels = _pixels(transform_points(T_camera_from_face, points_m.reshape(-1, 3)), lens)
+    where = (pixels - 0.5).astype(np.float32)
+    found = np.empty((len(where), 3))
+    image = rgb.astype(np.float32)
+    for begin in range(0, len(where), _LONGEST_ROW):
+        part = slice(begin, begin + _LONGEST_ROW)
+        x, y = (np.ascontiguousarray(where[None, part, k]) for k in range(2))
+        found[part] = cv2.remap(image, x, y, cv2.INTER_LINEAR)[0]
+    found[~_inside(pixels, lens)] = np.nan
+    return found.reshape(points_m.shape)
+
+
+def in_picture(points_m: Array, lens: Intrinsics) -> bool:
+    """Whether a photograph shows all points ``[N, 3]`` of the camera's frame, which lie before it."""
+    return bool(_inside(_pixels(points_m, lens), lens).all())
+
+
+def _pixels(points_m: Array, lens: Intrinsics) -> Array:
+    matrix, zero = lens.pinhole.matrix, np.zeros(3)
+    found = cv2.projectPoints(points_m, zero, zero, matrix, np.array(lens.distortion))[0]
+    return np.asarray(found.reshape(-1, 2), np.float64)
+
+
+def _inside(pixels: Array, lens: Intrinsics) -> NDArray[np.bool_]:
+    return np.asarray(((pixels >= 0.5) & (pixels <= np.array([lens.width, lens.height]) - 0.5)).all(axis=1))
+
+
+def light_on(rgb: Rgb, lens: Intrinsics, T_camera_from_face: Array, corners_m: Sequence[Array]) -> Light:
+    """The light on a print, from the paper around its seen markers.
+
+    Args:
+        rgb: The photograph ``[H, W, 3]``.
+        lens: Its lens.
+        T_camera_from_face: Pose ``[4, 4]`` of the print in nominal units.
+        corners_m: Nominal corners ``[4, 3]`` of each seen marker [m].
+
+    Raises:
+        DegenerateDataError: The paper is overexposed, or too dark.
+    """
+    places = np.concatenate([_ring(corners, _OUTSIDE) for corners in corners_m])
+    dark_places = np.concatenate([_ring(corners, _INSIDE) for corners in corners_m])
+    white, black = (sampled(rgb, lens, T_camera_from_face, each) for each in (places, dark_places))
+    kept = np.isfinite(white).all(axis=1)
+    clipped = float((white[kept] >= _CLIPPED).any(axis=1).mean())
+    if clipped > _MOST_CLIPPED:
+        raise DegenerateDataError(
+            f"expected white paper below {_CLIPPED} of 255, got more at {100 * clipped:.0f} % of it: shorten the exposure"
+        )
+    light, dark = linear(white[kept]), np.nanmedian(linear(black), axis=0)
+    mean = np.median(light, axis=0)
+    if mean.min() < _LEAST_WHITE or (mean < _LEAST_RATIO * dark).any():
+        raise DegenerateDataError(
+            f"expected white paper that is bright against black ink, got {np.round(mean, 3).tolist()} and {np.round(dark, 3).tolist()} of full light: "
+            "lengthen the exposure, or avoid reflections"
+        )
+    terms = _terms(places[kept], 6 if len(corners_m) >= _CURVED_FROM else 3)
+    coefficients = np.asarray(np.linalg.lstsq(terms, light, rcond=None)[0], np.float64)
+    fitted = terms @ coefficients
+    return Light(coefficients, dark / mean, float((np.ptp(fitted, axis=0) / fitted.mean(axis=0)).max()))
+
+
+def picture_points(picture_m: tuple[float, float], rows: int, columns: int) -> Array:
+    """Centres ``[rows, columns, 3]`` of a grid's cells over a picture, row 0 on top [m]."""
+    y = picture_m[0] * ((np.arange(columns) + 0.5) / columns - 0.5)
+    z = picture_m[1] * (0.5 - (np.arange(rows) + 0.5) / rows)
+    across, up = np.meshgrid(y, z)
+    return np.stack([np.zeros_like(across), across, up], axis=-1)
+
+
+def reflectance(seen: Array, light: Light, points_m: Array) -> Array:
+    """sRGB colours ``[..., 3]`` in 0..255 as in even white light, with white paper white and black ink black, of seen ones ``[..., 3]``."""
+    share = linear(seen) / np.maximum(light.white_at(points_m), 1e-6)
+    return encoded(np.clip((share - light.black) / (1.0 - light.black), 0.0, 1.0))
+
+
+def evenly_lit(seen: Array, light: Light, points_m: Array) -> Array:
+    """sRGB colours ``[..., 3]`` in 0..255 as seen under the light of the print's middle, of seen ones ``[..., 3]``."""
+    middle = light.white_at(np.zeros(3))
+    return encoded(np.clip(linear(seen) * middle / np.maximum(light.white_at(points_m), 1e-6), 0.0, 1.0))
+
+
+def encoded(light: Array) -> Array:
+    """sRGB colours in 0..255 of linear light in 0..1."""
+    bent = 1.055 * np.maximum(light, 1e-9) ** (1.0 / 2.4) - 0.055
+    return 255.0 * np.where(light <= 0.0031308, 12.92 * light, bent)
+
+
+def patch_colours(
+    rgb: Rgb,
+    lens: Intrinsics,
+    T_camera_from_face: Array,
+    picture_m: tuple[float, float],
+    shape: tuple[int, int],
+    corners_m: Sequence[Array],
+) -> Array:
+    """Mean colours ``[rows, columns, 3]`` in 0..1 of a chart's patches, as under the light of its middle.
+
+    Args:
+        rgb: The photograph ``[H, W, 3]``.
+        lens: Its lens.
+        T_camera_from_face: Pose ``[4, 4]`` of the chart in nominal units.
+        picture_m: Width and height of all patches [m].
+        shape: Rows and columns.
+        corners_m: Nominal corners ``[4, 3]`` of each seen marker [m].
+
+    Raises:
+        DegenerateDataError: The light is uneven, or a patch is not in the photograph.
+    """
+    light = light_on(rgb, lens, T_camera_from_face, corners_m)
+    if light.uneven > _MOST_UNEVEN:
+        raise DegenerateDataError(
+            f"expected even light on the chart, got a change of {100 * light.uneven:.0f} %: turn it, or move the lamp"
+        )
+    centres = picture_points(picture_m, *shape)
+    inside = picture_points((0.5 * picture_m[0] / shape[1], 0.5 * picture_m[1] / shape[0]), 9, 9).reshape(
+        -1, 3
+    )
+    points = centres[:, :, None] + inside
+    seen = sampled(rgb, lens, T_camera_from_face, points)
+    if not np.isfinite(seen).all():
+        raise DegenerateDataError("expected the whole chart in the photograph, got patches outside; go back")
+    even = evenly_lit(seen, light, points)
+    clipped = (seen >= _CLIPPED).any(axis=(-1, -2))
+    even[clipped] = seen[clipped]
+    return np.asarray(even.mean(axis=2) / 255.0, np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class PrintColours:
+    """The picture of a print, as photographed. Parts that the photograph does not show have the nominal texture, in its light.
+
+    Attributes:
+        seen: As the camera saw it ``[n, n, 3]`` uint8.
+        unlit: In even white light, see `reflectance` ``[n, n, 3]`` uint8.
+        rms: Root mean square difference of ``unlit`` to the nominal texture, in 0..255.
+        mean: Mean difference of each channel ``[3]``.
+        far_share: Share of cells that are off by more than a quarter of full scale, such as covered ones.
+        seen_share: Share of the picture that the photograph shows.
+        uneven: See `Light`.
+    """
+
+    seen: Rgb
+    unlit: Rgb
+    rms: float
+    mean: tuple[float, float, float]
+    far_share: float
+    seen_share: float
+    uneven: float
+
+
+def print_colours(
+    rgb: Rgb,
+    lens: Intrinsics,
+    T_camera_from_face: Array,
+    nominal: Rgb,
+    picture_m: tuple[float, float],
+    corners_m: Mapping[int, Array],
+    cells: int = 64,
+) -> PrintColours:
+    """The picture of a print in a photograph, and its difference to the nominal texture ``[H, W, 3]``.
+
+    Args:
+        rgb: The photograph ``[H, W, 3]``.
+        lens: Its lens.
+        T_camera_from_face: Pose ``[4, 4]`` of the print in nominal units.
+        nominal: The texture that was printed.
+        picture_m: Nominal width and height of the picture [m].
+        corners_m: Nominal corners ``[4, 3]`` of each seen marker by number [m].
+        cells: Cells along each side of the found picture.
+
+    Raises:
+        DegenerateDataError: The exposure does not show colours.
+    """
+    light = light_on(rgb, lens, T_camera_from_face, list(corners_m.values()))
+    finer = 4
+    points = picture_points(picture_m, cells * finer, cells * finer)
+    raw = sampled(rgb, lens, T_camera_from_face, points)
+    wanted = cv2.resize(nominal, (cells, cells), interpolation=cv2.INTER_AREA).astype(np.float64)
+    hidden = np.asarray(~np.isfinite(_coarse(raw, finer)).all(axis=-1), np.bool_)
+    if hidden.mean() > _MOST_HIDDEN:
+        raise DegenerateDataError(
+            f"expected at least {100 * (1 - _MOST_HIDDEN):.0f} % of the picture in the photograph, got {100 * (1 - hidden.mean()):.0f} %; go back"
+        )
+    middles = picture_points(picture_m, cells, cells)
+    ink = light.black + (1.0 - light.black) * linear(wanted)
+    seen = np.where(hidden[..., None], encoded(ink * light.white_at(middles)), _coarse(raw, finer))
+    unlit = np.where(hidden[..., None], wanted, _coarse(reflectance(raw, light, points), finer))
+    off = (unlit - wanted)[~hidden]
+    red, green, blue = off.mean(axis=0)
+    return PrintColours(
+        _whole(seen),
+        _whole(unlit),
+        float(np.sqrt(np.mean(off**2))),
+        (float(red), float(green), float(blue)),
+        float((np.abs(off).max(axis=-1) > _FAR).mean()),
+        float(1.0 - hidden.mean()),
+        light.uneven,
+    )
+
+
+def _whole(colours: Array) -> Rgb:
+    return np.round(np.clip(colours, 0.0, 255.0)).astype(np.uint8)
+
+
+def _coarse(fine: Array, times: int) -> Array:
+    cells = len(fine) // times
+    return np.asarray(fine.reshape(cells, times, cells, times, 3).mean(axis=(1, 3)))
+
+
+def _ring(corners: Array, share: float) -> Array:
+    """Points ``[n, 3]`` about a marker, at a share of the way from its middle to its sides."""
+    middle = corners.mean(axis=0)
+    ends = middle + share * (corners - middle)
+    along = (np.arange(_PER_SIDE) + 0.5)[:, None] / _PER_SIDE
+    return np.concatenate([a + along * (b - a) for a, b in zip(ends, np.roll(ends, -1, axis=0), strict=True)])
+
+
+def _terms(points_m: Array, count: int) -> Array:
+    y, z = points_m[..., 1], points_m[..., 2]
+    terms = [np.ones_like(y), y, z, y * y, y * z, z * z][:count]
+    return np.stack(terms, axis=-1)

@@ -1,0 +1,222 @@
+"""The result of measuring a print: what the photograph or drive determines, and what it does not, as JSON data and as text."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from advnerf_core.geometry import Array
+from advnerf_core.plain import Numbers, PlainData
+from calibration.print_colour import PrintColours
+from calibration.print_drive import PlacedPrint
+from calibration.print_pose import PrintPose
+
+CARD, DISTANCE, WIDTH, POSES = "a card", "the distance", "the width", "the camera's poses"
+_NO_SIZE = "unknown: one photograph gives the pose in units of the nominal size; give --card, --distance or --width, or a bag with the car's poses"
+
+
+@dataclass(frozen=True, eq=False)
+class ColourError(PlainData):
+    """Difference of a print to its nominal texture, of sRGB colours in 0..255 in even white light.
+
+    Attributes:
+        rms: Root mean square.
+        mean: Mean of each channel.
+        far_share: Share of the picture that is off by more than a quarter of full scale.
+        seen_share: Share of the picture that the photograph shows.
+        uneven: Change of the light over the print, as a share of its mean.
+    """
+
+    rms: float
+    mean: tuple[float, float, float]
+    far_share: float
+    seen_share: float
+    uneven: float
+
+    @classmethod
+    def of(cls, colours: PrintColours) -> ColourError:
+        """The errors of photographed colours."""
+        return cls(colours.rms, colours.mean, colours.far_share, colours.seen_share, colours.uneven)
+
+
+@dataclass(frozen=True, eq=False)
+class PrintMeasurement(PlainData):
+    """A measured print.
+
+    Attributes:
+        source: Name of the photograph or bag.
+        nominal_m: Nominal width and height of the picture [m].
+        size_m: True width and height of the picture [m]; None where the size is unknown.
+        size_sd: Standard deviation of the size, as a share of it.
+        size_from: What gives the size; empty where it is unknown.
+        T_camera_from_face: Pose ``[4, 4]`` before the camera of a photograph [m]; in nominal metres where the size is unknown. None of a bag.
+        T_world_from_face: Pose ``[4, 4]`` in the world; None where it is unknown.
+        angle_sd_deg: Standard deviation of the direction that it faces [deg].
+        view_angle_deg: Angle at which a photograph shows it; 0 from straight ahead. None of a bag.
+        markers_seen: Numbers of the markers that were used.
+        markers_dropped: Numbers of those that do not lie where the others put them.
+        markers_printed: Number of markers on the print.
+        residual_px: Root mean square distance of the corners from where a flat print has them [px].
+        residual_mm: The same in the print's plane [mm].
+        flatness_mm: Root mean square distance of the markers from their plane [mm]; None of a photograph, which shows it only from the side.
+        flatness_sd_mm: Standard deviation of one such distance [mm].
+        colours: Its colours; None where they are unknown.
+        colours_unknown: The reason for that.
+    """
+
+    source: str
+    nominal_m: tuple[float, float]
+    size_m: tuple[float, float] | None
+    size_sd: float
+    size_from: str
+    T_camera_from_face: Numbers | None
+    T_world_from_face: Numbers | None
+    angle_sd_deg: float
+    view_angle_deg: float | None
+    markers_seen: tuple[int, ...]
+    markers_dropped: tuple[int, ...]
+    markers_printed: int
+    residual_px: float
+    residual_mm: float
+    flatness_mm: float | None
+    flatness_sd_mm: float | None
+    colours: ColourError | None = None
+    colours_unknown: str = ""
+
+    @property
+    def scale(self) -> float:
+        """True size over nominal size; 1 where it is unknown."""
+        if self.size_m is None:
+            return 1.0
+        return float(np.sqrt(self.size_m[0] * self.size_m[1] / (self.nominal_m[0] * self.nominal_m[1])))
+
+    @property
+    def lines(self) -> list[tuple[str, str]]:
+        """Quantities and their values as text."""
+        rows = [("markers", self._markers()), ("size", self._size())]
+        if self.T_camera_from_face is not None:
+            x, y, z = np.asarray(self.T_camera_from_face)[:3, 3]
+            unit = "m" if self.size_m else "nominal m"
+            rows.append(
+                (
+                    "before the camera",
+                    f"x {x:.3f}, y {y:.3f}, z {z:.3f} {unit}, seen at {self.view_angle_deg:.1f} degrees",
+                )
+            )
+        if self.T_world_from_face is not None:
+            T = np.asarray(self.T_world_from_face)
+            yaw_deg, up_deg = np.degrees(
+                [np.arctan2(T[1, 0], T[0, 0]), np.arcsin(np.clip(T[2, 0], -1.0, 1.0))]
+            )
+            rows.append(
+                (
+                    "in the world",
+                    f"x {T[0, 3]:.3f}, y {T[1, 3]:.3f}, z {T[2, 3]:.3f} m, faces {yaw_deg:.1f} degrees, {up_deg:+.1f} up",
+                )
+            )
+        rows.append(("direction within", f"{self.angle_sd_deg:.2f} degrees (standard deviation)"))
+        rows.append(("flatness", self._flatness()))
+        rows.append(("colours", self._colours()))
+        return rows
+
+    def _markers(self) -> str:
+        text = f"{len(self.markers_seen)} of {self.markers_printed}"
+        if self.markers_dropped:
+            text += f"; left out, as they do not fit: {', '.join(map(str, self.markers_dropped))}"
+        missing = self.markers_printed - len(self.markers_seen) - len(self.markers_dropped)
+        return f"{text}; {missing} not found, so the print may be covered there" if missing else text
+
+    def _size(self) -> str:
+        if self.size_m is None:
+            return _NO_SIZE
+        (width, height), (w, h) = self.size_m, self.nominal_m
+        return (
+            f"{width:.4f} x {height:.4f} m ({100 * (width / w - 1):+.2f} % and {100 * (height / h - 1):+.2f} % of nominal), by {self.size_from}, "
+            f"within {100 * self.size_sd:.2f} %"
+        )
+
+    def _flatness(self) -> str:
+        flat = f"corners within {self.residual_mm:.1f} mm of a flat print's"
+        if self.flatness_mm is None:
+            return f"{flat}; a bend towards the camera does not show"
+        return f"{self.flatness_mm:.1f} mm from a plane (each within {self.flatness_sd_mm:.1f} mm), {flat}"
+
+    def _colours(self) -> str:
+        if self.colours is None:
+            return f"unknown: {self.colours_unknown}"
+        found = self.colours
+        red, green, blue = found.mean
+        text = f"{found.rms:.0f} of 255 from nominal (mean {red:+.0f}, {green:+.0f}, {blue:+.0f}), light uneven by {100 * found.uneven:.0f} %"
+        text += f"; {100 * found.far_share:.0f} % far off: covered?" if found.far_share > 0.02 else ""
+        hidden = 1.0 - found.seen_share
+        return text + (
+            f"; {100 * hidden:.0f} % outside the picture, taken as nominal" if hidden > 0.0 else ""
+        )
+
+
+def of_photograph(
+    source: str,
+    nominal_m: tuple[float, float],
+    printed: int,
+    pose: PrintPose,
+    known: tuple[str, float, float] | None,
+    T_world_from_camera: Array | None,
+) -> PrintMeasurement:
+    """The measurement of one photograph, without colours.
+
+    Args:
+        source: Name of the photograph.
+        nominal_m: Nominal width and height of the picture [m].
+        printed: Number of markers on the print.
+        pose: The fitted pose.
+        known: What gives the size, true over nominal size, and its standard deviation; None where nothing gives it.
+        T_world_from_camera: Pose ``[4, 4]`` of the camera in the world; None where it is unknown.
+    """
+    size_from, scale, sd = known or ("", 1.0, 0.0)
+    T = np.array(pose.T_camera_from_face)
+    T[:3, 3] *= scale
+    bend = np.sqrt(pose.aspect)
+    size_m = (nominal_m[0] * scale * bend, nominal_m[1] * scale / bend) if known else None
+    return PrintMeasurement(
+        source=source,
+        nominal_m=nominal_m,
+        size_m=size_m,
+        size_sd=sd,
+        size_from=size_from,
+        T_camera_from_face=T,
+        T_world_from_face=None if T_world_from_camera is None or known is None else T_world_from_camera @ T,
+        angle_sd_deg=float(np.degrees(pose.angle_sd_rad)),
+        view_angle_deg=float(np.degrees(pose.view_angle_rad)),
+        markers_seen=pose.seen,
+        markers_dropped=pose.dropped,
+        markers_printed=printed,
+        residual_px=pose.rms_px,
+        residual_mm=1000.0 * pose.rms_m * scale,
+        flatness_mm=None,
+        flatness_sd_mm=None,
+    )
+
+
+def of_drive(
+    source: str, nominal_m: tuple[float, float], printed: int, found: PlacedPrint, distance_px: float
+) -> PrintMeasurement:
+    """The measurement of a drive, without colours; ``distance_px`` is the mean distance over the focal length [m/px]."""
+    return PrintMeasurement(
+        source=source,
+        nominal_m=nominal_m,
+        size_m=(nominal_m[0] * found.scale, nominal_m[1] * found.scale),
+        size_sd=found.scale_sd,
+        size_from=f"{POSES} in {found.views} pictures",
+        T_camera_from_face=None,
+        T_world_from_face=found.T_world_from_face,
+        angle_sd_deg=float(np.degrees(found.angle_sd_rad)),
+        view_angle_deg=None,
+        markers_seen=found.seen,
+        markers_dropped=(),
+        markers_printed=printed,
+        residual_px=found.rms_px,
+        residual_mm=1000.0 * found.rms_px * distance_px,
+        flatness_mm=1000.0 * found.flatness_m,
+        flatness_sd_mm=1000.0 * found.flatness_sd_m,
+    )

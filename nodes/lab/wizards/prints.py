@@ -1,0 +1,280 @@
+"""Measures a print in a photograph, or in the bag of a drive past it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.attack.artifact import AttackFile
+from advnerf_core.attack.printing.poster import PrintError, poster_of
+from advnerf_core.attack.printing.record import PrintRecord
+from advnerf_core.data.image_files import write_image
+from advnerf_core.files import write_json
+from advnerf_core.geometry import Array, invert_transform, planar_pose, transform_points
+from advnerf_core.plain import PlainData
+from calibration.degeneracy import DegenerateDataError
+from calibration.print_colour import PrintColours, in_picture, picture_points, print_colours
+from calibration.print_drive import PrintView, place_print
+from calibration.print_markers import Marker, find_markers, why_none
+from calibration.print_measurement import (
+    CARD,
+    DISTANCE,
+    WIDTH,
+    ColourError,
+    PrintMeasurement,
+    of_drive,
+    of_photograph,
+)
+from calibration.print_pose import PrintPose, fit_print
+from calibration.schema import CalibrationError, CameraCalibration, Intrinsics, load_calibration
+from nodes.lab.wizards.bags import CAR, PICTURES, read_frames, read_picture, read_poses
+from nodes.lab.wizards.lens import load_lens
+
+Rgb = NDArray[np.uint8]
+_MOST_VIEWS = 60
+_MOST_GAP_NS = 150_000_000
+# Of a length read from a ruler or tape, as a share.
+_RULER_SD = 0.002
+
+
+@dataclass(frozen=True)
+class KnownLength:
+    """What is known of a photograph beside its pixels; at most one of the first three, which give its metres.
+
+    Attributes:
+        card: Record of a print of true size in the plane of the print, such as the colour chart.
+        distance_m: Distance from the lens to the middle of the print [m].
+        width_m: Width of the print's picture, by ruler [m].
+        car: Pose of the car that took the photograph: x [m], y [m], yaw [rad].
+    """
+
+    card: PrintRecord | None = None
+    distance_m: float | None = None
+    width_m: float | None = None
+    car: tuple[float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        given = [each for each in (self.card, self.distance_m, self.width_m) if each is not None]
+        if len(given) > 1:
+            raise CalibrationError(
+                f"expected one of --card, --distance and --width, got {len(given)}; give the surest"
+            )
+
+    def scale_of(self, pose: PrintPose, nominal_m: tuple[float, float]) -> tuple[str, float, float] | None:
+        """What gives the size, true over nominal size, and its standard deviation; None where nothing does."""
+        if pose.card_scale is not None:
+            return CARD, pose.card_scale, pose.card_scale_sd
+        if self.distance_m is not None:
+            nominal = float(np.linalg.norm(pose.T_camera_from_face[:3, 3]))
+            return DISTANCE, self.distance_m / nominal, float(np.hypot(pose.distance_sd, _RULER_SD))
+        if self.width_m is not None:
+            return WIDTH, self.width_m / (nominal_m[0] * np.sqrt(pose.aspect)), _RULER_SD
+        return None
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredPrint:
+    """A measured print, and its picture.
+
+    Attributes:
+        measurement: Sizes, poses, residuals.
+        colours: Its picture; None where the exposure or the view does not show its colours.
+        by_car: Whether the driving camera took it, so that the policy sees these colours.
+        nominal: The texture ``[H, W, 3]`` that was printed.
+    """
+
+    measurement: PrintMeasurement
+    colours: PrintColours | None
+    by_car: bool
+    nominal: Rgb
+
+    @property
+    def texture(self) -> Rgb:
+        """What a policy sees of the print ``[n, n, 3]``: as the driving camera saw it; of another camera's picture, without its light.
+
+        Raises:
+            DegenerateDataError: The colours are unknown.
+        """
+        if self.colours is None:
+            raise DegenerateDataError(
+                f"expected colours of the print, to predict what it does: {self.measurement.colours_unknown}"
+            )
+        return self.colours.seen if self.by_car else self.colours.unlit
+
+
+def measure(
+    source: Path, record: PrintRecord, attack: AttackFile, camera: Path, known: KnownLength
+) -> MeasuredPrint:
+    """Measure a print in a photograph or in a bag.
+
+    Args:
+        source: The photograph, or the bag.
+        record: Sizes and markers of the print.
+        attack: The attack that was printed.
+        camera: Lens or camera file; of a bag, and with a pose of the car, a camera file.
+        known: What is known of a photograph.
+
+    Raises:
+        CalibrationError: The source does not determine the print's pose.
+        PrintError: The record is of another print.
+    """
+    nominal = nominal_texture(record, attack)
+    if source.is_file() and source.suffix.lower() in PICTURES:
+        mounted = None if known.car is None else _camera_with_mount(camera)
+        return _measure_photograph(source, record, nominal, mounted or load_lens(camera), known)
+    if known != KnownLength():
+        raise CalibrationError(
+            f"expected no --card, --distance, --width or --car with a bag, whose poses give the size, got {source}; leave them out"
+        )
+    return _measure_drive(source, record, nominal, _camera_with_mount(camera))
+
+
+def write_measured(found: MeasuredPrint, effect: PlainData | None, path: Path) -> list[Path]:
+    """Write a measurement as JSON, and beside it the print's picture: nominal, as seen, and in even white light.
+
+    Returns:
+        The files.
+    """
+    data = found.measurement.to_dict() | ({} if effect is None else {"effect": effect.to_dict()})
+    write_json(path, data)
+    if found.colours is None:
+        return [path]
+    picture = path.with_suffix(".png")
+    size = found.colours.seen.shape[1::-1]
+    nominal = cv2.resize(found.nominal, size, interpolation=cv2.INTER_AREA)
+    row = np.concatenate([nominal, found.colours.seen, found.colours.unlit], axis=1)
+    write_image(picture, cv2.resize(row, None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST))
+    return [path, picture]
+
+
+def nominal_texture(record: PrintRecord, attack: AttackFile) -> Rgb:
+    """The texture ``[H, W, 3]`` of a printed attack.
+
+    Raises:
+        PrintError: The record is not that of this attack's poster.
+    """
+    if record.kind != "poster":
+        raise PrintError(
+            "expected the record of a poster, got that of a chart; give the poster's .print.json"
+        )
+    if record.attack_id != attack.attack_id:
+        raise PrintError(
+            f"expected attack {record.attack_id}, which was printed, got {attack.attack_id}; give its file with --attack"
+        )
+    number = [each.name for each in attack.objects].index(record.object)
+    edge_m = None if attack.objects[number].size_m or attack.face else record.picture_m[0]
+    return poster_of(attack, str(number), edge_m).texture
+
+
+def _measure_photograph(
+    photo: Path, record: PrintRecord, nominal: Rgb, lens: Intrinsics, known: KnownLength
+) -> MeasuredPrint:
+    rgb = read_picture(photo)
+    _require_size(rgb, lens, photo.name)
+    markers = find_markers(rgb, lens, record.markers)
+    if not markers:
+        raise DegenerateDataError(
+            f"{photo}: expected the print in the photograph, found none of its {len(record.markers)} markers: {why_none(rgb)}"
+        )
+    card = known.card
+    beside = None if card is None else (find_markers(rgb, lens, card.markers, "the card"), card.markers)
+    pose = fit_print(markers, record.markers, lens.pinhole, beside)
+    found = of_photograph(
+        photo.name,
+        record.picture_m,
+        len(record.markers),
+        pose,
+        known.scale_of(pose, record.picture_m),
+        _camera_in_world(lens, known),
+    )
+    by_car = isinstance(lens, CameraCalibration)
+    return _with_colours(found, rgb, lens, pose.T_camera_from_face, record, nominal, pose.seen, by_car)
+
+
+def _measure_drive(bag: Path, record: PrintRecord, nominal: Rgb, camera: CameraCalibration) -> MeasuredPrint:
+    poses, views, stamps = read_poses(bag, CAR), [], []
+    for stamp, rgb in read_frames(bag):
+        _require_size(rgb, camera, bag.name)
+        T_world_from_car = poses.at(stamp, _MOST_GAP_NS)
+        if T_world_from_car is not None and (markers := _seen(rgb, camera, record.markers)):
+            views.append(PrintView(markers, T_world_from_car @ camera.mount))
+            stamps.append(stamp)
+    if not views:
+        raise DegenerateDataError(
+            f"{bag}: expected pictures of the print from known poses of {CAR}, got none; drive nearer, or print larger markers"
+        )
+    chosen = np.unique(np.linspace(0, len(views) - 1, _MOST_VIEWS).round().astype(int))
+    placed = place_print([views[k] for k in chosen], record.markers, camera.pinhole)
+    poses_before = [invert_transform(each.T_world_from_camera) @ placed.T_world_from_face for each in views]
+    for T in poses_before:
+        T[:3, 3] /= placed.scale  # in nominal units
+    best = _clearest(poses_before, views, camera, record.picture_m)
+    metres_per_px = placed.scale * float(np.linalg.norm(poses_before[best][:3, 3])) / camera.fx
+    found = of_drive(bag.name, record.picture_m, len(record.markers), placed, metres_per_px)
+    frame = next(rgb for stamp, rgb in read_frames(bag) if stamp == stamps[best])
+    seen = tuple(views[best].markers)
+    return _with_colours(found, frame, camera, poses_before[best], record, nominal, seen, True)
+
+
+def _clearest(
+    poses: Sequence[Array], views: Sequence[PrintView], lens: Intrinsics, picture_m: tuple[float, float]
+) -> int:
+    """The view that shows the whole picture with most markers, and largest."""
+    corners = picture_points((2.0 * picture_m[0], 2.0 * picture_m[1]), 2, 2).reshape(-1, 3)
+
+    def rank(k: int) -> tuple[bool, int, float]:
+        before = transform_points(poses[k], corners)
+        whole = bool((before[:, 2] > 0.0).all()) and in_picture(before, lens)
+        return whole, len(views[k].markers), -float(np.linalg.norm(poses[k][:3, 3]))
+
+    return max(range(len(views)), key=rank)
+
+
+def _camera_in_world(lens: Intrinsics, known: KnownLength) -> Array | None:
+    """``T_world_from_camera`` ``[4, 4]`` of the driving camera, from the pose of the car; None if it is unknown."""
+    if known.car is None or not isinstance(lens, CameraCalibration):
+        return None
+    return planar_pose(*known.car) @ lens.mount
+
+
+def _camera_with_mount(file: Path) -> CameraCalibration:
+    return load_calibration(CameraCalibration, file)
+
+
+def _with_colours(
+    found: PrintMeasurement,
+    rgb: Rgb,
+    lens: Intrinsics,
+    T_camera_from_face: Array,
+    record: PrintRecord,
+    nominal: Rgb,
+    seen: tuple[int, ...],
+    by_car: bool,
+) -> MeasuredPrint:
+    corners = {number: record.markers[number] for number in seen}
+    try:
+        colours = print_colours(rgb, lens, T_camera_from_face, nominal, record.picture_m, corners)
+    except DegenerateDataError as error:
+        return MeasuredPrint(replace(found, colours_unknown=str(error)), None, by_car, nominal)
+    return MeasuredPrint(replace(found, colours=ColourError.of(colours)), colours, by_car, nominal)
+
+
+def _seen(rgb: Rgb, lens: Intrinsics, wanted: Mapping[int, Array]) -> dict[int, Marker]:
+    try:
+        return find_markers(rgb, lens, wanted)
+    except DegenerateDataError:  # of a drive, blurred and distant pictures are left out
+        return {}
+
+
+def _require_size(rgb: Rgb, lens: Intrinsics, name: str) -> None:
+    height, width = rgb.shape[:2]
+    if (width, height) != (lens.width, lens.height):
+        raise CalibrationError(
+            f"{name}: expected {lens.width} x {lens.height} pixels, as its lens was calibrated, got {width} x {height}; give the lens of this camera, and "
+            "photographs that were not cropped, scaled or turned"
+        )

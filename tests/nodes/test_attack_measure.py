@@ -1,0 +1,211 @@
+"""`advnerf attack measure`: an attack is printed, photographed, measured, and driven past as it hangs."""
+
+import json
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from advnerf_core.attack.artifact import AttackFile, load_attack, save_attack
+from advnerf_core.attack.printing.poster import poster_of
+from advnerf_core.data.image_files import write_image
+from advnerf_core.data.similarity import rotation_angles
+from advnerf_core.fields.voxel_grid import face_corners_in_object
+from advnerf_core.geometry import Pinhole, invert_transform, make_transform, planar_pose, rotation_z
+from calibration.print_chart import make_chart
+from calibration.schema import CameraCalibration, load_calibration, save_calibration
+from nodes.bags.writer import BagWriter
+from nodes.cli import main as cli
+from nodes.experiment.node.search import run_attack
+from nodes.runtime.messages import encode, image_message, pose_message
+from nodes.runtime.progress import ProgressDisplay
+from tests.support.photographed import before_camera, lens, photograph, scaled
+from tests.support.tiny_request import CALIBRATION, loaded, tiny_request
+
+LENS = lens(960, 720, 750.0)
+START_NS = 1_800_000_000_000_000_000
+
+
+@pytest.fixture
+def call(monkeypatch, capsys):
+    """Call the command: exit code, and what it says in one line."""
+
+    def call(*arguments: object) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["advnerf", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        said = capsys.readouterr()
+        return int(ended.value.code or 0), " ".join((said.out + said.err).split())
+
+    return call
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """An attack of 0.4 m, its print, and the lens of a phone."""
+    attack = AttackFile.of_face(
+        method="gradient", theta=np.random.default_rng(0).normal(0.0, 2.0, (8, 8, 3)).astype(np.float32), size_m=(0.4, 0.4),
+        subject="board", corners_in_subject=face_corners_in_object(0.4), T_world_from_object=np.eye(4),
+        camera=Pinhole(200, 66, 103.6, 103.4, 100, 32), scene_sha256="", policy_sha256="", config_sha256="", seed=0,
+        predicted_total_cte_m=None, software_version="0",
+    )  # fmt: skip
+    save_attack(tmp_path / "a.attack.safetensors", attack)
+    save_calibration(LENS, tmp_path / "lens.yaml")
+    return tmp_path
+
+
+def poster(folder):
+    return poster_of(load_attack(folder / "a.attack.safetensors")).with_markers()
+
+
+def test_a_photograph_gives_pose_and_colours_and_with_one_length_the_size(call, folder):
+    assert (
+        call("attack", "print", folder / "a.attack.safetensors", "-o", folder / "p.png", "--dpi", 100)[0] == 0
+    )
+    T, scale = before_camera(0.9, 25, 8, 3, 0.03), 1.03  # the shop printed 3 % too large
+    nominal = make_transform(T[:3, :3], T[:3, 3] / scale)
+    picture = photograph([(scaled(poster(folder), scale, scale), T)], LENS, light=(0.9, 0.75, 0.6), slope=0.4)
+    write_image(folder / "photo.jpg", picture)
+    command = (
+        "attack",
+        "measure",
+        folder / "photo.jpg",
+        "--print",
+        folder / "p.print.json",
+        "--camera",
+        folder / "lens.yaml",
+    )
+    code, said = call(*command)
+    assert code == 0
+    assert "8 of 8" in said
+    assert "unknown: one photograph gives the pose in units of the nominal size" in said
+    found = json.loads((folder / "photo.measured.json").read_text())
+    assert found["size_m"] is None
+    assert np.array(found["T_camera_from_face"]) == pytest.approx(nominal, abs=0.003)
+    assert found["colours"]["rms"] < 8.0  # of 255: the light is removed
+    assert found["colours"]["far_share"] < 0.002
+    assert found["colours"]["uneven"] > 0.1
+    assert cv2.imread(str(folder / "photo.measured.png")).shape == (256, 768, 3)
+    code, said = call(*command, "--distance", float(np.linalg.norm(T[:3, 3])), "-o", folder / "m.json")
+    assert code == 0
+    found = json.loads((folder / "m.json").read_text())
+    assert found["size_m"] == pytest.approx((0.412, 0.412), rel=0.004)
+    assert np.array(found["T_camera_from_face"]) == pytest.approx(T, abs=0.004)
+    assert "+3." in said or "+2.9" in said
+    assert call(*command, "--width", 0.412)[0] == 0
+    assert json.loads((folder / "photo.measured.json").read_text())["size_m"] == pytest.approx((0.412, 0.412))
+
+
+def test_a_chart_beside_it_is_a_card(call, folder):
+    call("attack", "print", folder / "a.attack.safetensors", "-o", folder / "p.png", "--dpi", 50)
+    assert call("car", "calibrate", "printer-chart", "-o", folder / "chart.png", "--dpi", 100)[0] == 0
+    T = before_camera(0.75, -15, 5, 0, -0.13)
+    beside = T @ make_transform(np.eye(3), [0.0, 0.42, 0.0])
+    picture = photograph([(make_chart("a4"), beside), (scaled(poster(folder), 0.98, 0.98), T)], LENS)
+    write_image(folder / "photo.png", picture)
+    command = (
+        "attack",
+        "measure",
+        folder / "photo.png",
+        "--print",
+        folder / "p.print.json",
+        "--camera",
+        folder / "lens.yaml",
+    )
+    code, said = call(*command, "--card", folder / "chart.print.json")
+    assert code == 0, said
+    found = json.loads((folder / "photo.measured.json").read_text())
+    assert (found["size_m"], found["size_from"]) == (pytest.approx((0.392, 0.392), rel=0.005), "a card")
+    assert np.array(found["T_camera_from_face"]) == pytest.approx(T, abs=0.006)
+    assert call(*command, "--card", folder / "chart.print.json", "--width", 0.4)[0] == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda folder: (folder / "photo.png").write_bytes(b"no picture"), "photo.png"),
+        (
+            lambda folder: write_image(folder / "photo.png", np.zeros((720, 960, 3), np.uint8)),
+            "check the exposure",
+        ),
+        (
+            lambda folder: write_image(folder / "photo.png", np.zeros((72, 96, 3), np.uint8)),
+            "expected 960 x 720 pixels",
+        ),
+        (lambda folder: (folder / "p.print.json").write_text("{}"), "written beside the print"),
+        (lambda folder: (folder / "p.print.json").write_text("[1"), "written beside the print"),
+        (lambda folder: (folder / "lens.yaml").write_text("kind: board\n"), "lens.yaml"),
+        (lambda folder: (folder / "a.attack.safetensors").unlink(), "expected an attack file"),
+    ],
+)
+def test_damaged_and_irrelevant_files_are_refused_in_one_line(call, folder, change, message):
+    call("attack", "print", folder / "a.attack.safetensors", "-o", folder / "p.png", "--dpi", 50)
+    noise = np.random.default_rng(0).integers(0, 256, (720, 960, 3)).astype(np.uint8)
+    write_image(folder / "photo.png", noise)
+    command = (
+        "attack",
+        "measure",
+        folder / "photo.png",
+        "--print",
+        folder / "p.print.json",
+        "--camera",
+        folder / "lens.yaml",
+    )
+    code, said = call(*command)
+    assert code == 2
+    assert "found none of its 8 markers" in said
+    change(folder)
+    code, said = call(*command)
+    assert code == 2
+    assert message in said
+    assert said.count("error:") == 1
+    assert not list(folder.glob("*.measured.*"))
+
+
+@pytest.fixture(scope="module")
+def searched(tmp_path_factory):
+    """A request of the simulated lab's camera, and its attack."""
+    file = tiny_request(tmp_path_factory.mktemp("request"), evaluations=2)
+    (attack,) = run_attack(loaded(file), file.parent / "run", ProgressDisplay())
+    return file, attack
+
+
+def seen_by_car(poster_sheet, T_world_from_face, car, camera):
+    T = invert_transform(planar_pose(*car) @ camera.mount) @ T_world_from_face
+    return photograph(
+        [(poster_sheet, T)], camera, noise=1.0, blur_px=0.5, supersampling=3, light=(0.9, 0.9, 0.9)
+    )
+
+
+def test_a_drive_gives_size_pose_flatness_and_the_effect_where_it_hangs(call, searched, tmp_path):
+    request, file = searched
+    camera = load_calibration(CameraCalibration, CALIBRATION / "camera.yaml")
+    assert call("attack", "print", file, "-o", tmp_path / "p.png", "--dpi", 50, "--marker-mm", 150)[0] == 0
+    sheet = poster_of(load_attack(file)).with_markers(0.15)
+    scale, T = 1.02, make_transform(rotation_z(3.0), [1.3, -1.6, 0.45])
+    printed = scaled(sheet, scale, scale, 60.0)
+    with BagWriter(tmp_path / "bag") as writer:
+        for k, s in enumerate(np.linspace(0.0, 1.0, 9)):
+            car = (-0.9 + 0.7 * s, -1.9 + 0.5 * s, 0.1 - 0.15 * s)
+            stamp = START_NS + round(1e8 * k)
+            rgb = seen_by_car(printed, T, car, camera)
+            writer.write("/camera/image_raw", encode(image_message(rgb, stamp, "camera")), stamp, stamp, k)
+            for step in (-1, 1):
+                pose = encode(pose_message(planar_pose(*car), stamp + step * 1000))
+                writer.write("/vicon/car", pose, stamp + step * 1000, stamp + step * 1000, 2 * k + (step > 0))
+    code, said = call(
+        "attack", "measure", tmp_path / "bag", "--print", tmp_path / "p.print.json", "--camera", CALIBRATION / "camera.yaml",
+        "--request", request, "-o", tmp_path / "found.json",
+    )  # fmt: skip
+    assert code == 0, said
+    found = json.loads((tmp_path / "found.json").read_text())
+    assert found["size_m"] == pytest.approx(np.multiply(scale, sheet.size_m), rel=0.01)
+    pose = np.array(found["T_world_from_face"])
+    assert np.degrees(rotation_angles((pose[:3, :3].T @ T[:3, :3])[None])[0]) < 1.0
+    assert pose[:3, 3] == pytest.approx(T[:3, 3], abs=0.015)
+    assert found["flatness_mm"] < 4.0 * found["flatness_sd_mm"] + 2.0
+    effect = found["effect"]
+    assert effect["at_measured_pose"]
+    assert "where it hangs" in said
+    assert min(effect[key] for key in ("clean_m", "nominal_m", "print_m")) >= 0.0
