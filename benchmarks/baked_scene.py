@@ -34,8 +34,8 @@ from advnerf_core.documents import read_json
 from advnerf_core.geometry import planar_poses
 from advnerf_core.learning.recipe import recovery_states
 from advnerf_core.objects.voxel.model import load_object, save_object
-from advnerf_core.scene.bake import bake
 from advnerf_core.scene.surrogate import BackgroundRenderer
+from advnerf_core.splats.scene_file import bake_scene
 from benchmarks.results import REPOSITORY, record_row
 from nodes.experiment.plan.victims import HARDENED, NAIVE
 from nodes.experiment.show.context import Experiment
@@ -199,7 +199,7 @@ class _ReachedError(Exception):
 def reach(experiment: Experiment) -> None:
     """From a trained scene to an attack: baking, and the search until it predicts enough."""
     began = time.perf_counter()
-    baked = bake(load_field(experiment), bake_stage.views_of(experiment), experiment.view.pinhole)
+    baked = bake_scene(load_field(experiment), bake_stage.views_of(experiment), experiment.view.pinhole)
     baking_s = time.perf_counter() - began
     problem, space = _problem(experiment, baked, HARDENED, 0), face_space(experiment, baked)
     plain_m = float(evaluate(problem, space.surrogate.plain_theta())[1].protocol_cte_m.mean())

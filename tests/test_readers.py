@@ -46,6 +46,7 @@ HEADERS = {  # text in the header of a tensor file or archive that our own write
     "advnerf_core/scene/baked.py": 3,
     "advnerf_core/scene/field.py": 3,
     "advnerf_core/scene/train.py": 1,
+    "advnerf_core/splats/scene_file.py": 2,
     "nodes/experiment/node/worker.py": 2,
     "nodes/experiment_page/searches.py": 1,
     "nodes/operator_page/pictures.py": 1,

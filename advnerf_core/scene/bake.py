@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
@@ -9,9 +11,12 @@ from scipy import ndimage
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Pinhole
 from advnerf_core.parallel import run_slots, slot_bounds
+from advnerf_core.render.march import MarchConfig
+from advnerf_core.render.occupancy import Leaps
 from advnerf_core.scene.baked import BakedScene, Voxels
 from advnerf_core.scene.baked_kernels import bake_points
 from advnerf_core.scene.colour import IDENTITY
+from advnerf_core.scene.field import SceneFieldConfig
 from advnerf_core.scene.render_field import FieldRenderer
 
 # Length of a brick's part in pixels at the nearest view. Shorter ones look a little better and take much more memory.
@@ -26,17 +31,31 @@ class NotBakedError(AdvnerfError):
     """A field cannot be baked."""
 
 
+class CornerValues(Protocol):
+    """What is baked: values at points of a box, and where in it there is something.
+
+    Attributes:
+        config: For the box.
+        march: Placement of samples on the rays of the baked scene.
+        leaps: Occupied cells.
+        least_transmittance: A ray stops when less light than this would still come through.
+        behind: Colour ``[3]`` behind everything.
+    """
+
+    config: SceneFieldConfig
+    march: MarchConfig
+    leaps: Leaps
+    least_transmittance: float
+    behind: NDArray[np.float32]
+
+    def at(self, points: NDArray[np.float32], spacing: float) -> NDArray[np.uint8]:
+        """Values ``[N, 4]`` as `Voxels` holds them, at points ``[N, 3]`` in box coordinates that are ``spacing`` apart."""
+
+
 def bake(
     source: FieldRenderer, T_world_from_camera: ArrayLike, pinhole: Pinhole, part_px: float = PART_PX
 ) -> BakedScene:
-    """Bake a field, including its colour map.
-
-    Every occupied cell gets values at its corners. A cell seen from near by also gets a brick of finer ones.
-
-    Args:
-        T_world_from_camera: Poses ``[N, 4, 4]`` like the later ones: bricks are made where these look.
-        pinhole: Intrinsics of the later renders.
-        part_px: Length of a brick's part in pixels, at the nearest view.
+    """Bake a field, including its colour map; see `bake_corners`.
 
     Raises:
         NotBakedError: The field's colours depend on the direction, it reaches beyond its box, or it is transparent.
@@ -53,9 +72,25 @@ def bake(
             f"{config.contraction}, learned_background = {config.learned_background}, direction_bands = {config.direction_bands}, "
             f"a longest side of {config.extent_m:.4g} m"
         )
+    return bake_corners(_OfField(source), T_world_from_camera, pinhole, part_px)
+
+
+def bake_corners(
+    source: CornerValues, T_world_from_camera: ArrayLike, pinhole: Pinhole, part_px: float = PART_PX
+) -> BakedScene:
+    """Bake the values of a source.
+
+    Every occupied cell gets values at its corners. A cell seen from near by also gets a brick of finer ones.
+
+    Args:
+        T_world_from_camera: Poses ``[N, 4, 4]`` like the later ones: bricks are made where these look.
+        pinhole: Intrinsics of the later renders.
+        part_px: Length of a brick's part in pixels, at the nearest view.
+    """
+    config = source.config
     shape = source.leaps.distance.shape
     none_yet = np.full(shape, -1, np.int32), np.zeros(shape, np.uint8)
-    coarse = Voxels(_corner_values(source), *none_yet, _far_colour(source))
+    coarse = Voxels(_corner_values(source), *none_yet, source.behind)
     plain = BakedScene(config, source.march, source.leaps, source.least_transmittance, coarse)
     poses = np.asarray(T_world_from_camera, np.float64).reshape(-1, 4, 4)
     cell_m = config.extent_m / float(source.leaps.cells.max())
@@ -64,7 +99,7 @@ def bake(
     return BakedScene(config, source.march, source.leaps, source.least_transmittance, voxels)
 
 
-def _corner_values(source: FieldRenderer) -> NDArray[np.uint8]:
+def _corner_values(source: CornerValues) -> NDArray[np.uint8]:
     """Values at the corners of all cells; empty where no sample of an occupied cell can lie."""
     shape = np.array(source.leaps.distance.shape)
     cell_m = source.config.extent_m / float(source.leaps.cells.max())
@@ -75,11 +110,11 @@ def _corner_values(source: FieldRenderer) -> NDArray[np.uint8]:
     values = np.zeros((near.size, 4), np.uint8)
     for part in np.array_split(corners, max(1, len(corners) // _CHUNK)):
         points = np.stack(np.unravel_index(part, shape + 1), -1).astype(np.float32)
-        values[part] = _values_at(source, points / source.leaps.cells)
+        values[part] = source.at(points / source.leaps.cells, _spacing(source))
     return values
 
 
-def _with_bricks(source: FieldRenderer, coarse: Voxels, parts: NDArray[np.float32]) -> Voxels:
+def _with_bricks(source: CornerValues, coarse: Voxels, parts: NDArray[np.float32]) -> Voxels:
     """The voxels with bricks of at least ``parts [X, Y, Z]`` along the sides of cells, up to the limit."""
     logs = np.ceil(np.log2(np.maximum(parts.reshape(-1), 1.0))).astype(np.int64)
     cells = np.flatnonzero(logs > 0)
@@ -97,7 +132,7 @@ def _with_bricks(source: FieldRenderer, coarse: Voxels, parts: NDArray[np.float3
 
 
 def _fill_bricks(
-    source: FieldRenderer,
+    source: CornerValues,
     values: NDArray[np.uint8],
     corners: NDArray[np.float32],
     begins: NDArray[np.int64],
@@ -107,29 +142,42 @@ def _fill_bricks(
     for part in np.array_split(np.arange(len(corners)), max(1, len(corners) * len(inside) // _CHUNK)):
         points = (corners[part, None] + inside) / source.leaps.cells
         rows = begins[part, None] + np.arange(len(inside))
-        values[rows.reshape(-1)] = _values_at(source, points.reshape(-1, 3))
+        values[rows.reshape(-1)] = source.at(points.reshape(-1, 3), _spacing(source) / side)
 
 
-def _values_at(source: FieldRenderer, points: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Values ``[N, 4]`` at points in box coordinates ``[N, 3]``."""
-    points, networks = np.ascontiguousarray(points, np.float32), source.networks
-    colours = source.colour_map or IDENTITY
-    matrix, offset = np.array(colours.matrix, np.float32), np.array(colours.offset, np.float32)
-    values, bounds = np.empty((len(points), 4), np.uint8), slot_bounds(len(points), _SLOTS)
+def _spacing(source: CornerValues) -> float:
+    """Length of a cell in box coordinates."""
+    return 1.0 / float(source.leaps.cells.max())
 
-    def work(slot: int) -> None:
-        bake_points(
-            points,
-            *bounds[slot],
-            *networks,
-            matrix,
-            offset,
-            np.float32(colours.power),
-            values,
-        )
 
-    run_slots(work, _SLOTS)
-    return values
+class _OfField:
+    """The corner values of a trained field."""
+
+    def __init__(self, field: FieldRenderer) -> None:
+        self._field, self.config, self.march, self.leaps = field, field.config, field.march, field.leaps
+        self.least_transmittance, self.behind = field.least_transmittance, _far_colour(field)
+
+    def at(self, points: NDArray[np.float32], spacing: float) -> NDArray[np.uint8]:
+        """See `CornerValues`; a field has learned its own sharpness."""
+        del spacing
+        points, networks = np.ascontiguousarray(points, np.float32), self._field.networks
+        colours = self._field.colour_map or IDENTITY
+        matrix, offset = np.array(colours.matrix, np.float32), np.array(colours.offset, np.float32)
+        values, bounds = np.empty((len(points), 4), np.uint8), slot_bounds(len(points), _SLOTS)
+
+        def work(slot: int) -> None:
+            bake_points(
+                points,
+                *bounds[slot],
+                *networks,
+                matrix,
+                offset,
+                np.float32(colours.power),
+                values,
+            )
+
+        run_slots(work, _SLOTS)
+        return values
 
 
 def _far_colour(source: FieldRenderer) -> NDArray[np.float32]:

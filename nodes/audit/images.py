@@ -19,6 +19,7 @@ from nodes.runtime.progress import ProgressDisplay
 POSES, IMPORTED, REPORT = "transforms.json", "photos", "import.json"
 # nerfstudio writes this key for poses from structure from motion, whose unit is arbitrary.
 _OF_COLMAP = "applied_transform"
+_SPLATS = (".ply", ".spz", ".splat", ".glb")
 _EXTENT_M = 1.0  # of a set without a known metre, which is then rejected
 _MOVEMENT, _MOST = 0.06, 300  # as in ``advnerf scene from-video``
 
@@ -107,6 +108,11 @@ def _importer(given: Path, found: ScanFolder | None) -> Callable[[Path, MetricOp
         raise ConfigError(
             f"--place {given}: expected the images that this scene was learned from, as a learned scene alone cannot be compared with its place; to "
             "search in it without a verdict, see world: {kind: scene} in docs/experiments.md"
+        )
+    if given.suffix.lower() in _SPLATS:
+        raise ConfigError(
+            f"--place {given}: expected the images that this splat was trained on, as a splat alone cannot be compared with its place; 'advnerf scene "
+            "from-splat' makes a scene of it, to search in without a verdict: world: {kind: scene} in docs/experiments.md"
         )
     if given.is_dir() and not any(
         each.suffix.lower() in (*SUFFIXES, *HEIF_SUFFIXES) for each in given.rglob("*")

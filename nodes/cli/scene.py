@@ -23,7 +23,7 @@ app = typer.Typer(
     cls=in_panels(
         {
             "Posed images": ("from-video", "from-images", "from-bag", "from-phone-and-car", "from-scan"),
-            "Learned scenes": ("train", "eval", "render", "view", "match-colours", "gate"),
+            "Scenes": ("train", "from-splat", "eval", "render", "view", "match-colours", "gate"),
             "Objects": ("object",),
             "Places to drive": ("world", "room", "carla"),
         }
@@ -84,10 +84,10 @@ def scene_eval(
 ) -> None:
     """Evaluate a scene on the held-out images of a data set."""
     from advnerf_core.data.transforms import load_transforms
-    from advnerf_core.scene.render_field import FieldRenderer
+    from advnerf_core.splats.scene_file import load_renderer
     from nodes.lab.scene_training import evaluate
 
-    renderer = FieldRenderer.from_file(scene, interval_scale=interval_scale)
+    renderer = load_renderer(scene, interval_scale)
     _print_figures(evaluate(renderer, load_transforms(transforms).training_and_held_out(every)[1], size))
 
 
@@ -106,11 +106,11 @@ def scene_render(
 ) -> None:
     """Render a scene from the cameras of a data set: colour, depth and, optionally, a video."""
     from advnerf_core.data.transforms import load_transforms
-    from advnerf_core.scene.render_field import FieldRenderer
+    from advnerf_core.splats.scene_file import load_renderer
     from nodes.lab.scene_training import render
     from nodes.runtime.progress import ProgressDisplay
 
-    renderer = FieldRenderer.from_file(scene, interval_scale=interval_scale)
+    renderer = load_renderer(scene, interval_scale)
     listed = load_transforms(transforms)
     listed = listed.training_and_held_out(every)[1] if held_out else listed.sorted_by_name()
     with ProgressDisplay() as display:

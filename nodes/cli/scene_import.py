@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from nodes.lab.importing.metric_options import MetricOptions
+from nodes.lab.importing.splat_options import SplatOptions
 from nodes.runtime.options import with_groups
 from nodes.runtime.terminal import print_table, table
 
@@ -225,6 +226,32 @@ def from_scan(
 
     options = ScanOptions(images, number, calibration, most)
     _run("from-scan", output, lambda report: run(scan, output, options, metric, report))
+
+
+@app.command("from-splat")
+@with_groups
+def from_splat(
+    splat: Annotated[
+        Path,
+        typer.Argument(help="A .ply, .spz, .splat or .glb file of Gaussians.", exists=True, dir_okay=False),
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Scene file to write (scene.safetensors).")],
+    options: SplatOptions,
+) -> None:
+    """Make a scene of a Gaussian splat, which is then rendered, baked and attacked like a learned one.
+
+    Invalid, invisible and floating Gaussians are left out and counted.
+    """
+    from nodes.lab.importing.splat import from_splat as run
+
+    found = run(splat, output, options)
+    for each in found.removed:
+        print(f"left out: {each.count:,} Gaussians: {each.reason}")
+    low, high = (", ".join(f"{value:g}" for value in corner) for corner in found.box)
+    print(f"scale: {found.metres_per_unit:.6g} m a unit; box [m]: {low} to {high}")
+    if found.psnr_db is not None:
+        print(f"it shows the images with a PSNR of {found.psnr_db:.1f} dB (median)")
+    print(f"{output}: {found.count:,} Gaussians")
 
 
 @app.command("match-colours")

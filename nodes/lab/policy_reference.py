@@ -187,11 +187,11 @@ def _drives_in_scene(scene: Path, calibration: Path, view: PolicyView) -> Drives
 
 def _sight_of_scene(scene: Path, calibration: Path, view: PolicyView) -> See:
     """Renderer of the policy's images of a learned scene, with the intrinsics of its view, including the crop."""
-    from advnerf_core.scene.render_field import FieldRenderer
     from advnerf_core.scene.surrogate import Surrogate
+    from advnerf_core.splats.scene_file import load_renderer
 
     mount = load_calibration(CameraCalibration, calibration / "camera.yaml").mount
-    surrogate = Surrogate(FieldRenderer.from_file(scene), view.pinhole, mount, [])
+    surrogate = Surrogate(load_renderer(scene), view.pinhole, mount, [])
     nothing = torch.zeros(surrogate.theta_shape)
     return lambda states: surrogate.sense(states, nothing).images
 

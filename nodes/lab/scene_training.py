@@ -28,6 +28,7 @@ from advnerf_core.scene.presets import FAST, PHOTOGRAPH_BANDS
 from advnerf_core.scene.presets import PRESETS as SCENE_PRESETS
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.train import TrainConfig, TrainingReport, train_scene
+from advnerf_core.splats.renderer import SplatRenderer
 from nodes.lab.training_request import TrainingRequest
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import Report
@@ -84,7 +85,9 @@ def train(request: TrainingRequest, report: Report) -> dict[str, Any]:
     return figures
 
 
-def evaluate(renderer: FieldRenderer, listed: PosedImages, size: tuple[int, int] | None) -> dict[str, Any]:
+def evaluate(
+    renderer: FieldRenderer | SplatRenderer, listed: PosedImages, size: tuple[int, int] | None
+) -> dict[str, Any]:
     """Compare with held-out images: PSNR [dB], PSNR after a gain fitted to each image [dB], and SSIM.
 
     Masked pixels are excluded from both PSNR.
@@ -99,7 +102,7 @@ def evaluate(renderer: FieldRenderer, listed: PosedImages, size: tuple[int, int]
 
 
 def _compared(
-    renderer: FieldRenderer, views: ImageSet, index: int, real: NDArray[np.uint8]
+    renderer: FieldRenderer | SplatRenderer, views: ImageSet, index: int, real: NDArray[np.uint8]
 ) -> dict[str, float]:
     rgb, _, alpha = (
         each[0].numpy()
@@ -113,7 +116,7 @@ def _compared(
 
 
 def render(
-    renderer: FieldRenderer,
+    renderer: FieldRenderer | SplatRenderer,
     listed: PosedImages,
     size: tuple[int, int] | None,
     output: Path,

@@ -24,8 +24,8 @@ from advnerf_core.data.transforms import load_transforms
 from advnerf_core.data.views import ImageSet
 from advnerf_core.geometry import Array, Pinhole
 from advnerf_core.objects.voxel.model import load_object
-from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.surrogate import Surrogate
+from advnerf_core.splats.scene_file import load_renderer
 from calibration.schema import RoomCalibration, load_calibration
 
 _MOVING_PX, _RESTING_PX = 160, 640  # image width
@@ -57,7 +57,7 @@ class SceneView:
         host: str = "127.0.0.1",
         port: int = 8080,
     ) -> None:
-        self._renderer = FieldRenderer.from_file(scene)
+        self._renderer = load_renderer(scene)
         self._objects = [load_object(path).placed(np.eye(4)) for path in objects]
         self._lock = threading.Lock()  # the renderer's threads are shared
         self.rendered = 0

@@ -15,9 +15,10 @@ from advnerf_core.data.views import PosedImages
 from advnerf_core.files import write_json
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.baked import BakedScene
-from advnerf_core.scene.field import load_scene
 from advnerf_core.scene.metrics import psnr, ssim
 from advnerf_core.scene.render_field import FieldRenderer
+from advnerf_core.splats.renderer import SplatRenderer
+from advnerf_core.splats.scene_file import load_hash, load_renderer
 from nodes.experiment.show.context import Experiment
 from nodes.runtime.progress import Report
 
@@ -36,12 +37,12 @@ def baked_file(experiment: Experiment) -> Path:
     return experiment.stage_folder("bake") / "baked.safetensors"
 
 
-def load_field(experiment: Experiment) -> FieldRenderer:
-    """The trained scene itself in the colours of the driving camera."""
-    return FieldRenderer.from_file(scene_file(experiment))
+def load_field(experiment: Experiment) -> FieldRenderer | SplatRenderer:
+    """The trained scene itself in the colours of the driving camera, or the splat."""
+    return load_renderer(scene_file(experiment))
 
 
-def load_background(experiment: Experiment) -> FieldRenderer | BakedScene:
+def load_background(experiment: Experiment) -> FieldRenderer | SplatRenderer | BakedScene:
     """The trained scene in the colours of the driving camera, fast if it was baked."""
     file = baked_file(experiment)
     return BakedScene.load(file) if file.exists() else load_field(experiment)
@@ -49,7 +50,7 @@ def load_background(experiment: Experiment) -> FieldRenderer | BakedScene:
 
 def scene_sha256(experiment: Experiment) -> str:
     """Content hash of the trained scene."""
-    return str(load_scene(scene_file(experiment))[2]["scene_hash"])
+    return load_hash(scene_file(experiment))
 
 
 def compare_views(experiment: Experiment, view: PolicyView, begin: float, report: Report) -> None:

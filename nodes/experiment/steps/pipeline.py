@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from advnerf_core.attack.objectives import objective_key
+from advnerf_core.splats.scene_file import is_splat_scene, load_hash
 from nodes.experiment.engine.artefact import Settings
 from nodes.experiment.engine.stages import Stage
 from nodes.experiment.plan.carriers import ScreenConfig
@@ -61,13 +62,14 @@ class _Module(Protocol):
 
 
 def stages_of(experiment: Experiment) -> list[Stage]:
-    """The stages that cells need, none in a learned scene of the user's own; the world must not have been opened for them.
+    """The stages that cells need; the world must not have been opened for them. In a scene of the user's own, a splat is baked.
 
     More rounds of retraining resume from the existing ones.
     """
     config = experiment.config
     if config.own_scene:
-        return []
+        file = Path(str(experiment.named_world.config.file))
+        return [_bake_own(experiment, file)] if is_splat_scene(file) else []
     found = [_capture(experiment), _scene(experiment), _bake(experiment), _object(experiment)]
     by_stage = {config.policy_stage(name): name for name in config.trained}
     found += [
@@ -120,6 +122,11 @@ def _scene(experiment: Experiment) -> Stage:
 def _bake(experiment: Experiment) -> Stage:
     settings = Settings.of(experiment.config, READS["bake"], view=experiment.view_settings)
     return _stage("bake", bake, experiment, settings, ("capture", "scene"))
+
+
+def _bake_own(experiment: Experiment, file: Path) -> Stage:
+    inputs = {"view": experiment.view_settings, "scene": load_hash(file), "world": experiment.world_settings}
+    return _stage("bake", bake, experiment, Settings.of(experiment.config, READS["bake"], **inputs))
 
 
 def _object(experiment: Experiment) -> Stage:

@@ -192,7 +192,15 @@ def make_ready(
     for each in experiment.config.trained.values():
         each.network.check()
     stages = stages_of(experiment)
-    return run_to_end(experiment, stages, _LIBRARIES, until if stages else None, console, reference, watcher)
+    return run_to_end(
+        experiment,
+        stages,
+        _LIBRARIES,
+        None if experiment.config.own_scene else until,
+        console,
+        reference,
+        watcher,
+    )
 
 
 def prepare_victims(experiment: Experiment) -> None:

@@ -28,7 +28,7 @@ class OwnSceneConfig(StrictModel):
     """A place described by a learned scene.
 
     Attributes:
-        file: Scene file of ``advnerf scene train``.
+        file: Scene file of ``advnerf scene train`` or ``advnerf scene from-splat``.
         calibration: Folder with ``camera.yaml``, ``vehicle.yaml`` and ``room.yaml``.
         camera: Camera calibration, instead of the folder's.
         vehicle: Vehicle calibration, instead of the folder's.
@@ -116,9 +116,9 @@ class OwnScene(Undriven):
         )
 
     def _box(self) -> Box:
-        from advnerf_core.scene.field import load_scene_config  # brings torch
+        from advnerf_core.splats.scene_file import load_box  # brings torch
 
-        learned = load_scene_config(self.config.file)
+        learned = load_box(Path(str(self.config.file)))
         return Box(learned.box_low_m, learned.box_high_m, learned.contraction)
 
     def __enter__(self) -> OwnScene:

@@ -1,0 +1,135 @@
+"""Scene files of splats, and functions for a scene file of either kind: learned field or splat."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import save as save_arrays
+
+from advnerf_core.files import with_sorted_header, write_atomically
+from advnerf_core.geometry import Pinhole
+from advnerf_core.places import open_tensors
+from advnerf_core.scene.bake import bake
+from advnerf_core.scene.baked import BakedScene
+from advnerf_core.scene.field import SceneFieldConfig, SceneFileError, load_scene, load_scene_config
+from advnerf_core.scene.render_field import FieldRenderer
+from advnerf_core.splats.bake import bake_splats
+from advnerf_core.splats.gaussians import GaussianSplats
+from advnerf_core.splats.renderer import SplatRenderer
+
+FORMAT = "advnerf-splat-1"
+
+
+def save_splat_scene(path: Path, renderer: SplatRenderer, metadata: dict[str, Any] | None = None) -> str:
+    """Write a splat in the world to one ``.safetensors`` file, atomically. Harmonics are stored in half precision.
+
+    Args:
+        metadata: JSON values: where it came from.
+
+    Returns:
+        The scene's hash.
+    """
+    parts: dict[str, NDArray[Any]] = dict(vars(renderer.splats))
+    parts["harmonics"] = np.clip(parts["harmonics"], -6e4, 6e4).astype(np.float16)
+    content = {"box": renderer.box, "behind": renderer.behind, "near_m": renderer.near_m}
+    digest = hashlib.sha256(json.dumps(content).encode())
+    for name, part in sorted(parts.items()):
+        digest.update(name.encode() + part.tobytes())
+    header = {
+        "format": FORMAT,
+        "content": json.dumps(content),
+        "scene_hash": digest.hexdigest()[:16],
+        "metadata": json.dumps(metadata or {}),
+    }
+    write_atomically(path, with_sorted_header(save_arrays(parts, header)))
+    return header["scene_hash"]
+
+
+def load_splat_scene(path: Path) -> tuple[SplatRenderer, dict[str, Any]]:
+    """The renderer of a file of `save_splat_scene`, and its metadata (with ``scene_hash``).
+
+    Raises:
+        SceneFileError: The file is missing, damaged, or of another kind.
+    """
+    header = _header(path)
+    if header.get("format") != FORMAT:
+        raise SceneFileError(
+            f"expected format {FORMAT} in {path}, got {header.get('format')}; run 'advnerf scene from-splat' again"
+        )
+    try:
+        with open_tensors(path, "numpy") as file:
+            parts = {name: file.get_tensor(name).astype(np.float32) for name in file.keys()}  # noqa: SIM118 - not a dict
+        splats, content = GaussianSplats(**parts), json.loads(header["content"])
+        low, high = ((float(x), float(y), float(z)) for x, y, z in content["box"])
+        renderer = SplatRenderer(splats, tuple(content["behind"]), near_m=content["near_m"], box=(low, high))
+    except (OSError, SafetensorError, ValueError, TypeError, KeyError) as error:
+        raise SceneFileError(
+            f"expected a splat in {path}, got: {error}; run 'advnerf scene from-splat' again"
+        ) from error
+    return renderer, {**json.loads(header["metadata"]), "scene_hash": header["scene_hash"]}
+
+
+def is_splat_scene(path: Path) -> bool:
+    """Whether a scene file holds a splat; a file that is missing or damaged does not."""
+    try:
+        return _header(path).get("format") == FORMAT
+    except SceneFileError:
+        return False
+
+
+def load_renderer(path: Path, interval_scale: float = 1.0) -> FieldRenderer | SplatRenderer:
+    """The renderer of a scene file of either kind; ``interval_scale`` as in `FieldRenderer.from_file`, for fields.
+
+    Raises:
+        SceneFileError: The file is missing, damaged, or of another kind.
+    """
+    if is_splat_scene(path):
+        return load_splat_scene(path)[0]
+    return FieldRenderer.from_file(path, interval_scale=interval_scale)
+
+
+def load_box(path: Path) -> SceneFieldConfig:
+    """The box of a scene file of either kind; the other sizes are a field's.
+
+    Raises:
+        SceneFileError: The file is missing, damaged, or of another kind.
+    """
+    return load_splat_scene(path)[0].config if is_splat_scene(path) else load_scene_config(path)
+
+
+def load_hash(path: Path) -> str:
+    """The content hash of a scene file of either kind.
+
+    Raises:
+        SceneFileError: The file is missing, damaged, or of another kind.
+    """
+    return str((load_splat_scene(path) if is_splat_scene(path) else load_scene(path))[-1]["scene_hash"])
+
+
+def bake_scene(
+    source: FieldRenderer | SplatRenderer, T_world_from_camera: ArrayLike, pinhole: Pinhole
+) -> BakedScene:
+    """Bake a scene of either kind for views like ``T_world_from_camera [N, 4, 4]``.
+
+    Raises:
+        NotBakedError: It cannot be baked.
+    """
+    if isinstance(source, SplatRenderer):
+        return bake_splats(source, T_world_from_camera, pinhole)
+    return bake(source, T_world_from_camera, pinhole)
+
+
+def _header(path: Path) -> dict[str, str]:
+    try:
+        with open_tensors(path, "numpy") as file:
+            return dict(file.metadata() or {})
+    except (OSError, SafetensorError) as error:
+        raise SceneFileError(
+            f"expected a scene file at {path}, got: {error}; make the scene again"
+        ) from error
