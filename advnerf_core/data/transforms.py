@@ -125,6 +125,8 @@ def _read_set(path: Path, split: str | None, require_all: bool) -> PosedImages:
 
 
 def _read_json(path: Path) -> _Values:
+    if path.suffix != ".json" and (advice := from_scan_advice(path, "")):
+        raise DatasetError(f"expected a transforms.json, got {path}; {advice}")
     try:
         content = read_json(path)
     except MissingFileError as error:

@@ -18,6 +18,7 @@ from advnerf_core.documents import read_csv, read_yaml
 from advnerf_core.geometry import Array, Pinhole, invert_transform
 from calibration.photo_model import LeftOut, Registered
 from calibration.scans.scan import (
+    MOST_OF_RECORDING,
     Picture,
     Scan,
     ScanError,
@@ -48,7 +49,7 @@ def read(path: Path, options: ScanOptions) -> Scan:
     trajectory = _trajectory(root)
     found, left_out, pictures = list[Registered](), list[LeftOut](), dict[str, Picture]()
     cameras = sorted(each.parent for each in root.glob("cam*/data.csv"))
-    share = None if options.most is None else max(options.most // len(cameras), 1)
+    share = max((options.most or MOST_OF_RECORDING) // len(cameras), 1)
     for camera in cameras:
         sensor = _sensor(camera)
         intrinsics = _intrinsics(camera, sensor, options)

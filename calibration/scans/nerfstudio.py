@@ -6,6 +6,7 @@ of a trained model: ``scale * (transform x)``.
 
 from __future__ import annotations
 
+import os
 import warnings
 from functools import partial
 from pathlib import Path
@@ -70,12 +71,9 @@ def _picture(name: str, frame: PosedImage) -> Picture:
 
 def _name(file: Path, folder: Path, taken: dict[str, Picture]) -> str:
     """Name of an image in the data set: relative to the folder, if it lies there."""
-    inside = file.resolve().is_relative_to(folder.resolve())
-    name = (
-        file.resolve().relative_to(folder.resolve()).as_posix()
-        if inside
-        else f"{file.parent.name}/{file.name}"
-    )
+    written, root = Path(os.path.normpath(file)), Path(os.path.normpath(folder))
+    inside = written.is_relative_to(root)
+    name = written.relative_to(root).as_posix() if inside else f"{written.parent.name}/{written.name}"
     name = name.removeprefix("images/")
     if name in taken:
         raise ScanError(f"{file}: expected images of different names, got {name} twice; rename one of them")

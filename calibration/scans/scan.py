@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -195,6 +195,11 @@ def model_of(
         first = f"; {left_out[0].name}: {left_out[0].why}" if left_out else ""
         raise ScanError(
             f"{where}: expected at least {MIN_IMAGES} images with a pose, got {len(images)}{first}; export the scan again, with its images"
+        )
+    name, count = Counter(each.name for each in images).most_common(1)[0]
+    if count > 1:
+        raise ScanError(
+            f"{where}: expected each image once, got {name} {count} times; remove the other entries"
         )
     found = np.zeros((0, 3)) if points is None else points
     return Model(tuple(images), tuple(left_out), found, None, 1, _cameras(images, why))

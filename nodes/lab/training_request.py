@@ -66,7 +66,7 @@ class TrainingRequest:
         typer.Option(
             "--unbounded/--bounded",
             help="Also learn the scene outside the box, to the horizon, with detail that decreases with distance.",
-            show_default="unbounded if aabb_scale in the file is more than 1",
+            show_default="unbounded if aabb_scale in the file is more than 1, or the file has no box",
         ),
     ] = None
     preset: Annotated[

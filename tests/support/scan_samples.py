@@ -130,22 +130,26 @@ def llff(folder, factor=1, unit=0.2):
     return folder
 
 
-def euroc(folder, fisheye=False, cameras=("cam0", "cam1")):
+def euroc(folder, fisheye=False, cameras=("cam0", "cam1"), tracked="state_groundtruth_estimate0"):
     T_BS = np.eye(4)
     T_BS[:3, :3] = Rotation.from_euler("zyx", [1.5, 0.1, -0.2]).as_matrix()
     T_BS[:3, 3] = [-0.02, -0.06, 0.01]
-    truth = folder / "mav0" / "state_groundtruth_estimate0"
+    T_BM = np.eye(4)  # what is tracked: the body, or markers on it
+    if tracked == "vicon0":
+        T_BM[:3, :3] = Rotation.from_euler("zyx", [0.7, -0.3, 0.2]).as_matrix()
+        T_BM[:3, 3] = [0.07, 0.01, 0.12]
+    truth = folder / "mav0" / tracked
     truth.mkdir(parents=True)
     stamps = range(START_NS, START_NS + round(1e9 * TIMES_S[-1]) + 1, 10_000_000)
     lines = [
         "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v_RS_R_x [m s^-1]"
     ]
     for stamp in stamps:
-        T_WB = camera_at(1e-9 * (stamp - START_NS)) @ np.linalg.inv(T_BS)
-        x, y, z, w = Rotation.from_matrix(T_WB[:3, :3]).as_quat()
-        lines.append(",".join(map(repr, (stamp, *map(float, (*T_WB[:3, 3], w, x, y, z, 0.0))))))
+        T_WM = camera_at(1e-9 * (stamp - START_NS)) @ np.linalg.inv(T_BS) @ T_BM
+        x, y, z, w = Rotation.from_matrix(T_WM[:3, :3]).as_quat()
+        lines.append(",".join(map(repr, (stamp, *map(float, (*T_WM[:3, 3], w, x, y, z, 0.0))))))
     (truth / "data.csv").write_text("\n".join(lines) + "\n")
-    body = "sensor_type: pose\nT_BS:\n  cols: 4\n  rows: 4\n  data: [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]\n"
+    body = f"sensor_type: pose\nT_BS:\n  cols: 4\n  rows: 4\n  data: {T_BM.ravel().tolist()}\n"
     (truth / "sensor.yaml").write_text(body)
     for number, name in enumerate(cameras):
         T = T_BS.copy()

@@ -57,6 +57,8 @@ def gather(media: Sequence[Path], output: Path, config: MediaConfig, report: Rep
             continue
         if path.is_dir():
             entries.append((path.resolve().name, photographs_in(path), False))
+        elif advice := from_scan_advice(path, ""):
+            raise ImportRecordingError(f"expected a video or a folder of photographs, got {path}; {advice}")
         elif path.is_file():
             entries.append((path.stem, [path], True))
         else:

@@ -17,8 +17,11 @@ from advnerf_core.data.views import HELD_OUT_SPLITS
 from advnerf_core.errors import AdvnerfError
 from calibration.scans.reading import READERS
 from calibration.scans.scan import ScanOptions
+from nodes.lab.importing.media import MediaConfig, gather
 from nodes.lab.importing.metric_options import MetricOptions
 from nodes.lab.importing.scan import from_scan
+from nodes.lab.scene_training import scene_field
+from nodes.lab.training_request import TrainingRequest
 from tests.support import scan_samples
 from tests.support.scan_samples import BROWN, FISHEYE, HEIGHT, KINDS, TRUTH, WIDTH, K
 
@@ -81,6 +84,19 @@ def test_every_format_that_is_recognised_has_a_reader(tmp_path):
     for kind in KINDS:
         assert scan_of(scan_samples.write(kind, tmp_path / kind)).name == kind
     assert scan_of(tmp_path) is None
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("read", [load_transforms, lambda path: gather([path], path, MediaConfig(), print)])
+def test_other_commands_name_this_one(tmp_path, kind, read):
+    scan = scan_samples.write(kind, tmp_path / "scan")
+    if kind == "nerfstudio" and read is load_transforms:
+        assert read(scan).frames
+        return
+    with pytest.raises(
+        AdvnerfError, match=f"of the format {kind}, so run: advnerf scene from-scan {scan} -o"
+    ):
+        read(scan)
 
 
 def test_polycam(tmp_path):
@@ -149,6 +165,23 @@ def test_euroc(tmp_path, fisheye, k):
     right = [T @ np.array([*np.eye(4)[:3], [0.11, 0.0, 0.0, 1.0]]).T for T in TRUTH]
     assert_same_pixels([each for each in frames if each.camera_id == "cam1"], right, k, fisheye)
     assert report["scale_from"] == "poses"
+
+
+def test_markers_on_the_body_of_euroc_are_not_its_camera(tmp_path):
+    frames, _ = run(tmp_path, scan_samples.euroc(tmp_path / "scan", cameras=("cam0",), tracked="vicon0"))
+    assert_same_pixels(frames, TRUTH, BROWN)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_training_takes_the_data_set_without_a_box(tmp_path, kind):
+    run(tmp_path, scan_samples.write(kind, tmp_path / "scan"))
+    listed = load_transforms(tmp_path / "out", require_all=True)
+    images = listed.load()
+    field = scene_field(TrainingRequest(tmp_path / "out", tmp_path / "learned"), listed, images)
+    places = images.T_world_from_camera[:, :3, 3]
+    assert (places > field.box_low_m).all()
+    assert (places < field.box_high_m).all()
+    assert field.contraction == (kind not in ("Polycam", "nerfstudio")), "unbounded without points"
 
 
 @pytest.mark.parametrize("listed", [True, False])
@@ -220,6 +253,30 @@ def test_a_known_length_gives_metres(tmp_path):
     )
     assert aligned(frames).scale == pytest.approx(1.0, rel=1e-6)
     assert report["scale_from"] == "length"
+
+
+def test_an_image_that_is_damaged_is_left_out(tmp_path):
+    scan = scan_samples.write("Record3D", tmp_path)
+    data = bytearray(scan.read_bytes())
+    at = data.index(b"rgbd/3.jpg") + 200
+    data[at : at + 20] = bytes(20)
+    scan.write_bytes(data)
+    frames, report = run(tmp_path, scan)
+    assert len(frames) == 7
+    assert report["model"]["left_out"][0]["name"] == "rgbd/3.jpg"
+    assert "Bad CRC-32" in report["model"]["left_out"][0]["why"]
+
+
+def test_silhouettes_leave_the_box_to_training(tmp_path):
+    scan = scan_samples.nerfstudio(tmp_path / "scan")
+    (scan / "sparse_pc.ply").unlink()
+    run(tmp_path, scan)
+    assert load_transforms(tmp_path / "out").aabb_scale == 16.0
+    for file in (scan / "images").iterdir():
+        image = cv2.imread(str(file))
+        assert cv2.imwrite(str(file), np.dstack([image, np.full(image.shape[:2], 200, np.uint8)]))
+    run(tmp_path, scan)
+    assert load_transforms(tmp_path / "out").aabb_scale is None
 
 
 def test_recordings_are_thinned(tmp_path):
