@@ -21,6 +21,8 @@ from advnerf_core.geometry import Array, Pinhole
 # An ideal pinhole that is wider spends nearly all its pixels on the border; a fisheye's view beyond is left out.
 WIDEST_HALF_ANGLE_RAD = math.radians(70.0)
 _EDGE_SAMPLES = 64
+# OpenCV's maps end at 2^15; the largest sensors of phones have 200 million pixels.
+LONGEST_PX, _MOST_PIXELS = 2**15 - 2, 2**28
 
 
 @dataclass(frozen=True)
@@ -85,8 +87,13 @@ def straightening(pinhole: Pinhole, lens: Lens, keep_all: bool = False) -> Strai
             window without missing pixels is kept.
 
     Raises:
-        DatasetError: The coefficients fold the image over itself, so that it cannot be undistorted.
+        DatasetError: The image is too large, or the coefficients fold it over itself, so that it cannot be undistorted.
     """
+    if max(pinhole.width, pinhole.height) > LONGEST_PX or pinhole.width * pinhole.height > _MOST_PIXELS:
+        raise DatasetError(
+            f"expected an image of at most {LONGEST_PX} px a side and {_MOST_PIXELS >> 20} million in all, got {pinhole.width} x {pinhole.height}; "
+            "correct the size, or reduce the images"
+        )
     ideal = _ideal_fisheye(pinhole, lens, keep_all) if lens.fisheye else _ideal_brown(pinhole, lens, keep_all)
     if ideal is None:
         raise _cannot_be_undone(pinhole, lens)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.image_files import SUFFIXES
-from advnerf_core.data.lens import Lens, straightening
+from advnerf_core.data.lens import LONGEST_PX, Lens, straightening
 from advnerf_core.data.rigid import rigid_pose
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Array, Pinhole
@@ -119,7 +119,7 @@ def pinhole_of(width: Any, height: Any, values: Sequence[Any], where: str) -> Pi
     """
     size = [number(each, where) for each in (width, height)]
     fx, fy, cx, cy = (number(each, where) for each in values)
-    if min(*size, fx, fy) <= 0.0 or max(size) > 1e6 or size != [int(each) for each in size]:
+    if min(*size, fx, fy) <= 0.0 or max(size) > LONGEST_PX or size != [int(each) for each in size]:
         raise ScanError(
             f"{where}: expected an image size and focal lengths above 0 px, got {size[0]:g} x {size[1]:g} and {fx:g}, {fy:g}; export the scan again"
         )

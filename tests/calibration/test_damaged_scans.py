@@ -21,7 +21,7 @@ def test_damaged_files_are_read_or_refused(tmp_path):
     for data in files.good:
         files.read(data)
     refused = 0
-    for _ in range(200):
+    for _ in range(300):
         good = random_.choice(files.good)
         try:
             files.read(good[:1] + mutate(random_, good[1:]))

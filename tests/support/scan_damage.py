@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 
 from calibration.scans.reading import read_scan
 from calibration.scans.scan import ScanOptions
-from tests.support import scan_samples
+from tests.support import colmap_models, scan_samples
 
 # Of each format, everything but images.
 _PATTERNS = ("*.json", "*.r3d", "metadata", "*.npy", "*.csv", "*.yaml", "*.txt", "*.ply")
@@ -25,6 +26,11 @@ class ScanFiles:
         for kind in scan_samples.KINDS:
             scan = scan_samples.write(kind, folder / kind)
             self._files += [(scan, file) for file in self._own(scan)]
+        for text in (False, True) if find_spec("pycolmap") else ():
+            project, model = folder / f"COLMAP{text}", colmap_models.synthetic(4)
+            colmap_models.write_images(project / "images", colmap_models.poses_by_name(model))
+            files = colmap_models.write(model, project / "sparse" / "0", text).iterdir()
+            self._files += [(project, file) for file in sorted(files)]
         self.good = [bytes([number]) + file.read_bytes() for number, (_, file) in enumerate(self._files)]
 
     @staticmethod

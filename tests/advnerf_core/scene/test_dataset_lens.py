@@ -92,6 +92,12 @@ def test_an_absurd_lens_is_refused_with_its_camera_and_advice_that_can_be_follow
         load_transforms(file).load()
 
 
+@pytest.mark.parametrize("size", [(2**40, 48), (40_000, 48), (30_000, 30_000)])
+def test_an_image_that_opencv_cannot_map_is_refused(size):
+    with pytest.raises(DatasetError, match=r"expected an image of at most 32766 px a side .* got \d+ x \d+"):
+        straightening(Pinhole(*size, 50.0, 50.0, 32.0, 24.0), Lens())
+
+
 def test_coefficients_that_fold_the_image_are_refused():
     with pytest.raises(DatasetError, match=r"distortion that can be undone.*k1, k2.*= -3, 0"):
         straightening(PINHOLE, Lens((-3.0, 0.0, 0.0, 0.0, 0.0)))
