@@ -60,7 +60,8 @@ def _in_hull(points: Array, images: ImageSet) -> NDArray[np.intp]:
     assert images.alpha is not None
     count = len(images.rgb)
     chosen = np.unique(np.linspace(0, count - 1, min(count, _MOST_VIEWS)).round().astype(int))
-    left, seen = np.arange(len(points)), np.zeros(len(points), np.int64)
+    left: NDArray[np.intp] = np.arange(len(points))
+    seen = np.zeros(len(points), np.int64)
     for index in chosen:
         pinhole, T = images.pinholes[index], invert_transform(images.T_world_from_camera[index])
         local = transform_points(T, points[left])

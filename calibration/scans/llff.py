@@ -47,7 +47,7 @@ def read(path: Path, options: ScanOptions) -> Scan:
             "give the images of the poses with --images, or remove the others"
         )
     found, left_out, pictures = list[Registered](), list[LeftOut](), dict[str, Picture]()
-    reached = [np.zeros((0, 3))]
+    reached: list[Array] = [np.zeros((0, 3))]
     for index in spread(len(rows), options.most):
         file, where = files[index], f"{path / POSES}: row {index}"
         try:

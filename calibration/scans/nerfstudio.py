@@ -90,7 +90,7 @@ def _points(folder: Path, content: dict[str, Any]) -> tuple[Array, dict[str, Any
 
         with warnings.catch_warnings():
             warnings.simplefilter("error", DeprecationWarning)
-            cloud = trimesh.load(folder / name, file_type="ply", process=False)
+            cloud: Any = trimesh.load(folder / name, file_type="ply", process=False)
         points = np.asarray(cloud.vertices, np.float64).reshape(-1, 3)
     except Exception as error:  # trimesh is not installed, or meets a damaged file; points are a help only
         reason = (str(error).splitlines() or [type(error).__name__])[0]
