@@ -14,7 +14,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
@@ -252,8 +252,10 @@ def totals(experiment: Experiment, backgrounds: Backgrounds) -> None:
     )
 
 
-def pairs(experiment: Experiment, backgrounds: Backgrounds) -> None:
-    """Attacks found both ways, from the same starts and seeds, deployed in the world."""
+def searched_pairs(
+    experiment: Experiment, backgrounds: Backgrounds, victims: Sequence[str]
+) -> list[dict[str, float]]:
+    """Excess [m a tick] of attacks found through each background, from the same starts and seeds, deployed in the world."""
     # Seeds of one start would repeat one drive.
     attack = experiment.config.attack.model_copy(update={"nominal_start": False})
     experiment = replace(experiment, config=experiment.config.model_copy(update={"attack": attack}))
@@ -261,7 +263,7 @@ def pairs(experiment: Experiment, backgrounds: Backgrounds) -> None:
     settings = search_settings(experiment, load_method("gradient"))
     with experiment.open_world() as scene:
         dressed = PaintedScene(experiment, scene)
-        for victim in (HARDENED, NAIVE):
+        for victim in victims:
             policy = load_victim(experiment, victim).policy
             for seed in range(_SEEDS):
                 starts = experiment.start_states(scenario, seed)
@@ -279,9 +281,16 @@ def pairs(experiment: Experiment, backgrounds: Backgrounds) -> None:
                     found[name] = float(np.mean(np.subtract(totals_m, plain_m))) / experiment.config.horizon
                 rows.append(found)
                 print(f"{victim}, seed {seed}: {found}", flush=True)
+    return rows
+
+
+def pairs(experiment: Experiment, backgrounds: Backgrounds) -> None:
+    """Attacks found both ways, from the same starts and seeds, deployed in the world."""
+    rows = searched_pairs(experiment, backgrounds, (HARDENED, NAIVE))
     field_m, baked_m = (float(mean(row[name] for row in rows)) for name in ("field", "baked"))
     difference = abs(baked_m - field_m) / field_m
-    note = f"{baked_m:.4f} m a tick against {field_m:.4f} m; {len(rows)} pairs of searches, two victims, three starts, {settings.evaluations} evaluations each"
+    evaluations = search_settings(experiment, load_method("gradient")).evaluations
+    note = f"{baked_m:.4f} m a tick against {field_m:.4f} m; {len(rows)} pairs of searches, two victims, three starts, {evaluations} evaluations each"
     record(
         "deployed excess of attacks found through a baked scene and through the field",
         100 * difference,

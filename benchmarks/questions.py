@@ -68,6 +68,7 @@ QUESTIONS = (
             "few_photographs",
             "sample_intervals",
             "exposure",
+            "splats",
             "training_step",
             "victim_training",
             "scene_stage",

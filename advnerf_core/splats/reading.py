@@ -57,7 +57,7 @@ def read_splats(path: Path) -> GaussianSplats:
         # Damaged files hold any numbers: the logistic function of a large one is 0 or 1.
         with np.errstate(over="ignore", invalid="ignore"):
             found = readers[path.suffix.lower()](path)
-    except SplatError:
+    except (SplatError, ImportError):
         raise
     except Exception as error:  # readers of damaged files raise any exception
         why = " ".join(f"{type(error).__name__}: {error}".split())

@@ -18,6 +18,7 @@ _EXTRA_OF = dict.fromkeys(("torch", "numba", "scipy", "matplotlib", "jinja2", "a
     "ray": "cluster",
     "carla": "carla",
     "pyarrow": "lerobot",
+    "gsply": "splats",
     "carla_driver_interface": "egodriver",
     "scenariogeneration": "audit",
     "sarif_pydantic": "audit",

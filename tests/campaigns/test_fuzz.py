@@ -51,6 +51,7 @@ SHARES = {
     "attack": 80_000,
     "bag": 10_000,
     "scan": 40_000,
+    "splat": 40_000,
 }
 _INPUT_LIMIT_S = 2
 _GROWTH_LIMIT_MIB = 200.0
@@ -188,6 +189,22 @@ def scan_reader(folder: Path) -> tuple[Sequence[bytes], Callable[[bytes], None]]
     return files.good, files.read
 
 
+def splat_reader(folder: Path) -> tuple[Sequence[bytes], Callable[[bytes], None]]:
+    """Splats of every format; the first byte says which."""
+    from advnerf_core.splats.reading import read_splats
+    from tests.support.splats import sample_files
+
+    files = sample_files(folder)
+    suffixes = list(files)
+
+    def read(data: bytes) -> None:
+        path = folder / f"damaged.{suffixes[data[0] % len(suffixes) if data else 0]}"
+        path.write_bytes(data[1:])
+        read_splats(path)
+
+    return [bytes([n]) + files[suffix] for n, suffix in enumerate(suffixes)], read
+
+
 def void(result: object) -> None:
     """Nothing: only whether it comes back counts."""
     del result
@@ -203,6 +220,7 @@ def run(name: str, count: int, seed: int, folder: Path) -> Outcome:
         "attack": lambda: attack_reader(folder),
         "bag": lambda: bag_reader(folder),
         "scan": lambda: scan_reader(folder),
+        "splat": lambda: splat_reader(folder),
     }
     good, read = makers[name]()
     for data in good:  # a reader that refuses everything would be tested by nothing
@@ -259,7 +277,7 @@ def test_no_input_crashes_or_hangs_a_reader(campaign: Campaign, tmp_path: Path) 
         )
     growth_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 - before_mib
     campaign.record(
-        "fuzz: VESC, VICON, bus, config, attack file, bag, scan",
+        "fuzz: VESC, VICON, bus, config, attack file, bag, scan, splat",
         total,
         "inputs",
         "10^6: no crash, hang or memory growth",

@@ -1,14 +1,29 @@
 """Splats whose images or values are known, and their files."""
 
+from __future__ import annotations
+
 import json
 import struct
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from advnerf_core.splats.gaussians import COLOUR_OFFSET, CONSTANT_BASIS, GaussianSplats
 
+Colours = Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]]
 
-def gaussians(means, scales, opacities, colours, rotations=None, bands=1):
+
+def gaussians(
+    means: ArrayLike,
+    scales: ArrayLike,
+    opacities: ArrayLike,
+    colours: ArrayLike,
+    rotations: ArrayLike | None = None,
+    bands: int = 1,
+) -> GaussianSplats:
     """Gaussians with plain colours ``[N, 3]``."""
     count = len(means)
     harmonics = np.zeros((count, bands**2, 3))
@@ -20,7 +35,7 @@ def gaussians(means, scales, opacities, colours, rotations=None, bands=1):
     return GaussianSplats(*(np.ascontiguousarray(part, np.float32) for part in parts))
 
 
-def random_splats(count, seed=0, bands=4, spread_m=1.0):
+def random_splats(count: int, seed: int = 0, bands: int = 4, spread_m: float = 1.0) -> GaussianSplats:
     """Gaussians of any shape, turn and colour, in a cloud."""
     rng = np.random.default_rng(seed)
     turns = rng.normal(size=(count, 4))
@@ -37,7 +52,12 @@ def random_splats(count, seed=0, bands=4, spread_m=1.0):
     return made
 
 
-def room(count, seed=0, size_m=(4.0, 4.0, 2.4), colour=None):
+def room(
+    count: int,
+    seed: int = 0,
+    size_m: tuple[float, float, float] = (4.0, 4.0, 2.4),
+    colour: Colours | None = None,
+) -> GaussianSplats:
     """Flat Gaussians on the inner walls of a box around the origin; ``colour(points, face)`` in 0..1, or a smooth pattern."""
     rng = np.random.default_rng(seed)
     size = np.array(size_m)
@@ -52,13 +72,13 @@ def room(count, seed=0, size_m=(4.0, 4.0, 2.4), colour=None):
     return gaussians(points, scales, 0.9, (colour or wall_colours)(points, face))
 
 
-def wall_colours(points, face):
+def wall_colours(points: NDArray[Any], face: NDArray[Any]) -> NDArray[Any]:
     """A smooth pattern, another on each wall."""
     waves = [np.sin(2.0 * points[:, k] + face) * np.cos(1.5 * points[:, (k + 1) % 3]) for k in range(3)]
     return 0.5 + 0.35 * np.stack(waves, axis=1)
 
 
-def splat_bytes(splats):
+def splat_bytes(splats: GaussianSplats) -> bytes:
     """The content of a .splat file."""
     rgb = CONSTANT_BASIS * splats.harmonics[:, 0] + COLOUR_OFFSET
     rgba = np.clip(np.round(255.0 * np.concatenate([rgb, splats.opacities[:, None]], axis=1)), 0, 255).astype(
@@ -71,7 +91,12 @@ def splat_bytes(splats):
     )
 
 
-def glb_bytes(splats, change=lambda tree: None, arrays=None, matrix=None):
+def glb_bytes(
+    splats: GaussianSplats,
+    change: Callable[[Any], object] = lambda tree: None,
+    arrays: Mapping[str, NDArray[Any]] | None = None,
+    matrix: NDArray[Any] | None = None,
+) -> bytes:
     """The content of a .glb file with the extension; ``change`` edits its JSON, ``arrays`` replaces attributes."""
     prefix = "KHR_gaussian_splatting:"
     w, x, y, z = splats.rotations.T
@@ -132,7 +157,7 @@ def glb_bytes(splats, change=lambda tree: None, arrays=None, matrix=None):
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
-def write_ply(path, splats, compressed=False):
+def write_ply(path: Path, splats: GaussianSplats, compressed: bool = False) -> Path:
     """A file of gsply; a compressed one gets another name, which is returned."""
     import gsply
 
@@ -143,7 +168,7 @@ def write_ply(path, splats, compressed=False):
     return path.with_name(f"{path.stem}.compressed.ply") if compressed else path
 
 
-def write_spz(path, splats, version=3):
+def write_spz(path: Path, splats: GaussianSplats, version: int = 3) -> Path:
     """A file of gsply."""
     import gsply
 
@@ -160,3 +185,16 @@ def write_spz(path, splats, version=3):
     )
     gsply.write_spz(path, data, version=version)
     return path
+
+
+def sample_files(folder: Path) -> dict[str, bytes]:
+    """The bytes of one small file of each format, by suffix."""
+    splats = random_splats(12, bands=2)
+    return {
+        "ply": write_ply(folder / "a.ply", splats).read_bytes(),
+        "compressed.ply": write_ply(folder / "b.ply", splats, compressed=True).read_bytes(),
+        "spz": write_spz(folder / "a.spz", splats).read_bytes(),
+        "v4.spz": write_spz(folder / "b.spz", splats, 4).read_bytes(),
+        "splat": splat_bytes(splats),
+        "glb": glb_bytes(splats),
+    }
