@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+from rich.console import Console
+
 from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.attack.clean import clean_drive
 from advnerf_core.attack.spaces.space import Space
@@ -18,7 +20,8 @@ from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import make_space
 from nodes.experiment.show.victims import load_victim, look_at_given
 from nodes.experiment.steps.attack import attack_problem, past
-from nodes.experiment.steps.run import load_experiment
+from nodes.experiment.steps.pipeline import stages_of
+from nodes.experiment.steps.run import load_experiment, make_ready
 from nodes.experiment.steps.shared_search import search_key
 
 
@@ -84,12 +87,14 @@ class Prepared:
 
 
 def prepare(experiment: Experiment, seed: int | None = None) -> Prepared:
-    """Load scene, policy, calibration and objects of a request; ``seed`` is its first if not given.
+    """Load scene, policy, calibration and objects of a request, and bake a splat; ``seed`` is its first if not given.
 
     Raises:
         AdvnerfError: A file is missing, damaged, or does not fit the others.
     """
     look_at_given(experiment)
+    if stages_of(experiment):
+        make_ready(experiment, console=Console(quiet=True))
     config = experiment.config
     seed = config.seeds[0] if seed is None else seed
     cell = Cell.of(config.cell_paths[0], config.main_victim, config.methods[0], seed)

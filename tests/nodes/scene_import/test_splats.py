@@ -14,9 +14,8 @@ from advnerf_core.splats.gaussians import SplatError
 from advnerf_core.splats.renderer import SplatRenderer
 from advnerf_core.splats.scene_file import load_splat_scene
 from nodes.audit.images import posed
-from nodes.experiment.node.prepare import load_request
-from nodes.experiment.show.learned_scene import load_background, load_field
-from nodes.experiment.steps.run import make_ready
+from nodes.experiment.node.prepare import load_request, prepare
+from nodes.experiment.show.learned_scene import load_field
 from nodes.lab.importing.errors import ImportRecordingError
 from nodes.lab.importing.metric_options import MetricOptions
 from nodes.lab.importing.splat import from_splat
@@ -165,8 +164,8 @@ def test_a_splat_is_a_place_whose_searches_use_its_voxels(tmp_path):
     scene.unlink()
     from_splat(write_ply(tmp_path / "a.ply", splats), scene, SplatOptions(metres_per_unit=1.0, up="z"))
     experiment = load_request(file, (), tmp_path / "run")
-    make_ready(experiment)
+    prepared = prepare(experiment)
     baked = read_json(tmp_path / "run" / "bake" / "baked.json")
     assert baked["psnr_to_splat_db"] > 25.0
     assert isinstance(load_field(experiment), SplatRenderer)
-    assert isinstance(load_background(experiment), BakedScene)
+    assert isinstance(prepared.space.surrogate.background, BakedScene)
