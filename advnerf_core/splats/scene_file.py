@@ -21,7 +21,7 @@ from advnerf_core.scene.field import SceneFieldConfig, SceneFileError, load_scen
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.splats.bake import bake_splats
 from advnerf_core.splats.gaussians import GaussianSplats
-from advnerf_core.splats.renderer import SplatRenderer
+from advnerf_core.splats.renderer import Corner, SplatRenderer
 
 FORMAT = "advnerf-splat-1"
 
@@ -58,21 +58,17 @@ def load_splat_scene(path: Path) -> tuple[SplatRenderer, dict[str, Any]]:
         SceneFileError: The file is missing, damaged, or of another kind.
     """
     header = _header(path)
-    if header.get("format") != FORMAT:
-        raise SceneFileError(
-            f"expected format {FORMAT} in {path}, got {header.get('format')}; run 'advnerf scene from-splat' again"
-        )
+    box, content = _content(path, header)
     try:
         with open_tensors(path, "numpy") as file:
             parts = {name: file.get_tensor(name).astype(np.float32) for name in file.keys()}  # noqa: SIM118 - not a dict
-        splats, content = GaussianSplats(**parts), json.loads(header["content"])
-        low, high = ((float(x), float(y), float(z)) for x, y, z in content["box"])
-        renderer = SplatRenderer(splats, tuple(content["behind"]), near_m=content["near_m"], box=(low, high))
+        renderer = SplatRenderer(
+            GaussianSplats(**parts), tuple(content["behind"]), near_m=content["near_m"], box=box
+        )
+        metadata = {**json.loads(header["metadata"]), "scene_hash": header["scene_hash"]}
     except (OSError, SafetensorError, ValueError, TypeError, KeyError) as error:
-        raise SceneFileError(
-            f"expected a splat in {path}, got: {error}; run 'advnerf scene from-splat' again"
-        ) from error
-    return renderer, {**json.loads(header["metadata"]), "scene_hash": header["scene_hash"]}
+        raise _damaged(path, error) from error
+    return renderer, metadata
 
 
 def is_splat_scene(path: Path) -> bool:
@@ -100,7 +96,10 @@ def load_box(path: Path) -> SceneFieldConfig:
     Raises:
         SceneFileError: The file is missing, damaged, or of another kind.
     """
-    return load_splat_scene(path)[0].config if is_splat_scene(path) else load_scene_config(path)
+    header = _header(path)
+    if header.get("format") != FORMAT:
+        return load_scene_config(path)
+    return SceneFieldConfig(*_content(path, header)[0])
 
 
 def load_hash(path: Path) -> str:
@@ -109,7 +108,10 @@ def load_hash(path: Path) -> str:
     Raises:
         SceneFileError: The file is missing, damaged, or of another kind.
     """
-    return str((load_splat_scene(path) if is_splat_scene(path) else load_scene(path))[-1]["scene_hash"])
+    header = _header(path)
+    if header.get("format") != FORMAT:
+        return str(load_scene(path)[2]["scene_hash"])
+    return header.get("scene_hash", "")
 
 
 def bake_scene(
@@ -133,3 +135,21 @@ def _header(path: Path) -> dict[str, str]:
         raise SceneFileError(
             f"expected a scene file at {path}, got: {error}; make the scene again"
         ) from error
+
+
+def _content(path: Path, header: dict[str, str]) -> tuple[tuple[Corner, Corner], dict[str, Any]]:
+    """The box, and what else the header of a splat says."""
+    if header.get("format") != FORMAT:
+        raise SceneFileError(
+            f"expected format {FORMAT} in {path}, got {header.get('format')}; run 'advnerf scene from-splat' again"
+        )
+    try:
+        content: dict[str, Any] = json.loads(header["content"])
+        low, high = ((float(x), float(y), float(z)) for x, y, z in content["box"])
+    except (ValueError, TypeError, KeyError) as error:
+        raise _damaged(path, error) from error
+    return (low, high), content
+
+
+def _damaged(path: Path, error: Exception) -> SceneFileError:
+    return SceneFileError(f"expected a splat in {path}, got: {error}; run 'advnerf scene from-splat' again")

@@ -25,7 +25,7 @@ def gaussians(
     bands: int = 1,
 ) -> GaussianSplats:
     """Gaussians with plain colours ``[N, 3]``."""
-    count = len(means)
+    count = len(np.asarray(means))
     harmonics = np.zeros((count, bands**2, 3))
     harmonics[:, 0] = (np.asarray(colours, np.float64) - COLOUR_OFFSET) / CONSTANT_BASIS
     if rotations is None:
@@ -111,7 +111,8 @@ def glb_bytes(
             attributes[f"{prefix}SH_DEGREE_{band}_COEF_{n}"] = splats.harmonics[:, band**2 + n]
     attributes |= arrays or {}
     kinds = {"f": 5126, "b": 5120, "B": 5121, "h": 5122, "H": 5123}
-    blob, views, accessors, index = b"", [], [], {}
+    blob, index = b"", dict[str, int]()
+    views, accessors = list[Any](), list[Any]()
     for name, array in attributes.items():
         array = (
             np.ascontiguousarray(array)
