@@ -46,7 +46,7 @@ class ZenohSettings(StrictModel):
     def _are_endpoints(cls, endpoints: tuple[str, ...] | None) -> tuple[str, ...] | None:
         for endpoint in endpoints or ():
             if not _ENDPOINT.fullmatch(endpoint):
-                raise ValueError(f"expected endpoints such as {ROUTER}, got {endpoint!r}")
+                raise ValueError(f"expected endpoints such as {ROUTER}")
         return endpoints
 
     @property
