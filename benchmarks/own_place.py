@@ -51,7 +51,7 @@ PHOTOGRAPHS, LIMIT_M, STARTS, SEED = 160, 0.4, 50, 30_000
 _WOBBLE_M, _TURNED_RAD = 0.05, 0.08
 POLICY, PHOTOS, VIDEO = "my_policy.onnx", "photos", "drive.mp4"
 OPTIONS = ("--car", "my_car.yaml", "--limit", str(LIMIT_M))
-_VIDEO_FRAMES, _USAGE = 600, 64
+_VIDEO_FRAMES, _ASKED = 600, 2
 _MEASURED = 8  # places of the camera that the user measures, to a centimetre
 _WHAT = {
     "photographs": "an own ONNX policy in photographs of an own drive",
@@ -77,7 +77,7 @@ def make_video(folder: Path) -> tuple[str, ...]:
         write_video(folder / VIDEO, [lab.observe_at(*state, depth=False)[0] for state in states])
         at_m = [(planar_pose(*state) @ lab.T_car_from_camera)[:3, 3] for state in states]
     ended = audit(folder, "audit", POLICY, "--place", VIDEO, *OPTIONS)
-    assert ended.returncode == _USAGE, f"it did not ask for a length, but ended with {ended.returncode}"
+    assert ended.returncode == _ASKED, f"it did not ask for a length, but ended with {ended.returncode}"
     names = [each["file_path"] for each in read_json(folder / "audit" / IMPORTED / POSES)["frames"]]
     lines = ["image,x_m,y_m,z_m"]
     for name in names[:: max(1, len(names) // _MEASURED)]:
