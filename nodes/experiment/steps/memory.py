@@ -30,7 +30,7 @@ from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.attack import attack_problem
 from nodes.runtime.progress import Report
 
-HORIZONS = (50, 200, 400)
+HORIZONS = (50, 400)
 _BEFORE_TICKS = 16
 
 
