@@ -91,9 +91,16 @@ def place_of_photographs(
         world["camera"]["pinhole"] = asdict(camera)
     derived, held_out = _found_out(world)
     world |= derived
-    name = given.resolve().name if given.is_dir() else given.resolve().parent.name
-    title, source = f"the place of {name}", str(given)
+    title, source = f"the place of {name_of(given)}", str(given)
     return Place(title, there.kind, source, there.scale, world, path=PATH, held_out=held_out), limit_m
+
+
+def name_of(given: Path) -> str:
+    """The name of a folder, of the folder of a ``transforms.json``, or of a video without its suffix."""
+    whole = given.resolve()
+    if whole.is_dir():
+        return whole.name
+    return whole.parent.name if whole.suffix == ".json" else whole.stem
 
 
 def _height_m(poses: Path) -> float:
