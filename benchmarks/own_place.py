@@ -198,7 +198,8 @@ def main() -> None:
     parser.add_argument("--ci", action="store_true", help="measure the small setting instead")
     options = parser.parse_args()
     os.environ.setdefault("MUJOCO_GL", "egl")
-    command = COMMAND if options.through == "photographs" else f"{COMMAND} --through {options.through}"
+    command = COMMAND + f" --through {options.through}" * (options.through != "photographs")
+    command += f" --budget {options.budget}" * (options.budget != parser.get_default("budget"))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         if options.through == "video":
