@@ -167,10 +167,8 @@ def chosen_name(wanted: str | None, known: Sequence[str], what: str, path: Path)
     """
     if wanted is None and known:
         return known[0]
+    if not known:
+        raise LogError(f"expected {what} in {path}, it has none; give another log")
     if wanted is None or wanted not in known:
-        raise LogError(
-            f"expected {what} {wanted or ''} in {path}, it has {', '.join(known) or 'none'}; choose one of these".replace(
-                "  ", " "
-            )
-        )
+        raise LogError(f"expected {what} {wanted} in {path}, it has {', '.join(known)}; choose one of these")
     return wanted
