@@ -46,10 +46,16 @@ def read_gltf(path: Path) -> Parts:
 
     found: list[tuple[dict[str, Any], dict[str, NDArray[Any]]]] = []
 
+    broken: list[Exception] = []
+
     def take(context: dict[str, Any]) -> None:
         """Keep the arrays of a primitive; in the scene one point stands for it, whose x is its number."""
-        primitive, accessors = context["primitive"], context["accessors"]
-        arrays = {name: np.asarray(accessors[index]) for name, index in primitive["attributes"].items()}
+        try:
+            primitive, accessors = context["primitive"], context["accessors"]
+            arrays = {name: np.asarray(accessors[index]) for name, index in primitive["attributes"].items()}
+        except (LookupError, TypeError, AttributeError) as error:  # trimesh would only log it
+            broken.append(error)
+            return
         accessors.append(np.array([[len(found), 0.0, 0.0]], np.float32))
         primitive["attributes"] = {"POSITION": len(accessors) - 1}
         found.append((context["data"], arrays))
@@ -63,6 +69,8 @@ def read_gltf(path: Path) -> Parts:
         raise ValueError(f"{type(error).__name__}: {error}") from error
     finally:
         register_handler(EXTENSION, "primitive_preprocess")(lambda context: None)
+    if broken:
+        raise ValueError(f"attributes that are not there ({broken[0]})")
     if not found:
         raise SplatError(
             f"expected Gaussians ({EXTENSION}) in {path}, got none; give the splat instead of a mesh or a point cloud"
