@@ -13,7 +13,8 @@ from scipy.optimize import least_squares
 from advnerf_core.geometry import Array, Pinhole, invert_transform, make_transform
 from calibration.degeneracy import DegenerateDataError, PoorFitError
 from calibration.print_markers import LEAST_MARKERS, Marker
-from calibration.print_pose import CORRELATED, LEAST_NOISE_PX, MOST_ANGLE_RAD, MOST_SHARE, some_pose
+from calibration.print_model import CORRELATED, LEAST_NOISE_PX
+from calibration.print_pose import MOST_ANGLE_RAD, MOST_SHARE, some_pose
 
 _LEAST_VIEWS = 3
 _MOST_RMS_PX, _MOST_RMS_SHARE = 1.0, 0.02

@@ -29,6 +29,7 @@ _LEAST_CONTRAST = 0.03  # of linear light
 _LEAST_SAMPLES, _MOST_SAMPLES = 5, 60
 _QUARTILES = 1.349  # between the quartiles of a normal distribution, in its standard deviations
 _SHARP_PX = 3.0
+_LARGE_PX = 4_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +69,10 @@ def find_markers(
     """
     grey = cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY)
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARY))
-    corners, numbers, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(grey)
+    # Small markers are found in an enlarged picture.
+    times = 2 if grey.size < _LARGE_PX else 1
+    enlarged = cv2.resize(grey, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC)
+    corners, numbers, _ = cv2.aruco.ArucoDetector(dictionary, _small()).detectMarkers(enlarged)
     found = [] if numbers is None else [int(number) for number in numbers.ravel()]
     light = linear(grey).astype(np.float32)
     located, poor = {}, []
@@ -79,7 +83,8 @@ def find_markers(
             raise DegenerateDataError(
                 f"expected one print in the photograph, got marker {number} {found.count(number)} times; cover the other one"
             )
-        marker = _located(light, lens, pixels.reshape(4, 2).astype(np.float64))
+        rough = (pixels.reshape(4, 2).astype(np.float64) + 0.5) / times - 0.5
+        marker = _located(light, lens, rough)
         if isinstance(marker, Marker):
             located[number] = marker
         else:
@@ -89,6 +94,18 @@ def find_markers(
             f"expected at least {LEAST_MARKERS} sharp markers of {what}, got {len(located)}, and {len(poor)} of which {poor[0]}"
         )
     return located
+
+
+def _small() -> cv2.aruco.DetectorParameters:
+    """Parameters for small markers: the middle of each cell is read, and wrong cells are corrected as far as the dictionary allows.
+
+    A wrong detection is left to the geometry of the print to refuse.
+    """
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.perspectiveRemovePixelPerCell = 8
+    parameters.perspectiveRemoveIgnoredMarginPerCell = 0.3
+    parameters.errorCorrectionRate = 1.0
+    return parameters
 
 
 def why_none(rgb: Rgb) -> str:

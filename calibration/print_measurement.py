@@ -59,8 +59,8 @@ class PrintMeasurement(PlainData):
         markers_printed: Number of markers on the print.
         residual_px: Root mean square distance of the corners from where a flat print has them [px].
         residual_mm: The same in the print's plane [mm].
-        flatness_mm: Root mean square distance of the markers from their plane [mm]; None of a photograph, which shows it only from the side.
-        flatness_sd_mm: Standard deviation of one such distance [mm].
+        flatness_mm: Root mean square distance of the markers from their plane [mm]; of a photograph, as far as it shows a bend.
+        flatness_sd_mm: Its standard deviation [mm].
         colours: Its colours; None where they are unknown.
         colours_unknown: The reason for that.
     """
@@ -79,8 +79,8 @@ class PrintMeasurement(PlainData):
     markers_printed: int
     residual_px: float
     residual_mm: float
-    flatness_mm: float | None
-    flatness_sd_mm: float | None
+    flatness_mm: float
+    flatness_sd_mm: float
     colours: ColourError | None = None
     colours_unknown: str = ""
 
@@ -137,10 +137,8 @@ class PrintMeasurement(PlainData):
         )
 
     def _flatness(self) -> str:
-        flat = f"corners within {self.residual_mm:.1f} mm of a flat print's"
-        if self.flatness_mm is None:
-            return f"{flat}; a bend towards the camera does not show"
-        return f"{self.flatness_mm:.1f} mm from a plane (each within {self.flatness_sd_mm:.1f} mm), {flat}"
+        off = f"{self.flatness_mm:.1f} mm from a plane (standard deviation {self.flatness_sd_mm:.1f} mm)"
+        return f"{off}, corners within {self.residual_mm:.1f} mm of where that puts them"
 
     def _colours(self) -> str:
         if self.colours is None:
@@ -193,8 +191,8 @@ def of_photograph(
         markers_printed=printed,
         residual_px=pose.rms_px,
         residual_mm=1000.0 * pose.rms_m * scale,
-        flatness_mm=None,
-        flatness_sd_mm=None,
+        flatness_mm=1000.0 * pose.bend_m * scale,
+        flatness_sd_mm=1000.0 * pose.bend_sd_m * scale,
     )
 
 

@@ -6,21 +6,37 @@ same. What the corners do not determine is refused, by the covariance of the fit
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.optimize import least_squares
 
 from advnerf_core.data.similarity import rotation_angles
 from advnerf_core.geometry import Array, Pinhole, invert_transform, make_transform
 from calibration.degeneracy import DegenerateDataError, PoorFitError
 from calibration.print_markers import LEAST_MARKERS, Marker
+from calibration.print_model import (
+    ASPECT,
+    BEND,
+    BENT,
+    CORRELATED,
+    COUNT,
+    LEAST_NOISE_PX,
+    RIGID,
+    Errors,
+    Fit,
+    bend_m,
+    corner_errors,
+    fit_parameters,
+    half_side,
+    moved,
+    parameters,
+)
 
-# Corners of one marker share the errors of its edges: standard deviations are those of independent errors, times this.
-CORRELATED = 2.0
-LEAST_NOISE_PX = 0.05
+Seen = tuple[Mapping[int, Marker], Mapping[int, Array]]
+"""Markers in the photograph, and corners ``[4, 3]`` of all markers [m], by number."""
+
 MOST_ANGLE_RAD, MOST_SHARE = np.radians(0.5), 0.005
 _AMBIGUOUS = 25.0  # difference of the sums of squares of two tilts, in variances
 _MOST_RMS_PX, _MOST_RMS_SHARE = 0.6, 0.004  # of the extent of the markers in the picture
@@ -28,6 +44,7 @@ _OUTLIER, _LEAST_OUTLIER_PX = 4.0, 1.0
 _MOST_DROPPED = 0.34
 _LEAST_ASPECT, _BETTER = 0.002, 0.7  # a ratio of width and height is believed where it explains the errors
 _MOST_CARD_TILT_RAD = np.radians(4.0)
+_MOST_BEND = 0.06  # of half a side: beyond, a bend is no parabola
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,11 +52,13 @@ class PrintPose:
     """A print in a photograph. Lengths are in units of the nominal size: times the print's true scale, they are metres.
 
     Attributes:
-        T_camera_from_face: Pose ``[4, 4]`` of the print.
+        T_camera_from_face: Pose ``[4, 4]`` of the print's middle plane.
         seen: Numbers of the markers that were used.
         dropped: Numbers of those that were found, and left out, because they do not lie where the others put them.
         rms_px: Root mean square distance of the corners from their projections [px].
         rms_m: The same in the print's plane.
+        bend_m: Root mean square distance of the markers from the middle plane, as far as the photograph shows a bend.
+        bend_sd_m: Its standard deviation.
         angle_sd_rad: Standard deviation of the direction that the print faces [rad].
         distance_sd: Standard deviation of the distance, as a share of it.
         aspect: Width over height, as a share of the nominal ratio; 1 where the photograph does not tell it from 1.
@@ -52,6 +71,8 @@ class PrintPose:
     dropped: tuple[int, ...]
     rms_px: float
     rms_m: float
+    bend_m: float
+    bend_sd_m: float
     angle_sd_rad: float
     distance_sd: float
     aspect: float
@@ -66,32 +87,24 @@ class PrintPose:
 
 
 def fit_print(
-    markers: Mapping[int, Marker],
-    corners_m: Mapping[int, Array],
-    pinhole: Pinhole,
-    card: tuple[Mapping[int, Marker], Mapping[int, Array]] | None = None,
+    markers: Mapping[int, Marker], corners_m: Mapping[int, Array], pinhole: Pinhole, card: Seen | None = None
 ) -> PrintPose:
-    """Fit the pose of a flat print.
+    """Fit the pose of a nearly flat print.
 
     Args:
         markers: Markers in the photograph by number.
         corners_m: Nominal corners ``[4, 3]`` of all markers of the print [m].
         pinhole: Intrinsics of the undistorted photograph.
-        card: Markers in the photograph, and true corners [m], of a card in the plane of the print.
+        card: A card of true size in the plane of the print.
 
     Raises:
         DegenerateDataError: Too few markers, or they do not determine the pose.
-        PoorFitError: The markers do not lie in one plane as printed, or before the camera.
+        PoorFitError: The markers do not lie as printed, or the print is bent.
     """
-    if len(markers) < LEAST_MARKERS:
-        raise DegenerateDataError(
-            f"expected at least {LEAST_MARKERS} of the print's {len(corners_m)} markers, got {len(markers)}; "
-            "uncover the print, go nearer, or photograph it from further in front"
-        )
+    _require_markers(len(markers), len(corners_m), "print")
     kept, dropped = dict(markers), []
     while True:
-        T = _without_doubt(kept, corners_m, pinhole)
-        fit = _fit(_rigid(kept, corners_m, pinhole), np.concatenate([_vector(T), [0.0]]))
+        fit = _only_pose((kept, corners_m), pinhole)
         worst = _worst(fit.errors_px, list(kept))
         if worst is None:
             break
@@ -102,102 +115,25 @@ def fit_print(
                 f"expected markers in one plane, as printed, got {len(dropped)} of {len(markers)} elsewhere; is the print bent, is this its "
                 ".print.json, and the right lens?"
             )
-    return _result(fit, kept, tuple(dropped), corners_m, pinhole, card)
-
-
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    values: Array
-    covariance: Array
-    errors_px: Array  # [N, 4, 2]
-
-    @property
-    def rms_px(self) -> float:
-        return float(np.sqrt(np.mean(self.errors_px**2) * 2.0))
-
-    @property
-    def cost(self) -> float:
-        return float(np.sum(self.errors_px**2))
-
-
-def _fit(errors: Callable[[Array], Array], start: Array) -> _Fit:
-    shape = errors(start).shape
-    found = least_squares(lambda p: errors(p).ravel(), start, x_scale="jac", method="lm")
-    free = max(1, found.fun.size - found.x.size)
-    variance = max(float(found.fun @ found.fun) / free, LEAST_NOISE_PX**2) * CORRELATED**2
-    return _Fit(found.x, variance * np.linalg.pinv(found.jac.T @ found.jac), found.fun.reshape(shape))
-
-
-def _rigid(
-    markers: Mapping[int, Marker], corners_m: Mapping[int, Array], pinhole: Pinhole
-) -> Callable[[Array], Array]:
-    """Errors ``[N, 4, 2]`` [px] over rotation vector, translation, growth of the black, and, if given, the logarithm of the aspect."""
-    points, pixels = _arrays(markers, corners_m)
-    middles = points.mean(axis=1, keepdims=True)
-
-    def errors(p: Array) -> Array:
-        grown = middles + (1.0 + p[6]) * (points - middles)
-        if len(p) > 7:
-            grown = grown * np.exp([0.0, 0.5 * p[7], -0.5 * p[7]])
-        return pinhole.project(_moved(p, grown)) - pixels
-
-    return errors
-
-
-def _with_card(
-    markers: Mapping[int, Marker],
-    corners_m: Mapping[int, Array],
-    pinhole: Pinhole,
-    card: tuple[Mapping[int, Marker], Mapping[int, Array]],
-    aspect: float,
-) -> Callable[[Array], Array]:
-    """As `_rigid`, at a given aspect, with a card in the print's plane: its place y, z, its turn, the logarithm of its size in nominal units, its growth."""
-    own = _rigid(markers, corners_m, pinhole)
-    points, pixels = _arrays(*card)
-    middles = points.mean(axis=1, keepdims=True)
-
-    def errors(p: Array) -> Array:
-        y, z, turn, log_size, growth = p[7:]
-        c, s = np.cos(turn), np.sin(turn)
-        grown = np.exp(log_size) * (middles + (1.0 + growth) * (points - middles))
-        laid = grown @ np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]).T + [0.0, y, z]
-        return np.concatenate([own(np.append(p[:7], aspect)), pinhole.project(_moved(p, laid)) - pixels])
-
-    return errors
-
-
-def _result(
-    fit: _Fit,
-    markers: Mapping[int, Marker],
-    dropped: tuple[int, ...],
-    corners_m: Mapping[int, Array],
-    pinhole: Pinhole,
-    card: tuple[Mapping[int, Marker], Mapping[int, Array]] | None,
-) -> PrintPose:
-    extent_px = float(np.ptp(np.concatenate([each.pixels for each in markers.values()]), axis=0).max())
-    fit, aspect = _with_aspect(fit, markers, corners_m, pinhole)
-    _require_flat(fit, extent_px)
+    fit = _with_aspect(fit, (kept, corners_m), pinhole)
+    extent_px = float(np.ptp(np.concatenate([each.pixels for each in kept.values()]), axis=0).max())
+    bend, bend_sd = _require_flat(fit, extent_px, kept, corners_m)
     scale, scale_sd = None, 0.0
     if card is not None:
-        fit, scale, scale_sd = _carded(fit, markers, corners_m, pinhole, card)
-        _require_flat(fit, extent_px)
-    T = _transform(fit.values)
-    distance = float(np.linalg.norm(T[:3, 3]))
-    along = T[:3, 3] / distance
-    angle_sd = float(np.sqrt(np.linalg.eigvalsh(fit.covariance[:3, :3])[-1]))
-    distance_sd = float(np.sqrt(along @ fit.covariance[3:6, 3:6] @ along)) / distance
-    if angle_sd > MOST_ANGLE_RAD or max(distance_sd, scale_sd) > MOST_SHARE:
-        raise DegenerateDataError(
-            f"expected markers that give the direction within {np.degrees(MOST_ANGLE_RAD):.1f} degrees and lengths within {100 * MOST_SHARE:.1f} %, got "
-            f"{np.degrees(angle_sd):.2f} degrees and {100 * max(distance_sd, scale_sd):.2f} % from {len(markers)} markers; go nearer, or uncover more of them"
-        )
+        fit, scale, scale_sd = _carded(fit, (kept, corners_m), card, pinhole)
+        _require_flat(fit, extent_px, kept, corners_m)
+    distance_sd = _require_sure(fit, scale_sd, len(kept))
+    rms_m = fit.rms_px * float(np.linalg.norm(fit.values[3:6])) / pinhole.fx
+    aspect = float(np.exp(fit.values[ASPECT]))
     return PrintPose(
-        T,
-        tuple(markers),
-        dropped,
+        fit.transform,
+        tuple(kept),
+        tuple(dropped),
         fit.rms_px,
-        fit.rms_px * distance / pinhole.fx,
-        angle_sd,
+        rms_m,
+        bend,
+        bend_sd,
+        fit.angle_sd_rad,
         distance_sd,
         aspect,
         scale,
@@ -205,96 +141,51 @@ def _result(
     )
 
 
-def _require_flat(fit: _Fit, extent_px: float) -> None:
-    most_px = max(_MOST_RMS_PX, _MOST_RMS_SHARE * extent_px)
-    if fit.rms_px > most_px:
-        raise PoorFitError(
-            f"expected markers in one plane within {most_px:.1f} px, got {fit.rms_px:.1f} px; is the print bent, is this its .print.json, and the "
-            "right lens?"
-        )
+def some_pose(markers: Mapping[int, Marker], corners_m: Mapping[int, Array], pinhole: Pinhole) -> Array:
+    """The pose ``[4, 4]`` that explains the corners best, in nominal units, whatever else explains them."""
+    return _fits((markers, corners_m), pinhole)[0].transform
 
 
-def _carded(
-    fit: _Fit,
-    markers: Mapping[int, Marker],
-    corners_m: Mapping[int, Array],
-    pinhole: Pinhole,
-    card: tuple[Mapping[int, Marker], Mapping[int, Array]],
-) -> tuple[_Fit, float, float]:
-    if len(card[0]) < LEAST_MARKERS:
+def _require_markers(seen: int, printed: int, what: str) -> None:
+    if seen < LEAST_MARKERS:
         raise DegenerateDataError(
-            f"expected at least {LEAST_MARKERS} markers of the card, got {len(card[0])}; uncover it, or go nearer"
+            f"expected at least {LEAST_MARKERS} of the {what}'s {printed} markers, got {seen}; uncover it, go nearer, or photograph it from further in front"
         )
-    own = _fit(_rigid(*card, pinhole), np.concatenate([_vector(some_pose(*card, pinhole)), [0.0]]))
-    T, T_card = _transform(fit.values), _transform(own.values)
-    tilt_rad = float(np.arccos(np.clip(T[:3, 0] @ T_card[:3, 0], -1.0, 1.0)))
-    tilt_sd = float(np.sqrt(np.linalg.eigvalsh(own.covariance[:3, :3])[-1]))
-    if tilt_rad > max(_MOST_CARD_TILT_RAD, 4.0 * tilt_sd):
-        raise PoorFitError(
-            f"expected the card in the plane of the print, got an angle of {np.degrees(tilt_rad):.0f} degrees between them; fix it flat beside the print"
-        )
-    # The card's middle meets the print's plane where its ray does.
-    T_face_from_camera = invert_transform(T)
-    ray = T_face_from_camera[:3, :3] @ T_card[:3, 3]
-    reach = -T_face_from_camera[0, 3] / ray[0]
-    y, z = (T_face_from_camera[:3, 3] + reach * ray)[1:]
-    turned = T_face_from_camera[:3, :3] @ T_card[:3, 1]
-    start = [y, z, np.arctan2(turned[2], turned[1]), np.log(reach), 0.0]
-    joint = _fit(
-        _with_card(markers, corners_m, pinhole, card, fit.values[7]), np.concatenate([fit.values[:7], start])
-    )
-    return joint, float(np.exp(-joint.values[10])), float(np.sqrt(joint.covariance[10, 10]))
 
 
-def _with_aspect(
-    fit: _Fit, markers: Mapping[int, Marker], corners_m: Mapping[int, Array], pinhole: Pinhole
-) -> tuple[_Fit, float]:
-    """The fit with a free width over height, and this ratio over the nominal one, where the photograph tells it from 1."""
-    free = _fit(_rigid(markers, corners_m, pinhole), np.concatenate([fit.values[:7], [0.0]]))
-    found, sd = float(free.values[7]), float(np.sqrt(free.covariance[7, 7]))
-    if abs(found) > max(3.0 * sd, _LEAST_ASPECT) and free.rms_px < _BETTER * fit.rms_px:
-        return free, float(np.exp(found))
-    return _Fit(np.append(fit.values, 0.0), fit.covariance, fit.errors_px), 1.0
-
-
-def _without_doubt(
-    markers: Mapping[int, Marker], corners_m: Mapping[int, Array], pinhole: Pinhole, alone: bool = True
-) -> Array:
-    """The pose ``[4, 4]`` that explains the corners best; of two that do so about equally well, an error, or the better one."""
-    points, pixels = _arrays(markers, corners_m)
-    count, turns, moves, _ = cv2.solvePnPGeneric(
-        np.ascontiguousarray(points.reshape(-1, 3)[:, [1, 2, 0]]),
-        np.ascontiguousarray(pixels.reshape(-1, 2)),
-        pinhole.matrix,
-        None,
-        flags=cv2.SOLVEPNP_IPPE,
-    )
+def _fits(seen: Seen, pinhole: Pinhole) -> list[Fit]:
+    """All poses that explain the corners, the best first."""
+    markers, corners_m = seen
+    points = np.concatenate([corners_m[number] for number in markers])
+    pixels = np.concatenate([each.pixels for each in markers.values()])
+    flat = np.ascontiguousarray(points[:, [1, 2, 0]])
+    _, turns, moves, _ = cv2.solvePnPGeneric(flat, pixels, pinhole.matrix, None, flags=cv2.SOLVEPNP_IPPE)
     starts = [
         make_transform(cv2.Rodrigues(turn)[0][:, [2, 0, 1]], move.ravel())
         for turn, move in zip(turns, moves, strict=True)
         if np.isfinite(turn).all() and np.isfinite(move).all()
     ]
-    errors = _rigid(markers, corners_m, pinhole)
-    fits = [_fit(errors, np.concatenate([_vector(T), [0.0]])) for T in starts[:count]]
-    fits = sorted((each for each in fits if each.values[5] > 0.0), key=lambda each: each.cost)
-    if not fits:
+    errors, half_m = corner_errors(markers, corners_m, pinhole), half_side(corners_m)
+    flat_fits = [fit_parameters(errors, parameters(T), RIGID, half_m) for T in starts]
+    found = [fit_parameters(errors, each.values, BENT, half_m) for each in flat_fits if each.values[5] > 0.0]
+    if not found:
         raise PoorFitError(
             f"expected the corners of {len(markers)} markers that some pose explains, got none; is this its .print.json, and the right lens?"
         )
-    best = _transform(fits[0].values)
-    for other in fits[1:] if alone else ():
-        apart = float(rotation_angles((best[:3, :3].T @ _transform(other.values)[:3, :3])[None])[0])
-        noise = max(fits[0].cost / fits[0].errors_px.size, LEAST_NOISE_PX**2) * CORRELATED**2
-        if apart > MOST_ANGLE_RAD and other.cost - fits[0].cost < _AMBIGUOUS * noise:
+    return sorted(found, key=lambda each: each.cost)
+
+
+def _only_pose(seen: Seen, pinhole: Pinhole) -> Fit:
+    """The pose that explains the corners; an error if two do so about equally well."""
+    best, *others = _fits(seen, pinhole)
+    for other in others:
+        apart = float(rotation_angles((best.transform[:3, :3].T @ other.transform[:3, :3])[None])[0])
+        noise = max(best.cost / best.errors_px.size, LEAST_NOISE_PX**2) * CORRELATED**2
+        if apart > MOST_ANGLE_RAD and other.cost - best.cost < _AMBIGUOUS * noise:
             raise DegenerateDataError(
                 f"expected one pose, got two that look alike, {np.degrees(apart):.0f} degrees apart; go nearer, or photograph it from the side"
             )
     return best
-
-
-def some_pose(markers: Mapping[int, Marker], corners_m: Mapping[int, Array], pinhole: Pinhole) -> Array:
-    """The pose ``[4, 4]`` that explains the corners best, in nominal units, whatever else explains them."""
-    return _without_doubt(markers, corners_m, pinhole, False)
 
 
 def _worst(errors_px: Array, numbers: list[int]) -> int | None:
@@ -305,18 +196,80 @@ def _worst(errors_px: Array, numbers: list[int]) -> int | None:
     return numbers[index] if each[index] > limit else None
 
 
-def _arrays(markers: Mapping[int, Marker], corners_m: Mapping[int, Array]) -> tuple[Array, Array]:
-    points = np.stack([corners_m[number] for number in markers])
-    return points, np.stack([each.pixels for each in markers.values()])
+def _with_aspect(fit: Fit, seen: Seen, pinhole: Pinhole) -> Fit:
+    """The fit with a free width over height, where the photograph tells its ratio from the nominal one."""
+    errors, half_m = corner_errors(*seen, pinhole), half_side(seen[1])
+    free = fit_parameters(errors, fit.values, (*BENT, ASPECT), half_m)
+    believed = abs(free.values[ASPECT]) > max(3.0 * free.sd(ASPECT), _LEAST_ASPECT)
+    return free if believed and free.rms_px < _BETTER * fit.rms_px else fit
 
 
-def _moved(p: Array, points: Array) -> Array:
-    return np.asarray(points @ cv2.Rodrigues(p[:3])[0].T + p[3:6])
+def _require_flat(
+    fit: Fit, extent_px: float, markers: Mapping[int, Marker], corners_m: Mapping[int, Array]
+) -> tuple[float, float]:
+    """Root mean square bend at the markers and its standard deviation, in nominal metres; an error if it is too large."""
+    most_px = max(_MOST_RMS_PX, _MOST_RMS_SHARE * extent_px)
+    half_m = half_side(corners_m)
+    at = np.concatenate([corners_m[number] for number in markers]) / half_m
+    terms = np.stack([bend_m(row, at) for row in np.eye(3)], axis=-1)
+    off, off_sd = (float(np.sqrt(np.mean(square))) for square in (
+        (terms @ fit.values[BEND]) ** 2, np.einsum("ni,ij,nj->n", terms, fit.covariance[BEND, BEND], terms)
+    ))  # fmt: skip
+    bend = float(np.abs(fit.values[BEND]).max())
+    if fit.rms_px > most_px or bend > _MOST_BEND * half_m:
+        raise PoorFitError(
+            f"expected markers in one plane within {most_px:.1f} px and a bend below {100 * _MOST_BEND:.0f} % of half a side, got {fit.rms_px:.1f} px and "
+            f"{100 * bend / half_m:.0f} %; is the print bent, is this its .print.json, and the right lens?"
+        )
+    return off, off_sd
 
 
-def _vector(T: Array) -> Array:
-    return np.concatenate([cv2.Rodrigues(np.ascontiguousarray(T[:3, :3]))[0].ravel(), T[:3, 3]])
+def _require_sure(fit: Fit, scale_sd: float, count: int) -> float:
+    """The standard deviation of the distance, as a share of it; an error if direction or lengths are too unsure."""
+    move = fit.values[3:6]
+    distance_sd = float(np.sqrt(move @ fit.covariance[3:6, 3:6] @ move) / (move @ move))
+    if fit.angle_sd_rad > MOST_ANGLE_RAD or max(distance_sd, scale_sd) > MOST_SHARE:
+        raise DegenerateDataError(
+            f"expected markers that give the direction within {np.degrees(MOST_ANGLE_RAD):.1f} degrees and lengths within {100 * MOST_SHARE:.1f} %, got "
+            f"{np.degrees(fit.angle_sd_rad):.2f} degrees and {100 * max(distance_sd, scale_sd):.2f} % from {count} markers; go nearer, or uncover more of them"
+        )
+    return distance_sd
 
 
-def _transform(p: Array) -> Array:
-    return make_transform(cv2.Rodrigues(p[:3])[0], p[3:6])
+def _carded(fit: Fit, seen: Seen, card: Seen, pinhole: Pinhole) -> tuple[Fit, float, float]:
+    _require_markers(len(card[0]), len(card[1]), "card")
+    half_m = half_side(seen[1])
+    own = fit_parameters(corner_errors(*card, pinhole), parameters(some_pose(*card, pinhole)), RIGID, half_m)
+    T, T_card = fit.transform, own.transform
+    tilt_rad = float(np.arccos(np.clip(T[:3, 0] @ T_card[:3, 0], -1.0, 1.0)))
+    if tilt_rad > max(_MOST_CARD_TILT_RAD, 4.0 * own.angle_sd_rad):
+        raise PoorFitError(
+            f"expected the card in the plane of the print, got an angle of {np.degrees(tilt_rad):.0f} degrees between them; fix it flat beside the print"
+        )
+    # The card's middle meets the print's plane where its ray does.
+    T_face_from_camera = invert_transform(T)
+    ray = T_face_from_camera[:3, :3] @ T_card[:3, 3]
+    reach = -T_face_from_camera[0, 3] / ray[0]
+    y, z = (T_face_from_camera[:3, 3] + reach * ray)[1:]
+    turned = T_face_from_camera[:3, :3] @ T_card[:3, 1]
+    start = np.concatenate([fit.values, [y, z, np.arctan2(turned[2], turned[1]), np.log(reach), 0.0]])
+    free = (*BENT, *range(COUNT, COUNT + 5))
+    joint = fit_parameters(_with_card(seen, card, pinhole), start, free, half_m)
+    return joint, float(np.exp(-joint.values[COUNT + 3])), joint.sd(COUNT + 3)
+
+
+def _with_card(seen: Seen, card: Seen, pinhole: Pinhole) -> Errors:
+    """Errors with a card in the print's plane, over five more parameters: its place y, z, its turn, the logarithm of its size, its growth."""
+    own = corner_errors(*seen, pinhole)
+    points = np.stack([card[1][number] for number in card[0]])
+    pixels = np.stack([each.pixels for each in card[0].values()])
+    middles = points.mean(axis=1, keepdims=True)
+
+    def errors(p: Array) -> Array:
+        y, z, turn, log_size, growth = p[COUNT:]
+        c, s = np.cos(turn), np.sin(turn)
+        grown = np.exp(log_size) * (middles + (1.0 + growth) * (points - middles))
+        laid = grown @ np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]).T + [0.0, y, z]
+        return np.concatenate([own(p), pinhole.project(moved(p, laid)) - pixels])
+
+    return errors

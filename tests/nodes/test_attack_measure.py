@@ -78,7 +78,7 @@ def test_a_photograph_gives_pose_and_colours_and_with_one_length_the_size(call, 
     )
     code, said = call(*command)
     assert code == 0
-    assert "8 of 8" in said
+    assert "12 of 12" in said
     assert "unknown: one photograph gives the pose in units of the nominal size" in said
     found = json.loads((folder / "photo.measured.json").read_text())
     assert found["size_m"] is None
@@ -154,7 +154,7 @@ def test_damaged_and_irrelevant_files_are_refused_in_one_line(call, folder, chan
     )
     code, said = call(*command)
     assert code == 2
-    assert "found none of its 8 markers" in said
+    assert "found none of its 12 markers" in said
     change(folder)
     code, said = call(*command)
     assert code == 2

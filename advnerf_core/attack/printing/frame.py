@@ -21,7 +21,7 @@ SET_SIZE, SETS = 16, 36  # numbers of one print, and how many prints have number
 CHART_SET = SETS - 1
 _QUIET_CELLS = 1.5  # white around a marker
 _SHARE, _LEAST_M, _LARGEST_M = 0.12, 0.02, 0.15  # of the picture's shorter side
-_SPACING = 6.0  # of markers along an edge, in their sides
+_SPACING = 4.0  # of markers along an edge, in their sides
 _MOST_BETWEEN = 3
 
 Rgb = NDArray[np.uint8]
