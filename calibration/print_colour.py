@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from advnerf_core.attack.printing.frame import CELLS
+from advnerf_core.attack.printing.poster import MM_PER_M, Printable
 from advnerf_core.geometry import Array, transform_points
 from calibration.degeneracy import DegenerateDataError
 from calibration.print_markers import linear
@@ -26,6 +27,7 @@ _CLIPPED, _MOST_CLIPPED = 252, 0.2
 _LEAST_WHITE, _LEAST_RATIO = 0.02, 2.0  # of linear light; of white to black
 _MOST_UNEVEN = 0.5
 _MOST_HIDDEN, _FAR = 0.5, 64.0
+_CELLS, _FINER = 96, 4  # of the found print along a side, and samples along a side of a cell
 _LONGEST_ROW = 2**14  # of OpenCV's remap
 
 
@@ -119,12 +121,6 @@ def picture_points(picture_m: tuple[float, float], rows: int, columns: int) -> A
     return np.stack([np.zeros_like(across), across, up], axis=-1)
 
 
-def reflectance(seen: Array, light: Light, points_m: Array) -> Array:
-    """sRGB colours ``[..., 3]`` in 0..255 as in even white light, with white paper white and black ink black, of seen ones ``[..., 3]``."""
-    share = linear(seen) / np.maximum(light.white_at(points_m), 1e-6)
-    return encoded(np.clip((share - light.black) / (1.0 - light.black), 0.0, 1.0))
-
-
 def evenly_lit(seen: Array, light: Light, points_m: Array) -> Array:
     """sRGB colours ``[..., 3]`` in 0..255 as seen under the light of the print's middle, of seen ones ``[..., 3]``."""
     middle = light.white_at(np.zeros(3))
@@ -179,18 +175,20 @@ def patch_colours(
 
 @dataclass(frozen=True, eq=False)
 class PrintColours:
-    """The picture of a print, as photographed. Parts that the photograph does not show have the nominal texture, in its light.
+    """A print with its border, as photographed. Parts that the photograph does not show are nominal, in its light.
 
     Attributes:
+        nominal: What was printed ``[n, n, 3]`` uint8.
         seen: As the camera saw it ``[n, n, 3]`` uint8.
-        unlit: In even white light, see `reflectance` ``[n, n, 3]`` uint8.
-        rms: Root mean square difference of ``unlit`` to the nominal texture, in 0..255.
+        unlit: In even white light, in which paper is white ``[n, n, 3]`` uint8.
+        rms: Root mean square difference of the picture to the nominal texture, in 0..255, in light in which ink is black too.
         mean: Mean difference of each channel ``[3]``.
-        far_share: Share of cells that are off by more than a quarter of full scale, such as covered ones.
-        seen_share: Share of the picture that the photograph shows.
+        far_share: Share of the picture that is off by more than a quarter of full scale, such as covered parts.
+        seen_share: Share of the print that the photograph shows.
         uneven: See `Light`.
     """
 
+    nominal: Rgb
     seen: Rgb
     unlit: Rgb
     rms: float
@@ -201,47 +199,43 @@ class PrintColours:
 
 
 def print_colours(
-    rgb: Rgb,
-    lens: Intrinsics,
-    T_camera_from_face: Array,
-    nominal: Rgb,
-    picture_m: tuple[float, float],
-    corners_m: Mapping[int, Array],
-    cells: int = 64,
+    rgb: Rgb, lens: Intrinsics, T_camera_from_face: Array, sheet: Printable, corners_m: Mapping[int, Array]
 ) -> PrintColours:
-    """The picture of a print in a photograph, and its difference to the nominal texture ``[H, W, 3]``.
+    """The colours of a print in a photograph, and their difference to what was printed.
 
     Args:
         rgb: The photograph ``[H, W, 3]``.
         lens: Its lens.
         T_camera_from_face: Pose ``[4, 4]`` of the print in nominal units.
-        nominal: The texture that was printed.
-        picture_m: Nominal width and height of the picture [m].
+        sheet: What was printed.
         corners_m: Nominal corners ``[4, 3]`` of each seen marker by number [m].
-        cells: Cells along each side of the found picture.
 
     Raises:
-        DegenerateDataError: The exposure does not show colours.
+        DegenerateDataError: The exposure does not show colours, or too much is outside the photograph.
     """
     light = light_on(rgb, lens, T_camera_from_face, list(corners_m.values()))
-    finer = 4
-    points = picture_points(picture_m, cells * finer, cells * finer)
+    width_mm, height_mm = sheet.sheet_mm
+    fine = _CELLS * _FINER
+    points = picture_points((width_mm / MM_PER_M, height_mm / MM_PER_M), fine, fine)
     raw = sampled(rgb, lens, T_camera_from_face, points)
-    wanted = cv2.resize(nominal, (cells, cells), interpolation=cv2.INTER_AREA).astype(np.float64)
-    hidden = np.asarray(~np.isfinite(_coarse(raw, finer)).all(axis=-1), np.bool_)
+    printed = sheet.pixels((0.0, 0.0, width_mm, height_mm), (fine, fine))
+    wanted, seen = _coarse(printed), _coarse(raw)
+    hidden = np.asarray(~np.isfinite(seen).all(axis=-1), np.bool_)
     if hidden.mean() > _MOST_HIDDEN:
         raise DegenerateDataError(
-            f"expected at least {100 * (1 - _MOST_HIDDEN):.0f} % of the picture in the photograph, got {100 * (1 - hidden.mean()):.0f} %; go back"
+            f"expected at least {100 * (1 - _MOST_HIDDEN):.0f} % of the print in the photograph, got {100 * (1 - hidden.mean()):.0f} %; go back"
         )
-    middles = picture_points(picture_m, cells, cells)
-    ink = light.black + (1.0 - light.black) * linear(wanted)
-    seen = np.where(hidden[..., None], encoded(ink * light.white_at(middles)), _coarse(raw, finer))
-    unlit = np.where(hidden[..., None], wanted, _coarse(reflectance(raw, light, points), finer))
-    off = (unlit - wanted)[~hidden]
+    inside = (np.abs(points[..., 1:]) < 0.5 * np.array(sheet.size_m)).all(axis=-1) & np.isfinite(raw).all(
+        axis=-1
+    )
+    off = (_in_white(raw, light, points, light.black) - printed)[inside]
+    ink = light.black + (1.0 - light.black) * linear(printed)
+    as_lit = _coarse(encoded(ink * light.white_at(points)))
     red, green, blue = off.mean(axis=0)
     return PrintColours(
-        _whole(seen),
-        _whole(unlit),
+        _whole(wanted),
+        _whole(np.where(hidden[..., None], as_lit, seen)),
+        _whole(np.where(hidden[..., None], wanted, _coarse(_in_white(raw, light, points, 0.0)))),
         float(np.sqrt(np.mean(off**2))),
         (float(red), float(green), float(blue)),
         float((np.abs(off).max(axis=-1) > _FAR).mean()),
@@ -250,13 +244,19 @@ def print_colours(
     )
 
 
+def _in_white(seen: Array, light: Light, points_m: Array, black: Array | float) -> Array:
+    """sRGB colours ``[..., 3]`` in 0..255 in light in which paper is white, and what is as dark as ``black`` is black."""
+    share = linear(seen) / np.maximum(light.white_at(points_m), 1e-6)
+    return encoded(np.clip((share - black) / (1.0 - black), 0.0, 1.0))
+
+
 def _whole(colours: Array) -> Rgb:
     return np.round(np.clip(colours, 0.0, 255.0)).astype(np.uint8)
 
 
-def _coarse(fine: Array, times: int) -> Array:
-    cells = len(fine) // times
-    return np.asarray(fine.reshape(cells, times, cells, times, 3).mean(axis=(1, 3)))
+def _coarse(fine: ArrayLike) -> Array:
+    parts = np.asarray(fine, np.float64).reshape(_CELLS, _FINER, _CELLS, _FINER, 3)
+    return np.asarray(parts.mean(axis=(1, 3)))
 
 
 def _ring(corners: Array, share: float) -> Array:

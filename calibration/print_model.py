@@ -31,7 +31,7 @@ Errors = Callable[[Array], Array]
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class PrintFit:
     """Fitted parameters.
 
     Attributes:
@@ -99,7 +99,7 @@ def bend_m(bend: Array, shares: Array) -> Array:
     return np.asarray(bend[0] * (y * y - 1.0 / 3.0) + bend[1] * y * z + bend[2] * (z * z - 1.0 / 3.0))
 
 
-def fit_parameters(errors: Errors, start: Array, free: Sequence[int], half_m: float) -> Fit:
+def fit_parameters(errors: Errors, start: Array, free: Sequence[int], half_m: float) -> PrintFit:
     """Least squares over the free parameters; a free bend has its prior.
 
     Args:
@@ -126,7 +126,7 @@ def fit_parameters(errors: Errors, start: Array, free: Sequence[int], half_m: fl
     variance = max(float(corners @ corners) / max(1, corners.size - len(chosen)), LEAST_NOISE_PX**2)
     covariance = np.zeros((len(start), len(start)))
     covariance[np.ix_(chosen, chosen)] = variance * CORRELATED**2 * np.linalg.pinv(found.jac.T @ found.jac)
-    return Fit(complete(found.x), covariance, corners.reshape(shape), float(found.fun @ found.fun))
+    return PrintFit(complete(found.x), covariance, corners.reshape(shape), float(found.fun @ found.fun))
 
 
 def moved(p: Array, points: Array) -> Array:

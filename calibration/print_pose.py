@@ -25,7 +25,7 @@ from calibration.print_model import (
     LEAST_NOISE_PX,
     RIGID,
     Errors,
-    Fit,
+    PrintFit,
     bend_m,
     corner_errors,
     fit_parameters,
@@ -153,7 +153,7 @@ def _require_markers(seen: int, printed: int, what: str) -> None:
         )
 
 
-def _fits(seen: Seen, pinhole: Pinhole) -> list[Fit]:
+def _fits(seen: Seen, pinhole: Pinhole) -> list[PrintFit]:
     """All poses that explain the corners, the best first."""
     markers, corners_m = seen
     points = np.concatenate([corners_m[number] for number in markers])
@@ -175,7 +175,7 @@ def _fits(seen: Seen, pinhole: Pinhole) -> list[Fit]:
     return sorted(found, key=lambda each: each.cost)
 
 
-def _only_pose(seen: Seen, pinhole: Pinhole) -> Fit:
+def _only_pose(seen: Seen, pinhole: Pinhole) -> PrintFit:
     """The pose that explains the corners; an error if two do so about equally well."""
     best, *others = _fits(seen, pinhole)
     for other in others:
@@ -196,7 +196,7 @@ def _worst(errors_px: Array, numbers: list[int]) -> int | None:
     return numbers[index] if each[index] > limit else None
 
 
-def _with_aspect(fit: Fit, seen: Seen, pinhole: Pinhole) -> Fit:
+def _with_aspect(fit: PrintFit, seen: Seen, pinhole: Pinhole) -> PrintFit:
     """The fit with a free width over height, where the photograph tells its ratio from the nominal one."""
     errors, half_m = corner_errors(*seen, pinhole), half_side(seen[1])
     free = fit_parameters(errors, fit.values, (*BENT, ASPECT), half_m)
@@ -205,7 +205,7 @@ def _with_aspect(fit: Fit, seen: Seen, pinhole: Pinhole) -> Fit:
 
 
 def _require_flat(
-    fit: Fit, extent_px: float, markers: Mapping[int, Marker], corners_m: Mapping[int, Array]
+    fit: PrintFit, extent_px: float, markers: Mapping[int, Marker], corners_m: Mapping[int, Array]
 ) -> tuple[float, float]:
     """Root mean square bend at the markers and its standard deviation, in nominal metres; an error if it is too large."""
     most_px = max(_MOST_RMS_PX, _MOST_RMS_SHARE * extent_px)
@@ -224,7 +224,7 @@ def _require_flat(
     return off, off_sd
 
 
-def _require_sure(fit: Fit, scale_sd: float, count: int) -> float:
+def _require_sure(fit: PrintFit, scale_sd: float, count: int) -> float:
     """The standard deviation of the distance, as a share of it; an error if direction or lengths are too unsure."""
     move = fit.values[3:6]
     distance_sd = float(np.sqrt(move @ fit.covariance[3:6, 3:6] @ move) / (move @ move))
@@ -236,7 +236,7 @@ def _require_sure(fit: Fit, scale_sd: float, count: int) -> float:
     return distance_sd
 
 
-def _carded(fit: Fit, seen: Seen, card: Seen, pinhole: Pinhole) -> tuple[Fit, float, float]:
+def _carded(fit: PrintFit, seen: Seen, card: Seen, pinhole: Pinhole) -> tuple[PrintFit, float, float]:
     _require_markers(len(card[0]), len(card[1]), "card")
     half_m = half_side(seen[1])
     own = fit_parameters(corner_errors(*card, pinhole), parameters(some_pose(*card, pinhole)), RIGID, half_m)

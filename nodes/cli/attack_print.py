@@ -11,6 +11,7 @@ from nodes.runtime.terminal import print_table, table
 
 if TYPE_CHECKING:
     from advnerf_core.attack.artifact import AttackFile
+    from advnerf_core.attack.printing.record import PrintRecord
     from nodes.experiment.node.print_effect import PrintEffect
     from nodes.lab.wizards.prints import MeasuredPrint
 
@@ -145,7 +146,7 @@ def attack_measure(
     print_table(rows)
     effect = None
     if request is not None:
-        effect = _effect(request, attack, record.object, found)
+        effect = _effect(request, attack, record, found)
         print(effect.text)
     target = output or source.with_name(f"{source.stem}.measured.json")
     print(f"written: {', '.join(map(str, write_measured(found, effect, target)))}")
@@ -165,7 +166,7 @@ def _pose(text: str | None) -> tuple[float, float, float] | None:
     return x_m, y_m, yaw_rad
 
 
-def _effect(request: Path, attack: AttackFile, name: str, found: MeasuredPrint) -> PrintEffect:
+def _effect(request: Path, attack: AttackFile, record: PrintRecord, found: MeasuredPrint) -> PrintEffect:
     from nodes.experiment.node.prepare import load_request
     from nodes.experiment.node.print_effect import print_effect
     from nodes.lab.plugin_tables import say_code
@@ -173,8 +174,11 @@ def _effect(request: Path, attack: AttackFile, name: str, found: MeasuredPrint) 
     experiment = load_request(request)
     say_code(experiment.config.model_dump(mode="json"), request.parent)
     measurement = found.measurement
-    pose = measurement.T_world_from_face
-    return print_effect(experiment, attack, name, found.texture, measurement.scale, pose)
+    (width_m, height_m), (w, h) = record.sheet_m, record.picture_m
+    scale = measurement.scale * (width_m * height_m / (w * h)) ** 0.5  # it hangs with its border
+    return print_effect(
+        experiment, attack, record.object, found.texture, scale, measurement.T_world_from_face
+    )
 
 
 def add_to(app: typer.Typer) -> None:

@@ -84,9 +84,9 @@ def test_a_photograph_gives_pose_and_colours_and_with_one_length_the_size(call, 
     assert found["size_m"] is None
     assert np.array(found["T_camera_from_face"]) == pytest.approx(nominal, abs=0.003)
     assert found["colours"]["rms"] < 8.0  # of 255: the light is removed
-    assert found["colours"]["far_share"] < 0.002
+    assert found["colours"]["far_share"] < 0.01
     assert found["colours"]["uneven"] > 0.1
-    assert cv2.imread(str(folder / "photo.measured.png")).shape == (256, 768, 3)
+    assert cv2.imread(str(folder / "photo.measured.png")).shape == (384, 1152, 3)
     code, said = call(*command, "--distance", float(np.linalg.norm(T[:3, 3])), "-o", folder / "m.json")
     assert code == 0
     found = json.loads((folder / "m.json").read_text())

@@ -50,6 +50,12 @@ class PrintRecord(PlainData):
     object: str = ""
     patches: Numbers | None = None
 
+    @property
+    def frame(self) -> MarkerFrame:
+        """The markers around the picture."""
+        first = min(self.markers)
+        return MarkerFrame(self.picture_m, float(np.ptp(self.markers[first][:, 1])), first)
+
     def __post_init__(self) -> None:
         sizes = np.array([*self.picture_m, *self.sheet_m])
         if not (np.isfinite(sizes).all() and (sizes > _LEAST_M).all() and (sizes < _LARGEST_M).all()):

@@ -67,8 +67,8 @@ def print_effect(
         request: The attack's request.
         attack: The attack that was printed.
         name: The object whose texture it is.
-        texture: The print as the driving camera sees it, ``[n, n, 3]`` uint8.
-        scale: True size over nominal size.
+        texture: The print with its border as the driving camera sees it, ``[n, n, 3]`` uint8.
+        scale: Its true size with its border over the size of the attack's texture.
         T_world_from_face: Where it hangs ``[4, 4]``; None for the attack's pose.
 
     Raises:

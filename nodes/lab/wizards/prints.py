@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.attack.artifact import AttackFile
-from advnerf_core.attack.printing.poster import PrintError, poster_of
+from advnerf_core.attack.printing.poster import Printable, PrintError, poster_of
 from advnerf_core.attack.printing.record import PrintRecord
 from advnerf_core.data.image_files import write_image
 from advnerf_core.files import write_json
@@ -85,17 +84,15 @@ class MeasuredPrint:
         measurement: Sizes, poses, residuals.
         colours: Its picture; None where the exposure or the view does not show its colours.
         by_car: Whether the driving camera took it, so that the policy sees these colours.
-        nominal: The texture ``[H, W, 3]`` that was printed.
     """
 
     measurement: PrintMeasurement
     colours: PrintColours | None
     by_car: bool
-    nominal: Rgb
 
     @property
     def texture(self) -> Rgb:
-        """What a policy sees of the print ``[n, n, 3]``: as the driving camera saw it; of another camera's picture, without its light.
+        """What a policy sees of the print with its border ``[n, n, 3]``: as the driving camera saw it; of another camera, without its light.
 
         Raises:
             DegenerateDataError: The colours are unknown.
@@ -123,19 +120,19 @@ def measure(
         CalibrationError: The source does not determine the print's pose.
         PrintError: The record is of another print.
     """
-    nominal = nominal_texture(record, attack)
+    sheet = printed_sheet(record, attack)
     if source.is_file() and source.suffix.lower() in PICTURES:
         mounted = None if known.car is None else _camera_with_mount(camera)
-        return _measure_photograph(source, record, nominal, mounted or load_lens(camera), known)
+        return _measure_photograph(source, record, sheet, mounted or load_lens(camera), known)
     if known != KnownLength():
         raise CalibrationError(
             f"expected no --card, --distance, --width or --car with a bag, whose poses give the size, got {source}; leave them out"
         )
-    return _measure_drive(source, record, nominal, _camera_with_mount(camera))
+    return _measure_drive(source, record, sheet, _camera_with_mount(camera))
 
 
 def write_measured(found: MeasuredPrint, effect: PlainData | None, path: Path) -> list[Path]:
-    """Write a measurement as JSON, and beside it the print's picture: nominal, as seen, and in even white light.
+    """Write a measurement as JSON, and beside it pictures of the print: nominal, as seen, and in even white light.
 
     Returns:
         The files.
@@ -145,15 +142,13 @@ def write_measured(found: MeasuredPrint, effect: PlainData | None, path: Path) -
     if found.colours is None:
         return [path]
     picture = path.with_suffix(".png")
-    size = found.colours.seen.shape[1::-1]
-    nominal = cv2.resize(found.nominal, size, interpolation=cv2.INTER_AREA)
-    row = np.concatenate([nominal, found.colours.seen, found.colours.unlit], axis=1)
-    write_image(picture, cv2.resize(row, None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST))
+    row = np.concatenate([found.colours.nominal, found.colours.seen, found.colours.unlit], axis=1)
+    write_image(picture, row.repeat(4, axis=0).repeat(4, axis=1))
     return [path, picture]
 
 
-def nominal_texture(record: PrintRecord, attack: AttackFile) -> Rgb:
-    """The texture ``[H, W, 3]`` of a printed attack.
+def printed_sheet(record: PrintRecord, attack: AttackFile) -> Printable:
+    """The poster of an attack, as its record says.
 
     Raises:
         PrintError: The record is not that of this attack's poster.
@@ -168,11 +163,11 @@ def nominal_texture(record: PrintRecord, attack: AttackFile) -> Rgb:
         )
     number = [each.name for each in attack.objects].index(record.object)
     edge_m = None if attack.objects[number].size_m or attack.face else record.picture_m[0]
-    return poster_of(attack, str(number), edge_m).texture
+    return Printable(poster_of(attack, str(number), edge_m).texture, record.picture_m, record.frame)
 
 
 def _measure_photograph(
-    photo: Path, record: PrintRecord, nominal: Rgb, lens: Intrinsics, known: KnownLength
+    photo: Path, record: PrintRecord, sheet: Printable, lens: Intrinsics, known: KnownLength
 ) -> MeasuredPrint:
     rgb = read_picture(photo)
     _require_size(rgb, lens, photo.name)
@@ -193,10 +188,12 @@ def _measure_photograph(
         _camera_in_world(lens, known),
     )
     by_car = isinstance(lens, CameraCalibration)
-    return _with_colours(found, rgb, lens, pose.T_camera_from_face, record, nominal, pose.seen, by_car)
+    return _with_colours(found, rgb, lens, pose.T_camera_from_face, record, sheet, pose.seen, by_car)
 
 
-def _measure_drive(bag: Path, record: PrintRecord, nominal: Rgb, camera: CameraCalibration) -> MeasuredPrint:
+def _measure_drive(
+    bag: Path, record: PrintRecord, sheet: Printable, camera: CameraCalibration
+) -> MeasuredPrint:
     poses, views, stamps = read_poses(bag, CAR), [], []
     for stamp, rgb in read_frames(bag):
         _require_size(rgb, camera, bag.name)
@@ -213,19 +210,19 @@ def _measure_drive(bag: Path, record: PrintRecord, nominal: Rgb, camera: CameraC
     poses_before = [invert_transform(each.T_world_from_camera) @ placed.T_world_from_face for each in views]
     for T in poses_before:
         T[:3, 3] /= placed.scale  # in nominal units
-    best = _clearest(poses_before, views, camera, record.picture_m)
+    best = _clearest(poses_before, views, camera, record.sheet_m)
     metres_per_px = placed.scale * float(np.linalg.norm(poses_before[best][:3, 3])) / camera.fx
     found = of_drive(bag.name, record.picture_m, len(record.markers), placed, metres_per_px)
     frame = next(rgb for stamp, rgb in read_frames(bag) if stamp == stamps[best])
     seen = tuple(views[best].markers)
-    return _with_colours(found, frame, camera, poses_before[best], record, nominal, seen, True)
+    return _with_colours(found, frame, camera, poses_before[best], record, sheet, seen, True)
 
 
 def _clearest(
-    poses: Sequence[Array], views: Sequence[PrintView], lens: Intrinsics, picture_m: tuple[float, float]
+    poses: Sequence[Array], views: Sequence[PrintView], lens: Intrinsics, sheet_m: tuple[float, float]
 ) -> int:
-    """The view that shows the whole picture with most markers, and largest."""
-    corners = picture_points((2.0 * picture_m[0], 2.0 * picture_m[1]), 2, 2).reshape(-1, 3)
+    """The view that shows the whole print with most markers, and largest."""
+    corners = picture_points((2.0 * sheet_m[0], 2.0 * sheet_m[1]), 2, 2).reshape(-1, 3)
 
     def rank(k: int) -> tuple[bool, int, float]:
         before = transform_points(poses[k], corners)
@@ -252,16 +249,16 @@ def _with_colours(
     lens: Intrinsics,
     T_camera_from_face: Array,
     record: PrintRecord,
-    nominal: Rgb,
+    sheet: Printable,
     seen: tuple[int, ...],
     by_car: bool,
 ) -> MeasuredPrint:
     corners = {number: record.markers[number] for number in seen}
     try:
-        colours = print_colours(rgb, lens, T_camera_from_face, nominal, record.picture_m, corners)
+        colours = print_colours(rgb, lens, T_camera_from_face, sheet, corners)
     except DegenerateDataError as error:
-        return MeasuredPrint(replace(found, colours_unknown=str(error)), None, by_car, nominal)
-    return MeasuredPrint(replace(found, colours=ColourError.of(colours)), colours, by_car, nominal)
+        return MeasuredPrint(replace(found, colours_unknown=str(error)), None, by_car)
+    return MeasuredPrint(replace(found, colours=ColourError.of(colours)), colours, by_car)
 
 
 def _seen(rgb: Rgb, lens: Intrinsics, wanted: Mapping[int, Array]) -> dict[int, Marker]:
