@@ -1,8 +1,10 @@
 """A printer whose inks are known: dots that spread, by Yule, Nielsen and Neugebauer; and the display model that is equal to it."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from advnerf_core.display import DisplayModel
+from advnerf_core.geometry import Array
 
 # Linear sRGB reflectances of paper, of each ink, and of inks on one another: cyan, magenta and yellow, 1 where there is ink.
 INKS = {
@@ -11,18 +13,18 @@ INKS = {
 }  # fmt: skip
 
 
-def printed(rgb):
+def printed(rgb: ArrayLike) -> Array:
     """Linear reflectance ``[..., 3]`` of sRGB colours in 0..1."""
     dots = 1.0 - np.asarray(rgb)
     dots = dots + 0.36 * dots * (1.0 - dots)
-    root = 0.0
+    root = np.zeros_like(dots)
     for inks, reflectance in INKS.items():
         share = np.prod(np.where(inks, dots, 1.0 - dots), axis=-1, keepdims=True)
         root = root + share * np.sqrt(reflectance)
-    return root**2
+    return np.asarray(root**2)
 
 
-def printer_model(levels=17):
+def printer_model(levels: int = 17) -> DisplayModel:
     """The model whose seen colours are `printed` at its levels: the polynomial through the roots of the eight reflectances."""
     bare = 1.0 - np.linspace(0.0, 1.0, levels)
     curve = 1.0 - (bare + 0.36 * bare * (1.0 - bare))
