@@ -162,7 +162,7 @@ QUESTIONS = (
         "other_worlds",
         "What is left of an attack in another world?",
         "Attacks on a panel that the world's own renderer shows, driven by the world's own car, and how well that was predicted.",
-        ("gap", "predictions", "learned_roads", "unseen_roads", "make world"),
+        ("gap", "predictions", "printed", "learned_roads", "unseen_roads", "make world"),
         picture="gap_duckietown_robust_above.webp",
     ),
     Question(
