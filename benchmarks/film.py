@@ -15,7 +15,8 @@ from PIL import Image
 from advnerf_core.files import write_atomically
 from advnerf_core.report.clips import webp
 
-WIDTH_PX, QUALITY = 780, 60
+WIDTH_PX, QUALITY = 780, 40
+_EVERY = 2  # frames, at ten a second
 # Methods in the order of their columns; others come between.
 _ORDER = ("none", "random", "gradient")
 
@@ -62,6 +63,7 @@ def main() -> None:
         print(f"wrote {arguments.picture}: {arguments.picture.stat().st_size / 1024:.0f} KiB")
         return
     frames, shown_ms = frames_of(next((arguments.run_folder / "report").glob("*.mp4")), WIDTH_PX)
+    frames, shown_ms = frames[::_EVERY], _EVERY * shown_ms
     data = webp(frames, shown_ms, QUALITY)
     write_atomically(arguments.picture, data)
     print(f"wrote {arguments.picture}: {len(frames)} frames, {len(data) / 1024:.0f} KiB")
