@@ -227,9 +227,10 @@ def test_glb_files_that_are_no_plain_splat_are_refused(tmp_path):
     refuse(tmp_path, glb_bytes(splats, matrix=np.diag([-1.0, 1.0, 1.0, 1.0])), "scale evenly")
     refuse(
         tmp_path,
-        glb_bytes(splats, lambda tree: primitive(tree)["attributes"].update(POSITION=99)),
+        glb_bytes(splats, lambda tree: primitive(tree)["attributes"].update({f"{KHR}:SCALE": 99})),
         "damaged file .*not there",
     )
+    refuse(tmp_path, glb_bytes(splats, lambda tree: primitive(tree).pop("attributes")), "damaged file")
     refuse(tmp_path, b"glTF", "damaged file")
 
 
