@@ -102,7 +102,7 @@ def attack_measure(
         str | None,
         typer.Option(
             metavar="X,Y,YAW",
-            help="Pose of the car that took the photograph, m and rad: gives the pose in the world.",
+            help="Pose of the car that took the photograph, m and rad: gives the pose in the world, and colours as the policy sees them.",
         ),
     ] = None,
     attack_file: Annotated[

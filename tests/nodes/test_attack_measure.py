@@ -121,6 +121,11 @@ def test_a_chart_beside_it_is_a_card(call, folder):
     assert call(*command, "--card", folder / "chart.print.json", "--width", 0.4)[0] == 2
 
 
+def changed(file, **values):
+    """Change values of a JSON file."""
+    file.write_text(json.dumps(json.loads(file.read_text()) | values))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -135,6 +140,12 @@ def test_a_chart_beside_it_is_a_card(call, folder):
         ),
         (lambda folder: (folder / "p.print.json").write_text("{}"), "written beside the print"),
         (lambda folder: (folder / "p.print.json").write_text("[1"), "written beside the print"),
+        (lambda folder: changed(folder / "p.print.json", picture_m=[0.5, 0.4]), "the file was changed"),
+        (lambda folder: changed(folder / "p.print.json", attack_id="0" * 12), "give its file with --attack"),
+        (
+            lambda folder: changed(folder / "p.print.json", object="car"),
+            "expected an object of face; got 'car'",
+        ),
         (lambda folder: (folder / "lens.yaml").write_text("kind: board\n"), "lens.yaml"),
         (lambda folder: (folder / "a.attack.safetensors").unlink(), "expected an attack file"),
     ],

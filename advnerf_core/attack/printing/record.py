@@ -18,7 +18,7 @@ from advnerf_core.files import write_json
 from advnerf_core.plain import Numbers, PlainData
 
 SUFFIX = ".print.json"
-_LEAST_M, _LARGEST_M = 0.01, 50.0
+_LEAST_M, _LARGEST_M, _SAME_M = 0.01, 50.0, 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +71,15 @@ class PrintRecord(PlainData):
                 )
         if len(self.markers) < 3:
             raise PrintError(f"expected at least 3 markers, got {len(self.markers)}; print it with markers")
+        frame = self.frame
+        same = set(frame.corners_m) == set(self.markers) and all(
+            np.allclose(corners, self.markers[number], atol=_SAME_M)
+            for number, corners in frame.corners_m.items()
+        )
+        if not same or not np.allclose(frame.sheet_m, self.sheet_m, atol=_SAME_M):
+            raise PrintError(
+                "expected markers where the size of picture and sheet puts them, got others: the file was changed"
+            )
         if (self.kind == "chart") != (self.patches is not None):
             raise PrintError("expected patches of a chart, and none of a poster")
         if self.patches is not None and (self.patches.ndim != 3 or self.patches.shape[2] != 3):

@@ -16,6 +16,7 @@ from advnerf_core.data.image_files import write_image
 from advnerf_core.files import write_json
 from advnerf_core.geometry import Array, invert_transform, planar_pose, transform_points
 from advnerf_core.plain import PlainData
+from advnerf_core.plugins import unknown
 from calibration.degeneracy import DegenerateDataError
 from calibration.print_colour import PrintColours, in_picture, picture_points, print_colours
 from calibration.print_drive import PrintView, place_print
@@ -161,7 +162,10 @@ def printed_sheet(record: PrintRecord, attack: AttackFile) -> Printable:
         raise PrintError(
             f"expected attack {record.attack_id}, which was printed, got {attack.attack_id}; give its file with --attack"
         )
-    number = [each.name for each in attack.objects].index(record.object)
+    names = [each.name for each in attack.objects]
+    if record.object not in names:
+        raise PrintError(unknown(record.object, "object", names))
+    number = names.index(record.object)
     edge_m = None if attack.objects[number].size_m or attack.face else record.picture_m[0]
     return Printable(poster_of(attack, str(number), edge_m).texture, record.picture_m, record.frame)
 
