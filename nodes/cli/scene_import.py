@@ -353,7 +353,7 @@ def _print_report(imported: Imported) -> None:
 
 
 def _print_model(model: dict[str, Any]) -> None:
-    rows = table("camera", "images", "lens", "focal length [px]", "k1, k2, p1, p2")
+    rows = table("camera", "images", "lens", "focal length [px]", "distortion")
     for camera, found in model["cameras"].items():
         focal = f"{found['fl_x']:.1f}" + (f", {found['fl_y']:.1f}" if found["fl_y"] != found["fl_x"] else "")
         error = f" +- {found['focal_error_percent']:.1f} %" if found["focal_error_percent"] else ""
