@@ -107,7 +107,7 @@ def experiment_data(question: AuditedQuestion) -> dict[str, Any]:
         "carrier": {"kind": "composed"},
         "space": {"kind": "colours", "cells": 8},
         "deploy": {"through": "world" if place.is_driven else "nothing"},
-        "measure": {"starts": question.selection, "seed": SELECTION_SEED},
+        "measure": {"starts": question.selection, "seed": SELECTION_SEED, "scene": "baked"},
         "retrain": None,
         "reference": None,
         "gate": None,  # the audit judges the scene itself, and reports the result

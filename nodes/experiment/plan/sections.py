@@ -209,6 +209,10 @@ class MeasureConfig(StrictModel):
 
     starts: Positive = Field(default=5, description="Starts, none of which a search had.")
     seed: int = Field(default=10_000, description="Of the starts.")
+    scene: Literal["field", "baked"] = Field(
+        default="field",
+        description="The learned scene of the drives: the field itself, or the baked one that searches use, several times as fast.",
+    )
 
 
 class ResponseConfig(StrictModel):

@@ -188,11 +188,15 @@ def past(problem: AttackProblem, space: Space, shown: Shown) -> AttackProblem:
 
 
 def past_field(experiment: Experiment, problem: AttackProblem, space: Space, shown: Shown) -> AttackProblem:
-    """`past` in the learned scene itself, if searches use the baked one: finished attacks are judged by it."""
+    """`past` in the learned scene itself, if searches use the baked one: finished attacks are measured in it, if not asked otherwise."""
     seen = shown.seen_by(space.surrogate)
-    if not over_the_world(experiment):
+    if _measured_in_field(experiment):
         seen = seen.with_background(load_field(experiment))
     return replace(problem, sensor=seen)
+
+
+def _measured_in_field(experiment: Experiment) -> bool:
+    return experiment.config.measure.scene == "field" and not over_the_world(experiment)
 
 
 def load_shown(space: Space, folder: Path, cell: Cell) -> Shown:
@@ -294,7 +298,7 @@ def attack_file(
         )
         total_m = float(found.protocol_cte_m.mean())
         attack = replace(attack, predicted_total_cte_m=total_m, extra=attack.extra | entry)
-    if not baked_file(experiment).exists() or over_the_world(experiment):
+    if not _measured_in_field(experiment) or not baked_file(experiment).exists():
         return attack
     _, totals_m = evaluate(past_field(experiment, problem.undisturbed(), space, shown), shown.colours)
     return replace(attack, field_total_cte_m=float(totals_m.protocol_cte_m.mean()))

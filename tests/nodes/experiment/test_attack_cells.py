@@ -240,6 +240,16 @@ def test_a_search_bears_what_it_is_asked_to_and_is_measured_undisturbed(fresh: E
         run.load_experiment(junction, "demo", wrong, fresh.folder / "x")
 
 
+def test_drives_are_measured_in_the_field_or_as_searches_see_it(fresh: Experiment) -> None:
+    baked = changed(fresh, "measure", scene="baked")
+    space, control = colour_space(fresh), replace(GRADIENT, method="none")
+    problem = attack.attack_problem(fresh, space, load_victim(fresh, control.victim), "right", 0)
+    searched = attack.past(problem, space, space.plain).sensor.background
+    assert attack.past_field(baked, problem, space, space.plain).sensor.background is searched
+    assert attack.past_field(fresh, problem, space, space.plain).sensor.background is not searched
+    assert cell_settings(baked, control) != cell_settings(fresh, control)
+
+
 def test_cells_that_differ_in_their_deployment_alone_share_one_search(fresh: Experiment) -> None:
     folder = fresh.folder / "together"
     first = search_cell(fresh, GRADIENT, folder / "ideal", silent)
