@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from advnerf_core.attack.printing.frame import CELLS
 from advnerf_core.attack.printing.poster import MM_PER_M, Printable
 from advnerf_core.geometry import Array, transform_points
+from advnerf_core.scene.colour import fit_colour_map
 from calibration.degeneracy import DegenerateDataError
 from calibration.print_markers import linear
 from calibration.schema import Intrinsics
@@ -175,7 +176,7 @@ def patch_colours(
 
 @dataclass(frozen=True, eq=False)
 class PrintColours:
-    """A print with its border, as photographed. Parts that the photograph does not show are nominal, in its light.
+    """A print with its border, as photographed. Parts that the photograph does not show have the nominal colours, changed as those of the others are.
 
     Attributes:
         nominal: What was printed ``[n, n, 3]`` uint8.
@@ -229,19 +230,26 @@ def print_colours(
         axis=-1
     )
     off = (_in_white(raw, light, points, light.black) - printed)[inside]
-    ink = light.black + (1.0 - light.black) * linear(printed)
-    as_lit = _coarse(encoded(ink * light.white_at(points)))
+    unlit = _coarse(_in_white(raw, light, points, 0.0))
     red, green, blue = off.mean(axis=0)
     return PrintColours(
         _whole(wanted),
-        _whole(np.where(hidden[..., None], as_lit, seen)),
-        _whole(np.where(hidden[..., None], wanted, _coarse(_in_white(raw, light, points, 0.0)))),
+        _whole(_completed(seen, wanted, hidden)),
+        _whole(_completed(unlit, wanted, hidden)),
         float(np.sqrt(np.mean(off**2))),
         (float(red), float(green), float(blue)),
         float((np.abs(off).max(axis=-1) > _FAR).mean()),
         float(1.0 - hidden.mean()),
         light.uneven,
     )
+
+
+def _completed(found: Array, wanted: Array, hidden: NDArray[np.bool_]) -> Array:
+    """Found colours ``[n, n, 3]``; where they are hidden, nominal ones as the map from nominal to found colours elsewhere changes them."""
+    if not hidden.any():
+        return found
+    colours = fit_colour_map(wanted[~hidden] / 255.0, found[~hidden] / 255.0)
+    return np.where(hidden[..., None], 255.0 * colours.apply((wanted / 255.0).astype(np.float32)), found)
 
 
 def _in_white(seen: Array, light: Light, points_m: Array, black: Array | float) -> Array:

@@ -149,7 +149,9 @@ class PrintMeasurement(PlainData):
         text += f"; {100 * found.far_share:.0f} % far off: covered?" if found.far_share > 0.02 else ""
         hidden = 1.0 - found.seen_share
         return text + (
-            f"; {100 * hidden:.0f} % outside the picture, taken as nominal" if hidden > 0.0 else ""
+            f"; {100 * hidden:.0f} % outside the picture, taken from the nominal texture"
+            if hidden > 0.0
+            else ""
         )
 
 
