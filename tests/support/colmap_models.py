@@ -1,9 +1,12 @@
 """COLMAP models that pycolmap itself writes, and images that fit them."""
 
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 WIDTH, HEIGHT = 64, 48
 # Parameters of every camera model for images of 64 x 48 pixels.
@@ -31,14 +34,20 @@ OTHER_CAMERAS = {
 }
 
 
-def camera(name="SIMPLE_RADIAL", params=None):
+def camera(name: str = "SIMPLE_RADIAL", params: Sequence[float] | None = None) -> Any:
     import pycolmap
 
     params = CAMERAS[name] if params is None else params
     return pycolmap.Camera(model=name, width=WIDTH, height=HEIGHT, params=params, camera_id=1)
 
 
-def synthetic(frames=5, per_rig=1, name="SIMPLE_RADIAL", params=None, seed=0):
+def synthetic(
+    frames: int = 5,
+    per_rig: int = 1,
+    name: str = "SIMPLE_RADIAL",
+    params: Sequence[float] | None = None,
+    seed: int = 0,
+) -> Any:
     """A model that pycolmap made up: cameras on a sphere around points."""
     import pycolmap
 
@@ -51,7 +60,9 @@ def synthetic(frames=5, per_rig=1, name="SIMPLE_RADIAL", params=None, seed=0):
     return pycolmap.synthesize_dataset(options)
 
 
-def posed(poses, names, points=()):
+def posed(
+    poses: Sequence[NDArray[np.float64]], names: Sequence[str], points: Sequence[ArrayLike] = ()
+) -> Any:
     """A model of one camera with poses ``T_world_from_camera`` and points that the first three images see."""
     import pycolmap
 
@@ -67,7 +78,7 @@ def posed(poses, names, points=()):
     return model
 
 
-def write(model, folder: Path, text=False, rigs=True) -> Path:
+def write(model: Any, folder: Path, text: bool = False, rigs: bool = True) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     model.write_text(folder) if text else model.write_binary(folder)
     if not rigs:  # as COLMAP wrote models before version 3.12
@@ -76,7 +87,7 @@ def write(model, folder: Path, text=False, rigs=True) -> Path:
     return folder
 
 
-def write_images(folder: Path, names, size=(WIDTH, HEIGHT)) -> Path:
+def write_images(folder: Path, names: Iterable[str], size: tuple[int, int] = (WIDTH, HEIGHT)) -> Path:
     for number, name in enumerate(names):
         pixels = np.random.default_rng(number).integers(0, 256, (size[1], size[0], 3), np.uint8)
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -84,7 +95,7 @@ def write_images(folder: Path, names, size=(WIDTH, HEIGHT)) -> Path:
     return folder
 
 
-def poses_by_name(model):
+def poses_by_name(model: Any) -> dict[str, NDArray[np.float64]]:
     """``T_world_from_camera`` by image name, as pycolmap says."""
     found = {}
     for image in model.images.values():

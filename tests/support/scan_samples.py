@@ -3,10 +3,13 @@
 import json
 import math
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 WIDTH, HEIGHT = 64, 48
@@ -14,10 +17,11 @@ COUNT = 8
 K = np.array([[50.0, 0.0, 31.5], [0.0, 51.0, 24.5], [0.0, 0.0, 1.0]])  # pixel centres at +0.5
 BROWN = (-0.1, 0.02, 0.001, -0.002)
 FISHEYE = (0.01, -0.002, 0.001, 0.0005)
+Array = NDArray[np.float64]
 RATE_HZ, START_NS = 20, 1403636579763555584
 
 
-def camera_at(time_s):
+def camera_at(time_s: float) -> Array:
     """``T_world_from_camera`` of a camera that walks around the origin, 1.5 m above the ground, x right, y down, z forward."""
     angle = 0.9 * time_s
     position = np.array([3.0 * math.cos(angle), 2.0 * math.sin(angle), 1.5 + 0.1 * math.sin(2.0 * angle)])
@@ -36,27 +40,27 @@ TRUTH = [camera_at(time_s) for time_s in TIMES_S]
 Y_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 
 
-def opengl(T):
+def opengl(T: Array) -> Array:
     """The same camera with x right, y up, z backward."""
     return np.column_stack([T[:, 0], -T[:, 1], -T[:, 2], T[:, 3]])
 
 
-def arkit(T):
+def arkit(T: Array) -> Array:
     moved = T.copy()
     moved[:3, 3] -= TRUTH[0][:3, 3]
     return Y_UP @ opengl(moved)
 
 
-def picture(number, size=(WIDTH, HEIGHT)):
+def picture(number: int, size: tuple[int, int] = (WIDTH, HEIGHT)) -> NDArray[np.uint8]:
     return np.random.default_rng(number).integers(0, 256, (size[1], size[0], 3), np.uint8)
 
 
-def write_image(file, number, size=(WIDTH, HEIGHT)):
+def write_image(file: Path, number: int, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(file), picture(number, size))
 
 
-def depth_of_floor(T, width, height):
+def depth_of_floor(T: Array, width: int, height: int) -> Array:
     """Planar depth [m] of the floor z = 0; 0 where the camera sees none."""
     scale = np.array([width / WIDTH, height / HEIGHT])
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
@@ -67,7 +71,7 @@ def depth_of_floor(T, width, height):
     return np.where(down < -1e-3, -T[2, 3] / np.minimum(down, -1e-3), 0.0)
 
 
-def polycam(folder, corrected=True, depth=True):
+def polycam(folder: Path, corrected: bool = True, depth: bool = True) -> Path:
     keyframes, prefix = folder / "keyframes", "corrected_" if corrected else ""
     for number, T in enumerate(TRUTH):
         name = f"{9876543 + 800_000 * number}"
@@ -87,10 +91,10 @@ def polycam(folder, corrected=True, depth=True):
     return folder
 
 
-def record3d(file, packed=True, each=False):
+def record3d(file: Path, packed: bool = True, each: bool = False) -> Path:
     relative = [np.linalg.inv(opengl(TRUTH[0])) @ opengl(T) for T in TRUTH]
     poses = [[*Rotation.from_matrix(T[:3, :3]).as_quat(), *T[:3, 3]] for T in relative]
-    metadata = {
+    metadata: dict[str, Any] = {
         "w": WIDTH, "h": HEIGHT, "dw": 16, "dh": 12, "fps": 60, "K": K.T.ravel().tolist(), "poses": poses,
         "initPose": [0, 0, 0, 1, 0, 0, 0], "frameTimestamps": TIMES_S.tolist(),
     }  # fmt: skip
@@ -114,7 +118,7 @@ def record3d(file, packed=True, each=False):
     return file
 
 
-def llff(folder, factor=1, unit=0.2):
+def llff(folder: Path, factor: int = 1, unit: float = 0.2) -> Path:
     """Poses in COLMAP's world: any rotation, any unit; the principal point is the centre."""
     turned = np.eye(4)
     turned[:3, :3] = Rotation.from_euler("xyz", [0.9, 0.4, -2.0]).as_matrix()
@@ -130,7 +134,12 @@ def llff(folder, factor=1, unit=0.2):
     return folder
 
 
-def euroc(folder, fisheye=False, cameras=("cam0", "cam1"), tracked="state_groundtruth_estimate0"):
+def euroc(
+    folder: Path,
+    fisheye: bool = False,
+    cameras: tuple[str, ...] = ("cam0", "cam1"),
+    tracked: str = "state_groundtruth_estimate0",
+) -> Path:
     T_BS = np.eye(4)
     T_BS[:3, :3] = Rotation.from_euler("zyx", [1.5, 0.1, -0.2]).as_matrix()
     T_BS[:3, 3] = [-0.02, -0.06, 0.01]
@@ -170,7 +179,7 @@ def euroc(folder, fisheye=False, cameras=("cam0", "cam1"), tracked="state_ground
     return folder
 
 
-def tum(folder, listed=True, depth=False):
+def tum(folder: Path, listed: bool = True, depth: bool = False) -> Path:
     start_s = 1305031102.175304
     folder.mkdir(parents=True, exist_ok=True)
     rows = ["# ground truth trajectory", "# file: 'a.bag'", "# timestamp tx ty tz qx qy qz qw"]
@@ -198,7 +207,7 @@ def tum(folder, listed=True, depth=False):
     return folder
 
 
-def nerfstudio(folder, fisheye=False, unit=0.2, masks=False):
+def nerfstudio(folder: Path, fisheye: bool = False, unit: float = 0.2, masks: bool = False) -> Path:
     """As ``ns-process-data`` writes it: COLMAP's world with x and y swapped and z turned, ``transforms.json`` and ``dataparser_transforms.json``."""
     applied = np.array([[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]])
     turned = np.eye(4)
@@ -209,7 +218,11 @@ def nerfstudio(folder, fisheye=False, unit=0.2, masks=False):
         moved[:3, 3] *= unit
         name = f"images/frame_{number + 1:05d}.png"
         write_image(folder / name, number)
-        frame = {"file_path": name, "transform_matrix": moved.tolist(), "colmap_im_id": number + 1}
+        frame: dict[str, Any] = {
+            "file_path": name,
+            "transform_matrix": moved.tolist(),
+            "colmap_im_id": number + 1,
+        }
         if masks:
             frame["mask_path"] = f"masks/frame_{number + 1:05d}.png"
             (folder / "masks").mkdir(exist_ok=True)
@@ -226,7 +239,7 @@ def nerfstudio(folder, fisheye=False, unit=0.2, masks=False):
     )
     lens = {"w": WIDTH, "h": HEIGHT, "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], **k}
     names = [frame["file_path"] for frame in frames]
-    content = {
+    content: dict[str, Any] = {
         **lens, "camera_model": "OPENCV_FISHEYE" if fisheye else "OPENCV", "applied_transform": applied.tolist(), "ply_file_path": "sparse_pc.ply",
         "train_filenames": names[:6], "val_filenames": names[6:], "test_filenames": names[6:7], "frames": frames,
     }  # fmt: skip
@@ -242,10 +255,16 @@ def nerfstudio(folder, fisheye=False, unit=0.2, masks=False):
     return folder
 
 
-WRITERS = {"Polycam": polycam, "LLFF": llff, "EuRoC": euroc, "TUM": tum, "nerfstudio": nerfstudio}
+WRITERS: dict[str, Callable[[Path], Path]] = {
+    "Polycam": polycam,
+    "LLFF": llff,
+    "EuRoC": euroc,
+    "TUM": tum,
+    "nerfstudio": nerfstudio,
+}
 
 
-def write(kind, folder):
+def write(kind: str, folder: Path) -> Path:
     """A sample of a format; the path to give to the command."""
     if kind == "Record3D":
         return record3d(folder / "scan.r3d")
