@@ -25,6 +25,7 @@ from advnerf_core.data.similarity import rotation_angles
 from advnerf_core.geometry import Array, invert_transform, make_transform, planar_pose
 from benchmarks.results import REPOSITORY, record_row
 from calibration.by_construction import twin_calibrations
+from calibration.display_colour import DisplayCalibration
 from calibration.print_chart import chart_record, fit_printer, make_chart, printer_calibration
 from calibration.print_colour import encoded
 from calibration.schema import CameraCalibration, load_calibration, save_calibration
@@ -70,10 +71,13 @@ _START_NS = 1_800_000_000_000_000_000
 
 def ink_of(sheet: Printable) -> Rgb:
     """A printed sheet ``[h, w, 3]`` as the lab's renderer takes textures."""
+    return np.round(encoded(printed(_sheet(sheet) / 255.0))).astype(np.uint8)
+
+
+def _sheet(sheet: Printable) -> Rgb:
     width_mm, height_mm = sheet.sheet_mm
     size = (round(width_mm * _DPI / 25.4), round(height_mm * _DPI / 25.4))
-    shown = sheet.pixels((0.0, 0.0, width_mm, height_mm), size) / 255.0
-    return np.round(encoded(printed(shown))).astype(np.uint8)
+    return sheet.pixels((0.0, 0.0, width_mm, height_mm), size)
 
 
 @contextmanager
@@ -132,14 +136,28 @@ def driven_m(lab: Lab, prepared: Prepared, shown: Shown) -> float:
     return float(np.mean([each.metrics.total_cte_m for each in drives]))
 
 
+def _small(texture: Rgb) -> Rgb:
+    rows = np.linspace(0, len(texture) - 1, _CELLS).round().astype(int)
+    return texture[np.ix_(rows, rows)]
+
+
 def as_hung(prepared: Prepared, sheet: Printable, T_world_from_face: Array) -> Shown:
     """The printed sheet in its true size, place and ink."""
     experiment, side = prepared.experiment, _SCALE * sheet.sheet_mm[0] / (1000.0 * sheet.size_m[0])
     field = flat_object(experiment, experiment.objects[0], T_world_from_face, _CELLS)
-    texture = ink_of(sheet).astype(np.float64)
-    rows = np.linspace(0, len(texture) - 1, _CELLS).round().astype(int)
-    share = np.clip(texture[np.ix_(rows, rows)] / 255.0, 1e-3, 1.0 - 1e-3)
-    return Shown([replace(field, scale=field.scale * side)], torch.from_numpy(np.log(share / (1.0 - share))))
+    return Shown([replace(field, scale=field.scale * side)], _theta(_small(ink_of(sheet)) / 255.0))
+
+
+def _plain(prepared: Prepared) -> Shown:
+    """The panel without an attack, in ink."""
+    plain = prepared.space.plain
+    assert plain.painted is not None, "the printer is part of the space"
+    return replace(plain, colours=_theta(encoded(printed(torch.sigmoid(plain.painted).numpy())) / 255.0))
+
+
+def _theta(colours: Array) -> torch.Tensor:
+    share = np.clip(colours, 1e-3, 1.0 - 1e-3)
+    return torch.from_numpy(np.log(share / (1.0 - share)))
 
 
 def measured(
@@ -179,13 +197,24 @@ def main() -> None:
         border = record.sheet_m[0] / record.picture_m[0]
         pose = measurement.T_world_from_face
         effect = print_effect(request, attack, "board", found.texture, measurement.scale * border, pose)
+        printer = load_calibration(DisplayCalibration, folder / "printer.yaml").display
+        seen = np.round(255.0 * printer.forward(_small(_sheet(sheet)) / 255.0)).astype(np.uint8)
+        exact = print_effect(request, attack, "board", seen, _SCALE * border, T)
         plain, driven = (
-            driven_m(lab, prepared, each) for each in (prepared.space.plain, as_hung(prepared, sheet, T))
+            driven_m(lab, prepared, each) for each in (_plain(prepared), as_hung(prepared, sheet, T))
         )
     for name, text in measurement.lines:
         print(f"{name}: {text}")
     print(f"{effect.text}; driven {driven:.2f} m, past the plain panel {plain:.2f} m")
-    _record(free, effect, driven, plain, _size_error(measurement.size_m, sheet), _angle_deg(pose, T))
+    _record(
+        free,
+        effect,
+        exact.print_m,
+        driven,
+        plain,
+        _size_error(measurement.size_m, sheet),
+        _angle_deg(pose, T),
+    )
 
 
 def _size_error(size_m: tuple[float, float] | None, sheet: Printable) -> float:
@@ -199,13 +228,19 @@ def _angle_deg(pose: Array | None, T: Array) -> float:
 
 
 def _record(
-    free: AttackFile, effect: PrintEffect, driven: float, plain: float, size: float, angle_deg: float
+    free: AttackFile,
+    effect: PrintEffect,
+    exact: float,
+    driven: float,
+    plain: float,
+    size: float,
+    angle_deg: float,
 ) -> None:
     assert free.clean_drive is not None, "a search drives past the plain object"
     total, clean = free.predicted_total_cte_m or 0.0, float(np.mean(free.clean_drive.total_cte_m))
     kept = (effect.nominal_m - effect.clean_m) / (total - clean)
     predicted = (effect.print_m - effect.clean_m) / (driven - plain)
-    note = f"predicted totals: plain {clean:.2f} m, free {total:.2f} m; printed plain {effect.clean_m:.2f} m, printable {effect.nominal_m:.2f} m, its print {effect.print_m:.2f} m; driven {driven:.2f} m, plain {plain:.2f} m"
+    note = f"predicted totals: plain {clean:.2f} m, free {total:.2f} m; printed plain {effect.clean_m:.2f} m, printable {effect.nominal_m:.2f} m, its print {effect.print_m:.2f} m; driven {driven:.2f} m, plain {plain:.2f} m; with the print's own colours, size and pose instead of measured ones the learned scene predicts {exact:.2f} m"
     for line, value, unit, target, met in (
         ("print in the lab: size by measurement", 100.0 * size, "% off", "<= 1 %", size <= 0.01),
         (
