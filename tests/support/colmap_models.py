@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 WIDTH, HEIGHT = 64, 48
 # Parameters of every camera model for images of 64 x 48 pixels.
-CAMERAS = {
+CAMERAS: dict[str, Sequence[float]] = {
     "SIMPLE_PINHOLE": [50, 32, 24],
     "PINHOLE": [50, 51, 32.5, 23.5],
     "SIMPLE_RADIAL": [50, 32, 24, -0.08],
@@ -23,7 +23,7 @@ CAMERAS = {
     "RADIAL_FISHEYE": [30, 32, 24, 0.02, -0.01],
     "OPENCV_FISHEYE": [30, 31, 32, 24, 0.01, -0.002, 0.001, 0.0005],
 }
-OTHER_CAMERAS = {
+OTHER_CAMERAS: dict[str, Sequence[float]] = {
     "FULL_OPENCV": [50, 51, 32, 24, -0.1, 0.02, 0.001, -0.002, 0.003, 0.01, 0, 0],
     "FOV": [50, 51, 32, 24, 0.8],
     "THIN_PRISM_FISHEYE": [30, 31, 32, 24, 0.01, 0.002, 0.0005, 0.0005, 0, 0, 0.001, 0.001],
