@@ -41,7 +41,7 @@ def read(path: Path, options: ScanOptions) -> Scan:
 
     Raises:
         DatasetError: The file cannot be used.
-        ScanError: There are too few images, or a lens cannot be undone.
+        ScanError: Too few images, or a lens whose distortion cannot be undone.
     """
     if options.images is not None:
         raise ScanError(

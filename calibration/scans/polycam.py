@@ -42,7 +42,7 @@ def read(path: Path, options: ScanOptions) -> Scan:
     """Read the keyframes; corrected ones if there are any.
 
     Raises:
-        ScanError: There are too few of them.
+        ScanError: Too few of them.
     """
     keyframes = path / "keyframes"
     corrected = all((keyframes / f"corrected_{each}").is_dir() for each in ("cameras", "images"))

@@ -40,7 +40,7 @@ def read(path: Path, options: ScanOptions) -> Scan:
     """Read a recording.
 
     Raises:
-        ScanError: It is damaged, or has too few images.
+        ScanError: The scan is damaged, or has too few images.
     """
     source = record3d_source(path)
     if source is None:

@@ -130,7 +130,7 @@ def number(value: Any, where: str) -> float:
     """A finite number.
 
     Raises:
-        ScanError: It is none.
+        ScanError: Not a finite number.
     """
     if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(float_of(value)):
         raise ScanError(f"{where}: expected a finite number, got {value!r:.60}; export the scan again")
@@ -149,7 +149,7 @@ def lens_of(pinhole: Pinhole, lens: Lens, where: str) -> Lens:
     """A lens whose distortion can be undone.
 
     Raises:
-        ScanError: It cannot.
+        ScanError: The lens cannot be undistorted.
     """
     try:
         straightening(pinhole, lens)
@@ -189,7 +189,7 @@ def model_of(
         why: Source of the lenses.
 
     Raises:
-        ScanError: There are too few images.
+        ScanError: Too few images.
     """
     if len(images) < MIN_IMAGES:
         first = f"; {left_out[0].name}: {left_out[0].why}" if left_out else ""

@@ -92,7 +92,7 @@ def stamp_ns(seconds: float, where: str) -> int:
     """A time in nanoseconds.
 
     Raises:
-        ScanError: It is no time in seconds.
+        ScanError: The text is not a time in seconds.
     """
     if not abs(seconds) < _LARGEST_S:
         raise ScanError(f"{where}: expected a time in seconds, got {seconds:g}; write seconds")

@@ -51,10 +51,10 @@ def open_transport(
     """Join ROS programs.
 
     Args:
-        transport: How.
+        transport: Name of the transport.
         domain_id: ``ROS_DOMAIN_ID``.
         interface: Network interface.
-        settings: How to find ROS programs over Zenoh.
+        settings: Ways to find ROS programs over Zenoh.
         sends: Topics to write.
         takes: Topics to read.
         inbox: Receives batches of samples.

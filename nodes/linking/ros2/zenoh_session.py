@@ -46,7 +46,7 @@ class Session:
         domain_id: ``ROS_DOMAIN_ID``.
         interface: Network interface.
         local: Whether that is the loopback of this computer.
-        settings: How to find ROS programs.
+        settings: Ways to find ROS programs.
         sends: Topics to write.
         takes: Topics to read.
         inbox: Receives batches of samples.

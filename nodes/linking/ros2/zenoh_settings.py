@@ -66,7 +66,7 @@ def session_config(settings: ZenohSettings, interface: str, local: bool) -> dict
     """Configuration of a session, by key.
 
     Args:
-        settings: How to find ROS programs.
+        settings: Ways to find ROS programs.
         interface: Network interface for multicast.
         local: Whether that is the loopback of this computer. Then an endpoint elsewhere is a `SecurityError`.
     """
