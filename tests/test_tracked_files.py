@@ -27,8 +27,8 @@ def test_all_tracked_files_are_at_most_45_mb(tracked):
     assert sum(sizes.values()) <= MOST_TRACKED_BYTES, f"the largest are {largest}"
 
 
-def test_films_of_published_sets_are_at_most_250_kb(tracked):
+def test_films_of_published_sets_are_at_most_180_kb(tracked):
     films = [file for file in tracked if file.match("docs/results/*.webp")]
     assert films
     assert {file.name: file.stat().st_size for file in films if file.stat().st_size > MOST_BYTES} == {}
-    assert MOST_BYTES == 250_000
+    assert MOST_BYTES == 180_000

@@ -21,7 +21,7 @@ from advnerf_core.report.evidence.results import Evidence
 from advnerf_core.report.evidence.verifying.layout import SET
 from nodes.experiment.show.context import Experiment
 
-MOST_BYTES = 250_000
+MOST_BYTES = 180_000
 _WIDTH_PX, _FRAME_MS, _QUALITIES = 760, 200, (70, 50, 35, 20, 10)
 _EVERY = 2  # frames, at ten frames a second
 
