@@ -221,6 +221,7 @@ class Audit:
             victim,
             plan.decided.evaluations or self.options.evaluations or 1,
             declared.differentiable,
+            declared.has_memory,
             limit_m,
             self.options.cluster,
         )

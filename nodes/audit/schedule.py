@@ -49,6 +49,8 @@ BLACK_BOX = (
     Round("cem", spots=2, seeds=1, starts=1, share=0.4),
     Round("guided", spots=1, seeds=1, starts=1, share=0.4),
 )
+# The student of `guided` learns from single images.
+BLACK_BOX_WITH_MEMORY = (*BLACK_BOX[:2], Round("cem", spots=1, seeds=1, starts=1, share=0.4))
 # Adam's rates: searches of an audit are short, so that they take larger steps than those of an experiment.
 LEARNING_RATE = 0.5
 _FEWEST, _FEWEST_CEM = 4, 20
@@ -78,10 +80,10 @@ class PlannedSearch:
     evaluations: int
 
 
-def rounds_for(differentiable: bool, flat: bool) -> tuple[Round, ...]:
-    """The schedule for a policy with or without a gradient, and an object that is flat or not."""
+def rounds_for(differentiable: bool, flat: bool, remembers: bool = False) -> tuple[Round, ...]:
+    """The schedule for a policy with or without a gradient, an object that is flat or not, and a policy with or without memory."""
     if not differentiable:
-        return BLACK_BOX
+        return BLACK_BOX_WITH_MEMORY if remembers else BLACK_BOX
     return WITH_GRADIENT if flat else WITH_GRADIENT_OF_A_SOLID
 
 

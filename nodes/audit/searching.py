@@ -107,6 +107,7 @@ class Searches:
         victim: Name of the experiment's victim.
         evaluations: Evaluations that the budget buys, from one start.
         differentiable: Whether the policy has a gradient.
+        remembers: Whether its output depends on earlier images.
         limit_m: |CTE| beyond which the car has left its lane [m].
         elsewhere: Machines for the searches; None for this process.
         found: Finished searches.
@@ -118,6 +119,7 @@ class Searches:
     victim: str
     evaluations: int
     differentiable: bool
+    remembers: bool
     limit_m: float
     elsewhere: SearchesElsewhere | None = None
     found: list[FoundAttack] = field(default_factory=list)
@@ -125,7 +127,7 @@ class Searches:
     @property
     def rounds(self) -> tuple[Round, ...]:
         """The schedule."""
-        return rounds_for(self.differentiable, flat=self.copies.question.kind == PANEL)
+        return rounds_for(self.differentiable, self.copies.question.kind == PANEL, self.remembers)
 
     @property
     def planned(self) -> list[list[PlannedSearch]]:

@@ -2,9 +2,11 @@
 
 import pytest
 
+from advnerf_core.attack.methods import black_box_methods
 from advnerf_core.attack.search.black_box import BlackBoxSearch
 from nodes.audit.schedule import (
     BLACK_BOX,
+    BLACK_BOX_WITH_MEMORY,
     WITH_GRADIENT,
     WITH_GRADIENT_OF_A_SOLID,
     fewest,
@@ -13,7 +15,9 @@ from nodes.audit.schedule import (
 )
 
 
-@pytest.mark.parametrize("rounds", [WITH_GRADIENT, WITH_GRADIENT_OF_A_SOLID, BLACK_BOX])
+@pytest.mark.parametrize(
+    "rounds", [WITH_GRADIENT, WITH_GRADIENT_OF_A_SOLID, BLACK_BOX, BLACK_BOX_WITH_MEMORY]
+)
 @pytest.mark.parametrize("evaluations", [200, 1000, 12345])
 def test_a_budget_is_spent_and_not_exceeded(rounds, evaluations):
     row_costs = [
@@ -23,12 +27,16 @@ def test_a_budget_is_spent_and_not_exceeded(rounds, evaluations):
     assert 0.9 * evaluations <= sum(row_costs) <= evaluations
 
 
-@pytest.mark.parametrize("rounds", [WITH_GRADIENT, WITH_GRADIENT_OF_A_SOLID, BLACK_BOX])
+@pytest.mark.parametrize(
+    "rounds", [WITH_GRADIENT, WITH_GRADIENT_OF_A_SOLID, BLACK_BOX, BLACK_BOX_WITH_MEMORY]
+)
 def test_shares_are_of_the_whole(rounds):
     assert sum(each.share for each in rounds) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("rounds", [WITH_GRADIENT, WITH_GRADIENT_OF_A_SOLID, BLACK_BOX])
+@pytest.mark.parametrize(
+    "rounds", [WITH_GRADIENT, WITH_GRADIENT_OF_A_SOLID, BLACK_BOX, BLACK_BOX_WITH_MEMORY]
+)
 def test_a_tiny_budget_still_lets_every_method_begin(rounds):
     for wanted, row in zip(rounds, planned(rounds, 1, 60), strict=True):
         assert all(search.evaluations >= fewest(wanted.method, 60) for search in row)
@@ -50,3 +58,6 @@ def test_only_flat_objects_are_searched_by_a_coarse_picture() -> None:
     assert rounds_for(differentiable=True, flat=True) == WITH_GRADIENT
     assert "gradient_coarse" not in {each.method for each in rounds_for(differentiable=True, flat=False)}
     assert rounds_for(differentiable=False, flat=False) == BLACK_BOX
+    methods = {each.method for each in rounds_for(differentiable=False, flat=True, remembers=True)}
+    assert methods <= set(black_box_methods(stateless=False))
+    assert not {each.method for each in BLACK_BOX} <= set(black_box_methods(stateless=False))
