@@ -1,7 +1,7 @@
 """Row: a policy learned from a bag that went through LeRobot, against one learned from the bag itself, on the same held-out frames.
 
 The expert drives in the simulated lab from starts beside its path. Its drives become a bag, and the bag a LeRobot data set (version 3, with
-video). Policies learn from both, with several seeds. Run as ``python -m benchmarks.log_round_trip [--trial]``.
+video). Policies learn from both, with several seeds. The bag and the policies from it are kept. Run as ``python -m benchmarks.log_round_trip [--trial]``.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from advnerf_core.policies.load import load_any_policy
 from benchmarks.results import record_row
 from calibration.schema import RoomCalibration, load_calibration
 from hardware.worlds.lab.lab import Lab
+from nodes.bags.parts import METADATA_FILE
 from nodes.bags.writer import BagWriter
 from nodes.lab.policy_data.evaluate import compared, predict
 from nodes.lab.policy_data.frames import HOLDOUT_EVERY
@@ -103,8 +104,11 @@ def main() -> None:
     trial = options.trial
     drives, ticks, steps, seeds = (6, 40, 60, 1) if trial else (24, 80, 800, 4)
     folder = options.folder or _ROOT / "runs" / ("log_round_trip_trial" if trial else "log_round_trip")
-    shutil.rmtree(folder, ignore_errors=True)
-    bag = write_drives(folder / "bag", drives, ticks)
+    bag = folder / "bag"
+    if not (bag / METADATA_FILE).is_file():
+        shutil.rmtree(folder, ignore_errors=True)
+        write_drives(bag, drives, ticks)
+    shutil.rmtree(folder / "lerobot", ignore_errors=True)
     done = write_lerobot(open_log(bag), folder / "lerobot")
     logs = open_logs(map(LogRequest, (bag, folder / "lerobot")), LogChoice(), "recorded")
     errors = np.array(

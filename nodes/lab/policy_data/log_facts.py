@@ -83,15 +83,15 @@ class LogFacts:
             return Verdict(
                 "learn a scene", False, self._unusable_images() or f"{log.count} images are too few"
             )
-        if log.labels == "expert" and log.poses and log.format.startswith("bag"):
+        is_bag = log.format.startswith("bag")
+        if is_bag and not log.poses:
+            return Verdict("learn a scene", False, "no poses on /vicon/car")
+        if is_bag:
             missing = "" if self.has_camera else ", with --calibration, as no camera.yaml is attached"
             return Verdict("learn a scene", True, f"advnerf scene from-bag{missing}")
-        if log.format.startswith("bag"):
-            return Verdict("learn a scene", False, "no poses on /vicon/car")
+        how = "scene from-images or from-video estimates the poses of the camera"
         return Verdict(
-            "learn a scene",
-            True,
-            "no camera poses in the log; scene from-images or from-video estimates them",
+            "learn a scene", True, how + (", or from-bag with the exported bag" if log.poses else "")
         )
 
     def _evaluation(self) -> Verdict:
