@@ -41,6 +41,7 @@ from nodes.runtime.topics import topic
 from nodes.runtime.wire import Meta, pack_meta, unpack
 from tests.campaigns.campaign import Campaign
 from tests.support.damaged_bytes import mutate
+from tests.support.log_damage import LogFiles
 from tests.support.scan_damage import ScanFiles
 
 SHARES = {
@@ -52,6 +53,7 @@ SHARES = {
     "bag": 10_000,
     "scan": 40_000,
     "splat": 40_000,
+    "log": 20_000,
 }
 _INPUT_LIMIT_S = 2
 _GROWTH_LIMIT_MIB = 200.0
@@ -189,6 +191,12 @@ def scan_reader(folder: Path) -> tuple[Sequence[bytes], Callable[[bytes], None]]
     return files.good, files.read
 
 
+def log_reader(folder: Path) -> tuple[Sequence[bytes], Callable[[bytes], None]]:
+    """Files of logs of every format."""
+    files = LogFiles(folder / "logs")
+    return files.good, files.read
+
+
 def splat_reader(folder: Path) -> tuple[Sequence[bytes], Callable[[bytes], None]]:
     """Splats of every format; the first byte says which."""
     from advnerf_core.splats.reading import read_splats
@@ -221,6 +229,7 @@ def run(name: str, count: int, seed: int, folder: Path) -> Outcome:
         "bag": lambda: bag_reader(folder),
         "scan": lambda: scan_reader(folder),
         "splat": lambda: splat_reader(folder),
+        "log": lambda: log_reader(folder),
     }
     good, read = makers[name]()
     for data in good:  # a reader that refuses everything would be tested by nothing
@@ -277,7 +286,7 @@ def test_no_input_crashes_or_hangs_a_reader(campaign: Campaign, tmp_path: Path) 
         )
     growth_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 - before_mib
     campaign.record(
-        "fuzz: VESC, VICON, bus, config, attack file, bag, scan, splat",
+        "fuzz: VESC, VICON, bus, config, attack file, bag, scan, splat, log",
         total,
         "inputs",
         "10^6: no crash, hang or memory growth",
