@@ -248,7 +248,9 @@ def _episode_videos(data: _DataSet, name: str, episodes: Sequence[int]) -> dict[
     if not isinstance(pattern, str):
         raise LogError(f"{data.path / INFO}: expected video_path, got {pattern!r}; copy the data set again")
     if data.version.startswith("v2"):
-        chunk = data.info.get("chunks_size") or 1000
+        chunk = data.info.get("chunks_size")
+        if not isinstance(chunk, int) or chunk < 1:
+            raise LogError(f"{data.path / INFO}: chunks_size: expected a number of episodes, got {chunk!r}")
         return {
             each: (
                 _filled(data, pattern, video_key=name, episode_chunk=each // chunk, episode_index=each),
