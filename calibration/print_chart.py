@@ -79,7 +79,7 @@ def fit_printer(rgb: Rgb, lens: Intrinsics, record: PrintRecord) -> DisplayFit:
     """Fit a printer, its paper and the light to one photograph ``[H, W, 3]`` of its chart.
 
     Raises:
-        PrintError: The record is not that of a chart.
+        PrintError: The record does not belong to a chart.
         DegenerateDataError: The photograph does not show the chart well enough.
         PoorFitError: The chart is bent, or its colours do not fit.
     """

@@ -85,7 +85,7 @@ def light_on(rgb: Rgb, lens: Intrinsics, T_camera_from_face: Array, corners_m: S
 
     Args:
         rgb: The photograph ``[H, W, 3]``.
-        lens: Its lens.
+        lens: Lens of the camera.
         T_camera_from_face: Pose ``[4, 4]`` of the print in nominal units.
         corners_m: Nominal corners ``[4, 3]`` of each seen marker [m].
 
@@ -146,7 +146,7 @@ def patch_colours(
 
     Args:
         rgb: The photograph ``[H, W, 3]``.
-        lens: Its lens.
+        lens: Lens of the camera.
         T_camera_from_face: Pose ``[4, 4]`` of the chart in nominal units.
         picture_m: Width and height of all patches [m].
         shape: Rows and columns.
@@ -176,12 +176,12 @@ def patch_colours(
 
 @dataclass(frozen=True, eq=False)
 class PrintColours:
-    """A print with its border, as photographed. Parts that the photograph does not show have the nominal colours, changed as those of the others are.
+    """A print with its border, as photographed. Parts that the photograph does not show have the nominal colours, changed like the others.
 
     Attributes:
-        nominal: What was printed ``[n, n, 3]`` uint8.
-        seen: As the camera saw it ``[n, n, 3]`` uint8.
-        unlit: In even white light, in which paper is white ``[n, n, 3]`` uint8.
+        nominal: Printed colours ``[n, n, 3]`` uint8.
+        seen: Colours in the camera ``[n, n, 3]`` uint8.
+        unlit: Colours in even white light, in which paper is white ``[n, n, 3]`` uint8.
         rms: Root mean square difference of the picture to the nominal texture, in 0..255, in light in which ink is black too.
         mean: Mean difference of each channel ``[3]``.
         far_share: Share of the picture that is off by more than a quarter of full scale, such as covered parts.
@@ -206,9 +206,9 @@ def print_colours(
 
     Args:
         rgb: The photograph ``[H, W, 3]``.
-        lens: Its lens.
+        lens: Lens of the camera.
         T_camera_from_face: Pose ``[4, 4]`` of the print in nominal units.
-        sheet: What was printed.
+        sheet: The printed sheet.
         corners_m: Nominal corners ``[4, 3]`` of each seen marker by number [m].
 
     Raises:
@@ -245,7 +245,7 @@ def print_colours(
 
 
 def _completed(found: Array, wanted: Array, hidden: NDArray[np.bool_]) -> Array:
-    """Found colours ``[n, n, 3]``; where they are hidden, nominal ones as the map from nominal to found colours elsewhere changes them."""
+    """Found colours ``[n, n, 3]``; where they are hidden, nominal ones as the map from nominal to found colours of the rest changes them."""
     if not hidden.any():
         return found
     colours = fit_colour_map(wanted[~hidden] / 255.0, found[~hidden] / 255.0)

@@ -1,4 +1,4 @@
-"""True size, pose and flatness of a print from pictures whose camera poses are known in metres, such as those of a drive."""
+"""True size, pose and flatness of a print from pictures whose camera poses are known in metres, as along a drive."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class PrintView:
     """One picture of a print.
 
     Attributes:
-        markers: Its markers by number.
+        markers: Markers by number.
         T_world_from_camera: Pose ``[4, 4]`` of the camera.
     """
 
@@ -40,7 +40,7 @@ class PlacedPrint:
 
     Attributes:
         scale: True size over nominal size.
-        scale_sd: Its standard deviation.
+        scale_sd: Standard deviation of the scale.
         T_world_from_face: Pose ``[4, 4]`` of the print.
         angle_sd_rad: Standard deviation of the direction that it faces [rad].
         rms_px: Root mean square distance of the corners from their projections [px].

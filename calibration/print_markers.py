@@ -60,9 +60,9 @@ def find_markers(
 
     Args:
         rgb: The photograph ``[H, W, 3]``, as the lens draws it.
-        lens: Its lens.
+        lens: Lens of the camera.
         wanted: Markers by number.
-        what: What carries them, for messages.
+        what: Name of the sheet, for messages.
 
     Raises:
         DegenerateDataError: A marker is seen twice, or the edges of most are too blurred or too small.

@@ -49,9 +49,9 @@ class PrintMeasurement(PlainData):
         nominal_m: Nominal width and height of the picture [m].
         size_m: True width and height of the picture [m]; None where the size is unknown.
         size_sd: Standard deviation of the size, as a share of it.
-        size_from: What gives the size; empty where it is unknown.
+        size_from: Source of the size; empty if unknown.
         T_camera_from_face: Pose ``[4, 4]`` before the camera of a photograph [m]; in nominal metres where the size is unknown. None of a bag.
-        T_world_from_face: Pose ``[4, 4]`` in the world; None where it is unknown.
+        T_world_from_face: Pose ``[4, 4]`` in the world; None if unknown.
         angle_sd_deg: Standard deviation of the direction that it faces [deg].
         view_angle_deg: Angle at which a photograph shows it; 0 from straight ahead. None of a bag.
         markers_seen: Numbers of the markers that were used.
@@ -60,8 +60,8 @@ class PrintMeasurement(PlainData):
         residual_px: Root mean square distance of the corners from where a flat print has them [px].
         residual_mm: The same in the print's plane [mm].
         flatness_mm: Root mean square distance of the markers from their plane [mm]; of a photograph, as far as it shows a bend.
-        flatness_sd_mm: Its standard deviation [mm].
-        colours: Its colours; None where they are unknown.
+        flatness_sd_mm: Standard deviation of the flatness [mm].
+        colours: Colours of the print; None if unknown.
         colours_unknown: The reason for that.
     """
 
@@ -86,7 +86,7 @@ class PrintMeasurement(PlainData):
 
     @property
     def scale(self) -> float:
-        """True size over nominal size; 1 where it is unknown."""
+        """True size over nominal size; 1 if unknown."""
         if self.size_m is None:
             return 1.0
         return float(np.sqrt(self.size_m[0] * self.size_m[1] / (self.nominal_m[0] * self.nominal_m[1])))
@@ -170,8 +170,8 @@ def of_photograph(
         nominal_m: Nominal width and height of the picture [m].
         printed: Number of markers on the print.
         pose: The fitted pose.
-        known: What gives the size, true over nominal size, and its standard deviation; None where nothing gives it.
-        T_world_from_camera: Pose ``[4, 4]`` of the camera in the world; None where it is unknown.
+        known: Source of the size, true over nominal size, and its standard deviation; None where nothing gives it.
+        T_world_from_camera: Pose ``[4, 4]`` of the camera in the world; None if unknown.
     """
     size_from, scale, sd = known or ("", 1.0, 0.0)
     T = np.array(pose.T_camera_from_face)

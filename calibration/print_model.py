@@ -21,7 +21,7 @@ POSE, GROWTH, ASPECT, BEND = slice(0, 6), 6, 7, slice(8, 11)
 COUNT = 11
 RIGID = tuple(range(7))
 BENT = (*RIGID, 8, 9, 10)
-# Corners of one marker share the errors of its edges: standard deviations are those of independent errors, times this.
+# Corners of one marker share the errors of its edges: standard deviations for independent errors are multiplied by this.
 CORRELATED = 2.0
 LEAST_NOISE_PX = 0.05
 _BEND_SHARE, _USUAL_NOISE_PX = 0.04, 0.2  # standard deviation of a bend, as a share of half the print's side

@@ -58,12 +58,12 @@ class PrintPose:
         rms_px: Root mean square distance of the corners from their projections [px].
         rms_m: The same in the print's plane.
         bend_m: Root mean square distance of the markers from the middle plane, as far as the photograph shows a bend.
-        bend_sd_m: Its standard deviation.
+        bend_sd_m: Standard deviation of the bend.
         angle_sd_rad: Standard deviation of the direction that the print faces [rad].
         distance_sd: Standard deviation of the distance, as a share of it.
         aspect: Width over height, as a share of the nominal ratio; 1 where the photograph does not tell it from 1.
         card_scale: True size over nominal size, by the card; None without a card.
-        card_scale_sd: Its standard deviation.
+        card_scale_sd: Standard deviation of the card's scale.
     """
 
     T_camera_from_face: Array

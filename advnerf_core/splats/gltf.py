@@ -39,7 +39,7 @@ def read_gltf(path: Path) -> Parts:
 
     Raises:
         SplatError: The file has no splats, or uses what is not supported.
-        ValueError: It is damaged.
+        ValueError: The data are damaged.
     """
     import trimesh
     from trimesh.exchange.gltf.extensions import register_handler
@@ -142,7 +142,7 @@ def _similarity(path: Path, transform: Array) -> Similarity:
     """A node's transform.
 
     Raises:
-        SplatError: It shears, mirrors or stretches.
+        SplatError: The transform shears, mirrors or stretches.
     """
     linear = transform[:3, :3]
     scale = float(np.cbrt(np.linalg.det(linear)))

@@ -50,8 +50,8 @@ def project(
         lens: ``fx, fy, cx, cy`` ``[4]``.
         limits: From `View` ``[4]``.
         near: Smallest depth [m].
-        width: Of the image [px].
-        height: Of the image [px].
+        width: Width of the image [px].
+        height: Height of the image [px].
         projected: ``[N, COLUMNS]``, written.
         source: The Gaussian at each place ``[N]``, written.
         reach: First and last tile along columns, then along rows ``[N, 4]``, written.
@@ -124,7 +124,7 @@ def fill_tiles(
         stop: One past the last place.
         reach: ``[N, 4]`` from `project`.
         across: Tiles in a row.
-        places: Where in ``lists`` each tile goes on ``[tiles]``; used up.
+        places: Next index in ``lists`` of each tile ``[tiles]``; used up.
         lists: Lists of all tiles, written.
     """
     for at in range(first, stop):
@@ -227,7 +227,7 @@ def draw_tiles(
     Args:
         first: First tile.
         stop: One past the last.
-        starts: Where each tile's list begins ``[tiles + 1]``.
+        starts: First index of each tile's list ``[tiles + 1]``.
         lists: From `fill_tiles`.
         projected: From `project`, as is the next.
         source: ``[N]``.
@@ -297,7 +297,7 @@ def draw_tiles(
 
 @njit(**_EXACT)
 def _in_buckets(lists, start, count, projected, begins):  # type: ignore[no-untyped-def]
-    """Keys of a tile's Gaussians, grouped by depth: the depth's bits, whose order is that of positive numbers, and the place.
+    """Keys of a tile's Gaussians, grouped by depth: the depth's bits, which sort as the positive numbers do, and the place.
 
     ``begins [_BUCKETS + 1]`` is written.
     """

@@ -157,7 +157,7 @@ def _check_ply(path: Path) -> None:
 
     Raises:
         ValueError: The header is damaged, or speaks of more data than there is.
-        SplatError: It holds no Gaussians.
+        SplatError: The file holds no Gaussians.
     """
     with path.open("rb") as file:
         head = file.read(_HEADER_BYTES)

@@ -120,7 +120,7 @@ def bake_scene(
     """Bake a scene of either kind for views like ``T_world_from_camera [N, 4, 4]``.
 
     Raises:
-        NotBakedError: It cannot be baked.
+        NotBakedError: The scene cannot be baked.
     """
     if isinstance(source, SplatRenderer):
         return bake_splats(source, T_world_from_camera, pinhole)

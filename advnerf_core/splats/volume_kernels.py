@@ -119,7 +119,7 @@ def list_cells(low: Array32, high: Array32, begins: Array32i, lists: Array32i, c
         high: High corner ``[N, 3]``.
         begins: Counting: one past each cell's place, its count is added ``[cells + 1]``. Else: next free entry of each cell, moved on.
         lists: Written, unless counting.
-        counting: Which of the two.
+        counting: Whether samples are only counted.
     """
     for n in range(low.shape[0]):
         reach = max(high[n, 0] - low[n, 0], max(high[n, 1] - low[n, 1], high[n, 2] - low[n, 2]))

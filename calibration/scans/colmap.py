@@ -20,7 +20,7 @@ def read(path: Path, options: ScanOptions) -> Scan:
 
     Raises:
         ReconstructionError: The model is damaged.
-        ScanError: The images are not those of the model.
+        ScanError: The images do not belong to the model.
     """
     models = colmap_models(path) or path
     found = read_colmap(models, options.model)

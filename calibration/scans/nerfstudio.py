@@ -99,7 +99,7 @@ def _points(folder: Path, content: dict[str, Any]) -> tuple[Array, dict[str, Any
 
 
 def _facts(folder: Path, content: dict[str, Any]) -> dict[str, Any]:
-    """Relations to the worlds of COLMAP and of a trained model, from coordinates there to those of the file."""
+    """Relations to the worlds of COLMAP and of a trained model, from its coordinates to the file's."""
     applied = content.get("applied_transform")
     T_file_from_colmap = np.eye(4) if applied is None else pose_of(applied, f"{folder}: applied_transform")
     facts: dict[str, Any] = {} if applied is None else {"T_scan_from_colmap": T_file_from_colmap.tolist()}

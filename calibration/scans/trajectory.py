@@ -37,7 +37,7 @@ class Trajectory:
     file: Path
 
     def at(self, stamp_ns: int) -> Array | None:
-        """Pose ``[4, 4]`` at a time: between two poses less than 0.1 s apart, or the nearest within 20 ms; None if there is none."""
+        """Pose ``[4, 4]`` at a time: between two poses less than 0.1 s apart, or the nearest within 20 ms; None without a pose."""
         after = int(np.searchsorted(self.stamps_ns, stamp_ns))
         near = [index for index in (after - 1, after) if 0 <= index < len(self.stamps_ns)]
         if len(near) == 2:

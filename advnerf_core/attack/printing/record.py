@@ -33,7 +33,7 @@ class PrintRecord(PlainData):
         markers: Corners ``[4, 3]`` by number [m]; see `MarkerFrame.corners_m`.
         dpi: Pixels per inch.
         attack_id: The attack of a poster.
-        attack_file: Its file, seen from the record's folder.
+        attack_file: Path of the attack, relative to the record's folder.
         object: The object that carries the texture.
         patches: sRGB colours ``[rows, columns, 3]`` (0..255) of a chart, which fill its picture from the upper left.
     """

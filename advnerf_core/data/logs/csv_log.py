@@ -1,4 +1,4 @@
-"""Reads CSV files with one row per image: those of Udacity's simulator as they are downloaded, and any other with a header.
+"""Reads CSV files with one row per image: Udacity's simulator's as downloaded, and any other with a header.
 
 Udacity's simulator writes ``driving_log.csv`` without a header; the published data set has one. Its paths are those of the computer
 that recorded them. Steering is -1 to 1 for 25 degrees, and positive to the right.

@@ -106,7 +106,7 @@ class DriveLog:
     """A recorded drive. Images are read when they are asked for.
 
     Attributes:
-        path: What the user named.
+        path: The file or folder.
         format: Name of the format.
         files: Files that stand for the content: if their sizes or times change, it counts as another log.
         images: The chosen camera, column, topic or feature.
@@ -118,7 +118,7 @@ class DriveLog:
         poses: Number of measured poses.
         steering: Reads the steering values ``[K]`` in the log's unit.
         frames: Reads the frames in order.
-        labels: What a policy learns from this format unless the user asks otherwise: the recorded steering, or the expert's.
+        labels: Steering that a policy learns from this format unless the user asks otherwise: the recorded steering, or the expert's.
         left_out: Number of records that the log itself marks as unusable, by reason.
         attached: Reads attached files by name, such as ``camera.yaml``.
         unchecked: Why damage may go unnoticed; empty if checksums cover the log.

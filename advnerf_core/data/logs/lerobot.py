@@ -59,7 +59,7 @@ class _DataSet:
         return self.info.get("robot_type") == ROBOT
 
     def names(self, feature: str) -> list[str]:
-        """Names of a feature's numbers: those of the data set, or 0, 1, 2."""
+        """Names of a feature's numbers from the data set, or 0, 1, 2."""
         description = self.features[feature]
         names = description.get("names")
         if isinstance(names, dict):
@@ -190,7 +190,7 @@ def _values(data: _DataSet, table: dict[str, NDArray[np.float64]], control: str)
 
 
 def _stamps(data: _DataSet, count: int) -> NDArray[np.int64]:
-    """Capture times [ns]. Numbers of nanoseconds since 1970 are no ``float64``, so they are read as they are."""
+    """Capture times [ns]. Numbers of nanoseconds since 1970 are no ``float64``, so they are read unchanged."""
     if not (data.is_ours and STAMP in data.features):
         return np.round(np.arange(count) * (1e9 / data.fps)).astype(np.int64)
     values = [value for file in data.tables for value in read_table(file, [STAMP])[STAMP].to_pylist()]

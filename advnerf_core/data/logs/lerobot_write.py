@@ -316,7 +316,7 @@ def _summary(values: NDArray[np.float64]) -> dict[str, list[Any]]:
 
 
 def _attach(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Copy attached files with plain names, so that a foreign bag cannot write elsewhere."""
+    """Copy attached files with plain names, so that a foreign bag cannot write outside the folder."""
     for name, content in files.items():
         if Path(name).name == name:
             folder.mkdir(exist_ok=True)

@@ -35,7 +35,7 @@ def from_scan(
     Args:
         path: Folder or file of the scan.
         output: Folder of the data set, with copies of the images.
-        options: What the user says about the scan.
+        options: Answers about the scan.
         metric: Known facts about the world.
 
     Raises:
@@ -118,7 +118,7 @@ def _others(images: Path | None, known: set[str], made: Set[Path]) -> list[str]:
 
 
 def _copied(image: Registered, picture: Picture, folder: Path) -> Registered:
-    """Store an image: its file as it is, or the pixels that replace it.
+    """Store an image: its file unchanged, or the pixels that replace it.
 
     Raises:
         DatasetError: The image cannot be read.

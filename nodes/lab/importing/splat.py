@@ -60,7 +60,7 @@ def from_splat(file: Path, output: Path, options: SplatOptions) -> ImportedSplat
 
     Raises:
         SplatError: The file cannot be read or used.
-        ImportRecordingError: Its scale is unknown, or it does not show the images.
+        ImportRecordingError: The scale is unknown, or the splat does not show the images.
     """
     require_scale(file, options)
     splats, removed = clean(read_splats(file), not options.keep_floaters)
@@ -89,7 +89,7 @@ def require_scale(file: Path, options: SplatOptions) -> None:
     """Raise unless the length of a metre is known exactly once.
 
     Raises:
-        ImportRecordingError: It is not.
+        ImportRecordingError: The scale is unknown, or given more than once.
     """
     if options.images is not None:
         given = {"--metres-per-unit": options.metres_per_unit, "--up": options.up, "--origin": options.origin}
@@ -115,7 +115,7 @@ def _placed_by_hand(file: Path, options: SplatOptions) -> Similarity:
 def _placed_by_images(splats: GaussianSplats, images: Path, behind: Point) -> tuple[Similarity, float]:
     """The similarity under which the splat shows the images best, and its median PSNR [dB].
 
-    Splats are trained in the frame of the scan or in that of the data set, and some tools turn y and z around.
+    Splats are trained in the frame of the scan or of the data set, and some tools turn y and z around.
     """
     listed = load_transforms(images)
     chosen = [

@@ -1,6 +1,6 @@
 """Reads a bag as a log of a drive: images joined by capture stamp with what was sent to the motor, and with poses.
 
-The wheel angle is that of ``/motor/sent``. A bag of other software has it in an ``AckermannDriveStamped``, whose ``steering_angle`` is in
+The wheel angle comes from ``/motor/sent``. A bag of other software has it in an ``AckermannDriveStamped``, whose ``steering_angle`` is in
 radians, left positive, by definition of the message. The velocities of a ``Twist`` are no wheel angle.
 """
 
@@ -82,7 +82,7 @@ def read_bag_log(bag: Path, choice: LogChoice) -> DriveLog:
 
     Raises:
         BagError: The bag cannot be read.
-        LogError: It lacks the chosen topics, or any images.
+        LogError: The bag lacks the chosen topics, or any images.
     """
     info = read_info(bag)
     counts = {topic.name: topic.count for topic in info.topics if topic.count}

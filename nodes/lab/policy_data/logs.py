@@ -35,9 +35,9 @@ class OpenLog:
     """A log that a user named.
 
     Attributes:
-        name: What the user wrote.
+        name: The path as written.
         choice: Answers about it.
-        log: Its description.
+        log: Description of the log.
         labels: Source of its labels.
     """
 
@@ -53,7 +53,7 @@ def open_logs(
     """Describe the logs that a user named.
 
     Args:
-        requests: The logs, each with answers of its own.
+        requests: The logs, each with its answers.
         common: Answers about all logs.
         labels: Source of the labels; None leaves it to the format.
     """

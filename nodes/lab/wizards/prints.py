@@ -83,7 +83,7 @@ class MeasuredPrint:
 
     Attributes:
         measurement: Sizes, poses, residuals.
-        colours: Its picture; None where the exposure or the view does not show its colours.
+        colours: The rectified picture; None where the exposure or the view does not show its colours.
         by_car: Whether the driving camera took it, so that the policy sees these colours.
     """
 
@@ -115,7 +115,7 @@ def measure(
         record: Sizes and markers of the print.
         attack: The attack that was printed.
         camera: Lens or camera file; of a bag, and with a pose of the car, a camera file.
-        known: What is known of a photograph.
+        known: Known lengths of a photograph.
 
     Raises:
         CalibrationError: The source does not determine the print's pose.
@@ -152,7 +152,7 @@ def printed_sheet(record: PrintRecord, attack: AttackFile) -> Printable:
     """The poster of an attack, as its record says.
 
     Raises:
-        PrintError: The record is not that of this attack's poster.
+        PrintError: The record belongs to another poster.
     """
     if record.kind != "poster":
         raise PrintError(

@@ -27,7 +27,7 @@ class Publishers:
 
     Args:
         endpoint: Topic and type.
-        own: Our own token on that topic; empty if there is none.
+        own: Our own token on that topic; empty without one.
     """
 
     def __init__(self, endpoint: Endpoint, own: str = "") -> None:

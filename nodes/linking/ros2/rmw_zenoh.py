@@ -1,6 +1,6 @@
 """The wire of ``rmw_zenoh_cpp``: key expressions, liveliness tokens and attachments. Pure.
 
-As in docs/design.md of https://github.com/ros2/rmw_zenoh. Attachments are those of versions from April 2025 on (Jazzy 0.2.4, Kilted 0.6.0);
+As in docs/design.md of https://github.com/ros2/rmw_zenoh. Attachments are as in versions from April 2025 on (Jazzy 0.2.4, Kilted 0.6.0);
 earlier ones had labels between the numbers.
 """
 

@@ -27,7 +27,7 @@ _MESSAGES = (
 
 
 class ZenohSettings(StrictModel):
-    """How the node finds ROS programs over Zenoh. The defaults are those of ``rmw_zenoh_cpp``.
+    """How the node finds ROS programs over Zenoh. The defaults equal ``rmw_zenoh_cpp``'s.
 
     Attributes:
         router: Be the Zenoh router of this computer, instead of a running ``rmw_zenohd``.
