@@ -1,6 +1,9 @@
 """Logs of a drive as other software writes them. Image ``k`` is uniformly ``GREY * k`` and its steering ``(k - 6) / 10``."""
 
 import json
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -9,22 +12,27 @@ COUNT, GREY, FPS = 12, 20, 10
 CAMERA = "observation.images.front"
 
 
-def value(k):
+def value(k: int) -> float:
     return (k - 6) / 10
 
 
-def picture(k, height=48, width=64):
+def picture(k: int, height: int = 48, width: int = 64) -> np.ndarray:
     return np.full((height, width, 3), GREY * k, np.uint8)
 
 
-def write_tub_2(folder, deleted=(), piloted=(), size=(48, 64)):
+def write_tub_2(
+    folder: Path,
+    deleted: Collection[int] = (),
+    piloted: Collection[int] = (),
+    size: tuple[int, int] = (48, 64),
+) -> Path:
     """As ``donkeycar/parts/tub_v2.py`` writes it, five records to a catalog."""
     (folder / "images").mkdir(parents=True)
-    catalogs = {}
+    catalogs: dict[str, list[str]] = {}
     for k in range(COUNT):
         name = f"{k}_cam_image_array_.jpg"
         cv2.imwrite(str(folder / "images" / name), picture(k, *size))
-        record = {"cam/image_array": name, "user/angle": value(k), "user/throttle": 0.4}
+        record: dict[str, Any] = {"cam/image_array": name, "user/angle": value(k), "user/throttle": 0.4}
         record |= {"user/mode": "local" if k in piloted else "user", "_timestamp_ms": 1700000000000 + 100 * k}
         catalogs.setdefault(f"catalog_{k // 5}.catalog", []).append(
             json.dumps(record | {"_index": k, "_session_id": "26-11-26_0"})
@@ -32,12 +40,18 @@ def write_tub_2(folder, deleted=(), piloted=(), size=(48, 64)):
     for name, lines in catalogs.items():
         (folder / name).write_text("\n".join(lines) + "\n")
     state = {"paths": list(catalogs), "current_index": COUNT, "max_len": 5, "deleted_indexes": list(deleted)}
-    rows = [["cam/image_array", "user/angle"], ["image_array", "float"], {}, {"created_at": 1.0}, state]
+    rows: list[Any] = [
+        ["cam/image_array", "user/angle"],
+        ["image_array", "float"],
+        {},
+        {"created_at": 1.0},
+        state,
+    ]
     (folder / "manifest.json").write_text("\n".join(map(json.dumps, rows)) + "\n")
     return folder
 
 
-def write_tub_1(folder, removed=(), excluded=()):
+def write_tub_1(folder: Path, removed: Collection[int] = (), excluded: Collection[int] = ()) -> Path:
     """As ``donkeycar/parts/datastore.py`` writes it; records from 1 on."""
     folder.mkdir(parents=True)
     for k in range(COUNT):
@@ -59,7 +73,7 @@ def write_tub_1(folder, removed=(), excluded=()):
     return folder
 
 
-def write_udacity(folder, header, prefix=""):
+def write_udacity(folder: Path, header: bool, prefix: str = "") -> Path:
     """``driving_log.csv`` beside ``IMG``, with paths of the recording computer."""
     (folder / "IMG").mkdir(parents=True)
     lines = ["center,left,right,steering,throttle,brake,speed"] if header else []
@@ -74,7 +88,7 @@ def write_udacity(folder, header, prefix=""):
     return folder
 
 
-def write_lerobot_2(folder, names=("steering", "throttle")):
+def write_lerobot_2(folder: Path, names: Sequence[str] = ("steering", "throttle")) -> Path:
     """Version 2.1: one table and one video for each episode."""
     info = _info("v2.1", "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet", names)
     info["video_path"] = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
@@ -90,7 +104,9 @@ def write_lerobot_2(folder, names=("steering", "throttle")):
     return folder
 
 
-def write_lerobot_3(folder, names=("steering", "throttle"), images="video"):
+def write_lerobot_3(
+    folder: Path, names: Sequence[str] = ("steering", "throttle"), images: str = "video"
+) -> Path:
     """Version 3.0: several episodes in one table and in one video, or the images in the table."""
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -105,7 +121,7 @@ def write_lerobot_3(folder, names=("steering", "throttle"), images="video"):
     if images == "video":
         _video(folder / f"videos/{CAMERA}/chunk-000/file-000.mp4", np.arange(COUNT))
     starts = [int(numbers[0]) / FPS for numbers in parts]
-    rows = {"episode_index": [0, 1, 2], f"videos/{CAMERA}/from_timestamp": starts}
+    rows: dict[str, list[Any]] = {"episode_index": [0, 1, 2], f"videos/{CAMERA}/from_timestamp": starts}
     rows |= {f"videos/{CAMERA}/{key}": [0, 0, 0] for key in ("chunk_index", "file_index")}
     file = folder / "meta/episodes/chunk-000/file-000.parquet"
     file.parent.mkdir(parents=True)
@@ -113,8 +129,10 @@ def write_lerobot_3(folder, names=("steering", "throttle"), images="video"):
     return folder
 
 
-def _info(version, data_path, names, images="video"):
-    features = {CAMERA: {"dtype": images, "shape": [48, 64, 3], "names": ["height", "width", "channels"]}}
+def _info(version: str, data_path: str, names: Sequence[str], images: str = "video") -> dict[str, Any]:
+    features: dict[str, Any] = {
+        CAMERA: {"dtype": images, "shape": [48, 64, 3], "names": ["height", "width", "channels"]}
+    }
     features["action"] = {"dtype": "float32", "shape": [len(names)], "names": list(names)}
     return {
         "codebase_version": version,
@@ -126,12 +144,14 @@ def _info(version, data_path, names, images="video"):
     }
 
 
-def _write_json(file, data):
+def _write_json(file: Path, data: object) -> None:
     file.parent.mkdir(parents=True)
     file.write_text(json.dumps(data))
 
 
-def _table(file, numbers, episodes, within, images="video"):
+def _table(
+    file: Path, numbers: np.ndarray, episodes: list[int], within: list[int], images: str = "video"
+) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -147,7 +167,7 @@ def _table(file, numbers, episodes, within, images="video"):
     pq.write_table(pa.table(columns), file)
 
 
-def _video(file, numbers):
+def _video(file: Path, numbers: np.ndarray) -> None:
     import av
 
     file.parent.mkdir(parents=True, exist_ok=True)
