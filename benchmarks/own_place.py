@@ -201,7 +201,7 @@ def main() -> None:
     os.environ.setdefault("MUJOCO_GL", "egl")
     command = COMMAND + f" --through {options.through}" * (options.through != "photographs")
     command += f" --budget {options.budget}" * (options.budget != parser.get_default("budget"))
-    # A driver takes whole pictures of its camera, which no baked scene draws well enough: each of its drives takes many times as long.
+    # A driver takes whole pictures of its camera: each of its drives takes many times as long.
     effort = _FEW if options.through == "driver" else ("--budget", options.budget)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -23,8 +23,9 @@ from nodes.runtime.progress import Report
 # output follows from the scene, and machines differ in the last bits.
 VERSION = 1
 COMPARED = "baked.json"
-# Largest loss by baking on held-out views [dB]; a scene that loses more is rendered from its field.
-_MOST_LOST_DB = 0.3
+# Largest loss by baking on held-out views [dB]; a scene that loses more is rendered from its field. Where finished attacks are measured in the
+# baked scene too, as in audits, its steering is what the gate compares with real pictures: baking may then double the field's own error.
+_MOST_LOST_DB = {"field": 0.3, "baked": 10.0 * np.log10(2.0)}
 # Views for which bricks are made: as far from a path as an attack may divert a car [m, for half a lane of 1.75 m], and as turned [rad].
 _VIEWS, _LATERAL_M, _HEADING_RAD, _SEED = 320, 3.0, 0.5, 0
 # A splat is searched through its voxels if these look like it; finished attacks are judged by the splat itself.
@@ -45,14 +46,15 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         return
     fidelity = read_json(experiment.stage_folder("scene") / FIDELITY)
     before_db, after_db = fidelity["mean"]["psnr_policy_db"], _held_out_psnr_db(experiment, baked)
-    used = before_db - after_db <= _MOST_LOST_DB
+    most_lost_db = float(_MOST_LOST_DB[experiment.config.measure.scene])
+    used = before_db - after_db <= most_lost_db
     if used:
         baked.save(baked_file(experiment))
     found = {
         "used": used,
         "psnr_field_db": before_db,
         "psnr_baked_db": after_db,
-        "most_lost_db": _MOST_LOST_DB,
+        "most_lost_db": most_lost_db,
         "mib": baked.voxels.nbytes / 2**20,
     }
     write_json(folder / COMPARED, found)

@@ -35,7 +35,7 @@ _DRIVE: dict[str, Any] = {"paths": True, "horizon": True, "dt_s": True}
 READS: Mapping[str, dict[str, Any]] = {
     "capture": {"capture": True, "objects": True, **_CARRIER, **_DRIVE},
     "scene": {"scene": True, "capture": {"colour_pairs"}},
-    "bake": _DRIVE,
+    "bake": {"measure": {"scene"}, **_DRIVE},
     "object": {"object": {"car_resolution", "hydrant_resolution", "mesh_resolution", "fit_steps"}},
     "policy": {"policy": True, "attack": {"random_sigma"}, **_CARRIER, **_OBJECTS, **_DRIVE},
     "retrain": {

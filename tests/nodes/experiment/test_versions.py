@@ -54,7 +54,7 @@ def test_stages_read_no_settings_that_their_keys_lack(tiny_room):
             for key in each
         }
         assert read - known - set(keys[name]) <= _ASKED, name
-    assert tiny_room[2]["bake"] == {"horizon", "dt_s"}
+    assert tiny_room[2]["bake"] == {"horizon", "dt_s", "measure.scene"}
 
 
 def test_defaults_that_are_not_in_keys_are_of_their_versions():
