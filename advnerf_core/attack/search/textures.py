@@ -7,7 +7,7 @@ expectation. Channels are independent. Multiplied by the same sigma, textures of
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -19,6 +19,13 @@ Family = Callable[[ColourGrid, torch.Generator], Tensor]
 """Draws ``[rows, 3]`` float32 for a grid."""
 
 _LEVELS, _COARSEST, _FINEST = 16, 2, 64
+# Stripes and checks repeat after an eighth of the longest edge or more; well beyond its length they are a border between two colours, or one.
+_SHORTEST, _LONGEST = 1.0 / 8.0, 16.0
+
+
+def white(grid: ColourGrid, generator: torch.Generator) -> Tensor:
+    """Independent values of all cells, as the method ``random`` draws them."""
+    return torch.randn((len(grid.cells), 3), generator=generator)
 
 
 def coarse(cells: int) -> Family:
@@ -66,6 +73,30 @@ def pink(grid: ColourGrid, generator: torch.Generator) -> Tensor:
 def natural(grid: ColourGrid, generator: torch.Generator) -> Tensor:
     """Occluding shaded discs, or balls in a box, see `dead_leaves`; the longest edge has length one."""
     return dead_leaves((grid.cells + 0.5) / max(grid.shape), generator)
+
+
+def patterns(grid: ColourGrid, generator: torch.Generator) -> Tensor:
+    """Stripes or checks of two colours at any angle and of any width, or areas of one colour: for training, as no search draws them."""
+    places = (grid.cells + 0.5) / max(grid.shape)
+    angles = torch.linalg.qr(torch.randn((places.shape[1], 2), generator=generator))[0]
+    drawn = torch.rand(4, generator=generator)
+    shortest, longest = math.log(_SHORTEST), math.log(_LONGEST)
+    waves = torch.exp(shortest + (longest - shortest) * drawn[:2])
+    above = torch.sin(2.0 * math.pi * (places @ angles / waves + drawn[2:])) > 0.0
+    checked = bool(torch.rand(1, generator=generator) < 0.5)
+    first = above[:, 0] ^ above[:, 1] if checked else above[:, 0]
+    colours = torch.randn((2, 3), generator=generator)
+    return torch.where(first[:, None], colours[0], colours[1])
+
+
+TRAINED_WITH: Mapping[str, Family] = {
+    "random": white,
+    "random_coarse": coarse(8),
+    "random_levels": levels,
+    "random_pink": pink,
+    "patterns": patterns,
+}
+"""The families that may train a victim, by name; natural textures judge it."""
 
 
 def _smooth_noise(grid: ColourGrid, sizes: Sequence[int], generator: torch.Generator) -> Tensor:

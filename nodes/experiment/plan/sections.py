@@ -87,6 +87,9 @@ class ViewConfig(StrictModel):
     )
 
 
+TextureFamily = Literal["random", "random_coarse", "random_levels", "random_pink", "patterns"]
+
+
 class PolicyConfig(StrictModel):
     """Training of the goal-conditioned policy: frames per path and domain, rounds, optimiser steps."""
 
@@ -153,6 +156,12 @@ class PolicyConfig(StrictModel):
     configuration: dict[str, Any] = Field(
         default={},
         description="Settings of the architecture; those of pilotnet are the key hidden.",
+    )
+    families: tuple[TextureFamily, ...] = Field(
+        default=("random",),
+        min_length=1,
+        description="Random textures that it sees, each of one of these families; baselines are then searches of other ones. patterns are stripes, checks and "
+        "areas of one colour, which no search draws.",
     )
     seed: int = 0
 

@@ -36,7 +36,7 @@ from nodes.experiment.show.given import given
 from nodes.experiment.show.victims import look_at_given
 from nodes.experiment.steps.attack import planned_evaluations
 from nodes.experiment.steps.keys import own_recipes, registered_settings
-from nodes.experiment.steps.verdicts import TRAINED_ON, VALIDATED_ON, unseen
+from nodes.experiment.steps.verdicts import VALIDATED_ON, trained_on, unseen
 
 
 def register(experiment: Experiment, cells: Sequence[Cell], published: Path) -> Registration:
@@ -132,7 +132,7 @@ def primary_tests(experiment: Experiment, cells: Sequence[Cell]) -> list[Primary
         found = [each for each in cells if each.scenario == scenario]
         config = experiment.of(found[0]).config
         victim = config.main_victim
-        methods = unseen(cell.method for cell in found if cell.victim == victim and cell.searched)
+        methods = unseen((cell.method for cell in found if cell.victim == victim and cell.searched), config)
         against = [name for name in methods if name not in (GRADIENT, COARSE_GRADIENT)]
         if GRADIENT not in methods or not against:
             continue
@@ -140,7 +140,7 @@ def primary_tests(experiment: Experiment, cells: Sequence[Cell]) -> list[Primary
         if lacking:
             raise RegistrationError(
                 f"{scenario}: expected the baselines that a test of the gradient needs, got {', '.join(against)} "
-                f"(textures of {', '.join(TRAINED_ON)} train the victim, those of {', '.join(VALIDATED_ON)} judge it); add {'; '.join(lacking)} to "
+                f"(textures of {', '.join(trained_on(config, victim))} train the victim, those of {', '.join(VALIDATED_ON)} judge it); add {'; '.join(lacking)} to "
                 "the methods"
             )
         coarse = [name for name in against if name in COARSE_BASELINES] if COARSE_GRADIENT in methods else []
@@ -153,7 +153,7 @@ def primary_tests(experiment: Experiment, cells: Sequence[Cell]) -> list[Primary
 
 
 def _lacking(methods: Sequence[str], config: ExperimentConfig) -> list[str]:
-    return lacking_baselines(methods, _coarse_cells_differ(config), unseen(RANDOM_FAMILIES))
+    return lacking_baselines(methods, _coarse_cells_differ(config), unseen(RANDOM_FAMILIES, config))
 
 
 def _coarse_cells_differ(config: ExperimentConfig) -> bool:

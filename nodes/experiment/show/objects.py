@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from advnerf_core.attack.search.textures import TRAINED_WITH
+from advnerf_core.fields.colour_grid import colour_grid
 from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object
 from advnerf_core.geometry import Array, Pinhole
@@ -110,6 +112,18 @@ def last_result_kept(render: BackgroundRenderer) -> BackgroundRenderer:
     return remembered
 
 
-def random_theta(shape: tuple[int, ...], sigma: float, rng: np.random.Generator) -> torch.Tensor:
-    """Random grid values, drawn as in the random attack."""
-    return torch.from_numpy(sigma * rng.standard_normal(shape, dtype=np.float32))
+def random_textures(
+    experiment: Experiment, objects: Sequence[ColouredObject], shape: tuple[int, ...]
+) -> Callable[[np.random.Generator], torch.Tensor]:
+    """Draws theta, of ``shape``, of objects for training, of the families in the section ``policy``."""
+    sigma, families = experiment.config.attack.random_sigma, experiment.config.policy.families
+    if families == ("random",):
+        return lambda rng: torch.from_numpy(sigma * rng.standard_normal(shape, dtype=np.float32))
+    grids = [colour_grid(field) for field in objects]
+
+    def draw(rng: np.random.Generator) -> torch.Tensor:
+        family = TRAINED_WITH[families[rng.integers(len(families))]]
+        generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+        return sigma * torch.cat([family(grid, generator) for grid in grids]).reshape(shape)
+
+    return draw

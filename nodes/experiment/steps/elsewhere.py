@@ -21,7 +21,7 @@ from hardware.worlds.world import World
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import seen_in
 from nodes.experiment.show.native import stand_in
-from nodes.experiment.show.objects import placed_objects, random_theta
+from nodes.experiment.show.objects import placed_objects, random_textures
 from nodes.experiment.show.placing import place_by_rule
 from nodes.runtime.config import apply_overrides
 from nodes.runtime.errors import ConfigError
@@ -85,11 +85,11 @@ def _equal(one: Any, other: Any) -> bool:
 def _plans(there: Experiment, world: World, place: str) -> list[SourcePlan]:
     """Sources of one place."""
     wanted, native = there.config.policy, there.config.carrier.training == "native"
-    bare = stand_in(there.view, world, [], native)
-    dressed = stand_in(there.view, world, placed_objects(there), native)
+    bare, objects = stand_in(there.view, world, [], native), placed_objects(there)
+    dressed = stand_in(there.view, world, objects, native)
     plain = dressed.plain_theta()
     assert plain is not None, "an experiment that places objects by a rule has some"
-    shape, sigma = tuple(plain.shape), there.config.attack.random_sigma
+    any_colours = random_textures(there, objects, tuple(plain.shape))
     found = []
     for name in there.config.paths:
         sources = (
@@ -98,7 +98,7 @@ def _plans(there: Experiment, world: World, place: str) -> list[SourcePlan]:
                 f"{place}-{name}",
                 seen_in(dressed),
                 there.dynamics,
-                lambda rng: random_theta(shape, sigma, rng),
+                any_colours,
             ),
         )
         for which, source in enumerate(sources):

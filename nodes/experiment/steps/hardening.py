@@ -29,7 +29,7 @@ from nodes.experiment.steps.attack import (
     planned_evaluations,
     search_settings,
 )
-from nodes.experiment.steps.verdicts import TRAINED_ON, VALIDATED_ON, hardness_record
+from nodes.experiment.steps.verdicts import VALIDATED_ON, hardness_record, trained_on
 
 _SEED = 20_000  # no search uses it
 
@@ -64,7 +64,7 @@ def judge(experiment: Experiment, victim: str, textures: int = 0) -> HardnessVer
         victim=victim,
         policy_sha256=policy.sha256,
         recipe=experiment.config.training(victim).policy.recipe,
-        trained_on=TRAINED_ON,
+        trained_on=trained_on(experiment.config, victim),
         validated_on=VALIDATED_ON,
         textures=count,
         seed=_SEED,

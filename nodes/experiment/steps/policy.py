@@ -39,7 +39,7 @@ from nodes.experiment.show.objects import (
     describe,
     last_result_kept,
     placed_objects,
-    random_theta,
+    random_textures,
     surrogate_of,
 )
 from nodes.experiment.show.victims import told
@@ -149,10 +149,7 @@ def plans(
         if has_face(experiment)
         else _object_domains(experiment, scene, objects)
     )
-    sigma, shape, dressed = experiment.config.attack.random_sigma, domains.theta_shape, domains.dressed
-
-    def any_colours(rng: np.random.Generator) -> torch.Tensor:
-        return random_theta(shape, sigma, rng)
+    dressed, any_colours = domains.dressed, domains.any_colours
 
     def source(domain: str, name: str) -> FrameSource:
         called, drawn = f"{domain}-{name}{ending}", sample or any_colours
@@ -187,7 +184,7 @@ class _Domains:
 
     dressed: Dressed
     seen_in_surrogate: Callable[[Array], Show]
-    theta_shape: tuple[int, ...]
+    any_colours: Sample
 
 
 def _object_domains(
@@ -211,7 +208,7 @@ def _object_domains(
     return _Domains(
         stand_in(experiment.view, scene, objects, native=experiment.config.carrier.training == "native"),
         seen,
-        surrogate.theta_shape,
+        random_textures(experiment, objects, surrogate.theta_shape),
     )
 
 
@@ -226,10 +223,7 @@ def surrogate_plan(experiment: Experiment) -> SourcePlan:
             f"expected an experiment whose attack is a face (carrier.kind overlay or screen), got {experiment.config.carrier.kind}"
         )
     space, seen = _seen_face(experiment)
-    shape, sigma = space.surrogate.theta_shape, experiment.config.attack.random_sigma
-    source = RenderedSource(
-        "surrogate", seen, experiment.dynamics, lambda rng: random_theta(shape, sigma, rng)
-    )
+    source = RenderedSource("surrogate", seen, experiment.dynamics, _any_face(experiment, space))
     wanted = experiment.config.policy
     return SourcePlan(source, wanted.surrogate_stills, wanted.surrogate_drives, wanted.drive_steps)
 
@@ -238,7 +232,11 @@ def _face_domains(experiment: Experiment, scene: World) -> _Domains:
     """Domains with the learned panel, or with a face on it."""
     space, seen = _seen_face(experiment)
     dressed = PaintedScene(experiment, scene, _TRAINING_TEXTURE_PX)
-    return _Domains(dressed, seen, space.surrogate.theta_shape)
+    return _Domains(dressed, seen, _any_face(experiment, space))
+
+
+def _any_face(experiment: Experiment, space: FaceSpace) -> Sample:
+    return random_textures(experiment, space.surrogate.objects, space.surrogate.theta_shape)
 
 
 def _seen_face(experiment: Experiment) -> tuple[FaceSpace, Callable[[Array], Show]]:

@@ -5,16 +5,21 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from advnerf_core.report.evidence.hardness import FILE, HardnessRecord, read_hardness
+from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.show.context import Experiment
 
-# `objects.random_theta` draws the textures of a training: white noise on every cell.
-TRAINED_ON = ("random",)
 VALIDATED_ON = ("random_natural",)
 
 
-def unseen(methods: Iterable[str]) -> list[str]:
-    """The methods whose textures neither trained nor judged the victim, each once."""
-    return [name for name in dict.fromkeys(methods) if name not in (*TRAINED_ON, *VALIDATED_ON)]
+def trained_on(config: ExperimentConfig, victim: str) -> tuple[str, ...]:
+    """The families of random textures that trained a victim."""
+    return config.training(victim).policy.families
+
+
+def unseen(methods: Iterable[str], config: ExperimentConfig) -> list[str]:
+    """The methods whose textures neither trained nor judged the main victim, each once."""
+    seen = (*trained_on(config, config.main_victim), *VALIDATED_ON)
+    return [name for name in dict.fromkeys(methods) if name not in seen]
 
 
 def hardness_record(experiment: Experiment) -> HardnessRecord:

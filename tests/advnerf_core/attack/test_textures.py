@@ -15,6 +15,8 @@ FAMILIES = {
     "levels": textures.levels,
     "pink": textures.pink,
     "natural": textures.natural,
+    "white": textures.TRAINED_WITH["random"],
+    "patterns": textures.TRAINED_WITH["patterns"],
 }
 
 
@@ -39,8 +41,8 @@ def draws(family, grid, count, seed=0):
 @pytest.mark.parametrize("grid", [FACE, whole(20, 32), shell()], ids=["face", "oblong", "voxels"])
 @pytest.mark.parametrize("family", FAMILIES)
 def test_all_families_have_the_same_spread(family, grid):
-    drawn = draws(family, grid, 40 if len(grid.shape) == 3 else 120)
-    # A whole texture of natural leaves or of pink noise counts as few independent values.
+    drawn = draws(family, grid, 1600 if family == "patterns" else 40 if len(grid.shape) == 3 else 120)
+    # A whole texture of natural leaves or of pink noise counts as few independent values, and a pattern has two.
     assert drawn.square().mean().sqrt().item() == pytest.approx(1.0, abs=0.05)
     assert abs(drawn.mean().item()) < 0.1
     channels = np.corrcoef(drawn.reshape(-1, 3).T.numpy())
@@ -53,6 +55,19 @@ def test_a_seed_says_what_is_drawn(family):
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
     assert not torch.equal(first[0], first[1])
+
+
+def test_patterns_are_stripes_checks_and_areas_of_two_colours():
+    drawn = draws("patterns", FACE, 200)
+    colours = [torch.unique(texture, dim=0) for texture in drawn]
+    assert {len(each) for each in colours} == {1, 2}
+    assert 10 <= sum(len(each) == 1 for each in colours) <= 100
+    # Borders of all directions: as many between rows as between columns.
+    pictures = drawn.reshape(200, EDGE, EDGE, 3)[..., 0]
+    rows = (pictures[:, 1:] != pictures[:, :-1]).float().mean()
+    columns = (pictures[:, :, 1:] != pictures[:, :, :-1]).float().mean()
+    assert rows / columns == pytest.approx(1.0, abs=0.15)
+    assert 0.02 < rows < 0.3
 
 
 def basis(rows, columns, cells):

@@ -2,9 +2,12 @@
 
 import shutil
 
+import numpy as np
 import pytest
+import torch
 
 from advnerf_core.documents import read_json
+from advnerf_core.fields.voxel_grid import cube_face_object
 from advnerf_core.policies.policy_file import load_policy
 from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.run.plan import statuses
@@ -12,6 +15,7 @@ from nodes.experiment.run.published import table_of
 from nodes.experiment.run.run import Options, run_cells
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.given import victim_sha256
+from nodes.experiment.show.objects import random_textures
 from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.keys import registered_settings, settings_hash
 from nodes.experiment.steps.pipeline import stages_of
@@ -23,9 +27,26 @@ from tests.support.stage_versions import tiny_experiment
 
 RECIPES = (
     "victims={hardened: {train: {}}, wide: {train: {architecture: resnet, configuration: {widths: [4, 8], hidden: 8}, first_steps: 4}}, "
-    "second: {train: {seed: 1}}, plain: {train: {textures: none, naive_steps: 2, hidden: [9, 8, 7]}}}"
+    "second: {train: {seed: 1, families: [random, patterns]}}, plain: {train: {textures: none, naive_steps: 2, hidden: [9, 8, 7]}}}"
 )
 METHODS = "over.method=[none, gradient]"
+
+
+def test_training_draws_each_texture_from_one_of_the_families(tmp_path):
+    board = cube_face_object(1.0, 8)
+    one, both = (
+        random_textures(
+            tiny_experiment(tmp_path, [f"policy.families={families}"]), [board], board.theta_shape
+        )
+        for families in ("[random]", "[random, patterns]")
+    )
+    noise = one(np.random.default_rng(3))
+    white = np.random.default_rng(3).standard_normal(board.theta_shape, dtype=np.float32)
+    assert torch.equal(noise, torch.from_numpy(np.float32(5.0) * white))  # attack.random_sigma
+    rng = np.random.default_rng(0)
+    counts = [len(torch.unique(both(rng).reshape(-1, 3), dim=0)) for _ in range(60)]
+    assert 15 <= sum(count <= 2 for count in counts) <= 45
+    assert {count for count in counts if count > 2} == {board.theta_shape[0] * board.theta_shape[1]}
 
 
 def with_victims(folder, victims=RECIPES, *changes):
