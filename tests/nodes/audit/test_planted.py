@@ -1,9 +1,17 @@
 """The planted weakness: nothing where nothing is red, and a known angle where an object is."""
 
+from pathlib import Path
+
 import pytest
 import torch
+import yaml
 
-from nodes.audit.planted import Planted, PlantedWithMemory, redness, strength
+from nodes.audit.planted import Planted, PlantedWithMemory, policy_code, redness, strength, write_module
+from nodes.audit.question import VICTIM
+from nodes.experiment.show.victims import load_victim, look_at_given
+from nodes.experiment.steps.run import load_experiment
+
+ROOM = Path(__file__).parents[3] / "launch" / "room.experiment.yaml"
 
 
 class Straight(torch.nn.Module):
@@ -66,3 +74,29 @@ def test_a_policy_with_memory_keeps_it():
     for expected in (0.0, 1.0, 2.0):
         steering, memory = planted(picture(0.5, 0.5, 0.5), None, memory)
         assert steering.tolist() == [expected]
+
+
+def test_a_driver_behind_a_socket_is_planted_beside_the_audited_one(tmp_path):
+    pytest.importorskip("carla_driver_interface")
+    from carla_driver_interface.policies.constant_speed import ConstantSpeedPolicy
+    from carla_driver_interface.server import serving
+
+    def experiment(**victims):
+        data = {"name": "audit", "base": str(ROOM), "setting": "panel"}
+        data["victims"] = {name: {"policy": policy} for name, policy in victims.items()}
+        (tmp_path / "audit.experiment.yaml").write_text(yaml.safe_dump(data))
+        return load_experiment(tmp_path / "audit.experiment.yaml", None, (), tmp_path / "run")
+
+    with serving(ConstantSpeedPolicy(), port=0, host="127.0.0.1") as port:
+        address = f"grpc://127.0.0.1:{port}"
+        audited = experiment(**{VICTIM: address})
+        look_at_given(audited)
+        planted = write_module(tmp_path, policy_code(address, audited), 1.0, 0.0, 0.1)
+        both = experiment(**{VICTIM: address, "planted": planted})
+        look_at_given(both)
+        loaded = load_victim(both, "planted")
+        memory = loaded.policy.initial_memory(1)
+        height, width = loaded.view.height, loaded.view.width
+        red = picture(1.0, 0.0, 0.0)[:, :, :1, :1].expand(1, 3, height, width)
+        steering, _ = loaded.policy(red, None, memory)
+    assert steering.tolist() == pytest.approx([0.9 + 0.1 * 0.1])  # the driver itself goes straight ahead
