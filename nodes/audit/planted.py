@@ -9,7 +9,6 @@ the policy.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -89,10 +88,9 @@ def plant(loaded: LoadedPolicy, gain_rad: float, middle: float, reach: float) ->
     return adapt(kind(loaded.policy, gain_rad, middle, reach).eval(), own)
 
 
-def audited_driver(address: str, file: str, folder: str, setting: str) -> LoadedPolicy:
+def audited_driver(file: str, folder: str, setting: str) -> LoadedPolicy:
     """The driver behind a socket that an audit queries, with the experiment's car and camera."""
-    alone = f"victims={{{VICTIM}: {{policy: {json.dumps(address)}}}}}"  # the planted one is not there before this returns
-    return load_victim(load_experiment(Path(file), setting, [alone], Path(folder)), VICTIM)
+    return load_victim(load_experiment(Path(file), setting, (), Path(folder)), VICTIM)
 
 
 def strength(plain: Sequence[Tensor], red: Tensor, wanted_rad: float) -> tuple[float, float, float]:
@@ -118,7 +116,7 @@ def policy_code(spec: str, experiment: Experiment) -> str:
     """The Python expression that loads the audited policy."""
     if not is_address(spec):
         return f"load_any_policy({spec!r})"
-    return f"audited_driver({spec!r}, {str(experiment.file)!r}, {str(experiment.folder)!r}, {experiment.setting!r})"
+    return f"audited_driver({str(experiment.file)!r}, {str(experiment.folder)!r}, {experiment.setting!r})"
 
 
 def write_module(folder: Path, loads: str, gain_rad: float, middle: float, reach: float) -> str:

@@ -45,7 +45,7 @@ from nodes.audit.searching import FoundAttack, Searches, SearchesElsewhere
 from nodes.audit.spots import Spot, best_spots
 from nodes.experiment.plan.object_kinds import footprint_m
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.given import given
+from nodes.experiment.show.given import given_victim
 from nodes.experiment.show.placing import clean_poses
 from nodes.experiment.show.victims import look_at_given
 from nodes.runtime.progress import ProgressDisplay
@@ -213,7 +213,7 @@ class Audit:
     def _searches(
         self, copies: Copies, plan: AuditPlan, spots: list[Spot], victim: str, limit_m: float
     ) -> Searches:
-        declared = given(copies.experiment("place"))[VICTIM].declared
+        declared = given_victim(copies.experiment("place"), VICTIM).declared
         searches = Searches(
             copies,
             plan,

@@ -29,7 +29,7 @@ from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.plan.placed import PlacedObject, in_a_lane
 from nodes.experiment.plan.sections import ResponseConfig
 from nodes.experiment.show.experiment_world import ExperimentWorld
-from nodes.experiment.show.given import given, given_in
+from nodes.experiment.show.given import given_in, given_victim
 from nodes.lab.policy_camera import require_camera
 from nodes.lab.worlds.expert_drive import as_path
 from nodes.runtime.errors import ConfigError
@@ -167,7 +167,8 @@ class Experiment(ExperimentWorld):
         Raises:
             ConfigError: The window leaves the camera's image; or a policy was made for another camera, or was not loaded yet.
         """
-        for name, policy in given(self).items():
+        for name in given_in(self.config):
+            policy = given_victim(self, name)
             view = policy.declared.view
             if "view" in self.config.model_fields_set:
                 raise ConfigError(

@@ -66,18 +66,18 @@ def given(experiment: RunFolder[ExperimentConfig]) -> Mapping[str, GivenPolicy]:
     Raises:
         VictimUnknownError: A victim was not loaded yet, or its file or code has changed since.
     """
-    wanted = given_in(experiment.config)
-    if not wanted:
-        return {}
-    known = read_kept(experiment.folder)
-    for name, spec in wanted.items():
-        kept = known.get(name)
-        if kept is None or (kept.policy, kept.source_sha256) != (spec, source_sha256(spec)):
-            raise VictimUnknownError(
-                f"{experiment.file}: victims.{name}: expected {spec} as it was when the experiment was last run, got "
-                f"{'one that was never looked at' if kept is None else 'another'}; run the experiment"
-            )
-    return {name: known[name] for name in wanted}
+    return {name: given_victim(experiment, name) for name in given_in(experiment.config)}
+
+
+def given_victim(experiment: RunFolder[ExperimentConfig], victim: str) -> GivenPolicy:
+    """Stored facts about one existing victim, whether or not the others were loaded; see `given`."""
+    spec, kept = given_in(experiment.config)[victim], read_kept(experiment.folder).get(victim)
+    if kept is None or (kept.policy, kept.source_sha256) != (spec, source_sha256(spec)):
+        raise VictimUnknownError(
+            f"{experiment.file}: victims.{victim}: expected {spec} as it was when the experiment was last run, got "
+            f"{'one that was never looked at' if kept is None else 'another'}; run the experiment"
+        )
+    return kept
 
 
 def victim_spec(experiment: RunFolder[ExperimentConfig], victim: str) -> str:
@@ -94,11 +94,11 @@ def victim_spec(experiment: RunFolder[ExperimentConfig], victim: str) -> str:
 def victim_sha256(experiment: RunFolder[ExperimentConfig], victim: str) -> str:
     """Content hash of a victim; nothing of it is executed."""
     if victim in given_in(experiment.config):
-        return given(experiment)[victim].sha256
+        return given_victim(experiment, victim).sha256
     return policy_sha256(victim_spec(experiment, victim))
 
 
 def victim_without_gradient(experiment: RunFolder[ExperimentConfig]) -> bool:
     """Whether the main victim declares that it has no gradient."""
-    kept = given(experiment).get(experiment.config.main_victim)
-    return kept is not None and not kept.declared.differentiable
+    main = experiment.config.main_victim
+    return main in given_in(experiment.config) and not given_victim(experiment, main).declared.differentiable

@@ -13,7 +13,7 @@ from advnerf_core.policies.load import is_address, load_any_policy, source_sha25
 from advnerf_core.policies.policy_file import LoadedPolicy
 from advnerf_core.policies.view import PolicyView
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.given import KEPT, GivenPolicy, given, given_in, read_kept, victim_spec
+from nodes.experiment.show.given import KEPT, GivenPolicy, given_in, given_victim, read_kept, victim_spec
 from nodes.runtime.errors import ConfigError
 
 
@@ -88,7 +88,7 @@ def load_victim(experiment: Experiment, victim: str) -> LoadedPolicy:
     spec = victim_spec(experiment, victim)
     if victim not in given_in(experiment.config):
         return _loaded(spec, Path(spec).stat().st_mtime_ns)
-    expected_sha256 = given(experiment)[victim].sha256
+    expected_sha256 = given_victim(experiment, victim).sha256
     if is_address(spec):
         return _driver_at(experiment, spec, expected_sha256)
     return _loaded(spec, 0, expected_sha256)

@@ -17,7 +17,7 @@ from nodes.experiment.plan.sections import NETWORK
 from nodes.experiment.plan.victims import NAIVE, RETRAINED
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.faces import has_face
-from nodes.experiment.show.given import given, given_in, victim_sha256, victim_spec
+from nodes.experiment.show.given import given_in, given_victim, victim_sha256, victim_spec
 from nodes.experiment.show.spaces import named_objects
 from nodes.experiment.steps import bake
 from nodes.runtime.errors import RuntimeFault
@@ -189,7 +189,7 @@ def _require_gradient(experiment: Experiment, cell: Cell) -> None:
     method = METHODS.get(cell.code)
     if method is None or not method.needs_gradient or cell.victim not in given_in(experiment.config):
         return
-    if not given(experiment)[cell.victim].declared.differentiable:
+    if not given_victim(experiment, cell.victim).declared.differentiable:
         raise NoSuchCellError(
             f"expected methods that need no gradient against victim {cell.victim}, which declares that it has none, got {cell.method}; set "
             f"over.method to some of {', '.join(black_box_methods())}"
