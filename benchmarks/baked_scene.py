@@ -219,8 +219,8 @@ def reach(experiment: Experiment) -> None:
         "trained scene to an attack that predicts an excess of 0.15 m a tick",
         taken_s,
         "s",
-        "<= 60 s",
-        taken_s <= 60.0 and excess_m >= _EXCESS_M,
+        "<= 8 s",
+        taken_s <= 8.0 and excess_m >= _EXCESS_M,
         f"hardened victim, T = {problem.steps}: {excess_m:.3f} m a tick after {iteration + 1} evaluations; {baking_s:.0f} s of it baking",
     )
 
