@@ -20,7 +20,7 @@ HALF, OTHER_HALF = "half", "other-half"
 # The teacher of the exported steering returns to the path within about this many half lanes.
 _RETURNS_IN = 5.0
 # A small audit: fewer pictures would fail the fidelity gate, so the searches are shortened instead.
-CI_SECTIONS: Mapping[str, Any] = {"scene": {"steps": 600}, "horizon": 40}
+CI_SECTIONS: Mapping[str, Any] = {"scene": {"steps": 600}}
 Scale = Literal["world", "poses", "length", "positions", "fiducials"]
 PlaceKind = Literal["images", "video", "scene", "splat", "world"]
 

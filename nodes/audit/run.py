@@ -59,7 +59,7 @@ _LEAVES_AT_MOST = 0.25
 _PLANTED_SHARE = 1.0
 # Settings with the plain object at the first spot, and at its place in an earlier audit; and the budget of an audit in continuous integration.
 _FIRST, _BEFORE = "first", "before"
-CI_EVALUATIONS = 160
+CI_EVALUATIONS = 80
 _JUDGING = {"surrogate": "judging in the learned place", "world": "judging in the world"}
 _OVER = 1.1
 Say = Callable[[str], None]
