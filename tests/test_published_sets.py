@@ -24,7 +24,7 @@ def test_something_is_published():
 def test_a_published_set_verifies(name):
     found = verify_set(PUBLISHED / name)
     assert found.problems == ()
-    assert found.numbers > 0 or found.awaits_results
+    assert found.numbers > 0 or found.awaits
 
 
 def test_pictures_films_and_the_reference_build_are_as_published():

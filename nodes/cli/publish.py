@@ -51,7 +51,7 @@ def publish(
     """Copy the finished cells, and the scenes, victims and objects that they were run with, to where they are kept with the code."""
     from advnerf_core.report.evidence import registration
     from advnerf_core.report.evidence.above import write_above_of
-    from advnerf_core.report.evidence.publishing import write_numbers, write_page
+    from advnerf_core.report.evidence.publishing import cells_awaited, write_numbers, write_page
     from advnerf_core.report.evidence.verifying import victims
     from advnerf_core.report.evidence.verifying.digests import write_beside
     from nodes.experiment.run.plan import statuses
@@ -85,7 +85,12 @@ def publish(
         victims.declare(to / experiment.config.name, dict(_scenario_and_reason(each) for each in declare))
     if build:  # before the page, which says whether the set can be driven again
         _say_build(publish_build(experiment, cells, to, prune))
-    if registered:
+    awaits = cells_awaited(to / experiment.config.name) if registered else 0
+    if awaits:
+        print(
+            f"{to / experiment.config.name}: under way; its numbers are published when {awaits} more cells are there"
+        )
+    if registered and not awaits:
         print(write_numbers(to / experiment.config.name))
         if (film := write_film(experiment, to / experiment.config.name)) is not None:
             print(film)

@@ -52,8 +52,9 @@ def verify(
     wrong = 0
     for each in [name] if name is not None else known:
         found = with_attacks(verify_set(published / each), published / each)
-        if found.awaits_results:
-            print(f"{found.name}: registered, nothing published yet")
+        if found.awaits:
+            said = f"{found.drives} drives of a set under way, which awaits {found.awaits} registered cells"
+            wrong += _say(f"{found.name}: {said}", found.problems)
             continue
         wrong += _say(f"{found.name}: {found.numbers} numbers from {found.drives} drives", found.problems)
         for finding in found.findings:

@@ -34,6 +34,7 @@ from advnerf_core.report.evidence.verifying.layout import (
     sets_in,
 )
 from advnerf_core.report.evidence.verifying.numbers import number_problems, published_numbers
+from advnerf_core.report.evidence.verifying.registered import missing_cells
 from advnerf_core.report.evidence.verifying.victims import drives_badly, read_declared
 
 
@@ -47,7 +48,7 @@ class Verified:
         drives: Number of drives behind them.
         problems: Problems as text; empty if all is well.
         findings: Findings against itself that the set declares, as text.
-        awaits_results: Whether it is registered and nothing of it was published yet.
+        awaits: Number of cells that a set under way lacks: one that was registered and never published whole.
     """
 
     name: str
@@ -55,7 +56,7 @@ class Verified:
     drives: int
     problems: tuple[str, ...]
     findings: tuple[str, ...] = ()
-    awaits_results: bool = False
+    awaits: int = 0
 
 
 def verify_set(folder: Path) -> Verified:
@@ -65,10 +66,11 @@ def verify_set(folder: Path) -> Verified:
         withdrawn, declared = read_withdrawn(folder), read_declared(folder)
     except (SetError, RegistrationError, CellError) as error:
         return Verified(folder.name, 0, 0, (str(error),))
-    if not cells and not (folder / SET).exists() and folder.name not in known_digests(folder.parent):
-        return Verified(folder.name, 0, 0, (), awaits_results=True)
+    evidence = Evidence(registration, cells)
     try:
-        return _verified(folder, Evidence(registration, cells), cells, withdrawn, declared)
+        if not (folder / SET).exists() and folder.name not in known_digests(folder.parent):
+            return _under_way(folder, evidence, cells, withdrawn)
+        return _verified(folder, evidence, cells, withdrawn, declared)
     except (
         ValueError,
         LookupError,
@@ -78,6 +80,19 @@ def verify_set(folder: Path) -> Verified:
         return Verified(
             folder.name, 0, 0, (f"{folder}: cannot be computed again: {error!r}; restore it from git",)
         )
+
+
+def _under_way(
+    folder: Path, evidence: Evidence, cells: Sequence[CellResult], withdrawn: Mapping[str, str]
+) -> Verified:
+    """A set that was never published whole: no number of it is claimed, but the cells that are there must be right."""
+    problems = tuple(set_problems(folder, evidence, cells, under_way=True)) if cells else ()
+    missing = len(missing_cells(evidence, cells, withdrawn))
+    return Verified(folder.name, 0, _drives(cells), problems, awaits=missing)
+
+
+def _drives(cells: Sequence[CellResult]) -> int:
+    return sum(len(kept) for cell in cells for kept in cell.kept.values())
 
 
 def _verified(
@@ -91,8 +106,9 @@ def _verified(
     numbers = 0
     if not problems:  # numbers of damaged drives add nothing
         numbers, problems = number_problems(folder, published_numbers(evidence, withdrawn, declared))
-    drives = sum(len(kept) for cell in cells for kept in cell.kept.values())
-    return Verified(folder.name, numbers, drives, tuple(problems), tuple(_findings(evidence, problems)))
+    return Verified(
+        folder.name, numbers, _drives(cells), tuple(problems), tuple(_findings(evidence, problems))
+    )
 
 
 def verify_beside(published: Path) -> tuple[str, ...]:

@@ -233,10 +233,26 @@ def test_what_is_only_registered_awaits_its_results_and_what_vanished_does_not(c
     write_page(copied.parent)
     found = verify_set(copied)
     assert found.problems == ()
-    assert found.awaits_results
+    assert found.awaits == 26
     done = CliRunner().invoke(app, ["verify", "--folder", str(copied.parent)])
     assert done.exit_code == 0
-    assert "registered, nothing published yet" in done.output
+    assert "0 drives of a set under way, which awaits 26 registered cells" in done.output
+
+
+def test_a_set_under_way_lacks_cells_and_those_that_are_there_must_be_right(copied):
+    files = sorted(copied.glob("*_gradient_*.json"))
+    files[0].unlink()
+    (copied / "predictions" / files[0].name).unlink()
+    assert f"{files[0].stem}: was registered, and is not there" in verify_set(copied).problems
+    (copied / SET).unlink()
+    assert verify_set(copied).problems  # it was published whole
+    (copied.parent / DIGESTS).write_text("{}")
+    found = verify_set(copied)
+    assert (found.problems, found.awaits, found.numbers) == ((), 1, 0)
+    data = json.loads(files[1].read_text())
+    data["deployed"]["total_cte_m"][0] += 1.0
+    files[1].write_text(json.dumps(data))
+    assert files[1].stem in verify_set(copied).problems[0]
 
 
 def test_too_few_searches_for_any_test_leave_the_interval(copied):
