@@ -146,6 +146,7 @@ QUESTIONS = (
         "Latency, launch, memory, two computers, calibration, and a policy learned from recordings.",
         (
             "one_hop",
+            "log_round_trip",
             "frame_age",
             "launch_times",
             "car_nodes",
