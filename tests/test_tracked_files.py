@@ -8,7 +8,8 @@ import pytest
 from nodes.experiment.run.set_film import MOST_BYTES
 
 ROOT = Path(__file__).parents[1]
-MOST_TRACKED_BYTES = 45_000_000
+# 45 MB, and paper_car: scenes and victims of two places 19 MB, drives and textures of its 106 cells 16 MB.
+MOST_TRACKED_BYTES = 80_000_000
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +22,7 @@ def tracked():
     return [file for name in names.split("\0") if name and (file := ROOT / name).is_file()]
 
 
-def test_all_tracked_files_are_at_most_45_mb(tracked):
+def test_tracked_files_keep_to_their_budget(tracked):
     sizes = {file.relative_to(ROOT).as_posix(): file.stat().st_size for file in tracked}
     largest = sorted(sizes, key=sizes.__getitem__)[-5:]
     assert sum(sizes.values()) <= MOST_TRACKED_BYTES, f"the largest are {largest}"
