@@ -51,7 +51,8 @@ def publish(
     """Copy the finished cells, and the scenes, victims and objects that they were run with, to where they are kept with the code."""
     from advnerf_core.report.evidence import registration
     from advnerf_core.report.evidence.above import write_above_of
-    from advnerf_core.report.evidence.publishing import cells_awaited, write_numbers, write_page
+    from advnerf_core.report.evidence.publishing import write_numbers, write_page
+    from advnerf_core.report.evidence.verify import SetError, verify_set
     from advnerf_core.report.evidence.verifying import victims
     from advnerf_core.report.evidence.verifying.digests import write_beside
     from nodes.experiment.run.plan import statuses
@@ -85,18 +86,18 @@ def publish(
         victims.declare(to / experiment.config.name, dict(_scenario_and_reason(each) for each in declare))
     if build:  # before the page, which says whether the set can be driven again
         _say_build(publish_build(experiment, cells, to, prune))
-    awaits = cells_awaited(to / experiment.config.name) if registered else 0
-    if awaits:
-        print(
-            f"{to / experiment.config.name}: under way; its numbers are published when {awaits} more cells are there"
-        )
-    if registered and not awaits:
+    part = verify_set(to / experiment.config.name) if registered else None
+    if part is not None and not part.awaits:
         print(write_numbers(to / experiment.config.name))
         if (film := write_film(experiment, to / experiment.config.name)) is not None:
             print(film)
             print(write_above_of(to / experiment.config.name))  # with frames of the film
         print(write_page(to))
     else:
+        if part is not None and part.problems:
+            raise SetError(f"{to / part.name}: cannot be published: {part.problems[0]}")
+        if part is not None:
+            print(f"{to / part.name}: its numbers are published when {part.awaits} more cells are there")
         write_beside(to)
     unfinished = len(cells) - len(found.written) - len(found.same)
     print(f"{len(found.written)} cells written, {len(found.same)} were there, {unfinished} are not finished")

@@ -18,7 +18,6 @@ from advnerf_core.report.evidence.verifying.digests import digests_of, write_bes
 from advnerf_core.report.evidence.verifying.layout import PAGE, SET, SetError, read_set, sets_in
 from advnerf_core.report.evidence.verifying.numbers import published_numbers
 from advnerf_core.report.evidence.verifying.pictures import write_picture
-from advnerf_core.report.evidence.verifying.registered import missing_cells
 from advnerf_core.report.evidence.verifying.victims import read_declared
 
 
@@ -27,18 +26,6 @@ def write_set(folder: Path) -> Path:
     file = write_numbers(folder)
     write_page(folder.parent)
     return file
-
-
-def cells_awaited(folder: Path) -> int:
-    """Number of registered cells that a set never published whole still lacks; of a published one 0.
-
-    Raises:
-        SetError: The folder has no registration.
-    """
-    registration, cells = read_set(folder)
-    if (folder / SET).exists():
-        return 0
-    return len(missing_cells(Evidence(registration, cells), cells, read_withdrawn(folder)))
 
 
 def write_numbers(folder: Path) -> Path:

@@ -68,8 +68,11 @@ def verify_set(folder: Path) -> Verified:
         return Verified(folder.name, 0, 0, (str(error),))
     evidence = Evidence(registration, cells)
     try:
-        if not (folder / SET).exists() and folder.name not in known_digests(folder.parent):
-            return _under_way(folder, evidence, cells, withdrawn)
+        missing = len(missing_cells(evidence, cells, withdrawn))
+        if missing and not (folder / SET).exists() and folder.name not in known_digests(folder.parent):
+            # No number is claimed, but the cells that are there must be right.
+            problems = tuple(set_problems(folder, evidence, cells, under_way=True))
+            return Verified(folder.name, 0, _drives(cells), problems, awaits=missing)
         return _verified(folder, evidence, cells, withdrawn, declared)
     except (
         ValueError,
@@ -80,15 +83,6 @@ def verify_set(folder: Path) -> Verified:
         return Verified(
             folder.name, 0, 0, (f"{folder}: cannot be computed again: {error!r}; restore it from git",)
         )
-
-
-def _under_way(
-    folder: Path, evidence: Evidence, cells: Sequence[CellResult], withdrawn: Mapping[str, str]
-) -> Verified:
-    """A set that was never published whole: no number of it is claimed, but the cells that are there must be right."""
-    problems = tuple(set_problems(folder, evidence, cells, under_way=True)) if cells else ()
-    missing = len(missing_cells(evidence, cells, withdrawn))
-    return Verified(folder.name, 0, _drives(cells), problems, awaits=missing)
 
 
 def _drives(cells: Sequence[CellResult]) -> int:

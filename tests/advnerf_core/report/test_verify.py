@@ -255,6 +255,14 @@ def test_a_set_under_way_lacks_cells_and_those_that_are_there_must_be_right(copi
     assert files[1].stem in verify_set(copied).problems[0]
 
 
+def test_a_set_with_all_its_cells_is_not_under_way(copied):
+    (copied / SET).unlink()
+    (copied.parent / DIGESTS).write_text("{}")
+    found = verify_set(copied)
+    assert found.awaits == 0
+    assert "cannot be read" in found.problems[0]
+
+
 def test_too_few_searches_for_any_test_leave_the_interval(copied):
     whole = evidence_of(copied)
     few = {name: cell for name, cell in whole.cells.items() if cell.seed < 5}
