@@ -151,6 +151,16 @@ def test_the_body_is_out_of_sight_of_other_pictures(library, settings):
         assert heights[-1] == pytest.approx(2.5, abs=1e-4)
 
 
+def test_six_seconds_along_a_path_give_both_images_and_leave_no_actor(library, settings):
+    with scene_of(library, settings) as scene:
+        scene.reset(*scene.paths["left"].start_pose)
+        for _ in range(60):
+            rgb, depth = scene.observe()
+            scene.step(0.0, 6.0, 0.1)
+    assert depth.shape == rgb.shape[:2] == (46, 84)
+    assert not library.world.actors
+
+
 def test_photographs_need_no_car_at_all(library, settings):
     with scene_of(library, settings) as scene:
         scene.photograph(planar_pose(-10.0, 0.0, 0.0) @ camera_mount(0.0, 0.0, 2.0))
