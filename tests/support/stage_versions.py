@@ -51,7 +51,7 @@ def measured(folder: Path, watcher: StageDisplay | None = None) -> dict[str, dic
     from nodes.experiment.steps.run import make_ready
 
     experiment = tiny_experiment(folder)
-    make_ready(experiment, watcher=watcher)
+    make_ready(experiment, anew=True, watcher=watcher)
     views = load_transforms(experiment.stage_folder("capture") / "held_out", require_all=True).load()
     fidelity = json.loads((experiment.stage_folder("scene") / "fidelity.json").read_text())["mean"]
     baked = json.loads((experiment.stage_folder("bake") / "baked.json").read_text())

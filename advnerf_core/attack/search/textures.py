@@ -72,12 +72,12 @@ def pink(grid: ColourGrid, generator: torch.Generator) -> Tensor:
 
 def natural(grid: ColourGrid, generator: torch.Generator) -> Tensor:
     """Occluding shaded discs, or balls in a box, see `dead_leaves`; the longest edge has length one."""
-    return dead_leaves((grid.cells + 0.5) / max(grid.shape), generator)
+    return dead_leaves(_to_scale(grid), generator)
 
 
 def patterns(grid: ColourGrid, generator: torch.Generator) -> Tensor:
     """Stripes or checks of two colours at any angle and of any width, or areas of one colour: for training, as no search draws them."""
-    places = (grid.cells + 0.5) / max(grid.shape)
+    places = _to_scale(grid)
     angles = torch.linalg.qr(torch.randn((places.shape[1], 2), generator=generator))[0]
     drawn = torch.rand(4, generator=generator)
     shortest, longest = math.log(_SHORTEST), math.log(_LONGEST)
@@ -91,12 +91,14 @@ def patterns(grid: ColourGrid, generator: torch.Generator) -> Tensor:
 
 TRAINED_WITH: Mapping[str, Family] = {
     "random": white,
-    "random_coarse": coarse(8),
-    "random_levels": levels,
-    "random_pink": pink,
     "patterns": patterns,
 }
-"""The families that may train a victim, by name; natural textures judge it."""
+"""The families that may train a victim, by name: the others are for searches and for judging it."""
+
+
+def _to_scale(grid: ColourGrid) -> Tensor:
+    """Centres of the cells, the longest edge of length one, ``[rows, d]``."""
+    return (grid.cells + 0.5) / max(grid.shape)
 
 
 def _smooth_noise(grid: ColourGrid, sizes: Sequence[int], generator: torch.Generator) -> Tensor:

@@ -87,7 +87,7 @@ class ViewConfig(StrictModel):
     )
 
 
-TextureFamily = Literal["random", "random_coarse", "random_levels", "random_pink", "patterns"]
+TextureFamily = Literal["random", "patterns"]
 
 
 class PolicyConfig(StrictModel):

@@ -117,7 +117,7 @@ def random_textures(
 ) -> Callable[[np.random.Generator], torch.Tensor]:
     """Draws theta, of ``shape``, of objects for training, of the families in the section ``policy``."""
     sigma, families = experiment.config.attack.random_sigma, experiment.config.policy.families
-    if families == ("random",):
+    if families == ("random",):  # in the bits of all victims before there were other families
         return lambda rng: torch.from_numpy(sigma * rng.standard_normal(shape, dtype=np.float32))
     grids = [colour_grid(field) for field in objects]
 

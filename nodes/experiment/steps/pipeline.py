@@ -126,7 +126,8 @@ def _bake(experiment: Experiment) -> Stage:
 
 def _bake_own(experiment: Experiment, file: Path) -> Stage:
     inputs = {"view": experiment.view_settings, "scene": load_hash(file), "world": experiment.world_settings}
-    return _stage("bake", bake, experiment, Settings.of(experiment.config, READS["bake"], **inputs))
+    settings = Settings.of(experiment.config, READS["bake"], {"measure"}, **inputs)
+    return _stage("bake", bake, experiment, settings)
 
 
 def _object(experiment: Experiment) -> Stage:
