@@ -45,7 +45,7 @@ def main() -> None:
         with ExitStack() as opened:
             there, world = place_elsewhere(experiment, (f"road.blocks={blocks}", f"road.seed={seed}"), opened)
             for past, objects in (("no panel", []), ("a plain panel", placed_objects(there))):
-                mean_m, off = _drive(there, stand_in(there.view, world, objects, native=True), policy)
+                mean_m, off = _drive(there, stand_in(there, world, objects, native=True), policy)
                 means[past].append(mean_m)
                 well[past].append(drives(mean_m, off > 0, there.limits.off_track_m))
                 print(

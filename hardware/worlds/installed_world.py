@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from hardware.worlds.environments import ENVIRONMENTS
-from hardware.worlds.remote_world import RemotePanelWorld
+from hardware.worlds.remote_world import RemoteMeshWorld
 
 
-class InstalledWorld(RemotePanelWorld):
+class InstalledWorld(RemoteMeshWorld):
     """A remote world whose simulator runs in an environment of `ENVIRONMENTS`.
 
     Args:

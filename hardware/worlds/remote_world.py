@@ -30,7 +30,16 @@ from hardware.worlds.remote_answers import (
     state_in,
 )
 from hardware.worlds.remote_errors import RemoteWorldError, ServerLost, ServerProtocolError
-from hardware.worlds.world import NotOpenError, Panel, Rgb, View, WorldDescription, WorldError
+from hardware.worlds.world import (
+    Mesh,
+    NotOpenError,
+    Panel,
+    Rgb,
+    View,
+    WorldDescription,
+    WorldError,
+    require_texture,
+)
 
 _World = TypeVar("_World", bound="RemoteWorld")
 _Arrays = Mapping[str, NDArray[Any]]
@@ -290,35 +299,48 @@ class RemotePanelWorld(RemoteWorld):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self._panels: dict[str, tuple[Panel, Rgb]] = {}
+        # Arguments and arrays of each thing in the scene, by the call that added it and its name.
+        self._added: dict[tuple[str, str], tuple[dict[str, Any], _Arrays]] = {}
 
     def add_panel(self, name: str, panel: Panel, rgb: Rgb | None) -> None:
         """Add a textured panel to the simulator's scene, or remove it; see `hardware.worlds.world.NativePanels`."""
         if rgb is None:
-            self._panels.pop(name, None)
-            self._ask("add_panel", {"name": name, "size_m": None})
+            self._take_out("add_panel", name, {"size_m": None})
             return
-        texture = np.ascontiguousarray(rgb)
-        if texture.ndim != 3 or texture.shape[2] != 3 or texture.dtype != np.uint8 or not texture.size:
-            raise ValueError(
-                f"expected a picture [h, w, 3] uint8 for the panel {name}; got {texture.dtype} {list(texture.shape)}"
-            )
-        self._put_panel(name, panel, texture)
-        self._panels[name] = panel, texture.copy()
+        texture = require_texture(rgb, f"the panel {name}")
+        face = np.asarray(panel.T_world_from_face, dtype=np.float64)
+        self._add(
+            "add_panel",
+            name,
+            {"size_m": [panel.width_m, panel.height_m]},
+            {"T_world_from_face": face, "rgb": texture.copy()},
+        )
 
     def close(self) -> None:
-        """End the process, and forget the panels; safe to call twice."""
-        self._panels.clear()
+        """End the process, and forget what was added; safe to call twice."""
+        self._added.clear()
         super().close()
 
     def _open(self) -> None:
         super()._open()
-        for name, (panel, texture) in self._panels.items():
-            self._put_panel(name, panel, texture)
+        for (call, name), (arguments, arrays) in self._added.items():
+            self._ask(call, {"name": name, **arguments}, arrays)
 
-    def _put_panel(self, name: str, panel: Panel, texture: Rgb) -> None:
-        self._ask(
-            "add_panel",
-            {"name": name, "size_m": [panel.width_m, panel.height_m]},
-            {"T_world_from_face": np.asarray(panel.T_world_from_face, dtype=np.float64), "rgb": texture},
-        )
+    def _add(self, call: str, name: str, arguments: dict[str, Any], arrays: _Arrays) -> None:
+        self._ask(call, {"name": name, **arguments}, arrays)
+        self._added[call, name] = arguments, arrays
+
+    def _take_out(self, call: str, name: str, arguments: dict[str, Any]) -> None:
+        self._added.pop((call, name), None)
+        self._ask(call, {"name": name, **arguments})
+
+
+class RemoteMeshWorld(RemotePanelWorld):
+    """A remote world whose simulator adds textured meshes, too; a `hardware.worlds.world.NativeMeshes`."""
+
+    def add_mesh(self, name: str, mesh: Mesh | None) -> None:
+        """Add a textured mesh to the simulator's scene, or remove it; see `hardware.worlds.world.NativeMeshes`."""
+        if mesh is None:
+            self._take_out("add_mesh", name, {})
+        else:
+            self._add("add_mesh", name, {}, {key: np.array(array) for key, array in vars(mesh).items()})

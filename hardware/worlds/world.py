@@ -405,3 +405,61 @@ class NativePanels(Protocol):
             panel: Pose and true size; its ``screen_px`` is ignored here.
             rgb: Texture ``[h, w, 3]``, row 0 on top for a viewer; None removes the panel.
         """
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles in the world with one texture.
+
+    Attributes:
+        corners_m: Corners ``[F, 3, 3]`` [m], counter-clockwise for who sees the front; the back is not drawn.
+        normals: Unit normals at the corners ``[F, 3, 3]``, out of the front.
+        uv: Places of the corners in the texture ``[F, 3, 2]``: shares of its width from the left, and of its height from the top.
+        rgb: Texture ``[h, w, 3]``, row 0 on top, in the camera's display values.
+    """
+
+    corners_m: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    uv: NDArray[np.float32]
+    rgb: Rgb
+
+    def __post_init__(self) -> None:
+        """Refuse arrays that do not fit together."""
+        count = len(self.corners_m)
+        shapes = {"corners_m": (count, 3, 3), "normals": (count, 3, 3), "uv": (count, 3, 2)}
+        for name, shape in shapes.items():
+            array = getattr(self, name)
+            if not count or array.shape != shape or array.dtype != np.float32 or not np.isfinite(array).all():
+                raise WorldError(
+                    f"expected {name} {list(shape)} float32 of a mesh, finite, of one triangle at least; got {array.dtype} {list(array.shape)}"
+                )
+        require_texture(self.rgb, "a mesh")
+
+
+def require_texture(rgb: Rgb, what: str) -> Rgb:
+    """A texture ``[h, w, 3]`` uint8 of ``what``, whole in memory.
+
+    Raises:
+        WorldError: It is none.
+    """
+    texture = np.ascontiguousarray(rgb)
+    if texture.ndim != 3 or texture.shape[2] != 3 or texture.dtype != np.uint8 or not texture.size:
+        raise WorldError(
+            f"expected a picture [h, w, 3] uint8 for {what}; got {texture.dtype} {list(texture.shape)}"
+        )
+    return texture
+
+
+@runtime_checkable
+class NativeMeshes(Protocol):
+    """A world that adds textured meshes to its own scene: its own renderer lights, shades and occludes them."""
+
+    def add_mesh(self, name: str, mesh: Mesh | None, /) -> None:
+        """Add a mesh to the scene, replacing one of the same name; it stays until it is removed, or the world is closed.
+
+        Nothing collides with it.
+
+        Args:
+            name: Name of the mesh.
+            mesh: The mesh; None removes it.
+        """

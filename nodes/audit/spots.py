@@ -16,7 +16,7 @@ from nodes.experiment.plan.object_kinds import footprint_m
 from nodes.experiment.plan.placed import PlacedObject, in_a_lane
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.learned_scene import load_background
-from nodes.experiment.show.placing import SeenFrom, clean_poses, is_seen, poses_beside
+from nodes.experiment.show.placing import SeenFrom, clean_poses, poses_beside, seen_px
 
 # In half lanes: steps along the path and away from it, and the largest distance.
 _ALONG, _AWAY, _FARTHEST = 0.5, 0.25, 4.0
@@ -100,17 +100,9 @@ def _places(
 
 
 def _seen(experiment: Experiment, placed: PlacedObject, views: Sequence[SeenFrom]) -> Spot | None:
-    pixels = [_pixels(experiment, placed, view) for view in views]
+    pixels = [seen_px(experiment, placed, view, _LEAST_PX) for view in views]
     ticks = sum(each > 0.0 for each in pixels)
     return Spot(placed, float(sum(pixels)), ticks, int(np.argmax(pixels))) if ticks else None
-
-
-def _pixels(experiment: Experiment, placed: PlacedObject, view: SeenFrom) -> float:
-    """Pixels of the policy's picture that the object covers; 0 unless nearly all of it is visible."""
-    if not is_seen(experiment, placed, view, _LEAST_PX):
-        return 0.0
-    ahead_m = float((view.T_camera_from_world @ placed.T_world_from_face)[2, 3])
-    return (placed.side_m * experiment.view.pinhole.fy / ahead_m) ** 2
 
 
 def _distance_m(one: Spot, other: Spot) -> float:

@@ -19,6 +19,7 @@ from advnerf_core.objects.voxel.mesh import MeshError, SurfaceMesh, part_from_co
 
 _WELD = 1e-6  # relative to the size: nearer vertices are merged
 _SAMPLES_PER_TEXEL = 16.0
+_SMOOTH_COS = 0.75  # between a triangle and its surroundings; where they turn more, there is an edge
 _OUTER = 0.1  # texels: anything deeper below the outermost layer does not contribute its colour
 # In-plane axes of the six views (column, row) with their signs, so that each is upright for a viewer outside.
 _VIEWS = (
@@ -78,11 +79,19 @@ class TexturedMesh:
 
 
 def unwrapped(mesh: SurfaceMesh, resolution: int = 32) -> TexturedMesh:
+    """Weld a mesh and give it one texture, in its own colours; see `with_places`."""
+    return with_places(mesh, resolution)[0]
+
+
+def with_places(mesh: SurfaceMesh, resolution: int) -> tuple[TexturedMesh, Array]:
     """Weld a mesh and give it one texture, in its own colours.
 
     Args:
         mesh: The surface [m].
         resolution: Texels along its longest side.
+
+    Returns:
+        The mesh, and the place of each texel on its surface ``[H, W, 3]`` [m]; that of texels outside all charts is the origin.
 
     Raises:
         MeshError: All triangles are without area, or the resolution is not in 2..512.
@@ -100,11 +109,24 @@ def unwrapped(mesh: SurfaceMesh, resolution: int = 32) -> TexturedMesh:
     view = _facing(normals)[solid]
     corners = vertices[faces[solid]]
     texels, charts = _layout(corners, view, size / (resolution - 1))
-    texture = _baked(mesh, solid, corners, texels, view, charts, size / (resolution - 1))
+    baked = _baked(mesh, solid, corners, texels, view, charts, size / (resolution - 1))
     used = np.unique(faces[solid])
     place = np.zeros(len(vertices), np.int32)
     place[used] = np.arange(len(used), dtype=np.int32)
-    return TexturedMesh(vertices[used], place[faces[solid]], texels, texture, charts)
+    texture = baked[..., :3].astype(np.float32)
+    return TexturedMesh(vertices[used], place[faces[solid]], texels, texture, charts), baked[..., 3:]
+
+
+def corner_normals(mesh: TexturedMesh) -> Array:
+    """Unit normals at the corners of the triangles ``[F, 3, 3]``: smooth over the surface, but not over its edges."""
+    sides = np.diff(mesh.corners, axis=1)
+    areas = np.cross(sides[:, 0], sides[:, 1])
+    flat = areas / np.maximum(np.linalg.norm(areas, axis=1, keepdims=True), 1e-300)
+    sums = np.zeros_like(mesh.vertices)
+    np.add.at(sums, mesh.faces.reshape(-1), np.repeat(areas, 3, axis=0))
+    smooth = (sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-300))[mesh.faces]
+    sharp = np.einsum("fkc,fc->fk", smooth, flat) < _SMOOTH_COS
+    return np.where(sharp[..., None], flat[:, None], smooth)
 
 
 def sphere(radius_m: float, rgb: tuple[float, float, float], subdivisions: int = 3) -> SurfaceMesh:
@@ -163,8 +185,8 @@ def _baked(
     view: NDArray[np.int64],
     charts: NDArray[np.int16],
     texel: float,
-) -> NDArray[np.float32]:
-    """Mean colour of the outermost layer in each texel; texels that no triangle touches take the nearest one's."""
+) -> Array:
+    """Mean colour and place of the outermost layer in each texel ``[H, W, 6]``; texels that no triangle touches take the nearest one's."""
     face, weights = _spread(corners, texel)
     colours = _colours(mesh, np.flatnonzero(solid)[face], weights)
     where = np.floor(np.einsum("nk,nkc->nc", weights, texels[face])).astype(np.int64)
@@ -178,9 +200,10 @@ def _baked(
     np.maximum.at(top, flat, height)
     outer = height >= top[flat] - _OUTER * texel
     count = np.bincount(flat[outer], minlength=charts.size)
-    sums = [np.bincount(flat[outer], colours[outer, k], minlength=charts.size) for k in range(3)]
-    texture = (np.stack(sums, axis=-1) / np.maximum(count, 1)[:, None]).reshape(*charts.shape, 3)
-    return _filled(texture, count.reshape(charts.shape) > 0, charts).astype(np.float32)
+    values = np.concatenate([colours[outer], points[outer]], axis=1)
+    sums = [np.bincount(flat[outer], values[:, k], minlength=charts.size) for k in range(6)]
+    means = (np.stack(sums, axis=-1) / np.maximum(count, 1)[:, None]).reshape(*charts.shape, 6)
+    return _filled(means, count.reshape(charts.shape) > 0, charts)
 
 
 def _spread(corners: Array, texel: float) -> tuple[NDArray[np.int64], Array]:

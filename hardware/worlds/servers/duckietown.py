@@ -36,7 +36,7 @@ import geometry  # noqa: E402 - of Duckietown's packages, which need the names a
 from duckietown_world.world_duckietown.dynamics_delay import ApplyDelay  # noqa: E402
 from duckietown_world.world_duckietown.pwm_dynamics import PWMCommands, get_DB18_nominal  # noqa: E402
 from gym_duckietown.simulator import CAMERA_FORWARD_DIST, Simulator, get_agent_corners  # noqa: E402
-from pyglet_camera import PygletPanel, PygletView, taken_from, to_opengl  # noqa: E402
+from pyglet_camera import PygletMesh, PygletPanel, PygletView, taken_from, to_opengl  # noqa: E402
 
 STEP_S, DELAY_S = 0.02, 0.15
 _CURVE_POINTS, _JOINED_M = 12, 0.01
@@ -58,7 +58,7 @@ class Map:
         )  # fmt: skip
         self._views = {name: PygletView(lens, config["supersampling"]) for name, lens in cameras.items()}
         self._things = list(self._sim.objects)
-        self._panels: dict[str, Any] = {}
+        self._added: dict[tuple[str, str], Any] = {}
         self._model: Any = None
 
     def describe(self) -> Reply:
@@ -80,9 +80,9 @@ class Map:
         view, sim = self._views[camera], self._sim
         kept = sim.cur_pos, sim.cur_angle
         self._aim(T_world_from_camera, view)
-        sim.objects = [*self._things, *self._panels.values()]
+        sim.objects = [*self._things, *self._added.values()]
         fine = sim._render_img(*view.size, view.drawn, view.resolved, view.pixels, top_down=False)
-        sim.objects = self._things  # the robot does not collide with panels
+        sim.objects = self._things  # the robot does not collide with them
         found = {"rgb": view.mean(fine), "T_world_from_camera": taken_from()}
         if depth:
             found["depth"] = view.depth()
@@ -122,9 +122,16 @@ class Map:
 
     def add_panel(self, name: str, size_m: list[float] | None, **arrays: np.ndarray) -> Reply:
         """Put a panel with ``T_world_from_face`` and texture ``rgb`` into the scene; without a size, remove it."""
-        self._panels.pop(name, None)
+        self._added.pop(("panel", name), None)
         if size_m is not None:
-            self._panels[name] = PygletPanel(size_m, **arrays)
+            self._added["panel", name] = PygletPanel(size_m, **arrays)
+        return {}, {}
+
+    def add_mesh(self, name: str, **arrays: np.ndarray) -> Reply:
+        """Put triangles ``corners_m``, with ``normals``, ``uv`` and texture ``rgb``, into the scene; without them, take them out."""
+        self._added.pop(("mesh", name), None)
+        if arrays:
+            self._added["mesh", name] = PygletMesh(**arrays)
         return {}, {}
 
     def _rolling(self, speed_mps: float) -> Any:

@@ -40,7 +40,7 @@ class Room:
         self._views = {
             name: FilamentView(self._context, self._scene, lens, fine) for name, lens in cameras.items()
         }
-        self._panels: dict[str, list[Any]] = {}
+        self._added: dict[str, tuple[tuple[Any, ...], tuple[Any, ...]]] = {}
 
     def _fill(self, model: Any) -> None:
         """Put the model into the scene; its parts must stay referenced while it is drawn."""
@@ -69,16 +69,54 @@ class Room:
 
     def add_panel(self, name: str, size_m: list[float] | None, **arrays: np.ndarray) -> Reply:
         """Put a panel with ``T_world_from_face`` and texture ``rgb`` into the scene; without a size, remove it."""
-        for solid in self._panels.pop(name, [])[:2]:
+        return self._add(f"panel {name}", *(((), ()) if size_m is None else self._panel(size_m, **arrays)))
+
+    def add_mesh(self, name: str, **arrays: np.ndarray) -> Reply:
+        """Put triangles ``corners_m``, with ``normals``, ``uv`` and texture ``rgb``, into the scene; without them, take them out."""
+        return self._add(f"mesh {name}", *(self._mesh(**arrays) if arrays else ((), ())))
+
+    def _add(self, name: str, solids: tuple[Any, ...], kept: tuple[Any, ...]) -> Reply:
+        """Put solids into the scene in place of those of this name; what they are drawn with must stay referenced."""
+        for solid in self._added.pop(name, ((), ()))[0]:
             self._scene.remove_renderable(solid)
-        if size_m is not None:
-            self._panels[name] = self._panel(size_m, **arrays)
-            for solid in self._panels[name][:2]:
-                self._scene.add_renderable(solid)
+        if solids:
+            self._added[name] = solids, kept
+        for solid in solids:
+            self._scene.add_renderable(solid)
         return {}, {}
 
-    def _panel(self, size_m: list[float], T_world_from_face: np.ndarray, rgb: np.ndarray) -> list[Any]:
-        """A face that is lit like other matte surfaces, a plain thin box behind it, and the face's texture, which must stay referenced."""
+    def _mesh(self, corners_m: np.ndarray, normals: np.ndarray, uv: np.ndarray, rgb: np.ndarray) -> Any:
+        """Triangles that are lit like other matte surfaces, and their mesh and texture."""
+        vertices = np.concatenate([corners_m, _tangents(normals), uv], axis=2).astype(np.float32)
+        count, usage, form = 3 * len(corners_m), mjrf.VertexAttributeUsage, mjrf.VertexAttributeType
+        config = mjrf.MeshConfig(
+            max_vertices=count,
+            max_indices=count,
+            attributes=[
+                mjrf.VertexAttribute(
+                    usage.VERTEX_ATTRIBUTE_USAGE_POSITION, form.VERTEX_ATTRIBUTE_TYPE_FLOAT3
+                ),
+                mjrf.VertexAttribute(
+                    usage.VERTEX_ATTRIBUTE_USAGE_TANGENTS, form.VERTEX_ATTRIBUTE_TYPE_FLOAT4
+                ),
+                mjrf.VertexAttribute(usage.VERTEX_ATTRIBUTE_USAGE_UV, form.VERTEX_ATTRIBUTE_TYPE_FLOAT2),
+            ],
+            interleaved=True,
+            index_type=mjrf.IndexType.INDEX_TYPE_U32,
+            primitive_type=mjrf.MeshPrimitiveType.MESH_PRIMITIVE_TYPE_TRIANGLES,
+        )
+        low, high = (edge(corners_m, axis=(0, 1)).astype(np.float32) for edge in (np.min, np.max))
+        mesh, data = self._context.create_mesh(config), mjrf.MeshData(False, low, high)
+        data.set_vertices(config, vertices.tobytes())
+        data.set_indices(config, np.arange(count, dtype=np.uint32).tobytes())
+        mesh.upload(data)
+        solid, texture = self._context.create_renderable(mjrf.RenderableParams()), self._texture(rgb)
+        solid.set_mesh(mesh, 0, count)
+        solid.set_material(_matte(texture))
+        return (solid,), (mesh, texture)
+
+    def _panel(self, size_m: list[float], T_world_from_face: np.ndarray, rgb: np.ndarray) -> Any:
+        """A face that is lit like other matte surfaces with a plain thin box behind it, and the face's texture."""
         half_m = 0.5 * size_m[0], 0.5 * size_m[1]
         # A plane faces its z; its x is to the viewer's right, which is the face's y.
         axes, place = T_world_from_face[:3, [1, 2, 0]], T_world_from_face[:3, 3]
@@ -87,15 +125,9 @@ class Room:
             mujoco.mjtGeom.mjGEOM_BOX, (*half_m, 0.5 * BACK_M), place - 0.6 * BACK_M * axes[:, 2], axes
         )
         texture = self._texture(rgb)
-        for solid in (face, back):
-            matte = mjrf.Material()
-            matte.specular = matte.glossiness = matte.reflectance = matte.emissive = 0.0
-            if solid is face:
-                matte.color_texture = texture
-            else:
-                matte.color = np.array([*BACK_RGB, 1.0], np.float32)
-            solid.set_material(matte)
-        return [face, back, texture]
+        face.set_material(_matte(texture))
+        back.set_material(_matte(None))
+        return (face, back), (texture,)
 
     def _solid(self, kind: Any, half_m: tuple[float, ...], place: np.ndarray, axes: np.ndarray) -> Any:
         quality = self._kept[0].vis.quality
@@ -118,6 +150,26 @@ class Room:
         data.set_image(rgb.tobytes())
         texture.upload(data)
         return texture
+
+
+def _matte(texture: Any) -> Any:
+    """A matte material with a texture; without one it has the plain colour of a back."""
+    matte = mjrf.Material()
+    matte.specular = matte.glossiness = matte.reflectance = matte.emissive = 0.0
+    if texture is None:
+        matte.color = np.array([*BACK_RGB, 1.0], np.float32)
+    else:
+        matte.color_texture = texture
+    return matte
+
+
+def _tangents(normals: np.ndarray) -> np.ndarray:
+    """Quaternions (x, y, z, w) ``[F, 3, 4]`` that turn the z axis to the normals: Filament takes tangent frames in place of normals."""
+    w = np.maximum(1.0 + normals[..., 2], 1e-4)  # a positive w says that the frame is not mirrored
+    turns = np.stack([-normals[..., 1], normals[..., 0], np.zeros_like(w), w], axis=-1)
+    below = normals[..., 2] < -0.9999
+    turns[below] = [1.0, 0.0, 0.0, 1e-4]
+    return np.asarray(turns / np.linalg.norm(turns, axis=-1, keepdims=True))
 
 
 class FilamentView:

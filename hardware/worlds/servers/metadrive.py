@@ -19,7 +19,7 @@ from metadrive.constants import BodyName, CamMask  # noqa: E402
 from metadrive.engine.core.our_pbr import OurPipeline  # noqa: E402
 from metadrive.envs.metadrive_env import MetaDriveEnv  # noqa: E402
 from panda3d.core import LQuaternionf, Vec3  # noqa: E402
-from panda_camera import PandaView, panel_card  # noqa: E402
+from panda_camera import PandaView, mesh_node, panel_card  # noqa: E402
 
 # Software rendering has no 16 samples per pixel for the pass before the tone curve; our cameras average pixels and apply that curve to the mean.
 loadPrcFileData("", "framebuffer-multisample 0\nmultisamples 0\nload-display p3headlessgl")
@@ -58,7 +58,7 @@ class Simulator:
         for window in self._engine.graphicsEngine.getWindows():
             window.setActive(False)
         self._engine.world_light.direction_np.node().setShadowCaster(False)
-        self._panels: dict[str, Any] = {}
+        self._added: dict[str, Any] = {}
         self._prepare()
         self._wheelbase_m = float(self._vehicle.FRONT_WHEELBASE + self._vehicle.REAR_WHEELBASE)
         self._physics = self._engine.physics_world.dynamic_world
@@ -132,11 +132,19 @@ class Simulator:
 
     def add_panel(self, name: str, size_m: list[float] | None, **arrays: np.ndarray) -> Reply:
         """Put a card with ``T_world_from_face`` and texture ``rgb`` into the scene; without a size, remove it."""
-        if name in self._panels:
-            self._panels.pop(name).removeNode()
-        if size_m is not None:
-            self._panels[name] = panel_card(name, size_m, **arrays)
-            self._panels[name].reparentTo(self._engine.render)
+        return self._add(f"panel {name}", None if size_m is None else panel_card(name, size_m, **arrays))
+
+    def add_mesh(self, name: str, **arrays: np.ndarray) -> Reply:
+        """Put triangles ``corners_m``, with ``normals``, ``uv`` and texture ``rgb``, into the scene; without them, take them out."""
+        return self._add(f"mesh {name}", mesh_node(name, **arrays) if arrays else None)
+
+    def _add(self, name: str, node: Any) -> Reply:
+        """Put a node into the scene in place of the one of this name; None only takes that out."""
+        if name in self._added:
+            self._added.pop(name).removeNode()
+        if node is not None:
+            self._added[name] = node
+            node.reparentTo(self._engine.render)
         return {}, {}
 
     def _put(self, height_m: float, speed_mps: float) -> None:

@@ -1,4 +1,4 @@
-"""A camera of our own in a Panda3D scene: any pose, colours and metric depth, several samples per pixel. For simulators on Panda3D."""
+"""A camera of our own in a Panda3D scene: any pose, colours and metric depth, several samples per pixel, panels and meshes. For simulators on Panda3D."""
 
 from __future__ import annotations
 
@@ -10,6 +10,11 @@ from panda3d.core import (
     Camera,
     CardMaker,
     FrameBufferProperties,
+    Geom,
+    GeomNode,
+    GeomTriangles,
+    GeomVertexData,
+    GeomVertexFormat,
     GraphicsOutput,
     GraphicsPipe,
     LMatrix4f,
@@ -87,15 +92,10 @@ class PandaView:
 
 def panel_card(name: str, size_m: list[float], T_world_from_face: np.ndarray, rgb: np.ndarray) -> Any:
     """A card of this size and texture, lit like everything else in linear light; its back is plain."""
-    root, maker, texture = NodePath(name), CardMaker(name), Texture(name)
+    root, maker = NodePath(name), CardMaker(name)
     maker.setFrame(-0.5 * size_m[0], 0.5 * size_m[0], -0.5 * size_m[1], 0.5 * size_m[1])
     maker.setHasNormals(True)
-    texture.setup2dTexture(rgb.shape[1], rgb.shape[0], Texture.T_unsigned_byte, Texture.F_srgb)
-    texture.setRamImage(np.ascontiguousarray(rgb[::-1, :, ::-1]).tobytes())
-    texture.setMinfilter(Texture.FTLinearMipmapLinear)
-    texture.setWrapU(Texture.WMClamp)
-    texture.setWrapV(Texture.WMClamp)
-    root.attachNewNode(maker.generate()).setTexture(texture)
+    root.attachNewNode(maker.generate()).setTexture(_texture(name, rgb))
     back = root.attachNewNode(maker.generate())
     back.setH(180.0)
     back.setColor(0.2, 0.2, 0.2, 1.0)
@@ -103,6 +103,35 @@ def panel_card(name: str, size_m: list[float], T_world_from_face: np.ndarray, rg
     R = T_world_from_face[:3, :3]
     root.setMat(_matrix(R[:, 1], -R[:, 0], R[:, 2], T_world_from_face[:3, 3]))
     return root
+
+
+def mesh_node(name: str, corners_m: np.ndarray, normals: np.ndarray, uv: np.ndarray, rgb: np.ndarray) -> Any:
+    """Triangles in the world with one texture, lit like everything else in linear light."""
+    # Panda3D counts a texture's rows from below.
+    vertices = np.concatenate([corners_m, normals, uv * [1.0, -1.0] + [0.0, 1.0]], axis=2)
+    vertices = vertices.reshape(-1, 8).astype(np.float32)
+    data = GeomVertexData(name, GeomVertexFormat.getV3n3t2(), Geom.UHStatic)
+    data.unclean_set_num_rows(len(vertices))
+    memoryview(data.modify_array(0)).cast("B")[:] = vertices.tobytes()
+    triangles = GeomTriangles(Geom.UHStatic)
+    triangles.add_next_vertices(len(vertices))
+    geometry, node = Geom(data), GeomNode(name)
+    geometry.add_primitive(triangles)
+    node.add_geom(geometry)
+    root = NodePath(node)
+    root.setTexture(_texture(name, rgb))
+    return root
+
+
+def _texture(name: str, rgb: np.ndarray) -> Texture:
+    """A picture ``[h, w, 3]`` of display values."""
+    texture = Texture(name)
+    texture.setup2dTexture(rgb.shape[1], rgb.shape[0], Texture.T_unsigned_byte, Texture.F_srgb)
+    texture.setRamImage(np.ascontiguousarray(rgb[::-1, :, ::-1]).tobytes())
+    texture.setMinfilter(Texture.FTLinearMipmapLinear)
+    texture.setWrapU(Texture.WMClamp)
+    texture.setWrapV(Texture.WMClamp)
+    return texture
 
 
 def _matrix(x: np.ndarray, y: np.ndarray, z: np.ndarray, origin: np.ndarray) -> Any:

@@ -1,9 +1,11 @@
-"""A camera of our own in a scene that pyglet's OpenGL draws: depth, several samples per pixel, and panels. For Duckietown's simulator."""
+"""A camera of our own in a scene that pyglet's OpenGL draws: depth, several samples per pixel, panels and meshes. For Duckietown's simulator."""
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -64,10 +66,7 @@ class PygletPanel:
     """A textured rectangle that is lit like everything else; its back is plain."""
 
     def __init__(self, size_m: list[float], T_world_from_face: np.ndarray, rgb: np.ndarray) -> None:
-        image = pyglet.image.ImageData(
-            rgb.shape[1], rgb.shape[0], "RGB", np.ascontiguousarray(rgb[::-1]).tobytes()
-        )
-        self._texture = image.get_mipmapped_texture()
+        self._texture = _texture(rgb)
         R, at, u, v = T_world_from_face[:3, :3], T_world_from_face[:3, 3], 0.5 * size_m[0], 0.5 * size_m[1]
         self._normal = to_opengl(R[:, 0])
         # For a viewer left is against the face's y; the texture's origin is at its lower left.
@@ -78,16 +77,10 @@ class PygletPanel:
 
     def render(self, draw_bbox: bool, segment: bool, enable_leds: bool) -> None:
         """Called by Duckietown for each of its objects."""
-        # Duckietown draws its road with the normal and texture that were set last.
-        gl.glPushAttrib(gl.GL_ALL_ATTRIB_BITS)
-        gl.glEnable(gl.GL_TEXTURE_2D)
-        gl.glBindTexture(self._texture.target, self._texture.id)
-        gl.glTexParameteri(gl.GL_TEXTURE_2D, gl.GL_TEXTURE_MIN_FILTER, gl.GL_LINEAR_MIPMAP_LINEAR)
-        gl.glEnable(gl.GL_CULL_FACE)
-        self._draw(self._corners, self._normal, 1.0)
-        gl.glDisable(gl.GL_TEXTURE_2D)
-        self._draw(self._corners[::-1], -self._normal, 0.2)
-        gl.glPopAttrib()
+        with _textured(self._texture):
+            self._draw(self._corners, self._normal, 1.0)
+            gl.glDisable(gl.GL_TEXTURE_2D)
+            self._draw(self._corners[::-1], -self._normal, 0.2)
 
     def _draw(self, corners: list[Any], normal: np.ndarray, brightness: float) -> None:
         """Draw one side of the panel."""
@@ -100,9 +93,47 @@ class PygletPanel:
         gl.glEnd()
 
 
-def to_opengl(point: np.ndarray) -> np.ndarray:
-    """A point or direction in axes whose y points up and whose z points to the south."""
-    return np.array([point[0], point[2], -point[1]])
+class PygletMesh:
+    """Triangles with one texture that are lit like everything else."""
+
+    def __init__(self, corners_m: np.ndarray, normals: np.ndarray, uv: np.ndarray, rgb: np.ndarray) -> None:
+        self._texture = _texture(rgb)
+        flat = [to_opengl(each.reshape(-1, 3)).ravel().tolist() for each in (corners_m, normals)]
+        places = (uv.reshape(-1, 2) * [1.0, -1.0] + [0.0, 1.0]).ravel().tolist()
+        self._triangles = pyglet.graphics.vertex_list(
+            3 * len(corners_m), ("v3f/static", flat[0]), ("n3f/static", flat[1]), ("t2f/static", places)
+        )
+
+    def render(self, draw_bbox: bool, segment: bool, enable_leds: bool) -> None:
+        """Called by Duckietown for each of its objects."""
+        with _textured(self._texture):
+            gl.glColor4f(1.0, 1.0, 1.0, 1.0)
+            self._triangles.draw(gl.GL_TRIANGLES)
+
+
+@contextlib.contextmanager
+def _textured(texture: Any) -> Iterator[None]:
+    """Draw with a texture, and leave all as it was: Duckietown draws its road with the normal and texture that were set last."""
+    gl.glPushAttrib(gl.GL_ALL_ATTRIB_BITS)
+    gl.glEnable(gl.GL_CULL_FACE)
+    gl.glEnable(gl.GL_TEXTURE_2D)
+    gl.glBindTexture(texture.target, texture.id)
+    gl.glTexParameteri(gl.GL_TEXTURE_2D, gl.GL_TEXTURE_MIN_FILTER, gl.GL_LINEAR_MIPMAP_LINEAR)
+    try:
+        yield
+    finally:
+        gl.glPopAttrib()
+
+
+def _texture(rgb: np.ndarray) -> Any:
+    """A picture ``[h, w, 3]`` of display values."""
+    rows = np.ascontiguousarray(rgb[::-1]).tobytes()
+    return pyglet.image.ImageData(rgb.shape[1], rgb.shape[0], "RGB", rows).get_mipmapped_texture()
+
+
+def to_opengl(points: np.ndarray) -> np.ndarray:
+    """Points or directions ``[..., 3]`` in axes whose y points up and whose z points to the south."""
+    return points[..., [0, 2, 1]] * np.array([1.0, 1.0, -1.0])
 
 
 def taken_from() -> np.ndarray:

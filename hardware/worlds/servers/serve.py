@@ -76,7 +76,7 @@ class Server:
         if name == "open":
             self._simulator = self._open_simulator(**arguments, **arrays)
             return self._simulator.describe()
-        if name not in ("render", "reset", "step", "add_panel"):
+        if name not in ("render", "reset", "step", "add_panel", "add_mesh"):
             raise ValueError(f"expected a call of the protocol, got {name!r}")
         return getattr(self._simulator, name)(**arguments, **arrays)
 

@@ -192,18 +192,20 @@ class PlacedObject(StrictModel):
         return [(self.x_m + c * u - s * v, self.y_m + s * u + c * v) for u, v in ends]
 
 
-class FirstSeen(StrictModel):
-    """A rule for the place of an object: the first spot beside a path where it fits and is visible; see `nodes.experiment.show.placing`.
+class Stands(StrictModel):
+    """A rule for the place of an object: a spot beside a path where it fits and is visible; see `nodes.experiment.show.placing`.
 
     Attributes:
         path: The path; None for the experiment's first.
-        side: Side of the path.
+        side: Side of the path; outside: of the turn that the path makes on the way to it, and none where that is straight.
+        choose: The first such spot along the path, or the one at which it covers most of a drive's pictures: pixels times time.
         seen_s: Time for which a drive along the path sees nearly all of it, unhidden and from the front [s].
         least_px: Smallest height in the policy's picture during that time [px].
     """
 
     path: str | None = None
-    side: Literal["right", "left", "either"] = "either"
+    side: Literal["right", "left", "either", "outside"] = "either"
+    choose: Literal["first", "largest_view"] = "first"
     seen_s: float = Field(default=2.0, gt=0.0)
     least_px: float = Field(default=8.0, gt=0.0)
 
@@ -213,17 +215,17 @@ class RuledObject(StrictModel):
 
     Attributes:
         name: Unique name.
-        kind: Kind of object: a panel.
+        kind: Kind of object; see `PlacedObject`.
         z_m: Height of the ground under it [m].
         scale: Size relative to the object as built.
         stands: The rule.
     """
 
     name: str = Field(min_length=1)
-    kind: Literal["panel"]
+    kind: ObjectKind
     z_m: float = 0.0
     scale: float = Field(default=1.0, gt=0.0, le=2.0)
-    stands: FirstSeen
+    stands: Stands
 
     def at(self, x_m: float, y_m: float, yaw_rad: float) -> PlacedObject:
         """The object at one place, rounded to the millimetre, so that no machine's last bit moves it."""

@@ -81,18 +81,20 @@ def check_objects(
     carrier: CarrierConfig, objects: Sequence[WantedObject], deploy: DeployConfig, retrains: bool
 ) -> None:
     """Raise for objects that the carrier cannot show."""
-    others = [each.name for each in objects if each.kind != PANEL]
+    voxels = [each.name for each in objects if each.kind.endswith(OBJECT_SUFFIX)]
     _refuse(
         deploy.live,
         f"expected carrier.kind overlay or screen, which the live nodes can show, with deploy.through nodes, got {carrier.kind}",
     )
     _refuse(
-        "native" in (carrier.kind, carrier.training) and (others or not objects),
-        f"expected objects of kind panel alone with panels in the world's own scene (carrier native), got {', '.join(others) or 'none'}",
+        "native" in (carrier.kind, carrier.training) and (voxels or not objects),
+        f"expected panels and objects with a mesh in the world's own scene (carrier native), got {', '.join(voxels) or 'none'}; "
+        f"of voxels (*{OBJECT_SUFFIX}) it has none: name the mesh itself (.glb)",
     )
     _refuse(
-        carrier.response == "measured" and (len(objects) != 1 or retrains),
-        f"expected one panel and no retrain with carrier.response measured, got {len(objects)} objects{' and retrain' * retrains}",
+        carrier.response == "measured" and ([each.kind for each in objects] != [PANEL] or retrains),
+        f"expected one panel and no retrain with carrier.response measured, got {', '.join(name_of(each.kind) for each in objects) or 'no objects'}"
+        f"{' and retrain' * retrains}",
     )
 
 

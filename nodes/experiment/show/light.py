@@ -49,14 +49,11 @@ def measure_light(experiment: Experiment, world: World) -> DisplayFit:
         world: The open world; it has no panel afterwards.
 
     Raises:
-        ConfigError: The world takes no panels, or no drive sees this one large enough.
+        ConfigError: No drive sees the panel large enough.
         DegenerateDataError: The colours do not determine the light, for example because all are too bright.
         PoorFitError: The model does not fit the light.
     """
-    if not isinstance(world, NativePanels):
-        raise ConfigError(
-            f"expected a world that takes panels (add_panel) with carrier.response measured, got {type(world).__name__}"
-        )
+    assert isinstance(world, NativePanels), "experiments are refused where their world takes no panels"
     (thing,) = experiment.objects
     poses = _poses(experiment, world, thing)
     panel = Panel(thing.T_world_from_face, thing.side_m, thing.side_m)

@@ -1,67 +1,128 @@
-"""Panels in a world's own scene: its renderer lights, shades and occludes them, and no picture is composed."""
+"""Objects in a world's own scene: its renderer lights, shades and occludes them, and no picture is composed."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from itertools import zip_longest
+from typing import Any, ClassVar, NamedTuple, Protocol
 from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from advnerf_core.attack.artifact import TEXTURE_PX, face_texture
 from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.geometry import Array
+from advnerf_core.objects.mesh.field import MeshField
+from advnerf_core.objects.mesh.skin import skin_of
+from advnerf_core.objects.mesh.surface import TexturedMesh, corner_normals
+from advnerf_core.objects.voxel.mesh import SurfaceMesh
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.surrogate import split_theta
-from hardware.worlds.world import NativePanels, Panel, Rgb, World
+from hardware.worlds.world import Mesh, NativeMeshes, NativePanels, Panel, Rgb, World
+from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import Dressed, DressedScene
+from nodes.experiment.show.objects import surface_of
 from nodes.runtime.errors import ConfigError
 
-# Name, pose and texture of each panel.
-_Shown = tuple[tuple[str, bytes, bytes], ...]
-# Current panels of each open world, which several `NativeScene` may share.
-_STANDING: WeakKeyDictionary[Any, _Shown] = WeakKeyDictionary()
 
+def stand_in(
+    experiment: Experiment, scene: World, objects: Sequence[ColouredObject], native: bool
+) -> Dressed:
+    """An open deployment scene with objects in it: composed by depth, or in the world's own scene.
 
-def stand_in(view: PolicyView, scene: World, objects: Sequence[ColouredObject], native: bool) -> Dressed:
-    """An open deployment scene with objects in it: composed by depth, or as panels of the world's own scene.
+    Args:
+        experiment: The experiment whose objects they are.
+        scene: The open scene.
+        objects: All objects of the experiment, or none.
+        native: Whether they stand in the world's own scene.
 
     Raises:
-        ConfigError: The world takes no panels.
+        ConfigError: The world does not take them.
     """
-    return (NativeScene if native else DressedScene)(scene, view, objects)
+    if not native:
+        return DressedScene(scene, experiment.view, objects)
+    surfaces = [
+        surface_of(thing.kind) if _is_solid(field) else None
+        for thing, field in zip(experiment.objects, objects, strict=bool(objects))
+    ]
+    return NativeScene(scene, experiment.view, objects, surfaces)
+
+
+class _Thing(Protocol):
+    """An object of a world's own scene: a panel, or a mesh."""
+
+    @property
+    def is_mesh(self) -> bool:
+        """Whether it is a mesh."""
+
+    @property
+    def shape(self) -> bytes:
+        """All that it depends on except its colours."""
+
+    def texture(self, colours: Tensor) -> Rgb:
+        """Its texture ``[h, w, 3]`` in these colours."""
+
+    def put(self, name: str, texture: Rgb) -> None:
+        """Put it into the scene."""
+
+
+class _Entry(NamedTuple):
+    """An object that a world shows."""
+
+    name: str
+    is_mesh: bool
+    shape: bytes
+    texture: bytes
+
+
+# Current objects of each open world, which several `NativeScene` may share.
+_STANDING: WeakKeyDictionary[Any, tuple[_Entry, ...]] = WeakKeyDictionary()
 
 
 class NativeScene:
-    """A deployment scene whose own renderer shows the attacked panels: `nodes.experiment.show.deployed.Dressed`.
+    """A deployment scene whose own renderer shows the attacked objects: `nodes.experiment.show.deployed.Dressed`.
 
     Args:
         scene: The open scene.
         view: The policy's view of its camera.
-        panels: Faces from `cube_face_object`, at their places; none removes all.
+        objects: The objects, at their places; none removes all.
+        surfaces: The mesh that each object of voxels was made of; None for panels and meshes.
 
     Raises:
-        ConfigError: The world takes no panels, or an object is not a panel.
+        ConfigError: The world takes no such objects, or the mesh of one of voxels is not given.
     """
 
-    def __init__(self, scene: World, view: PolicyView, panels: Sequence[ColouredObject]) -> None:
+    def __init__(
+        self,
+        scene: World,
+        view: PolicyView,
+        objects: Sequence[ColouredObject],
+        surfaces: Sequence[SurfaceMesh | None] = (),
+    ) -> None:
         if not isinstance(scene, NativePanels):
             raise ConfigError(
                 f"expected a world that takes panels (add_panel) with carrier.kind native, got {type(scene).__name__}; "
                 "set carrier.kind=composed"
             )
         self.scene: World = scene
-        self.view, self._native = view, scene
-        self._fields = tuple(panels)
-        self._panels = [_panel_of(field) for field in panels]
-        self._plain = DressedScene(scene, view, panels).plain_theta()
-        self._shown: tuple[Tensor, _Shown] | None = None
+        self.view = view
+        self._fields = tuple(objects)
+        self._things = [
+            _thing(scene, field, surface)
+            for field, surface in zip_longest(objects, surfaces, fillvalue=None)
+            if field is not None
+        ]
+        self._plain = DressedScene(scene, view, objects).plain_theta()
+        self._shown: tuple[Tensor, tuple[_Entry, ...]] | None = None
 
     def plain_theta(self) -> Tensor:
-        """The panels' own colours."""
+        """The objects' own colours."""
         return self._plain
 
     def prepare(self, states: Array) -> Array:
@@ -84,34 +145,119 @@ class NativeScene:
         return self.scene.observe_at(x_m, y_m, yaw_rad, depth=False)[0]
 
     def paint(self, rgb: Rgb, state: Array, theta: Tensor) -> Rgb:
-        """The whole camera image with the panels in these colours; it is rendered again, as only the world models its light."""
+        """The whole camera image with the objects in these colours; it is rendered again, as only the world models its light."""
         del rgb
         return self.camera_image(state, theta)
 
     def _show(self, theta: Tensor | None) -> None:
-        """Make the world show the panels in these colours, in plain ones for None, unless it does already."""
+        """Make the world show the objects in these colours, in plain ones for None, unless it does already."""
         colours = self._plain if theta is None else theta.detach()
         standing = _STANDING.get(self.scene, ())
         # Every tick of a drive asks for the same colours; their textures are painted once.
         if self._shown is not None and self._shown[1] is standing and torch.equal(self._shown[0], colours):
             return
-        textures = [face_texture(part.numpy(), TEXTURE_PX) for part in split_theta(self._fields, colours)]
-        wanted: _Shown = tuple(
-            (f"panel{number}", panel.T_world_from_face.tobytes(), texture.tobytes())
-            for number, (panel, texture) in enumerate(zip(self._panels, textures, strict=True))
+        parts = split_theta(self._fields, colours)
+        textures = [thing.texture(part) for thing, part in zip(self._things, parts, strict=True)]
+        wanted = tuple(
+            _Entry(f"object{number}", thing.is_mesh, thing.shape, texture.tobytes())
+            for number, (thing, texture) in enumerate(zip(self._things, textures, strict=True))
         )
-        for name, *_ in standing[len(wanted) :]:
-            self._native.add_panel(name, Panel(np.eye(4), 1.0, 1.0), None)
-        for entry, panel, texture in zip(wanted, self._panels, textures, strict=True):
+        kept = {entry[:2] for entry in wanted}
+        for entry in standing:
+            if entry[:2] not in kept:
+                _take_out(self.scene, entry)
+        for entry, thing, texture in zip(wanted, self._things, textures, strict=True):
             if entry not in standing:
-                self._native.add_panel(entry[0], panel, texture)
+                thing.put(entry.name, texture)
         _STANDING[self.scene] = wanted
         self._shown = colours.clone(), wanted
 
 
-def _panel_of(field: ColouredObject) -> Panel:
-    if not isinstance(field, VoxelGridObject) or field.face_size_m is None:
+@dataclass(frozen=True, eq=False)
+class _Board:
+    """A panel."""
+
+    scene: NativePanels
+    panel: Panel
+    is_mesh: ClassVar[bool] = False
+
+    @property
+    def shape(self) -> bytes:
+        """See `_Thing`."""
+        return np.asarray(self.panel.T_world_from_face).tobytes()
+
+    def texture(self, colours: Tensor) -> Rgb:
+        """See `_Thing`."""
+        return face_texture(colours.numpy(), TEXTURE_PX)
+
+    def put(self, name: str, texture: Rgb) -> None:
+        """See `_Thing`."""
+        self.scene.add_panel(name, self.panel, texture)
+
+
+@dataclass(frozen=True, eq=False)
+class _Solid:
+    """A mesh."""
+
+    scene: NativeMeshes
+    field: ColouredObject
+    mesh: TexturedMesh
+    colours: Callable[[Tensor], NDArray[np.float32]]
+    is_mesh: ClassVar[bool] = True
+
+    @property
+    def shape(self) -> bytes:
+        """See `_Thing`."""
+        return self._corners.tobytes()
+
+    def texture(self, colours: Tensor) -> Rgb:
+        """See `_Thing`."""
+        return np.rint(255.0 * np.clip(self.colours(colours), 0.0, 1.0)).astype(np.uint8)
+
+    def put(self, name: str, texture: Rgb) -> None:
+        """See `_Thing`. Both sides of each triangle are shown: not all meshes are wound outwards."""
+        height, width = texture.shape[:2]
+        normals = (corner_normals(self.mesh) @ self.field.T_world_from_object[:3, :3].T).astype(np.float32)
+        uv = (self.mesh.texels / [width, height]).astype(np.float32)
+        corners_m = np.concatenate([self._corners, self._corners[:, ::-1]])
+        both = np.concatenate([normals, -normals[:, ::-1]])
+        self.scene.add_mesh(name, Mesh(corners_m, both, np.concatenate([uv, uv[:, ::-1]]), texture))
+
+    @cached_property
+    def _corners(self) -> NDArray[np.float32]:
+        """Corners of the triangles in the world ``[F, 3, 3]`` [m]."""
+        T = self.field.T_world_from_object
+        return (self.field.scale * self.mesh.corners @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+
+
+def _is_solid(field: ColouredObject) -> bool:
+    """Whether an object is made of voxels and is no panel."""
+    return isinstance(field, VoxelGridObject) and field.face_size_m is None
+
+
+def _thing(scene: NativePanels, field: ColouredObject, surface: SurfaceMesh | None) -> _Thing:
+    if isinstance(field, VoxelGridObject) and field.face_size_m is not None:
+        return _Board(scene, Panel(np.array(field.T_world_from_object), *field.face_size_m))
+    if not isinstance(scene, NativeMeshes):
         raise ConfigError(
-            "expected panels with carrier.kind native, got a solid object; set carrier.kind=composed"
+            f"expected a world that takes meshes (add_mesh) with carrier.kind native, got {type(scene).__name__}, which takes panels alone; "
+            "set carrier.kind=composed"
         )
-    return Panel(np.array(field.T_world_from_object), *field.face_size_m)
+    if isinstance(field, MeshField):
+        return _Solid(scene, field, field.mesh, field.texture)
+    if surface is None or not isinstance(field, VoxelGridObject):
+        raise ConfigError(
+            "expected panels, or objects whose meshes are known, with carrier.kind native, got a solid object without one; "
+            "set carrier.kind=composed"
+        )
+    skin = skin_of(field, surface)
+    return _Solid(scene, field, skin.mesh, partial(skin.texture, field))
+
+
+def _take_out(scene: World, entry: _Entry) -> None:
+    if entry.is_mesh:
+        assert isinstance(scene, NativeMeshes), "it took the mesh"
+        scene.add_mesh(entry.name, None)
+    else:
+        assert isinstance(scene, NativePanels), "it took the panel"
+        scene.add_panel(entry.name, Panel(np.eye(4), 1.0, 1.0), None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,13 @@ from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object
 from advnerf_core.geometry import Array, Pinhole
 from advnerf_core.objects.voxel.build import build_from_mesh
 from advnerf_core.objects.voxel.generators import GENERATORS
-from advnerf_core.objects.voxel.mesh import stand
+from advnerf_core.objects.voxel.mesh import SurfaceMesh, stand
 from advnerf_core.objects.voxel.model import ObjectModel, load_object, save_object
 from advnerf_core.scene.surrogate import BackgroundRenderer, Surrogate
 from nodes.experiment.plan.object_kinds import MADE_HERE_M, PANEL, is_mesh, load_mesh_of, name_of
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.learned_scene import load_background
+from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import Report
 
 GENERATOR_OF: dict[str, str] = {"small_car": "car", "hydrant": "hydrant"}
@@ -47,15 +49,31 @@ def build(experiment: Experiment, kind: str, progress: Any = None) -> ObjectMode
     """
     wanted = experiment.config.object
     if is_mesh(kind):
-        own, name = load_mesh_of(kind), name_of(kind)
+        own, name = surface_of(kind), name_of(kind)
         source = {"mesh": name, "sha256": own.sha256}
         return build_from_mesh(own, name, wanted.mesh_resolution, wanted.fit_steps, source, progress)
     if kind not in MADE_HERE_M:
         return load_object(Path(kind))
-    generator = GENERATOR_OF[kind]
     resolution = wanted.car_resolution if kind == "small_car" else wanted.hydrant_resolution
-    mesh = stand(GENERATORS[generator]())
-    return build_from_mesh(mesh, kind, resolution, wanted.fit_steps, {"generator": generator}, progress)
+    source = {"generator": GENERATOR_OF[kind]}
+    return build_from_mesh(surface_of(kind), kind, resolution, wanted.fit_steps, source, progress)
+
+
+@lru_cache(maxsize=8)
+def surface_of(kind: str) -> SurfaceMesh:
+    """The surface of a kind of solid object, upright: a user's mesh, or a generator's.
+
+    Raises:
+        ConfigError: The kind is a file of voxels, which have no surface.
+        MeshError: The user's mesh cannot be read.
+    """
+    if is_mesh(kind):
+        return load_mesh_of(kind)
+    if kind not in GENERATOR_OF:
+        raise ConfigError(
+            f"expected a kind of object with a mesh, got the voxels of {name_of(kind)}; name the mesh that they were made of (.glb)"
+        )
+    return stand(GENERATORS[GENERATOR_OF[kind]]())
 
 
 def object_file(experiment: Experiment, kind: str) -> Path:

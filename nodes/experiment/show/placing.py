@@ -1,4 +1,4 @@
-"""Places a panel by a rule: the first spot beside a path where it fits and is visible for long enough.
+"""Places an object by a rule: the first spot beside a path where it fits and is visible for long enough, or the one where it is largest for longest.
 
 Placing by hand may use knowledge of the attack. This rule uses only the world's description, its depth, and the drive without an error
 along the path; it runs while the world is photographed, before there is a learned scene or a victim.
@@ -10,6 +10,7 @@ import json
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from nodes.runtime.errors import ConfigError
 _ALONG, _AWAY, _FARTHEST = 0.25, 0.25, 6.0
 # Share of a panel's points that must be visible, the tolerance of the scene's depth, and the steepest view [cos].
 _SEEN, _DEPTH_SHARE, _FACING = 0.9, 0.03, 0.3
+_TURN_RAD = 0.2  # a path that turns by less is straight
 _FACE = np.stack(np.meshgrid(*[np.linspace(-0.95, 0.95, 7)] * 2), axis=-1).reshape(
     -1, 2
 )  # across and up, in half sides
@@ -57,14 +59,17 @@ def place_by_rule(experiment: Experiment, world: World) -> list[PlacedObject]:
             continue
         name = wanted.stands.path or experiment.config.paths[0]
         seen = views.setdefault(name, list(_views(experiment, world, name)))
-        spot = next(
-            (
-                spot
-                for spot in _spots(experiment, wanted, name)
-                if _fits(experiment, spot, standing, seen, wanted)
-            ),
-            None,
+        fitting = (
+            spot
+            for spot in _spots(experiment, wanted, name)
+            if _fits(experiment, spot, standing, seen, wanted)
         )
+        if wanted.stands.choose == "first":
+            spot = next(fitting, None)
+        else:
+            spot = max(
+                fitting, key=partial(_total_px, experiment, seen, wanted.stands.least_px), default=None
+            )
         if spot is None:
             raise ConfigError(
                 f"{experiment.file}: expected a spot beside the path {name} where {wanted.name} fits and is seen for {wanted.stands.seen_s:g} s, got "
@@ -103,10 +108,16 @@ def _spots(experiment: Experiment, wanted: RuledObject, name: str) -> Iterator[P
     ahead_m = wanted.stands.seen_s * experiment.car.speed_mps
     begin_m = float(path.project(drive[:1, :2]).s_m[0])
     length_m = float(np.hypot(*np.diff(drive[:, :2], axis=0).T).sum())
-    sides = {"right": (-1.0,), "left": (1.0,), "either": (-1.0, 1.0)}[wanted.stands.side]
+    sides = {"right": (-1.0,), "left": (1.0,), "either": (-1.0, 1.0), "outside": ()}[wanted.stands.side]
     away_m = (half_lane_m * np.arange(1.0, _FARTHEST, _AWAY)).tolist()
     for passed_m in np.arange(ahead_m, length_m, _ALONG * half_lane_m).tolist():
         along_m = begin_m + passed_m
+        if wanted.stands.side == "outside":
+            turn_rad = float(
+                np.subtract(*np.asarray(path.pose_at(np.array([along_m, along_m - ahead_m])))[:, 2])
+            )
+            turn_rad = math.remainder(turn_rad, 2.0 * math.pi)
+            sides = (-math.copysign(1.0, turn_rad),) if abs(turn_rad) > _TURN_RAD else ()
         # It faces the car's position at the time when it must begin to be visible.
         for pose in poses_beside(path, along_m, along_m - ahead_m, sides, away_m):
             yield wanted.at(*pose)
@@ -157,6 +168,21 @@ def seen_from(experiment: Experiment, world: World, panel: PlacedObject, least_p
     return [
         pose for pose, view in zip(poses, views, strict=True) if is_seen(experiment, panel, view, least_px)
     ]
+
+
+def seen_px(experiment: Experiment, spot: PlacedObject, view: SeenFrom, least_px: float) -> float:
+    """Pixels of the policy's picture that an object covers, taken for an upright square; 0 unless nearly all of it is visible."""
+    if not is_seen(experiment, spot, view, least_px):
+        return 0.0
+    ahead_m = float((view.T_camera_from_world @ spot.T_world_from_face)[2, 3])
+    return (spot.side_m * experiment.view.pinhole.fy / ahead_m) ** 2
+
+
+def _total_px(
+    experiment: Experiment, views: Sequence[SeenFrom], least_px: float, spot: PlacedObject
+) -> float:
+    """Pixels that an object covers, summed over the ticks of the drive."""
+    return sum(seen_px(experiment, spot, view, least_px) for view in views)
 
 
 def is_seen(experiment: Experiment, spot: PlacedObject, view: SeenFrom, least_px: float) -> bool:

@@ -21,12 +21,10 @@ from advnerf_core.files import sha256_of
 from advnerf_core.objects.mesh.field import MeshField
 from advnerf_core.objects.mesh.shape import ShapeLimits
 from advnerf_core.objects.mesh.surface import sphere, unwrapped
-from advnerf_core.objects.voxel.generators import GENERATORS
-from advnerf_core.objects.voxel.mesh import stand
 from advnerf_core.scene.remembered import frame_bytes
 from advnerf_core.scene.surrogate import Surrogate
 from hardware.worlds.world import World
-from nodes.experiment.plan.object_kinds import MADE_HERE_M, PANEL, is_mesh, load_mesh_of
+from nodes.experiment.plan.object_kinds import MADE_HERE_M, PANEL
 from nodes.experiment.plan.placed import PlacedObject
 from nodes.experiment.plan.space_config import (
     ColoursConfig,
@@ -41,10 +39,10 @@ from nodes.experiment.show.frames import DeployedFrames
 from nodes.experiment.show.light import light_on_panels
 from nodes.experiment.show.native import stand_in
 from nodes.experiment.show.objects import (
-    GENERATOR_OF,
     object_file,
     panel_object,
     placed_objects,
+    surface_of,
     surrogate_of,
 )
 from nodes.experiment.show.own_scene import display_of, mount_of, own_objects
@@ -107,7 +105,7 @@ def dress(experiment: Experiment, scene: World, shown: Shown) -> Dressed:
     """An open deployment scene with the attacked objects; see `shown_there` for its colours."""
     if has_face(experiment):
         return PaintedScene(experiment, scene)
-    return stand_in(experiment.view, scene, shown.objects, experiment.config.carrier.kind == "native")
+    return stand_in(experiment, scene, shown.objects, experiment.config.carrier.kind == "native")
 
 
 def shown_there(experiment: Experiment, shown: Shown, attack: AttackFile | None) -> Tensor | None:
@@ -131,14 +129,7 @@ def mesh_objects(experiment: Experiment, wanted: MeshTextureConfig | MeshShapeCo
     """The experiment's objects as meshes, in their plain colours and shapes."""
     found = []
     for thing in experiment.objects:
-        if wanted.ball_m is None:
-            mesh = (
-                load_mesh_of(thing.kind)
-                if is_mesh(thing.kind)
-                else stand(GENERATORS[GENERATOR_OF[thing.kind]]())
-            )
-        else:
-            mesh = sphere(wanted.ball_m, wanted.ball_rgb)
+        mesh = surface_of(thing.kind) if wanted.ball_m is None else sphere(wanted.ball_m, wanted.ball_rgb)
         found.append(MeshField(unwrapped(mesh, wanted.texels), thing.T_world_from_object, thing.scale))
     return found
 

@@ -85,8 +85,8 @@ def _equal(one: Any, other: Any) -> bool:
 def _plans(there: Experiment, world: World, place: str) -> list[SourcePlan]:
     """Sources of one place."""
     wanted, native = there.config.policy, there.config.carrier.training == "native"
-    bare, objects = stand_in(there.view, world, [], native), placed_objects(there)
-    dressed = stand_in(there.view, world, objects, native)
+    bare, objects = stand_in(there, world, [], native), placed_objects(there)
+    dressed = stand_in(there, world, objects, native)
     plain = dressed.plain_theta()
     assert plain is not None, "an experiment that places objects by a rule has some"
     any_colours = random_textures(there, objects, tuple(plain.shape))

@@ -206,7 +206,7 @@ def _object_domains(
         return show
 
     return _Domains(
-        stand_in(experiment.view, scene, objects, native=experiment.config.carrier.training == "native"),
+        stand_in(experiment, scene, objects, native=experiment.config.carrier.training == "native"),
         seen,
         random_textures(experiment, objects, surrogate.theta_shape),
     )

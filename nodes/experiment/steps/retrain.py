@@ -82,7 +82,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     thetas: list[torch.Tensor] = []
     with experiment.open_world() as scene:
         dressed = stand_in(
-            experiment.view,
+            experiment,
             scene,
             placed_objects(experiment),
             native=experiment.config.carrier.training == "native",

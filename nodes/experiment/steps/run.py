@@ -11,11 +11,12 @@ from rich.console import Console
 from advnerf_core.documents import Document
 from advnerf_core.plugins import unknown
 from advnerf_core.run_module import search_folder_last
-from hardware.worlds.world import Photographed
+from hardware.worlds.world import NativeMeshes, NativePanels, Photographed
 from nodes.experiment.engine.artefact import REFERENCE, Artefact
 from nodes.experiment.engine.run_folder import require_own_folder, run_to_end
 from nodes.experiment.engine.stages import begun_with, stage_digests
-from nodes.experiment.plan.carriers import ComposedConfig, FaceCarrier, ScreenConfig
+from nodes.experiment.plan.carriers import ComposedConfig, FaceCarrier, NativeConfig, ScreenConfig
+from nodes.experiment.plan.object_kinds import PANEL
 from nodes.experiment.plan.placed import PlacedObject, in_a_lane
 from nodes.experiment.plan.victims import RETRAINED
 from nodes.experiment.show.context import Experiment
@@ -81,6 +82,7 @@ def _check_world(experiment: Experiment, document: Document) -> None:
     read_world(document.part(("world",)), experiment.file.parent)
     _check_ticks(experiment, document)
     _check_objective(experiment, document)
+    _check_native(experiment, document)
     if experiment.config.deploy.live:
         lab_of(experiment)
     if experiment.is_described:
@@ -104,6 +106,23 @@ def _check_objective(experiment: Experiment, document: Document) -> None:
             f"{document.place(('attack', 'objective'))}: attack.objective: expected an objective that needs no solids, as the world "
             f"{experiment.named_world.kind} does not say what its car can hit, got collision; choose cte, or add solids to the world (docs/worlds.md)"
         )
+
+
+def _check_native(experiment: Experiment, document: Document) -> None:
+    """Check that worlds take the objects that stand in their own scenes: while victims learn, and in the deployed drive."""
+    config, named = experiment.config, []
+    if config.carrier.training == "native":
+        named.append(experiment.named_world)
+    if isinstance(config.carrier, NativeConfig):
+        named.append(experiment.deployed_world)
+    meshes = [each.name for each in config.objects if each.kind != PANEL]
+    wanted, call = (NativeMeshes, "add_mesh") if meshes else (NativePanels, "add_panel")
+    for world in named:
+        if not isinstance(world.make(), wanted):
+            raise ConfigError(
+                f"{document.place(('carrier',))}: expected a world that takes {', '.join(meshes) or 'panels'} into its own scene ({call}) with "
+                f"carrier native, got {world.kind}; set carrier.kind=composed"
+            )
 
 
 def _check_places(experiment: Experiment, document: Document) -> None:

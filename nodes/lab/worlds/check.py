@@ -14,6 +14,7 @@ from advnerf_core.files import write_atomically
 from advnerf_core.geometry import planar_pose
 from advnerf_core.plugins import unknown
 from hardware.worlds.world import (
+    NativeMeshes,
     NativePanels,
     NotOpenError,
     World,
@@ -30,7 +31,7 @@ from nodes.lab.worlds.driving import (
 )
 from nodes.lab.worlds.geometry import box_holds_what_is_seen, ground_is_flat, photographs_cover, views_agree
 from nodes.lab.worlds.named import NamedWorld
-from nodes.lab.worlds.panels import panels_are_native
+from nodes.lab.worlds.panels import meshes_are_native, panels_are_native
 from nodes.lab.worlds.pictures import form, is_not_late, photographs_match, repeats, takes_no_time
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.findings import ContractFinding, NotMet, look
@@ -54,8 +55,11 @@ _CHECKS: tuple[tuple[str, Check], ...] = (
 )
 # Errors that a world raises itself, such as that its server is gone.
 _OF_THE_WORLD = (AdvnerfError,)
-# For worlds that take panels into their own scene.
-_PANELS: tuple[str, Check] = ("panels", panels_are_native)
+# For worlds that take panels, or meshes, into their own scene.
+_NATIVE: tuple[tuple[type, tuple[str, Check]], ...] = (
+    (NativePanels, ("panels", panels_are_native)),
+    (NativeMeshes, ("meshes", meshes_are_native)),
+)
 
 
 def check_world(
@@ -74,7 +78,7 @@ def check_world(
         AdvnerfError: The world cannot be made or opened; its own message.
         ConfigError: No part has this name.
     """
-    names = (_DESCRIPTION, *(name for name, _ in (*_FIRST, *_CHECKS, _PANELS)))
+    names = (_DESCRIPTION, *(name for name, _ in (*_FIRST, *_CHECKS, *(each for _, each in _NATIVE))))
     for name in only:
         if name not in names:
             raise ConfigError(unknown(name, "part of the contract", names))
@@ -97,7 +101,7 @@ def check_world(
                 return findings
         if pictures is not None:
             _write_pictures(bench, pictures)
-        wanted = (*_CHECKS, _PANELS) if isinstance(world, NativePanels) else _CHECKS
+        wanted = (*_CHECKS, *(each for kind, each in _NATIVE if isinstance(world, kind)))
         findings += [
             look(name, check, bench, _OF_THE_WORLD) for name, check in wanted if not only or name in only
         ]

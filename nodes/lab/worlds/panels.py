@@ -1,15 +1,16 @@
-"""Checks of a world that takes textured panels into its own scene: their place, size, orientation, and occlusion."""
+"""Checks of a world that takes textured panels or meshes into its own scene: their place, size, orientation, and occlusion."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.geometry import Array, invert_transform, make_transform, planar_pose, rotation_z
 from hardware.worlds.paths import Pose
-from hardware.worlds.world import NativePanels, Panel, Rgb, require_depth
+from hardware.worlds.world import Mesh, NativeMeshes, NativePanels, Panel, Rgb, require_depth
 from nodes.lab.worlds.bench import WorldBench
 from nodes.runtime.findings import NotMet
 
@@ -33,21 +34,35 @@ def panels_are_native(bench: WorldBench) -> str:
     """A panel appears at its place, in its true size, the right way up and not mirrored, in depth too; the ground hides it; it can be removed."""
     world = bench.world
     assert isinstance(world, NativePanels), "only asked where the world takes panels"
-    place, half_lane_m = bench.places[0], bench.description.off_track_m
+    return _are_native(bench, lambda panel, rgb: world.add_panel(_NAME, panel, rgb))
+
+
+def meshes_are_native(bench: WorldBench) -> str:
+    """So does a mesh: a sheet of the same size."""
+    world = bench.world
+    assert isinstance(world, NativeMeshes), "only asked where the world takes meshes"
+    return _are_native(
+        bench, lambda panel, rgb: world.add_mesh(_NAME, None if rgb is None else sheet(panel, rgb))
+    )
+
+
+def _are_native(bench: WorldBench, put: Callable[[Panel, Rgb | None], None]) -> str:
+    """Check what ``put`` puts where a panel is asked for, or takes out where there is no texture."""
+    world, place, half_lane_m = bench.world, bench.places[0], bench.description.off_track_m
     height_m = max(float(world.T_car_from_camera[2, 3]), 0.6 * _HIGH * half_lane_m)
     standing = _panel(bench, place, height_m)
     views = [place, bench.beside(place, _NEARER * _AHEAD * half_lane_m, 0.0, _TURNED_RAD)]
     plain = [world.observe_at(*view) for view in views]
     overlaps = []
     try:
-        world.add_panel(_NAME, standing, _texture())
+        put(standing, _texture())
         for view, (before, _) in zip(views, plain, strict=True):
             overlaps.append(_stands_there(bench, standing, view, before))
         _drives_on(bench, place)
-        world.add_panel(_NAME, sunk := _panel(bench, place, 0.0), _texture())
+        put(sunk := _panel(bench, place, 0.0), _texture())
         hidden = _is_hidden_by_the_ground(bench, sunk, place, plain[0][0])
     finally:
-        world.add_panel(_NAME, standing, None)
+        put(standing, None)
     for view, (before, _) in zip(views, plain, strict=True):
         if not np.array_equal(world.observe_at(*view, depth=False)[0], before):
             raise NotMet("expected the scene as it was once a panel is taken out; got another picture")
@@ -55,6 +70,20 @@ def panels_are_native(bench: WorldBench) -> str:
         f"{100 * min(overlaps):.0f} % of its outline is where it should be, the right way round, at its depth; {100 * hidden:.0f} % where the ground hides "
         "its lower half"
     )
+
+
+def sheet(panel: Panel, rgb: Rgb) -> Mesh:
+    """A panel as a mesh of two triangles."""
+    # For a viewer right is the face's y.
+    left_top, left_low, right_low, right_top = (0.0, 0.0), (0.0, 1.0), (1.0, 1.0), (1.0, 0.0)
+    uv = np.array([[left_top, left_low, right_low], [left_top, right_low, right_top]], dtype=np.float32)
+    on_face = np.stack(
+        [np.zeros((2, 3)), (uv[..., 0] - 0.5) * panel.width_m, (0.5 - uv[..., 1]) * panel.height_m], axis=-1
+    )
+    T = np.asarray(panel.T_world_from_face)
+    corners_m = (on_face @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+    normals = np.ascontiguousarray(np.broadcast_to(T[:3, 0].astype(np.float32), (2, 3, 3)))
+    return Mesh(corners_m, normals, uv, rgb)
 
 
 def _drives_on(bench: WorldBench, place: Pose) -> None:

@@ -11,6 +11,11 @@ import torch
 from advnerf_core.attack.spaces.space import ColourSpace, NamedObject
 from advnerf_core.fields.voxel_grid import cube_face_object
 from advnerf_core.geometry import make_transform, rotation_z
+from advnerf_core.objects.mesh.field import MeshField
+from advnerf_core.objects.mesh.surface import unwrapped
+from advnerf_core.objects.voxel.build import build_from_mesh
+from advnerf_core.objects.voxel.generators import hydrant
+from advnerf_core.objects.voxel.mesh import stand
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.surrogate import Surrogate
 from nodes.experiment.plan.placed import PlacedObject
@@ -66,6 +71,37 @@ def test_the_world_shows_what_composition_draws(world: Any) -> None:
     assert np.array_equal(native.policy_images(native.prepare(STATE[None]), quarters())[0], view.image(shown))
 
 
+def test_solid_objects_stand_in_the_world_as_meshes(world: Any) -> None:
+    """An object of voxels in its true surface, and a mesh, against both drawn by composition."""
+    view, surface = PolicyView(world.camera_pinhole), stand(hydrant(1.0))
+    place = make_transform(rotation_z(0.4), [3.0, 0.9, 0.05])
+    voxels = build_from_mesh(surface, "hydrant", 40, steps=0).placed(place, 1.3)
+    height = np.argwhere(voxels.slots < voxels.free_count)[:, 2] / voxels.slots.shape[2]
+    upper = torch.zeros(voxels.theta_shape)
+    rows = voxels.slots[voxels.slots < voxels.free_count]
+    upper[rows, 0] = torch.from_numpy(np.where(height > 0.5, 9.0, -9.0).astype(np.float32))
+    upper[:, 1:] = -9.0
+    mesh = MeshField(unwrapped(surface, 32), place, 1.3)
+    NativeScene(world, view, []).camera_image(STATE, None)
+    bare = world.observe_at(*map(float, STATE), depth=False)[0]
+    for field, theta in (
+        (voxels, upper),
+        (mesh, torch.from_numpy(mesh.plain_theta.reshape(mesh.theta_shape))),
+    ):
+        drawn = DressedScene(world, view, [field]).camera_image(STATE, theta)
+        native = NativeScene(world, view, [field], [surface])
+        shown = native.camera_image(STATE, theta)
+        NativeScene(world, view, []).camera_image(STATE, None)
+        inside, seen = (np.abs(each.astype(int) - bare).max(axis=2) > 25 for each in (drawn, shown))
+        assert inside.sum() > 1500
+        assert (inside & seen).sum() > 0.93 * (inside | seen).sum()
+        difference = np.abs(drawn.astype(int) - shown).mean(axis=2)[inside & seen]
+        assert np.median(difference) <= 3.0
+        assert (difference > 30.0).mean() < 0.12  # edges
+    with pytest.raises(ConfigError, match="whose meshes are known"):
+        NativeScene(world, view, [voxels])
+
+
 def test_scenes_that_share_a_world_do_not_see_each_others_panels(world: Any) -> None:
     view = PolicyView(world.camera_pinhole)
     one, two, none = (
@@ -90,7 +126,7 @@ def test_what_cannot_be_shown_is_refused(world: Any, make_wall: Any) -> None:
         NativeScene(make_wall(20.0), view, [face()])
     solid = cube_face_object(1.0, 4)
     flat = dataclasses.replace(solid, theta_shape=(16, 3))
-    with pytest.raises(ConfigError, match="expected panels"):
+    with pytest.raises(ConfigError, match="expected panels, or objects whose meshes"):
         NativeScene(world, view, [flat])
 
 
@@ -116,7 +152,7 @@ def test_a_panel_is_an_object_of_an_experiment(tmp_path: Path) -> None:
     surrogate = Surrogate(lambda poses, pinhole: None, experiment.view.pinhole, np.eye(4), [field])
     (attacked,) = ColourSpace(surrogate, [NamedObject("board", "")]).attacked(torch.zeros(16, 16, 3))
     assert (attacked.size_m, attacked.scale) == ((3.0, 3.0), 1.0)
-    with pytest.raises(ConfigError, match="objects of kind panel alone"):
+    with pytest.raises(ConfigError, match=r"takes car_.* into its own scene .add_mesh.*got junction"):
         load_experiment(LAUNCH / "junction.experiment.yaml", "demo", ["carrier.kind=native"], tmp_path)
     naive = [
         *changes,

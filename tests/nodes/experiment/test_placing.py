@@ -90,6 +90,45 @@ def test_the_rule_is_obeyed_or_refused(lab: Lab, tmp_path: Path) -> None:
     assert np.hypot(both[0].x_m - both[1].x_m, both[0].y_m - both[1].y_m) >= 0.24
 
 
+def test_the_largest_view_is_larger_than_any_other(lab: Lab, tmp_path: Path) -> None:
+    """Counted in pictures of the panel alone in a void, which the first spot's are, too."""
+    totals = {}
+    for rule in ("first", "largest_view"):
+        experiment = room(tmp_path / rule, f"{{seen_s: 1.5, choose: {rule}}}")
+        placed(experiment, lab)
+        alone = DressedScene(_Nothing(lab), experiment.view, placed_objects(experiment))
+        colours = torch.full(alone.theta_shape, 0.0)
+        colours[..., 0], colours[..., 1:] = 9.0, -9.0
+        path, start = experiment.paths["track"], lab.describe().paths["track"].drive_start
+        begin_m = float(path.project(np.array(start[:2])).s_m)
+        along_m = begin_m + 0.08 * np.arange(experiment.config.horizon + 1)
+        states = np.asarray(path.pose_at(along_m))
+        totals[rule] = sum(_red(each) for each in alone.policy_images(alone.prepare(states), colours))
+    assert totals["largest_view"] > 1.2 * totals["first"]
+
+
+def test_outside_is_where_a_car_goes_that_misses_the_turn(lab: Lab, tmp_path: Path) -> None:
+    """The room's track turns left all the way round: its outside is on the right, and there is none of a straight part."""
+    experiment = room(tmp_path, "{side: outside, seen_s: 1.0, least_px: 4}", 0.1)
+    spot, path = placed(experiment, lab), experiment.paths["track"]
+    assert float(path.project(np.array([spot.x_m, spot.y_m])).cte_m) < -0.4
+    along_m = float(path.project(np.array([spot.x_m, spot.y_m])).s_m)
+    yaws = np.asarray(path.pose_at(np.array([along_m - 0.8, along_m])))[:, 2]
+    assert np.remainder(yaws[1] - yaws[0], 2 * np.pi) > 0.2
+
+
+def test_a_solid_object_stands_by_the_rule_too(lab: Lab, tmp_path: Path) -> None:
+    changes = [
+        "carrier={kind: composed}",
+        "deploy.through=world",
+        "objects=[{name: hydrant, kind: hydrant, scale: 0.4, stands: {seen_s: 1.0, least_px: 4}}]",
+    ]
+    experiment = load_experiment(ROOM, "demo", changes, tmp_path)
+    spot = placed(experiment, lab)
+    assert (spot.kind, spot.scale) == ("hydrant", 0.4)
+    assert abs(float(experiment.paths["track"].project(np.array([spot.x_m, spot.y_m])).cte_m)) > 0.4
+
+
 def test_what_is_captured_depends_on_the_rule_and_on_no_place_by_hand(tmp_path: Path) -> None:
     def settings(experiment: Experiment) -> str:
         return json.dumps(stages_of(experiment)[0].settings.keyed, sort_keys=True)
@@ -104,9 +143,9 @@ def test_what_is_captured_depends_on_the_rule_and_on_no_place_by_hand(tmp_path: 
     assert settings(load_experiment(ROOM, "demo", by_hand, tmp_path / "hand")) == settings(plain)
     with pytest.raises(ConfigError, match=r"objects.*x_m"):
         load_experiment(ROOM, "demo", [*by_hand[:2], "objects=[{name: a, kind: panel}]"], tmp_path / "x")
-    with pytest.raises(ConfigError, match="hydrant"):
+    with pytest.raises(ConfigError, match="pannel"):
         load_experiment(
-            ROOM, "demo", [*by_hand[:2], "objects=[{name: a, kind: hydrant, stands: {}}]"], tmp_path / "x"
+            ROOM, "demo", [*by_hand[:2], "objects=[{name: a, kind: pannel, stands: {}}]"], tmp_path / "x"
         )
 
 

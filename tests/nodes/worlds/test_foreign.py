@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from advnerf_core.documents import Document
+from advnerf_core.geometry import make_transform, rotation_z
 from hardware.worlds.duckietown.config import DuckietownConfig
 from hardware.worlds.duckietown.world import Duckietown
 from hardware.worlds.environments import ENVIRONMENTS
@@ -19,6 +20,7 @@ from hardware.worlds.remote_errors import RemoteWorldError
 from hardware.worlds.world import NotOpenError, Panel, WorldError
 from nodes.lab.worlds.check import check_world
 from nodes.lab.worlds.named import read_world
+from nodes.lab.worlds.panels import sheet
 from nodes.runtime.config import apply_overrides
 
 installed = {
@@ -45,7 +47,31 @@ def test_a_foreign_world_keeps_the_contract(kind: str, changes: tuple[str, ...])
     apply_overrides(document, changes)
     findings = check_world(read_world(document, Path.cwd()))
     assert [f"{each.name}: {each.text}" for each in findings if not each.met] == []
-    assert findings[-1].name == "panels"
+    assert [each.name for each in findings[-2:]] == ["panels", "meshes"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [pytest.param(name, marks=mark) for name, mark in installed.items()])
+def test_a_mesh_has_the_light_of_a_panel_in_its_place(kind: str) -> None:
+    with read_world(Document({"kind": kind}, "test"), Path.cwd()).make() as world:
+        described = world.describe()
+        x, y, yaw = next(iter(described.paths.values())).start_pose
+        ahead_m, side_m = 4.0 * described.off_track_m, described.off_track_m
+        T = make_transform(rotation_z(yaw + math.pi - 0.3), [0.0, 0.0, 0.6 * side_m])
+        T[:2, 3] = x + ahead_m * math.cos(yaw), y + ahead_m * math.sin(yaw)
+        panel, texture = Panel(T, side_m, side_m), np.full((8, 8, 3), (200, 90, 40), np.uint8)
+        pictures = [world.observe_at(x, y, yaw, depth=False)[0].astype(int)]
+        for put in (
+            lambda rgb: world.add_panel("it", panel, rgb),
+            lambda rgb: world.add_mesh("it", None if rgb is None else sheet(panel, rgb)),
+        ):
+            put(texture)
+            pictures.append(world.observe_at(x, y, yaw, depth=False)[0].astype(int))
+            put(None)
+        bare, as_panel, as_mesh = pictures
+        shown = (as_panel != bare).any(axis=-1) & (as_mesh != bare).any(axis=-1)
+        assert shown.sum() > 500
+        assert np.abs(as_panel - as_mesh)[shown].mean() < 0.5
 
 
 @pytest.mark.slow

@@ -1,15 +1,16 @@
-"""The check of panels in a world's own scene: a world in another process passes, and each planted fault is found and named."""
+"""The checks of panels and meshes in a world's own scene: a world in another process passes, and each planted fault is found and named."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from advnerf_core.geometry import make_transform, rotation_y, rotation_z
-from hardware.worlds.world import NativePanels, Panel, Rgb
-from nodes.lab.worlds.bench import WorldBench
+from hardware.worlds.world import Mesh, NativeMeshes, NativePanels, Panel, Rgb, WorldError
+from nodes.lab.worlds.bench import Check, WorldBench
 from nodes.lab.worlds.named import NamedWorld
-from nodes.lab.worlds.panels import panels_are_native
+from nodes.lab.worlds.panels import meshes_are_native, panels_are_native
 from nodes.runtime.findings import NotMet
 from tests.support.remote.flat_world import FlatConfig, FlatWorld
 from tests.support.warehouse import Warehouse
@@ -119,16 +120,79 @@ class NothingHidesIt(OverThePicture):
         super().add_panel(name, lifted, rgb)
 
 
-def look(kind: type[FlatWorld]) -> str:
+def look(kind: type[FlatWorld], check: Check = panels_are_native) -> str:
     with kind(FlatConfig(width=224, height=126)) as world:
         named = NamedWorld("flat", kind, world.config, "")
-        return panels_are_native(WorldBench(named, world, world.describe(), None))
+        return check(WorldBench(named, world, world.describe(), None))
 
 
-def test_a_world_that_takes_panels_says_how_well() -> None:
-    assert "the right way round" in look(FlatWorld)
+@pytest.mark.parametrize("check", [panels_are_native, meshes_are_native])
+def test_a_world_that_takes_panels_and_meshes_says_how_well(check: Check) -> None:
+    assert "the right way round" in look(FlatWorld, check)
     assert issubclass(FlatWorld, NativePanels)
-    assert not issubclass(Warehouse, NativePanels)
+    assert issubclass(FlatWorld, NativeMeshes)
+    assert not issubclass(Warehouse, (NativePanels, NativeMeshes))
+
+
+class OtherMeshes(FlatWorld):
+    """Puts other meshes into the scene than it was asked to."""
+
+    def add_mesh(self, name: str, mesh: Mesh | None) -> None:
+        super().add_mesh(name, None if mesh is None else self.other(mesh))
+
+    def other(self, mesh: Mesh) -> Mesh:
+        return mesh
+
+
+class TexturesFromBelow(OtherMeshes):
+    def other(self, mesh: Mesh) -> Mesh:
+        return replace(mesh, uv=mesh.uv * np.float32([1, -1]) + np.float32([0, 1]))
+
+
+class MirroredTextures(OtherMeshes):
+    def other(self, mesh: Mesh) -> Mesh:
+        return replace(mesh, uv=mesh.uv * np.float32([-1, 1]) + np.float32([1, 0]))
+
+
+class YUp(OtherMeshes):
+    def other(self, mesh: Mesh) -> Mesh:
+        return replace(mesh, corners_m=mesh.corners_m[..., [0, 2, 1]])
+
+
+class InCentimetres(OtherMeshes):
+    def other(self, mesh: Mesh) -> Mesh:
+        return replace(mesh, corners_m=np.float32(100) * mesh.corners_m)
+
+
+class InsideOut(OtherMeshes):
+    def other(self, mesh: Mesh) -> Mesh:
+        return replace(mesh, corners_m=mesh.corners_m[:, ::-1], uv=mesh.uv[:, ::-1])
+
+
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [
+        (TexturesFromBelow, "upside down"),
+        (MirroredTextures, "mirrored left to right"),
+        (YUp, "its outline is there"),
+        (InCentimetres, "its outline is there"),
+        (InsideOut, "nothing in the picture changed"),
+    ],
+)
+def test_a_fault_planted_in_meshes_is_found_and_named(fault: type[FlatWorld], told: str) -> None:
+    with pytest.raises(NotMet, match=told):
+        look(fault, meshes_are_native)
+
+
+def test_what_is_no_mesh_is_refused() -> None:
+    corners = np.zeros((2, 3, 3), np.float32)
+    texture = np.zeros((2, 2, 3), np.uint8)
+    with pytest.raises(WorldError, match=r"expected uv \[2, 3, 2\] float32 of a mesh"):
+        Mesh(corners, corners, corners, texture)
+    with pytest.raises(WorldError, match="corners_m"):
+        Mesh(corners * np.float32(np.nan), corners, corners[..., :2], texture)
+    with pytest.raises(WorldError, match="expected a picture"):
+        Mesh(corners, corners, corners[..., :2], texture.astype(np.float32))
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ class FlatSimulator:
         )
         self._colours = rng.uniform(40.0, 240.0, (24, 3))
         self._tiles = rng.uniform(60.0, 200.0, (64, 64, 3))
-        self._panels = {}
+        self._panels, self._meshes = {}, {}
         self._pose = (0.0, 0.0, 0.0)
 
     def describe(self):
@@ -61,6 +61,12 @@ class FlatSimulator:
             self._panels[name] = (T_world_from_face.copy(), size_m, rgb.copy())
         return {}, {}
 
+    def add_mesh(self, name, **arrays):
+        self._meshes.pop(name, None)
+        if arrays:
+            self._meshes[name] = {key: array.copy() for key, array in arrays.items()}
+        return {}, {}
+
     def render(self, camera, depth, T_world_from_camera):
         lens, T = self._cameras[camera], T_world_from_camera
         columns = (np.arange(lens["width"]) + 0.5 - lens["cx"]) / lens["fx"]
@@ -80,6 +86,8 @@ class FlatSimulator:
             self._post(rgb, z, eye, rays, steep, px, py, radius, colour)
         for T_face, size, texture in self._panels.values():
             rgb, z = self._panel(rgb, z, eye, rays, T_face, size, texture)
+        for mesh in self._meshes.values():
+            self._mesh(rgb, z, lens, T, np.stack([x, y, np.ones_like(x)], axis=-1), mesh)
         found = {"rgb": np.rint(np.clip(rgb, 0.0, 255.0)).astype(np.uint8), "T_world_from_camera": T}
         if depth:
             found["depth"] = np.where(z < FAR_M, z, np.inf).astype("<f4")
@@ -110,3 +118,28 @@ class FlatSimulator:
         h, w = texture.shape[:2]
         column, row = np.clip((u * w).astype(int), 0, w - 1), np.clip((v * h).astype(int), 0, h - 1)
         return np.where(seen[..., None], texture[row, column], rgb), np.where(seen, hit, z)
+
+    def _mesh(self, rgb, z, lens, T, rays, mesh):
+        """Triangles, unlit, seen from the front: each is drawn where the pixels of its box hit it in front of all else."""
+        seen = (mesh["corners_m"] - T[:3, 3]) @ T[:3, :3]
+        texture = mesh["rgb"]
+        h, w = texture.shape[:2]
+        for corners, uv in zip(seen, mesh["uv"], strict=True):
+            if corners[:, 2].min() < 0.05 or np.dot(np.cross(*np.diff(corners, axis=0)), corners[0]) >= 0.0:
+                continue
+            columns = corners[:, 0] / corners[:, 2] * lens["fx"] + lens["cx"]
+            rows = corners[:, 1] / corners[:, 2] * lens["fy"] + lens["cy"]
+            left, right = max(int(columns.min()), 0), min(int(columns.max()) + 1, lens["width"])
+            top, bottom = max(int(rows.min()), 0), min(int(rows.max()) + 1, lens["height"])
+            if left >= right or top >= bottom or abs(np.linalg.det(corners)) < 1e-15:
+                continue
+            box = np.s_[top:bottom, left:right]
+            weights = rays[box] @ np.linalg.inv(corners)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                hit = 1.0 / weights.sum(axis=-1)
+            met = (weights >= 0.0).all(axis=-1) & (hit > 0.05) & (hit < z[box])
+            at = (weights[met] * hit[met, None]) @ uv
+            rgb[box][met] = texture[
+                np.clip((at[:, 1] * h).astype(int), 0, h - 1), np.clip((at[:, 0] * w).astype(int), 0, w - 1)
+            ]
+            z[box][met] = hit[met]

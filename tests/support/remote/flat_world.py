@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from advnerf_core.geometry import Array, Pinhole, camera_mount, look_at, planar_pose
 from hardware.worlds.fitting import path_through
 from hardware.worlds.remote import SERVERS
-from hardware.worlds.remote_world import RemotePanelWorld, ServerDeadlines
+from hardware.worlds.remote_world import RemoteMeshWorld, ServerDeadlines
 from hardware.worlds.world import Box, CarDescription, WorldDescription
 
 HERE = Path(__file__).parent
@@ -45,7 +45,7 @@ class FlatConfig(BaseModel):
     faulty: Path | None = Field(default=None, exclude=True)
 
 
-class FlatWorld(RemotePanelWorld):
+class FlatWorld(RemoteMeshWorld):
     """A chequered floor with posts about a round lane."""
 
     Config: ClassVar[type[FlatConfig]] = FlatConfig
