@@ -258,6 +258,11 @@ def with_titles(folder: Path, data: Mapping[str, Any]) -> dict[str, Any]:
             for part in ("contrasts", "does_not_drive_well")
             if part in data
         },
+        **(
+            {"claims": [{**row, "each": [titled(each) for each in row["each"]]} for row in data["claims"]]}
+            if "claims" in data
+            else {}
+        ),
     }
 
 

@@ -136,6 +136,8 @@ def _section(name: str, sets: Mapping[str, Mapping[str, Any]]) -> str:
         )
     if data.get("contrasts"):
         parts += ["### What each difference costs\n", _contrasts(data["contrasts"])]
+    if data.get("claims"):
+        parts += ["### Over places and victims\n", *map(_place_claim, data["claims"])]
     if explored:
         parts += ["### Not registered\n", "Run, and not registered before.\n", _table(explored)]
     parts += ["### How to run it\n", _commands(name, data["registered"])]
@@ -252,6 +254,28 @@ def _contrasts(found: Sequence[Mapping[str, Any]]) -> str:
     )
 
 
+def _place_claim(row: Mapping[str, Any]) -> str:
+    """A claim about a kind of place: one sentence, and what it is the mean of."""
+    said = (
+        f"**{row['name']}**{'' if row['registered'] else ' (not registered)'}: {style_of(row['method']).title} minus the strongest baseline, "
+        f"{row['places']} places and {row['victims']} victims: {row['difference_m']:+.3f} m per tick "
+        f"({ends(row['low_m'], row['high_m'])} for new places and victims), off track {row['off_track_points']:+.0f} points "
+        f"({row['off_track_low']:+.0f} to {row['off_track_high']:+.0f}).\n"
+    )
+    return f"{said}\n" + _lines(
+        [
+            {
+                "place": each["scenario"].replace("_", " "),
+                "victim": each["victim"],
+                "minus": style_of(each["baseline"]).title,
+                "difference [m per tick]": f"{each['difference_m']:+.3f}",
+                "off track [points]": f"{each['off_track_points']:+.0f}",
+            }
+            for each in row["each"]
+        ]
+    )
+
+
 def _table(rows: Sequence[Mapping[str, Any]]) -> str:
     """One line for each method and domain. Conditions of the same searches share their drives in the learned scene, which appear once."""
     shown: list[dict[str, str]] = []
@@ -305,8 +329,8 @@ def _commands(name: str, registration: Mapping[str, Any]) -> str:
     what = f"launch/{launch_file(registration['file'])}{setting}{changes}"
     return "\n".join(
         [
-            f"    advnerf experiment {what}",
-            f"    advnerf publish {what}",
+            f"    advnerf experiment run {what}",
+            f"    advnerf experiment publish {what}",
             f"    advnerf verify {name}\n",
             f"Registered on {registration['date'][:10]}, digest `{registration['digest'][:12]}`: {len(registration['cells'])} cells, "
             f"{len(registration['primary'])} primary tests.\n",

@@ -135,6 +135,23 @@ class Contrast(StrictModel):
     after_in: Domain = "deployed"
 
 
+class PlaceClaim(StrictModel):
+    """A claim about a kind of place: a method's deployed effect against that of the baseline that is strongest in the surrogate.
+
+    Attributes:
+        name: What is claimed about, for readers.
+        scenarios: The places, drawn by a rule before any attack.
+        victims: Victims of one recipe, each of which was driven at all places.
+        against: The baselines.
+    """
+
+    name: str = Field(min_length=1)
+    scenarios: tuple[str, ...] = Field(min_length=4)
+    victims: tuple[str, ...] = Field(min_length=2)
+    method: str = "gradient"
+    against: tuple[str, ...] = Field(min_length=1)
+
+
 class Registration(StrictModel):
     """The planned cells and tests of a set.
 
@@ -149,6 +166,7 @@ class Registration(StrictModel):
         scenarios: Scenarios by name, ``NAME`` or ``NAME.PLACEMENT``.
         primary: The claimed tests; Holm's adjustment is over these.
         contrasts: Comparisons of the same attacks under two conditions.
+        claims: Claims about kinds of places.
         level: Coverage of all intervals.
         alpha: Level of the tests.
     """
@@ -164,6 +182,7 @@ class Registration(StrictModel):
     cells: tuple[RegisteredCell, ...]
     primary: tuple[PrimaryTest, ...] = ()
     contrasts: tuple[Contrast, ...] = ()
+    claims: tuple[PlaceClaim, ...] = ()
     level: Share = 0.95
     alpha: Share = 0.05
 
@@ -178,7 +197,8 @@ class Registration(StrictModel):
     @property
     def digest(self) -> str:
         """SHA-256 of the file's content except its date; keys that were added to the format later are not in older files."""
-        data = self.model_dump(mode="json", exclude={"date"}, exclude_unset=True)
+        left_out = {"date"} if self.claims else {"date", "claims"}
+        data = self.model_dump(mode="json", exclude=left_out, exclude_unset=True)
         return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 

@@ -9,7 +9,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from advnerf_core.plugins import name_in_results
 from advnerf_core.report.conditions import CONTROLS, EMPTY
-from advnerf_core.report.evidence.registration import Contrast
+from advnerf_core.report.evidence.registration import Contrast, PlaceClaim
 from advnerf_core.scene.gate_limits import GateLimits
 from advnerf_core.strict import StrictModel
 from nodes.experiment.plan import rules
@@ -105,6 +105,10 @@ class ExperimentConfig(StrictModel):
     contrasts: tuple[Contrast, ...] = Field(
         default=(),
         description="What the same attacks in two variants tell apart; they must be searched alike.",
+    )
+    claims: tuple[PlaceClaim, ...] = Field(
+        default=(),
+        description="What is claimed about a kind of place, from at least four of them (variants or paths) and two victims.",
     )
     run_folder: Path | None = Field(
         default=None,

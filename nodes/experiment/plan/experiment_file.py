@@ -23,7 +23,7 @@ from nodes.runtime.errors import ConfigError
 # Default for a file with settings.
 DEFAULT_SETTING = "demo"
 # Keys of the whole experiment, not of a variant.
-_OF_THE_WHOLE = ("name", "run_folder", "contrasts")
+_OF_THE_WHOLE = ("name", "run_folder", "contrasts", "claims")
 
 
 @dataclass(frozen=True)

@@ -61,6 +61,7 @@ def register(experiment: Experiment, cells: Sequence[Cell], published: Path) -> 
         cells=tuple(registered_cell(cell) for cell in cells),
         primary=tuple(primary_tests(experiment, cells)),
         contrasts=experiment.config.contrasts,
+        claims=experiment.config.claims,
     ).as_filed()
     folder = published / experiment.config.name
     before = read_registration(folder)

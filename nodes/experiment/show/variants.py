@@ -136,17 +136,17 @@ def resolve(
 
 
 def _check_cells(made: Variants, document: Document) -> None:
-    """Check that cells have different names, and that contrasts name existing cells."""
+    """Check that cells have different names, and that contrasts and claims name existing cells."""
     (name, count), *_ = Counter(cell.name for cell in made.cells).most_common(1)
     if count > 1:
         raise ConfigError(
             f"{document.place((OVER,))}: expected cells of different names, got {name} {count} times; rename a variant"
         )
     known = dict.fromkeys(cell.scenario for cell in made.cells)
-    for index, contrast in enumerate(made.config.contrasts):
-        for name in (contrast.before, contrast.after):
+    named = [("contrasts", (each.before, each.after), each.name) for each in made.config.contrasts]
+    named += [("claims", each.scenarios, each.name) for each in made.config.claims]
+    for section, scenarios, title in named:
+        for name in scenarios:
             if name not in known:
                 message = unknown(name, "variant", known)
-                raise ConfigError(
-                    f"{document.place(('contrasts', index))}: contrast {contrast.name!r}: {message}"
-                )
+                raise ConfigError(f"{document.place((section,))}: {section}: {title!r}: {message}")

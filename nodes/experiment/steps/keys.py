@@ -34,6 +34,7 @@ FREE: Mapping[str, Any] = {
     "reference": True,
     "over": True,
     "contrasts": True,
+    "claims": True,
     "run_folder": True,
     "maps": True,
     "world": True,

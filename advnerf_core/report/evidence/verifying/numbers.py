@@ -11,11 +11,12 @@ import numpy as np
 
 from advnerf_core.documents import read_json
 from advnerf_core.report.evidence.contrasts import contrast_data
+from advnerf_core.report.evidence.place_claims import place_claim_data
 from advnerf_core.report.evidence.results import Evidence, as_data
 from advnerf_core.report.evidence.verifying.layout import FORMAT, SET
 from advnerf_core.report.evidence.verifying.victims import declared_data
 
-_TABLES = ("rows", "primary", "contrasts", "does_not_drive_well")
+_TABLES = ("rows", "primary", "contrasts", "claims", "does_not_drive_well")
 
 
 def published_numbers(
@@ -30,6 +31,7 @@ def published_numbers(
         **declared_data(evidence, declared),
         **as_data(evidence),
         **contrast_data(evidence),
+        **place_claim_data(evidence),
     }
 
 

@@ -1,0 +1,118 @@
+"""Claims about kinds of places, against sums by hand and against an analysis of variance of a linear model."""
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.special import stdtrit
+
+from advnerf_core.report.cells import CellResult, read_cells
+from advnerf_core.report.evidence.page import results_page
+from advnerf_core.report.evidence.place_claims import place_claim_data, place_claim_rows
+from advnerf_core.report.evidence.registration import (
+    FILE,
+    PlaceClaim,
+    RegisteredCell,
+    Registration,
+    read_registration,
+)
+from advnerf_core.report.evidence.results import Evidence, as_data
+from benchmarks.planted_changes import write_simulated_set
+
+PLACES, VICTIMS = ("one", "two", "three", "four"), ("hardened", "other")
+CLAIM = PlaceClaim(name="four roads", scenarios=PLACES, victims=VICTIMS, against=("random",))
+
+
+def replace(cell: CellResult, **values: Any) -> CellResult:
+    return cell.model_copy(update=values)
+
+
+def at_places(folder: Any, without_effect: set[tuple[str, str]]) -> Evidence:
+    """The drives of one set at four places, of two victims; the gradient does nothing in some: there it drives as random textures."""
+    registration = read_registration(folder)
+    assert registration is not None
+    cells = {cell.name: cell for cell in read_cells(folder) if cell.key[:3] == ("track", "", "hardened")}
+    made, named = [], []
+    for place in PLACES:
+        for victim in VICTIMS:
+            for cell in cells.values():
+                weak = (place, victim) in without_effect and cell.method == "gradient"
+                kept = cells[cell.name.replace("gradient", "random")].kept if weak else cell.kept
+                made.append(replace(cell, scenario=place, victim=victim, kept=kept))
+                named.append(
+                    RegisteredCell(scenario=place, victim=victim, method=cell.method, seed=cell.seed)
+                )
+    registered = registration.model_copy(
+        update={
+            "scenarios": dict.fromkeys(PLACES, registration.scenarios["track"]),
+            "cells": tuple(named),
+            "primary": (),
+            "claims": (CLAIM,),
+        }
+    )
+    return Evidence(registered, [replace(cell, registration=registered.digest) for cell in made])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory):
+    folder = tmp_path_factory.mktemp("published") / "simulated"
+    write_simulated_set(folder)
+    return folder
+
+
+def mean_m(evidence: Evidence, method: str) -> float:
+    cells = evidence.searches(("one", "", "other", method))
+    return float(np.mean([o.excess_cte_m_per_tick for c in cells for o in evidence.outcomes(c, "deployed")]))
+
+
+def test_the_interval_is_over_places_and_victims(folder: Any) -> None:
+    evidence = at_places(folder, {(place, victim) for place in ("two", "three") for victim in VICTIMS})
+    (row,) = place_claim_rows(evidence)
+    full_m = mean_m(evidence, "gradient") - mean_m(evidence, "random")
+    values = full_m * np.array([[1, 1], [0, 0], [0, 0], [1, 1]], float)
+    assert [each["difference_m"] for each in row.each] == pytest.approx(values.ravel(), abs=1e-12)
+    assert row.difference_m == pytest.approx(values.mean())
+    assert (row.places, row.victims, row.registered) == (4, 2, True)
+    # Places differ and victims do not, symmetrically: Student's interval of four values.
+    half = stdtrit(3, 0.975) * values.mean(axis=1).std(ddof=1) / 2.0
+    assert (row.low_m, row.high_m) == pytest.approx((values.mean() - half, values.mean() + half))
+    assert row.off_track_low <= row.off_track_points <= row.off_track_high
+
+
+def test_many_searches_make_no_narrower_interval(folder: Any) -> None:
+    """One place in two without an effect says the same of six searches as of two."""
+    weak = {(place, victim) for place in ("one", "two") for victim in VICTIMS}
+    evidence = at_places(folder, weak)
+    (many,) = place_claim_rows(evidence)
+    few = Evidence(evidence.registration, [cell for cell in evidence.cells.values() if cell.seed < 2])
+    (two,) = place_claim_rows(few)
+    assert many.low_m < 0.0 < many.difference_m
+    assert (many.high_m - many.low_m) == pytest.approx(two.high_m - two.low_m, rel=0.15)
+
+
+def test_a_claim_needs_all_its_cells_and_stands_on_the_page(folder: Any) -> None:
+    evidence = at_places(folder, set())
+    fewer = Evidence(
+        evidence.registration,
+        [cell for cell in evidence.cells.values() if (cell.scenario, cell.method) != ("four", "random")],
+    )
+    assert place_claim_data(fewer) == {"claims": []}
+    data = json.loads(json.dumps({**as_data(evidence), **place_claim_data(evidence)}))
+    data |= {"registered": {**evidence.registration.as_filed().model_dump(mode="json"), "digest": "d" * 64}}
+    page = results_page({"simulated": {**data, "filmed": False, "notes": []}})
+    assert "**four roads**: " in page
+    assert "4 places and 2 victims" in page
+
+
+def test_registrations_without_claims_keep_their_digest(folder: Any) -> None:
+    registration = read_registration(folder)
+    assert registration is not None
+    written = json.loads((folder / FILE).read_text())
+    del written["claims"]
+    assert Registration.model_validate(written).digest == registration.digest
+    claimed = registration.model_copy(update={"claims": (CLAIM,)})
+    assert claimed.as_filed().digest != registration.digest
+    assert Registration.model_validate(claimed.model_dump(mode="json")).claims == (CLAIM,)
+    with pytest.raises(ValueError, match="at least 4 items"):
+        PlaceClaim(name="x", scenarios=("a", "b"), victims=VICTIMS, against=("random",))
