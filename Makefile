@@ -2,7 +2,6 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-export MUJOCO_GL ?= egl
 # Kept byte code, whatever the shell asks for: the second run of pytest need not rewrite the assertions of 365 files again.
 export PYTHONDONTWRITEBYTECODE :=
 

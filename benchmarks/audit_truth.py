@@ -7,7 +7,6 @@ effect over all of these starts. ``--against`` is asked in the same groups, of t
 
 from __future__ import annotations
 
-import os
 import sys
 import tempfile
 from dataclasses import replace
@@ -102,7 +101,6 @@ def alarms(now: list[dict[str, ArmDrives]], then: list[dict[str, ArmDrives]]) ->
 
 def main() -> None:
     """Command line."""
-    os.environ.setdefault("MUJOCO_GL", "egl")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         make_folder(folder)

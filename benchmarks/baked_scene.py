@@ -320,7 +320,6 @@ def main() -> None:
         "--pairs", action="store_true", help="search and deploy attacks both ways, instead (minutes)"
     )
     options = parser.parse_args()
-    os.environ.setdefault("MUJOCO_GL", "egl")
     experiment = Experiment.resolved_in(options.run.resolve())
     backgrounds: Backgrounds = {"field": load_field(experiment), "baked": load_background(experiment)}
     if options.pairs:

@@ -7,7 +7,6 @@ of this project learns from them and writes an ONNX file, which is audited as it
 from __future__ import annotations
 
 import argparse
-import os
 import subprocess
 import sys
 import tempfile
@@ -72,7 +71,6 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], help="handed on to the audit")
     parser.add_argument("--output", type=Path, help="keep the audit here")
     options = parser.parse_args()
-    os.environ.setdefault("MUJOCO_GL", "egl")
     file, _, name = options.world.rpartition(":")
     named = f"{Path(file).resolve()}:{name}" if file else name
     with tempfile.TemporaryDirectory() as made:

@@ -7,7 +7,6 @@ best random search of each published set did to the set's victim, from the kept 
 from __future__ import annotations
 
 import argparse
-import os
 from pathlib import Path
 
 from advnerf_core.report.evidence.verify import sets_in
@@ -19,7 +18,6 @@ PUBLISHED = Path("docs/results")
 
 def main() -> None:
     """Judge the victim of a run folder, or read the published sets."""
-    os.environ.setdefault("MUJOCO_GL", "egl")
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path, nargs="?", help="run folder; without one: the published sets")
     parser.add_argument("--victim", default="hardened")

@@ -7,7 +7,6 @@ video). Policies learn from both, with several seeds. The bag and the policies f
 from __future__ import annotations
 
 import argparse
-import os
 import shutil
 from pathlib import Path
 
@@ -96,7 +95,6 @@ def held_out_error_rad(learned: OpenLog, judged: OpenLog, out: Path, steps: int,
 
 def main() -> None:
     """Write the bag, export it, train on both, and record the row."""
-    os.environ.setdefault("MUJOCO_GL", "egl")
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--trial", action="store_true", help="a small size; records nothing")
     parser.add_argument("--folder", type=Path, default=None, help="working folder")

@@ -198,7 +198,6 @@ def main() -> None:
     parser.add_argument("--through", choices=tuple(_WHAT), default="photographs", help="what the user has")
     parser.add_argument("--ci", action="store_true", help="measure the small setting instead")
     options = parser.parse_args()
-    os.environ.setdefault("MUJOCO_GL", "egl")
     command = COMMAND + f" --through {options.through}" * (options.through != "photographs")
     command += f" --budget {options.budget}" * (options.budget != parser.get_default("budget"))
     # A driver takes whole pictures of its camera: each of its drives takes many times as long.

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import shutil
 import socket
 from pathlib import Path
@@ -104,7 +103,6 @@ def main() -> None:
     parser.add_argument("--trial", action="store_true", help="a small size; records nothing")
     parser.add_argument("--folder", type=Path, default=None)
     arguments = parser.parse_args()
-    os.environ.setdefault("MUJOCO_GL", "egl")
     trial = arguments.trial
     folder = arguments.folder or _ROOT / "runs" / ("policy_from_bags_trial" if trial else "policy_from_bags")
     laps, collect_laps, steps, rounds = (0.5, 0.4, 60, 0) if trial else (3.0, 2.0, 800, 1)

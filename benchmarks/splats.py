@@ -8,7 +8,6 @@ found in the world.
 from __future__ import annotations
 
 import argparse
-import os
 from pathlib import Path
 from statistics import mean
 
@@ -135,7 +134,6 @@ def splat_of(background: BackgroundRenderer, poses: Array, pinhole: Pinhole) -> 
 
 def attack(run: Path) -> None:
     """What searches in a splat of the room and in its field find, deployed."""
-    os.environ.setdefault("MUJOCO_GL", "egl")
     experiment = Experiment.resolved_in(run.resolve())
     field, poses, pinhole = (
         load_background(experiment),

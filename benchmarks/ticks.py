@@ -6,7 +6,6 @@ It names nothing that the code of before baked scenes lacks, so that the same sc
 from __future__ import annotations
 
 import json
-import os
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -93,5 +92,4 @@ def _iteration(experiment: Experiment, repeats: int) -> float:
 
 
 if __name__ == "__main__":
-    os.environ.setdefault("MUJOCO_GL", "egl")
     print(json.dumps(measured(Path(sys.argv[1]))))

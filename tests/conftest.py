@@ -20,6 +20,7 @@ from _pytest.runner import runtestprotocol
 
 from tests.support.processors import Shortage
 
+os.environ.setdefault("MUJOCO_GL", "egl")  # before any test imports MuJoCo
 _ATTEMPTS, _REST_S = 5, 4.0
 _INSIDE = "ADVNERF_TEST_IN_ITS_OWN_PROCESS"
 

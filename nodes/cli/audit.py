@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import time
 import traceback
@@ -245,7 +244,6 @@ def audit(
     """
     del schema
     began_s = time.monotonic()
-    os.environ.setdefault("MUJOCO_GL", "egl")
     if (place.place is None) == (place.world is None):
         say_error("expected either --place or --world")
         raise typer.Exit(USAGE_EXIT)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -62,7 +61,6 @@ class CellChoice:
 
 def load_cells(choice: CellChoice, executes: bool = True) -> tuple[Experiment, list[Cell]]:
     """An experiment and its requested cells; see `load_experiment` for ``executes``."""
-    os.environ.setdefault("MUJOCO_GL", "egl")
     from nodes.experiment.plan.cell import select
     from nodes.experiment.steps.run import load_experiment
 

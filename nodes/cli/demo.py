@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from contextlib import nullcontext
 from pathlib import Path
@@ -39,7 +38,6 @@ def demo(
     ] = True,
 ) -> None:
     """Run the whole experiment in its small setting on the simulated lab, from the photographs to the report (four to twelve minutes on 2 cores)."""
-    os.environ.setdefault("MUJOCO_GL", "egl")
     from nodes.lab.recorded_victim import FirstPicture
     from nodes.runtime.termination import ends_in_order
 

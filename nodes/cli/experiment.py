@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -118,7 +117,6 @@ def experiment(
     ] = False,
 ) -> None:
     """Run an experiment, from the photographs to the report: every stage and every cell that is not there yet. It may be stopped at any time."""
-    os.environ.setdefault("MUJOCO_GL", "egl")
     from advnerf_core.attack.device import use_device
     from nodes.experiment.run.run import Options
 
@@ -198,7 +196,6 @@ def predict(
     draws: Annotated[int, typer.Option(min=9, help="Drives per prediction.")] = 20,
 ) -> None:
     """Predict how the attacks transfer from pictures without a deployed drive with them; the table then says how good that was."""
-    os.environ.setdefault("MUJOCO_GL", "egl")
     from nodes.experiment.run.predictions import predict_cells
 
     experiment, cells = load_cells(choice)
@@ -215,7 +212,6 @@ def maps(
     ] = None,
 ) -> None:
     """Draw the loss landscape and the robustness map (starts x moves of an object) of finished cells that have placed objects."""
-    os.environ.setdefault("MUJOCO_GL", "egl")
     from nodes.experiment.run.maps import map_cells
 
     experiment, cells = load_cells(choice)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import sys
 import time
@@ -214,6 +215,7 @@ def main() -> None:
         AdvnerfError, OSError
     ):  # only what needs a cache fails without one; stopping the car does not
         use_writable_cache()
+    os.environ.setdefault("MUJOCO_GL", "egl")  # for users' worlds that import MuJoCo themselves: no window
     words = sys.argv[1:]
     resumable = is_resumable(words)
     with ends_in_order() if resumable else contextlib.nullcontext():

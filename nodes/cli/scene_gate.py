@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -43,7 +42,6 @@ def gate(
     overrides: Overrides = None,
 ) -> None:
     """Compare learned with real views by image quality and by the policy's steering. Exit code 1 if the surrogate fails."""
-    os.environ.setdefault("MUJOCO_GL", "egl")
     from advnerf_core.report.conditions import NONE
     from advnerf_core.scene.gate_limits import GateLimits
     from nodes.experiment.plan.cell import Cell

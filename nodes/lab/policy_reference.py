@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -63,7 +62,6 @@ class ReferenceFrames:
 
 def from_twin(view: PolicyView, count: int = 48, seed: int = 0) -> ReferenceFrames:
     """Make reference frames in the simulated lab around its path. No recording is needed."""
-    os.environ.setdefault("MUJOCO_GL", "egl")
     from hardware.worlds.lab.config import LabConfig
     from hardware.worlds.lab.lab import Lab
 

@@ -7,7 +7,6 @@ simulated lab in this process. Neither imports torch.
 from __future__ import annotations
 
 import contextlib
-import os
 import shutil
 import sys
 import threading
@@ -196,7 +195,6 @@ def _room() -> RoomCalibration:
 
 def main() -> None:
     """Drive the recorded victim that comes with advnerf."""
-    os.environ.setdefault("MUJOCO_GL", "egl")
     cv2.setNumThreads(1)
     victim = find_recorded()
     if victim is None:

@@ -7,7 +7,6 @@ from machine to machine.
 from __future__ import annotations
 
 import json
-import os
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -41,7 +40,6 @@ def measured(folder: Path, watcher: StageDisplay | None = None) -> dict[str, dic
         folder: Gets the run folder.
         watcher: Receives the starts and ends of the stages.
     """
-    os.environ.setdefault("MUJOCO_GL", "egl")
     from advnerf_core.data.transforms import load_transforms
     from advnerf_core.objects.voxel.build import build_from_mesh
     from advnerf_core.objects.voxel.generators import GENERATORS

@@ -109,7 +109,6 @@ def run_in_process(job: Job) -> Ended:
         "PYTHONUNBUFFERED": "1",
         **dict.fromkeys(_THREAD_VARIABLES, str(job.threads)),
     }
-    environment.setdefault("MUJOCO_GL", "egl")
     process = subprocess.Popen(
         module_command("nodes.experiment.run.worker", str(os.getpid())),
         stdin=subprocess.PIPE,

@@ -143,7 +143,9 @@ def _check_cells(made: Variants, document: Document) -> None:
             f"{document.place((OVER,))}: expected cells of different names, got {name} {count} times; rename a variant"
         )
     known = dict.fromkeys(cell.scenario for cell in made.cells)
-    named = [("contrasts", (each.before, each.after), each.name) for each in made.config.contrasts]
+    named: list[tuple[str, tuple[str, ...], str]] = [
+        ("contrasts", (each.before, each.after), each.name) for each in made.config.contrasts
+    ]
     named += [("claims", each.scenarios, each.name) for each in made.config.claims]
     for section, scenarios, title in named:
         for name in scenarios:

@@ -1,7 +1,6 @@
 """The whole experiment in its smallest size: real lab, real field, real node graph. What it finds is not judged, only that it runs."""
 
 import json
-import os
 from collections import Counter
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -35,7 +34,6 @@ SMALL = [
 @pytest.mark.slow
 @pytest.mark.parametrize("file", ["room", "monitor"])
 def test_from_photographs_to_report_and_nothing_twice(tmp_path, file, monkeypatch):
-    os.environ.setdefault("MUJOCO_GL", "egl")
     started, start = Counter(), Child.start
     monkeypatch.setattr(Child, "start", lambda child: (started.update([child.name]), start(child)))
     experiment = LAUNCH / f"{file}.experiment.yaml"
@@ -67,7 +65,6 @@ def test_from_photographs_to_report_and_nothing_twice(tmp_path, file, monkeypatc
 @pytest.mark.slow
 def test_an_experiment_that_load_keeps_from_driving_live_ends_well_and_says_so(tmp_path, monkeypatch):
     """The attacked drive is spoiled every time, the others once; another command may try again."""
-    os.environ.setdefault("MUJOCO_GL", "egl")
     tried = []
 
     def spoiled(experiment, run, folder, nodes):
@@ -134,7 +131,6 @@ def planted_track(experiment, scene, space, cell, title, folder):
 @pytest.mark.parametrize("file", ["room", "monitor"])
 def test_a_face_is_also_deployed_without_nodes_and_meets_the_same_searches(tmp_path, file):
     """The second deployer: the lab's own car in this process, past the face that is drawn, or shown on the screen."""
-    os.environ.setdefault("MUJOCO_GL", "egl")
     asked = [*SMALL, "deploy.through=world", "deploy.starts=null"]
     experiment = load_experiment(LAUNCH / f"{file}.experiment.yaml", "demo", asked, tmp_path)
     run_experiment(experiment)
@@ -152,7 +148,6 @@ def test_a_face_is_also_deployed_without_nodes_and_meets_the_same_searches(tmp_p
 
 @pytest.mark.slow
 def test_a_cell_of_another_seed_is_searched_and_driven_live_once(tmp_path):
-    os.environ.setdefault("MUJOCO_GL", "egl")
     experiment = load_experiment(LAUNCH / "monitor.experiment.yaml", "demo", SMALL, tmp_path / "run")
     make_ready(experiment, until="policy")
     asked = (
