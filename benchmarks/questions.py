@@ -167,6 +167,13 @@ QUESTIONS = (
         picture="gap_duckietown_robust_above.webp",
     ),
     Question(
+        "correlation",
+        "Does the learned scene tell what will happen?",
+        "Each registered search: the effect of its attack in the learned scene against the effect deployed.",
+        ("transfer_correlation",),
+        picture="transfer_correlation.png",
+    ),
+    Question(
         "green",
         "Are tests and demo green on a slow or busy machine?",
         "Repeated runs, beside endless loops and on one core, and tests of whole kinds of faults.",

@@ -1,0 +1,163 @@
+"""Does the learned scene predict what happens? ``python -m benchmarks.transfer_correlation``.
+
+One point is one search: its mean excess in the learned scene, against that of the same attack deployed, both in half lanes per tick.
+All registered searches of all complete sets count, those of random textures too, and none else; a search that several conditions
+of a set drove counts once, under the last one. Pooled over sets a correlation may be that of the sets' means; within sets each
+set has a mean of its own (a fixed effect). Searches of a set are not independent, so that lower bounds come from sets drawn again.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.stats import rankdata
+
+from advnerf_core.report.cells import CellResult
+from advnerf_core.report.conditions import CONTROLS
+from advnerf_core.report.evidence.results import Evidence
+from advnerf_core.report.evidence.verify import sets_in
+from advnerf_core.report.evidence.verifying.layout import SET
+from advnerf_core.report.palette import LIGHT
+from advnerf_core.report.plots import new_axes
+from advnerf_core.report.reference import DOMAINS, Domain
+from benchmarks.predictions import PUBLISHED, evidence_of
+from benchmarks.results import LedgerRow
+
+COMMAND = "python -m benchmarks.transfer_correlation"
+PICTURE = "transfer_correlation.png"
+_DRAWS, _SEED, _LOWEST = 4000, 0, 0.05
+_LEAST = {"Pearson": 0.8, "Spearman": 0.7}
+_COLOURS = ("#1b6ca8", "#c2410c", "#15803d", "#7e22ce", "#b45309", "#0f766e", "#be123c", "#4d4d4d")
+_MARKERS = "os^Dv<>"
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SetPoints:
+    """The searches of one set.
+
+    Attributes:
+        name: Name of the set.
+        xy: Mean excess of each search in the learned scene and deployed ``[searches, 2]`` [half lanes per tick].
+    """
+
+    name: str
+    xy: Floats
+
+
+def points_of(evidence: Evidence) -> SetPoints:
+    """The registered searches of a set, each once."""
+    found: dict[tuple[str, str, int, str], list[float]] = {}
+    for registered in evidence.registration.cells:
+        cell = evidence.cells.get(registered.name)
+        if cell is None or cell.method in CONTROLS or not evidence.is_registered(cell):
+            continue
+        means = [_mean(evidence, cell, domain) for domain in DOMAINS]
+        if np.isfinite(means).all():
+            found[cell.victim, cell.method, cell.seed, cell.attack_id or cell.name] = means
+    return SetPoints(evidence.registration.name, np.array([*found.values()]).reshape(-1, 2))
+
+
+def correlation(sets: Sequence[SetPoints], within: bool, of_ranks: bool) -> float:
+    """Correlation over all searches: Pearson's, or Spearman's; within sets, each set's mean is taken away."""
+    both = np.concatenate([_centred(each.xy) if within else each.xy for each in sets])
+    if of_ranks:
+        both = np.stack([rankdata(column) for column in both.T], axis=1)
+    return float(np.corrcoef(both.T)[0, 1])
+
+
+def line(sets: Sequence[SetPoints], within: bool) -> tuple[float, float]:
+    """Slope and intercept of deployed on learned [half lanes per tick]; within sets the intercept is that of the mean set."""
+    both = np.concatenate([each.xy for each in sets])
+    centred = np.concatenate([_centred(each.xy) for each in sets]) if within else _centred(both)
+    slope = float((centred[:, 0] * centred[:, 1]).sum() / (centred[:, 0] ** 2).sum())
+    middle = np.mean([each.xy.mean(axis=0) for each in sets], axis=0) if within else both.mean(axis=0)
+    return slope, float(middle[1] - slope * middle[0])
+
+
+def lower_bound(sets: Sequence[SetPoints], within: bool, of_ranks: bool) -> float:
+    """One-sided 95 % bound of a correlation: whole sets are drawn again, with replacement."""
+    rng, found = np.random.default_rng(_SEED), []
+    for _ in range(_DRAWS):
+        drawn = [sets[number] for number in rng.integers(len(sets), size=len(sets))]
+        found.append(correlation(drawn, within, of_ranks))
+    return float(np.quantile(found, _LOWEST))
+
+
+def ledger_rows() -> list[LedgerRow]:
+    """The rows, from the complete published sets."""
+    sets = _complete()
+    count = sum(len(each.xy) for each in sets)
+    made = []
+    for within in (False, True):
+        slope, intercept = line(sets, within)
+        for name, least in _LEAST.items():
+            value = correlation(sets, within, name == "Spearman")
+            bound = lower_bound(sets, within, name == "Spearman")
+            which = "within sets" if within else "pooled"
+            note = (
+                f"{count} searches of {len(sets)} sets ({', '.join(f'{each.name} {len(each.xy)}' for each in sets)}); at least {bound:.2f} (one-sided 95 %, "
+                f"sets drawn again); deployed = {slope:.2f} x learned {intercept:+.3f} half lanes per tick"
+            )
+            made.append(
+                LedgerRow(
+                    f"excess of a search in the learned scene against deployed, {which}: {name}'s correlation",
+                    round(value, 3),
+                    "",
+                    f">= {least:g}" if within else "",
+                    value >= least if within else None,
+                    COMMAND,
+                    note,
+                )
+            )
+    return made
+
+
+def picture() -> Figure:
+    """All points, by set."""
+    sets = _complete()
+    with new_axes(6.0, 5.0) as ax:
+        ends = np.array([min(each.xy.min() for each in sets), max(each.xy.max() for each in sets)])
+        ax.plot(ends, ends, color=LIGHT["muted"], lw=1.0, zorder=1, label="as in the learned scene")
+        for number, each in enumerate(sets):
+            colour, marker = _COLOURS[number % len(_COLOURS)], _MARKERS[number % len(_MARKERS)]
+            ax.plot(*each.xy.T, marker, ms=5, mfc="none", color=colour, label=each.name.replace("_", " "))
+        ax.set(xlabel="in the learned scene [half lanes per tick]", ylabel="deployed [half lanes per tick]")
+        ax.legend(loc="upper left", fontsize=8)
+    figure: Figure = ax.figure
+    return figure
+
+
+def main() -> None:
+    """Compute, record and draw."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
+    for row in ledger_rows():
+        row.record()
+        print(f"{row.line}: {row.value}; {row.note}")
+    picture().savefig(PUBLISHED / PICTURE, dpi=110)
+
+
+def _mean(evidence: Evidence, cell: CellResult, domain: Domain) -> float:
+    """Mean excess of a cell's drives [half lanes per tick]; not a number where it was not driven."""
+    drives = [each.excess_cte_m_per_tick for each in evidence.outcomes(cell, domain)]
+    return float(np.mean(drives)) / evidence.scenario_of(cell).off_track_m if drives else float("nan")
+
+
+def _complete() -> list[SetPoints]:
+    """The sets of which all cells are published, with their searches."""
+    names = [name for name in sets_in(PUBLISHED) if (PUBLISHED / name / SET).exists()]
+    found = [points_of(evidence_of(name)) for name in names]
+    return [each for each in found if len(each.xy) > 1]
+
+
+def _centred(xy: Floats) -> Floats:
+    return xy - xy.mean(axis=0)
+
+
+if __name__ == "__main__":
+    main()
