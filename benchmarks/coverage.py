@@ -75,6 +75,11 @@ SMALLER = (
     Design("normal, equal effects", "normal", (0.3, 0.3, 0.3), searches=3),
     Design("normal, equal effects", "normal", (0.3, 0.3, 0.3), searches=2),
     Design("normal, equal effects", "normal", (0.3, 0.3, 0.3), starts=5),
+    # Claims about kinds of places: places in place of searches, victims in place of starts.
+    Design("normal, equal effects", "normal", (0.3, 0.3, 0.3), searches=4, starts=2),
+    Design("normal, searches dominate", "normal", (0.3, 0.1, 0.1), searches=4, starts=2),
+    Design("normal, starts dominate", "normal", (0.1, 0.3, 0.1), searches=4, starts=2),
+    Design("normal, starts dominate", "normal", (0.1, 0.3, 0.1), searches=4, starts=3),
 )
 
 

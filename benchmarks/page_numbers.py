@@ -150,7 +150,7 @@ def _of_sets(published: Path) -> Iterator[Number]:
     """Lengths and shares of the published sets."""
     for file in sorted(published.glob("*/set/set.json")):
         data = read_json(file)
-        for row in (*data.get("rows", ()), *data.get("primary", ()), *data.get("contrasts", ())):
+        for row in (row for part in ("rows", "primary", "contrasts", "claims") for row in data.get(part, ())):
             for key, value in row.items():
                 if key.endswith("_m") and value is not None:
                     yield from _rounded(value, "m")

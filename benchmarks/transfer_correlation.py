@@ -1,9 +1,10 @@
 """Does the learned scene predict what happens? ``python -m benchmarks.transfer_correlation``.
 
-One point is one search: its mean excess in the learned scene, against that of the same attack deployed, both in half lanes per tick.
-All registered searches of all complete sets count, those of random textures too, and none else; a search that several conditions
-of a set drove counts once, under the last one. Pooled over sets a correlation may be that of the sets' means; within sets each
-set has a mean of its own (a fixed effect). Searches of a set are not independent, so that lower bounds come from sets drawn again.
+One point is one search of one set: its mean excess in the learned scene, against that of the same attack deployed, both in half
+lanes per tick. All registered searches of all complete sets count, those of random textures too, and none else; a search that several
+conditions of a set drove counts once, under the last one. Pooled over sets a correlation may be that of the sets' means; within sets
+each set has a mean of its own (a fixed effect), and ranks are taken inside each set. Searches of a set are not independent, nor are
+sets that share searches, so that lower bounds come from groups of such sets, drawn again. With so few groups they are rough.
 """
 
 from __future__ import annotations
@@ -17,8 +18,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
+from advnerf_core.documents import read_json
 from advnerf_core.report.cells import CellResult
 from advnerf_core.report.conditions import CONTROLS
+from advnerf_core.report.evidence.page import groups_of_searches
 from advnerf_core.report.evidence.results import Evidence
 from advnerf_core.report.evidence.verify import sets_in
 from advnerf_core.report.evidence.verifying.layout import SET
@@ -43,14 +46,16 @@ class SetPoints:
 
     Attributes:
         name: Name of the set.
+        group: Number of the group of sets that share searches.
         xy: Mean excess of each search in the learned scene and deployed ``[searches, 2]`` [half lanes per tick].
     """
 
     name: str
+    group: int
     xy: Floats
 
 
-def points_of(evidence: Evidence) -> SetPoints:
+def points_of(evidence: Evidence, group: int) -> SetPoints:
     """The registered searches of a set, each once."""
     found: dict[tuple[str, str, int, str], list[float]] = {}
     for registered in evidence.registration.cells:
@@ -60,14 +65,17 @@ def points_of(evidence: Evidence) -> SetPoints:
         means = [_mean(evidence, cell, domain) for domain in DOMAINS]
         if np.isfinite(means).all():
             found[cell.victim, cell.method, cell.seed, cell.attack_id or cell.name] = means
-    return SetPoints(evidence.registration.name, np.array([*found.values()]).reshape(-1, 2))
+    return SetPoints(evidence.registration.name, group, np.array([*found.values()]).reshape(-1, 2))
 
 
 def correlation(sets: Sequence[SetPoints], within: bool, of_ranks: bool) -> float:
-    """Correlation over all searches: Pearson's, or Spearman's; within sets, each set's mean is taken away."""
-    both = np.concatenate([_centred(each.xy) if within else each.xy for each in sets])
-    if of_ranks:
-        both = np.stack([rankdata(column) for column in both.T], axis=1)
+    """Correlation over all searches: Pearson's, or Spearman's; within sets, values or ranks are those above the set's mean."""
+    if within:
+        parts = [_ranks(each.xy) / len(each.xy) if of_ranks else each.xy for each in sets]
+        both = np.concatenate([_centred(part) for part in parts])
+    else:
+        both = np.concatenate([each.xy for each in sets])
+        both = _ranks(both) if of_ranks else both
     return float(np.corrcoef(both.T)[0, 1])
 
 
@@ -81,10 +89,13 @@ def line(sets: Sequence[SetPoints], within: bool) -> tuple[float, float]:
 
 
 def lower_bound(sets: Sequence[SetPoints], within: bool, of_ranks: bool) -> float:
-    """One-sided 95 % bound of a correlation: whole sets are drawn again, with replacement."""
+    """One-sided 95 % percentile bound of a correlation: whole groups of sets are drawn again, with replacement."""
+    groups = [
+        [each for each in sets if each.group == group] for group in sorted({each.group for each in sets})
+    ]
     rng, found = np.random.default_rng(_SEED), []
     for _ in range(_DRAWS):
-        drawn = [sets[number] for number in rng.integers(len(sets), size=len(sets))]
+        drawn = [each for number in rng.integers(len(groups), size=len(groups)) for each in groups[number]]
         found.append(correlation(drawn, within, of_ranks))
     return float(np.quantile(found, _LOWEST))
 
@@ -92,7 +103,10 @@ def lower_bound(sets: Sequence[SetPoints], within: bool, of_ranks: bool) -> floa
 def ledger_rows() -> list[LedgerRow]:
     """The rows, from the complete published sets."""
     sets = _complete()
-    count = sum(len(each.xy) for each in sets)
+    count, groups = sum(len(each.xy) for each in sets), len({each.group for each in sets})
+    alone = ", ".join(
+        f"{each.name} {correlation([each], True, False):.2f} of {len(each.xy)}" for each in sets
+    )
     made = []
     for within in (False, True):
         slope, intercept = line(sets, within)
@@ -101,8 +115,9 @@ def ledger_rows() -> list[LedgerRow]:
             bound = lower_bound(sets, within, name == "Spearman")
             which = "within sets" if within else "pooled"
             note = (
-                f"{count} searches of {len(sets)} sets ({', '.join(f'{each.name} {len(each.xy)}' for each in sets)}); at least {bound:.2f} (one-sided 95 %, "
-                f"sets drawn again); deployed = {slope:.2f} x learned {intercept:+.3f} half lanes per tick"
+                f"{count} searches of {len(sets)} sets in {groups} groups without common searches; the target is for the estimate, its lower bound is "
+                f"{bound:.2f} (one-sided 95 %, groups drawn again); deployed = {slope:.2f} x learned {intercept:+.3f} half lanes per tick; Pearson's of "
+                f"each set: {alone}"
             )
             made.append(
                 LedgerRow(
@@ -150,9 +165,18 @@ def _mean(evidence: Evidence, cell: CellResult, domain: Domain) -> float:
 
 def _complete() -> list[SetPoints]:
     """The sets of which all cells are published, with their searches."""
-    names = [name for name in sets_in(PUBLISHED) if (PUBLISHED / name / SET).exists()]
-    found = [points_of(evidence_of(name)) for name in names]
+    data = {
+        name: read_json(PUBLISHED / name / SET)
+        for name in sets_in(PUBLISHED)
+        if (PUBLISHED / name / SET).exists()
+    }
+    group_of = {name: number for number, group in enumerate(groups_of_searches(data)) for name in group}
+    found = [points_of(evidence_of(name), group_of[name]) for name in data]
     return [each for each in found if len(each.xy) > 1]
+
+
+def _ranks(xy: Floats) -> Floats:
+    return np.stack([rankdata(column) for column in xy.T], axis=1)
 
 
 def _centred(xy: Floats) -> Floats:

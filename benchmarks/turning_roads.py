@@ -1,8 +1,8 @@
 """Roads of MetaDrive whose turns a car can miss: ``python -m benchmarks.turning_roads``.
 
 On a gentle curve there is no turn to miss: a car that steers wrongly for a moment is still in its lane. The rule takes, before any
-attack, the first road of each block sequence whose route has a sharp turn with a way on behind it, and the stretch that begins
-two seconds before that turn. It prints what an experiment file needs: ``world.road``.
+attack, the first road of each block sequence whose route has a sharp turn, two seconds of way before it and two behind it, and the
+stretch of that length. It prints what an experiment file needs: ``world.road``.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ SEEDS = range(1, 13)
 # A turn that can be missed: at most this radius, in half lanes, at least this angle, and so much way behind it [s].
 SHARPEST_HALF_LANES, LEAST_RAD, ONWARD_S = 12.0, math.radians(60.0), 2.0
 APPROACH_S = 2.0
+_LENGTH_M = 75  # at 6 m/s: 12 m before the turn, a right angle of the largest radius, 12 m behind it, and what the last block has left
 
 
 def missable_turn_m(path: ReferencePath, half_lane_m: float, onward_m: float) -> float | None:
@@ -59,7 +60,10 @@ def main() -> None:
             turn_m = missable_turn_m(path, described.off_track_m, ONWARD_S * speed_mps)
             if turn_m is not None and turn_m >= APPROACH_S * speed_mps:
                 from_m = math.floor(turn_m - APPROACH_S * speed_mps)
-                print(f"road: {{blocks: {blocks}, seed: {seed}, from_m: {from_m}, length_m: 60}}", flush=True)
+                print(
+                    f"road: {{blocks: {blocks}, seed: {seed}, from_m: {from_m}, length_m: {_LENGTH_M}}}",
+                    flush=True,
+                )
                 break
 
 

@@ -44,6 +44,7 @@ def a_dropped_scenario(world: World) -> None:
     data["contrasts"] = [
         each for each in data.get("contrasts", []) if name not in (each["before"], each["after"])
     ]
+    data["claims"] = [each for each in data.get("claims", []) if name not in each["scenarios"]]
     for file in [*world.folder.glob(f"{name}_*.json"), *world.folder.glob(f"*/{name}_*.json")]:
         file.unlink()
     world.register_again(data)

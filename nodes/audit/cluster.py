@@ -42,6 +42,7 @@ class Cluster:
 
 def _search(folder: str, wanted: SearchJob) -> bool:
     """One search, in a worker of the cluster; one that fails does so again where its results are read, with its error."""
+    os.environ.setdefault("MUJOCO_GL", "egl")  # as the command line does, for users' worlds
     search_folder_last(folder)
     with contextlib.suppress(AdvnerfError):
         search_cell(wanted.experiment(), wanted.cell, Path(wanted.folder), lambda *told: None)

@@ -14,7 +14,7 @@ def sets_of(slope: float, noise: float, offsets: tuple[float, ...], seed: int = 
     for number, offset in enumerate(offsets):
         x = rng.uniform(0.0, 1.0, 12) + offset
         y = slope * x + rng.normal(0.0, noise, 12) - 2.0 * slope * offset
-        found.append(SetPoints(f"set{number}", np.stack([x, y], axis=1)))
+        found.append(SetPoints(f"set{number}", number, np.stack([x, y], axis=1)))
     return found
 
 
@@ -37,7 +37,8 @@ def test_within_sets_is_a_regression_with_a_constant_for_each() -> None:
     assert intercept == pytest.approx(coefficients[1:].mean())
     left = [column - of_set @ (of_set.T @ column) / 12 for column in both.T]
     assert correlation(sets, True, False) == pytest.approx(pearsonr(*left).statistic)
-    assert correlation(sets, True, True) == pytest.approx(spearmanr(*left).statistic)
+    one = sets_of(0.7, 0.2, (0.5,))
+    assert correlation(one, True, True) == pytest.approx(spearmanr(*one[0].xy.T).statistic)
     assert correlation(sets, True, False) > 0.9 > 0.0 > correlation(sets, False, False)
 
 
@@ -45,15 +46,18 @@ def test_the_bound_is_below_and_one_strange_set_lowers_it() -> None:
     sets = sets_of(0.7, 0.1, (0.0,) * 6)
     alike = lower_bound(sets, True, False)
     assert alike < correlation(sets, True, False)
-    strange = [*sets[:-1], SetPoints("strange", sets[-1].xy * [1.0, -1.0])]
+    strange = [*sets[:-1], SetPoints("strange", 5, sets[-1].xy * [1.0, -1.0])]
     assert lower_bound(strange, True, False) < alike - 0.2
+    # Sets that share searches are drawn together: of one group there is nothing to draw.
+    together = [SetPoints(each.name, 0, each.xy) for each in strange]
+    assert lower_bound(together, True, False) == pytest.approx(correlation(strange, True, False))
 
 
 def test_a_search_counts_once_and_controls_do_not() -> None:
     names = sets_in(PUBLISHED)
     assert "gap_room" in names
     evidence = evidence_of("gap_room")
-    found = points_of(evidence)
+    found = points_of(evidence, 0)
     searches = {
         (cell.method, cell.seed, cell.attack_id)
         for cell in evidence.cells.values()

@@ -256,11 +256,12 @@ def _contrasts(found: Sequence[Mapping[str, Any]]) -> str:
 
 def _place_claim(row: Mapping[str, Any]) -> str:
     """A claim about a kind of place: one sentence, and what it is the mean of."""
+    title = f"**{row['name']}**, {style_of(row['method']).title} minus the strongest baseline, {row['places']} places and {row['victims']} victims"
+    if row["difference_m"] is None:
+        return f"{title}: no claim, as {row['reason']}.\n"
     said = (
-        f"**{row['name']}**{'' if row['registered'] else ' (not registered)'}: {style_of(row['method']).title} minus the strongest baseline, "
-        f"{row['places']} places and {row['victims']} victims: {row['difference_m']:+.3f} m per tick "
-        f"({ends(row['low_m'], row['high_m'])} for new places and victims), off track {row['off_track_points']:+.0f} points "
-        f"({row['off_track_low']:+.0f} to {row['off_track_high']:+.0f}).\n"
+        f"{title}: {row['difference_m']:+.3f} m per tick ({ends(row['low_m'], row['high_m'])} for new places and victims), off track "
+        f"{row['off_track_points']:+.0f} points, at least {row['least_off_track_points']:+.0f} at each place.\n"
     )
     return f"{said}\n" + _lines(
         [

@@ -151,6 +151,13 @@ class PlaceClaim(StrictModel):
     method: str = "gradient"
     against: tuple[str, ...] = Field(min_length=1)
 
+    @field_validator("scenarios", "victims", "against")
+    @classmethod
+    def _different(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        if len(set(names)) < len(names):
+            raise ValueError(f"expected different ones, got {', '.join(names)}")
+        return names
+
 
 class Registration(StrictModel):
     """The planned cells and tests of a set.

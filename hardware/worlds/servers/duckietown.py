@@ -122,16 +122,18 @@ class Map:
 
     def add_panel(self, name: str, size_m: list[float] | None, **arrays: np.ndarray) -> Reply:
         """Put a panel with ``T_world_from_face`` and texture ``rgb`` into the scene; without a size, remove it."""
-        self._added.pop(("panel", name), None)
-        if size_m is not None:
-            self._added["panel", name] = PygletPanel(size_m, **arrays)
-        return {}, {}
+        return self._add(("panel", name), None if size_m is None else PygletPanel(size_m, **arrays))
 
     def add_mesh(self, name: str, **arrays: np.ndarray) -> Reply:
         """Put triangles ``corners_m``, with ``normals``, ``uv`` and texture ``rgb``, into the scene; without them, take them out."""
-        self._added.pop(("mesh", name), None)
-        if arrays:
-            self._added["mesh", name] = PygletMesh(**arrays)
+        return self._add(("mesh", name), PygletMesh(**arrays) if arrays else None)
+
+    def _add(self, name: tuple[str, str], thing: Any) -> Reply:
+        """Put something into the scene in place of what has this name; None only takes that out."""
+        if name in self._added:
+            self._added.pop(name).delete()
+        if thing is not None:
+            self._added[name] = thing
         return {}, {}
 
     def _rolling(self, speed_mps: float) -> Any:

@@ -77,7 +77,8 @@ class Room:
 
     def _add(self, name: str, solids: tuple[Any, ...], kept: tuple[Any, ...]) -> Reply:
         """Put solids into the scene in place of those of this name; what they are drawn with must stay referenced."""
-        for solid in self._added.pop(name, ((), ()))[0]:
+        before = self._added.pop(name, ((), ()))
+        for solid in before[0]:
             self._scene.remove_renderable(solid)
         if solids:
             self._added[name] = solids, kept

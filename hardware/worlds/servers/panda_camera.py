@@ -119,7 +119,9 @@ def mesh_node(name: str, corners_m: np.ndarray, normals: np.ndarray, uv: np.ndar
     geometry.add_primitive(triangles)
     node.add_geom(geometry)
     root = NodePath(node)
-    root.setTexture(_texture(name, rgb))
+    texture = _texture(name, rgb)
+    texture.setMinfilter(Texture.FTLinear)  # coarser copies would mix the parts of its texture
+    root.setTexture(texture)
     return root
 
 

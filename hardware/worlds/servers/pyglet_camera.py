@@ -66,7 +66,7 @@ class PygletPanel:
     """A textured rectangle that is lit like everything else; its back is plain."""
 
     def __init__(self, size_m: list[float], T_world_from_face: np.ndarray, rgb: np.ndarray) -> None:
-        self._texture = _texture(rgb)
+        self._texture = _texture(rgb[::-1], True)
         R, at, u, v = T_world_from_face[:3, :3], T_world_from_face[:3, 3], 0.5 * size_m[0], 0.5 * size_m[1]
         self._normal = to_opengl(R[:, 0])
         # For a viewer left is against the face's y; the texture's origin is at its lower left.
@@ -81,6 +81,10 @@ class PygletPanel:
             self._draw(self._corners, self._normal, 1.0)
             gl.glDisable(gl.GL_TEXTURE_2D)
             self._draw(self._corners[::-1], -self._normal, 0.2)
+
+    def delete(self) -> None:
+        """Give its memory back."""
+        gl.glDeleteTextures(1, ctypes.byref(self._texture))
 
     def _draw(self, corners: list[Any], normal: np.ndarray, brightness: float) -> None:
         """Draw one side of the panel."""
@@ -97,9 +101,10 @@ class PygletMesh:
     """Triangles with one texture that are lit like everything else."""
 
     def __init__(self, corners_m: np.ndarray, normals: np.ndarray, uv: np.ndarray, rgb: np.ndarray) -> None:
-        self._texture = _texture(rgb)
+        # Without coarser copies, in which the parts of a mesh's texture would mix.
+        self._texture = _texture(rgb, False)
         flat = [to_opengl(each.reshape(-1, 3)).ravel().tolist() for each in (corners_m, normals)]
-        places = (uv.reshape(-1, 2) * [1.0, -1.0] + [0.0, 1.0]).ravel().tolist()
+        places = uv.ravel().tolist()  # the first row of pixels is at 0
         self._triangles = pyglet.graphics.vertex_list(
             3 * len(corners_m), ("v3f/static", flat[0]), ("n3f/static", flat[1]), ("t2f/static", places)
         )
@@ -110,25 +115,43 @@ class PygletMesh:
             gl.glColor4f(1.0, 1.0, 1.0, 1.0)
             self._triangles.draw(gl.GL_TRIANGLES)
 
+    def delete(self) -> None:
+        """Give its memory back, which pyglet and OpenGL keep otherwise."""
+        self._triangles.delete()
+        gl.glDeleteTextures(1, ctypes.byref(self._texture))
+
 
 @contextlib.contextmanager
 def _textured(texture: Any) -> Iterator[None]:
-    """Draw with a texture, and leave all as it was: Duckietown draws its road with the normal and texture that were set last."""
+    """Draw fronts with a texture, and leave all as it was: Duckietown draws its road with the normal and texture that were set last."""
     gl.glPushAttrib(gl.GL_ALL_ATTRIB_BITS)
     gl.glEnable(gl.GL_CULL_FACE)
     gl.glEnable(gl.GL_TEXTURE_2D)
-    gl.glBindTexture(texture.target, texture.id)
-    gl.glTexParameteri(gl.GL_TEXTURE_2D, gl.GL_TEXTURE_MIN_FILTER, gl.GL_LINEAR_MIPMAP_LINEAR)
+    gl.glBindTexture(gl.GL_TEXTURE_2D, texture)
     try:
         yield
     finally:
         gl.glPopAttrib()
 
 
-def _texture(rgb: np.ndarray) -> Any:
-    """A picture ``[h, w, 3]`` of display values."""
-    rows = np.ascontiguousarray(rgb[::-1]).tobytes()
-    return pyglet.image.ImageData(rgb.shape[1], rgb.shape[0], "RGB", rows).get_mipmapped_texture()
+def _texture(rgb: np.ndarray, coarser: bool) -> Any:
+    """A picture ``[h, w, 3]`` of any size, its first row at 0; with coarser copies of itself for far views, or without."""
+    texture, pixels = gl.GLuint(), np.ascontiguousarray(rgb)
+    gl.glGenTextures(1, ctypes.byref(texture))
+    gl.glBindTexture(gl.GL_TEXTURE_2D, texture)
+    for key, value in (
+        (gl.GL_TEXTURE_MIN_FILTER, gl.GL_LINEAR_MIPMAP_LINEAR if coarser else gl.GL_LINEAR),
+        (gl.GL_TEXTURE_MAG_FILTER, gl.GL_LINEAR),
+        (gl.GL_TEXTURE_WRAP_S, gl.GL_CLAMP_TO_EDGE),
+        (gl.GL_TEXTURE_WRAP_T, gl.GL_CLAMP_TO_EDGE),
+    ):
+        gl.glTexParameteri(gl.GL_TEXTURE_2D, key, value)
+    gl.glPixelStorei(gl.GL_UNPACK_ALIGNMENT, 1)
+    form = (gl.GL_RGB, rgb.shape[1], rgb.shape[0], 0, gl.GL_RGB, gl.GL_UNSIGNED_BYTE)
+    gl.glTexImage2D(gl.GL_TEXTURE_2D, 0, *form, pixels.ctypes.data_as(ctypes.c_void_p))
+    if coarser:
+        gl.glGenerateMipmap(gl.GL_TEXTURE_2D)
+    return texture
 
 
 def to_opengl(points: np.ndarray) -> np.ndarray:

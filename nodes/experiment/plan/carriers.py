@@ -79,12 +79,12 @@ class ComposedConfig(_ObjectCarrier):
 
 
 class NativeConfig(_ObjectCarrier):
-    """Panels stand in the world's own scene, which lights and hides them."""
+    """Objects stand in the world's own scene, which lights and hides them."""
 
     kind: Literal["native"]
     training: Way = Field(
         default="native",
-        description="How frames of the deployment scene show the panels while victims learn.",
+        description="How frames of the deployment scene show the objects while victims learn.",
     )
 
 

@@ -80,7 +80,7 @@ class ExperimentConfig(StrictModel):
     carrier: CarrierConfig = Field(
         default=ComposedConfig(kind="composed"),
         description="What shows a texture: overlay (drawn on a panel of the world), screen, composed (objects drawn by depth) or native "
-        "(panels in the world's own scene).",
+        "(objects in the world's own scene).",
     )
     space: SpaceConfig = Field(
         default=ColoursConfig(kind="colours"), description="What the attacks may change."

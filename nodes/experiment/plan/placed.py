@@ -99,7 +99,7 @@ class MeshConfig(StrictModel):
 
 
 class PlacedObject(StrictModel):
-    """Place of an object of the attack. It is not part of the world: the deployment composes it by depth.
+    """Place of an object of the attack, which is not part of the captured world.
 
     Attributes:
         name: Unique name.
@@ -200,7 +200,7 @@ class Stands(StrictModel):
         side: Side of the path; outside: of the turn that the path makes on the way to it, and none where that is straight.
         choose: The first such spot along the path, or the one at which it covers most of a drive's pictures: pixels times time.
         seen_s: Time for which a drive along the path sees nearly all of it, unhidden and from the front [s].
-        least_px: Smallest height in the policy's picture during that time [px].
+        least_px: Smallest height in the policy's picture during that time [px]. A solid object is taken for an upright square of its width.
     """
 
     path: str | None = None
@@ -226,6 +226,13 @@ class RuledObject(StrictModel):
     z_m: float = 0.0
     scale: float = Field(default=1.0, gt=0.0, le=2.0)
     stands: Stands
+
+    @field_validator("kind")
+    @classmethod
+    def _is_built(cls, kind: str) -> str:
+        if kind in (CUBE, BALL):
+            raise ValueError(f"expected no {kind} by a rule, which only a learned scene of your own has")
+        return kind
 
     def at(self, x_m: float, y_m: float, yaw_rad: float) -> PlacedObject:
         """The object at one place, rounded to the millimetre, so that no machine's last bit moves it."""

@@ -29,6 +29,7 @@ from advnerf_core.scene.surrogate import PoseBatch, Surrogate
 from hardware.cameras.effects import ImperfectCamera
 from hardware.worlds.world import Depth, Rgb, World, collided_with, require_depth
 from nodes.experiment.show.images import as_uint8
+from nodes.experiment.show.standing import clear
 
 # At a camera's own resolution a rasteriser takes one ray per pixel; the policy's resize averages three of them.
 _SUPERSAMPLE = 1
@@ -120,6 +121,7 @@ class DressedScene:
 
     def seen_now(self, theta: Tensor | None) -> NDArray[np.uint8]:
         """Policy image ``[66, 200, 3]`` at the car's current pose."""
+        clear(self.scene)
         rgb, depth_m = require_depth(self.scene.observe())
         window = self.view.window
         state = self.scene.state
@@ -148,6 +150,7 @@ class DressedScene:
         T_camera_from_car = np.linalg.inv(self.scene.T_car_from_camera)
         top, left = round(self.view.camera.cy - pinhole.cy), round(self.view.camera.cx - pinhole.cx)
         kept = slice(top, top + pinhole.height), slice(left, left + pinhole.width)
+        clear(self.scene)
         rgb: list[Rgb] = []
         depth_m: list[Depth] = []
         for pose in poses @ T_camera_from_car:

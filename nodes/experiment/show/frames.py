@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from advnerf_core.geometry import Array, Pinhole, yaw_of
 from advnerf_core.policies.view import PolicyView
 from hardware.worlds.world import World, require_depth
+from nodes.experiment.show.standing import clear
 
 
 class DeployedFrames:
@@ -31,6 +32,7 @@ class DeployedFrames:
         if pinhole != self.view.pinhole:
             raise ValueError(f"expected the camera of the policy's view, {self.view.pinhole}, got {pinhole}")
         size = (self.view.width, self.view.height)
+        clear(self.scene)
         rgb, depth_m = [], []
         for pose in poses @ self._T_camera_from_car:
             image, depth = require_depth(

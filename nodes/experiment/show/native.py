@@ -6,8 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import zip_longest
-from typing import Any, ClassVar, NamedTuple, Protocol
-from weakref import WeakKeyDictionary
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import torch
@@ -28,6 +27,7 @@ from hardware.worlds.world import Mesh, NativeMeshes, NativePanels, Panel, Rgb, 
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import Dressed, DressedScene
 from nodes.experiment.show.objects import surface_of
+from nodes.experiment.show.standing import Standing, make_stand, standing_in
 from nodes.runtime.errors import ConfigError
 
 
@@ -72,19 +72,6 @@ class _Thing(Protocol):
         """Put it into the scene."""
 
 
-class _Entry(NamedTuple):
-    """An object that a world shows."""
-
-    name: str
-    is_mesh: bool
-    shape: bytes
-    texture: bytes
-
-
-# Current objects of each open world, which several `NativeScene` may share.
-_STANDING: WeakKeyDictionary[Any, tuple[_Entry, ...]] = WeakKeyDictionary()
-
-
 class NativeScene:
     """A deployment scene whose own renderer shows the attacked objects: `nodes.experiment.show.deployed.Dressed`.
 
@@ -105,11 +92,6 @@ class NativeScene:
         objects: Sequence[ColouredObject],
         surfaces: Sequence[SurfaceMesh | None] = (),
     ) -> None:
-        if not isinstance(scene, NativePanels):
-            raise ConfigError(
-                f"expected a world that takes panels (add_panel) with carrier.kind native, got {type(scene).__name__}; "
-                "set carrier.kind=composed"
-            )
         self.scene: World = scene
         self.view = view
         self._fields = tuple(objects)
@@ -119,7 +101,7 @@ class NativeScene:
             if field is not None
         ]
         self._plain = DressedScene(scene, view, objects).plain_theta()
-        self._shown: tuple[Tensor, tuple[_Entry, ...]] | None = None
+        self._shown: tuple[Tensor, tuple[Standing, ...]] | None = None
 
     def plain_theta(self) -> Tensor:
         """The objects' own colours."""
@@ -152,25 +134,25 @@ class NativeScene:
     def _show(self, theta: Tensor | None) -> None:
         """Make the world show the objects in these colours, in plain ones for None, unless it does already."""
         colours = self._plain if theta is None else theta.detach()
-        standing = _STANDING.get(self.scene, ())
         # Every tick of a drive asks for the same colours; their textures are painted once.
-        if self._shown is not None and self._shown[1] is standing and torch.equal(self._shown[0], colours):
+        if (
+            self._shown is not None
+            and self._shown[1] is standing_in(self.scene)
+            and torch.equal(self._shown[0], colours)
+        ):
             return
         parts = split_theta(self._fields, colours)
         textures = [thing.texture(part) for thing, part in zip(self._things, parts, strict=True)]
-        wanted = tuple(
-            _Entry(f"object{number}", thing.is_mesh, thing.shape, texture.tobytes())
+        wanted = [
+            Standing(f"object{number}", thing.is_mesh, thing.shape, texture.tobytes())
             for number, (thing, texture) in enumerate(zip(self._things, textures, strict=True))
+        ]
+        stands = make_stand(
+            self.scene,
+            wanted,
+            lambda number: self._things[number].put(wanted[number].name, textures[number]),
         )
-        kept = {entry[:2] for entry in wanted}
-        for entry in standing:
-            if entry[:2] not in kept:
-                _take_out(self.scene, entry)
-        for entry, thing, texture in zip(wanted, self._things, textures, strict=True):
-            if entry not in standing:
-                thing.put(entry.name, texture)
-        _STANDING[self.scene] = wanted
-        self._shown = colours.clone(), wanted
+        self._shown = colours.clone(), stands
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +166,8 @@ class _Board:
     @property
     def shape(self) -> bytes:
         """See `_Thing`."""
-        return np.asarray(self.panel.T_world_from_face).tobytes()
+        size = (self.panel.width_m, self.panel.height_m)
+        return np.asarray(self.panel.T_world_from_face).tobytes() + np.array(size).tobytes()
 
     def texture(self, colours: Tensor) -> Rgb:
         """See `_Thing`."""
@@ -216,12 +199,19 @@ class _Solid:
 
     def put(self, name: str, texture: Rgb) -> None:
         """See `_Thing`. Both sides of each triangle are shown: not all meshes are wound outwards."""
-        height, width = texture.shape[:2]
+        self.scene.add_mesh(name, Mesh(*self._both_sides, texture))
+
+    @cached_property
+    def _both_sides(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Corners, normals and places in the texture, of fronts and backs."""
+        height, width = self.mesh.texture.shape[:2]
         normals = (corner_normals(self.mesh) @ self.field.T_world_from_object[:3, :3].T).astype(np.float32)
         uv = (self.mesh.texels / [width, height]).astype(np.float32)
-        corners_m = np.concatenate([self._corners, self._corners[:, ::-1]])
-        both = np.concatenate([normals, -normals[:, ::-1]])
-        self.scene.add_mesh(name, Mesh(corners_m, both, np.concatenate([uv, uv[:, ::-1]]), texture))
+        return (
+            np.concatenate([self._corners, self._corners[:, ::-1]]),
+            np.concatenate([normals, -normals[:, ::-1]]),
+            np.concatenate([uv, uv[:, ::-1]]),
+        )
 
     @cached_property
     def _corners(self) -> NDArray[np.float32]:
@@ -230,19 +220,22 @@ class _Solid:
         return (self.field.scale * self.mesh.corners @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
 
 
+def _refused(what: str, scene: World) -> str:
+    return f"expected a world that takes {what} with carrier.kind native, got {type(scene).__name__}; set carrier.kind=composed"
+
+
 def _is_solid(field: ColouredObject) -> bool:
     """Whether an object is made of voxels and is no panel."""
     return isinstance(field, VoxelGridObject) and field.face_size_m is None
 
 
-def _thing(scene: NativePanels, field: ColouredObject, surface: SurfaceMesh | None) -> _Thing:
+def _thing(scene: World, field: ColouredObject, surface: SurfaceMesh | None) -> _Thing:
     if isinstance(field, VoxelGridObject) and field.face_size_m is not None:
+        if not isinstance(scene, NativePanels):
+            raise ConfigError(_refused("panels (add_panel)", scene))
         return _Board(scene, Panel(np.array(field.T_world_from_object), *field.face_size_m))
     if not isinstance(scene, NativeMeshes):
-        raise ConfigError(
-            f"expected a world that takes meshes (add_mesh) with carrier.kind native, got {type(scene).__name__}, which takes panels alone; "
-            "set carrier.kind=composed"
-        )
+        raise ConfigError(_refused("meshes (add_mesh)", scene))
     if isinstance(field, MeshField):
         return _Solid(scene, field, field.mesh, field.texture)
     if surface is None or not isinstance(field, VoxelGridObject):
@@ -252,12 +245,3 @@ def _thing(scene: NativePanels, field: ColouredObject, surface: SurfaceMesh | No
         )
     skin = skin_of(field, surface)
     return _Solid(scene, field, skin.mesh, partial(skin.texture, field))
-
-
-def _take_out(scene: World, entry: _Entry) -> None:
-    if entry.is_mesh:
-        assert isinstance(scene, NativeMeshes), "it took the mesh"
-        scene.add_mesh(entry.name, None)
-    else:
-        assert isinstance(scene, NativePanels), "it took the panel"
-        scene.add_panel(entry.name, Panel(np.eye(4), 1.0, 1.0), None)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +58,6 @@ def build(experiment: Experiment, kind: str, progress: Any = None) -> ObjectMode
     return build_from_mesh(surface_of(kind), kind, resolution, wanted.fit_steps, source, progress)
 
 
-@lru_cache(maxsize=8)
 def surface_of(kind: str) -> SurfaceMesh:
     """The surface of a kind of solid object, upright: a user's mesh, or a generator's.
 

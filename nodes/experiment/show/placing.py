@@ -18,6 +18,7 @@ from advnerf_core.driving.path import Path
 from advnerf_core.geometry import Array, invert_transform, planar_pose
 from hardware.worlds.paths import Pose
 from hardware.worlds.world import Depth, World, require_depth
+from nodes.experiment.plan.object_kinds import PANEL, footprint_m
 from nodes.experiment.plan.placed import PlacedObject, RuledObject, in_a_lane
 from nodes.experiment.show.context import Experiment
 from nodes.runtime.errors import ConfigError
@@ -150,7 +151,7 @@ def _fits(
     if in_a_lane([spot], experiment.world) is not None:
         return False
     for other in standing:
-        if math.hypot(spot.x_m - other.x_m, spot.y_m - other.y_m) < 0.5 * (spot.side_m + other.side_m):
+        if math.hypot(spot.x_m - other.x_m, spot.y_m - other.y_m) < _reach_m(spot) + _reach_m(other):
             return False
     needed, ticks = math.ceil((wanted.stands.seen_s - 1e-9) / experiment.config.dt_s), 0
     for passed, view in enumerate(views):
@@ -158,6 +159,11 @@ def _fits(
             break
         ticks += is_seen(experiment, spot, view, wanted.stands.least_px)
     return ticks >= needed
+
+
+def _reach_m(spot: PlacedObject) -> float:
+    """Half of the longest side of the ground that an object covers [m]."""
+    return 0.5 * spot.scale * max(footprint_m(spot.kind))
 
 
 def seen_from(experiment: Experiment, world: World, panel: PlacedObject, least_px: float) -> list[Pose]:
@@ -171,7 +177,7 @@ def seen_from(experiment: Experiment, world: World, panel: PlacedObject, least_p
 
 
 def seen_px(experiment: Experiment, spot: PlacedObject, view: SeenFrom, least_px: float) -> float:
-    """Pixels of the policy's picture that an object covers, taken for an upright square; 0 unless nearly all of it is visible."""
+    """Pixels of the policy's picture that an upright square of an object's width would cover there, facing the camera; 0 unless nearly all of it is visible."""
     if not is_seen(experiment, spot, view, least_px):
         return 0.0
     ahead_m = float((view.T_camera_from_world @ spot.T_world_from_face)[2, 3])
@@ -181,8 +187,16 @@ def seen_px(experiment: Experiment, spot: PlacedObject, view: SeenFrom, least_px
 def _total_px(
     experiment: Experiment, views: Sequence[SeenFrom], least_px: float, spot: PlacedObject
 ) -> float:
-    """Pixels that an object covers, summed over the ticks of the drive."""
-    return sum(seen_px(experiment, spot, view, least_px) for view in views)
+    """Pixels that an object covers, summed over the ticks of the drive; a panel covers less the more it is turned away."""
+    total = 0.0
+    for view in views:
+        facing = 1.0
+        if spot.kind == PANEL:
+            T_camera_from_face = view.T_camera_from_world @ spot.T_world_from_face
+            middle = T_camera_from_face[:3, 3]
+            facing = float(-(middle @ T_camera_from_face[:3, 0]) / np.linalg.norm(middle))
+        total += facing * seen_px(experiment, spot, view, least_px)
+    return total
 
 
 def is_seen(experiment: Experiment, spot: PlacedObject, view: SeenFrom, least_px: float) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -143,12 +143,21 @@ def _check_cells(made: Variants, document: Document) -> None:
             f"{document.place((OVER,))}: expected cells of different names, got {name} {count} times; rename a variant"
         )
     known = dict.fromkeys(cell.scenario for cell in made.cells)
-    named: list[tuple[str, tuple[str, ...], str]] = [
-        ("contrasts", (each.before, each.after), each.name) for each in made.config.contrasts
-    ]
-    named += [("claims", each.scenarios, each.name) for each in made.config.claims]
-    for section, scenarios, title in named:
-        for name in scenarios:
-            if name not in known:
-                message = unknown(name, "variant", known)
-                raise ConfigError(f"{document.place((section,))}: {section}: {title!r}: {message}")
+
+    def require(name: str, what: str, names: Iterable[str], *place: str | int) -> None:
+        if name not in names:
+            message = unknown(name, what, names)
+            raise ConfigError(f"{document.place(place)}: {'.'.join(map(str, place))}: {message}")
+
+    for index, contrast in enumerate(made.config.contrasts):
+        for name in (contrast.before, contrast.after):
+            require(name, "variant", known, "contrasts", index)
+    for index, claim in enumerate(made.config.claims):
+        for scenario in claim.scenarios:
+            require(scenario, "variant", known, "claims", index)
+            for victim in claim.victims:
+                there = [cell for cell in made.cells if cell.scenario == scenario]
+                require(victim, f"victim of {scenario}", {cell.victim for cell in there}, "claims", index)
+                methods = {cell.method for cell in there if cell.victim == victim}
+                for method in (claim.method, *claim.against):
+                    require(method, f"method against {victim} in {scenario}", methods, "claims", index)

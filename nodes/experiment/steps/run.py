@@ -115,14 +115,18 @@ def _check_native(experiment: Experiment, document: Document) -> None:
         named.append(experiment.named_world)
     if isinstance(config.carrier, NativeConfig):
         named.append(experiment.deployed_world)
-    meshes = [each.name for each in config.objects if each.kind != PANEL]
-    wanted, call = (NativeMeshes, "add_mesh") if meshes else (NativePanels, "add_panel")
+    wanted = (
+        (NativePanels, "add_panel", [each.name for each in config.objects if each.kind == PANEL]),
+        (NativeMeshes, "add_mesh", [each.name for each in config.objects if each.kind != PANEL]),
+    )
     for world in named:
-        if not isinstance(world.make(), wanted):
-            raise ConfigError(
-                f"{document.place(('carrier',))}: expected a world that takes {', '.join(meshes) or 'panels'} into its own scene ({call}) with "
-                f"carrier native, got {world.kind}; set carrier.kind=composed"
-            )
+        made = world.make()
+        for kind, call, names in wanted:
+            if names and not isinstance(made, kind):
+                raise ConfigError(
+                    f"{document.place(('carrier',))}: expected a world that takes {', '.join(names)} into its own scene ({call}) with "
+                    f"carrier native, got {world.kind}; set carrier.kind=composed"
+                )
 
 
 def _check_places(experiment: Experiment, document: Document) -> None:

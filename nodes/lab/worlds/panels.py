@@ -20,7 +20,8 @@ _AHEAD, _WIDE, _HIGH = 4.0, 1.6, 1.0
 _NEARER, _TURNED_RAD = 0.3, 0.12
 _CHANGED, _EDGE_PX = 4, 1.5
 _OVERLAP, _HIDDEN_OVERLAP, _SAME_DEPTH, _DEPTH_SHARE, _LEAST_PX = 0.8, 0.75, 0.03, 0.9, 150
-_NAME, _TEXELS = "advnerf check", 64
+# A texture whose height is no power of two.
+_NAME, _TEXELS = "advnerf check", (48, 64)
 # Colours of the quarters: top left, top right, bottom left, bottom right.
 _QUARTERS = np.array([[225, 30, 30], [30, 200, 30], [30, 30, 225], [215, 205, 30]], dtype=np.uint8)
 _WRONG_WAYS = {
@@ -41,9 +42,20 @@ def meshes_are_native(bench: WorldBench) -> str:
     """So does a mesh: a sheet of the same size."""
     world = bench.world
     assert isinstance(world, NativeMeshes), "only asked where the world takes meshes"
-    return _are_native(
+    found = _are_native(
         bench, lambda panel, rgb: world.add_mesh(_NAME, None if rgb is None else sheet(panel, rgb))
     )
+    place = bench.places[0]
+    before = world.observe_at(*place, depth=False)[0]
+    turned = _panel(bench, place, float(world.T_car_from_camera[2, 3]))
+    back = Panel(turned.T_world_from_face @ planar_pose(0.0, 0.0, math.pi), turned.width_m, turned.height_m)
+    try:
+        world.add_mesh(_NAME, sheet(back, _texture()))
+        if not np.array_equal(world.observe_at(*place, depth=False)[0], before):
+            raise NotMet("expected triangles to be seen from their front alone; got one from its back")
+    finally:
+        world.add_mesh(_NAME, None)
+    return found
 
 
 def _are_native(bench: WorldBench, put: Callable[[Panel, Rgb | None], None]) -> str:
@@ -106,9 +118,9 @@ def _panel(bench: WorldBench, place: Pose, height_m: float) -> Panel:
 
 
 def _texture() -> Rgb:
-    """Four quarters of different colours ``[64, 64, 3]``."""
+    """Four quarters of different colours ``[48, 64, 3]``."""
     return np.ascontiguousarray(
-        _QUARTERS.reshape(2, 2, 3).repeat(_TEXELS // 2, axis=0).repeat(_TEXELS // 2, axis=1)
+        _QUARTERS.reshape(2, 2, 3).repeat(_TEXELS[0] // 2, axis=0).repeat(_TEXELS[1] // 2, axis=1)
     )
 
 

@@ -9,7 +9,7 @@ from scipy.special import stdtrit
 
 from advnerf_core.report.cells import CellResult, read_cells
 from advnerf_core.report.evidence.page import results_page
-from advnerf_core.report.evidence.place_claims import place_claim_data, place_claim_rows
+from advnerf_core.report.evidence.place_claims import place_claim_data, place_claim_row
 from advnerf_core.report.evidence.registration import (
     FILE,
     PlaceClaim,
@@ -68,25 +68,27 @@ def mean_m(evidence: Evidence, method: str) -> float:
 
 def test_the_interval_is_over_places_and_victims(folder: Any) -> None:
     evidence = at_places(folder, {(place, victim) for place in ("two", "three") for victim in VICTIMS})
-    (row,) = place_claim_rows(evidence)
+    row = place_claim_row(evidence, CLAIM)
     full_m = mean_m(evidence, "gradient") - mean_m(evidence, "random")
     values = full_m * np.array([[1, 1], [0, 0], [0, 0], [1, 1]], float)
     assert [each["difference_m"] for each in row.each] == pytest.approx(values.ravel(), abs=1e-12)
     assert row.difference_m == pytest.approx(values.mean())
-    assert (row.places, row.victims, row.registered) == (4, 2, True)
+    assert (row.places, row.victims, row.reason) == (4, 2, "")
     # Places differ and victims do not, symmetrically: Student's interval of four values.
     half = stdtrit(3, 0.975) * values.mean(axis=1).std(ddof=1) / 2.0
     assert (row.low_m, row.high_m) == pytest.approx((values.mean() - half, values.mean() + half))
-    assert row.off_track_low <= row.off_track_points <= row.off_track_high
+    assert row.least_off_track_points == 0.0 < row.off_track_points
 
 
 def test_many_searches_make_no_narrower_interval(folder: Any) -> None:
     """One place in two without an effect says the same of six searches as of two."""
-    weak = {(place, victim) for place in ("one", "two") for victim in VICTIMS}
-    evidence = at_places(folder, weak)
-    (many,) = place_claim_rows(evidence)
-    few = Evidence(evidence.registration, [cell for cell in evidence.cells.values() if cell.seed < 2])
-    (two,) = place_claim_rows(few)
+    evidence = at_places(folder, {(place, victim) for place in ("one", "two") for victim in VICTIMS})
+    many = place_claim_row(evidence, CLAIM)
+    registered = evidence.registration.model_copy(
+        update={"cells": tuple(cell for cell in evidence.registration.cells if cell.seed < 2)}
+    )
+    cells = [replace(cell, registration=registered.digest) for cell in evidence.cells.values()]
+    two = place_claim_row(Evidence(registered, [cell for cell in cells if cell.seed < 2]), CLAIM)
     assert many.low_m < 0.0 < many.difference_m
     assert (many.high_m - many.low_m) == pytest.approx(two.high_m - two.low_m, rel=0.15)
 
@@ -97,12 +99,17 @@ def test_a_claim_needs_all_its_cells_and_stands_on_the_page(folder: Any) -> None
         evidence.registration,
         [cell for cell in evidence.cells.values() if (cell.scenario, cell.method) != ("four", "random")],
     )
-    assert place_claim_data(fewer) == {"claims": []}
+    (told,) = place_claim_data(fewer)["claims"]
+    assert told["difference_m"] is None
+    assert told["reason"] == "four_hardened_random_0 was not driven as registered"
     data = json.loads(json.dumps({**as_data(evidence), **place_claim_data(evidence)}))
     data |= {"registered": {**evidence.registration.as_filed().model_dump(mode="json"), "digest": "d" * 64}}
     page = results_page({"simulated": {**data, "filmed": False, "notes": []}})
-    assert "**four roads**: " in page
-    assert "4 places and 2 victims" in page
+    assert "**four roads**, " in page
+    assert "4 places and 2 victims: +" in page
+    data["claims"] = [told]
+    page = results_page({"simulated": {**data, "filmed": False, "notes": []}})
+    assert "no claim, as four_hardened_random_0 was not driven as registered" in page
 
 
 def test_registrations_without_claims_keep_their_digest(folder: Any) -> None:
@@ -116,3 +123,5 @@ def test_registrations_without_claims_keep_their_digest(folder: Any) -> None:
     assert Registration.model_validate(claimed.model_dump(mode="json")).claims == (CLAIM,)
     with pytest.raises(ValueError, match="at least 4 items"):
         PlaceClaim(name="x", scenarios=("a", "b"), victims=VICTIMS, against=("random",))
+    with pytest.raises(ValueError, match="expected different ones, got a, a, a, a"):
+        PlaceClaim(name="x", scenarios=("a",) * 4, victims=VICTIMS, against=("random",))

@@ -100,6 +100,35 @@ def test_a_product_without_end_is_refused_before_it_is_read(file):
         load(file, *many)
 
 
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ("scenarios: [near, room, straight_places, elsewhere]", r"claims.0: .*elsewhere"),
+        ("victims: [hardened, nobody]", r"claims.0: .*victim of near.*nobody"),
+        ("method: gradeint", r"claims.0: .*method against hardened in near.*gradeint"),
+        ("against: [nothing]", r"claims.0: .*nothing"),
+        ("victims: [naive, naive]", "expected different ones, got naive, naive"),
+        ("scenarios: [near, room]", "at least 4 items"),
+    ],
+)
+def test_a_claim_is_about_cells_that_are_there(file, change, told):
+    claim = {
+        "name": "places",
+        "scenarios": "[near, straight_places, right_places, left_places]",
+        "victims": "[hardened, naive]",
+        "against": "[none]",
+    }
+
+    def said(values):
+        return f"claims=[{{{', '.join(f'{key}: {value}' for key, value in values.items())}}}]"
+
+    (found,) = load(file, said(claim)).config.claims
+    assert found.scenarios == ("near", "straight_places", "right_places", "left_places")
+    key, value = change.split(": ")
+    with pytest.raises(ConfigError, match=told):
+        load(file, said({**claim, key: value}))
+
+
 def test_overrides_hold_for_all_variants(file):
     loaded = load(file, "attack.evaluations=9", "over.seed=[4]")
     assert {each.attack.evaluations for each in loaded.variants.values()} == {9}
@@ -133,7 +162,7 @@ def test_cells_are_selected_by_what_they_are(file):
         ("setting: panel", "setting: pannel", "no setting called 'pannel'; known are demo, full"),
         (f"base: {JUNCTION}\n", "", r"mine.experiment.yaml:1: expected setting only with base"),
         ("    near:", "    Near!:", "Near!"),
-        ("before: near", "before: nearer", r":16: contrast 'far': expected a variant of near, .*'nearer' \(did you mean near\?\)"),
+        ("before: near", "before: nearer", r":16: contrasts.0: expected a variant of near, .*'nearer' \(did you mean near\?\)"),
         ("    places:", "    straight_places: {over.path: [straight]}\n    places:", "straight_places_hardened_none_0 2 times; rename"),
         ("  victim:", "  attack.starts: [1, 1]\n  victim:", "two variants of the name near_starts-1"),
         ("  victim:", "  attack.starts: 2\n  victim:", r":12: over.attack.starts: input should be a valid list"),

@@ -10,7 +10,7 @@ import torch
 
 from advnerf_core.attack.spaces.space import ColourSpace, NamedObject
 from advnerf_core.fields.voxel_grid import cube_face_object
-from advnerf_core.geometry import make_transform, rotation_z
+from advnerf_core.geometry import make_transform, planar_pose, rotation_z
 from advnerf_core.objects.mesh.field import MeshField
 from advnerf_core.objects.mesh.surface import unwrapped
 from advnerf_core.objects.voxel.build import build_from_mesh
@@ -20,6 +20,7 @@ from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.surrogate import Surrogate
 from nodes.experiment.plan.placed import PlacedObject
 from nodes.experiment.show.deployed import DressedScene
+from nodes.experiment.show.frames import DeployedFrames
 from nodes.experiment.show.native import NativeScene
 from nodes.experiment.show.objects import placed_objects
 from nodes.experiment.steps.run import load_experiment
@@ -165,3 +166,42 @@ def test_a_panel_is_an_object_of_an_experiment(tmp_path: Path) -> None:
     mesh = [*changes, "space={kind: mesh_texture}"]
     with pytest.raises(ConfigError, match="objects with a mesh"):
         load_experiment(LAUNCH / "junction.experiment.yaml", "demo", mesh, tmp_path)
+
+
+def test_what_is_composed_or_searched_over_a_world_sees_it_bare(world: Any) -> None:
+    """Cells share an open world: what one has put there is not in the background of the next."""
+    view = PolicyView(world.camera_pinhole)
+    NativeScene(world, view, []).camera_image(STATE, None)
+    pose = planar_pose(*STATE)[None] @ world.T_car_from_camera
+    bare = DeployedFrames(world, view)(pose, view.pinhole)[0]
+    composed = DressedScene(world, view, [face()])
+    alone = composed.camera_image(STATE, quarters())
+    shown = NativeScene(world, view, [face(0.7)])
+    shown.camera_image(STATE, quarters())
+    assert np.array_equal(DeployedFrames(world, view)(pose, view.pinhole)[0], bare)
+    shown.camera_image(STATE, quarters())
+    assert np.array_equal(composed.camera_image(STATE, quarters()), alone)
+    world.reset(*map(float, STATE))
+    shown.camera_image(STATE, quarters())
+    assert np.array_equal(
+        composed.seen_now(quarters()), composed.policy_images(composed.prepare(STATE[None]), quarters())[0]
+    )
+
+
+def test_a_change_that_fails_half_way_is_made_good(world: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    view = PolicyView(world.camera_pinhole)
+    two = NativeScene(world, view, [face(0.8), face(0.8, 5.0)])
+    NativeScene(world, view, []).camera_image(STATE, None)
+    wanted = two.camera_image(STATE, torch.zeros(2 * 64, 3))
+    NativeScene(world, view, []).camera_image(STATE, None)
+    put, count = world.add_panel, iter(range(9))
+
+    def fails_once(*arguments: Any) -> None:
+        if next(count) == 1:
+            raise RuntimeError("the simulator ended")
+        put(*arguments)
+
+    monkeypatch.setattr(world, "add_panel", fails_once)
+    with pytest.raises(RuntimeError, match="the simulator ended"):
+        two.camera_image(STATE, torch.zeros(2 * 64, 3))
+    assert np.array_equal(two.camera_image(STATE, torch.zeros(2 * 64, 3)), wanted)

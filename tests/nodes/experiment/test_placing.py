@@ -143,6 +143,10 @@ def test_what_is_captured_depends_on_the_rule_and_on_no_place_by_hand(tmp_path: 
     assert settings(load_experiment(ROOM, "demo", by_hand, tmp_path / "hand")) == settings(plain)
     with pytest.raises(ConfigError, match=r"objects.*x_m"):
         load_experiment(ROOM, "demo", [*by_hand[:2], "objects=[{name: a, kind: panel}]"], tmp_path / "x")
+    with pytest.raises(ConfigError, match="expected no cube by a rule"):
+        load_experiment(
+            ROOM, "demo", [*by_hand[:2], "objects=[{name: a, kind: cube, stands: {}}]"], tmp_path / "x"
+        )
     with pytest.raises(ConfigError, match="pannel"):
         load_experiment(
             ROOM, "demo", [*by_hand[:2], "objects=[{name: a, kind: pannel, stands: {}}]"], tmp_path / "x"

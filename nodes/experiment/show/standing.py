@@ -1,0 +1,78 @@
+"""What worlds show in their own scenes now. Several presentations of one experiment may share an open world, and each asks for its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from hardware.worlds.world import NativeMeshes, NativePanels, Panel, World
+
+
+class Standing(NamedTuple):
+    """An object in a world's own scene.
+
+    Attributes:
+        name: Its name there.
+        is_mesh: Whether it is a mesh; else it is a panel.
+        shape: Everything that it depends on except its colours.
+        texture: Its texture.
+    """
+
+    name: str
+    is_mesh: bool
+    shape: bytes
+    texture: bytes
+
+
+# By open world. What is written here stands there, also after a change that failed half-way.
+_STANDING: WeakKeyDictionary[Any, tuple[Standing, ...]] = WeakKeyDictionary()
+
+
+def standing_in(world: World) -> tuple[Standing, ...]:
+    """The objects in a world's own scene; the same tuple as long as nothing changes."""
+    takes = isinstance(world, (NativePanels, NativeMeshes))
+    return _STANDING.get(world, ()) if takes else ()
+
+
+def make_stand(world: World, wanted: Sequence[Standing], put: Callable[[int], None]) -> tuple[Standing, ...]:
+    """Have these objects in a world's own scene, and no others.
+
+    Args:
+        world: The open world.
+        wanted: The objects.
+        put: Puts one of them there, by its number, in place of the one of its name.
+
+    Returns:
+        What `standing_in` says from now on.
+    """
+    standing = list(standing_in(world))
+    names = {each[:2] for each in wanted}
+    for each in [one for one in standing if one[:2] not in names]:
+        _take_out(world, each)
+        standing.remove(each)
+        _STANDING[world] = tuple(standing)
+    for number, each in enumerate(wanted):
+        if each not in standing:
+            put(number)
+            standing = [one for one in standing if one[:2] != each[:2]] + [each]
+            _STANDING[world] = tuple(standing)
+    _STANDING[world] = tuple(wanted)
+    return _STANDING[world]
+
+
+def clear(world: World) -> None:
+    """Take out all that was put into a world's own scene."""
+    if standing_in(world):
+        make_stand(world, (), lambda number: None)
+
+
+def _take_out(world: World, thing: Standing) -> None:
+    if thing.is_mesh:
+        assert isinstance(world, NativeMeshes), "it took the mesh"
+        world.add_mesh(thing.name, None)
+    else:
+        assert isinstance(world, NativePanels), "it took the panel"
+        world.add_panel(thing.name, Panel(np.eye(4), 1.0, 1.0), None)
