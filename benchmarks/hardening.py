@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from advnerf_core.report.evidence.verify import sets_in
+from advnerf_core.report.evidence.verifying.layout import complete_sets
 from benchmarks.results import record_row
 from benchmarks.strongest import Strongest, strongest_random
 
@@ -26,7 +26,7 @@ def main() -> None:
     )
     options = parser.parse_args()
     if options.run is None:
-        for name in sets_in(PUBLISHED):
+        for name in complete_sets(PUBLISHED):
             for found in strongest_random(PUBLISHED / name)[-1:]:  # where everything is the world's own
                 _record_published(name, found)
     else:

@@ -24,7 +24,7 @@ from advnerf_core.report.evidence.prediction_score import (
 )
 from advnerf_core.report.evidence.registration import read_registration
 from advnerf_core.report.evidence.results import Evidence
-from advnerf_core.report.evidence.verify import sets_in
+from advnerf_core.report.evidence.verifying.layout import complete_sets
 from benchmarks.results import REPOSITORY, LedgerRow
 from benchmarks.transfer_factor import (
     Transfer,
@@ -78,7 +78,7 @@ def main() -> None:
 
 def ledger_rows() -> list[LedgerRow]:
     """All rows, from the published sets."""
-    sets = [evidence_of(name) for name in sets_in(PUBLISHED)]
+    sets = [evidence_of(name) for name in complete_sets(PUBLISHED)]
     sets = sorted((each for each in sets if each.cells), key=lambda each: each.registration.date)
     rows: list[LedgerRow] = []
     for baseline in (False, True):

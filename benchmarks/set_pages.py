@@ -8,14 +8,15 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from advnerf_core.report.evidence.verify import sets_in, write_numbers, write_page
+from advnerf_core.report.evidence.verify import write_numbers, write_page
+from advnerf_core.report.evidence.verifying.layout import complete_sets
 
 PUBLISHED = Path(__file__).resolve().parents[1] / "docs" / "results"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("sets", nargs="*", default=sets_in(PUBLISHED))
+    parser.add_argument("sets", nargs="*", default=complete_sets(PUBLISHED))
     for name in parser.parse_args().sets:
         print(write_numbers(PUBLISHED / name).relative_to(PUBLISHED))
     write_page(PUBLISHED)

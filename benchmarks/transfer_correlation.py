@@ -23,8 +23,7 @@ from advnerf_core.report.cells import CellResult
 from advnerf_core.report.conditions import CONTROLS
 from advnerf_core.report.evidence.page import groups_of_searches
 from advnerf_core.report.evidence.results import Evidence
-from advnerf_core.report.evidence.verify import sets_in
-from advnerf_core.report.evidence.verifying.layout import SET
+from advnerf_core.report.evidence.verifying.layout import SET, complete_sets
 from advnerf_core.report.palette import LIGHT
 from advnerf_core.report.plots import new_axes
 from advnerf_core.report.reference import DOMAINS, Domain
@@ -165,11 +164,7 @@ def _mean(evidence: Evidence, cell: CellResult, domain: Domain) -> float:
 
 def _complete() -> list[SetPoints]:
     """The sets of which all cells are published, with their searches."""
-    data = {
-        name: read_json(PUBLISHED / name / SET)
-        for name in sets_in(PUBLISHED)
-        if (PUBLISHED / name / SET).exists()
-    }
+    data = {name: read_json(PUBLISHED / name / SET) for name in complete_sets(PUBLISHED)}
     group_of = {name: number for number, group in enumerate(groups_of_searches(data)) for name in group}
     found = [points_of(evidence_of(name), group_of[name]) for name in data]
     return [each for each in found if len(each.xy) > 1]

@@ -15,7 +15,7 @@ from advnerf_core.report.evidence.registration import read_registration, read_wi
 from advnerf_core.report.evidence.results import Evidence
 from advnerf_core.report.evidence.verifying.checks import set_problems
 from advnerf_core.report.evidence.verifying.digests import digests_of, write_beside, write_known_digest
-from advnerf_core.report.evidence.verifying.layout import PAGE, SET, SetError, read_set, sets_in
+from advnerf_core.report.evidence.verifying.layout import PAGE, SET, SetError, complete_sets, read_set
 from advnerf_core.report.evidence.verifying.numbers import published_numbers
 from advnerf_core.report.evidence.verifying.pictures import write_picture
 from advnerf_core.report.evidence.verifying.victims import read_declared
@@ -66,9 +66,9 @@ def write_page(published: Path) -> Path:
 def page_text(published: Path) -> str:
     """The page of all sets, from their manifests and registrations."""
     sets, about = {}, read_about(published)
-    for name in sets_in(published):
+    for name in complete_sets(published):
         registration = read_registration(published / name)
-        if registration is not None and (published / name / SET).exists():
+        if registration is not None:
             registered = {**registration.model_dump(mode="json"), "digest": registration.digest}
             data = with_titles(published / name, read_json(published / name / SET))
             filmed = (published / film_of(name)).exists()

@@ -24,6 +24,11 @@ def sets_in(published: Path) -> list[str]:
     return sorted(file.parents[1].name for file in published.glob(f"*/{FILE}"))
 
 
+def complete_sets(published: Path) -> list[str]:
+    """Names of the sets of which all cells are published; the others are under way, and no number is read from them."""
+    return [name for name in sets_in(published) if (published / name / SET).exists()]
+
+
 def cell_files(folder: Path) -> list[Path]:
     """Files of the cells of a set, by name."""
     return sorted(folder.glob("*.json"))
