@@ -32,7 +32,7 @@ from benchmarks.results import LedgerRow
 
 COMMAND = "python -m benchmarks.transfer_correlation"
 PICTURE = "transfer_correlation.png"
-_DRAWS, _SEED, _LOWEST = 4000, 0, 0.05
+_DRAWS, _SEED, _LOWEST = 1000, 0, 0.05
 _LEAST = {"Pearson": 0.8, "Spearman": 0.7}
 _COLOURS = ("#1b6ca8", "#c2410c", "#15803d", "#7e22ce", "#b45309", "#0f766e", "#be123c", "#4d4d4d")
 _MARKERS = "os^Dv<>"
