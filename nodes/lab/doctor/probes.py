@@ -48,9 +48,9 @@ def gpu(device_type: str) -> dict[str, Any]:
 
 def egl() -> dict[str, Any]:
     """Version of MuJoCo and its renderer, tested by rendering without a window."""
-    from hardware.worlds.lab.gl import load_mujoco
+    os.environ.setdefault("MUJOCO_GL", "egl")  # as in load_mujoco, whose error says the cure once more
+    import mujoco
 
-    mujoco = load_mujoco()
     context = mujoco.GLContext(16, 16)
     context.make_current()
     return {"version": str(mujoco.__version__)}
