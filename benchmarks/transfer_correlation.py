@@ -19,14 +19,13 @@ from numpy.typing import NDArray
 from scipy.stats import rankdata
 
 from advnerf_core.documents import read_json
-from advnerf_core.report.cells import CellResult
 from advnerf_core.report.conditions import CONTROLS
 from advnerf_core.report.evidence.page import groups_of_searches
-from advnerf_core.report.evidence.results import Evidence
+from advnerf_core.report.evidence.results import Evidence, mean_excess_m
 from advnerf_core.report.evidence.verifying.layout import SET, complete_sets
 from advnerf_core.report.palette import LIGHT
 from advnerf_core.report.plots import new_axes
-from advnerf_core.report.reference import DOMAINS, Domain
+from advnerf_core.report.reference import DOMAINS
 from benchmarks.predictions import PUBLISHED, evidence_of
 from benchmarks.results import LedgerRow
 
@@ -61,8 +60,9 @@ def points_of(evidence: Evidence, group: int) -> SetPoints:
         cell = evidence.cells.get(registered.name)
         if cell is None or cell.method in CONTROLS or not evidence.is_registered(cell):
             continue
-        means = [_mean(evidence, cell, domain) for domain in DOMAINS]
-        if np.isfinite(means).all():
+        if all(evidence.outcomes(cell, domain) for domain in DOMAINS):
+            half_lane_m = evidence.scenario_of(cell).off_track_m
+            means = [mean_excess_m(evidence, cell, domain) / half_lane_m for domain in DOMAINS]
             found[cell.victim, cell.method, cell.seed, cell.attack_id or cell.name] = means
     return SetPoints(evidence.registration.name, group, np.array([*found.values()]).reshape(-1, 2))
 
@@ -154,12 +154,6 @@ def main() -> None:
         row.record()
         print(f"{row.line}: {row.value}; {row.note}")
     picture().savefig(PUBLISHED / PICTURE, dpi=110)
-
-
-def _mean(evidence: Evidence, cell: CellResult, domain: Domain) -> float:
-    """Mean excess of a cell's drives [half lanes per tick]; not a number where it was not driven."""
-    drives = [each.excess_cte_m_per_tick for each in evidence.outcomes(cell, domain)]
-    return float(np.mean(drives)) / evidence.scenario_of(cell).off_track_m if drives else float("nan")
 
 
 def _complete() -> list[SetPoints]:

@@ -78,7 +78,7 @@ def test_the_blocks_of_a_page_run(home, page):
     done = subprocess.run(
         [sys.executable, "-c", runnable(page.read_text(encoding="utf-8"))],
         cwd=home,
-        env={**os.environ, "PYTHONPATH": str(ROOT), "MUJOCO_GL": "egl"},
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
         timeout=600,

@@ -37,7 +37,6 @@ def run(*arguments):
         env={
             "PYTHONPATH": str(REPOSITORY),
             "PATH": "/usr/bin:/bin",
-            "MUJOCO_GL": "egl",
             "OMP_NUM_THREADS": "1",
         },
         timeout=600,

@@ -68,7 +68,6 @@ class Programs:
             cwd=REPOSITORY,
             stdout=self._log,
             stderr=self._log,
-            env={**os.environ, "MUJOCO_GL": "egl"},
         )
         self._honest: subprocess.Popen[str] | None = None
         self._stranger = self._start()

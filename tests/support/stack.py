@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
 import subprocess
 import sys
@@ -61,11 +60,8 @@ class Stack(LiveOperator):
         module = "tests.support.live.straight_policy" if name == "policy" else f"nodes.{name}"
         command = [sys.executable, "-m", module, "--config", str(config), *arguments]
         log = open(self.run_dir / f"{name}.log", "ab")  # noqa: SIM115 - belongs to the child
-        environment = {**os.environ, "MUJOCO_GL": "egl"}
         # A session of its own, as in a launch: where sessions share the processors, each node has a share.
-        return subprocess.Popen(
-            command, stdout=log, stderr=log, env=environment, cwd=REPOSITORY, start_new_session=True
-        )
+        return subprocess.Popen(command, stdout=log, stderr=log, cwd=REPOSITORY, start_new_session=True)
 
     def check(self) -> None:
         for name, process in self.processes.items():

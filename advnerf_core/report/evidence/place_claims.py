@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from advnerf_core.report.cells import CellResult
 from advnerf_core.report.evidence.intervals import clustered_interval
-from advnerf_core.report.evidence.outcome import Outcome
 from advnerf_core.report.evidence.registration import PlaceClaim
-from advnerf_core.report.evidence.results import Evidence
+from advnerf_core.report.evidence.results import Evidence, mean_excess_m
 from advnerf_core.report.reference import DOMAINS, Domain
 
 
@@ -116,27 +116,22 @@ def _missing(evidence: Evidence, claim: PlaceClaim) -> str:
 def _difference(evidence: Evidence, claim: PlaceClaim, scenario: str, victim: str) -> PlaceDifference:
     """The values of one place and victim."""
 
-    def outcomes(method: str, domain: Domain) -> list[Outcome]:
-        cells = evidence.searches((scenario, "", victim, method))
-        return [
-            outcome
-            for cell in cells
-            if evidence.is_registered(cell)
-            for outcome in evidence.outcomes(cell, domain)
-        ]
+    def searches(method: str) -> list[CellResult]:
+        found = evidence.searches((scenario, "", victim, method))
+        return [cell for cell in found if evidence.is_registered(cell)]
 
     def excess_m(method: str, domain: Domain) -> float:
-        return float(np.mean([each.excess_cte_m_per_tick for each in outcomes(method, domain)]))
+        return float(np.mean([mean_excess_m(evidence, cell, domain) for cell in searches(method)]))
+
+    def off_track(method: str) -> float:
+        drives = [drive for cell in searches(method) for drive in evidence.outcomes(cell, "deployed")]
+        return float(np.mean([drive.off_track for drive in drives]))
 
     baseline = max(claim.against, key=lambda method: excess_m(method, "surrogate"))
-    shares = [
-        float(np.mean([each.off_track for each in outcomes(method, "deployed")]))
-        for method in (claim.method, baseline)
-    ]
     return PlaceDifference(
         scenario,
         victim,
         baseline,
         excess_m(claim.method, "deployed") - excess_m(baseline, "deployed"),
-        100.0 * (shares[0] - shares[1]),
+        100.0 * (off_track(claim.method) - off_track(baseline)),
     )

@@ -211,7 +211,7 @@ def _test(evidence: Evidence, test: PrimaryTest) -> TestResult | None:
         return None
 
     def means(method: str, domain: Domain) -> Floats:
-        return np.array([_mean_excess_m(evidence, cell, domain) for cell in by_method[method]])
+        return np.array([mean_excess_m(evidence, cell, domain) for cell in by_method[method]])
 
     baseline = max(test.against, key=lambda method: float(means(method, "surrogate").mean()))
     two = (test.method, baseline)
@@ -254,11 +254,12 @@ def _search_means(evidence: Evidence, cell: CellResult) -> SearchMeans:
     assert clean is not None, "without it there is no outcome"
     drives = zip(evidence.metrics(cell, "surrogate"), evidence.metrics(clean, "surrogate"), strict=False)
     shifts = [float(np.mean(attacked.ctes_m) - np.mean(none.ctes_m)) for attacked, none in drives]
-    excess = [_mean_excess_m(evidence, cell, domain) for domain in DOMAINS]
+    excess = [mean_excess_m(evidence, cell, domain) for domain in DOMAINS]
     return SearchMeans(excess[0], excess[1], float(np.mean(shifts)))
 
 
-def _mean_excess_m(evidence: Evidence, cell: CellResult, domain: Domain) -> float:
+def mean_excess_m(evidence: Evidence, cell: CellResult, domain: Domain) -> float:
+    """Mean excess |CTE| per tick of a cell's drives [m]; the cell must have some in this domain."""
     return float(np.mean([outcome.excess_cte_m_per_tick for outcome in evidence.outcomes(cell, domain)]))
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from itertools import zip_longest
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -47,9 +46,10 @@ def stand_in(
     """
     if not native:
         return DressedScene(scene, experiment.view, objects)
+    things = experiment.objects if objects else ()
     surfaces = [
         surface_of(thing.kind) if _is_solid(field) else None
-        for thing, field in zip(experiment.objects, objects, strict=bool(objects))
+        for thing, field in zip(things, objects, strict=True)
     ]
     return NativeScene(scene, experiment.view, objects, surfaces)
 
@@ -79,7 +79,7 @@ class NativeScene:
         scene: The open scene.
         view: The policy's view of its camera.
         objects: The objects, at their places; none removes all.
-        surfaces: The mesh that each object of voxels was made of; None for panels and meshes.
+        surfaces: The mesh that each object of voxels was made of, None for panels and meshes; empty if there are only these.
 
     Raises:
         ConfigError: The world takes no such objects, or the mesh of one of voxels is not given.
@@ -97,8 +97,7 @@ class NativeScene:
         self._fields = tuple(objects)
         self._things = [
             _thing(scene, field, surface)
-            for field, surface in zip_longest(objects, surfaces, fillvalue=None)
-            if field is not None
+            for field, surface in zip(objects, surfaces or [None] * len(objects), strict=True)
         ]
         self._plain = DressedScene(scene, view, objects).plain_theta()
         self._shown: tuple[Tensor, tuple[Standing, ...]] | None = None

@@ -200,8 +200,7 @@ def launch_of(file, run_dir, *settings):
             str(run_dir),
             *options,
         ]
-        environment = {**os.environ, "MUJOCO_GL": "egl"}
-        return subprocess.Popen(command, cwd=ROOT, env=environment, stdout=log, stderr=log)
+        return subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=log)
 
 
 def test_a_car_in_ros_obeys_the_safety_node_only(tmp_path, peer_of):
