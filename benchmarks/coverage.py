@@ -26,7 +26,7 @@ SEARCHES, STARTS = 6, 20
 LEVEL, ALPHA = 0.95, 0.05
 LOWEST, HIGHEST = 93.0, 97.0
 COMMAND = "python -m benchmarks.coverage"
-PARTS = ("means", "differences")
+PARTS = ("means", "differences", "places")
 OFF_TRACK_M, WOBBLE_M = 2.0, 0.1
 
 
@@ -75,11 +75,13 @@ SMALLER = (
     Design("normal, equal effects", "normal", (0.3, 0.3, 0.3), searches=3),
     Design("normal, equal effects", "normal", (0.3, 0.3, 0.3), searches=2),
     Design("normal, equal effects", "normal", (0.3, 0.3, 0.3), starts=5),
-    # Claims about kinds of places: places in place of searches, victims in place of starts.
-    Design("normal, equal effects", "normal", (0.3, 0.3, 0.3), searches=4, starts=2),
-    Design("normal, searches dominate", "normal", (0.3, 0.1, 0.1), searches=4, starts=2),
-    Design("normal, starts dominate", "normal", (0.1, 0.3, 0.1), searches=4, starts=2),
-    Design("normal, starts dominate", "normal", (0.1, 0.3, 0.1), searches=4, starts=3),
+)
+# Claims about kinds of places: places stand for searches, and victims for starts. They draw numbers of their own.
+PLACES = (
+    Design("a claim's places x victims, equal effects", "normal", (0.3, 0.3, 0.3), searches=4, starts=2),
+    Design("a claim's places x victims, places dominate", "normal", (0.3, 0.1, 0.1), searches=4, starts=2),
+    Design("a claim's places x victims, victims dominate", "normal", (0.1, 0.3, 0.1), searches=4, starts=2),
+    Design("a claim's places x victims, victims dominate", "normal", (0.1, 0.3, 0.1), searches=4, starts=3),
 )
 
 
@@ -318,6 +320,10 @@ def main() -> None:
     if "differences" in chosen:
         for two in DIFFERENCES:
             record_difference(two, count, np.random.default_rng(1), record)
+    if "places" in chosen:
+        places = np.random.default_rng(2)
+        for design in PLACES:
+            record_coverage(design, count, places, record)
     print(f"{time.monotonic() - began:.0f} s")
 
 
