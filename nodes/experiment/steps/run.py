@@ -110,22 +110,22 @@ def _check_objective(experiment: Experiment, document: Document) -> None:
 
 def _check_native(experiment: Experiment, document: Document) -> None:
     """Check that worlds take the objects that stand in their own scenes: while victims learn, and in the deployed drive."""
-    config, named = experiment.config, []
-    if config.carrier.training == "native":
-        named.append(experiment.named_world)
-    if isinstance(config.carrier, NativeConfig):
-        named.append(experiment.deployed_world)
+    config = experiment.config
     wanted = (
         (NativePanels, "add_panel", [each.name for each in config.objects if each.kind == PANEL]),
         (NativeMeshes, "add_mesh", [each.name for each in config.objects if each.kind != PANEL]),
     )
-    for world in named:
-        made = world.make()
+    uses = (
+        ("training", config.carrier.training == "native", experiment.named_world),
+        ("kind", isinstance(config.carrier, NativeConfig), experiment.deployed_world),
+    )
+    for key, native, world in uses:
+        made = world.make() if native else None
         for kind, call, names in wanted:
-            if names and not isinstance(made, kind):
+            if native and names and not isinstance(made, kind):
                 raise ConfigError(
                     f"{document.place(('carrier',))}: expected a world that takes {', '.join(names)} into its own scene ({call}) with "
-                    f"carrier native, got {world.kind}; set carrier.kind=composed"
+                    f"carrier.{key} native, got {world.kind}; set carrier.{key}=composed"
                 )
 
 

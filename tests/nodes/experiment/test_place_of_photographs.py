@@ -108,7 +108,7 @@ def test_without_an_object_there_is_nothing_to_search(folder: Path) -> None:
         ("victims={}", "expected victims that exist"),
         ("objects=[{name: a, kind: panel, stands: {}}]", "expected objects whose places are given"),
         ("space={kind: mesh_shape}", "an object with a mesh|objects with a mesh|expected space.kind colours"),
-        ("carrier={kind: native}", "expected carrier"),
+        ("carrier={kind: native}", r"--set carrier=.*into its own scene \(add_panel\)"),
         ("world.images=nowhere", r"world\.images|images: expected a file or folder"),
         ("world.camera.height_m=0.3", r"unknown key .*camera\.height_m"),
     ],
