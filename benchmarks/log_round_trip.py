@@ -1,7 +1,7 @@
 """Row: a policy learned from a bag that went through LeRobot, against one learned from the bag itself, on the same held-out frames.
 
 The expert drives in the simulated lab from starts beside its path. Its drives become a bag, and the bag a LeRobot data set (version 3, with
-video). Policies learn from both, with several seeds. The bag and the policies from it are kept. Run as ``python -m benchmarks.log_round_trip [--trial]``.
+video). Policies learn from both, with several seeds. The bag and the policies from it are kept. Run as ``python -m benchmarks.log_round_trip [--trial] [--seeds N]``.
 """
 
 from __future__ import annotations
@@ -98,9 +98,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--trial", action="store_true", help="a small size; records nothing")
     parser.add_argument("--folder", type=Path, default=None, help="working folder")
+    parser.add_argument("--seeds", type=int, default=4, help="pairs of policies")
     options = parser.parse_args()
     trial = options.trial
-    drives, ticks, steps, seeds = (6, 40, 60, 1) if trial else (24, 80, 800, 4)
+    drives, ticks, steps, seeds = (6, 40, 60, 1) if trial else (24, 80, 800, options.seeds)
     folder = options.folder or _ROOT / "runs" / ("log_round_trip_trial" if trial else "log_round_trip")
     bag = folder / "bag"
     if not (bag / METADATA_FILE).is_file():
@@ -120,8 +121,10 @@ def main() -> None:
     )
     change = errors[:, 1].mean() / errors[:, 0].mean() - 1.0
     spread = errors[:, 0].std(ddof=1) / errors[:, 0].mean() if seeds > 1 else np.nan
+    changes = (errors[:, 1] - errors[:, 0]) / errors[:, 0].mean()
+    unsure = changes.std(ddof=1) / np.sqrt(seeds) if seeds > 1 else np.nan
     said = f"{1e3 * errors[:, 0].mean():.2f} mrad from the bag, {1e3 * errors[:, 1].mean():.2f} mrad through LeRobot"
-    note = f"{said}; {done.frames} frames, {seeds} seeds, whose standard deviation is {100 * spread:.0f} %"
+    note = f"{said}; {done.frames} frames, {seeds} seeds, whose standard deviation is {100 * spread:.0f} %; standard error of the change {100 * unsure:.1f} %"
     print(f"{100 * change:+.1f} %: {note}\n{1e3 * errors}")
     if not trial:
         record_row(
@@ -130,7 +133,7 @@ def main() -> None:
             "%",
             f"<= {100 * _TARGET:g} %",
             bool(change <= _TARGET),
-            "python -m benchmarks.log_round_trip",
+            f"python -m benchmarks.log_round_trip --seeds {seeds}",
             note,
         )
 
