@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from advnerf_core.report.conditions import style_of
+from advnerf_core.report.evidence.words import collisions
 from advnerf_core.report.reference import Limit
 from advnerf_core.report.result_table import ResultTable, TableRow
 from advnerf_core.report.text_table import Table, count, number
@@ -125,6 +126,8 @@ def _target(
     text = "not measured in this run" if value is None else number(value, measure.digits, measure.unit)
     if value is not None and row is not None and limit.of in ("off_track", "off_track_share"):
         text = f"{row.off_track} of {count(row.drives, 'drive')}"
+        if row.excess is not None and row.excess.collided:  # a car that ran into something went no farther off
+            text += f", collided: {collisions(row.excess.collided)}"
     said = limit.said or _limit_text(limit, bound)
     return Target(_what(limit), said, value, text, met, verdict, limit.paper)
 

@@ -38,6 +38,16 @@ def test_leaving_the_track_in_two_of_three(bare_report, make, off_track, met):
     assert verdicts(bare_report, table)["gradient attack, live: left the track"] is met
 
 
+def test_a_car_that_ran_into_something_is_not_told_as_one_that_merely_stayed(make):
+    drives = [("deployed", "none", [1.0] * 3, [False] * 3), ("deployed", "gradient", [5.0] * 3, [False] * 3)]
+    blocked = {"extra": {"horizon": 60, "blocked_tick": [None, 44, 45]}}
+    limit = Limit(method="gradient", of="off_track_share", at_least=0.6)
+    free, hit = (evaluate([limit], make.table(drives, **extra))[0] for extra in ({}, blocked))
+    assert free.measured == "0 of 3 drives"
+    assert hit.measured == "0 of 3 drives, collided: 2 (2 obstacle)"
+    assert free.met is hit.met is False
+
+
 @pytest.mark.parametrize(("ratio", "left"), [(1.4, False), (1.6, False), (1.4, True)])
 def test_random_may_neither_be_strong_nor_leave(bare_report, make, ratio, left):
     table = make.table([("deployed", "random", [ratio], [left])])
