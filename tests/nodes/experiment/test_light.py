@@ -91,7 +91,9 @@ def test_light_needs_a_panel_and_a_world_that_takes_it(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"training native with carrier\.response measured"):
         load("room", *CHANGES[:-1], "carrier={kind: composed, response: measured}", f"objects=[{BOARD}]")
     board = "objects=[{name: board, kind: panel, x_m: 12.0, y_m: 5.0, yaw_rad: -2.0}]"
-    with pytest.raises(ConfigError, match=r"own scene \(add_panel\) with carrier.training native, got junction"):
+    with pytest.raises(
+        ConfigError, match=r"own scene \(add_panel\) with carrier.training native, got junction"
+    ):
         load("junction", *CHANGES[2:], board)
     with Lab() as world, pytest.raises(ConfigError, match="hidden, turned away or too small"):
         measure_light(load("room", *CHANGES, f"objects=[{BOARD.replace('2.8, scale', '0.3, scale')}]"), world)
