@@ -126,7 +126,8 @@ def _target(
     text = "not measured in this run" if value is None else number(value, measure.digits, measure.unit)
     if value is not None and row is not None and limit.of in ("off_track", "off_track_share"):
         text = f"{row.off_track} of {count(row.drives, 'drive')}"
-        if row.excess is not None and row.excess.collided:  # a car that ran into something went no farther off
+        # A car that ran into something went no farther off.
+        if row.excess is not None and row.excess.collided:
             text += f", collided: {collisions(row.excess.collided)}"
     said = limit.said or _limit_text(limit, bound)
     return Target(_what(limit), said, value, text, met, verdict, limit.paper)
