@@ -12,7 +12,7 @@ from hardware.cameras.v4l2.negotiation import identify, modes
 from hardware.cameras.v4l2.port import KernelPort, VideoPort, open_device
 from hardware.errors import DeviceBusy, HardwareError, ProtocolError
 from nodes.lab.camera_tools import CameraToolError, SourceTrial, try_source
-from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, CheckResult, in_child
+from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, CheckResult, in_child, report
 from nodes.lab.doctor.motor import permission_cure
 
 _NAME = "camera"
@@ -27,9 +27,9 @@ def video_devices(port: VideoPort | None = None) -> list[CheckResult]:
     """List every video device of Linux with its formats."""
     port = port or KernelPort()
     rows = [row for name in port.names() if (row := _device(port, Path(name))) is not None]
-    return rows or [
-        CheckResult(_NAME, ABSENT, "no video device", "check its USB cable, then run advnerf car camera list")
-    ]
+    return rows or report(
+        _NAME, ABSENT, "no video device", "check its USB cable, then run advnerf car camera list"
+    )
 
 
 def _device(port: VideoPort, path: Path) -> CheckResult | None:
@@ -56,25 +56,15 @@ def _device(port: VideoPort, path: Path) -> CheckResult | None:
 def oaks(required: bool = False, timeout_s: float = _OAK_S) -> list[CheckResult]:
     """List OAK cameras, from a separate process, because depthai may hang."""
     answer = in_child("oaks", timeout_s=timeout_s)
-    bad = FAILURE if required else WARNING
+    absent = FAILURE if required else ABSENT
     if answer.data is None:
         if "ModuleNotFoundError" in answer.trouble:
-            return [
-                CheckResult(
-                    "OAK", FAILURE if required else ABSENT, "depthai is missing", "pip install 'advnerf[oak]'"
-                )
-            ]
-        return [
-            CheckResult(
-                "OAK",
-                bad,
-                f"depthai: {answer.trouble}",
-                "unplug it and plug it in again; install the udev rule of docs/cameras.md",
-            )
-        ]
+            return report("OAK", absent, "depthai is missing", "pip install 'advnerf[oak]'")
+        do = "unplug it and plug it in again; install the udev rule of docs/cameras.md"
+        return report("OAK", FAILURE if required else WARNING, f"depthai: {answer.trouble}", do)
     if not answer.data:
         do = "check the USB 3 cable, the power supply and the udev rule of docs/cameras.md"
-        return [CheckResult("OAK", FAILURE if required else ABSENT, "none found", do)]
+        return report("OAK", absent, "none found", do)
     return [CheckResult("OAK", OK, str(line)) for line in answer.data]
 
 
@@ -96,7 +86,7 @@ def source(
             if "in use" in str(error)
             else "run advnerf car camera list; see docs/cameras.md"
         )
-        return [CheckResult(_NAME, FAILURE, str(error), do)]
+        return report(_NAME, FAILURE, str(error), do)
     return [*_measured(config, trial, calibration), *_stable(getattr(config, "device", None))]
 
 
@@ -108,19 +98,15 @@ def _measured(
     rows = []
     if calibration is not None and (calibration.width, calibration.height) != (width, height):
         do = "set the size of the source, or calibrate at this size; the camera node refuses these images"
-        rows.append(
-            CheckResult(_NAME, FAILURE, f"calibrated for {calibration.width} x {calibration.height}", do)
-        )
+        rows += report(_NAME, FAILURE, f"calibrated for {calibration.width} x {calibration.height}", do)
     if (period_s := config.period_s()) and trial.rate_hz < _SLOW / period_s:
         do = "add light (long exposures reduce the rate), or use another USB port or format"
-        rows.append(CheckResult(_NAME, WARNING, f"expected {1.0 / period_s:.1f} Hz", do))
+        rows += report(_NAME, WARNING, f"expected {1.0 / period_s:.1f} Hz", do)
     if trial.age_ms[0] > _OLD_MS:
         do = "reduce size or rate, or close other programs; the camera node drops such frames"
-        rows.append(CheckResult(_NAME, FAILURE, f"frames are {trial.age_ms[0]:.0f} ms old", do))
+        rows += report(_NAME, FAILURE, f"frames are {trial.age_ms[0]:.0f} ms old", do)
     if not _DARK < trial.brightness < _BRIGHT:
-        rows.append(
-            CheckResult(_NAME, WARNING, "the image is black or white", "check lens cap, light and exposure")
-        )
+        rows += report(_NAME, WARNING, "the image is black or white", "check lens cap, light and exposure")
     return [CheckResult(_NAME, OK, text), *rows]
 
 
@@ -129,4 +115,4 @@ def _stable(device: Any) -> Sequence[CheckResult]:
     if not path.startswith("/dev/video"):
         return []
     do = "use its name in /dev/v4l/by-id or by-path; numbers change when it is plugged in again"
-    return [CheckResult(_NAME, WARNING, f"{path} is not a stable name", do)]
+    return report(_NAME, WARNING, f"{path} is not a stable name", do)

@@ -41,6 +41,11 @@ class CheckResult:
         return asdict(self)
 
 
+def report(check: str, state: str, found: str, do: str = "") -> list[CheckResult]:
+    """Return one result, as a check does that has no more to say; see `CheckResult`."""
+    return [CheckResult(check, state, found, do)]
+
+
 @dataclass(frozen=True)
 class DoctorCheck:
     """A check to run.
@@ -130,7 +135,7 @@ def _within_deadline(check: DoctorCheck) -> Sequence[CheckResult]:
     return (
         found[0]
         if found
-        else [CheckResult(check.name, FAILURE, f"no answer within {check.deadline_s:g} s", check.cure)]
+        else report(check.name, FAILURE, f"no answer within {check.deadline_s:g} s", check.cure)
     )
 
 
@@ -138,10 +143,7 @@ def _run(check: DoctorCheck) -> Sequence[CheckResult]:
     try:
         return check.run()
     except (AdvnerfError, OSError, ValueError) as error:
-        return [CheckResult(check.name, FAILURE, str(error) or type(error).__name__)]
+        return report(check.name, FAILURE, str(error) or type(error).__name__)
     except Exception as error:  # a bug in one check must not prevent the others
-        return [
-            CheckResult(
-                check.name, WARNING, f"the check itself failed: {type(error).__name__}: {error}", "report it"
-            )
-        ]
+        do = "report it"
+        return report(check.name, WARNING, f"the check itself failed: {type(error).__name__}: {error}", do)

@@ -18,7 +18,7 @@ from calibration.schema import (
     load_calibration,
 )
 from nodes.compositor import show
-from nodes.lab.doctor.check import FAILURE, OK, CheckResult
+from nodes.lab.doctor.check import FAILURE, OK, CheckResult, report
 from nodes.launching.launch_file import Plan
 
 _CURE = "run advnerf car calibrate (docs/calibration.md), or set params.calibration to the right folder"
@@ -37,11 +37,11 @@ def calibrations(plan: Plan) -> list[CheckResult]:
         try:
             good.append((file, load_calibration(kind, file)))
         except (AdvnerfError, OSError, ValueError) as error:
-            rows.append(CheckResult("calibration", FAILURE, str(error), _CURE))
+            rows += report("calibration", FAILURE, str(error), _CURE)
     if good:
         oldest = min(good, key=lambda item: item[1].date)
         text = f"{', '.join(str(file) for file, _ in good)}; the oldest, {oldest[0].name}, is from {oldest[1].date}"
-        rows.append(CheckResult("calibration", OK, text))
+        rows += report("calibration", OK, text)
     return rows
 
 
@@ -72,7 +72,7 @@ def named(plan: Plan) -> list[CheckResult]:
         ]
         if isinstance(data, dict) and data.get("attack"):
             rows += _attack(name, data)
-    return rows or [CheckResult("files", OK, "all files that the nodes name exist")]
+    return rows or report("files", OK, "all files that the nodes name exist")
 
 
 def _paths(value: Any) -> Iterator[str]:
@@ -93,7 +93,7 @@ def _attack(name: str, data: dict[str, Any]) -> list[CheckResult]:
     try:
         attack = load_attack(file)
     except AdvnerfError as error:
-        return [CheckResult("attack", FAILURE, str(error), "run the attack again, or name another file")]
+        return report("attack", FAILURE, str(error), "run the attack again, or name another file")
     try:
         if "camera" in data and "target" in data:
             camera = load_calibration(CameraCalibration, data["camera"])
@@ -101,6 +101,6 @@ def _attack(name: str, data: dict[str, Any]) -> list[CheckResult]:
     except CalibrationError:
         pass  # reported under "calibration"
     except AdvnerfError as error:
-        return [CheckResult("attack", FAILURE, f"{name}: {error}", "give the target that it was made for")]
+        return report("attack", FAILURE, f"{name}: {error}", "give the target that it was made for")
     subject = "no subject" if attack.face is None else attack.face.subject
-    return [CheckResult("attack", OK, f"{name}: {attack.attack_id}, {attack.method}, for {subject}")]
+    return report("attack", OK, f"{name}: {attack.attack_id}, {attack.method}, for {subject}")

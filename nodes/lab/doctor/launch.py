@@ -19,7 +19,7 @@ from hardware.motor.vesc_settings import TimeoutSettings
 from nodes.camera import CameraNodeConfig
 from nodes.gateway import GatewayConfig
 from nodes.lab.doctor import cameras, files, graphics, machine, mocap, motor, network, ros2
-from nodes.lab.doctor.check import CHILD_S, FAILURE, OK, CheckResult, DoctorCheck, in_child
+from nodes.lab.doctor.check import CHILD_S, FAILURE, OK, CheckResult, DoctorCheck, in_child, report
 from nodes.lab.doctor.recording import ImageFormat, bytes_per_s
 from nodes.launching.launch_check import check_nodes
 from nodes.launching.launch_file import Plan
@@ -125,7 +125,7 @@ def _nodes(plan: Plan) -> list[CheckResult]:
             CheckResult("nodes", FAILURE, " ".join(text.split()), "correct the launch file")
             for text in problems.values()
         ]
-    return [CheckResult("nodes", OK, f"{', '.join(plan.nodes)} accept their configuration")]
+    return report("nodes", OK, f"{', '.join(plan.nodes)} accept their configuration")
 
 
 def _camera(asked: _Asked) -> list[DoctorCheck]:
@@ -159,9 +159,7 @@ def _calibration(file: Path) -> CameraCalibration | None:
 
 def _nobody(name: str, where: str) -> list[CheckResult]:
     do = "give the real device, or enable the simulated lab (twin.if=true)"
-    return [
-        CheckResult(name, FAILURE, f"expected at {where}, but this launch has no node that provides it", do)
-    ]
+    return report(name, FAILURE, f"expected at {where}, but this launch has no node that provides it", do)
 
 
 def _vicon(asked: _Asked) -> list[DoctorCheck]:
@@ -221,14 +219,8 @@ def _policy_findings(config: PolicyNodeConfig, size: tuple[int, int] | None) -> 
     if data is None:
         return rows
     if data["ms"] > _POLICY_SLOW_MS:
-        rows.append(
-            CheckResult(
-                "policy",
-                FAILURE,
-                f"{data['ms']:.0f} ms for one image",
-                "use a faster computer, or an ONNX policy",
-            )
-        )
+        do = "use a faster computer, or an ONNX policy"
+        rows += report("policy", FAILURE, f"{data['ms']:.0f} ms for one image", do)
     return [
         CheckResult(
             "policy", OK, f"{config.policy}, {data['sha256'][:12]}, {data['ms']:.1f} ms for one image"
@@ -252,16 +244,14 @@ def _try_policy(
     answer = in_child("policy", config.policy, config.sha256)
     if answer.data is None:
         trouble = answer.trouble.partition(": ")[2] or answer.trouble
-        return None, [CheckResult("policy", FAILURE, trouble, answer.cure("correct params.policy"))]
+        return None, report("policy", FAILURE, trouble, answer.cure("correct params.policy"))
     data, rows = answer.data, []
     if size is not None and tuple(data["size"]) != size:
         text = f"trained for {data['size'][0]} x {data['size'][1]}, the camera is calibrated for {size[0]} x {size[1]}"
-        rows.append(
-            CheckResult("policy", FAILURE, text, "train for this camera, or set the size of the source")
-        )
+        rows += report("policy", FAILURE, text, "train for this camera, or set the size of the source")
     if data["goal_size"] != len(config.goal):
         text = f"expected a goal of {data['goal_size']} numbers, got {len(config.goal)}"
-        rows.append(CheckResult("policy", FAILURE, text, "set policy.goal"))
+        rows += report("policy", FAILURE, text, "set policy.goal")
     return data, rows
 
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.kernel_cache import use_own_folder
 from advnerf_core.places import PlaceError, is_writable, user_place
-from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, CheckResult
+from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, CheckResult, report
 from nodes.launching.running import active_launches
 from nodes.linking.keys import DRIVE, KeyFolder, default_folder
 from nodes.runtime.bus import Bus
@@ -45,7 +45,7 @@ def versions() -> list[CheckResult]:
     tested = (3, 10) <= sys.version_info[:2] <= (3, 12)
     text = f"{found}, advnerf {importlib.metadata.version('advnerf')}, Linux {platform.release()} {platform.machine()}"
     do = "" if tested else "create the environment with Python 3.10, 3.11 or 3.12, which are tested"
-    rows = [CheckResult("python", OK if tested else WARNING, text, do)]
+    rows = report("python", OK if tested else WARNING, text, do)
     return rows + packages(importlib.metadata.requires("advnerf") or [])
 
 
@@ -60,13 +60,13 @@ def packages(requirements: Iterable[str]) -> list[CheckResult]:
         if trouble := _trouble(match[1], match[2].strip()):
             wrong[extra].append(trouble)
     extras = [name for name in wrong if name and not wrong[name]]
-    rows = [CheckResult("extras", OK, f"complete: {', '.join(extras) or 'none'}")]
+    rows = report("extras", OK, f"complete: {', '.join(extras) or 'none'}")
     if base := wrong.get("", []):
         rows.insert(0, CheckResult("packages", FAILURE, "; ".join(base), "pip install advnerf"))
     for name in (name for name in wrong if name and wrong[name]):
         stale = [trouble for trouble in wrong[name] if not trouble.endswith("missing")]
         if stale:
-            rows.append(CheckResult("extras", WARNING, "; ".join(stale), f"pip install 'advnerf[{name}]'"))
+            rows += report("extras", WARNING, "; ".join(stale), f"pip install 'advnerf[{name}]'")
     return rows
 
 
@@ -102,8 +102,8 @@ def machine() -> list[CheckResult]:
     text = f"{os.cpu_count()} cores, {memory:.0f} GiB memory"
     if memory < _MEMORY_WARNING_GIB:
         do = f"train and attack on another computer, which needs {_MEMORY_WARNING_GIB} GiB"
-        return [CheckResult("machine", WARNING, text, do)]
-    return [CheckResult("machine", OK, text)]
+        return report("machine", WARNING, text, do)
+    return report("machine", OK, text)
 
 
 def disk(folder: Path, bytes_per_s: float, minutes: float = 30.0) -> list[CheckResult]:
@@ -116,25 +116,17 @@ def disk(folder: Path, bytes_per_s: float, minutes: float = 30.0) -> list[CheckR
     """
     existing = next(path for path in (folder.resolve(), *folder.resolve().parents) if path.is_dir())
     if not os.access(existing, os.W_OK):
-        return [
-            CheckResult(
-                "disk",
-                FAILURE,
-                f"{existing} cannot be written to",
-                "choose another folder, or change its permissions",
-            )
-        ]
+        do = "choose another folder, or change its permissions"
+        return report("disk", FAILURE, f"{existing} cannot be written to", do)
     free = shutil.disk_usage(existing).free
     lasts = free / bytes_per_s / 60.0
     hourly = bytes_per_s * 3600.0 / 1e9
     text = f"{free / 2**30:.1f} GiB free in {existing}: {lasts:.0f} minutes of recording at {hourly:.1f} GB an hour"
     if lasts < 1.0:
-        return [CheckResult("disk", FAILURE, text, "free some space, or give another --folder")]
+        return report("disk", FAILURE, text, "free some space, or give another --folder")
     if lasts < minutes:
-        return [
-            CheckResult("disk", WARNING, text, "free some space; advnerf bag info shows what a bag contains")
-        ]
-    return [CheckResult("disk", OK, text)]
+        return report("disk", WARNING, text, "free some space; advnerf bag info shows what a bag contains")
+    return report("disk", OK, text)
 
 
 def places() -> list[CheckResult]:
@@ -170,16 +162,10 @@ def _cache() -> CheckResult:
 def sockets() -> list[CheckResult]:
     """Check whether nodes can create their sockets."""
     try:
-        return [CheckResult("sockets", OK, f"in {user_folder()}")]
+        return report("sockets", OK, f"in {user_folder()}")
     except (AdvnerfError, OSError) as error:
-        return [
-            CheckResult(
-                "sockets",
-                FAILURE,
-                str(error),
-                "change the owner of that folder to your user, or set XDG_RUNTIME_DIR",
-            )
-        ]
+        do = "change the owner of that folder to your user, or set XDG_RUNTIME_DIR"
+        return report("sockets", FAILURE, str(error), do)
 
 
 def keys(folder: Path | None = None) -> list[CheckResult]:
@@ -192,14 +178,12 @@ def keys(folder: Path | None = None) -> list[CheckResult]:
             if row.ours:
                 store.secret(row.name)
     except (AdvnerfError, OSError) as error:
-        return [CheckResult("keys", WARNING, str(error))]
+        return report("keys", WARNING, str(error))
     ours = ", ".join(row.name for row in rows if row.ours)
     drivers = ", ".join(row.name for row in rows if DRIVE in row.rights) or "no key"
     if not ours:
-        return [
-            CheckResult("keys", ABSENT, f"none in {folder}", "two hosts need them: advnerf car keys new NAME")
-        ]
-    return [CheckResult("keys", OK, f"ours: {ours}; {drivers} may drive over the network")]
+        return report("keys", ABSENT, f"none in {folder}", "two hosts need them: advnerf car keys new NAME")
+    return report("keys", OK, f"ours: {ours}; {drivers} may drive over the network")
 
 
 def clock() -> list[CheckResult]:
@@ -207,20 +191,16 @@ def clock() -> list[CheckResult]:
     seconds, keeper = adjtimex_error_s(), _keeper()
     if seconds is None:
         do = "for two hosts, install chrony on both: sudo apt-get install chrony"
-        return [
-            CheckResult(
-                "clock",
-                WARNING,
-                f"not synchronised according to the kernel; {keeper or 'no time service found'}",
-                do,
-            )
-        ]
+        return report(
+            "clock",
+            WARNING,
+            f"not synchronised according to the kernel; {keeper or 'no time service found'}",
+            do,
+        )
     text = f"off by at most {seconds * 1e3:.1f} ms{', ' + keeper if keeper else ''}"
     if seconds > CLOCK_ERROR_S:
-        return [
-            CheckResult("clock", WARNING, text, "wait for chrony; chronyc sources lists its time sources")
-        ]
-    return [CheckResult("clock", OK, text)]
+        return report("clock", WARNING, text, "wait for chrony; chronyc sources lists its time sources")
+    return report("clock", OK, text)
 
 
 def adjtimex_error_s() -> float | None:
@@ -257,13 +237,10 @@ def launches() -> list[CheckResult]:
     rows = []
     for launch in active_launches():
         text = f"running: {launch['name']} in {launch['run_dir']} (process {launch['pid']})"
-        rows.append(
-            CheckResult(
-                "launches", WARNING, text, "its devices are in use; stop it with Ctrl-C in its terminal"
-            )
-        )
+        do = "its devices are in use; stop it with Ctrl-C in its terminal"
+        rows += report("launches", WARNING, text, do)
         rows += _offset(Path(launch["run_dir"]))
-    return rows or [CheckResult("launches", OK, "none running")]
+    return rows or report("launches", OK, "none running")
 
 
 def _offset(run_dir: Path) -> Sequence[CheckResult]:
@@ -287,6 +264,5 @@ def offset_finding(peer: str, offset_s: float, error_s: float) -> CheckResult:
         do = "install chrony on both hosts, then run chronyc makestep; until then the car cannot be armed"
         return CheckResult("clock offset", FAILURE, text, do)
     near = abs(offset_s) <= CLOCK_ERROR_S
-    return CheckResult(
-        "clock offset", OK if near else WARNING, text, "" if near else "install chrony on both hosts"
-    )
+    do = "" if near else "install chrony on both hosts"
+    return CheckResult("clock offset", OK if near else WARNING, text, do)

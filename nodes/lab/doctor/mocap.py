@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from hardware.errors import DeviceBusy, ProtocolError
 from hardware.mocap.vicon import DEFAULT_PORT, ViconConfig, ViconReceiver
 from hardware.mocap.vicon_codec import decode_block
-from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, CheckResult
+from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, CheckResult, report
 
 LISTEN_S = 1.5
 _NAME = "VICON"
@@ -26,8 +26,8 @@ def free_port(port: int = DEFAULT_PORT, host: str = "") -> list[CheckResult]:
             do = f"stop the program that uses it (sudo ss -ulpn 'sport = {port}'), or choose another port here and in Tracker"
             if error.errno == errno.EADDRNOTAVAIL:
                 do = "give an address of this computer, or 0.0.0.0 for all"
-            return [CheckResult(_NAME, FAILURE, f"UDP {host or '*'}:{port}: {error.strerror}", do)]
-    return [CheckResult(_NAME, OK, f"UDP {port} is free")]
+            return report(_NAME, FAILURE, f"UDP {host or '*'}:{port}: {error.strerror}", do)
+    return report(_NAME, OK, f"UDP {port} is free")
 
 
 def listen(
@@ -59,16 +59,14 @@ def listen(
     where = f"UDP {config.host or '*'}:{config.port}"
     if not counts.datagrams:
         text = f"no datagram on {where} within {listen_s:g} s"
-        return [CheckResult(_NAME, FAILURE if required else ABSENT, text, _CURE.format(port=config.port))]
+        return report(_NAME, FAILURE if required else ABSENT, text, _CURE.format(port=config.port))
     rate_hz = counts.datagrams / listen_s
-    rows = [CheckResult(_NAME, OK, f"{rate_hz:.0f} datagrams a second on {where}")]
+    rows = report(_NAME, OK, f"{rate_hz:.0f} datagrams a second on {where}")
     if counts.refused:
         do = "find the other sender, or set vicon.source to Tracker's address"
-        rows = [
-            CheckResult(
-                _NAME, WARNING, f"{counts.refused} of {counts.datagrams} datagrams are not Tracker's", do
-            )
-        ]
+        rows = report(
+            _NAME, WARNING, f"{counts.refused} of {counts.datagrams} datagrams are not Tracker's", do
+        )
     return rows + [
         _subject(name, number / listen_s, required and name in (needed or config.subjects))
         for name, number in seen.items()

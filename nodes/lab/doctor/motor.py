@@ -13,7 +13,7 @@ from hardware.errors import DeviceBusy, DeviceNotFound, HardwareError, LinkTimeo
 from hardware.motor.limits import DriveLimits, VehicleGains
 from hardware.motor.vesc import Vesc
 from hardware.motor.vesc_settings import TimeoutSettings
-from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, CheckResult
+from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, CheckResult, report
 
 # The VESC's USB port is ST's virtual COM port.
 VESC_USB = (0x0483, 0x5740)
@@ -37,24 +37,13 @@ def serial_ports() -> list[CheckResult]:
     """Check USB serial devices: stable names and permissions."""
     found = ports()
     if not found:
-        return [
-            CheckResult(
-                "serial",
-                ABSENT,
-                "no USB serial device",
-                "check the USB cable of the VESC; the twin does not need one",
-            )
-        ]
+        do = "check the USB cable of the VESC; the twin does not need one"
+        return report("serial", ABSENT, "no USB serial device", do)
     rows = [_port(port) for port in found]
     if manager := _running("ModemManager"):
         do = 'ENV{ID_MM_DEVICE_IGNORE}="1" in the udev rule (docs/wiring.md), or: sudo apt-get purge modemmanager'
-        rows.append(
-            CheckResult(
-                "serial",
-                WARNING,
-                f"ModemManager is running (process {manager}) and writes to serial devices",
-                do,
-            )
+        rows += report(
+            "serial", WARNING, f"ModemManager is running (process {manager}) and writes to serial devices", do
         )
     return rows
 
@@ -119,57 +108,40 @@ def vesc(
     """
     port = port or find_vesc()
     if port is None:
-        return [
-            CheckResult(
-                "VESC",
-                FAILURE if required else ABSENT,
-                "none found",
-                "check its USB cable; see docs/wiring.md",
-            )
-        ]
+        do = "check its USB cable; see docs/wiring.md"
+        return report("VESC", FAILURE if required else ABSENT, "none found", do)
     device = Vesc(port, VehicleGains(), DriveLimits())
     try:
         device.open()
     except DeviceBusy as error:
-        return [CheckResult("VESC", WARNING, str(error), "stop the launch, or close VESC Tool")]
+        return report("VESC", WARNING, str(error), "stop the launch, or close VESC Tool")
     except DeviceNotFound as error:
         denied = os.path.exists(port) and not os.access(port, os.R_OK | os.W_OK)
         do = (
             permission_cure(_SERIAL_GROUP) if denied else "check its USB cable and udev rule (docs/wiring.md)"
         )
-        return [CheckResult("VESC", FAILURE, str(error), do)]
+        return report("VESC", FAILURE, str(error), do)
     try:
         return _ask(device, wanted, battery_v)
     except LinkTimeout as error:
-        return [
-            CheckResult(
-                "VESC",
-                FAILURE,
-                str(error),
-                "connect the motor battery, check the port, and disconnect VESC Tool",
-            )
-        ]
+        do = "connect the motor battery, check the port, and disconnect VESC Tool"
+        return report("VESC", FAILURE, str(error), do)
     except HardwareError as error:
-        return [
-            CheckResult(
-                "VESC", FAILURE, str(error), "run advnerf car motor info, then check cable and firmware"
-            )
-        ]
+        do = "run advnerf car motor info, then check cable and firmware"
+        return report("VESC", FAILURE, str(error), do)
     finally:
         device.abandon()
 
 
 def _ask(device: Vesc, wanted: TimeoutSettings, battery_v: float) -> list[CheckResult]:
     firmware, values = device.identify(), device.read_values(0.5)
-    rows = [CheckResult("VESC", OK, f"{firmware} at {device.port}, telemetry {values.generation}")]
+    rows = report("VESC", OK, f"{firmware} at {device.port}, telemetry {values.generation}")
     if values.fault:
-        rows.append(
-            CheckResult("VESC", WARNING, f"reports a fault: {values.fault_name}", "see docs/faults.md")
-        )
+        rows += report("VESC", WARNING, f"reports a fault: {values.fault_name}", "see docs/faults.md")
     rows.append(_time_out(device, wanted))
     low = values.v_in < battery_v
     do = "charge or connect the motor battery" if low else ""
-    return [*rows, CheckResult("battery", WARNING if low else OK, f"{values.v_in:.1f} V at the VESC", do)]
+    return rows + report("battery", WARNING if low else OK, f"{values.v_in:.1f} V at the VESC", do)
 
 
 def _time_out(device: Vesc, wanted: TimeoutSettings) -> CheckResult:
@@ -177,9 +149,8 @@ def _time_out(device: Vesc, wanted: TimeoutSettings) -> CheckResult:
     try:
         found = device.read_timeout()
     except (LinkTimeout, ProtocolError) as error:
-        return CheckResult(
-            name, WARNING, f"this firmware does not report it: {error}", "check it in VESC Tool"
-        )
+        do = "check it in VESC Tool"
+        return CheckResult(name, WARNING, f"this firmware does not report it: {error}", do)
     if found.at_least(wanted):
         return CheckResult(name, OK, f"{found}; required is at most {wanted}")
     do = (
@@ -213,12 +184,8 @@ def gamepads(required: bool) -> Sequence[CheckResult]:
     )
     if not found:
         do = "use advnerf car teleop with the keyboard, or plug in a gamepad (docs/driving.md)"
-        return [CheckResult("gamepad", WARNING if required else ABSENT, "none", do)]
+        return report("gamepad", WARNING if required else ABSENT, "none", do)
     denied = [str(path) for path in found if not os.access(path, os.R_OK)]
     if denied:
-        return [
-            CheckResult(
-                "gamepad", WARNING, f"no permission for {', '.join(denied)}", permission_cure("input")
-            )
-        ]
-    return [CheckResult("gamepad", OK, ", ".join(map(str, found)))]
+        return report("gamepad", WARNING, f"no permission for {', '.join(denied)}", permission_cure("input"))
+    return report("gamepad", OK, ", ".join(map(str, found)))

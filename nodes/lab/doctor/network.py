@@ -8,7 +8,7 @@ import socket
 
 from hardware.mocap.library import SYSTEMS
 from nodes.gateway import GatewayConfig
-from nodes.lab.doctor.check import FAILURE, OK, WARNING, CheckResult
+from nodes.lab.doctor.check import FAILURE, OK, WARNING, CheckResult, report
 from nodes.linking.keys import DRIVE, KeyFolder, require_keys
 from nodes.runtime.errors import SecurityError
 
@@ -30,31 +30,19 @@ def _keys(config: GatewayConfig, address: str) -> list[CheckResult]:
         if config.listen:
             require_keys(address, store)
         if store is None:
-            return [CheckResult("keys", OK, f"none, on the loopback address {address}")]
+            return report("keys", OK, f"none, on the loopback address {address}")
         store.secret(config.key)
         if not config.listen:
             store.public(config.peer_key)
-            return [CheckResult("keys", OK, f"ours is {config.key}, the other host's {config.peer_key}")]
+            return report("keys", OK, f"ours is {config.key}, the other host's {config.peer_key}")
         drivers = ", ".join(store.allowed(DRIVE))
     except (SecurityError, OSError) as error:
-        return [
-            CheckResult(
-                "keys",
-                FAILURE,
-                str(error),
-                "create and allow keys with advnerf car keys new, add, allow (docs/two_hosts.md)",
-            )
-        ]
+        do = "create and allow keys with advnerf car keys new, add, allow (docs/two_hosts.md)"
+        return report("keys", FAILURE, str(error), do)
     if not drivers:
-        return [
-            CheckResult(
-                "keys",
-                FAILURE,
-                "no key may drive over the network",
-                "advnerf car keys allow workstation --right drive",
-            )
-        ]
-    return [CheckResult("keys", OK, f"ours is {config.key}; {drivers} may drive")]
+        do = "advnerf car keys allow workstation --right drive"
+        return report("keys", FAILURE, "no key may drive over the network", do)
+    return report("keys", OK, f"ours is {config.key}; {drivers} may drive")
 
 
 def _own_port(address: str, port: int) -> list[CheckResult]:
@@ -69,10 +57,8 @@ def _own_port(address: str, port: int) -> list[CheckResult]:
                 if mine
                 else "use an address of this computer (ip addr lists them)"
             )
-            return [
-                CheckResult("network", FAILURE, f"cannot listen on {address}:{port}: {error.strerror}", do)
-            ]
-    return [CheckResult("network", OK, f"TCP {address}:{port} is free")]
+            return report("network", FAILURE, f"cannot listen on {address}:{port}: {error.strerror}", do)
+    return report("network", OK, f"TCP {address}:{port} is free")
 
 
 def _other_host(address: str, port: int) -> list[CheckResult]:
@@ -81,39 +67,27 @@ def _other_host(address: str, port: int) -> list[CheckResult]:
     except OSError as error:
         why = error.strerror or str(error) or "no answer"
         do = "start the launch there; then check ping and its firewall (sudo ufw allow from ... to any port ...)"
-        return [CheckResult("network", WARNING, f"{address}:{port} does not answer: {why}", do)]
-    return [CheckResult("network", OK, f"{address}:{port} answers")]
+        return report("network", WARNING, f"{address}:{port} does not answer: {why}", do)
+    return report("network", OK, f"{address}:{port} answers")
 
 
 def viewer(host: str, port: int) -> list[CheckResult]:
     """Check whether the viewer can listen."""
     if importlib.util.find_spec("foxglove") is None:
-        return [CheckResult("viewer", FAILURE, "foxglove-sdk is missing", "pip install 'advnerf[view]'")]
+        return report("viewer", FAILURE, "foxglove-sdk is missing", "pip install 'advnerf[view]'")
     return [] if port == 0 else _own_port(host, port)
 
 
 def mocap_library(system: str, hostname: str) -> list[CheckResult]:
     """Check whether the library is installed and its host can be resolved."""
     if importlib.util.find_spec("motioncapture") is None:
-        return [
-            CheckResult(
-                "VICON",
-                FAILURE,
-                "the library motioncapture is missing",
-                "pip install 'advnerf[mocap]' (Linux on x86)",
-            )
-        ]
+        do = "pip install 'advnerf[mocap]' (Linux on x86)"
+        return report("VICON", FAILURE, "the library motioncapture is missing", do)
     if system not in SYSTEMS:
-        return [CheckResult("VICON", FAILURE, f"unknown system {system}", f"use one of {', '.join(SYSTEMS)}")]
+        return report("VICON", FAILURE, f"unknown system {system}", f"use one of {', '.join(SYSTEMS)}")
     try:
         socket.getaddrinfo(hostname, None)
     except OSError as error:
-        return [
-            CheckResult(
-                "VICON",
-                FAILURE,
-                f"{hostname}: {error.strerror or error}",
-                "set vicon.hostname to its IP address",
-            )
-        ]
-    return [CheckResult("VICON", OK, f"{system} at {hostname}; the node reports the subjects")]
+        do = "set vicon.hostname to its IP address"
+        return report("VICON", FAILURE, f"{hostname}: {error.strerror or error}", do)
+    return report("VICON", OK, f"{system} at {hostname}; the node reports the subjects")

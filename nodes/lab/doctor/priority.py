@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from nodes.lab.doctor.check import OK, WARNING, CheckResult
+from nodes.lab.doctor.check import OK, WARNING, CheckResult, report
 from nodes.launching.running import active_launches
 from nodes.runtime.paths import lock_path, socket_path
 from nodes.runtime.priority import FIRST, Share, share_of
@@ -34,13 +34,13 @@ def shares() -> list[CheckResult]:
         check=False,
     )
     if done.returncode:
-        return [CheckResult("priority", WARNING, (done.stderr.strip().splitlines() or ["no answer"])[-1])]
+        return report("priority", WARNING, (done.stderr.strip().splitlines() or ["no answer"])[-1])
     share = Share(*json.loads(done.stdout))
     if share.reaches(FIRST):
-        rows = [CheckResult("priority", OK, f"safety and motor run before all other nodes: {share}")]
+        rows = report("priority", OK, f"safety and motor run before all other nodes: {share}")
     else:
         text = f"safety and motor get {share}, expected nice {FIRST}: on a busy computer they stop the car too early"
-        rows = [CheckResult("priority", WARNING, text, _DO)]
+        rows = report("priority", WARNING, text, _DO)
     return rows + [CheckResult("priority", OK, line) for line in _running()]
 
 

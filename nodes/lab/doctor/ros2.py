@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 
-from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, CheckResult
+from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, CheckResult, report
 from nodes.linking.ros2.transports import DDS, chosen_transport, installed_transports, is_loopback_interface
 from nodes.linking.ros2.zenoh_settings import address_of, require_local_router, session_config
 from nodes.ros2 import Ros2Config
@@ -18,8 +18,8 @@ def installed() -> list[CheckResult]:
     """Check which transports are installed."""
     found = installed_transports()
     if not found:
-        return [CheckResult(_CHECK, ABSENT, "no transport", "pip install 'advnerf[ros2]'")]
-    return [CheckResult(_CHECK, OK, f"transports: {', '.join(found)}")]
+        return report(_CHECK, ABSENT, "no transport", "pip install 'advnerf[ros2]'")
+    return report(_CHECK, OK, f"transports: {', '.join(found)}")
 
 
 def node(config: Ros2Config) -> list[CheckResult]:
@@ -27,9 +27,9 @@ def node(config: Ros2Config) -> list[CheckResult]:
     try:
         transport = chosen_transport(config.transport)
     except ConfigError as error:
-        return [CheckResult(_CHECK, FAILURE, str(error), "pip install 'advnerf[ros2]'")]
+        return report(_CHECK, FAILURE, str(error), "pip install 'advnerf[ros2]'")
     local = is_loopback_interface(config.interface)
-    rows = [CheckResult(_CHECK, OK, f"{transport}, domain {config.domain_id} on {config.interface}")]
+    rows = report(_CHECK, OK, f"{transport}, domain {config.domain_id} on {config.interface}")
     if transport == DDS:
         return rows
     session_config(config.zenoh, config.interface, local)
