@@ -22,16 +22,16 @@ from advnerf_core.policies.conformance import FAILURE, OK, WARNING, Finding, Ver
 from advnerf_core.policies.network import images_to_tensor
 from advnerf_core.policies.view import PolicyView
 from calibration.schema import CameraCalibration, RoomCalibration, VehicleCalibration, load_calibration
+from nodes.bags.decoded import read_poses
 from nodes.bags.images import image_messages, image_topic
-from nodes.bags.reader import read_info, read_messages
+from nodes.bags.reader import read_info
 from nodes.control.pose_buffer import PoseBuffer
 from nodes.lab.policy_camera import require_camera
 from nodes.lab.policy_drive import See, drive_round
 from nodes.runtime.errors import BagError, ConfigError
-from nodes.runtime.messages import decode, pose_matrix, stamp_ns
+from nodes.runtime.messages import stamp_ns
 from nodes.runtime.paths import shipped
 from nodes.runtime.pictures import rgb_image
-from nodes.runtime.topics import topic as topic_row
 
 _CAR = "/vicon/car"
 _LATERAL_M, _HEADING_RAD = 0.15, 0.2
@@ -90,9 +90,8 @@ def from_twin(view: PolicyView, count: int = 48, seed: int = 0) -> ReferenceFram
 def from_bag(bag: Path, room: Path, view: PolicyView, count: int = 96) -> ReferenceFrames:
     """Take reference frames spread over a bag, labelled by the expert at the recorded poses."""
     poses = PoseBuffer(keep_s=1e6)
-    for message in read_messages(bag, [_CAR]):
-        pose = decode(topic_row(_CAR).type, message.cdr)
-        poses.add(stamp_ns(pose), pose_matrix(pose))
+    for stamp, T in read_poses(bag, _CAR):
+        poses.add(stamp, T)
     topic = image_topic(bag)
     recorded = next(row.count for row in read_info(bag).topics if row.name == topic)
     wanted = set(np.linspace(0, recorded - 1, min(count, recorded)).astype(int).tolist())

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.files import write_json
-from nodes.bags.reader import read_info, read_messages
+from nodes.bags.decoded import read_decoded
+from nodes.bags.reader import read_info
 from nodes.replaying.nodes import Choice
 from nodes.replaying.replay import Replay
 from nodes.runtime.clock import NS_PER_S
@@ -208,8 +209,7 @@ def _steering(
 def _recorded(bag: Path) -> dict[int, float]:
     if _DRIVE not in [topic.name for topic in read_info(bag).topics]:
         return {}
-    messages = (decode(topic_row(_DRIVE).type, message.cdr) for message in read_messages(bag, [_DRIVE]))
-    return {stamp_ns(message): float(message.drive.steering_angle) for message in messages}
+    return {stamp_ns(message): float(message.drive.steering_angle) for message in read_decoded(bag, _DRIVE)}
 
 
 def _side(angle: float) -> str:

@@ -28,7 +28,7 @@ from advnerf_core.driving.metrics import Horizon
 from advnerf_core.geometry import Array, invert_transform, planar_poses, yaw_of
 from advnerf_core.scene.fidelity import PicturePairs
 from advnerf_core.scene.surrogate import Surrogate
-from nodes.bags.reader import read_messages
+from nodes.bags.decoded import read_decoded, read_poses
 from nodes.control.pose_buffer import PoseBuffer
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
@@ -43,9 +43,8 @@ from nodes.experiment.steps.attack import attack_problem, from_measured_starts, 
 from nodes.experiment.steps.deploy import DRIVES, live_name
 from nodes.experiment.steps.search_files import ATTACK
 from nodes.runtime.errors import BagError, RuntimeFault
-from nodes.runtime.messages import decode, ns_from_stamp, pose_matrix
+from nodes.runtime.messages import stamp_ns
 from nodes.runtime.pictures import rgb_image
-from nodes.runtime.topics import topic as topic_row
 
 Rgb = NDArray[np.uint8]
 _MOST_FRAMES = 120
@@ -223,20 +222,15 @@ def _along_the_drive(
 
 def posed_frames(bag: Path) -> tuple[list[Rgb], Array]:
     """Frames that were captured while the car was armed, evenly thinned out for a long drive, and the car's states ``[N, 3]`` at their stamps."""
-    poses, armed = PoseBuffer(keep_s=1e6), []
-    for message in read_messages(bag, [_CAR, _SAFETY]):
-        decoded = decode(topic_row(message.topic).type, message.cdr)
-        stamp_ns = ns_from_stamp(decoded.header.stamp)
-        if message.topic == _CAR:
-            poses.add(stamp_ns, pose_matrix(decoded))
-        elif decoded.armed:
-            armed.append(stamp_ns)
+    poses = PoseBuffer(keep_s=1e6)
+    for stamp, T in read_poses(bag, _CAR):
+        poses.add(stamp, T)
+    armed = [stamp_ns(state) for state in read_decoded(bag, _SAFETY) if state.armed]
     frames, states = [], []
-    for message in read_messages(bag, [_IMAGE]):
-        image = decode(topic_row(_IMAGE).type, message.cdr)
-        stamp_ns = ns_from_stamp(image.header.stamp)
-        pose = poses.at(stamp_ns, 0.0)
-        if pose is not None and armed and min(armed) <= stamp_ns <= max(armed):
+    for image in read_decoded(bag, _IMAGE):
+        stamp = stamp_ns(image)
+        pose = poses.at(stamp, 0.0)
+        if pose is not None and armed and min(armed) <= stamp <= max(armed):
             frames.append(rgb_image(image, f"{_IMAGE} in {bag}").copy())
             states.append((pose.T[0, 3], pose.T[1, 3], yaw_of(pose.T)))
     if not frames:

@@ -15,15 +15,15 @@ from advnerf_core.documents import decode_text
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array
 from calibration.schema import CameraCalibration, load_calibration, parse_calibration
+from nodes.bags.decoded import read_poses
 from nodes.bags.images import image_messages, image_topic
-from nodes.bags.reader import read_attachment, read_info, read_messages
+from nodes.bags.reader import read_attachment, read_info
 from nodes.control.pose_buffer import PoseBuffer
 from nodes.lab.importing.errors import ImportRecordingError
 from nodes.runtime.errors import BagError
-from nodes.runtime.messages import decode, pose_matrix, stamp_ns
+from nodes.runtime.messages import stamp_ns
 from nodes.runtime.pictures import rgb_image
 from nodes.runtime.progress import Report
-from nodes.runtime.topics import topic as topic_row
 
 CAR_TOPIC = "/vicon/car"
 CAR_CAMERA = "car"
@@ -86,7 +86,9 @@ def take_frames(
         ImportRecordingError: The calibration is missing, the image size differs from it, or the frames have no poses.
     """
     camera = _camera(bag, calibration)
-    poses = _car_poses(bag, config)
+    poses = PoseBuffer(keep_s=_WHOLE_DRIVE_S, max_gap_s=config.max_gap_s)
+    for stamp, T in read_poses(bag, CAR_TOPIC):
+        poses.add(stamp, T)
     topic = image_topic(bag)
     stamps = [stamp_ns(message) for message in image_messages(bag, topic)]
     placed = [
@@ -140,16 +142,6 @@ def _camera(bag: Path, file: Path | None) -> CameraCalibration:
     return parse_calibration(
         CameraCalibration, decode_text(text, source := f"{_ATTACHED_CALIBRATION} in {bag}"), source
     )
-
-
-def _car_poses(bag: Path, config: BagConfig) -> PoseBuffer:
-    poses = PoseBuffer(keep_s=_WHOLE_DRIVE_S, max_gap_s=config.max_gap_s)
-    for message in read_messages(bag, [CAR_TOPIC]):
-        pose = decode(topic_row(CAR_TOPIC).type, message.cdr)
-        T = pose_matrix(pose)
-        if np.isfinite(T).all():
-            poses.add(stamp_ns(pose), T)
-    return poses
 
 
 def _write_frames(

@@ -11,16 +11,15 @@ import numpy as np
 
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.driving.path import Path as DrivingPath
-from advnerf_core.geometry import yaw_of
 from calibration.schema import RoomCalibration, load_calibration
-from nodes.bags.reader import extract_attachments, read_info, read_messages
+from nodes.bags.decoded import read_decoded
+from nodes.bags.reader import extract_attachments, read_info
 from nodes.bags.time_gaps import skipped_gaps
 from nodes.lab.trials.evaluation import attack_ids, counterfactual, score, timing, trajectory
 from nodes.lab.trials.trial import MOVED_M
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError
-from nodes.runtime.messages import decode, ns_from_stamp, pose_matrix
-from nodes.runtime.topics import topic as topic_row
+from nodes.runtime.messages import pose_matrix, stamp_ns
 
 _ROOM = "room.yaml"
 
@@ -159,9 +158,8 @@ def _armings(bag: Path) -> list[tuple[int, int | None, str]]:
     """Times of arming and disarming [ns, CLOCK_REALTIME], and the reason of the disarming."""
     spans: list[tuple[int, int | None, str]] = []
     since: int | None = None
-    for message in read_messages(bag, ["/safety/state"]):
-        state = decode(topic_row("/safety/state").type, message.cdr)
-        stamp = ns_from_stamp(state.header.stamp)
+    for state in read_decoded(bag, "/safety/state"):
+        stamp = stamp_ns(state)
         if state.armed and since is None:
             since = stamp
         elif not state.armed and since is not None:
@@ -171,10 +169,6 @@ def _armings(bag: Path) -> list[tuple[int, int | None, str]]:
 
 
 def _positions(bag: Path) -> tuple[Any, Any]:
-    rows = {}
-    for message in read_messages(bag, ["/vicon/car"]):
-        pose = decode(topic_row("/vicon/car").type, message.cdr)
-        T = pose_matrix(pose)
-        rows[ns_from_stamp(pose.header.stamp)] = (T[0, 3], T[1, 3], yaw_of(T))
+    rows = {stamp_ns(pose): pose_matrix(pose)[:2, 3] for pose in read_decoded(bag, "/vicon/car")}
     stamps = sorted(rows)
-    return np.array(stamps, np.int64), np.array([rows[stamp][:2] for stamp in stamps])
+    return np.array(stamps, np.int64), np.array([rows[stamp] for stamp in stamps])

@@ -5,19 +5,19 @@ The rule is the same for every condition and reads no position of the car, so th
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from nodes.bags.reader import read_info, read_messages
+from nodes.bags.decoded import read_decoded
+from nodes.bags.reader import read_info
 from nodes.control.stop_causes import is_result
 from nodes.runtime.clock import NS_PER_S
-from nodes.runtime.messages import decode, ns_from_stamp
+from nodes.runtime.messages import ns_from_stamp
 from nodes.runtime.topics import STATUS_PREFIX
-from nodes.runtime.topics import topic as topic_row
 
 _SENT = "/motor/sent"
 # Share of control ticks that may have no new command, or a late one.
@@ -88,7 +88,7 @@ def read_health(
 def _command_ages_s(bag: Path, start_ns: int, end_ns: int) -> Any:
     """Time from capture to the first serial write of every image of the drive that became a command ``[n]`` [s]."""
     written: dict[int, float] = {}
-    for message in _decoded(bag, _SENT):
+    for message in read_decoded(bag, _SENT):
         stamp_ns = ns_from_stamp(message.header.stamp)
         if start_ns <= stamp_ns < end_ns and not message.braking:
             written.setdefault(stamp_ns, (int(message.serial_write_real_ns) - stamp_ns) / NS_PER_S)
@@ -98,7 +98,7 @@ def _command_ages_s(bag: Path, start_ns: int, end_ns: int) -> Any:
 def _missed_share(bag: Path, topic: str, start_ns: int, end_ns: int) -> float | None:
     """Share of its ticks that a node's loop missed during the drive; None for a node without ticks, or without two reports."""
     counts = []
-    for message in _decoded(bag, topic):
+    for message in read_decoded(bag, topic):
         values = dict(zip(message.counter_names, message.counter_values, strict=True))
         if "ticks" in values and start_ns <= ns_from_stamp(message.header.stamp) <= end_ns:
             counts.append((values["ticks"], values["ticks_missed"]))
@@ -106,8 +106,3 @@ def _missed_share(bag: Path, topic: str, start_ns: int, end_ns: int) -> float | 
         return None
     done, missed = (float(last - first) for first, last in zip(counts[0], counts[-1], strict=True))
     return missed / (done + missed) if done + missed > 0 else None
-
-
-def _decoded(bag: Path, topic: str) -> Iterator[Any]:
-    typename = topic_row(topic).type
-    return (decode(typename, message.cdr) for message in read_messages(bag, [topic]))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +13,7 @@ from advnerf_core.driving.metrics import DriveMetrics, Horizon, drive_metrics, s
 from advnerf_core.driving.path import Array
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.geometry import yaw_of
+from nodes.bags.decoded import read_decoded
 from nodes.bags.reader import read_info, read_messages
 from nodes.runtime.errors import BagError
 from nodes.runtime.messages import decode, ns_from_stamp, pose_matrix
@@ -76,7 +76,7 @@ def trajectory(bag: Path, start_real_ns: int, horizon: Horizon) -> Array:
     """Read the states ``[K, 3]`` of the rear axle at the control ticks from motion capture. Tick 0 is at ``start_real_ns``."""
     stamps: list[int] = []
     poses: list[tuple[float, float, float]] = []
-    for message in _decoded(bag, "/vicon/car"):
+    for message in read_decoded(bag, "/vicon/car"):
         stamp_ns = ns_from_stamp(message.header.stamp)
         if stamps and stamp_ns <= stamps[-1]:
             continue
@@ -105,7 +105,7 @@ def timing(bag: Path, start_real_ns: int, end_real_ns: int) -> Timing:
     captured = [stamp for stamp, _ in _stamps(bag, HOPS["camera"]) if start_real_ns <= stamp < end_real_ns]
     inside = set(captured)
     written: dict[int, float] = {}
-    for message in _decoded(bag, "/motor/sent"):
+    for message in read_decoded(bag, "/motor/sent"):
         stamp_ns = ns_from_stamp(message.header.stamp)
         if stamp_ns in inside and not message.braking:
             written.setdefault(stamp_ns, (int(message.serial_write_real_ns) - stamp_ns) / _NS_PER_MS)
@@ -121,7 +121,7 @@ def timing(bag: Path, start_real_ns: int, end_real_ns: int) -> Timing:
 def frames(bag: Path, start_real_ns: int, count: int, period_s: float = 0.1) -> NDArray[np.uint8]:
     """Read the policy's images at the control ticks, ``[count, H, W, 3]``: the newest image at each tick."""
     stamps, images = [], []
-    for message in _decoded(bag, _SEEN):
+    for message in read_decoded(bag, _SEEN):
         stamps.append(ns_from_stamp(message.header.stamp))
         images.append(rgb_image(message, f"{_SEEN} in {bag}").copy())
     if not images:
@@ -134,7 +134,9 @@ def frames(bag: Path, start_real_ns: int, count: int, period_s: float = 0.1) -> 
 def attack_ids(bag: Path, topics: Sequence[str] = SHOWN_BY) -> set[str]:
     """Ids of the attacks that were drawn into at least one frame or shown on the monitor."""
     present = {topic.name for topic in read_info(bag).topics}
-    return {str(m.attack_id) for name in topics if name in present for m in _decoded(bag, name) if m.drawn}
+    return {
+        str(m.attack_id) for name in topics if name in present for m in read_decoded(bag, name) if m.drawn
+    }
 
 
 def counterfactual(bag: Path, start_real_ns: int, end_real_ns: int) -> Counterfactual | None:
@@ -143,7 +145,7 @@ def counterfactual(bag: Path, start_real_ns: int, end_real_ns: int) -> Counterfa
         return None
     rows = [
         (stamp, float(message.delta_rad), bool(message.drawn))
-        for message in _decoded(bag, COUNTERFACTUAL)
+        for message in read_decoded(bag, COUNTERFACTUAL)
         if start_real_ns <= (stamp := ns_from_stamp(message.header.stamp)) < end_real_ns
     ]
     if not rows:
@@ -158,11 +160,6 @@ def counterfactual(bag: Path, start_real_ns: int, end_real_ns: int) -> Counterfa
         float(np.abs(delta[worst])),
         (rows[worst][0] - start_real_ns) / 1e9,
     )
-
-
-def _decoded(bag: Path, topic: str) -> Iterator[Any]:
-    typename = topic_row(topic).type
-    return (decode(typename, message.cdr) for message in read_messages(bag, [topic]))
 
 
 def _stamps(bag: Path, topic: str) -> Iterator[tuple[int, int]]:

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,13 +22,13 @@ from calibration.degeneracy import DegenerateDataError, mean_rotation
 from calibration.display_colour import mean_colour, screen_region
 from calibration.schema import CalibrationError
 from calibration.vehicle import RecordedDrive
+from nodes.bags import decoded
 from nodes.bags.images import image_messages, image_topic
 from nodes.bags.parts import holds_bag
-from nodes.bags.reader import read_info, read_messages
+from nodes.bags.reader import read_info
 from nodes.runtime.errors import BagError
-from nodes.runtime.messages import decode, pose_matrix, stamp_ns
+from nodes.runtime.messages import stamp_ns
 from nodes.runtime.pictures import rgb_image
-from nodes.runtime.topics import topic as topic_row
 
 Rgb = NDArray[np.uint8]
 IMAGES, CAR, SENT = "/camera/image_raw", "/vicon/car", "/motor/sent"
@@ -75,11 +74,8 @@ class PoseSeries:
 
 def read_poses(bag: Path, topic: str) -> PoseSeries:
     """Read all finite poses of a topic, in order of their stamps."""
-    rows = {}
-    for message in _decoded(bag, topic):
-        T = pose_matrix(message)
-        if np.isfinite(T).all():
-            rows[stamp_ns(message)] = T
+    _require(bag, topic)
+    rows = dict(decoded.read_poses(bag, topic))
     if len(rows) < 2:
         raise DegenerateDataError(
             f"expected poses on {topic} in {bag}, got {len(rows)}; was motion capture on?"
@@ -120,8 +116,9 @@ def read_picture(file: Path) -> Rgb:
 
 def read_drive(bag: Path) -> RecordedDrive:
     """Read the commands sent to the motor controller, and the poses of the car."""
+    _require(bag, SENT)
     rows = []
-    for message in _decoded(bag, SENT):
+    for message in decoded.read_decoded(bag, SENT):
         written = int(message.serial_write_real_ns)
         erpm = np.nan if message.braking else float(message.erpm)
         pipeline = np.nan if message.braking else (written - stamp_ns(message)) / 1e9
@@ -215,13 +212,10 @@ def has_topic(bag: Path, topic: str) -> bool:
     return any(row.name == topic and row.count > 0 for row in read_info(bag).topics)
 
 
-def _decoded(bag: Path, topic: str) -> Iterator[Any]:
+def _require(bag: Path, topic: str) -> None:
     if not has_topic(bag, topic):
         found = ", ".join(row.name for row in read_info(bag).topics if row.count)
         raise BagError(f"expected {topic} in {bag}, got {found or 'no messages'}; record this topic too")
-    typename = topic_row(topic).type
-    for message in read_messages(bag, [topic]):
-        yield decode(typename, message.cdr)
 
 
 def _still_view(
