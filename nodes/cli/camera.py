@@ -87,9 +87,7 @@ def camera_check(
         source = parse_source(text, overrides or [])
         bench = CameraBench(source.camera(), shows=shows or "")
         print(f"{source.kind}:")
-        findings = check_camera(bench)
-        print_findings(findings)
-        met &= all(finding.met for finding in findings)
+        met &= print_findings(check_camera(bench))
         if output is not None and bench.seen:
             save_picture(bench.seen[-1].rgb, output)
             print(f"saved {output}")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from nodes.runtime.terminal import Overrides, coloured, print_table, table
+from nodes.runtime.terminal import Overrides, print_findings, print_table, table
 from nodes.runtime.termination import ends_in_order
 
 if TYPE_CHECKING:
@@ -53,15 +53,9 @@ def carla_check(
     """Say what is right and what is wrong with a server; the world is left unchanged."""
     from nodes.lab.carla.check import check_server
 
-    rows, failed = table("check", "state", "found"), False
     with ends_in_order():
         checks = check_server(_config(config, overrides, host, port), pictures=pictures)
-    for check in checks:
-        colour = {"ok": "green", "warning": "yellow", "failure": "red"}[check.state]
-        rows.add_row(check.name, coloured(check.state, colour), check.text)
-        failed |= check.state == "failure"
-    print_table(rows)
-    if failed:
+    if not print_findings(checks, "check"):
         raise typer.Exit(FAILURE_EXIT)
 
 

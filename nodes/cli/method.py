@@ -45,7 +45,6 @@ def method_check(
         say_code({"method": reference}, Path.cwd())
         findings = check_method(reference, document.data)
         print(f"{reference}:")
-        print_findings(findings)
-        met &= all(finding.met for finding in findings)
+        met &= print_findings(findings)
     if not met:
         raise typer.Exit(_FAILURE_EXIT)

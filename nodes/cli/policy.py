@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from nodes.cli import policy_train as cli_policy_train
+from nodes.runtime.findings import Finding
 from nodes.runtime.paths import shipped
-from nodes.runtime.terminal import PolicyName, coloured, print_table, table
+from nodes.runtime.terminal import PolicyName, print_findings, print_table, table
 from nodes.runtime.termination import ends_in_order
 
 if TYPE_CHECKING:
@@ -28,7 +29,6 @@ app = typer.Typer(
     help="Train a policy from recordings; evaluate, check, export and inspect any policy.",
 )
 cli_policy_train.add_to(app)
-_COLOURS = {"ok": "green", "warning": "yellow", "failure": "red"}
 _FAILURE_EXIT = 1
 
 
@@ -82,7 +82,7 @@ def policy_check(
     given scene.
     """
     from advnerf_core.attack.methods import black_box_methods
-    from advnerf_core.policies.conformance import FAILURE, check_policy
+    from advnerf_core.policies.conformance import check_policy
     from advnerf_core.policies.load import is_factory, load_adapted
     from nodes.lab.policy_reference import judged_by_drives
 
@@ -95,15 +95,7 @@ def policy_check(
     methods = black_box_methods(adapted.stateless)
     findings = check_policy(adapted, reference.images, reference.steering_rad, told, methods)
     findings = judged_by_drives(adapted, reference, findings, told)
-    rows = table("check", "state", "found")
-    for finding in findings:
-        rows.add_row(
-            finding.name,
-            coloured(finding.verdict, _COLOURS[finding.verdict]),
-            finding.text,
-        )
-    print_table(rows)
-    if any(finding.verdict == FAILURE for finding in findings):
+    if not print_findings([Finding(each.name, each.verdict, each.text) for each in findings], "check"):
         raise typer.Exit(_FAILURE_EXIT)
 
 

@@ -49,8 +49,7 @@ def world_check(
     say_code({"world": document.data}, Path.cwd())
     with ends_in_order():
         findings = check_world(read_world(document, Path.cwd()), pictures, only or [])
-    print_findings(findings)
-    if not all(finding.met for finding in findings):
+    if not print_findings(findings):
         raise typer.Exit(_FAILURE_EXIT)
 
 

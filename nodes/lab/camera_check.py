@@ -14,7 +14,7 @@ import numpy as np
 from hardware.cameras.interface import Camera, Frame
 from hardware.cameras.steady import SteadyCamera
 from hardware.errors import DeviceBusy, DeviceNotFound, LinkLost
-from nodes.runtime.findings import ContractFinding, NotMet, look
+from nodes.runtime.findings import Finding, NotMet, look_at_all
 from nodes.runtime.inbox import Inbox, ReaderThread
 
 _FRAMES = 4
@@ -304,16 +304,11 @@ CHECKS: dict[str, Check] = {
 """Parts of the contract, in the order of the report."""
 
 
-def check_camera(bench: CameraBench) -> list[ContractFinding]:
+def check_camera(bench: CameraBench) -> list[Finding]:
     """A finding for each part of the contract; the first one alone if there are no frames of the right form.
 
     Raises:
         DeviceNotFound: The device does not exist.
         DeviceBusy: Another program has it.
     """
-    findings: list[ContractFinding] = []
-    for name, check in CHECKS.items():
-        findings.append(look(name, check, bench, (DeviceNotFound, DeviceBusy)))
-        if not findings[0].met:
-            break
-    return findings
+    return look_at_all(CHECKS, bench, (DeviceNotFound, DeviceBusy))

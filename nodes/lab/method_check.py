@@ -26,7 +26,7 @@ from advnerf_core.driving.path import Path as Reference
 from advnerf_core.fields.voxel_grid import cube_face_object
 from advnerf_core.geometry import Pinhole, camera_mount, make_transform
 from advnerf_core.scene.surrogate import Surrogate
-from nodes.runtime.findings import ContractFinding, NotMet, look
+from nodes.runtime.findings import Finding, NotMet, look_at_all
 
 _CAMERA = Pinhole(width=24, height=12, fx=15.0, fy=15.0, cx=12.0, cy=6.0)
 _STEPS, _EVALUATIONS, _STOPPED_AFTER = 4, 6, 2
@@ -240,7 +240,7 @@ CHECKS: Mapping[str, Callable[[MethodBench], str]] = {
 """Parts of the contract, in the order of the report."""
 
 
-def check_method(reference: str, options: Mapping[str, Any] | None = None) -> list[ContractFinding]:
+def check_method(reference: str, options: Mapping[str, Any] | None = None) -> list[Finding]:
     """A finding for each part of the contract; the first one alone if the method cannot search at all.
 
     Args:
@@ -252,14 +252,9 @@ def check_method(reference: str, options: Mapping[str, Any] | None = None) -> li
     """
     method = load_method(reference)
     settings = replace(_SETTINGS, options=method.options(options or {}))
-    findings: list[ContractFinding] = []
     with tempfile.TemporaryDirectory(prefix="advnerf-method-") as folder:
         bench = MethodBench(method, settings, Path(folder).resolve())
-        for name, check in CHECKS.items():
-            findings.append(look(name, check, bench))
-            if not findings[0].met:
-                break
-    return findings
+        return look_at_all(CHECKS, bench)
 
 
 def _losses(result: SearchResult) -> list[tuple[float, tuple[float, ...]]]:

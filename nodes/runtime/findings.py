@@ -1,8 +1,8 @@
-"""Report of checking a plug-in against its contract: one finding for each part of the contract."""
+"""Report of a check of a plug-in, a server or a policy: one finding for each part of what is asked."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -14,23 +14,28 @@ class NotMet(Exception):
 
 
 @dataclass(frozen=True)
-class ContractFinding:
+class Finding:
     """One line of the report.
 
     Attributes:
-        name: Part of the contract.
-        met: Whether it is met.
+        name: What was checked, such as a part of a contract.
+        state: ``met`` or ``not met``; ``ok``, ``warning`` or ``failure`` where there is no contract.
         text: The finding, with numbers; if it is not met also what to change.
     """
 
     name: str
-    met: bool
+    state: str
     text: str
+
+    @property
+    def met(self) -> bool:
+        """Whether nothing needs to be changed."""
+        return self.state not in ("not met", "failure")
 
 
 def look(
     name: str, check: Callable[[T], str], bench: T, lets_through: tuple[type[Exception], ...] = ()
-) -> ContractFinding:
+) -> Finding:
     """The finding of one check.
 
     Args:
@@ -39,12 +44,23 @@ def look(
         lets_through: Errors that end the whole report. Any other error is a part that is not met.
     """
     try:
-        return ContractFinding(name, True, check(bench))
+        return Finding(name, "met", check(bench))
     except NotMet as reason:
-        return ContractFinding(name, False, str(reason))
+        return Finding(name, "not met", str(reason))
     except lets_through:
         raise
     except Exception as error:  # a plug-in may raise anything
-        return ContractFinding(
-            name, False, f"raised {type(error).__name__}: {' '.join(str(error).split()):.200}"
-        )
+        text = f"raised {type(error).__name__}: {' '.join(str(error).split()):.200}"
+        return Finding(name, "not met", text)
+
+
+def look_at_all(
+    checks: Mapping[str, Callable[[T], str]], bench: T, lets_through: tuple[type[Exception], ...] = ()
+) -> list[Finding]:
+    """The finding of each check by its name; the first one alone if it is not met. See `look`."""
+    findings: list[Finding] = []
+    for name, check in checks.items():
+        findings.append(look(name, check, bench, lets_through))
+        if not findings[0].met:
+            break
+    return findings

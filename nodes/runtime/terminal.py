@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.table import Table
     from rich.text import Text
 
-    from nodes.runtime.findings import ContractFinding
+    from nodes.runtime.findings import Finding
 
 _ADDRESS = re.compile(r"(\[[0-9a-f:]+\]|[^:/\s]+):(\d{1,5})")
 _POLICY_FILES = (".safetensors", ".onnx", ".pt2")
@@ -116,10 +116,11 @@ def say_error(text: str) -> None:
     print(f"error: {' '.join(text.split())}", file=sys.stderr, flush=True)
 
 
-def print_findings(findings: Sequence[ContractFinding]) -> None:
-    """Print what a check of a plug-in found, a line for each part of its contract."""
-    rows = table("part", "state", "found")
+def print_findings(findings: Sequence[Finding], what: str = "part") -> bool:
+    """Print what a check found, a line for each part that ``what`` names. Returns whether all of it is met."""
+    rows = table(what, "state", "found")
     for finding in findings:
-        state = coloured("met", "green") if finding.met else coloured("not met", "red")
-        rows.add_row(finding.name, state, finding.text)
+        colour = {"warning": "yellow", "failure": "red", "not met": "red"}.get(finding.state, "green")
+        rows.add_row(finding.name, coloured(finding.state, colour), finding.text)
     print_table(rows)
+    return all(finding.met for finding in findings)
