@@ -11,7 +11,6 @@ fits camera and face. If it is refused, the reason is in the status and the curr
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,23 +19,22 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field, field_validator
 
-from advnerf_core.attack.artifact import AttackFile, attack_from_bytes, load_attack
+from advnerf_core.attack.artifact import AttackFile, load_attack
 from advnerf_core.attack.projection import FaceOverlay
-from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Array, invert_transform
 from advnerf_core.strict import StrictModel
 from calibration.schema import CameraCalibration, TargetCalibration, load_calibration
+from nodes.control.attack_receiver import ATTACK_FILE, AttackReceiver
 from nodes.control.interlock import ATTACK_SWITCH, SAFETY_STATE, AttackSwitch, Interlock
 from nodes.control.pose_buffer import PoseBuffer
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError, MessageError
 from nodes.runtime.messages import header, image_message, pose_matrix, stamp_ns, types
 from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out
-from nodes.runtime.pictures import RAW_TOPIC, rgb8_message, rgb_image
+from nodes.runtime.pictures import rgb8_message, rgb_image
 from nodes.runtime.process import run_node_main
-from nodes.runtime.transfer import Assembler, ReceivedFile
 
-_CAR, _FILE = "/vicon/car", "/attack/file"
+_CAR = "/vicon/car"
 _ACTIVE_S = 1.0
 _SIZE_TOLERANCE = 0.05
 
@@ -80,13 +78,11 @@ class Showing:
         attack_id: Short hash of the attack file.
         overlay: Draws the face.
         T_car_from_camera: Pose of the camera on the car.
-        subject: Motion-capture subject of the face.
     """
 
     attack_id: str
     overlay: FaceOverlay
     T_car_from_camera: Array
-    subject: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,14 +96,10 @@ class CompositorNode(Node):
     """Joins images with poses and draws the face. See the module's docstring.
 
     Args:
-        showing: The attack to draw; None passes images through.
-        wait_s: Longest time that an image waits for poses [s].
-        extrapolation_limit_s: Longest time over which poses are then extrapolated [s].
-        max_gap_s: Longest gap in a pose stream that is interpolated [s].
-        subject: Motion-capture subject of the face; ``showing`` overrides it.
-        prepare: Prepares a new attack, or refuses it; None ignores new attacks.
-        image_topic: Topic of the images, raw or compressed.
-        interlock: Decides when the attack may be drawn; None draws it always.
+        config: Configuration.
+        camera: Camera calibration.
+        target: Calibration of the face.
+        attack: The attack to draw; None passes images through.
     """
 
     publications = ("/compositor/image", "/compositor/attack")
@@ -115,28 +107,25 @@ class CompositorNode(Node):
 
     def __init__(
         self,
-        showing: Showing | None,
-        wait_s: float = 0.025,
-        extrapolation_limit_s: float = 0.05,
-        max_gap_s: float = 0.1,
-        subject: str = "board",
-        prepare: Callable[[AttackFile], Showing] | None = None,
-        image_topic: str = RAW_TOPIC,
-        interlock: Interlock | None = None,
+        config: CompositorConfig,
+        camera: CameraCalibration,
+        target: TargetCalibration,
+        attack: AttackFile | None = None,
     ) -> None:
-        self._interlock, self._switch = interlock, AttackSwitch()
-        self._image_topic = image_topic
-        self._showing = showing
-        self._prepare = prepare
-        self._assembler = Assembler()
-        self._shown_sha256 = self._transfer_trouble = ""
-        self._taken, self._refused, self._takeover_ms = 0, 0, 0.0
-        self._wait_ns = round(wait_s * NS_PER_S)
-        self._limit_s = extrapolation_limit_s
-        self._face_topic = f"/vicon/{showing.subject if showing else subject}"
-        optional = (_FILE,) * bool(prepare) + (SAFETY_STATE,) * bool(interlock)
-        self.subscriptions = (image_topic, _CAR, self._face_topic, *optional, ATTACK_SWITCH)
-        self._poses = {topic: PoseBuffer(max_gap_s=max_gap_s) for topic in (_CAR, self._face_topic)}
+        prepare = partial(show, camera=camera, target=target, supersample=config.supersample)
+        self._interlock, self._switch = Interlock() if config.interlock else None, AttackSwitch()
+        self._image_topic = config.image_topic
+        self._showing = None if attack is None else prepare(attack)
+        self._received = AttackReceiver(prepare)
+        self._takeover_ms = 0.0
+        self._wait_ns = round(config.wait_s * NS_PER_S)
+        self._limit_s = config.extrapolation_limit_s
+        self._face_topic = f"/vicon/{target.subject}"
+        interlock = (SAFETY_STATE,) * config.interlock
+        self.subscriptions = (
+            self._image_topic, _CAR, self._face_topic, ATTACK_FILE, *interlock, ATTACK_SWITCH,
+        )  # fmt: skip
+        self._poses = {topic: PoseBuffer(max_gap_s=config.max_gap_s) for topic in (_CAR, self._face_topic)}
         self._waiting: _Waiting | None = None
         self._counts = {"images": 0, "drawn": 0, "extrapolated": 0, "dropped_no_pose": 0, "dropped_bad": 0}
         self._last_image_ns: int | None = None
@@ -149,24 +138,13 @@ class CompositorNode(Node):
         del context  # not needed
         camera = load_calibration(CameraCalibration, config.camera)
         target = load_calibration(TargetCalibration, config.target)
-        prepare = partial(show, camera=camera, target=target, supersample=config.supersample)
-        showing = None if config.attack is None else prepare(load_attack(config.attack))
-        return cls(
-            showing,
-            config.wait_s,
-            config.extrapolation_limit_s,
-            config.max_gap_s,
-            target.subject,
-            prepare,
-            config.image_topic,
-            Interlock() if config.interlock else None,
-        )
+        return cls(config, camera, target, None if config.attack is None else load_attack(config.attack))
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Handle an image, a pose, a piece of an attack, the operator's switch, or the state of the safety node."""
         self._now_ns = now.mono_ns
-        if topic == _FILE:
-            return self._take_piece(message, info, now)
+        if topic == ATTACK_FILE:
+            return self._take_piece(message, info)
         if topic == SAFETY_STATE and self._interlock is not None:
             self._interlock.heard(message, info)
             return []
@@ -186,7 +164,7 @@ class CompositorNode(Node):
             return []
         refusal = self._switch.refusal() or (self._interlock.refusal(now.mono_ns) if self._interlock else "")
         # An older image that still waits is published with the current poses, so that only one image waits.
-        before = self._finish(now) if self._waiting else []
+        before = self._finish() if self._waiting else []
         if self._showing is None or refusal:
             self._trouble = refusal
             # A raw image is forwarded as the received bytes.
@@ -210,61 +188,36 @@ class CompositorNode(Node):
             f"attack {self._showing.attack_id}" if self._showing else "no attack file, images pass through"
         )
         if self._last_image_ns is None or self._now_ns - self._last_image_ns > _ACTIVE_S * NS_PER_S:
-            return READY, "; ".join(filter(None, (f"waiting for images; {shown}", self._transfer_trouble)))
-        return ACTIVE, "; ".join(filter(None, (shown, self._trouble, self._transfer_trouble)))
+            return READY, "; ".join(filter(None, (f"waiting for images; {shown}", self._received.trouble)))
+        return ACTIVE, "; ".join(filter(None, (shown, self._trouble, self._received.trouble)))
 
     def counters(self) -> dict[str, float]:
         """Report images received, drawn on, drawn with extrapolated poses, and dropped; attacks accepted and refused."""
         counts = {key: float(value) for key, value in self._counts.items()}
-        transfers = {
-            "attacks_taken": self._taken,
-            "attacks_refused": self._refused,
-            "takeover_ms": self._takeover_ms,
-        }
-        return counts | transfers
+        taken, refused = float(self._received.taken), float(self._received.refused)
+        return counts | {"attacks_taken": taken, "attacks_refused": refused, "takeover_ms": self._takeover_ms}
 
-    def _take_piece(self, chunk: Any, info: MessageInfo, now: Now) -> list[Out]:
+    def _take_piece(self, chunk: Any, info: MessageInfo) -> list[Out]:
         """Handle a piece of a new attack. After the last piece, a valid attack replaces the current one."""
-        if self._showing is not None and chunk.sha256 == self._shown_sha256 and not self._assembler.receiving:
-            return []  # sent again for others
-        received, trouble = self._assembler.add(chunk, info.instance_id)
-        if trouble:
-            self._refuse(trouble)
-        return self._take_over(received, now) if received is not None else []
-
-    def _take_over(self, received: ReceivedFile, now: Now) -> list[Out]:
-        assert self._prepare is not None
         # This clock only measures the reported duration. No decision depends on it, so replays stay deterministic.
         start = time.perf_counter()
-        try:
-            showing = self._prepare(attack_from_bytes(received.content, f"the attack {received.name}"))
-            if showing.subject != self._face_topic.removeprefix("/vicon/"):
-                raise ConfigError(
-                    f"expected an attack for the configured subject, got {received.name} for {showing.subject}"
-                )
-        except (AdvnerfError, ValueError) as error:
-            self._refuse(str(error))
+        showing = self._received.heard(chunk, info)
+        if showing is None:
             return []
         # A waiting image was captured before the change, so it gets the old attack.
-        before = self._finish(now) if self._waiting else []
-        self._showing, self._shown_sha256, self._transfer_trouble = showing, received.sha256, ""
-        self._taken += 1
+        before = self._finish() if self._waiting else []
+        self._showing = showing
         self._takeover_ms = 1e3 * (time.perf_counter() - start)
         return before
-
-    def _refuse(self, why: str) -> None:
-        self._refused += 1
-        self._transfer_trouble = f"new attack refused: {why}"
 
     def _release(self, now: Now) -> list[Out]:
         waiting = self._waiting
         if waiting is None:
             return []
         complete = all(poses.reaches(waiting.stamp_ns) for poses in self._poses.values())
-        return self._finish(now) if complete or now.mono_ns >= waiting.deadline_mono_ns else []
+        return self._finish() if complete or now.mono_ns >= waiting.deadline_mono_ns else []
 
-    def _finish(self, now: Now) -> list[Out]:
-        del now  # only stamps matter from here on
+    def _finish(self) -> list[Out]:
         waiting, self._waiting = self._waiting, None
         assert waiting is not None
         assert self._showing is not None
@@ -312,7 +265,7 @@ def show(
             f"target is {target.subject}, {size_m[0]:.2f} x {size_m[1]:.2f} m; name the target it was made for"
         )
     overlay = FaceOverlay(face.texture, corners, camera.pinhole, camera.distortion, supersample)
-    return Showing(attack.attack_id, overlay, camera.mount, target.subject)
+    return Showing(attack.attack_id, overlay, camera.mount)
 
 
 def main() -> None:

@@ -26,7 +26,7 @@ from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError, MessageError
 from nodes.runtime.messages import header, stamp_ns, types
 from nodes.runtime.node import ACTIVE, FAULT, READY, MessageInfo, Node, NodeContext, Now, Out
-from nodes.runtime.pictures import RAW_TOPIC, rgb_image
+from nodes.runtime.pictures import rgb_image
 from nodes.runtime.priority import HELPER, take_share
 from nodes.runtime.process import run_node_main
 
@@ -75,38 +75,29 @@ class CounterfactualNode(Node):
     """Joins both images by their stamp and runs the policy on each. See the module's docstring.
 
     Args:
+        config: Configuration.
         clean: The policy for the camera's images.
         attacked: A second instance of the same policy for the compositor's images, because a policy may have a state.
-        clean_topic: Topic of the camera's images, raw or compressed.
-        goal: Goal vector, of the length that the policy expects.
-        max_age_s: Largest age of a pair since publication [s].
     """
 
     publications = (COUNTERFACTUAL_TOPIC,)
     tick_rate_hz = 5.0
 
-    def __init__(
-        self,
-        clean: Driver,
-        attacked: Driver,
-        clean_topic: str = RAW_TOPIC,
-        goal: tuple[float, ...] = (),
-        max_age_s: float = 1.0,
-    ) -> None:
+    def __init__(self, config: CounterfactualConfig, clean: Driver, attacked: Driver) -> None:
         if clean.sha256 != attacked.sha256:
             raise ConfigError(
                 f"expected the same policy twice, got {clean.sha256[:12]} and {attacked.sha256[:12]}"
             )
-        if len(goal) != clean.goal_size:
+        if len(config.goal) != clean.goal_size:
             raise ConfigError(
-                f"expected a goal of {clean.goal_size} numbers for this policy, got {len(goal)}; set 'goal'"
+                f"expected a goal of {clean.goal_size} numbers for this policy, got {len(config.goal)}; set 'goal'"
             )
-        self.subscriptions = (clean_topic, _ATTACKED, _LABEL)
+        self.subscriptions = (config.clean_topic, _ATTACKED, _LABEL)
         # A queue, because the two images and the label of a stamp arrive one after the other.
         self.queues = dict.fromkeys(self.subscriptions, _QUEUE)
-        self._clean_topic = clean_topic
-        self._clean, self._attacked, self._goal = clean, attacked, goal
-        self._max_age_ns = round(max_age_s * NS_PER_S)
+        self._clean_topic = config.clean_topic
+        self._clean, self._attacked, self._goal = clean, attacked, config.goal
+        self._max_age_ns = round(config.max_age_s * NS_PER_S)
         self._open: OrderedDict[int, dict[str, Any]] = OrderedDict()
         self._counts = {"pairs": 0, "without_partner": 0, "dropped_late": 0, "dropped_bad": 0}
         self._largest_rad = 0.0
@@ -121,7 +112,7 @@ class CounterfactualNode(Node):
         del context  # not needed
         cv2.setNumThreads(1)
         clean, attacked = (load_driver(config.policy, config.sha256 or None) for _ in range(2))
-        return cls(clean, attacked, config.clean_topic, config.goal, config.max_age_s)
+        return cls(config, clean, attacked)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Store an image or label until its partners arrive, then run the policy on both images."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,22 +17,20 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
-from advnerf_core.attack.artifact import AttackFile, attack_from_bytes, load_attack
-from advnerf_core.errors import AdvnerfError
+from advnerf_core.attack.artifact import AttackFile, load_attack
 from advnerf_core.strict import StrictModel
 from calibration.panel import MonitorPanel, make_panel, require_fits
 from calibration.schema import TargetCalibration, load_calibration
 from hardware.errors import HardwareError
 from hardware.screen.display import Display, PygameDisplay, TwinDisplay
 from hardware.screen.edid import edid_of
-from nodes.control.interlock import ATTACK_SWITCH, AttackSwitch
+from nodes.control.attack_receiver import ATTACK_FILE, AttackReceiver
+from nodes.control.interlock import ATTACK_SWITCH, SAFETY_STATE, AttackSwitch
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.messages import header, types
 from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out
 from nodes.runtime.process import run_node_main
-from nodes.runtime.transfer import Assembler, ReceivedFile
 
-_SAFETY, _FILE = "/safety/state", "/attack/file"
 _SAY_S = 0.2
 _PLAIN_PX = 8
 Colour = tuple[float, float, float]
@@ -114,14 +111,11 @@ class MonitorNode(Node):
     """Shows the attack or the plain face. See the module's docstring.
 
     Args:
+        config: Configuration.
         display: The open screen, which the node closes.
         panel: Size of the panel.
+        target: Calibration with the corners of the panel.
         attack: The attack; None for none.
-        check: Raises an error for an attack that does not fit.
-        plain_rgb: Colour of the plain face, 0..1.
-        face_m: Side of the plain face without an attack [m]; None uses the centre square.
-        interlock: Whether to show the attack only while the car is armed.
-        state_age_s: Largest age of the safety node's state [s].
     """
 
     publications = ("/monitor/attack", "/monitor/shown")
@@ -129,30 +123,27 @@ class MonitorNode(Node):
 
     def __init__(
         self,
+        config: MonitorConfig,
         display: Display,
         panel: MonitorPanel,
+        target: TargetCalibration,
         attack: AttackFile | None,
-        check: Callable[[AttackFile], None],
-        plain_rgb: Colour = (0.20, 0.62, 0.28),
-        face_m: float | None = None,
-        interlock: bool = True,
-        state_age_s: float = 0.5,
     ) -> None:
-        self._display, self._panel, self._check = display, panel, check
-        self._interlock, self._state_age_ns = interlock, round(state_age_s * NS_PER_S)
-        self.subscriptions = (_FILE, ATTACK_SWITCH, *((_SAFETY,) if interlock else ()))
+        self._display, self._panel = display, panel
+        self._interlock, self._state_age_ns = config.interlock, round(config.state_age_s * NS_PER_S)
+        self.subscriptions = (ATTACK_FILE, ATTACK_SWITCH, *((SAFETY_STATE,) if config.interlock else ()))
         self._switch = AttackSwitch()
-        self._plain = np.full((_PLAIN_PX, _PLAIN_PX, 3), np.round(255.0 * np.array(plain_rgb)), np.uint8)
-        self._face_m = min(face_m or panel.square_m, panel.square_m)
-        self._assembler = Assembler()
+        plain = np.round(255.0 * np.array(config.plain_rgb))
+        self._plain = np.full((_PLAIN_PX, _PLAIN_PX, 3), plain, np.uint8)
+        self._face_m = min(config.face_m or panel.square_m, panel.square_m)
+        self._received = AttackReceiver(partial(_fitting, panel=panel, target=target))
         self._armed, self._safety_reason, self._state_ns = False, "not armed since the start", -1
-        self._trouble = ""
-        self._taken = self._refused = self._changes = 0
+        self._changes = 0
         self._attack: AttackFile | None = None
         self._pictures: dict[bool, NDArray[np.uint8]] = {}
         self._showing: bool | None = None
         self._sha256, self._show_ms, self._said_ns = "", 0.0, 0
-        self._load(attack)
+        self._load(None if attack is None else _fitting(attack, panel, target))
 
     @classmethod
     def build(cls, config: MonitorConfig, context: NodeContext) -> MonitorNode:
@@ -169,36 +160,21 @@ class MonitorNode(Node):
                 )
             else:
                 panel = make_panel(display.size_px, target, said)
-            check = partial(require_fits, panel=panel, target=target)
-            if attack is not None:
-                check(attack)
-            return cls(
-                display,
-                panel,
-                attack,
-                check,
-                config.plain_rgb,
-                config.face_m,
-                config.interlock,
-                config.state_age_s,
-            )
+            return cls(config, display, panel, target, attack)
         except BaseException:
             display.close()
             raise
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Apply the state of the safety node or the operator's switch at once, or handle a piece of a new attack."""
-        if topic == _SAFETY:
+        if topic == SAFETY_STATE:
             self._armed, self._safety_reason = bool(message.armed), str(message.reason)
             self._state_ns = info.publish_mono_ns
         elif topic == ATTACK_SWITCH:
             self._switch.heard(message, now.real_ns)
-        elif self._attack is None or message.sha256 != self._attack_sha256 or self._assembler.receiving:
-            received, trouble = self._assembler.add(message, info.instance_id)
-            if trouble:
-                self._refuse(trouble)
-            if received is not None:
-                self._take_over(received)
+        elif (attack := self._received.heard(message, info)) is not None:
+            # Show the plain face first. `_update` then shows the new attack if allowed.
+            self._load(attack)
         return self._update(now)
 
     def tick(self, now: Now) -> list[Out]:
@@ -213,14 +189,14 @@ class MonitorNode(Node):
         """Report active while the attack is on the screen."""
         name = f"attack {self._attack.attack_id}" if self._attack else "no attack file"
         text = name if self._showing else f"plain face ({self._reason}); {name}"
-        return (ACTIVE if self._showing else READY), "; ".join(filter(None, (text, self._trouble)))
+        return (ACTIVE if self._showing else READY), "; ".join(filter(None, (text, self._received.trouble)))
 
     def counters(self) -> dict[str, float]:
         """Report shown pictures, accepted and refused attacks, and the duration of the last change."""
         return {
             "shown": self._changes,
-            "attacks_taken": self._taken,
-            "attacks_refused": self._refused,
+            "attacks_taken": self._received.taken,
+            "attacks_refused": self._received.refused,
             "show_ms": self._show_ms,
         }
 
@@ -278,31 +254,20 @@ class MonitorNode(Node):
         label = types.AttackStamp(header=head, attack_id=attack_id, drawn=attacking, reason=self._reason)
         return [Out("/monitor/attack", label), Out("/monitor/shown", shown)]
 
-    def _load(self, attack: AttackFile | None, sha256: str = "") -> None:
+    def _load(self, attack: AttackFile | None) -> None:
         face = None if attack is None else attack.required_face()
         size = (self._face_m, self._face_m) if face is None else face.size_m
         self._pictures = {False: self._panel.picture(self._plain, size)}
         if face is not None:
             self._pictures[True] = self._panel.picture(face.texture, size)
-        self._attack, self._attack_sha256 = attack, sha256
+        self._attack = attack
         self._reason = "" if attack else "no attack file"
         self._put(False)
 
-    def _take_over(self, received: ReceivedFile) -> None:
-        try:
-            attack = attack_from_bytes(received.content, f"the attack {received.name}")
-            self._check(attack)
-        except (AdvnerfError, ValueError) as error:
-            self._refuse(str(error))
-            return
-        # Show the plain face first. `_update` then shows the new attack if allowed.
-        self._load(attack, received.sha256)
-        self._taken += 1
-        self._trouble = ""
 
-    def _refuse(self, why: str) -> None:
-        self._refused += 1
-        self._trouble = f"new attack refused: {why}"
+def _fitting(attack: AttackFile, panel: MonitorPanel, target: TargetCalibration) -> AttackFile:
+    require_fits(attack, panel, target)
+    return attack
 
 
 def _open(config: MonitorOutputConfig | TwinScreenConfig) -> Display:

@@ -10,27 +10,26 @@ from __future__ import annotations
 import contextlib
 import json
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import cv2
-from pydantic import Field
 
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.view import PolicyView
-from advnerf_core.strict import StrictModel
 from calibration.schema import RoomCalibration, load_calibration
 from nodes.launching.launched import read_launched
 from nodes.operator_page import board as topics
 from nodes.operator_page.board import ViewState
 from nodes.operator_page.catalogue import read_catalogue
 from nodes.operator_page.client import ClientAct, Gone
-from nodes.operator_page.desk import Desk, DeskLimits
+from nodes.operator_page.config import PageConfig
+from nodes.operator_page.desk import Desk
 from nodes.operator_page.diary import Diary
 from nodes.operator_page.disk import DiskWriter
 from nodes.operator_page.operation import ACT, FILE, RESET, SWITCH, TELEOP, Operation, Parts
 from nodes.operator_page.pictures import ATTACKED, CAMERA, POLICY, Picture, jpeg_of, view_of_policy
 from nodes.operator_page.recording import LAUNCH_RECORDER, RECORDER, RecorderControl
-from nodes.operator_page.server import PageServer, ServerSettings
+from nodes.operator_page.server import PageServer
 from nodes.operator_page.trial import Trial
 from nodes.runtime.arm_requests import ARM
 from nodes.runtime.clock import NS_PER_S
@@ -47,47 +46,6 @@ _COMPOSITOR = "/compositor/image"
 _INBOX = 4096
 _OFF_TRACK_M = 0.4
 FOLDER, DOOR, LOG = "page", "page/door.json", "page/acts.jsonl"
-
-
-class PageConfig(StrictModel):
-    """Configuration of the page node.
-
-    Attributes:
-        host: Address to listen on. Any address other than loopback is served with TLS, and asks for the one-time code that
-            ``advnerf car page`` shows on this computer.
-        port: TCP port; 0 selects a free one.
-        names: Further names of this computer by which browsers may call it.
-        role: ``operate``, or ``watch`` for a page that only shows the launch and can stop the car.
-        room: Room calibration file with path, fence and start; empty for none.
-        policy: The policy that drives, for the picture of what it sees. ``.safetensors`` and ``.onnx`` files tell.
-        attacks: Attack files, and folders with attack files, to choose from.
-        camera_topic: Topic of the camera's images.
-        nodes: Nodes whose health is shown; none means all of the launch.
-        picture_width_px: Largest width of a picture on the page [px].
-        picture_quality: JPEG quality of the pictures, 1 to 100.
-        hold_age_limit_s: Time without an answer of the operator's browser after which the button counts as released [s].
-        picture_age_limit_s: Age of the picture on the operator's screen after which the button counts as released [s].
-        lease_s: Time without an act after which another person may operate [s].
-        code_s: Time for which a one-time code is valid [s].
-        trial_ticks: Length of a trial in control ticks of 0.1 s.
-    """
-
-    host: str = "127.0.0.1"
-    port: int = Field(default=8090, ge=0, le=65535)
-    names: tuple[str, ...] = ()
-    role: Literal["operate", "watch"] = "operate"
-    room: Path | None = None
-    policy: str = ""
-    attacks: tuple[Path, ...] = ()
-    camera_topic: Literal["/camera/image_raw", "/camera/image_raw/compressed"] = "/camera/image_raw"
-    nodes: tuple[str, ...] | None = None
-    picture_width_px: int = Field(default=480, ge=64, le=1920)
-    picture_quality: int = Field(default=75, ge=10, le=95)
-    hold_age_limit_s: float = Field(default=0.25, ge=0.1, le=0.25)
-    picture_age_limit_s: float = Field(default=1.0, ge=0.3, le=5.0)
-    lease_s: float = Field(default=120.0, ge=5.0)
-    code_s: float = Field(default=300.0, ge=1.0)
-    trial_ticks: int = Field(default=60, ge=1)
 
 
 class PageNode(Node):
@@ -111,8 +69,7 @@ class PageNode(Node):
         self._operates = config.role == "operate"
         self._stops = self._operates or launched.known
         self._holds = launched.holds
-        limits = DeskLimits(config.hold_age_limit_s, config.picture_age_limit_s, config.lease_s)
-        self._desk = Desk(limits)
+        self._desk = Desk(config)
         self._disk = DiskWriter()
         self._diary = Diary(run_dir / LOG, self._disk)
         self._recording = RecorderControl(run_dir, nodes)
@@ -138,8 +95,7 @@ class PageNode(Node):
         self._beat_ns = self._state_ns = self._door_ns = 0
         self._door_is_new = True
         self._pictures = self._trouble_count = 0
-        settings = ServerSettings(config.host, config.port, config.names, config.code_s)
-        self._server = PageServer(settings, self.inbox, self._png_of, self._welcome, self._operation.stops)
+        self._server = PageServer(config, self.inbox, self._png_of, self._welcome, self._operation.stops)
         self._server.start()
 
     @classmethod

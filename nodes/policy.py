@@ -60,39 +60,25 @@ class PolicyNode(Node):
     """Turns images into drive commands.
 
     Args:
+        config: Configuration.
         driver: The policy with its view.
-        image_topic: Topic of the images.
-        speed_mps: Speed of the commands [m/s].
-        max_age_s: Largest age of an image [s].
-        goal: Goal vector, of the length that the policy expects.
-        planned_speed: Whether the waypoints of the policy say the speed, up to ``speed_mps``.
     """
 
     publications = (_DRIVE,)
     tick_rate_hz = 10.0
 
-    def __init__(
-        self,
-        driver: Driver,
-        image_topic: str = "/compositor/image",
-        speed_mps: float = 0.8,
-        max_age_s: float = 0.15,
-        goal: tuple[float, ...] = (),
-        planned_speed: bool = False,
-    ) -> None:
-        if len(goal) != driver.goal_size:
+    def __init__(self, config: PolicyNodeConfig, driver: Driver) -> None:
+        if len(config.goal) != driver.goal_size:
             raise ConfigError(
-                f"expected a goal of {driver.goal_size} numbers for this policy, got {len(goal)}; set 'goal'"
+                f"expected a goal of {driver.goal_size} numbers for this policy, got {len(config.goal)}; set 'goal'"
             )
-        if planned_speed and driver.contract.trajectory is None:
+        if config.planned_speed and driver.contract.trajectory is None:
             raise ConfigError(
                 "expected a policy that answers with waypoints for planned_speed, got one that steers; leave planned_speed out"
             )
-        self.subscriptions = (image_topic,)
-        self._driver = driver
-        self._goal = goal
-        self._speed_mps, self._planned_speed = speed_mps, planned_speed
-        self._max_age_ns = round(max_age_s * NS_PER_S)
+        self.subscriptions = (config.image_topic,)
+        self._config, self._driver = config, driver
+        self._max_age_ns = round(config.max_age_s * NS_PER_S)
         self._counts = {"images": 0, "dropped_stale": 0, "dropped_bad": 0}
         self._inference_ms = 0.0
         self._last_drive_ns: int | None = None
@@ -107,10 +93,7 @@ class PolicyNode(Node):
         del context  # not needed
         # One thread: with one image at a time, more would take cores from the other nodes and add wake-up delays.
         cv2.setNumThreads(1)
-        driver = load_driver(config.policy, config.sha256 or None)
-        return cls(
-            driver, config.image_topic, config.speed_mps, config.max_age_s, config.goal, config.planned_speed
-        )
+        return cls(config, load_driver(config.policy, config.sha256 or None))
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Compute a command from an image, unless the image is too old or does not fit the policy."""
@@ -171,11 +154,11 @@ class PolicyNode(Node):
         """Steering [rad] and speed [m/s]."""
         # This clock only measures the reported duration. No decision depends on it, so replays stay deterministic.
         start = time.perf_counter()
-        steering_rad, planned_mps = self._driver.command(self._driver.view.image(rgb), self._goal)
+        steering_rad, planned_mps = self._driver.command(self._driver.view.image(rgb), self._config.goal)
         self._inference_ms = 1e3 * (time.perf_counter() - start)
-        if planned_mps is None or not self._planned_speed:
-            return steering_rad, self._speed_mps
-        return steering_rad, float(np.minimum(planned_mps, self._speed_mps))  # NaN stays
+        if planned_mps is None or not self._config.planned_speed:
+            return steering_rad, self._config.speed_mps
+        return steering_rad, float(np.minimum(planned_mps, self._config.speed_mps))  # NaN stays
 
     def _warm_up(self) -> None:
         camera = self._driver.view.camera

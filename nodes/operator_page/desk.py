@@ -11,25 +11,11 @@ from __future__ import annotations
 from collections import OrderedDict
 from dataclasses import dataclass
 
+from nodes.operator_page.config import PageConfig
 from nodes.runtime.clock import NS_PER_S
 
 _BEATS_KEPT = 64
 _STOPPED = "the emergency stop is latched; release it first"
-
-
-@dataclass(frozen=True)
-class DeskLimits:
-    """Time limits of the desk.
-
-    Attributes:
-        hold_age_s: Age of the newest answered beat after which the button counts as released [s].
-        picture_age_s: Age of the picture on the operator's screen after which the button counts as released [s].
-        lease_s: Time without an act after which the desk is free again [s].
-    """
-
-    hold_age_s: float = 0.25
-    picture_age_s: float = 1.0
-    lease_s: float = 120.0
 
 
 @dataclass(frozen=True)
@@ -51,15 +37,15 @@ class Desk:
     """Decides who operates and whether the button counts as held.
 
     Args:
-        limits: Time limits.
+        limits: Configuration, with the time limits.
 
     Attributes:
         lease: The current lease; None while the desk is free.
         estop: Whether the e-stop is latched.
     """
 
-    def __init__(self, limits: DeskLimits | None = None) -> None:
-        self.limits = limits or DeskLimits()
+    def __init__(self, limits: PageConfig) -> None:
+        self.limits = limits
         self.lease: Lease | None = None
         self.estop = False
         self._beats: OrderedDict[int, int] = OrderedDict()
@@ -142,7 +128,7 @@ class Desk:
         if press != self._press and press <= self._last_press:
             return "this press has ended; release the button and hold it again"
         sent_ns = self._beats.get(beat)
-        if sent_ns is None or mono_ns - sent_ns > self.limits.hold_age_s * NS_PER_S:
+        if sent_ns is None or mono_ns - sent_ns > self.limits.hold_age_limit_s * NS_PER_S:
             return "the answer of the page is too old"  # it does not renew the hold, and `check` ends it
         if refusal := self._problem(picture_ns, mono_ns):
             self._last_press = max(self._last_press, press)
@@ -184,7 +170,7 @@ class Desk:
         if self._press is not None:
             ended = ""
             age_s = (mono_ns - self._answered_ns) / NS_PER_S
-            if age_s > self.limits.hold_age_s:
+            if age_s > self.limits.hold_age_limit_s:
                 ended = f"the page has not answered for {age_s:.2f} s"
             else:
                 ended = self._problem(self._picture_ns, mono_ns)
@@ -207,7 +193,7 @@ class Desk:
         if not picture_ns:
             return "the page has shown no picture yet"
         age_s = (mono_ns - picture_ns) / NS_PER_S
-        if age_s > self.limits.picture_age_s:
+        if age_s > self.limits.picture_age_limit_s:
             return f"the picture on the page is {age_s:.1f} s old"
         return ""
 

@@ -20,6 +20,7 @@ from typing import Any
 from nodes.linking.keys import is_loopback
 from nodes.operator_page.certificate import Certificate, certificate
 from nodes.operator_page.client import Client, ClientAct, Gone, Misuse
+from nodes.operator_page.config import PageConfig
 from nodes.operator_page.doors import COOKIE, Sessions, origin_is_ours, peer_is_same_user
 from nodes.operator_page.listening import bound_socket, require_packages
 from nodes.operator_page.pictures import Picture
@@ -34,23 +35,6 @@ _MOST_CONNECTIONS = 96
 _WRONG_CODE_S = 1.0
 _CONFIRM_S, _LOOK_S = 0.9, 0.02
 _START_S = 10.0
-
-
-@dataclass(frozen=True)
-class ServerSettings:
-    """Address and options of the web server.
-
-    Attributes:
-        host: Address to listen on.
-        port: TCP port; 0 selects a free one.
-        names: Further host names of this computer.
-        code_s: Time for which a one-time code is valid [s].
-    """
-
-    host: str = "127.0.0.1"
-    port: int = 8090
-    names: tuple[str, ...] = ()
-    code_s: float = 300.0
 
 
 @dataclass
@@ -79,7 +63,7 @@ class PageServer:
         stops: Returns the number of requests to stop, and the number up to which they are confirmed.
     """
 
-    settings: ServerSettings
+    settings: PageConfig
     inbox: Inbox[Any]
     png_of: Callable[[str], bytes | None]
     welcome: Callable[[], Mapping[str, Any]]

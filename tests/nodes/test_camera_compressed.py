@@ -13,7 +13,7 @@ from advnerf_core.policies.policy_file import LoadedPolicy
 from advnerf_core.policies.torch_driver import TorchDriver
 from advnerf_core.policies.view import PolicyView
 from nodes.compositor import CompositorConfig, CompositorNode
-from nodes.policy import PolicyNode
+from nodes.policy import PolicyNode, PolicyNodeConfig
 from nodes.runtime.clock import ManualClock
 from nodes.runtime.messages import decode, encode, image_message, stamp_ns, type_name
 from nodes.runtime.node import MessageInfo, NodeContext
@@ -79,9 +79,8 @@ def test_compositor_listens_to_cameras_only():
 def test_policy_steers_nearly_as_with_the_raw_picture():
     torch.manual_seed(0)
     view = PolicyView(Pinhole(336, 188, 173.97, 173.97, 168.0, 94.0))
-    node = PolicyNode(
-        TorchDriver(LoadedPolicy(PilotNet(0).eval().requires_grad_(False), view, {}, "ab" * 32))
-    )
+    loaded = LoadedPolicy(PilotNet(0).eval().requires_grad_(False), view, {}, "ab" * 32)
+    node = PolicyNode(PolicyNodeConfig(policy="policy"), TorchDriver(loaded))
     (raw,) = hand_over(node, image_message(picture(), T0, "camera"))
     (small,) = hand_over(node, compressed_image_message(picture(), T0, "camera", 95))
     assert stamp_ns(small.message) == T0

@@ -1,7 +1,6 @@
 import subprocess
 import sys
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ from advnerf_core.attack.artifact import AttackFile, AttackFileError, face_textu
 from advnerf_core.attack.projection import FaceOverlay
 from advnerf_core.geometry import Pinhole, invert_transform, make_transform, planar_pose, rotation_z
 from calibration.schema import CameraCalibration, TargetCalibration, load_calibration
-from nodes.compositor import CompositorConfig, CompositorNode, show
+from nodes.compositor import CompositorConfig, CompositorNode
 from nodes.runtime.clock import ManualClock
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.messages import decode, encode, image_message, pose_message, stamp_ns, type_name
@@ -99,9 +98,14 @@ class Bench:
         ]
 
 
+def node_of(first=None, **settings):
+    files = {"camera": CALIBRATION / "camera.yaml", "target": CALIBRATION / "board.yaml"}
+    return CompositorNode(CompositorConfig(**files, **settings), CAMERA, TARGET, first)
+
+
 @pytest.fixture
 def bench():
-    return Bench(CompositorNode(show(attack(), CAMERA, TARGET)))
+    return Bench(node_of(attack()))
 
 
 def expected_image(t_s, value=90):
@@ -192,7 +196,7 @@ def test_out_of_view_passes_the_image_unchanged_and_says_so(bench):
 
 
 def test_without_an_attack_file_images_pass_at_once():
-    bench = Bench(CompositorNode(None))
+    bench = Bench(node_of())
     bench.image(0.0)
     (image,), (label,) = bench.images(), bench.labels()
     assert (rgb_image(image, "test") == 90).all()
@@ -204,7 +208,7 @@ def test_without_an_attack_file_images_pass_at_once():
 
 def test_any_order_of_arrival_before_the_deadline_gives_the_same_bytes():
     def run(order):
-        bench = Bench(CompositorNode(show(attack(), CAMERA, TARGET)))
+        bench = Bench(node_of(attack()))
         events = [lambda t=t: bench.poses(t) for t in (0.0, 0.01, 0.02, 0.03)] + [lambda: bench.image(0.024)]
         for k in order:
             events[k]()
@@ -240,10 +244,6 @@ def test_build_reads_the_files_and_refuses_wrong_ones(tmp_path):
         CompositorConfig(atack=path, **files)
 
 
-def listening(showing=None):
-    return Bench(CompositorNode(showing, prepare=partial(show, camera=CAMERA, target=TARGET)))
-
-
 def file_of(tmp_path, **changes):
     save_attack(tmp_path / "new.safetensors", attack(**changes))
     return (tmp_path / "new.safetensors").read_bytes()
@@ -256,7 +256,7 @@ def drive_by(bench, t_s):
 
 
 def test_a_new_attack_is_taken_over_between_two_images_and_every_label_names_what_was_drawn(tmp_path):
-    bench = listening(show(attack(), CAMERA, TARGET))
+    bench = Bench(node_of(attack()))
     drive_by(bench, 0.1)
     chunks = chunk_messages(file_of(tmp_path, seed=7), "new", T0)
     assert len(chunks) > 0
@@ -278,7 +278,7 @@ def test_a_new_attack_is_taken_over_between_two_images_and_every_label_names_wha
 
 
 def test_without_an_attack_the_first_one_is_shown_when_it_comes(tmp_path):
-    bench = listening()
+    bench = Bench(node_of())
     drive_by(bench, 0.1)
     for chunk in chunk_messages(file_of(tmp_path), "new", T0):
         bench.send("/attack/file", chunk)
@@ -315,7 +315,7 @@ def broken(case, tmp_path):
     ],
 )
 def test_what_is_wrong_with_a_new_attack_is_said_and_the_old_one_stays(case, reason, tmp_path):
-    bench = listening(show(attack(seed=3), CAMERA, TARGET))
+    bench = Bench(node_of(attack(seed=3)))
     for chunk in broken(case, tmp_path):
         bench.send("/attack/file", chunk)
     drive_by(bench, 0.1)

@@ -63,6 +63,10 @@ def drivers(policy):
     return load_driver(policy), load_driver(policy)
 
 
+def node_of(clean, attacked, **settings):
+    return CounterfactualNode(CounterfactualConfig(policy="policy", **settings), clean, attacked)
+
+
 def picture(seed):
     return np.random.default_rng(seed).integers(0, 256, (188, 336, 3), dtype=np.uint8)
 
@@ -91,7 +95,7 @@ def give(node, *entries, mono_ms=100, published_ms=95):
 
 
 def test_both_images_of_a_stamp_go_through_the_policy_in_any_order(drivers, policy):
-    node = CounterfactualNode(*drivers)
+    node = node_of(*drivers)
     clean = picture(0)
     entries = [(CLEAN, image(clean, 0)), (ATTACKED, image(attacked(clean), 0)), (LABEL, label(0))]
     for order in ((0, 1, 2), (2, 1, 0), (1, 0, 2)):
@@ -116,14 +120,14 @@ def test_both_images_of_a_stamp_go_through_the_policy_in_any_order(drivers, poli
 
 
 def test_an_image_without_attack_differs_by_nothing(drivers):
-    node = CounterfactualNode(*drivers)
+    node = node_of(*drivers)
     clean = image(picture(1), 0)
     (said,) = give(node, (CLEAN, clean), (ATTACKED, clean), (LABEL, label(0, drawn=False)))
     assert (said.delta_rad, said.changed, said.drawn) == (0.0, 0.0, False)
 
 
 def test_the_clean_image_of_a_wireless_link_is_the_one_that_the_compositor_drew_on(drivers):
-    node = CounterfactualNode(*drivers, clean_topic="/camera/image_raw/compressed")
+    node = node_of(*drivers, clean_topic="/camera/image_raw/compressed")
     sent = compressed_image_message(picture(2), START_NS, "camera", 90)
     seen = cv2.imdecode(np.asarray(sent.data), cv2.IMREAD_COLOR)[:, :, ::-1]
     entries = [
@@ -136,7 +140,7 @@ def test_the_clean_image_of_a_wireless_link_is_the_one_that_the_compositor_drew_
 
 
 def test_what_has_no_partner_is_late_or_does_not_fit_is_left_out_and_counted(drivers):
-    node = CounterfactualNode(*drivers)
+    node = node_of(*drivers)
     for k in range(30):  # a compositor that drops every image
         assert give(node, (CLEAN, image(picture(0), 100 * k))) == []
     assert node.counters()["without_partner"] == 18
@@ -156,13 +160,13 @@ def test_what_has_no_partner_is_late_or_does_not_fit_is_left_out_and_counted(dri
 
 def test_one_policy_its_goal_and_a_compositor(drivers, policy):
     with pytest.raises(ConfigError, match="expected a goal of 0 numbers"):
-        CounterfactualNode(*drivers, goal=(1.0,))
+        node_of(*drivers, goal=(1.0,))
 
     class Other:
         sha256, goal_size, view = "0" * 64, 0, drivers[0].view
 
     with pytest.raises(ConfigError, match="the same policy twice"):
-        CounterfactualNode(drivers[0], Other())
+        node_of(drivers[0], Other())
     with pytest.raises(ConfigError, match="there is no clean image to compare with"):
         validate(CounterfactualConfig, parse_yaml(f"policy: {policy}\nshown_by: monitor", "a.yaml"))
     context = NodeContext("counterfactual", policy.parent, None)

@@ -5,8 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from nodes.compositor import CompositorNode, show
-from nodes.control.interlock import Interlock
 from nodes.runtime.messages import decode, encode, header, types
 from nodes.runtime.wire import MessageInfo
 
@@ -47,8 +45,7 @@ def drawn(bench, t_s):
 
 
 def test_nothing_is_drawn_unless_armed_and_fresh():
-    showing = show(bench_of.attack(), bench_of.CAMERA, bench_of.TARGET)
-    bench = bench_of.Bench(CompositorNode(showing, interlock=Interlock()))
+    bench = bench_of.Bench(bench_of.node_of(bench_of.attack(), interlock=True))
     assert "/safety/state" in bench.node.subscriptions
     assert drawn(bench, 0.0) == (False, "interlock: no message from the safety node")
     say(bench, True)
@@ -69,8 +66,7 @@ def switch(bench, show_it):
 
 
 def test_the_operator_switches_the_attack_off_and_on_but_never_past_the_interlock():
-    showing = show(bench_of.attack(), bench_of.CAMERA, bench_of.TARGET)
-    bench = bench_of.Bench(CompositorNode(showing, interlock=Interlock()))
+    bench = bench_of.Bench(bench_of.node_of(bench_of.attack(), interlock=True))
     say(bench, True)
     assert drawn(bench, 0.1) == (True, "")
     switch(bench, False)

@@ -1,6 +1,7 @@
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,6 +35,10 @@ def _loaded(goal_size: int = 0) -> LoadedPolicy:
     return LoadedPolicy(PilotNet(goal_size).eval().requires_grad_(False), VIEW, {}, "ab" * 32)
 
 
+def _node(driver: TorchDriver, **settings: Any) -> PolicyNode:
+    return PolicyNode(PolicyNodeConfig(policy="policy", **settings), driver)
+
+
 def _rgb(value: int = 90, shape: tuple[int, int, int] = (188, 336, 3)) -> np.ndarray:
     return (np.random.default_rng(value).random(shape) * 255).astype(np.uint8)
 
@@ -47,7 +52,7 @@ def _send(node: PolicyNode, message, captured_ms: int = 30, published_ms: int = 
 
 
 def test_steers_like_the_policy_and_keeps_the_capture_stamp() -> None:
-    node, rgb = PolicyNode(TorchDriver(_loaded()), speed_mps=0.7), _rgb()
+    node, rgb = _node(TorchDriver(_loaded()), speed_mps=0.7), _rgb()
     (out,) = _send(node, image_message(rgb, T0, "camera"))
     assert out.topic == "/policy/drive"
     assert stamp_ns(out.message) == T0
@@ -61,7 +66,7 @@ def test_steers_like_the_policy_and_keeps_the_capture_stamp() -> None:
 
 @pytest.mark.parametrize(("captured_ms", "published_ms"), [(151, 2), (30, 151)])
 def test_stale_images_are_refused(captured_ms: int, published_ms: int) -> None:
-    node = PolicyNode(TorchDriver(_loaded()))
+    node = _node(TorchDriver(_loaded()))
     assert _send(node, image_message(_rgb(), T0, "camera"), captured_ms, published_ms) == []
     assert node.counters()["dropped_stale"] == 1
     assert node.status() == ("ready", "image is 151 ms old")
@@ -70,7 +75,7 @@ def test_stale_images_are_refused(captured_ms: int, published_ms: int) -> None:
 
 
 def test_images_that_the_policy_does_not_know_are_a_fault() -> None:
-    node = PolicyNode(TorchDriver(_loaded()))
+    node = _node(TorchDriver(_loaded()))
     assert _send(node, image_message(_rgb(shape=(94, 168, 3)), T0, "camera")) == []
     assert node.status() == ("fault", "expected images of 336 x 188, got 168 x 94; train for this camera")
     depth = image_message(_rgb(), T0, "camera")
@@ -85,7 +90,7 @@ def test_images_that_the_policy_does_not_know_are_a_fault() -> None:
 
 def test_a_policy_that_is_not_finite_sends_nothing() -> None:
     loaded = _loaded()
-    node = PolicyNode(TorchDriver(loaded))
+    node = _node(TorchDriver(loaded))
     with torch.no_grad():
         loaded.policy.head[-1].bias.fill_(float("nan"))
     assert _send(node, image_message(_rgb(), T0, "camera")) == []
@@ -93,7 +98,7 @@ def test_a_policy_that_is_not_finite_sends_nothing() -> None:
 
 
 def test_status_shows_that_images_have_stopped() -> None:
-    node = PolicyNode(TorchDriver(_loaded()))
+    node = _node(TorchDriver(_loaded()))
     assert node.status() == ("ready", "policy abababababab, waiting for images")
     _send(node, image_message(_rgb(), T0, "camera"))
     clock = ManualClock(mono_ns=10**10 + 1100 * MS)
@@ -121,15 +126,15 @@ def test_built_from_a_file_with_its_hash(tmp_path: Path) -> None:
 
 def test_goal_must_fit_the_policy() -> None:
     with pytest.raises(ConfigError, match="goal of 3 numbers for this policy, got 0"):
-        PolicyNode(TorchDriver(_loaded(goal_size=3)))
-    node = PolicyNode(TorchDriver(_loaded(goal_size=3)), goal=(0.0, 1.0, 0.0))
+        _node(TorchDriver(_loaded(goal_size=3)))
+    node = _node(TorchDriver(_loaded(goal_size=3)), goal=(0.0, 1.0, 0.0))
     assert len(_send(node, image_message(_rgb(), T0, "camera"))) == 1
 
 
 def test_a_policy_of_several_images_forgets_them_after_a_gap() -> None:
     contract = PolicyContract(VIEW, frames=FrameStack(count=2, axis="time"))
     network = adapt(lambda stack: stack.mean((2, 3, 4)) @ torch.tensor([0.5, 1.0]), contract)
-    node = PolicyNode(TorchDriver(LoadedPolicy(network, VIEW, {}, "ab" * 32)))
+    node = _node(TorchDriver(LoadedPolicy(network, VIEW, {}, "ab" * 32)))
     greys = [np.full((188, 336, 3), value, np.uint8) for value in (51, 102, 204)]
 
     def steered(grey: np.ndarray, at_ms: int) -> float:
@@ -156,14 +161,14 @@ def test_the_speed_of_waypoints_is_used_where_it_is_asked_for() -> None:
     loaded, image = LoadedPolicy(network, VIEW, {}, "ab" * 32), np.full((188, 336, 3), 255, np.uint8)
 
     def speed(**settings: object) -> float:
-        (out,) = _send(PolicyNode(TorchDriver(loaded), **settings), image_message(image, T0, "camera"))
+        (out,) = _send(_node(TorchDriver(loaded), **settings), image_message(image, T0, "camera"))
         return float(out.message.drive.speed)
 
     assert speed(speed_mps=0.8) == pytest.approx(0.8)
     assert speed(speed_mps=0.8, planned_speed=True) == pytest.approx(0.6)
     assert speed(speed_mps=0.4, planned_speed=True) == pytest.approx(0.4), "the node's own is the limit"
     with pytest.raises(ConfigError, match="answers with waypoints for planned_speed"):
-        PolicyNode(TorchDriver(_loaded()), planned_speed=True)
+        _node(TorchDriver(_loaded()), planned_speed=True)
 
 
 def test_an_onnx_policy_steers_alike_in_a_process_without_torch(tmp_path: Path) -> None:
@@ -195,7 +200,7 @@ print(out.message.drive.steering_angle)
 
 
 def test_a_camera_that_sends_bgr_is_steered_by_in_its_true_colours() -> None:
-    node, rgb = PolicyNode(TorchDriver(_loaded())), _rgb()
+    node, rgb = _node(TorchDriver(_loaded())), _rgb()
     (straight,) = _send(node, image_message(rgb, T0, "camera"))
     (turned,) = _send(node, image_message(np.ascontiguousarray(rgb[..., ::-1]), T0, "camera", "bgr8"))
     assert turned.message.drive.steering_angle == straight.message.drive.steering_angle

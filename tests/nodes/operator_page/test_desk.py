@@ -3,10 +3,11 @@
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nodes.operator_page.desk import Desk, DeskLimits
+from nodes.operator_page.config import PageConfig
+from nodes.operator_page.desk import Desk
 
 MS = 1_000_000
-LIMITS = DeskLimits(hold_age_s=0.25, picture_age_s=1.0, lease_s=10.0)
+LIMITS = PageConfig(lease_s=10.0)
 
 
 class Bench:
