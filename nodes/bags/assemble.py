@@ -17,13 +17,12 @@ from mcap.records import (
     Header,
     Metadata,
     MetadataIndex,
-    Statistics,
     SummaryOffset,
 )
 
 from nodes.bags.metadata import Contents, rosbag2_metadata
 from nodes.bags.part import LIBRARY, PROFILE
-from nodes.bags.records import MAGIC, RECORD_HEAD
+from nodes.bags.records import MAGIC, RECORD_HEAD, bytes_of
 from nodes.bags.scanned import Piece, Scan
 
 ENDS, REPAIRS = "advnerf_end", "advnerf_repair"
@@ -58,14 +57,7 @@ def recorded_here(scan: Scan) -> bool:
 
 def contents_of(scan: Scan) -> Contents:
     """Contents of ``metadata.yaml``."""
-    contents = Contents(start_ns=scan.start_ns, end_ns=scan.end_ns)
-    for channel in scan.channels.values():
-        schema = scan.schemas.get(channel.schema_id)
-        contents.add_topic(
-            channel.topic, schema.name if schema else "", channel.metadata.get("topic_type_hash", "")
-        )
-        contents.counts[channel.topic] += scan.counts.get(channel.id, 0)
-    return contents
+    return Contents.of(scan.channels, scan.schemas, scan.counts, (scan.start_ns, scan.end_ns))
 
 
 def assemble(scan: Scan, file_name: str, notes: dict[str, str]) -> FileLayout:
@@ -100,12 +92,12 @@ def assemble(scan: Scan, file_name: str, notes: dict[str, str]) -> FileLayout:
 def _with_what_is_missing(scan: Scan) -> list[Piece]:
     pieces = list(scan.pieces)
     if scan.lost_definitions and scan.insert_at is not None:
-        pieces.insert(scan.insert_at, Piece(0, 0, content=b"".join(map(_bytes_of, scan.lost_definitions))))
+        pieces.insert(scan.insert_at, Piece(0, 0, content=b"".join(map(bytes_of, scan.lost_definitions))))
     if scan.header is None:
         profile = (
             PROFILE if any(channel.message_encoding == "cdr" for channel in scan.channels.values()) else ""
         )
-        pieces.insert(0, Piece(0, 0, content=_bytes_of(Header(profile, LIBRARY + " repair"))))
+        pieces.insert(0, Piece(0, 0, content=bytes_of(Header(profile, LIBRARY + " repair"))))
     return pieces
 
 
@@ -145,10 +137,10 @@ def _metadata(scan: Scan, file_name: str, notes: dict[str, str], at: int, entrie
     records.append(Metadata(REPAIRS, notes))
     content = b""
     for record in records:
-        row = _bytes_of(record)
+        row = bytes_of(record)
         entries.append(MetadataIndex(offset=at + len(content), length=len(row), name=record.name))
         content += row
-    return content + _bytes_of(DataEnd(0))
+    return content + bytes_of(DataEnd(0))
 
 
 def _ending(scan: Scan, entries: Sequence[Any], start: int) -> bytes:
@@ -159,23 +151,14 @@ def _ending(scan: Scan, entries: Sequence[Any], start: int) -> bytes:
         + start.to_bytes(8, "little")
         + offsets_start.to_bytes(8, "little")
     )
-    return summary + _bytes_of(Footer(start, offsets_start, zlib.crc32(head, zlib.crc32(summary)))) + MAGIC
+    return summary + bytes_of(Footer(start, offsets_start, zlib.crc32(head, zlib.crc32(summary)))) + MAGIC
 
 
 def _summary(scan: Scan, entries: Sequence[Any], start: int) -> tuple[bytes, int]:
     """Bytes of the summary section that begins at ``start``, and the offset of its table of offsets."""
     kinds = {kind: [entry for entry in entries if isinstance(entry, kind)] for kind in _KINDS}
-    statistics = Statistics(
-        attachment_count=len(kinds[AttachmentIndex]),
-        channel_count=len(scan.channels),
-        channel_message_counts=dict(scan.counts),
-        chunk_count=len(kinds[ChunkIndex]),
-        message_count=scan.messages,
-        message_end_time=scan.end_ns,
-        message_start_time=scan.start_ns,
-        metadata_count=len(kinds[MetadataIndex]),
-        schema_count=len(scan.schemas),
-    )
+    counts = [len(kinds[kind]) for kind in (AttachmentIndex, ChunkIndex, MetadataIndex)]
+    statistics = scan.statistics(*counts)
     groups: list[tuple[int, list[Any]]] = [
         (Opcode.SCHEMA, list(scan.schemas.values())),
         (Opcode.CHANNEL, list(scan.channels.values())),
@@ -198,9 +181,3 @@ def _summary(scan: Scan, entries: Sequence[Any], start: int) -> tuple[bytes, int
 _KINDS: dict[Any, int] = {
     ChunkIndex: Opcode.CHUNK_INDEX, AttachmentIndex: Opcode.ATTACHMENT_INDEX, MetadataIndex: Opcode.METADATA_INDEX,
 }  # fmt: skip
-
-
-def _bytes_of(record: Any) -> bytes:
-    builder = RecordBuilder()
-    record.write(builder)
-    return bytes(builder.end())

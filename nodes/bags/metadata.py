@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -38,6 +38,23 @@ class Contents:
     def messages(self) -> int:
         """Number of messages."""
         return sum(self.counts.values())
+
+    @classmethod
+    def of(
+        cls,
+        channels: Mapping[int, Any],
+        schemas: Mapping[int, Any],
+        counts: Mapping[int, int],
+        span_ns: tuple[int, int],
+    ) -> Contents:
+        """Contents of a file: its records and its numbers of messages, by id, and the log times of the first and the last message."""
+        contents = cls(start_ns=span_ns[0], end_ns=span_ns[1])
+        for channel in channels.values():
+            schema = schemas.get(channel.schema_id)
+            rihs = channel.metadata.get("topic_type_hash", "")
+            contents.add_topic(channel.topic, schema.name if schema else "", rihs)
+            contents.counts[channel.topic] += counts.get(channel.id, 0)
+        return contents
 
     def add_topic(self, topic: str, typename: str, rihs: str) -> None:
         """Add a topic."""

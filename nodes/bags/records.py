@@ -8,7 +8,7 @@ import zlib
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-from mcap.data_stream import ReadDataStream
+from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Attachment
 
@@ -66,6 +66,13 @@ def record_at(buffer: Any, at: int, limit: int) -> tuple[int, int, int]:
     if length > limit - body:
         raise Damaged(f"a record claims {length} bytes, but {limit - body} are left")
     return opcode, body, body + length
+
+
+def bytes_of(record: Any) -> bytes:
+    """Bytes of a record with its head."""
+    builder = RecordBuilder()
+    record.write(builder)
+    return bytes(builder.end())
 
 
 def chunk_head(buffer: Any, body: int, length: int | None) -> ChunkHead:

@@ -28,7 +28,7 @@ from nodes.bags.journal import RESERVE_BYTES, RESERVE_NAME, JournalEntry, journa
 from nodes.bags.metadata import rosbag2_metadata
 from nodes.bags.parts import METADATA_FILE, bag_parts
 from nodes.bags.scan import scan_file
-from nodes.bags.scanned import Piece, Scan
+from nodes.bags.scanned import Piece, Scan, chunk_index
 from nodes.runtime.errors import BagError
 from nodes.runtime.messages import type_definition, type_hash
 from nodes.runtime.topics import topic as topic_row
@@ -337,18 +337,8 @@ def _add_journal(scan: Scan, path: Path) -> None:
         channel_id = ids[entry.topic]
         indexes.setdefault(channel_id, []).append((entry.log_ns, builder.count))
         Message(channel_id, entry.log_ns, entry.cdr, entry.publish_ns, entry.sequence).write(builder)
-        _count(scan, channel_id, entry)
+        scan.count(channel_id, entry.sequence, entry.log_ns)
     scan.pieces.append(_chunk_piece(bytes(builder.end()), entries, indexes))
-
-
-def _count(scan: Scan, channel_id: int, entry: JournalEntry) -> None:
-    scan.start_ns = min(scan.start_ns, entry.log_ns) if scan.counts else entry.log_ns
-    scan.end_ns = max(scan.end_ns, entry.log_ns)
-    scan.counts[channel_id] = scan.counts.get(channel_id, 0) + 1
-    last = scan.sequences.get(channel_id)
-    if last is not None and entry.sequence > last + 1:
-        scan.gaps[channel_id] = scan.gaps.get(channel_id, 0) + entry.sequence - last - 1
-    scan.sequences[channel_id] = entry.sequence
 
 
 def _chunk_piece(
@@ -361,17 +351,8 @@ def _chunk_piece(
     for channel_id, rows in indexes.items():
         offsets[channel_id] = builder.count
         MessageIndex(channel_id, rows).write(builder)
-    record = ChunkIndex(
-        chunk_length=length,
-        chunk_start_offset=0,
-        compression="",
-        compressed_size=len(data),
-        message_end_time=end_ns,
-        message_index_length=builder.count - length,
-        message_index_offsets=offsets,
-        message_start_time=start_ns,
-        uncompressed_size=len(data),
-    )
+    record = chunk_index(0, length, (start_ns, end_ns), len(data))
+    record.message_index_length, record.message_index_offsets = builder.count - length, offsets
     return Piece(0, 0, record, bytes(builder.end()))
 
 

@@ -72,11 +72,5 @@ def _contents(part: Path) -> Contents:
             f"{part}: expected a summary with statistics after the repair, got none; repair it again"
         )
     summary, statistics = found
-    contents = Contents(start_ns=statistics.message_start_time, end_ns=statistics.message_end_time)
-    for channel in summary.channels.values():
-        schema = summary.schemas.get(channel.schema_id)
-        contents.add_topic(
-            channel.topic, "" if schema is None else schema.name, channel.metadata.get("topic_type_hash", "")
-        )
-        contents.counts[channel.topic] += statistics.channel_message_counts.get(channel.id, 0)
-    return contents
+    span_ns = statistics.message_start_time, statistics.message_end_time
+    return Contents.of(summary.channels, summary.schemas, statistics.channel_message_counts, span_ns)

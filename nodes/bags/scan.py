@@ -9,7 +9,6 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
     AttachmentIndex,
@@ -32,6 +31,7 @@ from nodes.bags.records import (
     RECORD_HEAD,
     ChunkHead,
     Damaged,
+    bytes_of,
     checked_attachment,
     chunk_head,
     index_entries,
@@ -42,7 +42,7 @@ from nodes.bags.records import (
 )
 from nodes.bags.resync import is_cut, makes_sense, next_record, only_zeros, plausible_end, runs_over
 from nodes.bags.salvage import good_records
-from nodes.bags.scanned import BAD, CUT, JUNK, ZEROS, Loss, MessageRun, Piece, Scan
+from nodes.bags.scanned import BAD, CUT, JUNK, ZEROS, Loss, MessageRun, Piece, Scan, chunk_index
 from nodes.bags.summary import Ending, read_ending, read_summary_section
 from nodes.runtime.errors import BagError
 
@@ -183,7 +183,7 @@ class _Scanner:
         channel_id, sequence, log_ns, _ = MESSAGE_HEAD.unpack_from(self._buffer, body)
         if channel_id not in self.found.channels and not plausible_end(self._buffer, end, self._limit):
             raise Damaged(f"a message is of channel {channel_id}, which does not exist")
-        self._count(channel_id, sequence, log_ns)
+        self.found.count(channel_id, sequence, log_ns)
         self.found.unchecked_messages += 1
         self._keep(at, end)
         runs = self.found.runs
@@ -218,23 +218,10 @@ class _Scanner:
         entries = self._count_all(definitions, messages)
         self.found.unchecked_chunks += head.crc == 0 and bool(messages)
         times = [log_ns for _, _, log_ns, _ in messages] or [head.start_ns, head.end_ns]
-        index = ChunkIndex(
-            chunk_length=end - at,
-            chunk_start_offset=at,
-            compression=head.compression,
-            compressed_size=head.data_length,
-            message_end_time=max(times),
-            message_index_length=0,
-            message_index_offsets={},
-            message_start_time=min(times),
-            uncompressed_size=len(records),
-        )
-        self._chunk, self._entries, self._indexed, self._index_wrong = (
-            Piece(at, end - at, index),
-            entries,
-            {},
-            False,
-        )
+        packed = head.compression, head.data_length
+        index = chunk_index(at, end - at, (min(times), max(times)), len(records), packed)
+        self._chunk, self._entries = Piece(at, end - at, index), entries
+        self._indexed, self._index_wrong = {}, False
         fits = (
             RECORD_HEAD.pack(Opcode.CHUNK, end - at - RECORD_HEAD.size)
             == self._buffer[at : at + RECORD_HEAD.size]
@@ -242,7 +229,7 @@ class _Scanner:
         if not fits or (head.start_ns, head.end_ns, head.size) != (min(times), max(times), len(records)):
             self.found.fixes.append(f"the head of the chunk at byte {at} did not agree with its content")
             data = self._buffer[head.data_at : end]
-            self._chunk.content = _record(
+            self._chunk.content = bytes_of(
                 Chunk(head.compression, data, max(times), min(times), head.crc, len(records))
             )
 
@@ -258,7 +245,7 @@ class _Scanner:
         entries: dict[int, list[tuple[int, int]]] = {}
         for channel_id, sequence, log_ns, place in messages:
             entries.setdefault(channel_id, []).append((log_ns, place))
-            self._count(channel_id, sequence, log_ns)
+            self.found.count(channel_id, sequence, log_ns)
         return entries
 
     def _chunk_in_disguise(self, at: int) -> tuple[int, ChunkHead, bytes] | None:
@@ -294,18 +281,8 @@ class _Scanner:
         self.found.unchecked_chunks += bool(messages) and not proven
         times = [log_ns for _, _, log_ns, _ in messages] or [head.start_ns, head.end_ns]
         crc = zlib.crc32(records) if proven else 0
-        content = _record(Chunk("", records, max(times), min(times), crc, len(records)))
-        index = ChunkIndex(
-            chunk_length=len(content),
-            chunk_start_offset=at,
-            compression="",
-            compressed_size=len(records),
-            message_end_time=max(times),
-            message_index_length=0,
-            message_index_offsets={},
-            message_start_time=min(times),
-            uncompressed_size=len(records),
-        )
+        content = bytes_of(Chunk("", records, max(times), min(times), crc, len(records)))
+        index = chunk_index(at, len(content), (min(times), max(times)), len(records))
         piece = Piece(at, after - at, index)
         _index_anew(piece, index, content, self._count_all(definitions, messages))
         self.found.pieces.append(piece)
@@ -477,21 +454,6 @@ class _Scanner:
     def _add_channel(self, channel: Channel) -> None:
         self.found.channels[channel.id] = channel
 
-    def _count(self, channel_id: int, sequence: int, log_ns: int) -> None:
-        """Count a message and the missing ones before it. A decreasing sequence number means a restarted publisher."""
-        found = self.found
-        if not found.counts:
-            found.start_ns = found.end_ns = log_ns
-        elif log_ns > found.end_ns:
-            found.end_ns = log_ns
-        elif log_ns < found.start_ns:
-            found.start_ns = log_ns
-        found.counts[channel_id] = found.counts.get(channel_id, 0) + 1
-        last = found.sequences.get(channel_id)
-        if last is not None and sequence > last + 1:
-            found.gaps[channel_id] = found.gaps.get(channel_id, 0) + sequence - last - 1
-        found.sequences[channel_id] = sequence
-
 
 _KINDS = {Opcode.CHUNK: "a chunk", Opcode.ATTACHMENT: "an attachment", Opcode.MESSAGE: "a message"}
 
@@ -518,11 +480,5 @@ def _index_anew(
     rows = bytearray()
     for channel_id, entries in by_channel.items():
         index.message_index_offsets[channel_id] = piece.offset + len(chunk) + len(rows)
-        rows += _record(MessageIndex(channel_id, entries))
+        rows += bytes_of(MessageIndex(channel_id, entries))
     piece.content, index.message_index_length = chunk + bytes(rows), len(rows)
-
-
-def _record(record: Any) -> bytes:
-    builder = RecordBuilder()
-    record.write(builder)
-    return bytes(builder.end())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from mcap.records import AttachmentIndex, Channel, ChunkIndex, Header, MetadataIndex, Schema
+from mcap.records import AttachmentIndex, Channel, ChunkIndex, Header, MetadataIndex, Schema, Statistics
 from mcap.summary import Summary
 
 from nodes.bags.summary import Ending
@@ -28,6 +28,32 @@ class Piece:
     length: int
     record: ChunkIndex | AttachmentIndex | MetadataIndex | None = None
     content: bytes | None = None
+
+
+def chunk_index(
+    at: int, length: int, span_ns: tuple[int, int], size: int, packed: tuple[str, int] | None = None
+) -> ChunkIndex:
+    """Entry in the summary of a chunk without message indexes.
+
+    Args:
+        at: Offset of its record.
+        length: Length of its record [bytes].
+        span_ns: Log times of its first and last message.
+        size: Size of its content [bytes].
+        packed: Compression and size of the compressed content; None if it is not compressed.
+    """
+    compression, compressed_size = packed or ("", size)
+    return ChunkIndex(
+        chunk_length=length,
+        chunk_start_offset=at,
+        compression=compression,
+        compressed_size=compressed_size,
+        message_end_time=span_ns[1],
+        message_index_length=0,
+        message_index_offsets={},
+        message_start_time=span_ns[0],
+        uncompressed_size=size,
+    )
 
 
 @dataclass
@@ -146,6 +172,34 @@ class Scan:
         if self.unchecked_chunks:
             parts.append(f"{self.unchecked_chunks} of its chunks have no checksum")
         return " and ".join(parts)
+
+    def count(self, channel_id: int, sequence: int, log_ns: int) -> None:
+        """Count a message and the missing ones before it. A decreasing sequence number means a restarted publisher."""
+        if not self.counts:
+            self.start_ns = self.end_ns = log_ns
+        elif log_ns > self.end_ns:
+            self.end_ns = log_ns
+        elif log_ns < self.start_ns:
+            self.start_ns = log_ns
+        self.counts[channel_id] = self.counts.get(channel_id, 0) + 1
+        last = self.sequences.get(channel_id)
+        if last is not None and sequence > last + 1:
+            self.gaps[channel_id] = self.gaps.get(channel_id, 0) + sequence - last - 1
+        self.sequences[channel_id] = sequence
+
+    def statistics(self, attachments: int, chunks: int, metadata: int) -> Statistics:
+        """Statistics for the summary of a file with so many attachments, chunks and metadata records."""
+        return Statistics(
+            attachment_count=attachments,
+            channel_count=len(self.channels),
+            channel_message_counts=dict(self.counts),
+            chunk_count=chunks,
+            message_count=self.messages,
+            message_end_time=self.end_ns,
+            message_start_time=self.start_ns,
+            metadata_count=metadata,
+            schema_count=len(self.schemas),
+        )
 
     def loses_more_than_the_tail(self) -> list[Loss]:
         """Losses before the end of the kept data, or in a finished file."""

@@ -117,15 +117,7 @@ def summary_of(scan: Scan) -> tuple[FileSummary, Statistics]:
             summary.attachment_indexes.append(piece.record)
         elif piece.record is not None:
             summary.metadata_indexes.append(piece.record)
-    summary.statistics = statistics = Statistics(
-        attachment_count=len(summary.attachment_indexes),
-        channel_count=len(scan.channels),
-        channel_message_counts=dict(scan.counts),
-        chunk_count=len(summary.chunk_indexes),
-        message_count=scan.messages,
-        message_end_time=scan.end_ns,
-        message_start_time=scan.start_ns,
-        metadata_count=len(summary.metadata_indexes),
-        schema_count=len(scan.schemas),
+    summary.statistics = statistics = scan.statistics(
+        len(summary.attachment_indexes), len(summary.chunk_indexes), len(summary.metadata_indexes)
     )
     return summary, statistics
