@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,18 +15,18 @@ from nodes.runtime.pictures import COMPRESSED_TOPIC, RAW_TOPIC
 CAMERA_TOPICS = (RAW_TOPIC, COMPRESSED_TOPIC)
 
 
-def image_topic(bag: Path, candidates: Sequence[str] = CAMERA_TOPICS) -> str:
-    """Return the first of some topics that has messages.
+def image_topic(bag: Path) -> str:
+    """Return the first topic of the camera that has messages.
 
     Raises:
         BagError: None of the topics has messages.
     """
     topics = {topic.name: topic for topic in read_info(bag).topics if topic.count}
-    for name in candidates:
+    for name in CAMERA_TOPICS:
         if name in topics:
             return name
     raise BagError(
-        f"expected images on {' or '.join(candidates)} in {bag}, got none; it has {', '.join(topics) or 'no message'}"
+        f"expected images on {' or '.join(CAMERA_TOPICS)} in {bag}, got none; it has {', '.join(topics) or 'no message'}"
     )
 
 

@@ -16,15 +16,14 @@ from nodes.runtime.wire import MessageInfo
 SAFETY_STATE, ATTACK_SWITCH = "/safety/state", "/attack/switch"
 
 
+# Largest age of a message of the safety node.
+_AGE_LIMIT_NS = NS_PER_S // 2
+
+
 class Interlock:
-    """Remembers the last message of the safety node.
+    """Remembers the last message of the safety node."""
 
-    Args:
-        age_limit_s: Largest age of a message [s].
-    """
-
-    def __init__(self, age_limit_s: float = 0.5) -> None:
-        self._age_limit_ns = round(age_limit_s * NS_PER_S)
+    def __init__(self) -> None:
         self._publish_ns: int | None = None
         self._armed, self._reason = False, ""
 
@@ -38,7 +37,7 @@ class Interlock:
 
     def refusal(self, mono_ns: int) -> str:
         """Return why the attack may not be shown; empty if it may."""
-        if self._publish_ns is None or mono_ns - self._publish_ns > self._age_limit_ns:
+        if self._publish_ns is None or mono_ns - self._publish_ns > _AGE_LIMIT_NS:
             return "interlock: no message from the safety node"
         return "" if self._armed else f"interlock: not armed: {self._reason}"
 

@@ -159,9 +159,7 @@ def try_source(source: Any, frames: int = 50, timeout_s: float = 10.0) -> Source
     )
 
 
-def calibration_from_zed(
-    factory: Path, mode: str, size: tuple[int, int], mount: Path, latency_s: float = 0.0
-) -> CameraCalibration:
+def calibration_from_zed(factory: Path, mode: str, size: tuple[int, int], mount: Path) -> CameraCalibration:
     """Make the calibration of the rectified left eye, with the pose on the car from another camera file."""
     pinhole = Rectifier(load_factory_calibration(factory, mode), size).pinhole
     return CameraCalibration(
@@ -175,5 +173,5 @@ def calibration_from_zed(
         cx=round(pinhole.cx, 4),
         cy=round(pinhole.cy, 4),
         T_car_from_camera=load_calibration(CameraCalibration, mount).T_car_from_camera,
-        latency_s=latency_s,
+        latency_s=0.0,
     )

@@ -60,7 +60,7 @@ class ReferenceFrames:
     asked: bool = False
 
 
-def from_twin(view: PolicyView, count: int = 48, seed: int = 0) -> ReferenceFrames:
+def from_twin(view: PolicyView, count: int = 48) -> ReferenceFrames:
     """Make reference frames in the simulated lab around its path. No recording is needed."""
     from hardware.worlds.lab.config import LabConfig
     from hardware.worlds.lab.lab import Lab
@@ -68,7 +68,7 @@ def from_twin(view: PolicyView, count: int = 48, seed: int = 0) -> ReferenceFram
     expert = Expert(
         load_calibration(RoomCalibration, shipped("calibration/twin") / "room.yaml").reference_path
     )
-    poses = _about_the_path(expert, count, seed)
+    poses = _about_the_path(expert, count)
 
     def frame(lab: Lab, x_m: float, y_m: float, yaw_rad: float) -> NDArray[np.uint8]:
         return _seen(view, lab.observe_at(x_m, y_m, yaw_rad, depth=False)[0], "the simulated lab")
@@ -156,20 +156,17 @@ def from_run(folder: Path, view: PolicyView) -> ReferenceFrames:
     )
 
 
-def from_scene(
-    scene: Path, calibration: Path, view: PolicyView, count: int = 48, seed: int = 0
-) -> ReferenceFrames:
+def from_scene(scene: Path, calibration: Path, view: PolicyView, count: int = 48) -> ReferenceFrames:
     """Render reference frames of a learned scene around the path of a room, and drives in it.
 
     Args:
         scene: Scene file.
         calibration: Folder with ``camera.yaml``, ``room.yaml`` and ``vehicle.yaml``.
         count: Number of frames.
-        seed: Random seed of the offsets from the path.
     """
     _camera(view, calibration)
     expert = Expert(load_calibration(RoomCalibration, calibration / "room.yaml").reference_path)
-    poses = _about_the_path(expert, count, seed)
+    poses = _about_the_path(expert, count)
     seen = _sight_of_scene(scene, calibration, view)(torch.from_numpy(poses))
     images = np.round(255.0 * seen.permute(0, 2, 3, 1).clamp(0.0, 1.0).numpy()).astype(np.uint8)
     drives = _drives_in_scene(scene, calibration, view)
@@ -205,9 +202,9 @@ def _camera(view: PolicyView, calibration: Path) -> CameraCalibration:
     return camera
 
 
-def _about_the_path(expert: Expert, count: int, seed: int) -> NDArray[np.float64]:
+def _about_the_path(expert: Expert, count: int) -> NDArray[np.float64]:
     """Car states ``[count, 3]`` around the path, with small offsets and rotations from it."""
-    offsets = np.random.default_rng(seed).uniform(-1.0, 1.0, (count, 2)) * (_LATERAL_M, _HEADING_RAD)
+    offsets = np.random.default_rng(0).uniform(-1.0, 1.0, (count, 2)) * (_LATERAL_M, _HEADING_RAD)
     poses: NDArray[np.float64] = expert.path.pose_at(np.arange(count) / count * expert.path.length_m)
     poses[:, 0] -= np.sin(poses[:, 2]) * offsets[:, 0]
     poses[:, 1] += np.cos(poses[:, 2]) * offsets[:, 0]

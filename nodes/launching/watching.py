@@ -83,14 +83,14 @@ def _launched(run_dir: Path) -> list[str]:
         return []
 
 
-def node_statuses(run_dir: Path, wait_s: float = _STATUS_WAIT_S) -> dict[str, Any]:
-    """Last status of every node that reports within ``wait_s`` [s]; None for a silent node."""
+def node_statuses(run_dir: Path) -> dict[str, Any]:
+    """Last status of every node that reports in time; None for a silent node."""
     names = node_names(run_dir)
     statuses: dict[str, Any] = dict.fromkeys(names)
     with Bus(run_dir) as bus:
         for name in names:
             bus.subscribe(status_topic(name))
-        deadline = time.monotonic() + wait_s
+        deadline = time.monotonic() + _STATUS_WAIT_S
         while None in statuses.values() and (left := deadline - time.monotonic()) > 0:
             bus.wait(left)
             for received in bus.receive():

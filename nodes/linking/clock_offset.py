@@ -29,14 +29,10 @@ class Exchange:
 
 
 class OffsetFilter:
-    """Selects the exchange with the shortest round trip of a short window, because it has the smallest error.
+    """Selects the exchange with the shortest round trip of a short window, because it has the smallest error."""
 
-    Args:
-        length: Number of exchanges in the window.
-    """
-
-    def __init__(self, length: int = 8) -> None:
-        self._window: deque[Exchange] = deque(maxlen=length)
+    def __init__(self) -> None:
+        self._window: deque[Exchange] = deque(maxlen=8)
 
     def add(self, exchange: Exchange) -> Exchange:
         """Add an exchange. Returns the best one."""

@@ -22,14 +22,14 @@ def raise_limit() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
-def require_free(needed: int = _NEEDED) -> None:
-    """Raise a `BusError` unless ``needed`` descriptors are free."""
-    held = _take(needed)
+def require_free() -> None:
+    """Raise a `BusError` unless enough descriptors are free."""
+    held = _take(_NEEDED)
     for descriptor in held:
         os.close(descriptor)
-    if len(held) < needed:
+    if len(held) < _NEEDED:
         raise BusError(
-            f"expected {needed} free file descriptors for the sockets, got {len(held)}: too many files are open;"
+            f"expected {_NEEDED} free file descriptors for the sockets, got {len(held)}: too many files are open;"
             " close some, or raise the limit (ulimit -n)"
         )
 

@@ -67,13 +67,10 @@ def in_a_child(module: str, path: Path, horizons: Sequence[int], *more: str) -> 
         raise subprocess.CalledProcessError(child.returncode, command)
 
 
-def print_peaks(
-    problem: AttackProblem, space: Space, horizons: Sequence[int], cache_mib: float = 0.0
-) -> None:
+def print_peaks(problem: AttackProblem, space: Space, horizons: Sequence[int]) -> None:
     """Print each horizon and the peak above idle of one gradient of the first start over it [MiB]."""
     goals = None if problem.goals is None else problem.goals[:1]
-    one, cache_bytes = problem.start_states[:1], int(cache_mib * 2**20)
-    problem = dataclasses.replace(problem, start_states=one, goals=goals, cache_bytes=cache_bytes)
+    problem = dataclasses.replace(problem, start_states=problem.start_states[:1], goals=goals, cache_bytes=0)
     theta = space.surrogate.initial_theta(torch.Generator().manual_seed(0))
     adjoint_gradient(dataclasses.replace(problem, steps=min(_BEFORE_TICKS, *horizons)), theta)
     for ticks in horizons:

@@ -28,6 +28,8 @@ from nodes.runtime.paths import user_folder
 from nodes.safety import SafetyConfig
 
 _MEMORY_WARNING_GIB = 4
+# Shortest recording that should fit on the disk.
+_RECORDING_MINUTES = 30.0
 # A smaller clock offset does not matter for the age limits, which are about 0.2 s.
 CLOCK_ERROR_S = 0.005
 _UNSYNCHRONISED = 0x0040
@@ -106,13 +108,12 @@ def machine() -> list[CheckResult]:
     return report("machine", OK, text)
 
 
-def disk(folder: Path, bytes_per_s: float, minutes: float = 30.0) -> list[CheckResult]:
+def disk(folder: Path, bytes_per_s: float) -> list[CheckResult]:
     """Check how many minutes of recording fit on the disk.
 
     Args:
         folder: Folder for bags, which need not exist.
         bytes_per_s: Data rate of a recording [bytes/s].
-        minutes: Shortest recording that should fit [min].
     """
     existing = next(path for path in (folder.resolve(), *folder.resolve().parents) if path.is_dir())
     if not os.access(existing, os.W_OK):
@@ -124,7 +125,7 @@ def disk(folder: Path, bytes_per_s: float, minutes: float = 30.0) -> list[CheckR
     text = f"{free / 2**30:.1f} GiB free in {existing}: {lasts:.0f} minutes of recording at {hourly:.1f} GB an hour"
     if lasts < 1.0:
         return report("disk", FAILURE, text, "free some space, or give another --folder")
-    if lasts < minutes:
+    if lasts < _RECORDING_MINUTES:
         return report("disk", WARNING, text, "free some space; advnerf bag info shows what a bag contains")
     return report("disk", OK, text)
 

@@ -38,13 +38,11 @@ class BagConfig:
     Attributes:
         step_m: Distance between two frames [m].
         step_rad: Rotation after which the next frame is taken even without that distance [rad].
-        max_gap_s: Longest gap of the motion capture in which frames get a pose [s].
         most: Largest number of frames, evenly thinned out.
     """
 
     step_m: float = 0.1
     step_rad: float = 0.087
-    max_gap_s: float = 0.1
     most: int = 300
 
 
@@ -86,7 +84,7 @@ def take_frames(
         ImportRecordingError: The calibration is missing, the image size differs from it, or the frames have no poses.
     """
     camera = _camera(bag, calibration)
-    poses = PoseBuffer(keep_s=_WHOLE_DRIVE_S, max_gap_s=config.max_gap_s)
+    poses = PoseBuffer(keep_s=_WHOLE_DRIVE_S)
     for stamp, T in read_poses(bag, CAR_TOPIC):
         poses.add(stamp, T)
     topic = image_topic(bag)

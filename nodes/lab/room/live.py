@@ -14,19 +14,16 @@ from calibration.degeneracy import mean_rotation
 from nodes.runtime.bus import Bus
 from nodes.runtime.messages import pose_matrix
 
-_LOST_S = 0.5
+_LOST_S = _WINDOW_S = 0.5
 _LEAST_POSES = 5
 
 
-def standing_poses(
-    run_dir: Path, topic: str, period_s: float, window_s: float = 0.5
-) -> Iterator[Array | None]:
+def standing_poses(run_dir: Path, topic: str, period_s: float) -> Iterator[Array | None]:
     """Yield the mean pose ``[4, 4]`` over a window once per period, for ever; None while the subject is lost.
 
     Args:
         run_dir: Folder of the running launch.
         period_s: Time between two results [s].
-        window_s: Averaging window [s].
     """
     recent: deque[tuple[float, Array]] = deque()
     with Bus(run_dir) as bus:
@@ -36,7 +33,7 @@ def standing_poses(
             bus.wait(max(0.0, min(0.05, due - time.monotonic())))
             now = time.monotonic()
             recent.extend((now, pose_matrix(received.message())) for received in bus.receive())
-            while recent and now - recent[0][0] > window_s:
+            while recent and now - recent[0][0] > _WINDOW_S:
                 recent.popleft()
             if now < due:
                 continue
