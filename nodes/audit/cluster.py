@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -18,26 +17,18 @@ from nodes.experiment.run.cluster import ray_session, run_on_ray
 HERE = "here"
 
 
-@dataclass(frozen=True)
-class Cluster:
-    """The cluster that runs the searches of a round in parallel.
+def search_on_cluster(address: str, searches: Sequence[SearchJob]) -> None:
+    """Run searches in parallel until all have written their results to their folders.
 
-    Attributes:
+    Args:
         address: ``HOST:PORT`` of the head, ``auto`` for this machine's, or ``here`` to start one.
+
+    Raises:
+        ConfigError: The cluster does not answer, or a machine in it cannot run a search.
     """
-
-    address: str
-
-    def search(self, searches: Sequence[SearchJob]) -> None:
-        """Run searches until all have written their results to their folders.
-
-        Raises:
-            ConfigError: The cluster does not answer, or a machine in it cannot run a search.
-        """
-        session = ray_session("" if self.address == HERE else self.address, os.cpu_count() or 1)
-        with session as cores:
-            for _ in run_on_ray(partial(_search, os.getcwd()), searches, cores):
-                pass  # a lost search has no results in its folder, and runs here
+    with ray_session("" if address == HERE else address, os.cpu_count() or 1) as cores:
+        for _ in run_on_ray(partial(_search, os.getcwd()), searches, cores):
+            pass  # a lost search has no results in its folder, and runs here
 
 
 def _search(folder: str, wanted: SearchJob) -> bool:

@@ -143,13 +143,7 @@ def _drives(experiment: Experiment, states: Sequence[Array], scores: Sequence[Dr
         np.concatenate([each, np.repeat(each[-1:], max(0, ticks - len(each)), axis=0)])[:ticks]
         for each in whole
     ]
-    return ArmDrives(
-        states=np.stack(held),
-        largest_m=np.array([score.max_cte_m for score in scores]),
-        mean_m=np.array([score.mean_cte_m for score in scores]),
-        ctes_m=np.array([score.ctes_m for score in scores]),
-        driven_ticks=np.array([len(score.ctes_m) - score.held_ticks for score in scores]),
-    )
+    return ArmDrives.of(np.stack(held), scores, [len(each.ctes_m) - each.held_ticks for each in scores])
 
 
 def pictures_along(experiment: Experiment, states: Array, shown: Shown) -> Tensor:

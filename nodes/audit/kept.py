@@ -63,13 +63,7 @@ def _measured(data: Mapping[str, Any]) -> dict[str, ArmDrives]:
             drive_metrics(path, each[: 1 + driven], horizon)
             for each, driven in zip(states, ticks, strict=True)
         ]
-        found[name] = ArmDrives(
-            states=states,
-            largest_m=np.array([score.max_cte_m for score in scores]),
-            mean_m=np.array([score.mean_cte_m for score in scores]),
-            ctes_m=np.array([score.ctes_m for score in scores]),
-            driven_ticks=ticks,
-        )
+        found[name] = ArmDrives.of(states, scores, ticks)
     return found
 
 

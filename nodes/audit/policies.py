@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -22,70 +22,63 @@ from nodes.runtime.errors import ConfigError
 
 FOLDER = "policy"
 Say = Callable[[str], None]
+Driven = Callable[[], tuple[Pinhole, float]]
 # Most common meanings of files without a declaration; printed, so that a wrong one is noticed.
 _USUAL = {"colour_space": "RGB", "value_max": 1.0, "output_unit": "normalised", "positive": "left"}
 
 
-@dataclass(frozen=True)
-class NamedPolicy:
-    """The policy by the user's name, and what is known about its place.
+def resolve_policy(
+    given: str, driven: Driven, declared: Sequence[str], folder: Path, say: Say
+) -> tuple[str, Pinhole | None]:
+    """The name for experiments of the policy by the user's name, and the policy's camera; None for a driver behind a socket.
 
-    Attributes:
+    Args:
         given: File, ``package.module:factory`` or address.
         driven: Asked only about a file without a declaration: gives the place's driving camera, which the file is taken to see, and the largest
             wheel angle of the car, which a normalised output of 1 stands for [rad].
         declared: ``key=value`` texts of a declaration.
         folder: Folder of the audit, for a copy of the file with its declaration, if it has none.
         say: Called with each assumption.
+
+    Raises:
+        ConfigError: The file does not exist.
+        AdvnerfError: The policy cannot be loaded.
     """
-
-    given: str
-    driven: Callable[[], tuple[Pinhole, float]]
-    declared: Sequence[str]
-    folder: Path
-    say: Say
-
-    def resolve(self) -> tuple[str, Pinhole | None]:
-        """The name for experiments, and the policy's camera; None for a driver behind a socket.
-
-        Raises:
-            ConfigError: The file does not exist.
-            AdvnerfError: The policy cannot be loaded.
-        """
-        if is_address(self.given):
-            return self.given, None
-        if is_code(self.given):
-            return self.given, load_any_policy(self.given).view.camera
-        file = Path(self.given)
-        if not file.is_file():
-            raise ConfigError(
-                f"expected a policy file, package.module:factory or grpc://HOST:PORT, got {self.given}, which is not there"
-            )
-        contract, questions = guess_contract(file)
-        if not questions and not self.declared:
-            return str(file.resolve()), contract.view.camera
-        return self._with_declaration(file, self._contract(contract, questions))
-
-    def _contract(self, guessed: PolicyContract, questions: Sequence[Question]) -> PolicyContract:
-        """The contract with declared, answered and usual values."""
-        values, answers = guessed.to_dict(), _read(self.declared)
-        for question in questions:
-            if question.key == "view":
-                values["view"] = _whole_picture(values["view"], self.driven()[0])
-            elif question.key not in answers:
-                usual = _USUAL.get(question.key, values.get(question.key))
-                values[question.key] = _answered(question, usual, self.say)
-        values |= answers
-        if values.get("output_unit") == "normalised" and values.get("full_steering_rad") is None:
-            values["full_steering_rad"] = self.driven()[1]
-        return PolicyContract.from_dict(values, "--declare")
-
-    def _with_declaration(self, file: Path, contract: PolicyContract) -> tuple[str, Pinhole | None]:
-        target = self.folder / FOLDER / file.name
+    if is_address(given):
+        return given, None
+    if is_code(given):
+        return given, load_any_policy(given).view.camera
+    file = Path(given)
+    if not file.is_file():
+        raise ConfigError(
+            f"expected a policy file, package.module:factory or grpc://HOST:PORT, got {given}, which is not there"
+        )
+    contract, questions = guess_contract(file)
+    if questions or declared:
+        contract = _completed(contract, questions, _read(declared), driven, say)
+        target = folder / FOLDER / file.name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(file, target)
         write_atomically(target.with_name(target.name + DECLARATION_SUFFIX), dump_yaml(contract.to_dict()))
-        return str(target.resolve()), contract.view.camera
+        file = target
+    return str(file.resolve()), contract.view.camera
+
+
+def _completed(
+    guessed: PolicyContract, questions: Sequence[Question], answers: dict[str, Any], driven: Driven, say: Say
+) -> PolicyContract:
+    """The contract with declared, answered and usual values."""
+    values = guessed.to_dict()
+    for question in questions:
+        if question.key == "view":
+            values["view"] = _whole_picture(values["view"], driven()[0])
+        elif question.key not in answers:
+            usual = _USUAL.get(question.key, values.get(question.key))
+            values[question.key] = _answered(question, usual, say)
+    values |= answers
+    if values.get("output_unit") == "normalised" and values.get("full_steering_rad") is None:
+        values["full_steering_rad"] = driven()[1]
+    return PolicyContract.from_dict(values, "--declare")
 
 
 def _read(declared: Sequence[str]) -> dict[str, Any]:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -89,11 +88,8 @@ class SearchJob:
         return load_experiment(Path(self.file), self.setting, self.overrides, Path(self.run_folder))
 
 
-class SearchesElsewhere(Protocol):
-    """Other machines that run the searches of a round in parallel."""
-
-    def search(self, searches: Sequence[SearchJob]) -> None:
-        """Run searches until all have written their results to their folders."""
+SearchesElsewhere = Callable[[Sequence[SearchJob]], None]
+"""Runs the searches of a round on other machines until all have written their results to their folders."""
 
 
 @dataclass
@@ -159,7 +155,7 @@ class Searches:
             jobs: Iterable[SearchJob] = (self._job(wanted, each, spots[each.spot]) for each in row)
             if self.elsewhere is not None:  # its results in the folders are then only read here
                 jobs = list(jobs)
-                self.elsewhere.search(jobs)
+                self.elsewhere(jobs)
             for search, job in zip(row, jobs, strict=True):
                 spot = spots[search.spot]
                 found = self._search(

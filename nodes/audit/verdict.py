@@ -7,14 +7,15 @@ and nothing else, drives the car off is tested exactly on the starts where only 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binomtest
 
+from advnerf_core.driving.metrics import DriveMetrics
 from advnerf_core.report.audit_parts import AuditEffect
 from advnerf_core.report.evidence.mean_estimate import one_sample
 
@@ -40,6 +41,17 @@ class ArmDrives:
     mean_m: Floats
     ctes_m: Floats
     driven_ticks: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, states: Floats, scores: Sequence[DriveMetrics], driven_ticks: Any) -> ArmDrives:
+        """Drives with their scores."""
+        return cls(
+            states,
+            np.array([score.max_cte_m for score in scores]),
+            np.array([score.mean_cte_m for score in scores]),
+            np.array([score.ctes_m for score in scores]),
+            np.array(driven_ticks),
+        )
 
     def left(self, limit_m: float) -> NDArray[np.bool_]:
         """Whether each drive left the lane ``[S]``."""

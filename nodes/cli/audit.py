@@ -6,6 +6,7 @@ import re
 import time
 import traceback
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,11 +15,11 @@ from typer.core import TyperCommand
 
 from nodes.cli.endings import INTERRUPTED, text_for_people
 from nodes.lab.importing.metric_options import MetricOptions
+from nodes.runtime.errors import ConfigError
 from nodes.runtime.options import with_groups
 from nodes.runtime.terminal import Overrides, say_error
 
 if TYPE_CHECKING:
-    from nodes.audit.cluster import Cluster
     from nodes.audit.question import AuditedQuestion
     from nodes.audit.run import AuditOptions
 
@@ -185,7 +186,7 @@ def _print_schema(wanted: bool) -> None:
 def _minutes(text: str) -> float:
     found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([smh]?)", text.strip())
     if found is None or float(found[1]) <= 0.0:
-        raise _wrong(f"--budget: expected a time such as 90s, 10m or 2h, got {text!r}")
+        raise ConfigError(f"--budget: expected a time such as 90s, 10m or 2h, got {text!r}")
     return float(found[1]) * _UNITS_MIN[found[2] or "m"]
 
 
@@ -199,7 +200,7 @@ def _limit_m(options: PlaceOptions) -> float | None:
     except ValueError:
         value = -1.0
     if not value > 0.0:
-        raise _wrong(
+        raise ConfigError(
             f"--limit: expected metres above 0, or {OFF_LANE} with a world, which declares its lanes, got {text!r}"
         )
     return value
@@ -209,12 +210,7 @@ def _say(text: str) -> None:
     print(text, flush=True)
 
 
-def _wrong(text: str) -> Exception:
-    from nodes.runtime.errors import ConfigError
-
-    return ConfigError(text)
-
-
+@with_groups
 def audit(
     policy: Annotated[
         str,
@@ -280,14 +276,15 @@ def _question(
 ) -> tuple[AuditedQuestion, AuditOptions]:
     from nodes.audit.asking import answer
     from nodes.audit.cars import car_of
+    from nodes.audit.cluster import search_on_cluster
     from nodes.audit.images import posed
     from nodes.audit.places import Answers, AuditedWorld, camera_of, place_of_photographs
-    from nodes.audit.policies import NamedPolicy
+    from nodes.audit.policies import resolve_policy
     from nodes.audit.question import CI_SECTIONS, AuditedQuestion
     from nodes.audit.run import CI_EVALUATIONS, AuditOptions
 
     if search.kind != "panel" and not Path(search.kind).is_file():
-        raise _wrong(
+        raise ConfigError(
             f"--object: expected panel, or a .glb or .object.safetensors file, got {search.kind}, which is not there"
         )
     answers = Answers(_limit_m(place), place.speed_mps, place.camera_height_m, place.path)
@@ -297,21 +294,21 @@ def _question(
             place.car, "--car", "Which car: racecarj, roboracer, donkey, duckiebot, car, or a YAML file", str
         )
         car, there = car_of(named), posed(place.place, folder, metric)
-        spec, wanted = NamedPolicy(
+        spec, wanted = resolve_policy(
             policy, lambda: (camera_of(there, place.path), car.car.max_steering_rad), declared, folder, _say
-        ).resolve()
+        )
         where, limit_m = place_of_photographs(place.place, there, answers, car, wanted)
     else:
         assert place.world is not None, "one of the two is given"
         world = AuditedWorld(place.world)
         where = world.place(place.path)
-        spec, _ = NamedPolicy(
+        spec, _ = resolve_policy(
             policy,
             lambda: (world.description.camera, world.description.car.largest_control),
             declared,
             folder,
             _say,
-        ).resolve()
+        )
     question = AuditedQuestion(
         policy=spec,
         given=policy,
@@ -330,22 +327,15 @@ def _question(
         result.against,
         result.harden,
         timed=not result.ci,
-        cluster=_cluster(search.cluster),
+        cluster=None if search.cluster is None else partial(search_on_cluster, search.cluster),
     )
 
 
-def _cluster(address: str | None) -> Cluster | None:
-    if address is None:
-        return None
-    from nodes.audit.cluster import Cluster
-
-    return Cluster(address)
-
-
-class _Command(TyperCommand):
+class AuditCommand(TyperCommand):
     """The command with exit code 64 for wrong options, as 2 is a verdict."""
 
     def make_context(self, *given: Any, **settings: Any) -> Any:
+        """As typer's; only the exit code is another."""
         try:
             return super().make_context(*given, **settings)
         except Exception as error:
@@ -356,4 +346,4 @@ class _Command(TyperCommand):
 
 def add_to(app: typer.Typer) -> None:
     """Add the command."""
-    app.command(cls=_Command)(with_groups(audit))
+    app.command(cls=AuditCommand)(audit)

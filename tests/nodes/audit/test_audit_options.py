@@ -14,7 +14,7 @@ from hardware.worlds.lab.lab import Lab
 from nodes.audit.cars import CARS, car_of
 from nodes.audit.images import posed
 from nodes.audit.places import AuditedWorld
-from nodes.audit.policies import NamedPolicy
+from nodes.audit.policies import resolve_policy
 from nodes.cli.audit import _minutes
 from nodes.experiment.show.experiment_world import as_json
 from nodes.lab.importing.metric_options import MetricOptions
@@ -93,8 +93,8 @@ def test_a_world_is_not_opened_for_what_a_policy_and_the_path_declare(openings: 
     assert world.place("track").path == "track"
     own = next(Path(__file__).parents[3].glob("docs/results/reference/policy_*/policy.safetensors"))
     for given in ("grpc://127.0.0.1:1", str(own)):
-        policy = NamedPolicy(given, lambda: pytest.fail("the world was asked"), (), tmp_path, print)
-        assert policy.resolve()[0] == given
+        found = resolve_policy(given, lambda: pytest.fail("the world was asked"), (), tmp_path, print)
+        assert found[0] == given
     assert not openings.read_text()
 
 
