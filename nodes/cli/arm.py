@@ -80,9 +80,3 @@ def _chosen(count: int) -> int:
     while not 1 <= number <= count:
         number = typer.prompt(f"Arm which one, 1 to {count}?", type=int)
     return number - 1
-
-
-def add_to(app: typer.Typer) -> None:
-    """Register the commands."""
-    app.command("arm")(arm)
-    app.command("disarm")(disarm)

@@ -13,12 +13,6 @@ from nodes.runtime.terminal import Overrides, RunDir
 _FAILURE_EXIT = 1
 
 
-def add_to(app: typer.Typer) -> None:
-    """Put the commands into the group ``attack``."""
-    app.command("request")(attack_request)
-    app.command("cancel")(attack_cancel)
-
-
 def attack_request(
     file: Annotated[
         Path,

@@ -111,10 +111,3 @@ def attack_robustness(
         )
     )
     print(f"{text}: {picture}")
-
-
-def add_to(app: typer.Typer) -> None:
-    """Register the commands."""
-    app.command("poses")(attack_poses)
-    app.command("landscape")(attack_landscape)
-    app.command("robustness")(attack_robustness)

@@ -179,9 +179,3 @@ def _effect(request: Path, attack: AttackFile, record: PrintRecord, found: Measu
     return print_effect(
         experiment, attack, record.object, found.texture, scale, measurement.T_world_from_face
     )
-
-
-def add_to(app: typer.Typer) -> None:
-    """Register the commands."""
-    app.command("print")(attack_print)
-    app.command("measure")(attack_measure)

@@ -342,8 +342,3 @@ class AuditCommand(TyperCommand):
             if getattr(error, "exit_code", 0) == CANNOT_JUDGE_EXIT:
                 error.exit_code = USAGE_EXIT  # type: ignore[attr-defined]
             raise
-
-
-def add_to(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command(cls=AuditCommand)(audit)

@@ -24,8 +24,10 @@ app = typer.Typer(
     help="Calibrate camera, car, room, monitor, printer and clocks. Poor data are rejected with the reason.",
 )
 
-cli_calibrate_display.add_to(app)
-cli_calibrate_printer.add_to(app)
+app.command("display-colours")(cli_calibrate_display.display_colours)
+app.command("display")(cli_calibrate_display.display)
+app.command("printer-chart")(cli_calibrate_printer.printer_chart)
+app.command("printer")(cli_calibrate_printer.printer)
 
 Output = Annotated[
     Path, typer.Option("--output", "-o", help="YAML file to write. The plot is saved next to it.")

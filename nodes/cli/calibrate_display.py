@@ -11,12 +11,6 @@ from nodes.lab.wizards.output import save_and_print
 from nodes.runtime.terminal import RunDir
 
 
-def add_to(app: typer.Typer) -> None:
-    """Register the commands with their group."""
-    app.command("display-colours")(display_colours)
-    app.command("display")(display)
-
-
 def display_colours(
     output: Annotated[
         Path,

@@ -10,12 +10,6 @@ import typer
 from nodes.lab.wizards.output import save_and_print
 
 
-def add_to(app: typer.Typer) -> None:
-    """Register the commands with their group."""
-    app.command("printer-chart")(printer_chart)
-    app.command("printer")(printer)
-
-
 def printer_chart(
     output: Annotated[Path, typer.Option("--output", "-o", help="A .pdf or .png file.")],
     paper: Annotated[

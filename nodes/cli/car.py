@@ -18,11 +18,12 @@ app = typer.Typer(
     ),
     help="Arm and drive the car, measure trials, watch a running launch, calibrate, test its devices.",
 )
-arm.add_to(app)
-teleop.add_to(app)
-trial.add_to(app)
-page.add_to(app)
-node.add_to(app)
+app.command("arm")(arm.arm)
+app.command("disarm")(arm.disarm)
+app.command("teleop")(teleop.teleop)
+app.command("trial")(trial.trial)
+app.command("page")(page.page)
+app.command("top")(node.top)
 app.add_typer(node.app, name="node")
 app.add_typer(topic.app, name="topic")
 app.add_typer(keys.app, name="keys")

@@ -16,11 +16,6 @@ if TYPE_CHECKING:
 _PORT = 8091
 
 
-def add_to(app: typer.Typer) -> None:
-    """Register the command."""
-    app.command()(demo)
-
-
 def demo(
     folder: Annotated[Path, typer.Option("--folder", help="Folder of all results.")] = Path("runs/demo"),
     page: Annotated[

@@ -17,11 +17,6 @@ _COLOURS = {"ok": "green", "absent": "bright_black", "warning": "yellow", "failu
 _FAILURE_EXIT = 1
 
 
-def add_to(app: typer.Typer) -> None:
-    """Register the command."""
-    app.command("doctor")(doctor)
-
-
 def doctor(
     file: Annotated[
         Path | None,

@@ -67,22 +67,26 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Find objects that drive a self-driving policy off its path, and prove it on the car or on its simulated lab.",
 )
-cli_audit.add_to(app)
-cli_demo.add_to(app)
-cli_verify.add_to(app)
+app.command(cls=cli_audit.AuditCommand)(cli_audit.audit)
+app.command()(cli_demo.demo)
+app.command()(cli_verify.verify)
 app.add_typer(cli_experiment.app, name="experiment")
 app.add_typer(cli_scene.app, name="scene")
 app.add_typer(cli_policy.app, name="policy")
 app.add_typer(cli_log.app, name="log")
-cli_attack_node.add_to(cli_attack.app)
-cli_attack_poses.add_to(cli_attack.app)
-cli_attack_print.add_to(cli_attack.app)
+cli_attack.app.command("request")(cli_attack_node.attack_request)
+cli_attack.app.command("cancel")(cli_attack_node.attack_cancel)
+cli_attack.app.command("poses")(cli_attack_poses.attack_poses)
+cli_attack.app.command("landscape")(cli_attack_poses.attack_landscape)
+cli_attack.app.command("robustness")(cli_attack_poses.attack_robustness)
+cli_attack.app.command("print")(cli_attack_print.attack_print)
+cli_attack.app.command("measure")(cli_attack_print.attack_measure)
 cli_attack.app.add_typer(cli_method.app, name="method")
 app.add_typer(cli_attack.app, name="attack")
 app.add_typer(cli_car.app, name="car")
 app.command("disarm")(cli_arm.disarm)
 app.add_typer(cli_bag.app, name="bag")
-cli_doctor.add_to(app)
+app.command("doctor")(cli_doctor.doctor)
 _debug = False
 
 

@@ -16,11 +16,6 @@ if TYPE_CHECKING:
 app = typer.Typer(no_args_is_help=True, help="Inspect the nodes of a running launch.")
 
 
-def add_to(car: typer.Typer) -> None:
-    """Register ``top`` beside the group."""
-    car.command("top")(top)
-
-
 @app.command("list")
 def node_list(run_dir: RunDir = None) -> None:
     """List the nodes with state and status text. A node that does not report is listed as silent."""

@@ -126,8 +126,3 @@ def _end(player: Child) -> None:
     while player.running and time.monotonic() < deadline:
         time.sleep(0.05)
     player.signal(signal.SIGKILL)
-
-
-def add_to(app: typer.Typer) -> None:
-    """Register the command."""
-    app.command("page")(page)

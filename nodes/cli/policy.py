@@ -28,7 +28,8 @@ app = typer.Typer(
     no_args_is_help=True,
     help="Train a policy from recordings; evaluate, check, export and inspect any policy.",
 )
-cli_policy_train.add_to(app)
+app.command("train")(cli_policy_train.train)
+app.command("eval")(cli_policy_train.evaluate)
 _FAILURE_EXIT = 1
 
 

@@ -80,6 +80,7 @@ class ExpertOptions:
         return Expert(DrivingPath.rounded_square(4.0, 1.1), config)
 
 
+@with_groups
 def train(
     logs: Logs,
     output: Annotated[
@@ -171,6 +172,7 @@ def train(
     )
 
 
+@with_groups
 def evaluate(
     policy: PolicyName,
     logs: Logs,
@@ -236,12 +238,6 @@ def _error_cells(e: Errors) -> list[str]:
     angles = (e.mean_abs_rad, e.rms_rad, e.worst_rad, e.bias_rad)
     texts = [f"{1e3 * value:.1f} mrad" for value in angles]
     return [str(e.count), *texts, f"{e.correlation:.3f}", f"{1e3 * e.zero_rad:.1f} mrad"]
-
-
-def add_to(app: typer.Typer) -> None:
-    """Register the commands with ``advnerf policy``."""
-    app.command("train")(with_groups(train))
-    app.command("eval")(with_groups(evaluate))
 
 
 def _architecture(name: str, configuration: list[str]) -> Architecture:

@@ -31,7 +31,7 @@ app = typer.Typer(
     help="Learn scenes from videos, photographs and bags; build objects; check worlds, measure a room, use CARLA.",
 )
 app.add_typer(cli_scene_import.app)
-cli_scene_gate.add_to(app)
+app.command("gate")(cli_scene_gate.gate)
 for name, group in (("object", cli_object), ("world", cli_world), ("room", cli_room), ("carla", cli_carla)):
     app.add_typer(group.app, name=name)
 

@@ -14,11 +14,6 @@ from nodes.runtime.terminal import Overrides, coloured, print_table, table
 _REFUSED_EXIT = 1
 
 
-def add_to(app: typer.Typer) -> None:
-    """Register the command."""
-    app.command("gate")(gate)
-
-
 def gate(
     file: File,
     setting: Setting = None,

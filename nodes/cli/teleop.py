@@ -50,8 +50,3 @@ def teleop(
         return TeleopNode.build(config, context)
 
     raise typer.Exit(run_node(build, "teleop", folder))
-
-
-def add_to(app: typer.Typer) -> None:
-    """Register the command."""
-    app.command("teleop")(teleop)

@@ -15,11 +15,6 @@ if TYPE_CHECKING:
     from nodes.lab.trials.plan import PlannedDrive
 
 
-def add_to(app: typer.Typer) -> None:
-    """Register ``trial``; ``evaluate`` is a command of ``bag``."""
-    app.command("trial")(trial)
-
-
 def trial(
     file: LaunchFile,
     attack: Annotated[

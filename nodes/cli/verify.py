@@ -150,8 +150,3 @@ def _redrive(folder: Path, count: int, seed: int) -> int:
         verdict = "as published" if each.same else f"otherwise: more than {TOLERANCE_M} m"
         print(f"{each.name}: at most {each.off_m:.4f} m from the published poses, {verdict}")
     return sum(not each.same for each in ended)
-
-
-def add_to(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(verify)
