@@ -23,17 +23,17 @@ def display_colours(
     seed: Annotated[int, typer.Option(help="Random seed of the mixed colours.")] = 0,
 ) -> None:
     """Write the sequence of plain-colour images to show full-screen for ``car calibrate display``."""
-    import cv2
     import numpy as np
 
+    from advnerf_core.data.image_files import write_image
     from advnerf_core.files import write_atomically
     from calibration.display_colour import colours_to_show
 
     colours = colours_to_show(seed=seed)
     lines = ["file,red,green,blue"]
     for index, (red, green, blue) in enumerate(colours.tolist()):
-        picture = np.full((height, width, 3), (blue, green, red), np.uint8)
-        write_atomically(output / "show" / f"{index:03d}.png", cv2.imencode(".png", picture)[1].tobytes())
+        picture = np.full((height, width, 3), (red, green, blue), np.uint8)
+        write_image(output / "show" / f"{index:03d}.png", picture)
         lines.append(f"seen/{index:03d}.png,{red},{green},{blue}")
     write_atomically(output / "shown.csv", "\n".join(lines) + "\n")
     print(

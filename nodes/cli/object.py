@@ -127,10 +127,9 @@ def object_show(
     ] = None,
 ) -> None:
     """Render an object from eight sides."""
-    import cv2
     import numpy as np
 
-    from advnerf_core.files import write_atomically
+    from advnerf_core.data.image_files import write_image
     from advnerf_core.objects.voxel.build import draw_object
     from advnerf_core.objects.voxel.model import load_object
     from advnerf_core.objects.voxel.views import ring, viewing_lens
@@ -141,9 +140,9 @@ def object_show(
     pictures = drawn[..., :3] + 1.0 - drawn[..., 3:]
     half = _TURNTABLE_VIEWS // 2
     sheet = np.concatenate([np.concatenate(list(row), axis=1) for row in (pictures[:half], pictures[half:])])
-    pixels = np.rint(255 * np.clip(sheet[..., ::-1], 0.0, 1.0)).astype(np.uint8)
+    pixels = np.rint(255 * np.clip(sheet, 0.0, 1.0)).astype(np.uint8)
     path = output or file.with_suffix(".png")
-    write_atomically(path, cv2.imencode(".png", pixels)[1].tobytes())
+    write_image(path, pixels)
     print(path)
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 
 from advnerf_core.attack.artifact import COLOURS, MESH_TEXTURE, AttackFileError, face_texture, load_attack
+from advnerf_core.data.image_files import encoded
 from advnerf_core.documents import read_json
 from advnerf_core.places import open_tensors
 
@@ -91,10 +92,7 @@ def texture_png(folder: Path) -> bytes | None:
     except (OSError, ValueError, KeyError, SafetensorError, AttackFileError):
         return None
     small = [_square(each) for each in pictures[:_MOST_OBJECTS]]
-    if not small:
-        return None
-    _, png = cv2.imencode(".png", cv2.cvtColor(np.concatenate(small, axis=1), cv2.COLOR_RGB2BGR))
-    return png.tobytes()
+    return encoded(np.concatenate(small, axis=1), ".png") if small else None
 
 
 def _attack_pictures(file: Path) -> list[Pixels]:

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from advnerf_core.attack.artifact import AttackFile, AttackFileError, load_attack
+from advnerf_core.data.image_files import encoded
 
 _PICTURE_PX = 160
 _SUFFIX = ".safetensors"
@@ -57,7 +58,7 @@ def read_catalogue(places: Iterable[Path]) -> tuple[dict[str, CatalogueEntry], l
 def _entry(attack: AttackFile, file: Path) -> CatalogueEntry:
     texture = attack.required_face().texture
     small = cv2.resize(texture, (_PICTURE_PX, _PICTURE_PX), interpolation=cv2.INTER_AREA)
-    _, png = cv2.imencode(".png", cv2.cvtColor(np.asarray(small, np.uint8), cv2.COLOR_RGB2BGR))
+    png = encoded(np.asarray(small, np.uint8), ".png")
     clean = attack.clean_drive
     stem = file.name.removesuffix(_SUFFIX).removesuffix(".attack")
     facts = {
@@ -68,4 +69,4 @@ def _entry(attack: AttackFile, file: Path) -> CatalogueEntry:
         "predicted_m": attack.predicted_total_cte_m,
         "clean_m": None if clean is None else clean.mean_total_cte_m,
     }
-    return CatalogueEntry(attack.attack_id, file, facts, png.tobytes())
+    return CatalogueEntry(attack.attack_id, file, facts, png)

@@ -23,12 +23,12 @@ def in_one_line(attack: AttackFile) -> str:
 
 def export_attack(attack: AttackFile, folder: Path, stem: str) -> list[Path]:
     """Write the texture of an attack's face as ``<stem>.texture.png``, and its meshes as ``<stem>.<number>_<name>.glb``."""
-    import cv2
+    from advnerf_core.data.image_files import write_image
 
     written: list[Path] = []
     if attack.face is not None:
         written.append(folder / f"{stem}.texture.png")
-        write_atomically(written[-1], cv2.imencode(".png", attack.face.texture[..., ::-1])[1].tobytes())
+        write_image(written[-1], attack.face.texture)
     for number, each in enumerate(attack.objects):
         if each.glb:
             written.append(folder / f"{stem}.{number}_{each.name}.glb")

@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
-from advnerf_core.data.image_files import Rgb
+from advnerf_core.data.image_files import Rgb, write_image
 from advnerf_core.data.similarity import rotation_angles
 from advnerf_core.documents import decode_text
-from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array
 from calibration.schema import CameraCalibration, load_calibration, parse_calibration
 from nodes.bags.decoded import read_poses
@@ -159,7 +157,7 @@ def _write_frames(
             continue
         file = folder / f"{wanted[index][1]}.png"
         if not file.exists():  # an existing file is complete, because it was written under another name first
-            _write_png(file, _rgb(message, camera, f"{topic} in {bag}"))
+            write_image(file, _rgb(message, camera, f"{topic} in {bag}"))
         files.append(file)
     for stranger in set(folder.glob("*.png")) - set(files):
         stranger.unlink()
@@ -174,7 +172,3 @@ def _rgb(message: Any, camera: CameraCalibration, source: str) -> Rgb:
             "give the calibration of this camera with --calibration"
         )
     return image
-
-
-def _write_png(file: Path, rgb: Rgb) -> None:
-    write_atomically(file, cv2.imencode(".png", np.ascontiguousarray(rgb[..., ::-1]))[1].tobytes())

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from advnerf_core.data.image_files import write_image
 from advnerf_core.driving.rollout import Remembering
 from advnerf_core.files import write_atomically
 from advnerf_core.learning.frames import HOLDOUT_BLOCK
@@ -165,7 +166,7 @@ def write_saliency(
     ):
         both = np.concatenate([images[index], overlay(images[index], share)])
         files.append(out / f"saliency_{index:05d}.png")
-        write_atomically(files[-1], cv2.imencode(".png", both[..., ::-1])[1].tobytes())
+        write_image(files[-1], both)
     if video:
         files.append(_write_video(policy, images, out / "saliency.mp4", goal))
     return files

@@ -6,10 +6,10 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from advnerf_core.data.image_files import write_image
 from advnerf_core.files import write_atomically
 from calibration.schema import CalibrationError
 from hardware.screen.display import Display
@@ -56,9 +56,7 @@ def show_and_watch(
         display.show(np.full((height, width, 3), colour, np.uint8))
         for number, picture in enumerate(_after(frames, now_ns(), display)):
             name = f"seen/{index:03d}_{number}.png"
-            write_atomically(
-                folder / name, cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))[1].tobytes()
-            )
+            write_image(folder / name, picture)
             lines.append(",".join([name, *(str(int(value)) for value in colour)]))
     # Written last, so that a stopped session has no table and can be restarted.
     write_atomically(table, "\n".join(lines) + "\n")
