@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from nodes.page import PageConfig
 
 _REQUESTS = ("/arm", "/attack/request", "/attack/cancel", "/player/control", "/player/state", "/clock")
+_END_S = 5.0
 
 
 def page(
@@ -79,7 +81,8 @@ def _show_recording(bag: Path, run_dir: Path | None, port: int, rate: float) -> 
         try:
             code = run_node(build, "page", folder)
         finally:
-            _end(player)
+            player.signal(signal.SIGINT)
+            player.wait_or_kill(_END_S)
         raise typer.Exit(code)
 
 
@@ -116,13 +119,3 @@ def _recording(bag: Path, folder: Path, port: int, rate: float) -> tuple[PageCon
     playing = {"bag": str(bag.resolve()), "rate": rate, "loop": True, "topics": topics, "wait_for": []}
     write_atomically(player.config, json.dumps(playing))
     return PageConfig.model_validate(values), player
-
-
-def _end(player: Child) -> None:
-    import signal
-
-    player.signal(signal.SIGINT)
-    deadline = time.monotonic() + 5.0
-    while player.running and time.monotonic() < deadline:
-        time.sleep(0.05)
-    player.signal(signal.SIGKILL)

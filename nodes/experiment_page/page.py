@@ -18,6 +18,7 @@ from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps.attack import planned_evaluations
 from nodes.experiment_page.server import HOST, PACKAGES
 from nodes.operator_page.listening import bound_socket, require_packages
+from nodes.runtime.termination import wait_or_kill
 
 _LOG = "page.log"
 _END_S = 3.0
@@ -77,11 +78,7 @@ class ExperimentPage:
         assert self._process.stdin is not None
         with contextlib.suppress(OSError):
             self._process.stdin.close()
-        try:
-            self._process.wait(_END_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        wait_or_kill(self._process, _END_S)
 
 
 def run_with_page(

@@ -17,16 +17,26 @@ from advnerf_core.strict import COMPLETE
 READ_AGAIN = {"read_again": True}
 
 
+def beside(path: Path | str, info: ValidationInfo) -> Path:
+    """A path relative to the file that names it, or to the current folder without a file."""
+    folder: Path = (info.context or {}).get("folder") or Path.cwd()
+    return folder / expanded(path)
+
+
+def refusal(text: str) -> PydanticCustomError:
+    """The error of a value, of which the text says everything."""
+    return PydanticCustomError(COMPLETE, "{text}", {"text": text})
+
+
 def located(path: Path, info: ValidationInfo) -> Path:
     """Absolute path of a file or folder.
 
     Raises:
         PydanticCustomError: The file or folder does not exist.
     """
-    found = ((info.context or {}).get("folder") or Path.cwd()) / expanded(path)
+    found = beside(path, info)
     if not found.exists():
-        text = f"expected a file or folder relative to this file, got {path}, which is not there"
-        raise PydanticCustomError(COMPLETE, "{text}", {"text": text})
+        raise refusal(f"expected a file or folder relative to this file, got {path}, which is not there")
     return found.resolve()
 
 

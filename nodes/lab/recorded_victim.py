@@ -6,7 +6,6 @@ result of the experiment contains them.
 
 from __future__ import annotations
 
-import contextlib
 import subprocess
 import threading
 from collections.abc import Callable
@@ -18,6 +17,7 @@ from advnerf_core.attack.artifact import load_attack
 from advnerf_core.documents import read_json
 from advnerf_core.run_module import module_command
 from nodes.runtime.paths import shipped
+from nodes.runtime.termination import wait_or_kill
 
 # In the run folder: the newest picture of the drive, its description, and the film, which has the suffix of its container.
 FOLDER, NOW, ABOUT, FILM = "recorded", "now.jpg", "about.json", "clip"
@@ -104,11 +104,7 @@ class FirstPicture:
         if self._process is None:
             return
         self._process.terminate()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(_END_S)
-            return
-        self._process.kill()
-        self._process.wait()
+        wait_or_kill(self._process, _END_S)
 
     def wait(self, timeout_s: float) -> int | None:
         """Wait for the end of the drive; its exit code, or None without a drive.

@@ -87,6 +87,13 @@ class Child:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self._process.pid, number)
 
+    def wait_or_kill(self, wait_s: float) -> None:
+        """Wait for a process that was asked to end; kill its group if it does not end within this time [s]."""
+        deadline = time.monotonic() + wait_s
+        while self.running and time.monotonic() < deadline:
+            time.sleep(0.05)
+        self.signal(signal.SIGKILL)
+
     def how_it_ended(self) -> str:
         """Describe how the process ended."""
         code = self.exit_code

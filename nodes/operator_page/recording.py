@@ -110,7 +110,4 @@ class RecorderControl:
             return
         if self._asked_s is None:
             self.stop()
-        deadline = time.monotonic() + _KILL_AFTER_S
-        while self._child.running and time.monotonic() < deadline:
-            time.sleep(0.05)
-        self._child.signal(signal.SIGKILL)
+        self._child.wait_or_kill(_KILL_AFTER_S)

@@ -4,8 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import signal
+import subprocess
 import sys
 from collections.abc import Iterator
+from typing import Any
+
+
+def wait_or_kill(process: subprocess.Popen[Any], wait_s: float) -> None:
+    """Wait for a process that was asked to end; kill it if it does not end within this time [s]."""
+    try:
+        process.wait(wait_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 @contextlib.contextmanager

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated
 
 from pydantic import AfterValidator, ValidationInfo
-from pydantic_core import PydanticCustomError
 
 from advnerf_core.attack.methods import require_method
 from advnerf_core.attack.objectives import require_objective
@@ -18,7 +17,7 @@ from advnerf_core.files import write_atomically
 from advnerf_core.plugins import PluginError, absolute_reference
 from advnerf_core.policies.architecture import require_architecture
 from advnerf_core.report.conditions import CONTROLS, know_methods
-from advnerf_core.strict import COMPLETE
+from nodes.lab.located import refusal
 
 
 def _checked(require: Callable[[str, Path], None]) -> Callable[[str, ValidationInfo], str]:
@@ -27,7 +26,7 @@ def _checked(require: Callable[[str, Path], None]) -> Callable[[str, ValidationI
         try:
             require(name, folder)
         except PluginError as error:
-            raise PydanticCustomError(COMPLETE, "{text}", {"text": str(error)}) from None
+            raise refusal(str(error)) from None
         return absolute_reference(name, folder)
 
     return checked

@@ -8,13 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from pydantic import AfterValidator, PlainSerializer, SerializationInfo, ValidationInfo
-from pydantic_core import PydanticCustomError
 
 from advnerf_core.files import sha256_of
-from advnerf_core.places import expanded
 from advnerf_core.plugins import unknown
-from advnerf_core.strict import COMPLETE
-from nodes.lab.located import is_read_again
+from nodes.lab.located import beside, is_read_again, refusal
 
 if TYPE_CHECKING:
     from advnerf_core.objects.voxel.mesh import SurfaceMesh
@@ -41,18 +38,15 @@ def _located(kind: str, info: ValidationInfo) -> str:
     if kind in MADE_HERE_M:
         return kind
     if not kind.endswith((OBJECT_SUFFIX, *MESH_SUFFIXES, *UNITLESS_SUFFIXES)):
-        raise PydanticCustomError(
-            COMPLETE,
-            "{text}",
-            {
-                "text": f"{unknown(kind, 'kind of object', MADE_HERE_M)}; one of your own is a file of 'advnerf scene object build' "
-                f"(*{OBJECT_SUFFIX}) or a mesh ({', '.join(MESH_SUFFIXES)}, in metres), relative to this file"
-            },
+        raise refusal(
+            f"{unknown(kind, 'kind of object', MADE_HERE_M)}; one of your own is a file of 'advnerf scene object build' "
+            f"(*{OBJECT_SUFFIX}) or a mesh ({', '.join(MESH_SUFFIXES)}, in metres), relative to this file"
         )
-    file = ((info.context or {}).get("folder") or Path.cwd()) / expanded(kind)
+    file = beside(kind, info)
     if not file.is_file():
-        text = f"expected an object or mesh file relative to this file, got {kind}, which is not there"
-        raise PydanticCustomError(COMPLETE, "{text}", {"text": text})
+        raise refusal(
+            f"expected an object or mesh file relative to this file, got {kind}, which is not there"
+        )
     return str(file.resolve())
 
 

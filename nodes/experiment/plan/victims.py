@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -14,13 +13,12 @@ from pydantic import (
     ValidationInfo,
     model_validator,
 )
-from pydantic_core import PydanticCustomError
 
-from advnerf_core.places import expanded
 from advnerf_core.policies.load import POLICY_SUFFIXES, is_code
-from advnerf_core.strict import COMPLETE, StrictModel
+from advnerf_core.strict import StrictModel
 from nodes.experiment.plan.numbers import Count
 from nodes.experiment.plan.sections import PolicyConfig
+from nodes.lab.located import beside, refusal
 
 # Policies that the section policy trains, and the first one's retrained version; a user's victims have other names.
 HARDENED, NAIVE, RETRAINED = "hardened", "naive", "retrained"
@@ -33,11 +31,12 @@ def _located(spec: str, info: ValidationInfo) -> str:
     """A policy's name in a form that another process in this working folder understands."""
     if is_code(spec):
         return spec
-    file = ((info.context or {}).get("folder") or Path.cwd()) / expanded(Path(spec))
+    file = beside(spec, info)
     if file.suffix not in POLICY_SUFFIXES or not file.is_file():
         wrong = "which is not there" if file.suffix in POLICY_SUFFIXES else "which is none of these"
-        text = f"expected a policy file ({', '.join(POLICY_SUFFIXES)}) relative to this file, package.module:factory or grpc://HOST:PORT, got {spec}, {wrong}"
-        raise PydanticCustomError(COMPLETE, "{text}", {"text": text})
+        raise refusal(
+            f"expected a policy file ({', '.join(POLICY_SUFFIXES)}) relative to this file, package.module:factory or grpc://HOST:PORT, got {spec}, {wrong}"
+        )
     return str(file.resolve())
 
 
@@ -72,7 +71,7 @@ class TrainingConfig(PolicyConfig):
             wanted = "naive_steps of at least 1, here or in the section policy, with textures none, got 0"
             if self.naive_steps:
                 wanted = f"textures none with naive_steps, got {self.naive_steps} with textures random"
-            raise PydanticCustomError(COMPLETE, "{text}", {"text": f"expected {wanted}"})
+            raise refusal(f"expected {wanted}")
         return self
 
     @property

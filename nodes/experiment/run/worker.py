@@ -33,7 +33,7 @@ from nodes.runtime.errors import RuntimeFault
 from nodes.runtime.locks import HeldError, hold
 from nodes.runtime.machine import machine_name
 from nodes.runtime.progress import Report
-from nodes.runtime.termination import ends_in_order
+from nodes.runtime.termination import ends_in_order, wait_or_kill
 
 Phase = Literal["search", "whole"]
 _DONE, _FAILED, _ELSEWHERE, _ASKED_TO_END = 0, 1, 3, 128 + signal.SIGTERM
@@ -121,11 +121,7 @@ def run_in_process(job: Job) -> Ended:
     except BaseException:
         # Asked to end before it is killed: a cell may have a world to restore, such as a CARLA server's.
         process.terminate()
-        try:
-            process.wait(_ENDING_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+        wait_or_kill(process, _ENDING_S)
         raise
     code, seconds = process.returncode, time.monotonic() - began
     said = (errors.decode("utf-8", "replace").strip().splitlines() or [""])[-1]
