@@ -25,14 +25,15 @@ RequestFile = Annotated[
         dir_okay=False,
     ),
 ]
+Output = Annotated[
+    Path | None, typer.Option("--output", "-o", help="Folder of the results.", show_default="runs/<name>")
+]
 
 
 @app.command("run")
 def attack_run(
     file: RequestFile,
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder of the results.", show_default="runs/<name>")
-    ] = None,
+    output: Output = None,
     device: Device = None,
     overrides: Overrides = None,
 ) -> None:

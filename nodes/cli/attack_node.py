@@ -3,25 +3,18 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from nodes.cli.attack import RequestFile
 from nodes.runtime.terminal import Overrides, RunDir
 
 _FAILURE_EXIT = 1
 
 
 def attack_request(
-    file: Annotated[
-        Path,
-        typer.Argument(
-            help="A *.experiment.yaml file of one attack in a learned scene of your own.",
-            exists=True,
-            dir_okay=False,
-        ),
-    ],
+    file: RequestFile,
     run_dir: RunDir = None,
     request_id: Annotated[
         str,

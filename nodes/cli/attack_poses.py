@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from nodes.cli.attack import Output
 from nodes.runtime.terminal import Overrides, print_table, table
 
 RequestFile = Annotated[
@@ -16,9 +17,6 @@ RequestFile = Annotated[
         exists=True,
         dir_okay=False,
     ),
-]
-Output = Annotated[
-    Path | None, typer.Option("--output", "-o", help="Folder of the results.", show_default="runs/<name>")
 ]
 FoundAttack = Annotated[
     Path | None,
