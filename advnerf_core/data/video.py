@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -17,6 +17,8 @@ from advnerf_core.data.image_files import Rgb, write_image
 from advnerf_core.data.keyframes import Candidate, KeyframeConfig, KeyframeSelector
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_json
+
+T = TypeVar("T")
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
 _RECORD = "keyframes.json"
@@ -95,7 +97,7 @@ def keep_keyframes(
         report(share, f"{path.name}: {len(kept)} of {number + 1} frames kept")
     if (chosen := selector.last()) is not None:
         kept.append(_write(folder, chosen))
-    rows = _thinned(kept, most)
+    rows = thinned(kept, most)
     for row in kept:
         if row not in rows:
             (folder / row["file"]).unlink()
@@ -109,7 +111,8 @@ def _write(folder: Path, frame: Candidate) -> dict[str, Any]:
     return {"file": name, "time_s": round(frame.time_s, 4), "sharpness": round(frame.sharpness, 2)}
 
 
-def _thinned(rows: list[dict[str, Any]], most: int) -> list[dict[str, Any]]:
+def thinned(rows: list[T], most: int) -> list[T]:
+    """At most so many of the rows, evenly spread."""
     if len(rows) <= most:
         return rows
     return [rows[i] for i in np.linspace(0, len(rows) - 1, most).round().astype(int)]

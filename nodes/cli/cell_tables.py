@@ -63,7 +63,7 @@ def table_command(
     """Print the table of all cells, and the targets."""
     choice, source = _published(choice, published)
     experiment, cells = load_cells(choice, executes=False)
-    _show(experiment, cells, None, source)
+    show_table(experiment, cells, None, source)
 
 
 def report(
@@ -85,7 +85,7 @@ def report(
         )
     choice, source = _published(choice, published)
     experiment, cells = load_cells(choice, executes=False)
-    _show(experiment, cells, output or page_folder(experiment), source)
+    show_table(experiment, cells, output or page_folder(experiment), source)
 
 
 def _published(choice: CellChoice, published: bool) -> tuple[CellChoice, Path | None]:
@@ -95,39 +95,36 @@ def _published(choice: CellChoice, published: bool) -> tuple[CellChoice, Path | 
     return replace(choice, folder=None), choice.folder or _PUBLISHED
 
 
-def _show(experiment: Experiment, cells: Sequence[Cell], output: Path | None, source: Path | None) -> None:
-    if source is None:
-        show_table(experiment, cells, output)
-    else:
-        _show_published(experiment, cells, output, source / experiment.config.name)
-
-
 def page_folder(experiment: Experiment) -> Path:
     """Where the page of all cells of an experiment goes."""
     return experiment.folder / "table"
 
 
-def show_table(experiment: Experiment, cells: Sequence[Cell], output: Path | None) -> None:
-    """Print the table of cells of the settings of now; write its page into ``output`` if it is given."""
-    from nodes.experiment.run.plan import statuses
-    from nodes.experiment.run.published import table_of
+def show_table(
+    experiment: Experiment, cells: Sequence[Cell], output: Path | None, source: Path | None = None
+) -> None:
+    """Print the table of cells; write its page into ``output`` if it is given.
 
-    know_methods(experiment)  # titles are kept since cells were run
-    found = statuses(experiment, cells)
-    full = table_of(experiment, found)
-    page = _write_and_print(experiment, full, experiment.folder, experiment.folder / "cells", output)
-    left_out = [each for each in found if each.state in ("changed", "unreadable")]
+    The cells are those of the settings of now, or in ``source``, the folder of published sets, whatever their settings.
+    """
+    from nodes.experiment.run.plan import statuses
+    from nodes.experiment.run.published import published_table, table_of
+
+    left_out = []
+    if source is None:
+        know_methods(experiment)  # titles are kept since cells were run
+        found = statuses(experiment, cells)
+        left_out = [each for each in found if each.state in ("changed", "unreadable")]
+        full, folder, clips = table_of(experiment, found), experiment.folder, experiment.folder / "cells"
+    else:
+        # Films are not published; films of the user's own cells may show other drives.
+        folder = clips = source / experiment.config.name
+        full = published_table(folder, experiment, list(cells))
+    page = _write_and_print(experiment, full, folder, clips, output)
     for each in left_out:
         say_error(f"{each.cell.name} is left out: {each.text}")
-    _say_where(full, cells, page)
-
-
-def _show_published(experiment: Experiment, cells: Sequence[Cell], output: Path | None, folder: Path) -> None:
-    from nodes.experiment.run.published import published_table
-
-    full = published_table(folder, experiment, list(cells))
-    # Films are not published; films of the user's own cells may show other drives.
-    _say_where(full, cells, _write_and_print(experiment, full, folder, folder, output))
+    told = f"page: {page}" if page else "advnerf experiment report writes a page of them"
+    print(f"{len(full.cells)} of {len(cells)} cells; {told}")
 
 
 def _write_and_print(
@@ -159,10 +156,3 @@ def _write_and_print(
         console.print(prediction_table(pairs).rich())
         print(skill_text(pairs))
     return page
-
-
-def _say_where(full: ResultTable, cells: Sequence[Cell], page: Path | None) -> None:
-    print(
-        f"{len(full.cells)} of {len(cells)} cells; "
-        + (f"page: {page}" if page else "advnerf experiment report writes a page of them")
-    )

@@ -52,11 +52,6 @@ class PoseBuffer:
     def __len__(self) -> int:
         return len(self._stamps)
 
-    @property
-    def newest_ns(self) -> int | None:
-        """Stamp of the newest pose [ns]; None if the buffer is empty."""
-        return self._stamps[-1] if self._stamps else None
-
     def add(self, stamp_ns: int, T: NDArray[np.float64]) -> None:
         """Add a pose. Poses may arrive in any order; of two with the same stamp, the first is kept.
 

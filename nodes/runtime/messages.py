@@ -214,12 +214,6 @@ def camera_info_message(
     )
 
 
-def pinhole_from_camera_info(message: Any) -> Pinhole:
-    """Convert a ``CameraInfo`` to intrinsics with pixel centres at +0.5."""
-    K = np.asarray(message.k, dtype=np.float64).reshape(3, 3)
-    return Pinhole(int(message.width), int(message.height), K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)
-
-
 def _require_type(typename: str) -> None:
     if not _TYPES.has(typename):
         raise MessageError(f"expected a message type of ROS 2 or of {MSG_FOLDER}, got {typename!r}")

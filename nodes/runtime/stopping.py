@@ -134,22 +134,3 @@ def stop_runs(run_dirs: Sequence[Path], reason: str, tell: Callable[[StopReport]
     finally:
         for request in requests:
             request.close()
-
-
-def ask_to_disarm(run_dir: Path, reason: str, silent: Callable[[float], None]) -> ArmAnswer:
-    """Ask the safety node to disarm, as the operator, until it answers. Then check that the motor node brakes.
-
-    Args:
-        run_dir: Folder of the run.
-        reason: Reason to record.
-        silent: Called with the waiting time [s] while the safety node does not answer.
-    """
-    request = StopRequest(run_dir, reason)
-    try:
-        while (report := request.report()).answer is None:
-            if request.late():
-                silent(report.waited_s)
-            request.step(_REPEAT_S)
-        return report.answer
-    finally:
-        request.close()

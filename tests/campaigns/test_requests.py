@@ -21,8 +21,8 @@ import pytest
 from hardware.emulators.vesc_firmware import WireEvent
 from nodes.runtime.arm_requests import ask_to_arm
 from nodes.runtime.errors import LaunchError
-from nodes.runtime.stopping import ask_to_disarm
 from tests.campaigns.campaign import Campaign
+from tests.support.disarm import ask_to_disarm
 from tests.support.live.graph import START, Graph, live_graph
 from tests.support.live.processes import REPOSITORY, end
 

@@ -19,7 +19,7 @@ from nodes.runtime.clock import SystemClock
 from nodes.runtime.errors import LaunchError
 from nodes.runtime.messages import drive_message, header, pose_message, types
 from nodes.runtime.requests import RequestIdentity
-from nodes.runtime.stopping import ask_to_disarm
+from tests.support.disarm import ask_to_disarm
 from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.live

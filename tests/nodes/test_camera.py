@@ -26,9 +26,10 @@ from nodes.runtime.bus import Bus
 from nodes.runtime.clock import SystemClock
 from nodes.runtime.config import load_node_config
 from nodes.runtime.errors import ConfigError, RuntimeFault
-from nodes.runtime.messages import ns_from_stamp, pinhole_from_camera_info
+from nodes.runtime.messages import ns_from_stamp
 from nodes.runtime.node import NodeContext
 from nodes.runtime.pictures import rgb_image
+from tests.support.camera_info import pinhole_from_camera_info
 from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.live

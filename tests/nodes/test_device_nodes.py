@@ -17,9 +17,10 @@ from hardware.mocap.vicon_codec import encode_blocks, object_pose
 from nodes.camera import CameraNode, CameraNodeConfig
 from nodes.runtime.clock import SystemClock
 from nodes.runtime.errors import RuntimeFault
-from nodes.runtime.messages import ns_from_stamp, pinhole_from_camera_info, pose_matrix
+from nodes.runtime.messages import ns_from_stamp, pose_matrix
 from nodes.runtime.pictures import rgb_image
 from nodes.vicon import ViconNode, ViconNodeConfig
+from tests.support.camera_info import pinhole_from_camera_info
 from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.live

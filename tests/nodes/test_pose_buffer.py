@@ -80,7 +80,8 @@ def test_old_poses_are_forgotten():
     buffer = filled(until_s=10.0, keep_s=2.0)
     assert len(buffer) == 101
     assert buffer.at(7_900_000_000) is None
-    assert buffer.newest_ns == 10_000_000_000
+    assert buffer.reaches(10_000_000_000)
+    assert not buffer.reaches(10_000_000_001)
     buffer.add(1, np.eye(4))
     assert len(buffer) == 101
     with pytest.raises(ValueError, match="expected positive times"):
@@ -93,5 +94,6 @@ def test_a_pose_of_a_wrong_clock_does_not_lock_out_the_right_ones(ahead_s):
     buffer.add(round((10.0 + ahead_s) * 1e9), on_circle(10.0))
     for k in range(1, 20):
         buffer.add(10_000_000_000 + k * 20_000_000, on_circle(10.0 + 0.02 * k))
-    assert buffer.newest_ns == 10_380_000_000
+    assert buffer.reaches(10_380_000_000)
+    assert not buffer.reaches(10_380_000_001)
     assert buffer.at(10_250_000_000) is not None

@@ -31,7 +31,7 @@ from nodes.experiment.plan.sections import ResponseConfig
 from nodes.experiment.show.experiment_world import ExperimentWorld
 from nodes.experiment.show.given import given_in, given_victim
 from nodes.lab.policy_camera import require_camera
-from nodes.lab.worlds.expert_drive import as_path
+from nodes.lab.worlds.expert_drive import as_path, expert_of
 from nodes.runtime.errors import ConfigError
 
 PLACED, CALIBRATION = "objects.json", "calibration"
@@ -132,18 +132,13 @@ class Experiment(ExperimentWorld):
     def expert(self, scenario: str) -> Expert:
         """The teacher on one path; its output is the car's control: turn rate [rad/s] or wheel angle [rad]."""
         wanted, car = self.config.policy, self.car
-        config = ExpertConfig(
-            speed_mps=car.speed_mps,
+        gains = ExpertConfig(
             delay_s=wanted.delay_s,
             stiffness_1pm=wanted.stiffness_1pm,
             feed_forward=wanted.feed_forward,
             smoothing_m=wanted.smoothing_m or car.speed_mps * self.config.dt_s,
-            steering_limits_rad=car.control_limits,
-            output="turn_rate",
         )
-        if car.wheelbase_m is not None:
-            config = replace(config, wheelbase_m=car.wheelbase_m, output="wheel_angle")
-        return Expert(self.paths[scenario], config)
+        return expert_of(self.paths[scenario], car, gains)
 
     @property
     def car(self) -> CarDescription:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,6 @@ from advnerf_core.attack.spaces.placement import KeepOut, PoseBounds
 from advnerf_core.attack.spaces.places import PlaceLimits, PlaceSpace, randomly_placed
 from advnerf_core.attack.spaces.space import ColourSpace, NamedObject, ShapeSpace, Shown, Space, colours_of
 from advnerf_core.fields.voxel_grid import VoxelGridObject
-from advnerf_core.files import sha256_of
 from advnerf_core.objects.mesh.field import MeshField
 from advnerf_core.objects.mesh.shape import ShapeLimits
 from advnerf_core.objects.mesh.surface import sphere, unwrapped
@@ -46,6 +44,7 @@ from nodes.experiment.show.objects import (
     surrogate_of,
 )
 from nodes.experiment.show.own_scene import display_of, mount_of, own_objects
+from nodes.lab.located import content_sha256
 from nodes.lab.worlds.expert_drive import as_path
 from nodes.runtime.errors import ConfigError
 
@@ -179,8 +178,7 @@ def geometry_sha256(experiment: Experiment, kind: str) -> str:
     """Hash of the object file of a kind; for a panel, the hash of the panel at scale 1."""
     if kind == PANEL:
         return panel_object(experiment, MADE_HERE_M[PANEL][1]).sha256
-    path = object_file(experiment, kind)
-    return _file_sha256(path, path.stat().st_mtime_ns)
+    return content_sha256(object_file(experiment, kind))
 
 
 def named_objects(experiment: Experiment) -> list[NamedObject]:
@@ -218,9 +216,3 @@ def _colours_in(file: Path, surrogate: Surrogate) -> Tensor:
             f"{file}: expected colours of shapes {expected} for the objects of the experiment, got {shapes}"
         )
     return colours_of(attack, torch.float64).reshape(surrogate.theta_shape)
-
-
-@lru_cache(maxsize=8)
-def _file_sha256(path: Path, changed_ns: int) -> str:
-    del changed_ns  # part of the cache's key
-    return sha256_of(path)

@@ -10,6 +10,7 @@ import numpy as np
 
 from advnerf_core.data.image_files import Rgb, write_image
 from advnerf_core.data.similarity import rotation_angles
+from advnerf_core.data.video import thinned
 from advnerf_core.documents import decode_text
 from advnerf_core.geometry import Array
 from calibration.schema import CameraCalibration, load_calibration, parse_calibration
@@ -121,9 +122,7 @@ def choose_by_motion(T_world_from_camera: Array, config: BagConfig) -> list[int]
         turned = float(rotation_angles(last[:3, :3].T @ pose[:3, :3]))
         if moved >= config.step_m or turned >= config.step_rad:
             chosen.append(index)
-    if len(chosen) <= config.most:
-        return chosen
-    return [chosen[i] for i in np.linspace(0, len(chosen) - 1, config.most).round().astype(int)]
+    return thinned(chosen, config.most)
 
 
 def _camera(bag: Path, file: Path | None) -> CameraCalibration:

@@ -10,8 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
 from advnerf_core.data import image_bytes, image_files, video
 from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.keyframes import KeyframeConfig
@@ -73,7 +71,7 @@ def gather(media: Sequence[Path], output: Path, config: MediaConfig, report: Rep
         if is_video:
             kept = video.keep_keyframes(files[0], folder, config.keyframes, config.most, progress)
         else:
-            kept = _copy_photographs(_thinned(files, config.most), folder, progress)
+            kept = _copy_photographs(video.thinned(files, config.most), folder, progress)
         images = tuple(path.relative_to(output).as_posix() for path in kept)
         sources.append(PhotoSource("camera" if config.one_camera else name, images, ordered=is_video))
     return sources
@@ -120,12 +118,6 @@ def _unique(label: str, taken: set[str]) -> str:
         name, number = f"{base}_{number}", number + 1
     taken.add(name)
     return name
-
-
-def _thinned(files: list[Path], most: int) -> list[Path]:
-    if len(files) <= most:
-        return files
-    return [files[i] for i in np.linspace(0, len(files) - 1, most).round().astype(int)]
 
 
 def _copy_photographs(files: Sequence[Path], folder: Path, report: Report) -> list[Path]:

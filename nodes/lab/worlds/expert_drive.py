@@ -49,17 +49,16 @@ def lane_expert(
     path: Path, car: CarDescription, dt_s: float, stiffness_1pm: float = _STIFFNESS_1PM
 ) -> Expert:
     """The project's expert with a car's control: the turn rate of a Dubins car, the wheel angle of one with a wheelbase."""
-    config = ExpertConfig(
-        speed_mps=car.speed_mps,
-        delay_s=_DELAY_S,
-        stiffness_1pm=stiffness_1pm,
-        smoothing_m=car.speed_mps * dt_s,
-        steering_limits_rad=car.control_limits,
-        output="turn_rate",
-    )
-    if car.wheelbase_m is not None:
-        config = replace(config, wheelbase_m=car.wheelbase_m, output="wheel_angle")
-    return Expert(path, config)
+    gains = ExpertConfig(delay_s=_DELAY_S, stiffness_1pm=stiffness_1pm, smoothing_m=car.speed_mps * dt_s)
+    return expert_of(path, car, gains)
+
+
+def expert_of(path: Path, car: CarDescription, gains: ExpertConfig) -> Expert:
+    """The expert with these gains, with a car's speed, limits and control; see `lane_expert`."""
+    config = replace(gains, speed_mps=car.speed_mps, steering_limits_rad=car.control_limits)
+    if car.wheelbase_m is None:
+        return Expert(path, replace(config, output="turn_rate"))
+    return Expert(path, replace(config, wheelbase_m=car.wheelbase_m, output="wheel_angle"))
 
 
 def drive_expert(

@@ -14,7 +14,7 @@ pytest.importorskip("websockets")
 from websockets.exceptions import InvalidStatus
 
 from nodes.runtime.arm_requests import ask_to_arm
-from nodes.runtime.stopping import ask_to_disarm
+from tests.support.disarm import ask_to_disarm
 from tests.support.live.page_client import Browser, cookie_of, request
 from tests.support.page import Run
 from tests.support.waiting import wait_for

@@ -16,7 +16,6 @@ from nodes.runtime.messages import (
     encode,
     header,
     image_message,
-    pinhole_from_camera_info,
     pose_matrix,
     pose_message,
     stamp_ns,
@@ -28,6 +27,7 @@ from nodes.runtime.messages import (
 from nodes.runtime.paths import socket_path
 from nodes.runtime.topics import TOPICS, status_topic, topic
 from nodes.runtime.wire import Meta, pack_meta, unpack
+from tests.support.camera_info import pinhole_from_camera_info
 
 pytestmark = pytest.mark.live
 

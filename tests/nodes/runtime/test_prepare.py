@@ -15,8 +15,8 @@ from nodes.lab.doctor.priority import shares
 from nodes.runtime.bus import Bus
 from nodes.runtime.descriptors import Reserve
 from nodes.runtime.priority import FIRST, HELPER, Share, nices_to_try, share_of
-from nodes.runtime.stopping import ask_to_disarm
 from tests.nodes.test_arm_live import Lab
+from tests.support.disarm import ask_to_disarm
 from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.live
