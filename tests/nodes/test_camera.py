@@ -17,9 +17,6 @@ from hardware.cameras.steady import SteadyCamera
 from hardware.cameras.v4l2.driver import V4l2Camera
 from hardware.cameras.v4l2.negotiation import Mode
 from hardware.cameras.zed.driver import ZedCamera
-from hardware.emulators.v4l2_device import VideoDevice
-from hardware.emulators.v4l2_emulator import VideoPortEmulator
-from hardware.emulators.zed_emulator import ZedRegisters
 from nodes.camera import CameraNode, CameraNodeConfig
 from nodes.launching.launch_file import load_launch
 from nodes.runtime.bus import Bus
@@ -30,7 +27,10 @@ from nodes.runtime.messages import ns_from_stamp
 from nodes.runtime.node import NodeContext
 from nodes.runtime.pictures import rgb_image
 from tests.support.camera_info import pinhole_from_camera_info
+from tests.support.v4l2_device import VideoDevice
+from tests.support.v4l2_emulator import VideoPortEmulator
 from tests.support.waiting import wait_for
+from tests.support.zed_emulator import ZedRegisters
 
 pytestmark = pytest.mark.live
 

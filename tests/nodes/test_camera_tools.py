@@ -9,12 +9,12 @@ from typer.testing import CliRunner
 
 from calibration.schema import CameraCalibration, load_calibration
 from hardware.cameras.zed.calibration import Rectifier, load_factory_calibration
-from hardware.emulators.v4l2_device import VideoDevice
-from hardware.emulators.v4l2_emulator import VideoPortEmulator
-from hardware.emulators.zed_emulator import ZedRegisters
 from nodes.cli.camera import app
 from nodes.lab.camera_tools import CameraToolError, describe_devices, parse_source, try_source
 from nodes.runtime.errors import ConfigError
+from tests.support.v4l2_device import VideoDevice
+from tests.support.v4l2_emulator import VideoPortEmulator
+from tests.support.zed_emulator import ZedRegisters
 
 pytestmark = pytest.mark.live
 

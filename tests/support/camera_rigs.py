@@ -15,9 +15,9 @@ from hardware.cameras.v4l2.negotiation import Mode
 from hardware.cameras.video import VideoCamera
 from hardware.cameras.zed.driver import ZedCamera
 from hardware.emulators.frame_server import FrameServer
-from hardware.emulators.v4l2_device import VideoDevice
-from hardware.emulators.v4l2_emulator import VideoPortEmulator
-from hardware.emulators.zed_emulator import ZedRegisters
+from tests.support.v4l2_device import VideoDevice
+from tests.support.v4l2_emulator import VideoPortEmulator
+from tests.support.zed_emulator import ZedRegisters
 
 PATH = "/dev/v4l/by-id/usb-Camera-video-index0"
 SHAPE = (188, 336, 3)

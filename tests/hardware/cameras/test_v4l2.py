@@ -18,7 +18,8 @@ from hardware.cameras.v4l2.controls import Controls
 from hardware.cameras.v4l2.driver import V4l2Camera
 from hardware.cameras.v4l2.negotiation import Mode
 from hardware.cameras.v4l2.port import KernelPort
-from hardware.emulators.v4l2_device import (
+from hardware.errors import DeviceBusy, DeviceNotFound, HardwareError, LinkLost, ProtocolError
+from tests.support.v4l2_device import (
     AUTO_EXPOSURE,
     AUTO_WHITE_BALANCE,
     EXPOSURE,
@@ -27,8 +28,7 @@ from hardware.emulators.v4l2_device import (
     WHITE_BALANCE,
     VideoDevice,
 )
-from hardware.emulators.v4l2_emulator import VideoPortEmulator
-from hardware.errors import DeviceBusy, DeviceNotFound, HardwareError, LinkLost, ProtocolError
+from tests.support.v4l2_emulator import VideoPortEmulator
 
 pytestmark = pytest.mark.live
 

@@ -24,10 +24,10 @@ from hardware.cameras.zed.exposure import (
     read_exposure_lines,
     read_gain,
 )
-from hardware.emulators.v4l2_device import VideoDevice
-from hardware.emulators.v4l2_emulator import VideoPortEmulator
-from hardware.emulators.zed_emulator import ZedRegisters
 from hardware.errors import HardwareError, ProtocolError
+from tests.support.v4l2_device import VideoDevice
+from tests.support.v4l2_emulator import VideoPortEmulator
+from tests.support.zed_emulator import ZedRegisters
 
 pytestmark = pytest.mark.live
 

@@ -10,10 +10,10 @@ from calibration.schema import CameraCalibration, load_calibration
 from hardware.cameras.sources import V4l2Source
 from hardware.cameras.v4l2.driver import V4l2Camera
 from hardware.cameras.v4l2.negotiation import Mode
-from hardware.emulators.v4l2_device import VideoDevice
-from hardware.emulators.v4l2_emulator import VideoPortEmulator
 from nodes.lab.doctor import cameras, graphics
 from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, DoctorCheck, examine
+from tests.support.v4l2_device import VideoDevice
+from tests.support.v4l2_emulator import VideoPortEmulator
 
 pytestmark = pytest.mark.live
 

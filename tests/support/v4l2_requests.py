@@ -13,7 +13,7 @@ import struct
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from hardware.emulators.v4l2_device import (
+from tests.support.v4l2_device import (
     AUTO_EXPOSURE,
     AUTO_WHITE_BALANCE,
     EXPOSURE,

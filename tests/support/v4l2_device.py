@@ -65,7 +65,6 @@ class VideoDevice:
         rates: Supported frame rates [Hz].
         metadata_only: Whether this is the second device of a webcam, which delivers no pictures.
         padding_bytes: Unused bytes at the end of every row.
-        stamp_flags: Clock and event of its stamps, as in ``v4l2_buffer.flags``.
         after_start: Changes that the device applies to itself when the stream starts.
         extension: Answers requests to the extension units of a UVC device: unit, selector, query, data.
     """
@@ -77,7 +76,6 @@ class VideoDevice:
     controls: dict[int, ControlState] = field(default_factory=webcam_controls)
     metadata_only: bool = False
     padding_bytes: int = 0
-    stamp_flags: int = 0x12000  # monotonic, start of exposure
     after_start: Callable[[VideoDevice], None] | None = None
     extension: Callable[[int, int, int, bytearray], None] | None = None
     card: str = "Emulated Camera"
@@ -124,7 +122,7 @@ class VideoDevice:
             buffer.memory[: len(data)] = data
             buffer.used, buffer.sequence = len(data), sequence
             buffer.stamp_ns = time.monotonic_ns() if stamp_ns is None else stamp_ns
-            buffer.flags = self.stamp_flags | (0x40 if damaged else 0)
+            buffer.flags = 0x12000 | (0x40 if damaged else 0)  # the stamp: monotonic, start of exposure
             self.done.append(index)
             self.condition.notify_all()
 

@@ -1,4 +1,4 @@
-"""The registers of a ZED behind its UVC extension unit, for `hardware.emulators.v4l2_emulator.VideoDevice.extension`."""
+"""The registers of a ZED behind its UVC extension unit, for `tests.support.v4l2_emulator.VideoDevice.extension`."""
 
 from __future__ import annotations
 

@@ -10,8 +10,8 @@ import errno
 from pathlib import Path
 from typing import Any
 
-from hardware.emulators.v4l2_device import VideoDevice
-from hardware.emulators.v4l2_requests import ANSWERS, PAGE, system_error
+from tests.support.v4l2_device import VideoDevice
+from tests.support.v4l2_requests import ANSWERS, PAGE, system_error
 
 
 class VideoPortEmulator:
@@ -23,7 +23,6 @@ class VideoPortEmulator:
 
     def __init__(self, devices: dict[str, VideoDevice]) -> None:
         self.devices = devices
-        self.calls: list[int] = []
         self._open: dict[int, VideoDevice] = {}
         self._next_fd = 1000
 
@@ -41,7 +40,6 @@ class VideoPortEmulator:
         device = self._open.get(fd)
         if device is None:
             raise system_error(errno.EBADF)
-        self.calls.append(request)
         with device.condition:
             if not device.there:
                 raise system_error(errno.ENODEV)
