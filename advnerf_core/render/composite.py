@@ -51,25 +51,6 @@ def visible_shares(alphas: Tensor, depths_m: Tensor) -> Tensor:
     return torch.stack(shares) if shares else torch.ones_like(alphas)
 
 
-def composite(premultiplied: Tensor, alphas: Tensor, depths_m: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Compose layers to one premultiplied image.
-
-    Args:
-        premultiplied: Colours times alpha, ``[L, ..., C]``.
-        alphas: ``[L, ...]``.
-        depths_m: ``[L, ...]`` [m].
-
-    Returns:
-        Premultiplied colour ``[..., C]``, alpha ``[...]`` and alpha-weighted depth ``[...]`` (infinite where alpha is 0).
-    """
-    shares = visible_shares(alphas, depths_m)
-    weights = shares * alphas
-    alpha = weights.sum(0)
-    depth = torch.where(weights > 0, weights * depths_m, torch.zeros_like(weights)).sum(0)
-    depth = torch.where(alpha > 0, depth / alpha.clamp_min(torch.finfo(alpha.dtype).tiny), torch.inf)
-    return (shares[..., None] * premultiplied).sum(0), alpha, depth
-
-
 def sparse_shares(
     pixels: Sequence[NDArray[np.int64]],
     alphas: Sequence[Array],

@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.geometry import Array, Pinhole, invert_transform, rotation_z, yaw_of
@@ -139,69 +138,6 @@ def soft_layer(
     kept = shown[:, 3] > 0.0
     alpha = shown[kept, 3]
     return SoftLayer(pixels[kept], shown[kept, :3], np.minimum(alpha, 1.0), shown[kept, 4] / alpha, walk)
-
-
-def render_soft(
-    field: VoxelGridObject,
-    placement: Tensor,
-    theta: Tensor,
-    T_world_from_camera: ArrayLike,
-    pinhole: Pinhole,
-    supersample: int = 2,
-    least_transmittance: float = LEAST_TRANSMITTANCE,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """One object as dense layers, differentiable once by autograd with respect to its placement and its colours.
-
-    Args:
-        field: The object; must have a density.
-        placement: ``(x_m, y_m, yaw_rad, scale)`` ``[4]``, finite, with a positive scale.
-        T_world_from_camera: ``[B, 4, 4]``.
-        supersample: Rays along each side of a pixel.
-        least_transmittance: A ray is followed until less light than this remains.
-
-    Returns:
-        Premultiplied colours ``[B, H, W, 3]``, alpha ``[B, H, W]`` and planar depth ``[B, H, W]`` [m] (infinite for empty pixels),
-        all float64; depth has no history.
-    """
-    settings = (field, T_world_from_camera, pinhole, supersample, least_transmittance)
-    shown: tuple[Tensor, Tensor, Tensor] = _RenderSoft.apply(placement, field.colours(theta), settings)
-    return shown
-
-
-class _RenderSoft(torch.autograd.Function):
-    """`soft_layer` as dense layers."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, placement: Tensor, colours: Tensor, settings: tuple[Any, ...]
-    ) -> tuple[Tensor, ...]:
-        field, poses, pinhole, supersample, least = settings
-        layer = soft_layer(
-            field, placement.detach(), colours.detach().numpy(), poses, pinhole, supersample, least
-        )
-        ctx.layer, ctx.types = layer, (placement.dtype, colours.dtype)
-        shape = (np.asarray(poses).reshape(-1, 4, 4).shape[0], pinhole.height, pinhole.width)
-        colour, alpha = np.zeros((int(np.prod(shape)), 3)), np.zeros(int(np.prod(shape)))
-        depth_m = np.full(len(alpha), np.inf)
-        colour[layer.pixels], alpha[layer.pixels], depth_m[layer.pixels] = (
-            layer.colour,
-            layer.alpha,
-            layer.depth_m,
-        )
-        out = tuple(
-            torch.from_numpy(part)
-            for part in (colour.reshape(*shape, 3), alpha.reshape(shape), depth_m.reshape(shape))
-        )
-        ctx.mark_non_differentiable(out[2])
-        return out
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor, None]:
-        pixels = torch.from_numpy(ctx.layer.pixels)
-        slopes = torch.cat([grads[0].reshape(-1, 3)[pixels], grads[1].reshape(-1, 1)[pixels]], dim=1)
-        by_place, by_colour = ctx.layer.pull(slopes.double().numpy())
-        return torch.from_numpy(by_place).to(ctx.types[0]), torch.from_numpy(by_colour).to(ctx.types[1]), None
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,12 +20,10 @@ from torch import Tensor
 from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.fields.seen_rows import SeenRows, compact
 from advnerf_core.fields.sparse_rows import SparseRows
-from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.geometry import Array, Pinhole, planar_poses
 from advnerf_core.parallel import Work, beside
 from advnerf_core.render.cast_object import ObjectCast, cast_work, made_opaque
-from advnerf_core.render.composite import composite, sparse_shares
-from advnerf_core.render.soft_pose import render_soft
+from advnerf_core.render.composite import sparse_shares
 from advnerf_core.scene.remembered import RememberedBackground
 
 BackgroundRenderer = Callable[[Array, Pinhole], Sequence[Any]]
@@ -258,36 +256,6 @@ class Surrogate:
     def render(self, T_world_from_camera: ArrayLike, theta: Tensor | None) -> Rendered:
         """Images at camera poses ``[B, 4, 4]`` and their vjp; see :class:`Rendered`. ``theta`` is None without objects."""
         return self.prepare(T_world_from_camera).render(None if theta is None else theta.detach())
-
-    def render_placed(self, T_world_from_camera: ArrayLike, theta: Tensor, placements: Tensor) -> Tensor:
-        """Images of the objects at other placements, differentiable by autograd with respect to these, and to ``theta``.
-
-        Args:
-            T_world_from_camera: Camera poses ``[B, 4, 4]``.
-            theta: Parameters of the objects, of ``theta_shape``.
-            placements: ``(x_m, y_m, yaw_rad, scale)`` of each object, ``[K, 4]``; see ``render/soft_pose``.
-
-        Returns:
-            Images ``[B, 3, H, W]`` in float64, with history.
-        """
-        if placements.shape != (len(self.objects), 4):
-            raise ValueError(f"expected placements [{len(self.objects)}, 4], got {list(placements.shape)}")
-        grids = [field for field in self.objects if isinstance(field, VoxelGridObject)]
-        if len(grids) != len(self.objects):
-            raise ValueError(
-                "expected objects made of voxels, got a mesh: only voxels are differentiable in their pose"
-            )
-        poses = np.asarray(T_world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
-        rgb, depth_m = self.scene_frames(poses)
-        layers = [
-            render_soft(field, placement, part, poses, self.camera, self.supersample)
-            for field, placement, part in zip(grids, placements, split_theta(grids, theta), strict=True)
-        ]
-        colours = torch.stack([*(layer[0] for layer in layers), rgb.double()])
-        alphas = torch.stack([*(layer[1] for layer in layers), torch.ones_like(depth_m).double()])
-        behind = torch.nan_to_num(depth_m.double(), nan=torch.inf)
-        depths = torch.stack([*(layer[2] - self.depth_tolerance_m for layer in layers), behind])
-        return composite(colours, alphas, depths)[0].permute(0, 3, 1, 2)
 
     def sense(self, states: Tensor, theta: Tensor | None) -> Rendered:
         """Images of the car's camera from states ``[B, n]``; poses are detached."""

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from advnerf_core.render.composite import composite, sparse_shares, visible_shares
+from advnerf_core.render.composite import sparse_shares, visible_shares
+from tests.support.layers import composite
 
 
 def test_three_layers_follow_the_formula_nearest_first():

@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object
-from advnerf_core.geometry import Pinhole, camera_mount, look_at, make_transform, rotation_z
+from advnerf_core.geometry import Pinhole, look_at, make_transform, rotation_z
 from advnerf_core.render.cast_object import cast_object
-from advnerf_core.render.soft_pose import placed_at, placement_of, render_soft
-from advnerf_core.scene.surrogate import Surrogate
+from advnerf_core.render.soft_pose import placed_at, placement_of
+from tests.support.layers import render_soft
 
 PINHOLE = Pinhole(30, 22, 26.0, 25.0, 15.0, 11.0)
 POSES = np.stack([look_at([1.6, 0.3, 0.6], [0.1, 0.0, 0.2]), look_at([0.4, -1.7, 0.5], [0.1, 0.0, 0.2])])
@@ -57,7 +57,7 @@ def test_derivatives_with_respect_to_the_placement_are_finite_differences(axis, 
     probe = torch.randn(2, 22, 30, 4, dtype=torch.float64, generator=generator)
 
     def probed(placement):
-        colour, alpha, _ = render_soft(field, placement, theta, POSES, PINHOLE, 1, least_transmittance=0.0)
+        colour, alpha, _ = render_soft(field, placement, theta, POSES, PINHOLE, 1, least=0.0)
         return (torch.cat([colour, alpha[..., None]], -1) * probe).sum()
 
     # Away from where the object was made, so that nothing is special about the place.
@@ -81,30 +81,6 @@ def test_colours_have_the_gradient_of_the_sparse_product():
     c = torch.sigmoid(theta.detach()).numpy()
     expected = cast.weights.T @ probe.reshape(-1, 3).numpy()[cast.pixels] * c * (1 - c)
     np.testing.assert_allclose(gradient, expected, atol=0.02 * np.abs(expected).max())
-
-
-def wall(poses, pinhole):
-    rgb = torch.full((len(poses), pinhole.height, pinhole.width, 3), 0.4, dtype=torch.float64)
-    return rgb, torch.full(rgb.shape[:3], 5.0, dtype=torch.float64)
-
-
-def test_a_scene_moves_its_objects_with_a_gradient():
-    near, far = cloud((1.4, 0.1, 0.2)), cloud((2.0, -0.1, 0.2))
-    scene = Surrogate(wall, PINHOLE, camera_mount(0.0, 0.0, 0.3), [far, near], dtype=torch.float64)
-    theta = torch.randn(scene.theta_shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    poses = scene.camera_poses(torch.tensor([[0.0, 0.0, 0.0]]))
-    placements = torch.stack([placement_of(far), placement_of(near)]).requires_grad_()
-    images = scene.render_placed(poses, theta, placements)
-    torch.testing.assert_close(images.detach(), scene.render(poses, theta).images, atol=0.02, rtol=0)
-    probe = torch.randn(images.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
-    (gradient,) = torch.autograd.grad((images * probe).sum(), placements)
-    direction = torch.randn(placements.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
-    with torch.no_grad():
-        plus, minus = (scene.render_placed(poses, theta, placements + s * 1e-6 * direction) for s in (1, -1))
-    difference = ((plus - minus) * probe).sum() / 2e-6
-    torch.testing.assert_close((gradient * direction).sum(), difference, rtol=1e-3, atol=1e-3)
-    with pytest.raises(ValueError, match="expected placements"):
-        scene.render_placed(poses, theta, placements[:1])
 
 
 def test_a_placement_moves_the_object_there():

@@ -4,8 +4,8 @@ import torch
 
 from advnerf_core.fields.voxel_grid import cube_face_object, squash
 from advnerf_core.geometry import Pinhole, camera_mount, make_transform, rotation_z
-from advnerf_core.render.composite import composite
 from advnerf_core.scene.surrogate import Surrogate
+from tests.support.layers import composite
 
 PINHOLE = Pinhole(40, 26, 25.0, 25.0, 20.0, 11.0)
 MOUNT = camera_mount(0.3, 0.0, 0.2, 0.17)
