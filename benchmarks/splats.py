@@ -20,7 +20,6 @@ from advnerf_core.scene.metrics import psnr
 from advnerf_core.scene.surrogate import BackgroundRenderer
 from advnerf_core.splats.bake import bake_splats
 from advnerf_core.splats.gaussians import COLOUR_OFFSET, CONSTANT_BASIS, GaussianSplats
-from advnerf_core.splats.reference import render_reference
 from advnerf_core.splats.renderer import NEAR_M, SplatRenderer
 from benchmarks.baked_scene import searched_pairs
 from benchmarks.results import record_row
@@ -29,6 +28,7 @@ from nodes.experiment.plan.victims import HARDENED
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.learned_scene import load_background
 from nodes.experiment.steps import bake as bake_stage
+from tests.support.splat_reference import render_reference
 
 COMMAND = "python -m benchmarks.splats"
 _COUNT, _FEWER, _LENS = 500_000, 20_000, Pinhole(200, 66, 104.0, 104.0, 100.0, 33.0)

@@ -8,8 +8,8 @@ from advnerf_core.data.similarity import Similarity
 from advnerf_core.geometry import Pinhole, look_at, make_transform
 from advnerf_core.parallel import set_thread_count
 from advnerf_core.splats.gaussians import GaussianSplats
-from advnerf_core.splats.reference import render_reference
 from advnerf_core.splats.renderer import NEAR_M, SplatRenderer
+from tests.support.splat_reference import render_reference
 from tests.support.splats import gaussians, random_splats, room
 
 LENS = Pinhole(53, 37, 60.0, 50.0, 25.5, 17.5)  # no multiple of a tile; (25, 17) is the middle of the view
