@@ -8,7 +8,6 @@ lines too. The models are Dubins' car (L. E. Dubins, 1957) and the kinematic bic
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import exp
 from typing import Protocol
 
 import torch
@@ -109,72 +108,6 @@ class Ackermann:
         df_dx, df_dyaw_rate = _arc_jacobians(states, gain * tangent, self.speed_mps, self.dt_s)
         dyaw_rate_du = gain * (1.0 + tangent**2) * _inside(controls, self.steering_limits_rad)
         return df_dx, df_dyaw_rate * dyaw_rate_du[:, None]
-
-
-@dataclass(frozen=True)
-class AckermannServoLag:
-    """Bicycle whose front wheels follow the (clamped) command with a first-order lag; state x, y, yaw, steering.
-
-    Over one tick the wheel angle decays exponentially to the command; the arc is driven with its mean over the tick.
-
-    Attributes:
-        wheelbase_m: Distance between the axles [m].
-        speed_mps: Forward speed [m/s].
-        dt_s: Length of one tick [s].
-        lag_s: Time constant of the steering [s].
-        steering_limits_rad: Rightmost and leftmost steering angle [rad].
-    """
-
-    wheelbase_m: float
-    speed_mps: float
-    dt_s: float
-    lag_s: float
-    steering_limits_rad: tuple[float, float] = STEERING_LIMITS_RAD
-
-    def __post_init__(self) -> None:
-        _require_positive(
-            wheelbase_m=self.wheelbase_m, speed_mps=self.speed_mps, dt_s=self.dt_s, lag_s=self.lag_s
-        )
-        _require_limits(self.steering_limits_rad)
-
-    @property
-    def state_size(self) -> int:
-        """Number of states: x, y, yaw, steering."""
-        return 4
-
-    def step(self, states: Tensor, controls: Tensor) -> Tensor:
-        """One tick; see :class:`Dynamics`."""
-        _check(states, controls, self.state_size)
-        left_at_end, left_on_average = self._remaining()
-        command = controls.clamp(*self.steering_limits_rad)
-        difference = states[:, 3] - command
-        yaw_rate = self.speed_mps / self.wheelbase_m * torch.tan(command + left_on_average * difference)
-        moved = _arc_step(states[:, :3], yaw_rate, self.speed_mps, self.dt_s)
-        return torch.cat([moved, (command + left_at_end * difference)[:, None]], dim=1)
-
-    def jacobians(self, states: Tensor, controls: Tensor) -> tuple[Tensor, Tensor]:
-        """Closed form; see :class:`Dynamics`."""
-        _check(states, controls, self.state_size)
-        left_at_end, left_on_average = self._remaining()
-        command = controls.clamp(*self.steering_limits_rad)
-        inside = _inside(controls, self.steering_limits_rad)
-        tangent = torch.tan(command + left_on_average * (states[:, 3] - command))
-        gain = self.speed_mps / self.wheelbase_m
-        pose_dx, pose_dyaw_rate = _arc_jacobians(states[:, :3], gain * tangent, self.speed_mps, self.dt_s)
-        pose_dmean = pose_dyaw_rate * (gain * (1.0 + tangent**2))[:, None]
-        df_dx = states.new_zeros(states.shape[0], 4, 4)
-        df_dx[:, :3, :3] = pose_dx
-        df_dx[:, :3, 3] = pose_dmean * left_on_average
-        df_dx[:, 3, 3] = left_at_end
-        df_du = torch.cat(
-            [pose_dmean * (1.0 - left_on_average), torch.full_like(states[:, :1], 1.0 - left_at_end)], 1
-        )
-        return df_dx, df_du * inside[:, None]
-
-    def _remaining(self) -> tuple[float, float]:
-        """Share of the initial steering error that remains at the end of a tick, and on average over it."""
-        decay = exp(-self.dt_s / self.lag_s)
-        return decay, (1.0 - decay) * self.lag_s / self.dt_s
 
 
 def _arc_step(states: Tensor, yaw_rate: Tensor, speed_mps: float, dt_s: float) -> Tensor:

@@ -7,7 +7,8 @@ import torch
 from torch import Tensor, nn
 
 from advnerf_core.attack.adjoint import AttackProblem, RenderCache, adjoint_gradient, evaluate, roll_out
-from advnerf_core.driving.dynamics import AckermannServoLag, Dubins
+from advnerf_core.driving.actuated import ActuatedAckermann
+from advnerf_core.driving.dynamics import Dubins
 from advnerf_core.geometry import Pinhole
 from advnerf_core.policies.adapter import AdaptedPolicy, adapt
 from advnerf_core.policies.contract import PolicyContract
@@ -50,7 +51,7 @@ def test_gradient_equals_finite_differences_with_frozen_poses(problem, result):
 
 
 @pytest.mark.parametrize(
-    "dynamics", [Dubins(0.8, 0.1), AckermannServoLag(0.25, 0.8, 0.1, lag_s=0.08)], ids=["dubins", "servo lag"]
+    "dynamics", [Dubins(0.8, 0.1), ActuatedAckermann(0.25, 0.8, 0.1, lag_s=0.08)], ids=["dubins", "servo lag"]
 )
 def test_other_dynamics_and_augmented_states(problem, dynamics):
     starts = torch.nn.functional.pad(problem.start_states, (0, dynamics.state_size - 3))

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from advnerf_core.driving.actuated import ActuatedAckermann
-from advnerf_core.driving.dynamics import Ackermann, AckermannServoLag
+from advnerf_core.driving.dynamics import Ackermann
 
 CASES = {
     "nothing": {},
@@ -69,8 +69,13 @@ def test_without_options_it_is_the_plain_bicycle_and_with_lag_the_lagging_one():
     states, controls = some(car())
     plain = Ackermann(0.25, 0.8, 0.1).step(states[:, :3], controls)
     torch.testing.assert_close(car().step(states, controls)[:, :3], plain, rtol=0, atol=1e-15)
-    lagging = AckermannServoLag(0.25, 0.8, 0.1, 0.08).step(states, controls)
-    torch.testing.assert_close(car(lag_s=0.08).step(states, controls), lagging, rtol=0, atol=1e-15)
+    # A lag alone: the error decays exponentially, and the arc is that of its mean over the tick.
+    lagging, left = car(lag_s=0.08).step(states, controls), np.exp(-0.1 / 0.08)
+    command = controls.clamp(*car().steering_limits_rad)
+    error = states[:, 3] - command
+    torch.testing.assert_close(lagging[:, 3], command + left * error, rtol=0, atol=1e-15)
+    arc = Ackermann(0.25, 0.8, 0.1, (-1.5, 1.5)).step(states[:, :3], command + (1.0 - left) * 0.08 / 0.1 * error)
+    torch.testing.assert_close(lagging[:, :3], arc, rtol=0, atol=1e-15)
 
 
 def test_a_delay_of_whole_ticks_shifts_the_controls():

@@ -2,10 +2,11 @@ import pytest
 import torch
 from torch.autograd.functional import jacobian
 
-from advnerf_core.driving.dynamics import Ackermann, AckermannServoLag, Dubins, Dynamics
+from advnerf_core.driving.actuated import ActuatedAckermann
+from advnerf_core.driving.dynamics import Ackermann, Dubins, Dynamics
 
 ACKERMANN = Ackermann(wheelbase_m=0.25, speed_mps=0.8, dt_s=0.1)
-MODELS = [Dubins(0.8, 0.1), ACKERMANN, AckermannServoLag(0.25, 0.8, 0.1, lag_s=0.08), Dubins(8.0, 0.5)]
+MODELS = [Dubins(0.8, 0.1), ACKERMANN, ActuatedAckermann(0.25, 0.8, 0.1, lag_s=0.08), Dubins(8.0, 0.5)]
 
 
 def _batch(model: Dynamics, controls: list[float]) -> tuple[torch.Tensor, torch.Tensor]:
@@ -66,7 +67,7 @@ def test_straight_line_and_dtype() -> None:
 
 
 def test_servo_lag_approaches_the_plain_bicycle() -> None:
-    fast = AckermannServoLag(0.25, 0.8, 0.1, lag_s=1e-4)
+    fast = ActuatedAckermann(0.25, 0.8, 0.1, lag_s=1e-4)
     x, u = _batch(ACKERMANN, [0.2, -0.1])
     lagged = fast.step(torch.cat([x, torch.zeros(2, 1, dtype=torch.float64)], 1), u)
     torch.testing.assert_close(lagged[:, :3], ACKERMANN.step(x, u), rtol=1e-3, atol=1e-4)

@@ -2,13 +2,14 @@ import numpy as np
 import pytest
 import torch
 
-from advnerf_core.driving.dynamics import Ackermann, AckermannServoLag, Dynamics
+from advnerf_core.driving.actuated import ActuatedAckermann
+from advnerf_core.driving.dynamics import Ackermann, Dynamics
 from advnerf_core.driving.expert import Expert, ExpertConfig
 from advnerf_core.driving.path import Arc, Path
 
 TRACK = Path.rounded_square(4.0, 1.1)
 PLAIN = Ackermann(0.25, 0.8, 0.1)
-LAGGED = AckermannServoLag(0.25, 0.8, 0.1, lag_s=0.10)
+LAGGED = ActuatedAckermann(0.25, 0.8, 0.1, lag_s=0.10)
 
 
 def _drive(dynamics: Dynamics, starts: np.ndarray, steps: int, delay_s: float) -> np.ndarray:
