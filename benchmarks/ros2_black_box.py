@@ -23,7 +23,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.fields.voxel_grid import cube_face_object
 from advnerf_core.policies.adapter import AdaptedPolicy
-from advnerf_core.report.evidence import clustered_interval
+from advnerf_core.report.evidence.intervals import clustered_interval
 from benchmarks.rclpy_peer import RclpyPeer
 from benchmarks.results import REPOSITORY, record_row
 from calibration.schema import RoomCalibration, load_calibration

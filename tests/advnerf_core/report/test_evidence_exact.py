@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from advnerf_core.report.evidence import (
+from advnerf_core.report.evidence.exact import (
     FEW_SEARCHES,
     McNemar,
     holm,

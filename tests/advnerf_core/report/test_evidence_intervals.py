@@ -10,8 +10,12 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy import optimize, stats
 
-from advnerf_core.report.evidence import clustered_interval, equivalence
-from advnerf_core.report.evidence.intervals import MEASURED_COVERAGE, difference_interval
+from advnerf_core.report.evidence.intervals import (
+    MEASURED_COVERAGE,
+    clustered_interval,
+    difference_interval,
+    equivalence,
+)
 from advnerf_core.report.evidence.mean_estimate import crossed, difference, one_sample
 from benchmarks.results import read_rows
 
