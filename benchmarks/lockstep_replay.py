@@ -19,7 +19,14 @@ from pathlib import Path
 
 import numpy as np
 
-from advnerf_core.attack.artifact import AttackFile, face_texture, save_attack
+from advnerf_core.attack.artifact import (
+    COLOURS,
+    AttackedObject,
+    AttackFace,
+    AttackFile,
+    face_texture,
+    save_attack,
+)
 from advnerf_core.documents import dump_yaml
 from advnerf_core.geometry import make_transform, planar_pose, rotation_z
 from benchmarks.results import REPOSITORY, record_row
@@ -44,14 +51,11 @@ def make_bag(folder: Path, seconds: int) -> Path:
     target = load_calibration(TargetCalibration, CALIBRATION / "board.yaml")
     T_world_from_board = make_transform(rotation_z(np.pi), [3.0, 0.0, 0.5])
     theta = np.random.default_rng(0).normal(size=(8, 8, 3)).astype(np.float32)
-    attack = AttackFile.of_face(
+    attack = AttackFile(
         method="gradient",
-        theta=theta,
-        texture=face_texture(theta, 256),
-        size_m=(1.0, 1.0),
-        T_world_from_object=T_world_from_board,
-        subject="board",
-        corners_in_subject=target.corners,
+        space=COLOURS,
+        objects=(AttackedObject("face", theta, T_world_from_board, 1.0, ""),),
+        face=AttackFace(face_texture(theta, 256), (1.0, 1.0), "board", target.corners),
         camera=camera.pinhole,
         scene_sha256="",
         policy_sha256="",

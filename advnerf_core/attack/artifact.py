@@ -173,37 +173,6 @@ class AttackFile:
                     f"expected theta [N, N, 3] of the face, got {self.face_object.theta.shape}"
                 )
 
-    @classmethod
-    def of_face(
-        cls,
-        *,
-        theta: NDArray[np.float32],
-        size_m: tuple[float, float],
-        subject: str,
-        corners_in_subject: Array,
-        T_world_from_object: Array,
-        texture: NDArray[np.uint8] | None = None,
-        name: str = "face",
-        sha256: str = "",
-        **others: Any,
-    ) -> AttackFile:
-        """The attack file of one face.
-
-        Args:
-            theta: Colour grid before squashing ``[N, N, 3]`` float32.
-            size_m: Width and height of the face [m].
-            subject: Motion-capture subject that carries the face.
-            corners_in_subject: Corners ``[4, 3]`` [m], see `AttackFace`.
-            T_world_from_object: Pose of the face, ``[4, 4]``.
-            texture: The displayed face, ``[H, W, 3]`` uint8 sRGB; computed from ``theta`` if not given.
-            sha256: Hash of the face's geometry.
-            others: The other attributes of an attack file.
-        """
-        carrier = AttackedObject(name, theta, T_world_from_object, 1.0, sha256)
-        shown = face_texture(theta) if texture is None else texture
-        face = AttackFace(shown, size_m, subject, corners_in_subject)
-        return cls(space=COLOURS, objects=(carrier,), face=face, **others)
-
     @cached_property
     def sha256(self) -> str:
         """Hash of the content: tensors and metadata."""

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from advnerf_core.attack.artifact import AttackFile, face_texture
+from advnerf_core.attack.artifact import face_texture
 from advnerf_core.driving.path import Arc, Line, Path
 from advnerf_core.geometry import Pinhole, make_transform, planar_pose, rotation_z, transform_points
 from calibration.degeneracy import DegenerateDataError
@@ -16,6 +16,7 @@ from calibration.room import (
     target_of_touches,
 )
 from calibration.schema import CalibrationError
+from tests.support.faces import face_attack
 
 SQUARE = Path.rounded_square(4.0, 1.1)
 
@@ -127,7 +128,7 @@ def test_wrong_touches_are_refused_with_what_to_do():
 
 def attack(T, size=1.0, subject="board"):
     theta = np.zeros((4, 4, 3), np.float32)
-    return AttackFile.of_face(
+    return face_attack(
         method="random",
         theta=theta,
         texture=face_texture(theta, 8),

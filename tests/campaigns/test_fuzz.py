@@ -142,12 +142,13 @@ def config_reader() -> tuple[Sequence[bytes], Callable[[bytes], None]]:
 
 def attack_reader(folder: Path) -> tuple[Sequence[bytes], Callable[[bytes], None]]:
     """An attack file's bytes: container, header and tensors."""
-    from advnerf_core.attack.artifact import AttackFile, attack_from_bytes, face_texture, save_attack
+    from advnerf_core.attack.artifact import attack_from_bytes, face_texture, save_attack
     from advnerf_core.geometry import Pinhole
+    from tests.support.faces import face_attack
 
     theta = np.zeros((2, 2, 3), np.float32)
     corners = np.array([[0.0, 0.4, 0.4], [0.0, -0.4, 0.4], [0.0, -0.4, -0.4], [0.0, 0.4, -0.4]])
-    attack = AttackFile.of_face(
+    attack = face_attack(
         method="gradient",
         theta=theta,
         texture=face_texture(theta, 4),

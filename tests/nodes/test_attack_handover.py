@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 import yaml
 
-from advnerf_core.attack.artifact import AttackFile, face_texture, save_attack
+from advnerf_core.attack.artifact import face_texture, save_attack
 from advnerf_core.geometry import Pinhole, make_transform, planar_pose, rotation_z
 from calibration.schema import TargetCalibration, load_calibration
 from nodes.runtime.bus import Bus
 from nodes.runtime.messages import decode, encode, image_message, pose_message
 from nodes.runtime.topics import status_topic
 from nodes.runtime.transfer import chunk_messages
+from tests.support.faces import face_attack
 
 REPOSITORY = Path(__file__).parents[2]
 CALIBRATION = REPOSITORY / "calibration" / "twin"
@@ -28,7 +29,7 @@ INPUTS = ("/camera/image_raw", "/vicon/car", "/vicon/board", "/attack/file")
 
 def attack(folder, seed):
     theta = np.random.default_rng(seed).normal(size=(8, 8, 3)).astype(np.float32)
-    made = AttackFile.of_face(
+    made = face_attack(
         method="gradient",
         theta=theta,
         texture=face_texture(theta),

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from advnerf_core.attack.artifact import AttackFile, load_attack, save_attack
+from advnerf_core.attack.artifact import load_attack, save_attack
 from advnerf_core.attack.printing.poster import poster_of
 from advnerf_core.data.image_files import write_image
 from advnerf_core.data.similarity import rotation_angles
@@ -20,6 +20,7 @@ from nodes.cli import main as cli
 from nodes.experiment.node.search import run_attack
 from nodes.runtime.messages import encode, image_message, pose_message
 from nodes.runtime.progress import ProgressDisplay
+from tests.support.faces import face_attack
 from tests.support.photographed import before_camera, lens, photograph, scaled
 from tests.support.tiny_request import CALIBRATION, loaded, tiny_request
 
@@ -44,7 +45,7 @@ def call(monkeypatch, capsys):
 @pytest.fixture
 def folder(tmp_path):
     """An attack of 0.4 m, its print, and the lens of a phone."""
-    attack = AttackFile.of_face(
+    attack = face_attack(
         method="gradient", theta=np.random.default_rng(0).normal(0.0, 2.0, (8, 8, 3)).astype(np.float32), size_m=(0.4, 0.4),
         subject="board", corners_in_subject=face_corners_in_object(0.4), T_world_from_object=np.eye(4),
         camera=Pinhole(200, 66, 103.6, 103.4, 100, 32), scene_sha256="", policy_sha256="", config_sha256="", seed=0,

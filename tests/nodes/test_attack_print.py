@@ -7,17 +7,18 @@ import cv2
 import numpy as np
 import pytest
 
-from advnerf_core.attack.artifact import AttackFile, load_attack, save_attack
+from advnerf_core.attack.artifact import load_attack, save_attack
 from advnerf_core.attack.printing.record import load_record
 from advnerf_core.fields.voxel_grid import face_corners_in_object
 from advnerf_core.geometry import Pinhole
 from nodes.cli import main as cli
+from tests.support.faces import face_attack
 
 
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
     path = tmp_path / "seed_0.attack.safetensors"
-    attack = AttackFile.of_face(
+    attack = face_attack(
         method="gradient",
         theta=np.random.default_rng(0).normal(size=(8, 8, 3)).astype(np.float32),
         size_m=(0.4, 0.4),

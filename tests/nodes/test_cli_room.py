@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from advnerf_core.attack.artifact import AttackFile, face_texture, save_attack
+from advnerf_core.attack.artifact import face_texture, save_attack
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.geometry import Pinhole, make_transform, planar_pose, rotation_z
 from calibration.placement import face_frame
@@ -22,6 +22,7 @@ from nodes.lab.room.measured_request import write_measured_request
 from nodes.runtime.bus import Bus
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.messages import encode, pose_message
+from tests.support.faces import face_attack
 
 ROOT = Path(__file__).parents[2]
 START_NS = 1_700_000_000_000_000_000
@@ -96,7 +97,7 @@ REQUEST = {
 
 def save_attack_at(folder, T):
     theta = np.zeros((4, 4, 3), np.float32)
-    attack = AttackFile.of_face(
+    attack = face_attack(
         method="random",
         theta=theta,
         texture=face_texture(theta, 8),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from advnerf_core.attack.artifact import AttackFile, AttackFileError, face_texture, save_attack
+from advnerf_core.attack.artifact import AttackFileError, face_texture, save_attack
 from advnerf_core.attack.projection import FaceOverlay
 from advnerf_core.geometry import Pinhole, invert_transform, make_transform, planar_pose, rotation_z
 from calibration.schema import CameraCalibration, TargetCalibration, load_calibration
@@ -18,6 +18,7 @@ from nodes.runtime.messages import decode, encode, image_message, pose_message, 
 from nodes.runtime.node import MessageInfo, NodeContext
 from nodes.runtime.pictures import rgb_image
 from nodes.runtime.transfer import chunk_messages
+from tests.support.faces import face_attack
 
 pytestmark = pytest.mark.live
 
@@ -47,7 +48,7 @@ def attack(**changes):
         "predicted_total_cte_m": 1.0,
         "software_version": "0",
     }
-    return AttackFile.of_face(**{**values, **changes})
+    return face_attack(**{**values, **changes})
 
 
 def car_at(t_s):

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from advnerf_core.attack.artifact import AttackFile, face_texture, save_attack
+from advnerf_core.attack.artifact import face_texture, save_attack
 from advnerf_core.geometry import Pinhole
 from calibration.panel import MonitorPanel, centre_square, make_panel, require_fits
 from calibration.schema import CalibrationError, TargetCalibration, load_calibration
@@ -18,6 +18,7 @@ from nodes.runtime.clock import ManualClock
 from nodes.runtime.messages import decode, encode, header, type_name, types
 from nodes.runtime.node import MessageInfo, NodeContext
 from nodes.runtime.transfer import chunk_messages
+from tests.support.faces import face_attack
 
 pytestmark = pytest.mark.live
 
@@ -46,7 +47,7 @@ def attack(seed=0, **changes):
         "predicted_total_cte_m": 1.0,
         "software_version": "0",
     }
-    return AttackFile.of_face(**{**values, **changes})
+    return face_attack(**{**values, **changes})
 
 
 class Screen:

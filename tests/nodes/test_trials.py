@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from advnerf_core.attack.artifact import AttackFile, face_texture, save_attack
+from advnerf_core.attack.artifact import face_texture, save_attack
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.geometry import Pinhole, planar_pose
 from benchmarks.host_pair import exchange_keys
@@ -21,6 +21,7 @@ from nodes.launching.launch import Launch
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError, ConfigError
 from nodes.runtime.messages import encode, header, pose_message, types
+from tests.support.faces import face_attack
 from tests.support.live.processes import free_ports, free_udp_port
 
 ROOT = Path(__file__).parents[2]
@@ -54,7 +55,7 @@ def test_the_order_is_seeded_balanced_and_complete():
 def attack_file(folder, seed):
     theta = np.random.default_rng(seed).normal(size=(4, 4, 3)).astype(np.float32)
     corners = [[0.0, y, z] for y, z in ((-0.5, 0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, -0.5))]
-    attack = AttackFile.of_face(
+    attack = face_attack(
         method="random",
         theta=theta,
         texture=face_texture(theta, 16),

@@ -13,10 +13,11 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from advnerf_core.attack.artifact import AttackFile, save_attack
+from advnerf_core.attack.artifact import save_attack
 from advnerf_core.geometry import Pinhole
 from nodes.bags.writer import BagWriter
 from nodes.runtime.messages import encode, image_message, pose_message
+from tests.support.faces import face_attack
 
 HERE = Path(__file__).parent
 BAG_NAME, GOLDEN_NAME = "corner.mcap", "corner.golden.mcap"
@@ -67,7 +68,7 @@ def attack_bytes(folder: Path) -> bytes:
     texture = np.zeros((32, 32, 3), np.uint8)
     texture[:, ::4] = (200, 40, 120)
     texture[:, :16, 1] += 150
-    attack = AttackFile.of_face(
+    attack = face_attack(
         method="gradient",
         theta=np.zeros((4, 4, 3), np.float32),
         texture=texture,

@@ -1,10 +1,17 @@
-"""Attacks on the faces of the simulated lab that are one red square, which no picture of the room has."""
+"""Attack files of one face, and those of the simulated lab that are one red square, which no picture of the room has."""
 
 from pathlib import Path
 
 import numpy as np
 
-from advnerf_core.attack.artifact import AttackFile, save_attack
+from advnerf_core.attack.artifact import (
+    COLOURS,
+    AttackedObject,
+    AttackFace,
+    AttackFile,
+    face_texture,
+    save_attack,
+)
 from advnerf_core.geometry import Pinhole
 from calibration.panel import centre_square
 from calibration.schema import TargetCalibration, load_calibration
@@ -12,12 +19,35 @@ from calibration.schema import TargetCalibration, load_calibration
 TWIN = Path(__file__).parents[2] / "calibration" / "twin"
 
 
+def face_attack(
+    *,
+    theta,
+    size_m,
+    subject,
+    corners_in_subject,
+    T_world_from_object,
+    texture=None,
+    name="face",
+    sha256="",
+    **others,
+) -> AttackFile:
+    """The attack file of one face; ``others`` are its other attributes."""
+    carrier = AttackedObject(name, theta, T_world_from_object, 1.0, sha256)  # it refuses what has no texture
+    shown = face_texture(theta) if texture is None else texture
+    return AttackFile(
+        space=COLOURS,
+        objects=(carrier,),
+        face=AttackFace(shown, size_m, subject, corners_in_subject),
+        **others,
+    )
+
+
 def red_attack(folder: Path, subject: str) -> tuple[AttackFile, Path]:
     """The attack, and its file in a folder: all of the board, or the square in the middle of the monitor."""
     target = load_calibration(TargetCalibration, TWIN / f"{subject}.yaml")
     corners = target.corners if subject == "board" else centre_square(target).corners
     side_m = 1.0 if subject == "board" else 0.3362
-    attack = AttackFile.of_face(
+    attack = face_attack(
         method="random",
         theta=np.zeros((4, 4, 3), np.float32),
         texture=np.full((64, 64, 3), (250, 0, 0), np.uint8),

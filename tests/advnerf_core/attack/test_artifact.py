@@ -10,7 +10,6 @@ from safetensors.numpy import save_file
 
 from advnerf_core.attack.artifact import (
     AttackedObject,
-    AttackFile,
     AttackFileError,
     attack_from_bytes,
     face_texture,
@@ -19,12 +18,13 @@ from advnerf_core.attack.artifact import (
 )
 from advnerf_core.fields.voxel_grid import face_corners_in_object, squash
 from advnerf_core.geometry import Pinhole, planar_pose
+from tests.support.faces import face_attack
 
 THETA = np.random.default_rng(0).normal(size=(16, 16, 3)).astype(np.float32)
 
 
 def attack(theta=THETA, texture=None, **changes):
-    base = AttackFile.of_face(
+    base = face_attack(
         method="gradient",
         theta=theta,
         texture=texture,

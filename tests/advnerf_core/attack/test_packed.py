@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from advnerf_core.attack.artifact import AttackFile, AttackFileError, load_attack, save_attack
+from advnerf_core.attack.artifact import AttackFileError, load_attack, save_attack
 from advnerf_core.geometry import Pinhole
+from tests.support.faces import face_attack
 
 
 def attack(theta, texture=None):
-    return AttackFile.of_face(
+    return face_attack(
         theta=theta, size_m=(1.0, 1.0), subject="board", corners_in_subject=np.eye(4, 3), T_world_from_object=np.eye(4), texture=texture,
         method="gradient", camera=Pinhole(200, 66, 100.0, 100.0, 100.0, 33.0), scene_sha256="s", policy_sha256="p", config_sha256="c", seed=3,
         predicted_total_cte_m=4.0, software_version="1",

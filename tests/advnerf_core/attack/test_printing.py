@@ -17,6 +17,7 @@ from advnerf_core.attack.printing.poster import Poster, PrintError, png_bytes, p
 from advnerf_core.attack.printing.tiles import layout_of
 from advnerf_core.fields.voxel_grid import face_corners_in_object
 from advnerf_core.geometry import Pinhole, make_transform, rotation_z
+from tests.support.faces import face_attack
 
 POPPLER = pytest.mark.skipif(shutil.which("pdftoppm") is None, reason="needs pdftoppm: poppler-utils")
 THETA = np.random.default_rng(3).normal(0.0, 2.0, (16, 16, 3)).astype(np.float32)
@@ -25,7 +26,7 @@ PAGES_MM = {"a4": (210, 297), "a1": (594, 841), "letter": (215.9, 279.4), "tablo
 
 
 def attack(**changes) -> AttackFile:
-    base = AttackFile.of_face(
+    base = face_attack(
         method="gradient",
         theta=THETA,
         size_m=(0.5, 0.35),

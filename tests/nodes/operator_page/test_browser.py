@@ -7,9 +7,10 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from advnerf_core.attack.artifact import AttackFile, save_attack
+from advnerf_core.attack.artifact import save_attack
 from advnerf_core.geometry import Pinhole, make_transform, rotation_z
 from calibration.schema import TargetCalibration, load_calibration
+from tests.support.faces import face_attack
 from tests.support.live.page_browser import PHONE, Phone, available, live_page
 from tests.support.page import TWIN
 
@@ -23,7 +24,7 @@ DESK = {"viewport": {"width": 1400, "height": 900}, "color_scheme": "dark"}
 
 def attack_file(path):
     target = load_calibration(TargetCalibration, TWIN / "board.yaml")
-    attack = AttackFile.of_face(
+    attack = face_attack(
         method="random",
         theta=np.random.default_rng(0).normal(size=(16, 16, 3)).astype(np.float32) * 3.0,
         size_m=(1.0, 1.0),

@@ -375,12 +375,13 @@ def test_off_the_machine_there_is_tls_and_a_code(tmp_path):
 def test_an_attack_is_chosen_and_switched_off(tmp_path):
     import numpy as np
 
-    from advnerf_core.attack.artifact import AttackFile, attack_from_bytes, save_attack
+    from advnerf_core.attack.artifact import attack_from_bytes, save_attack
     from advnerf_core.geometry import Pinhole
     from nodes.runtime.transfer import Assembler
+    from tests.support.faces import face_attack
 
     theta = np.random.default_rng(0).normal(size=(8, 8, 3)).astype(np.float32)
-    attack = AttackFile.of_face(
+    attack = face_attack(
         method="gradient",
         theta=theta,
         size_m=(0.6, 0.6),
