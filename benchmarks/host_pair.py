@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.results import REPOSITORY
-from hardware.emulators.vesc_emulator import read_wire_log
 from nodes.linking.keys import DRIVE, KeyFolder
 from nodes.runtime.bus import Bus
 from nodes.runtime.paths import bus_folder
@@ -23,6 +22,7 @@ from tests.support.live.graph import CONFIGURED, BrokenPromise
 from tests.support.live.network import ADDRESSES, Cable
 from tests.support.live.operator import LiveOperator
 from tests.support.live.processes import end
+from tests.support.wire_log import read_wire_log
 
 LAUNCH_FILE = REPOSITORY / "launch" / "two_hosts.launch.yaml"
 NODES = ("camera", "vicon", "compositor", "policy", "safety", "motor")

@@ -103,13 +103,3 @@ def require_fits(attack: AttackFile, panel: MonitorPanel, target: TargetCalibrat
             f"attack {attack.attack_id} has its face {100 * off_m:.1f} cm from the middle of {target.subject}; only the centre square "
             "of a monitor is used: search one whose corners are those of the centre square"
         )
-
-
-def centre_square(target: TargetCalibration) -> TargetCalibration:
-    """Make a target from the largest centred square of a panel, which an attack on a monitor may use."""
-    corners, (width, height) = target.corners, target_size(target)
-    middle, half = corners.mean(axis=0), 0.5 * min(width, height)
-    right, up = (corners[1] - corners[0]) / width, (corners[0] - corners[3]) / height
-    square = [middle + half * (x * right + y * up) for x, y in ((-1, 1), (1, 1), (1, -1), (-1, -1))]
-    rows = tuple(tuple(round(float(v), 6) for v in corner) for corner in square)
-    return target.model_copy(update={"corners_in_subject_m": rows, "notes": "centre square of the panel"})

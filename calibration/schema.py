@@ -238,13 +238,6 @@ class TargetCalibration(Calibration):
         """Corners ``[4, 3]`` [m]."""
         return np.array(self.corners_in_subject_m)
 
-    @property
-    def outward_normal(self) -> Array:
-        """Unit vector ``[3]`` out of the face, towards a viewer in front of it, in the subject's frame."""
-        points = self.corners
-        normal = np.cross(points[3] - points[0], points[1] - points[0])
-        return np.asarray(normal / np.linalg.norm(normal), dtype=np.float64)
-
 
 class RoomCalibration(Calibration):
     """The area and path of the car.

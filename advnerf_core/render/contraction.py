@@ -42,18 +42,6 @@ def contract(points: ArrayLike) -> NDArray[np.float64]:
     return np.asarray(0.25 * np.where(r <= 1.0, y, outside) + 0.5)
 
 
-def uncontract(cube: ArrayLike) -> NDArray[np.float64]:
-    """Inverse of ``contract``; NaN in the corners that no place is mapped to, infinite on the cube's surface."""
-    c = 4.0 * np.asarray(cube, np.float64) - 2.0
-    size = np.abs(c)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        r = 1.0 / (2.0 - size.max(axis=-1, keepdims=True))
-        largest = np.arange(3) == size.argmax(axis=-1)[..., None]
-        y = np.where(size.max(axis=-1, keepdims=True) <= 1.0, c, np.where(largest, np.sign(c) * r, c * r))
-    y[(size > 1.0).sum(axis=-1) > 1] = np.nan
-    return np.asarray(0.5 * y + 0.5)
-
-
 def radial_stretch(shape: tuple[int, int, int]) -> Array32:
     """Radial length of a grid's cells over the cube, relative to an inner cell: ``r^2``, at most the value at ``FAR``.
 

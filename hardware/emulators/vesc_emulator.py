@@ -214,22 +214,3 @@ class VescEmulator:
             for event in events:
                 value = "" if event.value is None else f"{event.value:g}"
                 self._log.write(f"{event.mono_ns},{event.name},{value},{speed:.4f},{driven:.4f}\n")
-
-
-def read_wire_log(path: Path, offset: int = 0) -> list[tuple[WireEvent, float, float]]:
-    """Events of a log file, each with the car's speed [m/s] and odometer [m] at that moment.
-
-    Args:
-        offset: Start in the file [bytes]; an earlier size of the file gives the newer part. Lines cut short are left out.
-    """
-    with path.open("rb") as log:
-        log.seek(offset)
-        text = log.read().decode("ascii")
-    rows = []
-    for line in text.splitlines(keepends=True):
-        fields = line.rstrip("\n").split(",")
-        if not line.endswith("\n") or len(fields) != 5 or not fields[0].isdigit():
-            continue
-        event = WireEvent(int(fields[0]), fields[1], float(fields[2]) if fields[2] else None)
-        rows.append((event, float(fields[3]), float(fields[4])))
-    return rows

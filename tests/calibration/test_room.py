@@ -16,7 +16,7 @@ from calibration.room import (
     target_of_touches,
 )
 from calibration.schema import CalibrationError
-from tests.support.faces import face_attack
+from tests.support.faces import face_attack, outward_normal
 
 SQUARE = Path.rounded_square(4.0, 1.1)
 
@@ -75,9 +75,9 @@ def test_a_target_by_ruler_has_its_corners_where_the_viewer_sees_them():
     target = target_of_size("board", (1.0, 0.8), (0.1, 0.0, 0.0), 0.0, "ruler")
     # Facing the board one looks along -x: left is -y.
     np.testing.assert_allclose(target.corners[0], [0.1, -0.5, 0.4])
-    np.testing.assert_allclose(target.outward_normal, [1.0, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(outward_normal(target), [1.0, 0.0, 0.0], atol=1e-12)
     turned = target_of_size("board", (1.0, 0.8), (0.0, 0.0, 0.0), np.pi / 2, "ruler")
-    np.testing.assert_allclose(turned.outward_normal, [0.0, 1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(outward_normal(turned), [0.0, 1.0, 0.0], atol=1e-12)
     with pytest.raises(DegenerateDataError, match="width and a height > 0"):
         target_of_size("board", (1.0, 0.0), (0.0, 0.0, 0.0), 0.0, "ruler")
 
@@ -116,7 +116,7 @@ def test_a_wand_finds_the_corners_of_a_panel():
     target = target_of_touches("monitor", touch())
     np.testing.assert_allclose(target.corners, TRUE_CORNERS, atol=0.001)
     assert target.residuals["rectangle_mm"] < 1.0
-    np.testing.assert_allclose(target.outward_normal, [1.0, 0.0, 0.0], atol=0.01)
+    np.testing.assert_allclose(outward_normal(target), [1.0, 0.0, 0.0], atol=0.01)
 
 
 def test_wrong_touches_are_refused_with_what_to_do():

@@ -20,6 +20,7 @@ from calibration.schema import (
 )
 from hardware.motor.limits import VehicleGains
 from hardware.worlds.lab.config import CameraConfig, LabConfig
+from tests.support.faces import outward_normal
 
 SHIPPED = Path(__file__).parents[2] / "calibration" / "twin"
 MODELS = {
@@ -58,7 +59,7 @@ def test_faces_look_where_their_subject_looks(name):
     lab = LabConfig()
     panel = getattr(lab, name)
     target = load_calibration(TargetCalibration, SHIPPED / f"{name}.yaml")
-    assert target.outward_normal == pytest.approx([1.0, 0.0, 0.0])
+    assert outward_normal(target) == pytest.approx([1.0, 0.0, 0.0])
     corners = transform_points(panel.T_world_from_face, target.corners)
     assert corners.mean(axis=0) == pytest.approx([panel.x_m, panel.y_m, panel.z_m])
     # The board faces a driver on the bottom straight, who sees +y of the world on the left.

@@ -10,7 +10,7 @@ import tty
 import pytest
 
 from hardware.emulators.pacing import Pacer
-from hardware.emulators.vesc_emulator import VescEmulator, read_wire_log
+from hardware.emulators.vesc_emulator import VescEmulator
 from hardware.emulators.vesc_firmware import VescEmulatorConfig, VescFirmware
 from hardware.errors import DeviceBusy, DeviceNotFound, HardwareError, LinkLost, LinkTimeout
 from hardware.motor.limits import DriveLimits, VehicleGains
@@ -20,6 +20,7 @@ from hardware.motor.vesc_replies import FirmwareVersion
 from hardware.worlds.lab.config import CarConfig
 from hardware.worlds.lab.vehicle import TwinVehicle
 from tests.support.waiting import wait_for
+from tests.support.wire_log import read_wire_log
 
 pytestmark = pytest.mark.live
 

@@ -9,7 +9,7 @@ import pytest
 
 from advnerf_core.attack.artifact import face_texture, save_attack
 from advnerf_core.geometry import Pinhole
-from calibration.panel import MonitorPanel, centre_square, make_panel, require_fits
+from calibration.panel import MonitorPanel, make_panel, require_fits
 from calibration.schema import CalibrationError, TargetCalibration, load_calibration
 from hardware.emulators.monitor_port import MonitorPort
 from hardware.errors import HardwareError
@@ -18,7 +18,7 @@ from nodes.runtime.clock import ManualClock
 from nodes.runtime.messages import decode, encode, header, type_name, types
 from nodes.runtime.node import MessageInfo, NodeContext
 from nodes.runtime.transfer import chunk_messages
-from tests.support.faces import face_attack
+from tests.support.faces import centre_square, face_attack, outward_normal
 
 pytestmark = pytest.mark.live
 
@@ -241,7 +241,7 @@ def test_the_centre_square_is_square_centred_and_in_the_panel():
     np.testing.assert_allclose(
         np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1), 0.3362, atol=1e-6
     )
-    np.testing.assert_allclose(SQUARE.outward_normal, TARGET.outward_normal)
+    np.testing.assert_allclose(outward_normal(SQUARE), outward_normal(TARGET))
 
 
 def test_the_node_needs_neither_torch_nor_scipy():

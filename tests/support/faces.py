@@ -13,7 +13,7 @@ from advnerf_core.attack.artifact import (
     save_attack,
 )
 from advnerf_core.geometry import Pinhole
-from calibration.panel import centre_square
+from calibration.panel import target_size
 from calibration.schema import TargetCalibration, load_calibration
 
 TWIN = Path(__file__).parents[2] / "calibration" / "twin"
@@ -40,6 +40,22 @@ def face_attack(
         face=AttackFace(shown, size_m, subject, corners_in_subject),
         **others,
     )
+
+
+def centre_square(target: TargetCalibration) -> TargetCalibration:
+    """Make a target from the largest centred square of a panel, which an attack on a monitor may use."""
+    corners, (width, height) = target.corners, target_size(target)
+    middle, half = corners.mean(axis=0), 0.5 * min(width, height)
+    right, up = (corners[1] - corners[0]) / width, (corners[0] - corners[3]) / height
+    square = [middle + half * (x * right + y * up) for x, y in ((-1, 1), (1, 1), (1, -1), (-1, -1))]
+    rows = tuple(tuple(round(float(v), 6) for v in corner) for corner in square)
+    return target.model_copy(update={"corners_in_subject_m": rows, "notes": "centre square of the panel"})
+
+
+def outward_normal(target: TargetCalibration):
+    """Unit vector ``[3]`` out of the face, towards a viewer in front of it, in the subject's frame."""
+    normal = np.cross(target.corners[3] - target.corners[0], target.corners[1] - target.corners[0])
+    return normal / np.linalg.norm(normal)
 
 
 def red_attack(folder: Path, subject: str) -> tuple[AttackFile, Path]:

@@ -239,10 +239,5 @@ class Agreement:
         )
 
 
-def agreement_db(model: ObjectModel, views: PosedRgba) -> float:
-    """PSNR against pictures, both before white, over all their pixels [dB]."""
-    return Agreement.of(model, views).psnr_db
-
-
 def _psnr_db(squares: float, count: int) -> float:
     return float(-10.0 * np.log10(max(squares / max(count, 1), 1e-12)))

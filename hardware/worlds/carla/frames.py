@@ -133,10 +133,6 @@ class SceneFrame:
         """Pose ``[4, 4]`` in our world of an actor in CARLA's."""
         return invert_transform(self.T_mirrored_from_world) @ pose.matrix
 
-    def world_from_camera(self, pose: CarlaPose) -> Array:
-        """Pose ``[4, 4]`` in our world, with OpenCV axes, of a camera in CARLA's."""
-        return self.world_from_body(pose) @ BODY_FROM_CAMERA
-
     def carla_point(self, point_in_world: ArrayLike) -> tuple[float, float, float]:
         """A point ``[3]`` of our world in CARLA's axes [m]."""
         x, y, z = transform_points(self.T_mirrored_from_world, point_in_world)

@@ -11,8 +11,8 @@ import pytest
 import trimesh
 
 from advnerf_core.objects.voxel.build import (
+    Agreement,
     advice,
-    agreement_db,
     build_from_images,
     build_from_mesh,
     draw_object,
@@ -83,7 +83,7 @@ def test_fitting_brings_the_picture_nearer_to_the_mesh():
     before = build_from_mesh(mesh, "hydrant", resolution=24, steps=0)
     after = build_from_mesh(mesh, "hydrant", resolution=24, steps=40)
     held_out = mesh_views(mesh, 4, 96, phase=0.2)
-    assert agreement_db(after, held_out) > agreement_db(before, held_out) + 2.0
+    assert Agreement.of(after, held_out).psnr_db > Agreement.of(before, held_out).psnr_db + 2.0
     assert after.about["held_out_psnr_db"] > 20.0
     np.testing.assert_allclose(after.size_m, mesh.size_m, atol=3 * after.grids.voxel)
 
@@ -99,7 +99,7 @@ def test_an_object_is_carved_out_of_its_pictures():
     held_out = mesh_views(ball(), 2, 64, phase=0.37)
     model = build_from_images(views, "ball", resolution=24, steps=100, held_out=held_out)
     assert model.about["held_out_psnr_db"] > 22.0
-    assert model.about["held_out_psnr_db"] == round(agreement_db(model, held_out), 2)
+    assert model.about["held_out_psnr_db"] == round(Agreement.of(model, held_out).psnr_db, 2)
     assert model.about["held_out_object_psnr_db"] < model.about["held_out_psnr_db"]
     assert abs(model.about["train_psnr_db"] - model.about["held_out_psnr_db"]) < 3.0
 

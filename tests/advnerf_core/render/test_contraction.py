@@ -11,7 +11,6 @@ from advnerf_core.render.contraction import (
     into_cube,
     radial_stretch,
     span_before_far,
-    uncontract,
 )
 from advnerf_core.render.march import MarchConfig, Marcher, Samples
 from advnerf_core.render.occupancy import OccupancyGrid, leap_distances, refine_occupied
@@ -19,6 +18,18 @@ from advnerf_core.render.occupancy import OccupancyGrid, leap_distances, refine_
 SIDE_M = 8.0
 CELLS = 16
 ONES = np.ones(3, np.float32)
+
+
+def uncontract(cube):
+    """Inverse of ``contract``; NaN in the corners that no place is mapped to, infinite on the cube's surface."""
+    c = 4.0 * np.asarray(cube, np.float64) - 2.0
+    size = np.abs(c)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        r = 1.0 / (2.0 - size.max(axis=-1, keepdims=True))
+        largest = np.arange(3) == size.argmax(axis=-1)[..., None]
+        y = np.where(size.max(axis=-1, keepdims=True) <= 1.0, c, np.where(largest, np.sign(c) * r, c * r))
+    y[(size > 1.0).sum(axis=-1) > 1] = np.nan
+    return np.asarray(0.5 * y + 0.5)
 
 
 def random_rays(count: int, seed: int, reach: float = 0.5) -> NDArray[np.float32]:

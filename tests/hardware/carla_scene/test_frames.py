@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from advnerf_core.geometry import camera_mount, invert_transform, planar_pose, transform_points
-from hardware.worlds.carla.frames import CarlaPose, SceneFrame
+from hardware.worlds.carla.frames import BODY_FROM_CAMERA, CarlaPose, SceneFrame
 
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 # Every combination of signs and quadrants, and both poles.
@@ -62,7 +62,7 @@ def test_scene_frame_goes_there_and_back(carla):
     frame = SceneFrame(100.0, 40.0, 2.5, 0.7)
     T = planar_pose(4.0, -3.0, -2.1) @ camera_mount(1.2, 0.1, 1.5, 0.14, 0.2)
     through_the_library = CarlaPose.of(frame.camera_pose(T).to_transform(carla))
-    np.testing.assert_allclose(frame.world_from_camera(through_the_library), T, atol=2e-5)
+    np.testing.assert_allclose(frame.world_from_body(through_the_library) @ BODY_FROM_CAMERA, T, atol=2e-5)
     np.testing.assert_allclose(frame.world_from_body(frame.body_pose(T)), T, atol=1e-12)
     x, y, z = frame.carla_point([4.0, -3.0, 0.5])
     there = transform_points(invert_transform(frame.T_mirrored_from_world), [x, -y, z])

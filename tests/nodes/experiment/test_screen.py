@@ -11,12 +11,12 @@ from advnerf_core.display import DisplayModel
 from advnerf_core.geometry import invert_transform, planar_pose, transform_points
 from calibration.by_construction import LAB_DATE, METHOD, twin_calibrations
 from calibration.display_colour import DisplayCalibration
-from calibration.panel import centre_square
 from calibration.schema import CalibrationError, save_calibration
 from hardware.worlds.lab.config import MonitorOpticsConfig
 from hardware.worlds.lab.world import MONITOR_PIXELS
 from nodes.experiment.show import faces, screen
 from nodes.experiment.steps.run import load_experiment
+from tests.support.faces import centre_square
 
 LAUNCH = Path(__file__).parents[3] / "launch"
 # A dim and reddish monitor in a lit room.

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.geometry import planar_pose
-from hardware.emulators.vesc_emulator import read_wire_log
 from nodes.runtime.messages import pose_message
 from tests.support.live.operator import LiveOperator
 from tests.support.live.processes import REPOSITORY, end
+from tests.support.wire_log import read_wire_log
 
 LAUNCH_FILE = REPOSITORY / "launch" / "green_screen.launch.yaml"
 VICTIMS = ("camera", "vicon", "compositor", "policy", "safety", "motor")

@@ -7,12 +7,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from hardware.emulators.vesc_emulator import read_wire_log
 from hardware.emulators.vesc_firmware import WireEvent
 from nodes.runtime.arm_requests import arm_message
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import SystemClock
 from nodes.runtime.requests import RequestIdentity
+from tests.support.wire_log import read_wire_log
 
 _UP = ("ready", "active")
 MOTOR_EVENTS = ("SET_RPM", "SET_CURRENT_BRAKE", "SET_CURRENT", "TIMEOUT")
