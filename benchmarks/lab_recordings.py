@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from advnerf_core.geometry import Array, planar_pose
+from advnerf_core.geometry import Array, camera_mount, planar_pose
 from calibration.by_construction import write_twin_calibrations
 from hardware.worlds.lab.config import LabConfig
 from hardware.worlds.lab.lab import Lab
@@ -36,6 +36,36 @@ def photograph(lab: Lab, poses: Sequence[Array], folder: Path) -> list[Path]:
         files.append(folder / f"{index:04d}.jpg")
         cv2.imwrite(str(files[-1]), lab.photograph(pose)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
     return files
+
+
+def video_poses(config: LabConfig, count: int) -> list[Array]:
+    """A video filmed on three laps along the track: looking across the room, looking at the walls, then low and ahead.
+
+    Neighbours overlap, as structure from motion needs, and the last lap sees what a driving camera sees.
+
+    Args:
+        count: Number of frames over all laps.
+
+    Returns:
+        ``T_world_from_camera`` ``[4, 4]`` each.
+    """
+    # Height [m], angle of view to the left of the way [rad], pitch down [rad].
+    laps = (
+        (1.5, math.radians(65.0), math.radians(14.0)),
+        (1.2, math.radians(-40.0), math.radians(6.0)),
+        (0.4, 0.0, math.radians(8.0)),
+    )
+    length, poses = track_length(config.track), []
+    for index in range(count):
+        along = len(laps) * index / count
+        height, yaw, pitch = laps[int(along)]
+        # A person neither walks straight nor holds a phone still; the periods have no common multiple, so that no two laps are alike.
+        sway_m, bob_m = 0.12 * math.sin(2.3 * index), 0.06 * math.sin(1.7 * index)
+        pose = planar_pose(*track_pose(config.track, length * (along % 1.0)))
+        poses.append(
+            pose @ camera_mount(0.0, sway_m, height + bob_m, pitch, yaw + 0.08 * math.sin(0.9 * index))
+        )
+    return poses
 
 
 def car_state(lab: LabConfig, time_s: float) -> tuple[float, float, float]:

@@ -26,12 +26,11 @@ from advnerf_core.scene.field import SceneFieldConfig, save_scene
 from advnerf_core.scene.metrics import psnr
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.train import TrainConfig, train_scene
-from benchmarks.lab_recordings import lab_with_phone, photograph, record_drive
+from benchmarks.lab_recordings import lab_with_phone, photograph, record_drive, video_poses
 from benchmarks.results import record_row
 from benchmarks.structure_from_motion import say
 from calibration.photo_model import SfmConfig
 from hardware.worlds.lab.lab import Lab
-from hardware.worlds.lab.phone import video_poses
 from nodes.lab.importing.colours import match_colours
 from nodes.lab.importing.data_set import from_phone_and_car
 from nodes.lab.importing.driven_bag import BagConfig

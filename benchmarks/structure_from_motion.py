@@ -15,12 +15,11 @@ from pathlib import Path
 import numpy as np
 
 from advnerf_core.data.similarity import align_poses
-from benchmarks.lab_recordings import lab_with_phone, photograph
+from benchmarks.lab_recordings import lab_with_phone, photograph, video_poses
 from benchmarks.results import record_row
 from calibration.photo_model import PhotoSource, SfmConfig
 from calibration.structure_from_motion import reconstruct
 from hardware.worlds.lab.lab import Lab
-from hardware.worlds.lab.phone import video_poses
 
 POSITION_PERCENT, ROTATION_DEG = 0.3, 0.3
 

@@ -9,11 +9,10 @@ from advnerf_core.data.lens import Lens
 from advnerf_core.data.similarity import Similarity, align_poses, extent
 from advnerf_core.data.transforms import load_transforms
 from advnerf_core.geometry import Pinhole, look_at, make_transform, rotation_x, rotation_z
-from benchmarks.lab_recordings import lab_with_phone, photograph, record_drive
+from benchmarks.lab_recordings import lab_with_phone, photograph, record_drive, video_poses
 from calibration.photo_model import Model, Registered, SfmConfig
 from calibration.world_axes import extent_scale, on_ground
 from hardware.worlds.lab.lab import Lab
-from hardware.worlds.lab.phone import video_poses
 from nodes.lab.importing.data_set import from_media
 from nodes.lab.importing.errors import ImportRecordingError
 from nodes.lab.importing.media import MediaConfig
