@@ -5,8 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Iterable
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from advnerf_core.places import require_utf8
 
@@ -43,3 +45,36 @@ def with_sorted_header(content: bytes) -> bytes:
     header = json.dumps(json.loads(content[8:end]), sort_keys=True, separators=(",", ":")).encode()
     header += b" " * (-len(header) % 8)  # the tensors stay aligned
     return len(header).to_bytes(8, "little") + header + content[end:]
+
+
+def write_tensors(
+    path: str | os.PathLike[str],
+    framework: Literal["torch", "numpy"],
+    tensors: dict[str, Any],
+    header: dict[str, str],
+) -> None:
+    """Write a safetensors container, whole or not at all; the same content gives the same bytes."""
+    content = import_module(f"safetensors.{framework}").save(tensors, header)
+    write_atomically(Path(path), with_sorted_header(content))
+
+
+def read_tensors(
+    path: str | os.PathLike[str], framework: Literal["torch", "numpy"], names: Iterable[str] | None = None
+) -> tuple[dict[str, str], dict[str, Any]]:
+    """Header and tensors of a safetensors container, of all names or of these.
+
+    Raises:
+        OSError: The file cannot be opened.
+        ValueError: It is damaged, or has no tensor of a name.
+        PlaceError: The path is not UTF-8, which the library would take for a damaged file.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    require_utf8(Path(path))
+    try:
+        with safe_open(os.fspath(path), framework) as file:
+            return file.metadata() or {}, {
+                name: file.get_tensor(name) for name in (file.keys() if names is None else names)
+            }
+    except SafetensorError as error:
+        raise ValueError(str(error)) from error

@@ -7,7 +7,7 @@ import stat
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from advnerf_core.errors import AdvnerfError
 
@@ -114,15 +114,3 @@ def require_utf8(path: Path | str) -> None:
         raise PlaceError(
             f"expected a path in UTF-8, got {os.fsencode(path)!r}; rename that folder, or use another one"
         ) from None
-
-
-def open_tensors(path: Path | str, framework: Literal["pt", "numpy"]) -> Any:
-    """``safe_open`` of safetensors, which supports UTF-8 paths only, and takes others for damaged files.
-
-    Raises:
-        PlaceError: The path is not UTF-8.
-    """
-    from safetensors import safe_open
-
-    require_utf8(path)
-    return safe_open(os.fspath(path), framework=framework)

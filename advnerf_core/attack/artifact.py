@@ -18,14 +18,13 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from safetensors import SafetensorError
-from safetensors.numpy import load, save
+from safetensors.numpy import load
 
 from advnerf_core.attack.packed import PACKED_FORMAT, packed, unpacked
 from advnerf_core.driving.clean_drive import CleanDrive
 from advnerf_core.errors import AdvnerfError
-from advnerf_core.files import with_sorted_header, write_atomically
+from advnerf_core.files import read_tensors, write_tensors
 from advnerf_core.geometry import Array, Pinhole, yaw_of
-from advnerf_core.places import open_tensors
 
 FILE_FORMAT = "advnerf-attack-2"
 TEXTURE_PX = 512
@@ -279,7 +278,7 @@ def save_attack(path: str | os.PathLike[str], attack: AttackFile, small: bool = 
     if small:
         header["format"] = PACKED_FORMAT
         tensors = packed(tensors, attack.face.carried_by if attack.face else None, face_texture)
-    write_atomically(Path(path), with_sorted_header(save(tensors, metadata=header)))
+    write_tensors(path, "numpy", tensors, header)
     return attack.attack_id
 
 
@@ -295,10 +294,8 @@ def load_attack(path: str | os.PathLike[str]) -> AttackFile:
             f"expected an attack file at {source}, found none; run the attack, or correct the path"
         )
     try:
-        with open_tensors(source, "numpy") as handle:
-            header = handle.metadata() or {}
-            tensors = {name: handle.get_tensor(name) for name in handle.keys()}  # noqa: SIM118 - not a mapping
-    except (SafetensorError, OSError, ValueError) as error:
+        header, tensors = read_tensors(source, "numpy")
+    except (OSError, ValueError) as error:
         raise AttackFileError(f"cannot read {source} as an attack file ({error}); make it again") from error
     return _checked(header, tensors, str(source))
 

@@ -17,17 +17,14 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.nn.functional as F
-from safetensors import SafetensorError
-from safetensors.torch import save
 from torch import Tensor
 
 from advnerf_core.adam import Adam
-from advnerf_core.files import with_sorted_header, write_atomically
+from advnerf_core.files import read_tensors, write_tensors
 from advnerf_core.learning.augment import AugmentConfig, Changes
 from advnerf_core.learning.frames import Batch, FrameSet, FrameStoreError
 from advnerf_core.memory import freed_blocks_kept
 from advnerf_core.parallel import run_slots, slot_bounds
-from advnerf_core.places import open_tensors
 from advnerf_core.policies.network import SteeringNetwork, images_to_tensor
 from advnerf_core.policies.number_type import layer_type
 
@@ -188,7 +185,7 @@ def _write(path: Path, policy: SteeringNetwork, optimiser: Adam, step: int, conf
     # Copies, because the file holds each tensor of tied weights.
     contiguous = {name: value.contiguous().clone() for name, value in tensors.items()}
     header = {"step": str(step), "config": repr(asdict(config))}
-    write_atomically(path, with_sorted_header(save(contiguous, header)))
+    write_tensors(path, "torch", contiguous, header)
 
 
 def _resume(
@@ -198,10 +195,8 @@ def _resume(
     if not path.is_file():
         return 0, {}
     try:
-        with open_tensors(path, "pt") as file:
-            header = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-    except (SafetensorError, OSError) as error:
+        header, tensors = read_tensors(path, "torch")
+    except (OSError, ValueError) as error:
         raise FrameStoreError(
             f"expected a training checkpoint at {path}, got {error}; delete it to start again"
         ) from error

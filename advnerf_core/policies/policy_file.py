@@ -12,14 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import save
 from torch import Tensor
 
 from advnerf_core.code_files import file_sha256
 from advnerf_core.errors import AdvnerfError
-from advnerf_core.files import with_sorted_header, write_atomically
-from advnerf_core.places import open_tensors
+from advnerf_core.files import read_tensors, write_atomically, write_tensors
 from advnerf_core.plugins import code_sha256, is_file_reference
 from advnerf_core.policies.architecture import (
     ARCHITECTURES,
@@ -84,7 +81,7 @@ def save_policy(
     digest = _digest(weights, header)
     for name, content in policy.code_files.items():
         write_atomically(_code_folder(Path(path), policy.code_sha256) / name, content)
-    write_atomically(Path(path), with_sorted_header(save(weights, {**header, "sha256": digest})))
+    write_tensors(path, "torch", weights, {**header, "sha256": digest})
     return digest
 
 
@@ -219,14 +216,12 @@ def _view(header: Mapping[str, str]) -> PolicyView:
 
 def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
     try:
-        with open_tensors(path, "pt") as file:
-            header = dict(file.metadata() or {})
-            weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+        header, weights = read_tensors(path, "torch")
     except FileNotFoundError as error:
         raise PolicyFileError(
             f"expected a policy file at {path}, found none: train a policy first"
         ) from error
-    except (SafetensorError, OSError) as error:
+    except (OSError, ValueError) as error:
         raise PolicyFileError(
             f"expected a policy file at {path}, got an unreadable one ({error}): train again"
         ) from error

@@ -11,14 +11,11 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from safetensors import SafetensorError
-from safetensors.numpy import save as save_arrays
 from torch import Tensor
 
-from advnerf_core.files import with_sorted_header, write_atomically
+from advnerf_core.files import read_tensors, write_tensors
 from advnerf_core.geometry import Array, Pinhole
 from advnerf_core.parallel import Work, run_slots, slot_bounds, thread_count
-from advnerf_core.places import open_tensors
 from advnerf_core.render.march import MarchConfig
 from advnerf_core.render.occupancy import Leaps, flat_boxes, leap_distances
 from advnerf_core.render.rays import intrinsics_row, poses_in_box
@@ -168,7 +165,7 @@ class BakedScene:
             "shape": json.dumps(list(self.leaps.distance.shape)),
             "least_transmittance": repr(self.least_transmittance),
         }
-        write_atomically(path, with_sorted_header(save_arrays(arrays, header)))
+        write_tensors(path, "numpy", arrays, header)
 
     @classmethod
     def load(cls, path: Path) -> BakedScene:
@@ -178,17 +175,15 @@ class BakedScene:
             SceneFileError: The file is missing, damaged, or of another kind.
         """
         try:
-            with open_tensors(path, "numpy") as file:
-                header = file.metadata() or {}
-                if header.get("format") != FORMAT:
-                    raise SceneFileError(
-                        f"expected format {FORMAT} in {path}, got {header.get('format')}; bake the scene again"
-                    )
-                arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
-        except (OSError, SafetensorError) as error:
+            header, arrays = read_tensors(path, "numpy")
+        except (OSError, ValueError) as error:
             raise SceneFileError(
                 f"expected a baked scene at {path}, got: {error}; bake the scene again"
             ) from error
+        if header.get("format") != FORMAT:
+            raise SceneFileError(
+                f"expected format {FORMAT} in {path}, got {header.get('format')}; bake the scene again"
+            )
         config = SceneFieldConfig.from_dict(json.loads(header["config"]))
         shape = tuple(json.loads(header["shape"]))
         occupied = np.unpackbits(arrays["occupancy_bits"], count=int(np.prod(shape))).reshape(shape)

@@ -16,15 +16,12 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors import SafetensorError
-from safetensors.torch import save as save_tensors
 from torch import Tensor, nn
 
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.fields.hash_grid import HashGrid, HashGridConfig
 from advnerf_core.fields.spherical_harmonics import spherical_harmonics
-from advnerf_core.files import with_sorted_header, write_atomically
-from advnerf_core.places import open_tensors
+from advnerf_core.files import read_tensors, write_tensors
 from advnerf_core.render.contraction import contract
 from advnerf_core.render.volume_kernels import MAX_LOG_DENSITY
 
@@ -223,7 +220,7 @@ def save_scene(
         "scene_hash": content,
         "metadata": json.dumps(metadata or {}),
     }
-    write_atomically(Path(path), with_sorted_header(save_tensors(tensors, header)))
+    write_tensors(path, "torch", tensors, header)
     return content
 
 
@@ -265,13 +262,9 @@ def _read(
     path: Path, with_tensors: bool = True
 ) -> tuple[dict[str, str], SceneFieldConfig, dict[str, Tensor]]:
     """Header, sizes and tensors of a scene file."""
-    tensors: dict[str, Tensor] = {}
     try:
-        with open_tensors(path, "pt") as file:
-            header: dict[str, str] = file.metadata() or {}
-            if with_tensors:
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
-    except (OSError, SafetensorError) as error:
+        header, tensors = read_tensors(path, "torch", None if with_tensors else ())
+    except (OSError, ValueError) as error:
         raise SceneFileError(
             f"expected a scene file at {path}, got: {error}; train the scene again"
         ) from error

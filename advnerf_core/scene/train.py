@@ -12,13 +12,11 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors import SafetensorError
 from safetensors.numpy import save as save_arrays
 
 from advnerf_core.data.views import ImageSet
 from advnerf_core.errors import AdvnerfError
-from advnerf_core.files import write_atomically
-from advnerf_core.places import open_tensors
+from advnerf_core.files import read_tensors, write_atomically
 from advnerf_core.render.march import Marcher, Samples
 from advnerf_core.render.occupancy import Leaps, OccupancyGrid, leap_distances, refine_occupied
 from advnerf_core.render.rays import intrinsics_row, pixel_rays, poses_in_box
@@ -207,10 +205,9 @@ class Trainer:
             CheckpointError: The file cannot be read, or belongs to other images or settings.
         """
         try:
-            with open_tensors(path, "numpy") as file:
-                state: dict[str, Any] = json.loads((file.metadata() or {})["state"])
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
-        except (OSError, SafetensorError, KeyError, ValueError) as error:
+            header, tensors = read_tensors(path, "numpy")
+            state: dict[str, Any] = json.loads(header["state"])
+        except (OSError, KeyError, ValueError) as error:
             raise CheckpointError(
                 f"expected a training checkpoint at {path}, got: {error!r}; delete it to train from the start"
             ) from error

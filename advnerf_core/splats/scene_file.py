@@ -9,12 +9,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from safetensors import SafetensorError
-from safetensors.numpy import save as save_arrays
 
-from advnerf_core.files import with_sorted_header, write_atomically
+from advnerf_core.files import read_tensors, write_tensors
 from advnerf_core.geometry import Pinhole
-from advnerf_core.places import open_tensors
 from advnerf_core.scene.bake import bake
 from advnerf_core.scene.baked import BakedScene
 from advnerf_core.scene.field import SceneFieldConfig, SceneFileError, load_scene, load_scene_config
@@ -47,7 +44,7 @@ def save_splat_scene(path: Path, renderer: SplatRenderer, metadata: dict[str, An
         "scene_hash": digest.hexdigest()[:16],
         "metadata": json.dumps(metadata or {}),
     }
-    write_atomically(path, with_sorted_header(save_arrays(parts, header)))
+    write_tensors(path, "numpy", parts, header)
     return header["scene_hash"]
 
 
@@ -60,13 +57,12 @@ def load_splat_scene(path: Path) -> tuple[SplatRenderer, dict[str, Any]]:
     header = _header(path)
     box, content = _content(path, header)
     try:
-        with open_tensors(path, "numpy") as file:
-            parts = {name: file.get_tensor(name).astype(np.float32) for name in file.keys()}  # noqa: SIM118 - not a dict
+        parts = {name: part.astype(np.float32) for name, part in read_tensors(path, "numpy")[1].items()}
         renderer = SplatRenderer(
             GaussianSplats(**parts), tuple(content["behind"]), near_m=content["near_m"], box=box
         )
         metadata = {**json.loads(header["metadata"]), "scene_hash": header["scene_hash"]}
-    except (OSError, SafetensorError, ValueError, TypeError, KeyError) as error:
+    except (OSError, ValueError, TypeError, KeyError) as error:
         raise _damaged(path, error) from error
     return renderer, metadata
 
@@ -129,9 +125,8 @@ def bake_scene(
 
 def _header(path: Path) -> dict[str, str]:
     try:
-        with open_tensors(path, "numpy") as file:
-            return dict(file.metadata() or {})
-    except (OSError, SafetensorError) as error:
+        return read_tensors(path, "numpy", ())[0]
+    except (OSError, ValueError) as error:
         raise SceneFileError(
             f"expected a scene file at {path}, got: {error}; make the scene again"
         ) from error

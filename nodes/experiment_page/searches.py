@@ -10,12 +10,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError
 
 from advnerf_core.attack.artifact import COLOURS, MESH_TEXTURE, AttackFileError, face_texture, load_attack
 from advnerf_core.data.image_files import encoded
 from advnerf_core.documents import read_json
-from advnerf_core.places import open_tensors
+from advnerf_core.files import read_tensors
 
 ATTACK, SEARCHED, STATE = "attack.safetensors", "surrogate.json", "state.safetensors"
 # Spaces whose theta are colours. The others, places and shapes, have no texture to show.
@@ -55,7 +54,7 @@ def read_search(folder: Path, state: str = STATE) -> Search | None:
         try:
             changed_ns = (folder / name).stat().st_mtime_ns
             found = read(folder / name, changed_ns)
-        except (OSError, ValueError, KeyError, TypeError, SafetensorError):
+        except (OSError, ValueError, KeyError, TypeError):
             continue  # missing, or replaced while it was read
         if found:
             return Search(found, f"{changed_ns:x}", name == SEARCHED)
@@ -71,8 +70,7 @@ def _finished(file: Path, changed_ns: int) -> tuple[float, ...]:
 @lru_cache(maxsize=64)
 def _running(file: Path, changed_ns: int) -> tuple[float, ...]:
     del changed_ns
-    with open_tensors(file, "numpy") as handle:
-        history = json.loads((handle.metadata() or {})["history"])
+    history = json.loads(read_tensors(file, "numpy", ())[0]["history"])
     return tuple(round(sum(row["protocol_cte_m"]) / len(row["protocol_cte_m"]), 3) for row in history)
 
 
@@ -89,7 +87,7 @@ def texture_png(folder: Path) -> bytes | None:
             if (folder / ATTACK).exists()
             else _state_pictures(folder / STATE)
         )
-    except (OSError, ValueError, KeyError, SafetensorError, AttackFileError):
+    except (OSError, ValueError, KeyError, AttackFileError):
         return None
     small = [_square(each) for each in pictures[:_MOST_OBJECTS]]
     return encoded(np.concatenate(small, axis=1), ".png") if small else None
@@ -103,8 +101,7 @@ def _attack_pictures(file: Path) -> list[Pixels]:
 
 
 def _state_pictures(file: Path) -> list[Pixels]:
-    with open_tensors(file, "numpy") as handle:
-        return [_picture(handle.get_tensor("best_theta"))]
+    return [_picture(read_tensors(file, "numpy", ["best_theta"])[1]["best_theta"])]
 
 
 def _picture(theta: NDArray[np.float32]) -> Pixels:

@@ -10,9 +10,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError
 
-from advnerf_core.places import open_tensors
+from advnerf_core.files import read_tensors
 from advnerf_core.policies.contract import PolicyContractError
 from advnerf_core.policies.declaration import ONNX_METADATA_KEY, declaration_beside
 from advnerf_core.policies.view import PolicyView
@@ -62,9 +61,8 @@ def view_of_policy(policy: str) -> PolicyView | None:
         if path.suffix == ".onnx":
             return _view_of_onnx(path)
         if path.suffix == ".safetensors":
-            with open_tensors(path, "numpy") as file:
-                return PolicyView.from_dict(json.loads((file.metadata() or {})["view"]))
-    except (SafetensorError, PolicyContractError, OSError, KeyError, ValueError):
+            return PolicyView.from_dict(json.loads(read_tensors(path, "numpy", ())[0]["view"]))
+    except (PolicyContractError, OSError, KeyError, ValueError):
         pass
     return None
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from advnerf_core import kernel_cache, places
-from advnerf_core.files import write_atomically
-from advnerf_core.places import PlaceError, expanded, open_tensors, private_folder, require_utf8, user_place
+from advnerf_core.files import read_tensors, write_atomically
+from advnerf_core.places import PlaceError, expanded, private_folder, require_utf8, user_place
 from nodes.cli import main as cli
 
 ROOT = Path(__file__).parents[2]
@@ -110,7 +110,7 @@ def test_a_path_that_is_no_utf8_is_refused_before_work(tmp_path):
     for refuses in (
         lambda: require_utf8(folder),
         lambda: write_atomically(folder / "a", "b"),
-        lambda: open_tensors(folder / "policy.safetensors", "numpy"),
+        lambda: read_tensors(folder / "policy.safetensors", "numpy"),
     ):
         with pytest.raises(PlaceError, match=r"path in UTF-8, got b'.*f\\xe9vrier.*; rename"):
             refuses()
@@ -144,4 +144,4 @@ def test_commands_refuse_such_a_folder_in_one_line(tmp_path, monkeypatch, capsys
 def test_tensors_are_opened_in_one_place():
     """The library takes a path that is no UTF-8 for a damaged file."""
     files = [file for package in ("advnerf_core", "nodes") for file in (ROOT / package).rglob("*.py")]
-    assert [file.name for file in files if "safe_open(" in file.read_text(encoding="utf-8")] == ["places.py"]
+    assert [file.name for file in files if "safe_open(" in file.read_text(encoding="utf-8")] == ["files.py"]

@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
 from safetensors.torch import save
 from torch import Tensor
 
@@ -28,8 +27,7 @@ from advnerf_core.attack.objective import CrossTrackError
 from advnerf_core.attack.problem import ScaledSensor, SearchDivergedError
 from advnerf_core.attack.search.record import Evaluation, SearchResult
 from advnerf_core.errors import AdvnerfError
-from advnerf_core.files import write_atomically
-from advnerf_core.places import open_tensors
+from advnerf_core.files import read_tensors, write_atomically
 
 _FORMAT = "advnerf-search-1"
 
@@ -106,16 +104,14 @@ class SearchState:
 def load_state(path: Path, fingerprint: str) -> SearchState:
     """Read a state file that a search with the same settings wrote."""
     try:
-        with open_tensors(path, "pt") as handle:
-            header = handle.metadata() or {}
-            tensors = {name: handle.get_tensor(name) for name in handle.keys()}  # noqa: SIM118 - not a mapping
+        header, tensors = read_tensors(path, "torch")
         if header.get("format") != _FORMAT:
             raise SearchStateError(
                 f"expected {path} to be a search state of format {_FORMAT}; delete it to start afresh"
             )
         history = [evaluation_from_json(entry) for entry in json.loads(header["history"])]
         best_theta = tensors.pop("best_theta")
-    except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+    except (OSError, KeyError, TypeError, ValueError) as error:
         if isinstance(error, SearchStateError):
             raise
         raise SearchStateError(f"cannot resume from {path} ({error}); delete it to start afresh") from error

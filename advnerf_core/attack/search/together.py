@@ -15,7 +15,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError
 from safetensors.torch import save
 from torch import Tensor
 
@@ -29,8 +28,7 @@ from advnerf_core.attack.search.search import (
     evaluation_from_json,
     search_fingerprint,
 )
-from advnerf_core.files import write_atomically
-from advnerf_core.places import open_tensors
+from advnerf_core.files import read_tensors, write_atomically
 from advnerf_core.scene.many_textures import ManyTextures, ShowsMany
 from advnerf_core.scene.surrogate import Surrogate
 
@@ -180,12 +178,10 @@ def _save(path: Path, fingerprint: str, states: Sequence[SearchState], tensors: 
 
 def _load(path: Path, fingerprint: str, count: int) -> tuple[list[SearchState], dict[str, Tensor]]:
     try:
-        with open_tensors(path, "pt") as handle:
-            header = handle.metadata() or {}
-            tensors = {name: handle.get_tensor(name) for name in handle.keys()}  # noqa: SIM118 - not a mapping
+        header, tensors = read_tensors(path, "torch")
         best = tensors.pop("best_theta")
         histories = [[evaluation_from_json(each) for each in one] for one in json.loads(header["histories"])]
-    except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+    except (OSError, KeyError, TypeError, ValueError) as error:
         raise SearchStateError(f"cannot resume from {path} ({error!r}); delete it to start afresh") from error
     if header.get("format") != _FORMAT or header.get("fingerprint") != fingerprint or len(histories) != count:
         raise SearchStateError(

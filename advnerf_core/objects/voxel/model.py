@@ -13,16 +13,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from safetensors import SafetensorError
-from safetensors.numpy import save
 from scipy import ndimage
 
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.fields.voxel_grid import VoxelGridObject
-from advnerf_core.files import with_sorted_header, write_atomically
+from advnerf_core.files import read_tensors, write_tensors
 from advnerf_core.geometry import Array
 from advnerf_core.objects.voxel.voxelise import OPAQUE_PER_VOXEL, ObjectGrids
-from advnerf_core.places import open_tensors
 
 FILE_FORMAT = "advnerf-object-1"
 # A ray that has crossed two voxels of full density is dark to one part in 10^17.
@@ -110,7 +107,7 @@ def save_object(path: Path, model: ObjectModel) -> None:
         "box": np.stack([grids.box_min, grids.box_max]),
     }
     metadata = {"format": FILE_FORMAT, "name": model.name, "about": json.dumps(model.about, sort_keys=True)}
-    write_atomically(path, with_sorted_header(save(tensors, metadata)))
+    write_tensors(path, "numpy", tensors, metadata)
 
 
 def load_object(path: Path) -> ObjectModel:
@@ -124,15 +121,16 @@ def load_object(path: Path) -> ObjectModel:
             f"expected an object file at {path}, found none: make one with `advnerf scene object build`"
         )
     try:
-        with open_tensors(path, "numpy") as stream:
-            metadata = stream.metadata() or {}
-            if metadata.get("format") != FILE_FORMAT:
-                raise ObjectFileError(
-                    f"expected {path} to be an object file ({FILE_FORMAT}), got {metadata.get('format')}"
-                )
-            density, colours, box = (stream.get_tensor(name) for name in ("density", "colours", "box"))
-    except SafetensorError as error:
+        metadata, parts = read_tensors(path, "numpy")
+    except ValueError as error:
         raise ObjectFileError(f"cannot read {path} as an object file ({error}); build it again") from error
+    if metadata.get("format") != FILE_FORMAT:
+        raise ObjectFileError(
+            f"expected {path} to be an object file ({FILE_FORMAT}), got {metadata.get('format')}"
+        )
+    if missing := {"density", "colours", "box"} - parts.keys():
+        raise ObjectFileError(f"cannot read {path} as an object file (no {min(missing)}); build it again")
+    density, colours, box = parts["density"], parts["colours"], parts["box"]
     _check(path, density, colours, box)
     about = json.loads(metadata.get("about", "{}"))
     return ObjectModel(metadata.get("name", path.stem), ObjectGrids(density, colours, box[0], box[1]), about)

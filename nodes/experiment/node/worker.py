@@ -20,7 +20,7 @@ from advnerf_core.attack.artifact import face_texture, load_attack
 from advnerf_core.attack.search.record import Evaluation
 from advnerf_core.attack.search.search import evaluation_from_json
 from advnerf_core.errors import AdvnerfError
-from advnerf_core.places import open_tensors
+from advnerf_core.files import read_tensors
 from nodes.experiment.node.job import TOGETHER_STATE
 from nodes.experiment.node.prepare import Prepared
 from nodes.experiment.node.search import kept_request, planned_evaluations, run_attack
@@ -104,11 +104,11 @@ class Speaker:
         state = self._folder / TOGETHER_STATE if together else self._state(prepared)
         if not state.exists():
             return None
-        with open_tensors(state, "pt") as handle:
-            best: Tensor = handle.get_tensor("best_theta")
-            histories = json.loads((handle.metadata() or {}).get("histories", "[]"))
+        header, tensors = read_tensors(state, "torch", ["best_theta"])
+        best: Tensor = tensors["best_theta"]
         if not together:
             return best
+        histories = json.loads(header.get("histories", "[]"))
         values = [max(evaluation_from_json(entry).value for entry in history) for history in histories]
         return best[values.index(max(values))]
 
@@ -124,8 +124,7 @@ def _so_far(state: Path) -> tuple[int, Evaluation | None]:
     """Number of evaluations of an interrupted search, and the best of them."""
     if not state.exists():
         return 0, None
-    with open_tensors(state, "pt") as handle:
-        entries = json.loads((handle.metadata() or {}).get("history", "[]"))
+    entries = json.loads(read_tensors(state, "torch", ())[0].get("history", "[]"))
     history = [evaluation_from_json(entry) for entry in entries]
     return len(history), max(history, key=lambda each: each.value, default=None)
 
