@@ -1,6 +1,6 @@
 """The methods of attack: one table of the built-in ones, and those that users bring as an entry point or a file.
 
-A method is one file with a function ``search(problem, settings, run)`` that returns a `SearchResult`, and one `Method` that says what the
+A method is a function ``search(problem, settings, run)`` that returns a `SearchResult`, and one `Method` that says what the
 search needs. A built-in one is a row of `METHODS`; a user's is an entry point of the group ``advnerf.methods`` or ``file.py:Name``, see
 docs/methods.md. ``none`` is not a method but a condition (`advnerf_core.report.conditions`): there is nothing to search.
 
@@ -149,38 +149,38 @@ class Method:
         return options_of(self.Options, written, "option of this method", key, MethodError)
 
 
-def _late(module: str, function: str = "search") -> Callable[..., Any]:
-    """A function of a module beside the searches, which is imported when the function is first called."""
+def _late(module: str, function: str = "search", *first: str) -> Callable[..., Any]:
+    """A function of a module beside the searches, with its first arguments; the module is imported when it is first called."""
 
     def call(*arguments: Any) -> Any:
-        return getattr(import_module(f"advnerf_core.attack.search.{module}"), function)(*arguments)
+        return getattr(import_module(f"advnerf_core.attack.search.{module}"), function)(*first, *arguments)
 
     return call
 
 
-# In the order of tables. A method is one row here and one file in `search/`.
+# In the order of tables. A method is one row here and a function in `search/`.
 METHODS: Mapping[str, Method] = MappingProxyType(
     {
         "random": Method(_late("random_search"), reads_scale=True),
-        "random_coarse": Method(_late("random_families", "search_coarse")),
-        "random_levels": Method(_late("random_families", "search_levels")),
-        "random_pink": Method(_late("random_families", "search_pink")),
-        "random_natural": Method(_late("random_families", "search_natural")),
+        "random_coarse": Method(_late("random_families", "search", "random_coarse")),
+        "random_levels": Method(_late("random_families", "search", "random_levels")),
+        "random_pink": Method(_late("random_families", "search", "random_pink")),
+        "random_natural": Method(_late("random_families", "search", "random_natural")),
         "cem": Method(_late("cem")),
         "evolution": Method(_late("evolution")),
         "gradient": Method(_late("gradient"), needs_gradient=True, reads_scale=True),
         "gradient_coarse": Method(_late("gradient_coarse"), needs_gradient=True),
         "frame": Method(_late("frame"), needs_gradient=True, single_images=True),
         "guided": Method(
-            _late("guided"),
+            _late("black_box", "search_as", "guided"),
             single_images=True,
-            evaluations=_late("guided", "evaluations"),
+            evaluations=_late("black_box", "planned_evaluations", "guided"),
             Options=StudentOptions,
         ),
         "distilled": Method(
-            _late("distilled"),
+            _late("black_box", "search_as", "distilled"),
             single_images=True,
-            evaluations=_late("distilled", "evaluations"),
+            evaluations=_late("black_box", "planned_evaluations", "distilled"),
             Options=StudentOptions,
         ),
     }

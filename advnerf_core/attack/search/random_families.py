@@ -6,8 +6,6 @@ to smoothness, to large areas of one colour, or to edges alone.
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
@@ -19,36 +17,18 @@ from advnerf_core.attack.search.record import SearchResult
 from advnerf_core.attack.search.search import random_spread
 from advnerf_core.fields.colour_grid import colour_grid
 
-
-def search_coarse(problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
-    """The method ``random_coarse``; see `advnerf_core.attack.methods`."""
-    family = textures.coarse(settings.cells)
-    return _search("random_coarse", family, problem, settings, run, cells=settings.cells)
-
-
-def search_levels(problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
-    """The method ``random_levels``; see `advnerf_core.attack.methods`."""
-    return _search("random_levels", textures.levels, problem, settings, run)
+_FAMILIES = {
+    "random_levels": textures.levels,
+    "random_pink": textures.pink,
+    "random_natural": textures.natural,
+}
 
 
-def search_pink(problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
-    """The method ``random_pink``; see `advnerf_core.attack.methods`."""
-    return _search("random_pink", textures.pink, problem, settings, run)
-
-
-def search_natural(problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
-    """The method ``random_natural``; see `advnerf_core.attack.methods`."""
-    return _search("random_natural", textures.natural, problem, settings, run)
-
-
-def _search(
-    method: str,
-    family: textures.Family,
-    problem: AttackProblem,
-    settings: SearchSettings,
-    run: SearchRun,
-    **own: Any,
-) -> SearchResult:
+def search(method: str, problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
+    """The methods; see `advnerf_core.attack.methods`."""
+    coarse = method == "random_coarse"
+    family = textures.coarse(settings.cells) if coarse else _FAMILIES[method]
+    own = {"cells": settings.cells} if coarse else {}
     grids = [colour_grid(field) for field in problem.coloured(method).objects]
     shape, sigma = problem.sensor.theta_shape, random_spread(problem, settings)
 
