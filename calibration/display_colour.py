@@ -109,13 +109,13 @@ class DisplayFit:
         )
 
 
-def colours_to_show(mixed: int = 48, seed: int = 0) -> NDArray[np.uint8]:
+def colours_to_show(seed: int = 0) -> NDArray[np.uint8]:
     """Make the colour sequence ``[N, 3]``: black and white, grey and primary ramps, mixed colours, black and white again."""
     ramp = np.round(np.linspace(0, 255, LEVELS)).astype(np.uint8)
     ends = np.array([[0, 0, 0], [255, 255, 255]], np.uint8)
     grey = np.repeat(ramp[1:-1, None], 3, axis=1)
     primaries = np.concatenate([ramp[1::2, None] * np.eye(3, dtype=np.uint8)[c] for c in range(3)])
-    random = np.random.default_rng(seed).integers(0, 256, (mixed, 3)).astype(np.uint8)
+    random = np.random.default_rng(seed).integers(0, 256, (48, 3)).astype(np.uint8)
     return np.concatenate([ends, grey, primaries, random, ends])
 
 

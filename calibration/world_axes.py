@@ -49,7 +49,7 @@ def cameras_up(poses: Array) -> Array:
     return up / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
 
 
-def find_ground(poses: Array, points: Array, seed: int = 0, up: Array | None = None) -> Ground | None:
+def find_ground(poses: Array, points: Array, up: Array | None = None) -> Ground | None:
     """The plane of most points ``[M, 3]`` below the cameras and nearly level; None if no plane has enough points.
 
     Args:
@@ -59,7 +59,7 @@ def find_ground(poses: Array, points: Array, seed: int = 0, up: Array | None = N
     below = points[points @ up < np.median(positions @ up)]
     if len(below) < _MIN_POINTS:
         return None
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     thickness = _THICKNESS * float(np.median(np.linalg.norm(below - positions.mean(axis=0), axis=1)))
     drawn = (
         below if len(below) <= _DRAWN_POINTS else below[rng.choice(len(below), _DRAWN_POINTS, replace=False)]

@@ -22,7 +22,6 @@ def write_transforms(
     image_paths: Sequence[str | Path],
     T_world_from_camera: ArrayLike,
     pinhole: Pinhole | Sequence[Pinhole],
-    aabb_scale: float | None = None,
     *,
     lens: Lens | Sequence[Lens] | None = None,
     camera_ids: Sequence[str] | None = None,
@@ -35,7 +34,6 @@ def write_transforms(
         image_paths: Image files: absolute, or relative to the file's folder.
         T_world_from_camera: ``[N, 4, 4]``, OpenCV axes.
         pinhole: One for all images, or one each.
-        aabb_scale: Instant-NGP's box size.
         lens: Distortion of all images, or one each; None for none.
         camera_ids: Id of each image's camera.
         masks: Mask of each image, or None; as ``image_paths``.
@@ -56,8 +54,6 @@ def write_transforms(
     intrinsics = [_intrinsics(p, each) for p, each in zip(pinholes, lenses, strict=True)]
     shared = intrinsics[0] if intrinsics and all(values == intrinsics[0] for values in intrinsics) else {}
     content = {"camera_model": "OPENCV", **shared, **dict(extra or {})}
-    if aabb_scale is not None:
-        content["aabb_scale"] = aabb_scale
     frames = []
     for index, image in enumerate(image_paths):
         frame: dict[str, Any] = {"file_path": _relative(Path(image), path.parent)}

@@ -35,9 +35,9 @@ class LoadedView:
     pinhole: Pinhole
 
 
-def load_image(frame: PosedImage, size: tuple[int, int] | None = None) -> tuple[Rgb, Pinhole]:
-    """Colours and intrinsics of one image, undistorted and resized to ``size`` (width, height); see `load_view`."""
-    view = load_view(frame, size)
+def load_image(frame: PosedImage) -> tuple[Rgb, Pinhole]:
+    """Colours and intrinsics of one image, undistorted; see `load_view`."""
+    view = load_view(frame)
     return view.rgb, view.pinhole
 
 

@@ -97,7 +97,6 @@ class SceneSource:
         dt_s: Control tick [s].
         overlay: Shows the object with a texture parameter; None for scenes without a changing object.
         sample_texture: Draws a texture parameter for ``overlay``; needed with it.
-        variants: Textured images per state in which the object is in view.
     """
 
     batch_size = 1
@@ -111,14 +110,13 @@ class SceneSource:
         dt_s: float,
         overlay: Overlay | None = None,
         sample_texture: Callable[[np.random.Generator], Any] | None = None,
-        variants: int = 1,
     ) -> None:
         if (overlay is None) != (sample_texture is None):
             raise ValueError("expected overlay and sample_texture together, got one of them")
         self.name = name
         self._scene, self._view, self._overlay = scene, view, overlay
         self._speed_mps, self._dt_s = speed_mps, dt_s
-        self._sample, self._variants = sample_texture, variants
+        self._sample = sample_texture
 
     def look(self, states: Array, rng: np.random.Generator) -> PolicyImages:
         """Images from the states ``[B, 3]``."""
@@ -149,14 +147,12 @@ class SceneSource:
         return PolicyImages.join(parts)
 
     def _seen(self, rgb: Image, state: Array, rng: np.random.Generator, held: Any = None) -> PolicyImages:
-        """The plain view first, the textured ones after it, a held texture last."""
+        """The plain view, and after it the one with the held texture, or with a drawn one; none where the object is out of view."""
         images = [self._view.image(rgb)]
         if self._overlay is not None and self._sample is not None:
-            textures = [self._sample(rng) for _ in range(self._variants)]
-            for texture in textures if held is None else [*textures[:-1], held]:
-                painted = self._overlay(rgb, state, texture)
-                if np.array_equal(painted, rgb):  # the object is out of view
-                    break
+            drawn = self._sample(rng)  # also beside a held one: later draws do not depend on it
+            painted = self._overlay(rgb, state, drawn if held is None else held)
+            if not np.array_equal(painted, rgb):
                 images.append(self._view.image(painted))
         return PolicyImages(
             np.stack(images), np.tile(state[:3], (len(images), 1)), np.arange(len(images)) > 0
@@ -175,7 +171,6 @@ class RenderedSource:
         prepare: Takes states ``[B, 3]``, renders everything that does not depend on the texture (the background), returns ``Show``.
         dynamics: Vehicle model for drives.
         sample_texture: Draws a texture parameter for ``Show``; None for scenes without a changing object.
-        variants: Textured images per state in which the object is in view.
         batch_size: States per call of ``prepare``, and drives side by side.
     """
 
@@ -185,16 +180,10 @@ class RenderedSource:
         prepare: Callable[[Array], Show],
         dynamics: Dynamics,
         sample_texture: Callable[[np.random.Generator], Any] | None = None,
-        variants: int = 1,
         batch_size: int = 8,
     ) -> None:
         self.name, self.batch_size = name, batch_size
-        self._prepare, self._dynamics, self._sample, self._variants = (
-            prepare,
-            dynamics,
-            sample_texture,
-            variants,
-        )
+        self._prepare, self._dynamics, self._sample = prepare, dynamics, sample_texture
 
     def look(self, states: Array, rng: np.random.Generator) -> PolicyImages:
         """Images from the states ``[B, 3]``."""
@@ -225,14 +214,13 @@ class RenderedSource:
         show = self._prepare(states)
         plain = _as_uint8(show(None))
         painted = plain if held is None else _as_uint8(show(held))
-        textures = [] if self._sample is None else [self._sample(rng) for _ in range(self._variants)]
-        views = [_as_uint8(show(texture)) for texture in textures]
+        drawn = plain if self._sample is None else _as_uint8(show(self._sample(rng)))
         images, rows, textured = [], [], []
         for row in range(len(states)):
-            in_view = [view[row] for view in views if not np.array_equal(view[row], plain[row])]
-            images += [plain[row], *in_view]
-            rows += [row] * (1 + len(in_view))
-            textured += [False] + [True] * len(in_view)
+            in_view = not np.array_equal(drawn[row], plain[row])
+            images += [plain[row], drawn[row]] if in_view else [plain[row]]
+            rows += [row] * (1 + in_view)
+            textured += [False, True] if in_view else [False]
         return PolicyImages(np.stack(images), states[rows].copy(), np.array(textured)), plain, painted
 
 

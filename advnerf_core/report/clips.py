@@ -68,7 +68,6 @@ def write_clip(
     tracks: Sequence[ClipTrack],
     rate_hz: float = 10.0,
     off_track_m: float = 0.4,
-    max_bytes: int = MAX_BYTES,
 ) -> Path:
     """Write drives side by side as one video, atomically, as fine as the size limit allows.
 
@@ -77,7 +76,6 @@ def write_clip(
         tracks: The drives, left to right, of one frame size; a shorter one holds its last frame.
         rate_hz: Frames per second.
         off_track_m: ``|CTE|`` above this is shown as off-track [m].
-        max_bytes: Size limit [bytes].
 
     Returns:
         The file written: ``.mp4``, or ``.webm`` without libx264.
@@ -92,13 +90,13 @@ def write_clip(
         for quality in _QUALITIES:
             _encode(temporary, codec, quality, rate_hz, compose(tracks, rate_hz, off_track_m))
             size = temporary.stat().st_size
-            if size <= max_bytes:
+            if size <= MAX_BYTES:
                 os.replace(temporary, path)
                 return path
     finally:
         temporary.unlink(missing_ok=True)
     raise ValueError(
-        f"expected clip {path.name} under {max_bytes} bytes, got {size} at the coarsest setting: film fewer frames"
+        f"expected clip {path.name} under {MAX_BYTES} bytes, got {size} at the coarsest setting: film fewer frames"
     )
 
 

@@ -123,10 +123,11 @@ def loss_curves(drives: Drives, victim: str) -> Figure:
     return ax.figure
 
 
-def steering_agreement(fidelity: Fidelity, tolerance: float = 0.03) -> Figure:
+def steering_agreement(fidelity: Fidelity) -> Figure:
     """The policy's control on the surrogate's image against that on the real image."""
     pairs = fidelity.steering_rad
     low, high = float(pairs.min()), float(pairs.max())
+    tolerance = 0.03
     margin = max(0.06 * (high - low), tolerance)
     line = np.array([low - margin, high + margin])
     with new_axes(4.2, 3.9) as ax:

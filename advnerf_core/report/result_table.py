@@ -116,11 +116,9 @@ class ResultTable:
     cells: dict[str, CellResult] = field(default_factory=dict)
     name: str = ""
 
-    def find(
-        self, scenario: str, victim: str, method: str, domain: Domain, placement: str = ""
-    ) -> TableRow | None:
-        """One line; None if it was not requested."""
-        key = (scenario, placement, victim, method)
+    def find(self, scenario: str, victim: str, method: str, domain: Domain) -> TableRow | None:
+        """One line of no placement; None if it was not requested."""
+        key = (scenario, "", victim, method)
         return next((row for row in self.rows if row.key == key and row.domain == domain), None)
 
     def cells_of(self, row: TableRow) -> list[CellResult]:

@@ -49,7 +49,6 @@ def fit_grids(
     start: ObjectGrids,
     steps: int = 300,
     rays: int = 2048,
-    seed: int = 0,
     progress: Callable[[float, str], None] | None = None,
     max_seconds: float | None = None,
     learning_rate: float = LEARNING_RATE,
@@ -62,7 +61,6 @@ def fit_grids(
         start: Initial grids; voxels further than two from any with density stay empty.
         steps: Optimiser steps; 0 returns the start unchanged.
         rays: Rays per step.
-        seed: Seed of the rays and backgrounds.
         progress: Called after each step with the finished fraction and a text.
         max_seconds: Stop after this much time, if sooner [s]. The learning rate falls with the finished fraction, so that a fit
             that is stopped by time ends as smoothly as one that is stopped by steps.
@@ -72,8 +70,8 @@ def fit_grids(
         FitError: Too few pictures, or none shows the object or looks at the box.
     """
     views.refuse_useless()
-    batches = RayBatches(views, start.box_min, start.box_max, seed)
-    torch_rng = torch.Generator().manual_seed(seed)
+    batches = RayBatches(views, start.box_min, start.box_max, seed=0)
+    torch_rng = torch.Generator().manual_seed(0)
     field = _Field(start)
     optimiser = Adam(field.parameters)
     began, errors, fraction = time.monotonic(), list[float](), 0.0 if steps > 0 else 1.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +66,6 @@ def fit_in_stages(
     steps: int,
     progress: Callable[[float, str], None] | None = None,
     max_seconds: float | None = None,
-    sizes: Sequence[int] | None = None,
 ) -> Fit:
     """Carve the visual hull and fit it on finer and finer grids.
 
@@ -75,9 +74,8 @@ def fit_in_stages(
         steps: Optimiser steps over all stages.
         progress: Called with the finished fraction and a text.
         max_seconds: Stop after this much time, if sooner [s]. Time that a stage does not use goes to the later ones.
-        sizes: Resolutions of the stages, ending with ``resolution``; None: `resolutions`.
     """
-    sizes = list(sizes or resolutions(resolution))
+    sizes = resolutions(resolution)
     shares = stage_shares(len(sizes))
     began, done = time.monotonic(), 0.0
     fit: Fit | None = None

@@ -53,9 +53,9 @@ def luck_of(test: Mapping[str, Any]) -> Luck:
     )
 
 
-def luck_sentences(test: Mapping[str, Any], alpha: float = 0.05) -> str:
+def luck_sentences(test: Mapping[str, Any]) -> str:
     """Explains why a method is no better than the baseline in the surrogate; empty if it is better, or no test is claimed."""
-    if test["p_surrogate"] is None or test["p_surrogate"] <= alpha:
+    if test["p_surrogate"] is None or test["p_surrogate"] <= 0.05:
         return ""
     found = luck_of(test)
     ours, theirs = (style_of(name).title for name in (test["test"]["method"], test["baseline"]))

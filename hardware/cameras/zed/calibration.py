@@ -39,19 +39,18 @@ class EyeCalibration:
     distortion: tuple[float, float, float, float, float]
 
 
-def load_factory_calibration(path: Path | str, mode: str = "VGA", eye: str = "left") -> EyeCalibration:
-    """Read one eye's intrinsics for one mode from ``SN<serial>.conf``.
+def load_factory_calibration(path: Path | str, mode: str = "VGA") -> EyeCalibration:
+    """Read the left eye's intrinsics for one mode from ``SN<serial>.conf``.
 
     Args:
         mode: One of `EYE_SIZES`.
-        eye: ``left`` or ``right``.
 
     Raises:
         ZedCalibrationError: The file is missing or invalid, or has values that do not fit this mode.
     """
     path = Path(path)
     sections = _sections(path)
-    name = f"{eye}_cam_{_SECTION_SUFFIX[mode]}".lower()
+    name = f"left_cam_{_SECTION_SUFFIX[mode]}".lower()
     if name not in sections:
         raise ZedCalibrationError(
             f"expected a section [{name.upper()}] in {path}, found {', '.join(sorted(sections)) or 'none'}; download the file"

@@ -44,9 +44,10 @@ def test_the_caption_changes_when_the_car_leaves():
     assert not (on != off)[44:].any()
 
 
-def test_a_clip_over_the_limit_is_refused_and_leaves_nothing(tmp_path):
+def test_a_clip_over_the_limit_is_refused_and_leaves_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(clips, "MAX_BYTES", 100)
     with pytest.raises(ValueError, match="under 100 bytes"):
-        clips.write_clip(tmp_path / "big.mp4", [track(count=3)], max_bytes=100)
+        clips.write_clip(tmp_path / "big.mp4", [track(count=3)])
     assert list(tmp_path.iterdir()) == []
 
 

@@ -25,7 +25,7 @@ def write_set(folder: Path, count: int = 3, **shared: float) -> Path:
     for k in range(count):
         write_image(folder / "images" / f"{k}.png")
     path = folder / "transforms.json"
-    write_transforms(path, [f"images/{k}.png" for k in range(count)], poses, PINHOLE, aabb_scale=4)
+    write_transforms(path, [f"images/{k}.png" for k in range(count)], poses, PINHOLE, extra={"aabb_scale": 4})
     content = {**json.loads(path.read_text()), **shared}
     path.write_text(json.dumps(content))
     return path

@@ -50,7 +50,6 @@ def test_factory_file(zed_conf):
     assert (left.pinhole.width, left.pinhole.height) == (672, 376)
     assert (left.pinhole.fx, left.pinhole.cx, left.pinhole.cy) == (350.1, 335.1, 186.7)
     assert left.distortion == (-0.1737, 0.0276, 0.0003, -0.0002, 0.0011)
-    assert load_factory_calibration(zed_conf, eye="right").distortion == (-0.17, 0.025, 0.0, 0.0, 0.0)
     assert load_factory_calibration(zed_conf, "2K").distortion == (0.0,) * 5
 
 
