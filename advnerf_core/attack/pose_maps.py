@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem, evaluate
-from advnerf_core.attack.spaces.placed_sensor import PlacedSensor
+from advnerf_core.attack.search.poses import placed_sensor
 from advnerf_core.attack.spaces.placement import PoseSpace, placed
 from advnerf_core.documents import read_json
 from advnerf_core.driving.cross_track import cross_track
@@ -116,7 +116,7 @@ def landscape(
     Raises:
         PoseMapError: A wrong object number, an empty grid, or the file of another map.
     """
-    sensor = _sensor(problem)
+    sensor = placed_sensor(problem)
     if not 0 <= number < len(sensor.space.objects):
         raise PoseMapError(f"expected an object of 0..{len(sensor.space.objects) - 1}, got {number}")
     axes = [np.asarray(axis, dtype=np.float64) for axis in grid]
@@ -162,7 +162,7 @@ def robustness_map(
     Raises:
         PoseMapError: A wrong object number, no starts or moves, or the file of another map.
     """
-    sensor = _sensor(problem)
+    sensor = placed_sensor(problem)
     begin, shifts = np.asarray(starts, dtype=np.float64), np.asarray(moves, dtype=np.float64)
     for rows in (begin, shifts):
         if rows.ndim != 2 or rows.shape[1] != 3 or not len(rows) or not np.isfinite(rows).all():
@@ -191,7 +191,7 @@ def _drive(
     problem: AttackProblem, theta: Tensor, placements: Tensor, colours: Tensor | None = None
 ) -> tuple[list[float], list[float]]:
     """Total CTE and largest |CTE| of each start with objects at ``placements``; NaN if one of them is on the lane."""
-    sensor = _sensor(problem)
+    sensor = placed_sensor(problem)
     if not sensor.space.clear(placements):
         nothing = [float("nan")] * len(problem.start_states)
         return nothing, nothing
@@ -235,7 +235,7 @@ def _kept(file: Path, fingerprint: str) -> dict[int, Any]:
 
 
 def _fingerprint(problem: AttackProblem, theta: Tensor, settings_hash: str, names: dict[str, Any]) -> str:
-    sensor = _sensor(problem)
+    sensor = placed_sensor(problem)
     lane = sensor.space.keep_out
     clear = None if lane is None else [lane.clearance_m, *(path.to_dict() for path in lane.paths)]
     text = json.dumps({**names, "hash": settings_hash, "steps": problem.steps, "lane": clear}, sort_keys=True)
@@ -243,11 +243,3 @@ def _fingerprint(problem: AttackProblem, theta: Tensor, settings_hash: str, name
     for part in (sensor.placements(theta), sensor.colours(theta), problem.start_states):
         digest.update(part.detach().double().numpy().tobytes())
     return digest.hexdigest()
-
-
-def _sensor(problem: AttackProblem) -> PlacedSensor:
-    if not isinstance(problem.sensor, PlacedSensor):
-        raise TypeError(
-            f"expected a problem with a PlacedSensor, got one with a {type(problem.sensor).__name__}"
-        )
-    return problem.sensor

@@ -85,7 +85,7 @@ def multi_start(
         SearchStateError: The state file cannot be used.
     """
     budget = budget or MultiStart()
-    sensor = _sensor(problem)
+    sensor = placed_sensor(problem)
     fingerprint = _fingerprint(
         problem,
         "multi-start",
@@ -132,7 +132,7 @@ def random_poses(
         SearchDivergedError: A loss is not finite.
         SearchStateError: The state file cannot be used.
     """
-    sensor = _sensor(problem)
+    sensor = placed_sensor(problem)
     fingerprint = _fingerprint(problem, "random poses", seed=run.seed, sigma=sigma, hash=run.settings_hash)
     state, generator = begin_drawing(run, fingerprint, lambda generator: {})
 
@@ -163,7 +163,7 @@ def placed_problem(
         theta: Placements and colours.
         opaque: True composes without blending, as some deployments do.
     """
-    surrogate, colours = _sensor(problem).sharp(theta, opaque)
+    surrogate, colours = placed_sensor(problem).sharp(theta, opaque)
     return replace(problem, sensor=surrogate), colours
 
 
@@ -243,7 +243,8 @@ class _Climb:
         return out
 
 
-def _sensor(problem: AttackProblem) -> PlacedSensor:
+def placed_sensor(problem: AttackProblem) -> PlacedSensor:
+    """The sensor of a problem whose objects can be moved, and whose colours have no regulariser."""
     if not isinstance(problem.sensor, PlacedSensor):
         raise TypeError(
             f"expected a problem with a PlacedSensor, got one with a {type(problem.sensor).__name__}"
@@ -255,7 +256,7 @@ def _sensor(problem: AttackProblem) -> PlacedSensor:
 
 def _fingerprint(problem: AttackProblem, method: str, **settings: Any) -> str:
     """Hash of everything that a pose search depends on, except its length."""
-    sensor = _sensor(problem)
+    sensor = placed_sensor(problem)
     keep_out = sensor.space.keep_out
     lane = None if keep_out is None else [keep_out.clearance_m, *(path.to_dict() for path in keep_out.paths)]
     limits: Iterable[Tensor] = (sensor.space.middle, sensor.space.half)

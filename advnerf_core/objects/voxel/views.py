@@ -5,23 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from advnerf_core.geometry import Array, Pinhole
+from advnerf_core.geometry import Array, Pinhole, look_at
 
 FIELD_OF_VIEW_RAD = np.deg2rad(35.0)
 # Elevations of the cameras of a ring, and of a dome.
 _RING_RAD, _LOWEST_RAD, _HIGHEST_RAD = 0.25, -0.1, 1.1
-
-
-def look_at(eye: Array, target: Array) -> Array:
-    """``T_world_from_camera [4, 4]`` of a camera at ``eye`` that looks at ``target``, upright, OpenCV axes."""
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    if np.linalg.norm(right) < 1e-9:
-        raise ValueError(f"expected a camera that does not look straight up or down, from {eye} to {target}")
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :4] = np.stack([right, np.cross(forward, right), forward, eye], axis=1)
-    return pose
 
 
 def viewing_lens(pixels: int) -> Pinhole:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from advnerf_core.geometry import look_at
 from advnerf_core.objects.voxel.build import (
     Agreement,
     advice,
@@ -24,7 +25,7 @@ from advnerf_core.objects.voxel.hull import visual_hull
 from advnerf_core.objects.voxel.mesh import MeshError, SurfaceMesh, part_from_colours
 from advnerf_core.objects.voxel.model import ObjectFileError, ObjectModel, load_object, save_object
 from advnerf_core.objects.voxel.pictures import FitError, PosedRgba, RayBatches
-from advnerf_core.objects.voxel.views import look_at, viewing_lens
+from advnerf_core.objects.voxel.views import viewing_lens
 from advnerf_core.objects.voxel.voxelise import OPAQUE_PER_VOXEL, voxelise
 from advnerf_core.render.cast_object import cast_object
 
