@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.documents import parse_json, read_json
+from advnerf_core.report.evidence.kept_build import BUILD
 from advnerf_core.report.evidence.registration import FILE
 from advnerf_core.report.evidence.verifying.git import Change, History, NoHistory, blob_of
-from advnerf_core.report.evidence.verifying.layout import BUILD, SET, cell_files, sets_in
+from advnerf_core.report.evidence.verifying.layout import SET, cell_files, sets_in
 from advnerf_core.report.evidence.verifying.removed import LOG, read_removed, value_entry
 
 LEDGER = "../results.json"

@@ -11,8 +11,6 @@ from advnerf_core.report.evidence.registration import FILE, Registration, read_r
 SET, DIGESTS, PAGE, FORMAT = "set/set.json", "sets.json", "transfer.md", "advnerf-set-1"
 # Digests of all other published files: pictures, films, the reference build, sets without a registration.
 BESIDE = "files.json"
-# Folder of the reference build: scenes, victims and objects.
-BUILD = "reference"
 
 
 class SetError(AdvnerfError, ValueError):
