@@ -74,7 +74,9 @@ def test_without_options_it_is_the_plain_bicycle_and_with_lag_the_lagging_one():
     command = controls.clamp(*car().steering_limits_rad)
     error = states[:, 3] - command
     torch.testing.assert_close(lagging[:, 3], command + left * error, rtol=0, atol=1e-15)
-    arc = Ackermann(0.25, 0.8, 0.1, (-1.5, 1.5)).step(states[:, :3], command + (1.0 - left) * 0.08 / 0.1 * error)
+    arc = Ackermann(0.25, 0.8, 0.1, (-1.5, 1.5)).step(
+        states[:, :3], command + (1.0 - left) * 0.08 / 0.1 * error
+    )
     torch.testing.assert_close(lagging[:, :3], arc, rtol=0, atol=1e-15)
 
 
