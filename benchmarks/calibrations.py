@@ -11,6 +11,8 @@ from __future__ import annotations
 import argparse
 import math
 from datetime import date
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -19,10 +21,15 @@ from advnerf_core.data.similarity import rotation_angles
 from advnerf_core.geometry import Array, make_transform
 from benchmarks.results import record_row
 from calibration.by_construction import twin_calibrations
-from calibration.camera_to_car import MountView, calibrate_mount
+from calibration.camera_to_car import MountFit, MountView, calibrate_mount
 from calibration.charuco import Board, BoardDetector
 from calibration.measured import LensCalibration
-from calibration.schema import CameraCalibration
+from calibration.schema import (
+    CameraCalibration,
+    TargetCalibration,
+    VehicleCalibration,
+    save_calibration,
+)
 from calibration.time_offset import fit_offset, image_turns
 from calibration.vehicle import RecordedDrive, fit_gains
 from calibration.vehicle_response import fit_response
@@ -32,11 +39,13 @@ from hardware.worlds.lab.vehicle import TwinVehicle
 from nodes.experiment.show import screen
 
 COMMAND = "python -m benchmarks.calibrations"
-MOCAP_M, MOCAP_RAD, PIXEL_STDDEV = 0.0005, 0.001, 1.5
+MOCAP_M, MOCAP_RAD, PIXEL_STDDEV, TAPE_M = 0.0005, 0.001, 1.5, 0.001
 # On the 1 m board panel: eight squares of an eighth of it, a one-square margin, so that the print ends inside the panel.
 BOARD = Board(columns=6, rows=6, square_m=0.125, marker_m=0.094)
 VIEWS, REPETITIONS = 80, 5
 OFFSET_S, COMMAND_DELAY_S = 0.067, 0.03
+_FITTED_GAINS = ("servo_per_rad", "servo_offset", "erpm_per_mps")
+_MEASURED = {"method": "measured on the simulated lab", "notes": f"by {COMMAND} --write"}
 
 
 def noisy_image(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -75,10 +84,10 @@ def held_before_board(lab: Lab, rng: np.random.Generator) -> Array:
     return make_transform(R, eye[:3] - R @ camera[:3, 3])
 
 
-def measure_camera_to_car(lab: Lab, seed: int) -> tuple[float, float, int]:
-    """Error of the mounting pose: angle [degrees], distance [m]; and the number of views."""
+def fitted_mount(lab: Lab, seed: int) -> MountFit:
+    """The mounting pose as measured on noisy views of the board."""
     rng, detector = np.random.default_rng(seed), BoardDetector(BOARD)
-    pinhole, truth = lab.camera_pinhole, lab.config.camera.T_car_from_camera
+    pinhole = lab.camera_pinhole
     lens = LensCalibration(
         date=date(2026, 11, 21),
         method="twin",
@@ -98,15 +107,20 @@ def measure_camera_to_car(lab: Lab, seed: int) -> tuple[float, float, int]:
             views.append(MountView(noisy_pose(car, rng), noisy_pose(board, rng), found))
         if len(views) == VIEWS:
             break
-    fit = calibrate_mount(views, lens)
+    return calibrate_mount(views, lens)
+
+
+def measure_camera_to_car(lab: Lab, seed: int) -> tuple[float, float]:
+    """Error of the mounting pose: angle [degrees], distance [m]."""
+    fit, truth = fitted_mount(lab, seed), lab.config.camera.T_car_from_camera
     turn = float(rotation_angles(fit.T_car_from_camera[:3, :3].T @ truth[:3, :3]))
     distance = float(np.linalg.norm(fit.T_car_from_camera[:3, 3] - truth[:3, 3]))
     print(
         f"camera-to-car: {math.degrees(turn):.3f} degrees, {1000 * distance:.2f} mm (stated {math.degrees(fit.rotation_stddev_rad):.3f}, "
-        f"{1000 * fit.translation_stddev_m:.2f}), {int(fit.used.sum())} of {len(views)} views, rms {fit.rms_px:.2f} px",
+        f"{1000 * fit.translation_stddev_m:.2f}), {int(fit.used.sum())} of {len(fit.used)} views, rms {fit.rms_px:.2f} px",
         flush=True,
     )
-    return math.degrees(turn), distance, len(views)
+    return math.degrees(turn), distance
 
 
 def recorded_drive(seed: int) -> RecordedDrive:
@@ -207,6 +221,29 @@ def measure_display(world: Lab, seed: int) -> tuple[float, float]:
     return fit.rmse(True), ideal
 
 
+def write(folder: Path) -> None:
+    """Write calibration files of the default lab as somebody measured them: mount and gains by the fits above, sizes with a tape measure."""
+    exact, rng = twin_calibrations(LabConfig()), np.random.default_rng(0)
+    with Lab() as lab:
+        lab.set_board_image(board_texture())
+        mount = fitted_mount(lab, 0).T_car_from_camera
+    vehicle = exact["vehicle"]
+    assert isinstance(vehicle, VehicleCalibration)
+    fit = fit_gains(recorded_drive(0), CarConfig().wheelbase_m)
+    changed: dict[str, dict[str, Any]] = {"camera": {"T_car_from_camera": mount.tolist()}}
+    changed["vehicle"] = {"gains": vars(vehicle.gains) | {name: getattr(fit, name) for name in _FITTED_GAINS}}
+    for name in ("board", "monitor"):
+        target = exact[name]
+        assert isinstance(target, TargetCalibration)
+        grown = 1.0 + rng.normal(0.0, TAPE_M, 3) / np.maximum(np.ptp(target.corners, axis=0), TAPE_M)
+        changed[name] = {"corners_in_subject_m": np.round(target.corners * grown, 6).tolist()}
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, calibration in exact.items():
+        values = changed[name] | _MEASURED if name in changed else {}
+        found = type(calibration).model_validate({**calibration.model_dump(), **values})
+        save_calibration(found, folder / f"{name}.yaml")
+
+
 def record(name: str, value: float, unit: str, target: str, met: bool, note: str) -> None:
     record_row(f"calibration on the twin: {name}", round(value, 4), unit, target, met, COMMAND, note)
 
@@ -215,13 +252,18 @@ def main() -> None:
     """Measure, and record the worst repetition."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--trial", action="store_true", help="one repetition, nothing recorded")
-    trial = parser.parse_args().trial
+    parser.add_argument("--write", type=Path, metavar="FOLDER", help="write one repetition's files, instead")
+    options = parser.parse_args()
+    if options.write is not None:
+        write(options.write)
+        return
+    trial = options.trial
     seeds = range(1 if trial else REPETITIONS)
     drives = np.array([measure_vehicle(seed) for seed in seeds])
     config = LabConfig(monitor_optics=MonitorOpticsConfig.office())
     with Lab(config) as lab:
         lab.set_board_image(board_texture())
-        mounts = np.array([measure_camera_to_car(lab, seed)[:2] for seed in seeds])
+        mounts = np.array([measure_camera_to_car(lab, seed) for seed in seeds])
         lab.set_board_image(None)
         offsets = [measure_time_offset(lab, seed) for seed in seeds]
         displays = np.array([measure_display(lab, seed) for seed in seeds])

@@ -34,6 +34,7 @@ class ViconEmulatorConfig(StrictModel):
         block_bytes: Size of a datagram: 256, 512 or 1024.
         noise_m: Standard deviation of each coordinate [m].
         noise_rad: Standard deviation of each angle [rad].
+        latency_s: From the instant of a measurement until it is sent [s].
         seed: Seed of the noise.
         shuffle: Whether objects come in another order in every frame.
         loss: Probability that a datagram is lost on the way.
@@ -47,6 +48,7 @@ class ViconEmulatorConfig(StrictModel):
     block_bytes: int = 1024
     noise_m: float = Field(default=1e-4, ge=0.0)
     noise_rad: float = Field(default=3e-4, ge=0.0)
+    latency_s: float = Field(default=0.0, ge=0.0, le=0.5)
     seed: int = 0
     shuffle: bool = False
     loss: float = Field(default=0.0, ge=0.0, le=1.0)
@@ -175,8 +177,9 @@ class ViconEmulator:
         self._socket.close()
 
     def _run(self) -> None:
+        latency_ns = round(1e9 * self.config.latency_s)
         while (tick_ns := self._pacer.wait(self._stop)) is not None:
-            poses = self._poses(tick_ns)
+            poses = self._poses(tick_ns - latency_ns)
             with self._lock:
                 datagrams = self._frames.next(poses)
             for datagram in datagrams:

@@ -64,3 +64,12 @@ NamedFile = Annotated[Path, AfterValidator(located), PlainSerializer(_written)]
 """A file; as data that results depend on it is the hash of its content."""
 
 NamedFolder = Annotated[Path, AfterValidator(located)]
+
+
+def _contents_written(folder: Path, info: SerializationInfo) -> str | dict[str, str]:
+    files = sorted(file for file in folder.iterdir() if file.is_file())
+    return str(folder) if is_read_again(info) else {file.name: content_sha256(file) for file in files}
+
+
+NamedContents = Annotated[Path, AfterValidator(located), PlainSerializer(_contents_written)]
+"""A folder; as data that results depend on it is its files' names and the hashes of their contents."""

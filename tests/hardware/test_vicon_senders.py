@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from advnerf_core.geometry import planar_pose
-from hardware.emulators.vicon_emulator import ViconEmulatorConfig, ViconFrames
+from hardware.emulators.vicon_emulator import ViconEmulator, ViconEmulatorConfig, ViconFrames
 from hardware.mocap.vicon import SubjectTracker, ViconConfig, ViconReceiver
-from hardware.mocap.vicon_codec import encode_blocks, object_pose
+from hardware.mocap.vicon_codec import decode_block, encode_blocks, object_pose
 
 pytestmark = pytest.mark.live
 
@@ -143,6 +143,24 @@ def test_no_network_and_no_occlusion_looks_like_a_second_sender(
             mono_ns += 3_000_000
             tracker.update(datagram, mono_ns, mono_ns, A)
             assert tracker.senders.faults(mono_ns) == ""
+
+
+def test_a_late_system_sends_where_the_car_was():
+    began_ns = time.monotonic_ns()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(10.0)
+        config = ViconEmulatorConfig(
+            port=receiver.getsockname()[1], noise_m=0.0, noise_rad=0.0, latency_s=0.2
+        )
+        emulator = ViconEmulator(config, lambda ns: {"car": planar_pose(1e-9 * (ns - began_ns), 0.0, 0.0)})
+        try:
+            for _ in range(5):
+                (seen,) = decode_block(receiver.recv(2048)).objects
+                now_s = 1e-9 * (time.monotonic_ns() - began_ns)
+                assert seen.translation_mm[0] / 1000.0 <= now_s - 0.2
+        finally:
+            emulator.close()
 
 
 def test_two_real_senders():

@@ -1,6 +1,9 @@
 """Attack files of one face, and those of the simulated lab that are one red square, which no picture of the room has."""
 
+from __future__ import annotations
+
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +15,7 @@ from advnerf_core.attack.artifact import (
     face_texture,
     save_attack,
 )
-from advnerf_core.geometry import Pinhole
+from advnerf_core.geometry import Array, Pinhole
 from calibration.panel import target_size
 from calibration.schema import TargetCalibration, load_calibration
 
@@ -21,15 +24,15 @@ TWIN = Path(__file__).parents[2] / "calibration" / "twin"
 
 def face_attack(
     *,
-    theta,
-    size_m,
-    subject,
-    corners_in_subject,
-    T_world_from_object,
-    texture=None,
-    name="face",
-    sha256="",
-    **others,
+    theta: Any,
+    size_m: tuple[float, float],
+    subject: str,
+    corners_in_subject: Array,
+    T_world_from_object: Array,
+    texture: Any = None,
+    name: str = "face",
+    sha256: str = "",
+    **others: Any,
 ) -> AttackFile:
     """The attack file of one face; ``others`` are its other attributes."""
     carrier = AttackedObject(name, theta, T_world_from_object, 1.0, sha256)  # it refuses what has no texture
@@ -52,7 +55,7 @@ def centre_square(target: TargetCalibration) -> TargetCalibration:
     return target.model_copy(update={"corners_in_subject_m": rows, "notes": "centre square of the panel"})
 
 
-def outward_normal(target: TargetCalibration):
+def outward_normal(target: TargetCalibration) -> Array:
     """Unit vector ``[3]`` out of the face, towards a viewer in front of it, in the subject's frame."""
     normal = np.cross(target.corners[3] - target.corners[0], target.corners[1] - target.corners[0])
     return normal / np.linalg.norm(normal)

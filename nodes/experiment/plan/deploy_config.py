@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 from advnerf_core.strict import StrictModel
 from hardware.cameras.effects import PRESETS, Effects
 from nodes.experiment.plan.numbers import Count, Positive, PositiveNumber
+from nodes.lab.located import NamedContents
 
 
 class DeployConfig(StrictModel):
@@ -41,6 +42,14 @@ class DeployConfig(StrictModel):
         default=("twin", "camera", "vicon", "compositor", "policy", "safety", "motor", "recorder"),
         description="Nodes that must be ready before the car moves.",
     )
+    calibration: NamedContents | None = Field(
+        default=None,
+        description="Folder of the calibration files that live nodes use, such as measured ones; none: those of the simulated lab, which are exact but for the car's gains.",
+    )
+    changes: tuple[str, ...] = Field(
+        default=(),
+        description="Changes of the launch file, as its --set takes them, such as twin.vicon.latency_s=0.005.",
+    )
     laps: Count = Field(default=0, description="Laps driven live without attack before the cells.")
     empty_scene: bool = Field(default=False, description="Also drive with the panel taken away.")
     ready_timeout_s: PositiveNumber = Field(
@@ -49,10 +58,17 @@ class DeployConfig(StrictModel):
 
     @model_validator(mode="after")
     def _live_cars_are_their_own(self) -> DeployConfig:
-        wanted = {"deploy.car ideal": self.car == "ideal", "deploy.world": self.world is not None}
-        for what, is_wanted in wanted.items():
-            if is_wanted and self.through != "world":
-                raise ValueError(f"expected deploy.through world with {what}, got {self.through}")
+        of_a_way = {
+            "world": {"deploy.car ideal": self.car == "ideal", "deploy.world": self.world is not None},
+            "nodes": {
+                "deploy.calibration": self.calibration is not None,
+                "deploy.changes": bool(self.changes),
+            },
+        }
+        for way, wanted in of_a_way.items():
+            for what, is_wanted in wanted.items():
+                if is_wanted and self.through != way:
+                    raise ValueError(f"expected deploy.through {way} with {what}, got {self.through}")
         return self
 
     @property

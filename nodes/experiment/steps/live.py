@@ -26,6 +26,7 @@ from nodes.lab.trials.evaluation import attack_ids, counterfactual, score, timin
 from nodes.lab.trials.trial import TrialOutcome, TrialPlan
 from nodes.lab.trials.trial_runner import TrialNodes
 from nodes.lab.trials.tries import NotDrivenError, drive_with_tries
+from nodes.launching.launch_file import load_launch
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError, RuntimeFault
 from nodes.runtime.progress import Report
@@ -35,6 +36,11 @@ Pose = tuple[float, float, float]
 NODES = "nodes"
 # Nodes that may remember images of the drive before.
 _REMEMBERING = ("policy", "counterfactual")
+# Parts of the launch file that follow from the experiment; see `live_overrides`.
+_SET_HERE = (
+    *("params.policy", "params.attack", "params.calibration", "params.vicon_port", "policy.sha256"),
+    *("twin.lab", "twin.camera_effects", "monitor.plain_rgb", "monitor.face_m"),
+)
 # The absent panel of the empty scene stands outside the room, out of every camera's sight.
 _OUT_OF_SIGHT_M = 60.0
 
@@ -76,6 +82,29 @@ def lab_of(experiment: Experiment) -> LabConfig:
             f"{experiment.named_world.kind}; set deploy.through=world"
         )
     return config
+
+
+def check_live(experiment: Experiment, place: str) -> None:
+    """Check that live nodes can drive an experiment.
+
+    Args:
+        place: Where the section ``deploy`` is, for errors.
+
+    Raises:
+        ConfigError: The world is not the lab, or a change does not fit the launch file.
+    """
+    lab_of(experiment)
+    changes = experiment.config.deploy.changes
+    for change in changes:
+        if (key := change.partition("=")[0].strip()).startswith(_SET_HERE):
+            raise ConfigError(
+                f"{place}: expected changes of what the experiment itself does not set, got {change}; change the experiment's own setting of {key}"
+            )
+    try:
+        if changes:
+            load_launch(experiment.launch_file, changes)
+    except ConfigError as error:
+        raise ConfigError(f"{place}: changes: {error}") from error
 
 
 class LiveNodes:
@@ -214,13 +243,15 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
 
 def live_overrides(experiment: Experiment, live: LiveRun) -> list[str]:
     """Overrides of the launch file for a run: its calibration and room, its victim, its attack."""
+    wanted = experiment.config.deploy
     overrides = [
-        f"params.calibration={experiment.calibration_folder}",
+        *wanted.changes,
+        f"params.calibration={wanted.calibration or experiment.calibration_folder}",
         f"params.policy={victim_spec(experiment, live.victim)}",
         f"policy.sha256={victim_sha256(experiment, live.victim)}",
         f"twin.lab={json.dumps(lab_of(experiment).model_dump(mode='json'))}",
     ]
-    if not (effects := experiment.config.deploy.camera).ideal:
+    if not (effects := wanted.camera).ideal:
         overrides.append(f"twin.camera_effects={json.dumps(effects.model_dump(mode='json'))}")
     if on_screen(experiment):
         overrides += [

@@ -45,7 +45,12 @@ READS: Mapping[str, dict[str, Any]] = {
         **_OBJECTS,
         **_DRIVE,
     },
-    "live": {"deploy": {"nodes", "camera", "laps", "empty_scene"}, "held_cap_m": True, **_CARRIER, **_DRIVE},
+    "live": {
+        "deploy": {"nodes", "camera", "calibration", "changes", "laps", "empty_scene"},
+        "held_cap_m": True,
+        **_CARRIER,
+        **_DRIVE,
+    },
 }
 # Settings that the defence does not read of the first seed's gradient, which it answers; the objective is an input.
 _UNREAD_BY_RETRAIN: dict[str, Any] = {

@@ -24,7 +24,7 @@ from nodes.experiment.show.given import VictimUnknownError, given_in, victim_spe
 from nodes.experiment.show.kept_worlds import WorldUnknownError, is_users, keep_worlds
 from nodes.experiment.show.variants import resolve
 from nodes.experiment.show.victims import look_at_given
-from nodes.experiment.steps.live import lab_of
+from nodes.experiment.steps.live import check_live
 from nodes.experiment.steps.pipeline import stages_of
 from nodes.lab.worlds.named import read_world
 from nodes.runtime.errors import ConfigError
@@ -84,7 +84,7 @@ def _check_world(experiment: Experiment, document: Document) -> None:
     _check_objective(experiment, document)
     _check_native(experiment, document)
     if experiment.config.deploy.live:
-        lab_of(experiment)
+        check_live(experiment, document.place(("deploy",)))
     if experiment.is_described:
         _check_places(experiment, document)
 

@@ -1,6 +1,7 @@
 """Live drives of an experiment: which there are, which count, and what a bag says of their end."""
 
 import json
+import shutil
 from dataclasses import asdict
 from pathlib import Path
 
@@ -10,8 +11,10 @@ import pytest
 from advnerf_core.driving.metrics import Horizon, drive_metrics
 from advnerf_core.driving.path import Path as DrivingPath
 from nodes.experiment.steps import live
+from nodes.experiment.steps.pipeline import stages_of
 from nodes.experiment.steps.run import load_experiment
 from nodes.lab.trials.trial import SpoiledError
+from nodes.launching.launch_file import load_launch
 from nodes.runtime.errors import ConfigError
 
 LAUNCH = Path(__file__).parents[3] / "launch"
@@ -37,6 +40,44 @@ def test_a_car_that_runs_into_something_stands_from_then_on():
     assert live.blocked_tick(driven(against_it)) == 19
     assert live.blocked_tick(driven(against_it, "the car is outside the fence")) is None
     assert live.blocked_tick(driven(against_it, "stalled for 1.0 s: the car does not move")) == 19
+
+
+THROUGH_NODES = "deploy.through=nodes"
+
+
+def test_live_nodes_take_measured_calibrations_and_changes_of_the_launch_file(tmp_path, monkeypatch):
+    folder, change = tmp_path / "ours", "twin.vicon.latency_s=0.005"
+    shutil.copytree(LAUNCH.parent / "calibration" / "twin", folder)
+    wanted = [THROUGH_NODES, f"deploy.calibration={folder}", f'deploy.changes=["{change}"]', "deploy.laps=1"]
+    run = live.LiveRun("live0", "hardened", "track", (0.0, 0.0, 0.0))
+    experiment = room(tmp_path / "run", *wanted)
+    for name in ("victim_spec", "victim_sha256"):  # there is no policy yet
+        monkeypatch.setattr(live, name, lambda *_: "")
+    overrides = live.live_overrides(experiment, run)
+    twin = load_launch(experiment.launch_file, overrides).resolved["nodes"]
+    assert twin["twin"]["config"]["vicon"] == {"port": 51001, "latency_s": 0.005}
+    assert twin["motor"]["config"]["calibration"] == f"{folder}/vehicle.yaml"
+    before = {stage.name: stage.settings for stage in stages_of(experiment)}["live"]
+    # What results depend on is the content of the files, wherever they are.
+    moved = folder.rename(tmp_path / "elsewhere")
+    wanted[1] = f"deploy.calibration={moved}"
+    assert {s.name: s.settings for s in stages_of(room(tmp_path / "run", *wanted))}["live"] == before
+    (moved / "camera.yaml").write_text((moved / "camera.yaml").read_text() + "# measured again\n")
+    assert {s.name: s.settings for s in stages_of(room(tmp_path / "run", *wanted))}["live"] != before
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ([THROUGH_NODES, "deploy.calibration=nowhere"], "expected a file or folder relative to this file"),
+        ([THROUGH_NODES, 'deploy.changes=["twn.vicon.noise_m=0.001"]'], "no node called 'twn'; known are"),
+        ([THROUGH_NODES, 'deploy.changes=["params.policy=mine.onnx"]'], "what the experiment itself does not set"),
+        (['deploy.through=world', 'deploy.changes=["twin.vicon.noise_m=0.001"]'], r"expected deploy\.through nodes with deploy\.changes"),
+    ],
+)  # fmt: skip
+def test_a_wrong_change_of_the_graph_is_one_error_before_anything_is_made(tmp_path, overrides, message):
+    with pytest.raises(ConfigError, match=message):
+        room(tmp_path, *overrides)
 
 
 def test_a_spoiled_drive_is_driven_again_and_its_reasons_are_kept(tmp_path, monkeypatch):
