@@ -255,6 +255,28 @@ def test_a_set_under_way_lacks_cells_and_those_that_are_there_must_be_right(copi
     assert files[1].stem in verify_set(copied).problems[0]
 
 
+@pytest.mark.parametrize(
+    ("machine", "apart_m", "wrong"),
+    [(None, 0.001, False), (None, 0.01, True), ("another", 0.01, False), ("another", 0.1, True)],
+)
+def test_the_control_of_another_machine_may_differ_in_its_last_digits(copied, machine, apart_m, wrong):
+    (copied / SET).unlink()
+    (copied.parent / DIGESTS).write_text("{}")
+    file = next(copied.glob("*_gradient_*.json"))
+    data = json.loads(file.read_text())
+    data["machine"] = machine or data["machine"]
+    data["deployed"]["none_total_cte_m"][0] += apart_m
+    file.write_text(json.dumps(data))
+    found = [text for text in verify_set(copied).problems if "total CTE without attack" in text]
+    assert (
+        found
+        == [
+            f"{file.stem}, deployed, start 0: its total CTE without attack is not that of the control's poses"
+        ]
+        * wrong
+    )
+
+
 def test_a_set_with_all_its_cells_is_not_under_way(copied):
     (copied / SET).unlink()
     (copied.parent / DIGESTS).write_text("{}")
