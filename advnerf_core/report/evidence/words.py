@@ -93,9 +93,10 @@ def claim(test: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
     excess = smaller_excess(row)
     between = f" (95 % interval {ends(excess.low_m, excess.high_m)} m)" if excess.low_m is not None else ""
     shown = "" if excess.is_shown else " The interval is not above zero: no effect is shown."
+    hit = f"; {collisions(row['collided'])} run into something" if row["collided"] else ""
     return (
         f"**{place_of(which)}, victim {which['victim']}, deployed.** With the {style_of(which['method']).title} attack the car is {excess.mean_m:.3f} m "
-        f"per tick further from its path than with {_the(excess.over)}{between}, and {row['off_track']} of {row['drives']} drives leave the track.{shown} "
+        f"per tick further from its path than with {_the(excess.over)}{between}, and {row['off_track']} of {row['drives']} drives leave the track{hit}.{shown} "
         f"{_other_control(row, excess)} {_against_baseline(test)}"
     )
 

@@ -13,6 +13,7 @@ from nodes.cli.main import app
 from nodes.experiment.engine.artefact import BUILD
 from nodes.experiment.pages.table import write_table
 from nodes.experiment.plan.cell import select
+from nodes.experiment.run.admission import gate_file, gate_key
 from nodes.experiment.run.plan import elsewhere, plan_cells, statuses
 from nodes.experiment.run.published import (
     Published,
@@ -132,6 +133,22 @@ def test_a_table_and_published_cells_from_finished_cells(here, tmp_path):
         "missing",
         "unreadable",
     ]
+
+
+def test_a_verdict_of_another_machine_replaces_the_published_one_only_for_another_scene_or_limits(
+    here, tmp_path
+):
+    loaded = here.load()
+    plan = plan_cells(loaded, loaded.cells)
+    put(plan[0], here.cells)
+    judged, kept = (
+        gate_file(folder, gate_key(plan[0].cell)) for folder in (loaded.folder, tmp_path / "kept" / "toy")
+    )
+    judged.parent.mkdir()
+    for key, psnr_db, published_db in (("a", 36.0, 36.0), ("a", 36.1, 36.0), ("b", 36.2, 36.2)):
+        judged.write_text(json.dumps({"key": key, "psnr_db": psnr_db}))
+        publish(loaded, statuses(loaded, loaded.cells), tmp_path / "kept")
+        assert json.loads(kept.read_text())["psnr_db"] == published_db
 
 
 def test_a_published_cell_whose_key_matches_is_done_on_any_machine(here, tmp_path, monkeypatch):
