@@ -191,10 +191,7 @@ def _better(sets: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _victims(sets: Sequence[Mapping[str, Any]], published: Path) -> str:
-    # The last scenario of a set is the one in which everything is the world's own.
-    named = [
-        (data["name"], each[-1]) for data in sets if (each := strongest_random(published / data["name"]))
-    ]
+    named = [(data["name"], each) for data in sets for each in strongest_random(published / data["name"])]
     found = [each for _, each in named]
     if not found:
         return ""

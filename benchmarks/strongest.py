@@ -17,6 +17,7 @@ from advnerf_core.report.evidence.registration import read_registration
 from advnerf_core.report.evidence.results import Evidence
 from advnerf_core.report.evidence.rows import Key
 from advnerf_core.report.reference import DOMAINS
+from nodes.experiment.plan.victims import NAIVE
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,9 @@ class Strongest:
 
 
 def strongest_random(folder: Path) -> list[Strongest]:
-    """The strongest method without a gradient in every scenario of a published set; empty if none was deployed.
+    """The strongest method without a gradient in a published set, against victims that learned from textures; empty if none was deployed.
+
+    Of conditions that share their searches only the last counts, in which everything is the world's own.
 
     Args:
         folder: Folder of the set.
@@ -92,12 +95,17 @@ def strongest_random(folder: Path) -> list[Strongest]:
     wanted = {*RANDOM_FAMILIES, *COARSE_SEARCHES, *CONTROLS}
     cells = [cell for file in sorted(folder.glob("*.json")) if (cell := read_cell(file)).method in wanted]
     evidence = Evidence(registration, cells)
-    by_place: dict[tuple[str, str, str], dict[str, None]] = {}
+    by_place: dict[tuple[str, str, str], dict[str, set[str | None]]] = {}
     for cell in evidence.cells.values():
-        if cell.method not in CONTROLS and cell.kept.get("deployed") and evidence.without(cell):
-            by_place.setdefault((cell.scenario, cell.placement, cell.victim), {})[cell.method] = None
+        if cell.victim == NAIVE or cell.method in CONTROLS or not cell.kept.get("deployed"):
+            continue
+        if evidence.without(cell):
+            by_place.setdefault((cell.scenario, cell.placement, cell.victim), {}).setdefault(
+                cell.method, set()
+            ).add(cell.attack_id)
+    last = {frozenset().union(*methods.values()): place for place, methods in by_place.items()}
     found = [
-        [_of_method(evidence, (*place, method)) for method in methods] for place, methods in by_place.items()
+        [_of_method(evidence, (*place, method)) for method in by_place[place]] for place in last.values()
     ]
     return [max(each, key=lambda strongest: strongest.deployed.best_m) for each in found]
 
