@@ -12,7 +12,7 @@ from advnerf_core.report.conditions import style_of
 from advnerf_core.report.evidence.about import SetAbout, read_about
 from advnerf_core.report.evidence.families import GRADIENT
 from advnerf_core.report.evidence.hardness import with_titles
-from advnerf_core.report.evidence.page import groups_of_searches
+from advnerf_core.report.evidence.page import groups_of_searches, searched_apart
 from advnerf_core.report.evidence.words import (
     NOT_DRIVEN,
     ends,
@@ -104,17 +104,17 @@ def _sets(published: Path) -> list[dict[str, Any]]:
 
 
 def _told(sets: Sequence[Mapping[str, Any]]) -> list[tuple[Mapping[str, Any], Mapping[str, Any]]]:
-    """Sets with the test that is told here: of one with conditions that of the last, in which everything is the world's own."""
+    """Sets with the tests that are told here: of conditions that share searches the last one, in which everything is the world's own."""
     # The gradient in coarse cells is on the page of the sets.
     tests = [
         (found, [test for test in found["primary"] if test["test"]["method"] == GRADIENT]) for found in sets
     ]
-    return [(found, each[-1]) for found, each in tests if each]
+    return [(found, test) for found, each in tests if each for test in searched_apart(each)]
 
 
 def _line(found: Mapping[str, Any], test: Mapping[str, Any], about: Mapping[str, SetAbout]) -> list[str]:
     here, there = (row_of(found["rows"], test, domain) for domain in DOMAINS)
-    smaller = smaller_excess(there)
+    smaller, hit = smaller_excess(there), sum(there["collided"].values())
     said = about.get(found["name"])
     return [
         f"[{found['name']}](results/transfer.md#{found['name']}), {place_of(test['test'])}",
@@ -123,7 +123,7 @@ def _line(found: Mapping[str, Any], test: Mapping[str, Any], about: Mapping[str,
         _both(here),
         _both(there),
         ends(smaller.low_m, smaller.high_m),
-        f"{there['off_track']} of {there['drives']}",
+        f"{there['off_track']} of {there['drives']}" + f"; {hit} run into something" * bool(hit),
         f"{test['difference_m']:+.3f} ({style_of(test['baseline']).title})",
         "not tested" if test["p_holm"] is None else f"{test['p_holm']:.4f}",
         f"{test['difference_surrogate_m']:+.3f}",
@@ -151,9 +151,9 @@ def _transfers(sets: Sequence[Mapping[str, Any]], about: Mapping[str, SetAbout])
     moved = sum(excess.is_shown for excess in smaller)
     lacking = sum(there["over_no_object_m"] is None for _, there in pairs)
     return (
-        f"{_counts(sets, about)} In {moved} of {len(pairs)} sets the deployed attack moves the car further from its path than the controls do "
+        f"{_counts(sets, about)} In {moved} of {len(pairs)} comparisons the deployed attack moves the car further from its path than the controls do "
         f"(95 % interval above zero), by {min(each.mean_m for each in smaller):.3f} to {max(each.mean_m for each in smaller):.3f} m per tick over the "
-        f"control that leaves less; {lacking} sets have no drives with no object. Of this excess in the learned scene, {100 * min(kept):.0f} to "
+        f"control that leaves less; {lacking} have no drives with no object. Of this excess in the learned scene, {100 * min(kept):.0f} to "
         f"{100 * max(kept):.0f} % is left."
     )
 
@@ -181,9 +181,9 @@ def _better(sets: Sequence[Mapping[str, Any]]) -> str:
     unshown = sum(test.get("p_surrogate") is not None and test["p_surrogate"] >= 0.05 for test in tests)
     return (
         f"Than random textures: deployed, the gradient adds {min(added):.2f} to {max(added):.2f} m per tick, with p < 0.05 in {shown} of {len(tests)} "
-        f"sets. {single} of these sets ran one random family; the others take the one that is strongest in the learned scene."
+        f"comparisons. {single} of these ran one random family; the others take the one that is strongest in the learned scene."
         + (
-            f" In {unshown} sets the gradient is not shown to be better in the learned scene, where it searches."
+            f" In {unshown} the gradient is not shown to be better in the learned scene, where it searches."
             if unshown
             else ""
         )

@@ -167,6 +167,13 @@ QUESTIONS = (
         picture="gap_duckietown_robust_above.webp",
     ),
     Question(
+        "paper_table",
+        "What does the paper's table say on one build?",
+        "The registered sets of the paper's own experiments, and what its assumptions about the lab are worth.",
+        ("paper_table",),
+        picture="paper_car_above.webp",
+    ),
+    Question(
         "correlation",
         "Does the learned scene tell what will happen?",
         "Each registered search: the effect of its attack in the learned scene against the effect deployed.",

@@ -37,8 +37,8 @@ def test_the_short_answers_are_those_of_sets_and_rows(tmp_path):
     data["primary"][0] |= {"difference_m": 0.123, "p_holm": None}
     file.write_text(json.dumps(data))
     found = {each.question: each.text for each in answers([], tmp_path)}
-    assert "adds 0.12 to 0.12 m per tick, with p < 0.05 in 0 of 1 sets" in found["Better than what?"]
-    assert "1 registered sets, 1 groups of searches. In 1 of 1 sets" in found["Does it transfer?"]
+    assert "adds 0.12 to 0.12 m per tick, with p < 0.05 in 0 of 1 comparisons" in found["Better than what?"]
+    assert "1 registered sets, 1 groups of searches. In 1 of 1 comparisons" in found["Does it transfer?"]
     # The maximum over searches, from the kept drives: an attacker takes it.
     victims = found["Against which victims?"]
     assert victims.startswith(
@@ -52,6 +52,9 @@ def test_the_short_answers_are_those_of_sets_and_rows(tmp_path):
     everywhere = sets_table(published)
     assert "gap_room), native own | exploration | trained with textures |" in everywhere
     assert "composed" not in everywhere
+    # Scenarios with searches of their own are told one by one.
+    assert "0 of 120; 120 run into something" in everywhere
+    assert everywhere.count("[paper_car]") == 2
     # Nothing is claimed that was not measured.
     assert "How fast?" not in found
     assert answers([], tmp_path / "none") == []
@@ -85,7 +88,7 @@ def test_an_answer_counts_groups_of_searches_and_uses_the_smaller_excess(tmp_pat
     assert "3 registered sets are 2 groups of searches in 2 worlds: 3 sets explore, 0 confirm." in answer
     # MetaDrive's 0.204 m over the plain panel are 0.067 m over no object.
     assert (
-        "by 0.067 to 0.074 m per tick over the control that leaves less; 1 sets have no drives with no object"
+        "by 0.067 to 0.074 m per tick over the control that leaves less; 1 have no drives with no object"
         in answer
     )
     file = tmp_path / "gap_metadrive" / "set" / "set.json"
@@ -94,7 +97,7 @@ def test_an_answer_counts_groups_of_searches_and_uses_the_smaller_excess(tmp_pat
         row["over_no_object_low_m"] = row["over_no_object_low_m"] and -0.01
     file.write_text(json.dumps(data))
     (answer,) = [each.text for each in answers([], tmp_path) if each.question == "Does it transfer?"]
-    assert "In 2 of 3 sets" in answer
+    assert "In 2 of 3 comparisons" in answer
 
 
 def test_rows_of_the_earlier_build_stand_under_a_warning_and_only_there():

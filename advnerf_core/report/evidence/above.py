@@ -21,7 +21,7 @@ from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import read_cells
 from advnerf_core.report.conditions import NONE, style_of
 from advnerf_core.report.evidence.about import ObjectPlace, read_about
-from advnerf_core.report.evidence.page import above_of, film_of
+from advnerf_core.report.evidence.page import above_of, film_of, searched_apart
 from advnerf_core.report.evidence.registration import PrimaryTest, read_registration
 from advnerf_core.report.evidence.results import Evidence
 from advnerf_core.report.evidence.verifying.layout import SET
@@ -37,6 +37,7 @@ _STILLS_LEFT, _STILLS_BOTTOM, _STILL = (0.545, 0.772), (0.35, 0.645), (0.22, 0.2
 _QUALITIES = (90, 80, 65, 50)
 # Height of a film's captions as a share, and its frames per second.
 _CAPTION, _FILM_HZ, _COLUMNS = 0.2, 5.0, 3
+_MARGIN = 0.13  # left of each of several maps, as a share of its width
 _BEFORE_S = 1.0  # before the key moment, when the object is in sight
 _SPACING = 0.05  # between points along the path, in half lanes
 
@@ -51,6 +52,7 @@ class _Group:
         poses: ``[T + 1, 3]`` of each drive: x [m], y [m], yaw [rad].
         ctes_m: ``[T]`` signed cross-track error of each drive [m].
         off_track: Number of drives that left the track.
+        collided: Number of drives that ran into something.
     """
 
     title: str
@@ -58,10 +60,19 @@ class _Group:
     poses: Sequence[Floats]
     ctes_m: Sequence[Floats]
     off_track: int
+    collided: int
+
+    @property
+    def label(self) -> str:
+        """The condition and how its drives ended."""
+        hit = f", {self.collided} ran into something" if self.collided else ""
+        return f"{self.title}: {self.off_track} of {len(self.poses)} off track{hit}"
 
 
 def write_above_of(folder: Path) -> Path | None:
-    """Write the picture of a published set beside its folder, for its last primary test; None if it has none.
+    """Write the picture of a published set beside its folder; None if it has no primary test.
+
+    Of a set whose scenarios share their searches the last one is drawn, with stills of its film; otherwise one map for each.
 
     Args:
         folder: Folder of the set, with its ``set.json``.
@@ -72,7 +83,31 @@ def write_above_of(folder: Path) -> Path | None:
     about = read_about(folder.parent).get(folder.name)
     film, target = folder.parent / film_of(folder.name), folder.parent / above_of(folder.name)
     evidence = Evidence(registration, read_cells(folder))
+    shown = searched_apart(primary)
+    if len(shown) > 1:
+        return write_maps(evidence, shown, target)
     return write_above(evidence, primary[-1], primary[0], about.object if about else None, film, target)
+
+
+def write_maps(evidence: Evidence, shown: Sequence[Mapping[str, Any]], target: Path) -> Path:
+    """Write a picture with one map for each of some primary tests from ``set.json``, and below it the deviation over time."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=_SIZE_IN, dpi=_DPI, facecolor="white")
+        for number, each in enumerate(shown):
+            test = PrimaryTest.model_validate(each["test"])
+            groups = _groups(evidence, test, each["baseline"])
+            registered = evidence.registration.scenario(test.scenario, test.placement)
+            assert registered is not None, "the test was registered"
+            left, width = (number + _MARGIN) / len(shown), (1.0 - 1.2 * _MARGIN) / len(shown)
+            ax = figure.add_axes((left, 0.36, width, 0.46))
+            _draw_map(ax, groups, registered.reference_path(), registered.off_track_m, None)
+            ax.set_title(" ".join(filter(None, (test.scenario, test.placement))).replace("_", " "), pad=60)
+            handles = [Line2D([], [], color=group.colour, lw=2.2, label=group.label) for group in groups]
+            ax.legend(handles=handles, loc="lower left", bbox_to_anchor=(0.0, 1.0), frameon=False)
+            ax = figure.add_axes((left, 0.085, width, 0.15))
+            _draw_deviation(ax, groups, registered.off_track_m, registered.dt_s)
+    write_atomically(target, _webp(figure))
+    return target
 
 
 def write_above(
@@ -130,9 +165,9 @@ def _groups(evidence: Evidence, test: PrimaryTest, baseline: str) -> list[_Group
         metrics = [each for cell in cells for each in evidence.metrics(cell, "deployed")]
         poses = [drive.poses() for cell in cells for drive in cell.kept["deployed"]]
         off = sum(each.off_track for each in metrics)
-        found.append(
-            _Group(style_of(method).title, colour, poses, [np.array(each.ctes_m) for each in metrics], off)
-        )
+        hit = sum(each is not None for cell in cells for each in cell.obstacles("deployed"))
+        ctes_m = [np.array(each.ctes_m) for each in metrics]
+        found.append(_Group(style_of(method).title, colour, poses, ctes_m, off, hit))
     return found
 
 
@@ -153,7 +188,9 @@ def _draw_map(
     if place is not None:
         middle = _draw_object(ax, place)
         corners += [middle - 0.7 * place.width_m, middle + 0.7 * place.width_m]
-    low, high = _in_shape(np.min(corners, axis=0), np.max(corners, axis=0))
+    box = ax.get_position()
+    shape = box.width * _SIZE_IN[0] / (box.height * _SIZE_IN[1])
+    low, high = _in_shape(np.min(corners, axis=0), np.max(corners, axis=0), shape)
     ax.set(
         xlim=(low[0], high[0]),
         ylim=(low[1], high[1]),
@@ -164,10 +201,9 @@ def _draw_map(
     ax.set_aspect("equal")
 
 
-def _in_shape(low: Floats, high: Floats) -> tuple[Floats, Floats]:
-    """Corners of a box around another one, in the map's aspect ratio."""
-    wanted = _MAP[2] * _SIZE_IN[0] / (_MAP[3] * _SIZE_IN[1])
-    size = np.maximum(high - low, [wanted * (high - low)[1], (high - low)[0] / wanted])
+def _in_shape(low: Floats, high: Floats, shape: float) -> tuple[Floats, Floats]:
+    """Corners of a box around another one, whose width is ``shape`` times its height."""
+    size = np.maximum(high - low, [shape * (high - low)[1], (high - low)[0] / shape])
     middle = 0.5 * (low + high)
     return middle - 0.5 * size, middle + 0.5 * size
 
@@ -244,7 +280,7 @@ def _add_legend(figure: Figure, groups: Sequence[_Group], place: ObjectPlace | N
             [],
             color=group.colour,
             lw=2.2,
-            label=f"{group.title}: {group.off_track} of {len(group.poses)} off track",
+            label=group.label,
         )
         for group in groups
     ]

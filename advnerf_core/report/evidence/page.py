@@ -144,9 +144,21 @@ def _section(name: str, sets: Mapping[str, Mapping[str, Any]]) -> str:
     return "\n".join(parts)
 
 
+def searched_apart(primary: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Primary tests from ``set.json`` whose picture has a map each: of the first one's method, the last of those with the same searches."""
+    method = primary[0]["test"]["method"]
+    of_method = [each for each in primary if each["test"]["method"] == method]
+    # Conditions that share searches share the drives in the learned scene.
+    return list(
+        {tuple(s["surrogate_m"] for s in each["searches"][method]): each for each in of_method}.values()
+    )
+
+
 def _picture(name: str, data: Mapping[str, Any]) -> list[str]:
     if not data["primary"]:
         return []
+    if len(searched_apart(data["primary"])) > 1:
+        return [f"![All deployed drives of each scenario from above]({above_of(name)})\n"]
     shown, filmed = (place_of(data["primary"][at]["test"]) for at in (-1, 0))
     stills = f" Stills: {filmed}." if data["filmed"] else ""
     place = (data.get("about") or {}).get("object")

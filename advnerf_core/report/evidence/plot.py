@@ -16,6 +16,8 @@ from advnerf_core.report.palette import LIGHT
 from advnerf_core.report.plots import new_axes
 
 _MOST_COLUMNS = 8
+# Of the distance between methods.
+_DOMAINS_APART = 0.27
 
 
 def excess_plot(evidence: Evidence, titles: Mapping[str, str] = MappingProxyType({})) -> Figure:
@@ -60,14 +62,14 @@ def _means(shown: list[Row], titles: Mapping[str, str]) -> Figure:
     """Means with their intervals: deployed ones filled, surrogate ones hollow."""
     places = list(dict.fromkeys((row.scenario, row.placement, row.victim) for row in shown))
     methods = list(dict.fromkeys(row.method for row in shown))
-    with new_axes(7.2, 0.9 + 0.42 * len(places)) as ax:
+    apart = min(0.22, 0.85 / len(methods))
+    with new_axes(7.2, 0.9 + max(0.42, 0.16 * len(methods)) * len(places)) as ax:
         ax.axvline(0.0, color=LIGHT["tape"], lw=1.0, zorder=1)
         for row in shown:
             style, filled = style_of(row.method), row.domain == "deployed"
             down = float(places.index((row.scenario, row.placement, row.victim)))
-            down += 0.22 * (methods.index(row.method) - 0.5 * (len(methods) - 1)) + (
-                0.06 if filled else -0.06
-            )
+            aside = methods.index(row.method) - 0.5 * (len(methods) - 1)
+            down += apart * (aside + (_DOMAINS_APART if filled else -_DOMAINS_APART))
             if row.low_m is not None and row.high_m is not None:
                 ax.plot([row.low_m, row.high_m], [down, down], color=style.light, lw=1.2, zorder=2)
             label = f"{style.title}, {DOMAIN_TITLES[row.domain]}"

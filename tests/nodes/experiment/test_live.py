@@ -69,6 +69,7 @@ def test_live_nodes_take_measured_calibrations_and_changes_of_the_launch_file(tm
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
+        ([THROUGH_NODES, "deploy.camera=zed"], "at 10 Hz the first lost frame leaves the car without a command for 0.22 s"),
         ([THROUGH_NODES, "deploy.calibration=nowhere"], "expected a file or folder relative to this file"),
         ([THROUGH_NODES, 'deploy.changes=["twn.vicon.noise_m=0.001"]'], "no node called 'twn'; known are"),
         ([THROUGH_NODES, 'deploy.changes=["params.policy=mine.onnx"]'], "what the experiment itself does not set"),

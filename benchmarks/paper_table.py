@@ -1,0 +1,104 @@
+"""What the paper's table says on one build, and what its assumptions are worth: ``python -m benchmarks.paper_table``.
+
+Reads the published sets of ``launch/paper_*.experiment.yaml`` and ``launch/nothing_idealised.experiment.yaml`` that are complete.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from advnerf_core.documents import read_json
+from advnerf_core.report.conditions import NONE, style_of
+from advnerf_core.report.evidence.families import COARSE_SEARCHES, RANDOM_FAMILIES
+from advnerf_core.report.evidence.verifying.layout import SET, complete_sets
+from advnerf_core.report.evidence.words import collisions
+from benchmarks.results import REPOSITORY, LedgerRow
+
+COMMAND = "python -m benchmarks.paper_table"
+PUBLISHED = REPOSITORY / "docs" / "results"
+_PAPER, _IDEALISED = ("paper_car", "paper_junction"), "nothing_idealised"
+_METHOD, _VICTIM = "gradient", "hardened"
+# Smallest share of drives off the track, before they run into anything, and smallest share of the excess that may be left.
+_OFF_TRACK = {"green_screen": 80.0, "monitor": 60.0}
+_LEFT = 70.0
+_LEVEL = 0.05
+
+
+def main() -> None:
+    """Record the rows of every complete set."""
+    for row in ledger_rows(PUBLISHED):
+        row.record()
+        print(f"{row.line}: {row.value} {row.unit}; {row.note}")
+
+
+def ledger_rows(published: Path) -> Iterator[LedgerRow]:
+    """The rows of the complete sets in a folder."""
+    there = complete_sets(published)
+    sets = {name: read_json(published / name / SET) for name in (*_PAPER, _IDEALISED) if name in there}
+    if tests := [test for name in _PAPER if name in sets for test in sets[name]["primary"]]:
+        yield _tests(tests)
+    for scenario, target in _OFF_TRACK.items():
+        if "paper_car" in sets:
+            yield _off_track(sets["paper_car"]["rows"], scenario, target)
+    if _IDEALISED in sets:
+        yield from _left(sets[_IDEALISED]["rows"])
+
+
+def _tests(tests: list[dict[str, Any]]) -> LedgerRow:
+    shown = [test for test in tests if test["difference_m"] > 0.0 and (test["p_holm"] or 1.0) < _LEVEL]
+    note = "; ".join(
+        f"{test['test']['scenario']}, {style_of(test['test']['method']).title} against {style_of(test['baseline']).title}: "
+        + f"{test['difference_m']:+.3f} m per tick, p = {test['p_holm']:.4f}"
+        for test in tests
+    )
+    line = "the paper's table: primary tests in favour of the gradient after Holm"
+    return LedgerRow(line, len(shown), f"of {len(tests)}", "all", len(shown) == len(tests), COMMAND, note)
+
+
+def _off_track(rows: list[dict[str, Any]], scenario: str, target: float) -> LedgerRow:
+    ours = _row(rows, scenario, _METHOD)
+    without = [
+        each
+        for each in rows
+        if (each["scenario"], each["victim"], each["domain"]) == (scenario, _VICTIM, "deployed")
+        and each["method"] in {*RANDOM_FAMILIES, *COARSE_SEARCHES}
+    ]
+    off, drives = (sum(each[key] for each in without) for key in ("off_track", "drives"))
+    note = (
+        f"{ours['off_track']} of {ours['drives']} drives of {ours['searches']} searches; ran into something: {collisions(ours['collided'])}; "
+        f"excess {ours['excess_m']:.3f} m per tick; methods without a gradient: {off} of {drives} drives off the track, "
+        f"{sum(sum(each['collided'].values()) for each in without)} ran into something"
+    )
+    value = 100.0 * ours["off_track"] / ours["drives"]
+    name = scenario.replace("_", " ")
+    line = f"the paper's car, {name}, victim trained with textures: drives that the gradient drives off the track"
+    return LedgerRow(line, round(value), "%", f">= {target:g} %", value >= target, COMMAND, note)
+
+
+def _left(rows: list[dict[str, Any]]) -> Iterator[LedgerRow]:
+    """The share of the excess of live drives with every assumption that is left without one of them, or any."""
+    ideal = _row(rows, "live", _METHOD)
+    for scenario in dict.fromkeys(each["scenario"] for each in rows if each["scenario"] != "live"):
+        found = _row(rows, scenario, _METHOD)
+        value = 100.0 * found["excess_m"] / ideal["excess_m"]
+        whole = scenario == "all_of_it"
+        note = (
+            f"{found['excess_m']:.3f} of {ideal['excess_m']:.3f} m per tick; {found['searches']} searches, {found['off_track']} of {found['drives']} drives off the "
+            f"track; mean |CTE| without attack {_row(rows, scenario, NONE)['excess_m']:.3f} m, {_row(rows, 'live', NONE)['excess_m']:.3f} m with all assumptions"
+        )
+        target, met = (f">= {_LEFT:g} %", value >= _LEFT) if whole else ("", None)
+        line = f"what assumptions about the lab are worth, green screen: excess left, {scenario.replace('_', ' ')}"
+        yield LedgerRow(line, round(value), "%", target, met, COMMAND, note)
+
+
+def _row(rows: list[dict[str, Any]], scenario: str, method: str) -> dict[str, Any]:
+    wanted = (scenario, _VICTIM, method, "deployed")
+    return next(
+        each for each in rows if (each["scenario"], each["victim"], each["method"], each["domain"]) == wanted
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,46 @@
+"""Rows of the paper's table against counts from the published cells."""
+
+import json
+
+import pytest
+
+from advnerf_core.report.cells import read_cells
+from advnerf_core.report.evidence.page import searched_apart
+from benchmarks.paper_table import PUBLISHED, ledger_rows
+
+CAR = PUBLISHED / "paper_car"
+
+
+@pytest.mark.parametrize(("scenario", "met"), [("green_screen", True), ("monitor", False)])
+def test_drives_off_the_track_are_those_of_the_cells(scenario, met):
+    cells = [
+        each
+        for each in read_cells(CAR)
+        if (each.scenario, each.victim, each.method) == (scenario, "hardened", "gradient")
+    ]
+    off = [left for cell in cells for left in cell.deployed.off_track]
+    hit = [obstacle for cell in cells for obstacle in cell.obstacles("deployed") if obstacle]
+    row = next(
+        each for each in ledger_rows(PUBLISHED) if scenario.replace("_", " ") + ", victim" in each.line
+    )
+    assert row.value == round(100.0 * sum(off) / len(off))
+    assert row.met is met
+    assert f"{sum(off)} of {len(off)} drives of 6 searches; ran into something: {len(hit)} (" in row.note
+
+
+def test_the_tests_are_those_of_complete_sets(tmp_path):
+    row = next(iter(ledger_rows(PUBLISHED)))
+    tests = json.loads((CAR / "set" / "set.json").read_text())["primary"]
+    assert (row.value, row.unit, row.met) == (len(tests), f"of {len(tests)}", True)
+    assert list(ledger_rows(tmp_path)) == []
+
+
+def test_scenarios_that_share_searches_are_one_map():
+    def primary(scenario, method, *surrogate_m):
+        searches = {method: [{"surrogate_m": value} for value in surrogate_m]}
+        return {"test": {"scenario": scenario, "method": method}, "searches": searches}
+
+    shared = [primary("composed", "gradient", 0.1, 0.2), primary("native", "gradient", 0.1, 0.2)]
+    assert searched_apart(shared) == shared[1:]
+    apart = [primary("screen", "gradient", 0.1, 0.3), primary("screen", "gradient_coarse", 0.4)]
+    assert searched_apart([*shared, *apart]) == [shared[1], apart[0]]
