@@ -17,6 +17,7 @@ KEPT_COMMANDS: dict[str, re.Pattern[str]] = {
     ),
     "gap": re.compile(r"python -m benchmarks\.gap ([\w ]+)"),
     "predictions": re.compile(r"python -m benchmarks\.predictions"),
+    "paper": re.compile(r"python -m benchmarks\.paper_table"),
     "correlation": re.compile(r"python -m benchmarks\.transfer_correlation"),
 }
 NOT_KEPT = "Measured once, not kept."

@@ -9,7 +9,7 @@ from typing import Any
 
 from advnerf_core.documents import read_json
 from advnerf_core.report.evidence.verifying.numbers import same
-from benchmarks import gap, predictions, retraining, transfer_correlation, transfer_table
+from benchmarks import gap, paper_table, predictions, retraining, transfer_correlation, transfer_table
 from benchmarks.kept_commands import kept_by
 from benchmarks.results import REPOSITORY, LedgerRow
 from nodes.experiment.steps.run import load_experiment
@@ -41,6 +41,7 @@ _AGAIN: dict[str, Callable[..., list[LedgerRow]]] = {
     "retraining": retraining_rows,
     "gap": gap.ledger_rows,
     "predictions": predictions.ledger_rows,
+    "paper": paper_table.ledger_rows,
     "correlation": transfer_correlation.ledger_rows,
 }
 

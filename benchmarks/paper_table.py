@@ -28,13 +28,17 @@ _LEVEL = 0.05
 
 def main() -> None:
     """Record the rows of every complete set."""
-    for row in ledger_rows(PUBLISHED):
+    for row in ledger_rows():
         row.record()
         print(f"{row.line}: {row.value} {row.unit}; {row.note}")
 
 
-def ledger_rows(published: Path) -> Iterator[LedgerRow]:
+def ledger_rows(published: Path = PUBLISHED) -> list[LedgerRow]:
     """The rows of the complete sets in a folder."""
+    return list(_rows(published))
+
+
+def _rows(published: Path) -> Iterator[LedgerRow]:
     there = complete_sets(published)
     sets = {name: read_json(published / name / SET) for name in (*_PAPER, _IDEALISED) if name in there}
     if tests := [test for name in _PAPER if name in sets for test in sets[name]["primary"]]:
@@ -73,7 +77,7 @@ def _off_track(rows: list[dict[str, Any]], scenario: str, target: float) -> Ledg
     )
     value = 100.0 * ours["off_track"] / ours["drives"]
     name = scenario.replace("_", " ")
-    line = f"the paper's car, {name}, victim trained with textures: drives that the gradient drives off the track"
+    line = f"the paper's car, {name}, victim trained with textures: drives off the track past the gradient's attack"
     return LedgerRow(line, round(value), "%", f">= {target:g} %", value >= target, COMMAND, note)
 
 
