@@ -63,7 +63,7 @@ def _means(shown: list[Row], titles: Mapping[str, str]) -> Figure:
     places = list(dict.fromkeys((row.scenario, row.placement, row.victim) for row in shown))
     methods = list(dict.fromkeys(row.method for row in shown))
     apart = min(0.22, 0.85 / len(methods))
-    with new_axes(7.2, 0.9 + max(0.42, 0.16 * len(methods)) * len(places)) as ax:
+    with new_axes(7.2, 0.9 + max(0.42, 0.14 * len(methods)) * len(places)) as ax:
         ax.axvline(0.0, color=LIGHT["tape"], lw=1.0, zorder=1)
         for row in shown:
             style, filled = style_of(row.method), row.domain == "deployed"
