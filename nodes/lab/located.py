@@ -40,6 +40,18 @@ def located(path: Path, info: ValidationInfo) -> Path:
     return found.resolve()
 
 
+def located_folder(path: Path, info: ValidationInfo) -> Path:
+    """Absolute path of a folder.
+
+    Raises:
+        PydanticCustomError: It does not exist, or is a file.
+    """
+    found = located(path, info)
+    if not found.is_dir():
+        raise refusal(f"expected a folder relative to this file, got {path}, which is a file")
+    return found
+
+
 def is_read_again(info: SerializationInfo) -> bool:
     """Whether the output is a file that is read again; otherwise it is what results depend on."""
     return isinstance(info.context, dict) and bool(info.context.get("read_again"))
@@ -63,7 +75,7 @@ def _digest(path: Path, changed_ns: int) -> str:
 NamedFile = Annotated[Path, AfterValidator(located), PlainSerializer(_written)]
 """A file; as data that results depend on it is the hash of its content."""
 
-NamedFolder = Annotated[Path, AfterValidator(located)]
+NamedFolder = Annotated[Path, AfterValidator(located_folder)]
 
 
 def _contents_written(folder: Path, info: SerializationInfo) -> str | dict[str, str]:
@@ -71,5 +83,5 @@ def _contents_written(folder: Path, info: SerializationInfo) -> str | dict[str, 
     return str(folder) if is_read_again(info) else {file.name: content_sha256(file) for file in files}
 
 
-NamedContents = Annotated[Path, AfterValidator(located), PlainSerializer(_contents_written)]
+NamedContents = Annotated[NamedFolder, PlainSerializer(_contents_written)]
 """A folder; as data that results depend on it is its files' names and the hashes of their contents."""

@@ -26,8 +26,7 @@ from nodes.lab.trials.evaluation import attack_ids, counterfactual, score, timin
 from nodes.lab.trials.trial import TrialOutcome, TrialPlan
 from nodes.lab.trials.trial_runner import TrialNodes
 from nodes.lab.trials.tries import NotDrivenError, drive_with_tries
-from nodes.launching.launch_file import load_launch
-from nodes.motor import MotorConfig
+from nodes.launching.launch_file import Plan, load_launch
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError, RuntimeFault
 from nodes.runtime.progress import Report
@@ -42,8 +41,8 @@ _SET_HERE = (
     *("params.policy", "params.attack", "params.calibration", "params.vicon_port", "policy.sha256"),
     *("twin.lab", "twin.camera_effects", "monitor.plain_rgb", "monitor.face_m"),
 )
-# The motor node's limit of a command's age, and what a frame takes to a command at least.
-_COMMAND_AGE_S, _LEAST_LATENCY_S = MotorConfig.model_fields["command_age_limit_s"].default, 0.02
+# What a frame takes to a command at least.
+_LEAST_LATENCY_S = 0.02
 # The absent panel of the empty scene stands outside the room, out of every camera's sight.
 _OUT_OF_SIGHT_M = 60.0
 
@@ -97,22 +96,32 @@ def check_live(experiment: Experiment, place: str) -> None:
         ConfigError: The world is not the lab, a lost frame would stop its car, or a change does not fit the launch file.
     """
     rate_hz, wanted = lab_of(experiment).camera.rate_hz, experiment.config.deploy
-    if wanted.camera.lost and 2.0 / rate_hz + _LEAST_LATENCY_S >= _COMMAND_AGE_S:
-        raise ConfigError(
-            f"{place}: expected deploy.camera with lost 0, as at {rate_hz:g} Hz the first lost frame leaves the car without a command for "
-            f"{_COMMAND_AGE_S:g} s, and the stack stops it, got lost {wanted.camera.lost:g}; set it to 0, or raise world.camera.rate_hz"
-        )
-    changes = wanted.changes
-    for change in changes:
+    for change in wanted.changes:
         if (key := change.partition("=")[0].strip()).startswith(_SET_HERE):
             raise ConfigError(
                 f"{place}: expected changes of what the experiment itself does not set, got {change}; change the experiment's own setting of {key}"
             )
+    if not (wanted.changes or wanted.camera.lost):
+        return
     try:
-        if changes:
-            load_launch(experiment.launch_file, changes)
+        graph = load_launch(experiment.launch_file, wanted.changes)
     except ConfigError as error:
         raise ConfigError(f"{place}: changes: {error}") from error
+    limit_s = _command_age_limit_s(graph)
+    if wanted.camera.lost and 2.0 / rate_hz + _LEAST_LATENCY_S >= limit_s:
+        raise ConfigError(
+            f"{place}: expected deploy.camera with lost 0, as at {rate_hz:g} Hz the first lost frame leaves the car without a command for "
+            f"{limit_s:g} s, and the stack stops it, got lost {wanted.camera.lost:g}; set it to 0, or raise world.camera.rate_hz"
+        )
+
+
+def _command_age_limit_s(graph: Plan) -> float:
+    """Largest age of a command in a node graph [s]: as its motor node is configured, or that node's default."""
+    from nodes.motor import MotorConfig  # loads the drivers of its devices
+
+    default = MotorConfig.model_fields["command_age_limit_s"].default
+    motor = graph.resolved["nodes"].get("motor") or {}
+    return float((motor.get("config") or {}).get("command_age_limit_s", default))
 
 
 class LiveNodes:

@@ -71,6 +71,8 @@ def test_live_nodes_take_measured_calibrations_and_changes_of_the_launch_file(tm
     [
         ([THROUGH_NODES, "deploy.camera=zed"], "at 10 Hz the first lost frame leaves the car without a command for 0.22 s"),
         ([THROUGH_NODES, "deploy.calibration=nowhere"], "expected a file or folder relative to this file"),
+        ([THROUGH_NODES, f"deploy.calibration={LAUNCH / 'room.experiment.yaml'}"], "expected a folder relative to this file, got .* which is a file"),
+        ([THROUGH_NODES, "deploy.camera=zed", 'deploy.changes=["motor.command_age_limit_s=0.21"]'], "without a command for 0.21 s"),
         ([THROUGH_NODES, 'deploy.changes=["twn.vicon.noise_m=0.001"]'], "no node called 'twn'; known are"),
         ([THROUGH_NODES, 'deploy.changes=["params.policy=mine.onnx"]'], "what the experiment itself does not set"),
         (['deploy.through=world', 'deploy.changes=["twin.vicon.noise_m=0.001"]'], r"expected deploy\.through nodes with deploy\.changes"),
@@ -79,6 +81,11 @@ def test_live_nodes_take_measured_calibrations_and_changes_of_the_launch_file(tm
 def test_a_wrong_change_of_the_graph_is_one_error_before_anything_is_made(tmp_path, overrides, message):
     with pytest.raises(ConfigError, match=message):
         room(tmp_path, *overrides)
+
+
+def test_lost_frames_are_driven_where_the_motor_node_bears_them(tmp_path):
+    change = 'deploy.changes=["motor.command_age_limit_s=0.25"]'
+    assert room(tmp_path, THROUGH_NODES, "deploy.camera=zed", change).config.deploy.camera.lost > 0.0
 
 
 def test_a_spoiled_drive_is_driven_again_and_its_reasons_are_kept(tmp_path, monkeypatch):
