@@ -115,14 +115,15 @@ def _check_native(experiment: Experiment, document: Document) -> None:
         (NativePanels, "add_panel", [each.name for each in config.objects if each.kind == PANEL]),
         (NativeMeshes, "add_mesh", [each.name for each in config.objects if each.kind != PANEL]),
     )
-    uses = (
-        ("training", config.carrier.training == "native", experiment.named_world),
-        ("kind", isinstance(config.carrier, NativeConfig), experiment.deployed_world),
-    )
-    for key, native, world in uses:
-        made = world.make() if native else None
+    uses = {}
+    if config.carrier.training == "native":
+        uses["training"] = experiment.named_world
+    if isinstance(config.carrier, NativeConfig):
+        uses["kind"] = experiment.deployed_world
+    for key, world in uses.items():
+        made = world.make()
         for kind, call, names in wanted:
-            if native and names and not isinstance(made, kind):
+            if names and not isinstance(made, kind):
                 raise ConfigError(
                     f"{document.place(('carrier',))}: expected a world that takes {', '.join(names)} into its own scene ({call}) with "
                     f"carrier.{key} native, got {world.kind}; set carrier.{key}=composed"
