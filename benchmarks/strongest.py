@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from advnerf_core.driving.metrics import mean_cte_limit_m
-from advnerf_core.report.cells import read_cell
+from advnerf_core.report.cells import CellResult, read_cell
 from advnerf_core.report.conditions import CONTROLS, style_of
 from advnerf_core.report.evidence.families import COARSE_SEARCHES, RANDOM_FAMILIES
 from advnerf_core.report.evidence.outcome import Outcome
@@ -95,17 +96,15 @@ def strongest_random(folder: Path) -> list[Strongest]:
     wanted = {*RANDOM_FAMILIES, *COARSE_SEARCHES, *CONTROLS}
     cells = [cell for file in sorted(folder.glob("*.json")) if (cell := read_cell(file)).method in wanted]
     evidence = Evidence(registration, cells)
-    by_place: dict[tuple[str, str, str], dict[str, set[str | None]]] = {}
+    by_place: defaultdict[tuple[str, str, str], list[CellResult]] = defaultdict(list)
     for cell in evidence.cells.values():
-        if cell.victim == NAIVE or cell.method in CONTROLS or not cell.kept.get("deployed"):
-            continue
-        if evidence.without(cell):
-            by_place.setdefault((cell.scenario, cell.placement, cell.victim), {}).setdefault(
-                cell.method, set()
-            ).add(cell.attack_id)
-    last = {frozenset().union(*methods.values()): place for place, methods in by_place.items()}
+        searched = cell.victim != NAIVE and cell.method not in CONTROLS
+        if searched and cell.kept.get("deployed") and evidence.without(cell):
+            by_place[cell.scenario, cell.placement, cell.victim].append(cell)
+    last = {frozenset(each.attack_id for each in searches): searches for searches in by_place.values()}
     found = [
-        [_of_method(evidence, (*place, method)) for method in by_place[place]] for place in last.values()
+        [_of_method(evidence, key) for key in dict.fromkeys(each.key for each in searches)]
+        for searches in last.values()
     ]
     return [max(each, key=lambda strongest: strongest.deployed.best_m) for each in found]
 
