@@ -14,7 +14,14 @@ from advnerf_core.report.cells import CellResult, read_cell, read_cells
 from advnerf_core.report.evidence.hardness import FILE as HARDNESS
 from advnerf_core.report.evidence.hardness import PUBLISHED_FILE, merged, read_hardness, write_hardness
 from advnerf_core.report.result_table import ResultTable, make_table
-from nodes.experiment.engine.artefact import BUILD, RECORD, ReferenceBuild, read_artefact, read_current
+from nodes.experiment.engine.artefact import (
+    BUILD,
+    RECORD,
+    ReferenceBuild,
+    has_key,
+    read_artefact,
+    read_current,
+)
 from nodes.experiment.pages.table import wanted_rows
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.admission import gate_file, gate_key
@@ -159,8 +166,8 @@ def _publish_beside(experiment: Experiment, done: Sequence[CellStatus], folder: 
         for drive in (False, True):
             verdict, published = (gate_file(each, key, drive) for each in (experiment.folder, folder))
             # Another machine judges the same scene and policy again, with other last digits: what was published stays.
-            if verdict.exists() and read_current(published, key=read_json(verdict)["key"]) is None:
-                write_atomically(published, verdict.read_text(encoding="utf-8"))
+            if (judged := read_current(verdict)) is not None and not has_key(published, judged["key"]):
+                write_json(published, judged)
 
 
 def _publish_hardness(experiment: Experiment, folder: Path) -> None:

@@ -149,6 +149,9 @@ def test_a_verdict_of_another_machine_replaces_the_published_one_only_for_anothe
         judged.write_text(json.dumps({"key": key, "psnr_db": psnr_db}))
         publish(loaded, statuses(loaded, loaded.cells), tmp_path / "kept")
         assert json.loads(kept.read_text())["psnr_db"] == published_db
+    judged.write_text("half of it")  # it is judged again by the next run
+    publish(loaded, statuses(loaded, loaded.cells), tmp_path / "kept")
+    assert json.loads(kept.read_text())["psnr_db"] == 36.2
 
 
 def test_a_published_cell_whose_key_matches_is_done_on_any_machine(here, tmp_path, monkeypatch):
