@@ -11,7 +11,7 @@ from PIL import Image
 from advnerf_core.errors import ConfigError
 from advnerf_core.report.cells import read_cells
 from advnerf_core.report.evidence.about import ABOUT, AboutError, check_about, read_about
-from advnerf_core.report.evidence.above import MOST_BYTES, moment_of, write_above_of
+from advnerf_core.report.evidence.above import MOST_BYTES, moment_of, write_above_of, write_maps
 from advnerf_core.report.evidence.page import above_of, film_of, groups_of_searches, searched_apart
 from advnerf_core.report.evidence.registration import PrimaryTest, read_registration
 from advnerf_core.report.evidence.results import Evidence, rows
@@ -211,6 +211,18 @@ def test_a_set_without_a_film_and_a_known_object_has_its_drives_from_above(tmp_p
     shown = np.asarray(Image.open(picture).convert("RGB")).reshape(-1, 3).astype(int)
     for colour in ((0x00, 0x72, 0xB2), (0xDD, 0x93, 0x00), (0xB0, 0x12, 0x3C)):
         assert (np.abs(shown - colour).max(axis=1) < 40).sum() > 100  # all three are drawn
+
+
+def test_scenarios_with_searches_of_their_own_have_a_map_each(tmp_path):
+    folder = PUBLISHED / "paper_car"
+    evidence = Evidence(read_registration(folder), read_cells(folder))
+    shown = searched_apart(published("paper_car")["primary"])
+    picture = np.asarray(Image.open(write_maps(evidence, shown, tmp_path / "maps.webp")).convert("RGB"))
+    halves = np.split(picture.astype(int), 2, axis=1)
+    for half in halves:
+        for colour in ((0x00, 0x72, 0xB2), (0xDD, 0x93, 0x00), (0xB0, 0x12, 0x3C)):
+            assert (np.abs(half - colour).max(axis=-1) < 40).sum() > 100
+    assert (np.abs(halves[0] - halves[1]).max(axis=-1) > 40).sum() > 1000  # each of its own drives
 
 
 FORBIDDEN = ("the real place", "the real car", "learned copy", "no attack", "7 of 7 registered")
