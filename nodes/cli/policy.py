@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from nodes.cli import policy_train as cli_policy_train
-from nodes.runtime.findings import Finding
+from nodes.runtime.findings import CheckFinding
 from nodes.runtime.paths import shipped
 from nodes.runtime.terminal import PolicyName, print_findings, print_table, table
 from nodes.runtime.termination import ends_in_order
@@ -96,7 +96,7 @@ def policy_check(
     methods = black_box_methods(adapted.stateless)
     findings = check_policy(adapted, reference.images, reference.steering_rad, told, methods)
     findings = judged_by_drives(adapted, reference, findings, told)
-    if not print_findings([Finding(each.name, each.verdict, each.text) for each in findings], "check"):
+    if not print_findings([CheckFinding(each.name, each.verdict, each.text) for each in findings], "check"):
         raise typer.Exit(_FAILURE_EXIT)
 
 

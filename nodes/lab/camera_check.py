@@ -14,7 +14,7 @@ import numpy as np
 from hardware.cameras.interface import Camera, Frame
 from hardware.cameras.steady import SteadyCamera
 from hardware.errors import DeviceBusy, DeviceNotFound, LinkLost
-from nodes.runtime.findings import Finding, NotMet, look_at_all
+from nodes.runtime.findings import CheckFinding, NotMet, look_at_all
 from nodes.runtime.inbox import Inbox, ReaderThread
 
 _FRAMES = 4
@@ -304,7 +304,7 @@ CHECKS: dict[str, Check] = {
 """Parts of the contract, in the order of the report."""
 
 
-def check_camera(bench: CameraBench) -> list[Finding]:
+def check_camera(bench: CameraBench) -> list[CheckFinding]:
     """A finding for each part of the contract; the first one alone if there are no frames of the right form.
 
     Raises:

@@ -26,7 +26,7 @@ from advnerf_core.driving.path import Path as Reference
 from advnerf_core.fields.voxel_grid import cube_face_object
 from advnerf_core.geometry import Pinhole, camera_mount, make_transform
 from advnerf_core.scene.surrogate import Surrogate
-from nodes.runtime.findings import Finding, NotMet, look_at_all
+from nodes.runtime.findings import CheckFinding, NotMet, look_at_all
 
 _CAMERA = Pinhole(width=24, height=12, fx=15.0, fy=15.0, cx=12.0, cy=6.0)
 _STEPS, _EVALUATIONS, _STOPPED_AFTER = 4, 6, 2
@@ -240,7 +240,7 @@ CHECKS: Mapping[str, Callable[[MethodBench], str]] = {
 """Parts of the contract, in the order of the report."""
 
 
-def check_method(reference: str, options: Mapping[str, Any] | None = None) -> list[Finding]:
+def check_method(reference: str, options: Mapping[str, Any] | None = None) -> list[CheckFinding]:
     """A finding for each part of the contract; the first one alone if the method cannot search at all.
 
     Args:

@@ -14,7 +14,7 @@ class NotMet(Exception):
 
 
 @dataclass(frozen=True)
-class Finding:
+class CheckFinding:
     """One line of the report.
 
     Attributes:
@@ -35,7 +35,7 @@ class Finding:
 
 def look(
     name: str, check: Callable[[T], str], bench: T, lets_through: tuple[type[Exception], ...] = ()
-) -> Finding:
+) -> CheckFinding:
     """The finding of one check.
 
     Args:
@@ -44,21 +44,21 @@ def look(
         lets_through: Errors that end the whole report. Any other error is a part that is not met.
     """
     try:
-        return Finding(name, "met", check(bench))
+        return CheckFinding(name, "met", check(bench))
     except NotMet as reason:
-        return Finding(name, "not met", str(reason))
+        return CheckFinding(name, "not met", str(reason))
     except lets_through:
         raise
     except Exception as error:  # a plug-in may raise anything
         text = f"raised {type(error).__name__}: {' '.join(str(error).split()):.200}"
-        return Finding(name, "not met", text)
+        return CheckFinding(name, "not met", text)
 
 
 def look_at_all(
     checks: Mapping[str, Callable[[T], str]], bench: T, lets_through: tuple[type[Exception], ...] = ()
-) -> list[Finding]:
+) -> list[CheckFinding]:
     """The finding of each check by its name; the first one alone if it is not met. See `look`."""
-    findings: list[Finding] = []
+    findings: list[CheckFinding] = []
     for name, check in checks.items():
         findings.append(look(name, check, bench, lets_through))
         if not findings[0].met:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.table import Table
     from rich.text import Text
 
-    from nodes.runtime.findings import Finding
+    from nodes.runtime.findings import CheckFinding
 
 _ADDRESS = re.compile(r"(\[[0-9a-f:]+\]|[^:/\s]+):(\d{1,5})")
 _POLICY_FILES = (".safetensors", ".onnx", ".pt2")
@@ -116,7 +116,7 @@ def say_error(text: str) -> None:
     print(f"error: {' '.join(text.split())}", file=sys.stderr, flush=True)
 
 
-def print_findings(findings: Sequence[Finding], what: str = "part") -> bool:
+def print_findings(findings: Sequence[CheckFinding], what: str = "part") -> bool:
     """Print what a check found, a line for each part that ``what`` names. Returns whether all of it is met."""
     rows = table(what, "state", "found")
     for finding in findings:

@@ -20,14 +20,16 @@ from hardware.worlds.carla.errors import CarlaError, CarlaFrameError, CarlaMapEr
 from hardware.worlds.carla.library import load_carla, server_answers
 from hardware.worlds.carla.scene import CarlaScene, drives_in
 from hardware.worlds.world import require_depth
-from nodes.runtime.findings import Finding
+from nodes.runtime.findings import CheckFinding
 
 _STEPS = 10
 _GROUND_TOLERANCE = 0.03
 _GROUND_SHARE = 0.5  # at least this share of the picture's lower middle must be road
 
 
-def check_server(config: CarlaConfig, library: Any = None, pictures: Path | None = None) -> list[Finding]:
+def check_server(
+    config: CarlaConfig, library: Any = None, pictures: Path | None = None
+) -> list[CheckFinding]:
     """Check a server; stops at the first failure that prevents the rest.
 
     The map is not changed. If all checks pass a scene is opened for a few ticks and restored.
@@ -36,7 +38,7 @@ def check_server(config: CarlaConfig, library: Any = None, pictures: Path | None
         library: The ``carla`` module; None imports it.
         pictures: Folder for the driving camera's pictures, for a person to inspect.
     """
-    checks: list[Finding] = []
+    checks: list[CheckFinding] = []
 
     def look(name: str, what: Callable[[], Any]) -> Any:
         """The result of a check, or None if it failed, which is recorded."""
@@ -44,7 +46,7 @@ def check_server(config: CarlaConfig, library: Any = None, pictures: Path | None
             with server_answers(name):
                 found = what()
         except CarlaError as error:
-            checks.append(Finding(name, "failure", str(error)))
+            checks.append(CheckFinding(name, "failure", str(error)))
             return None
         return found
 
@@ -55,7 +57,7 @@ def check_server(config: CarlaConfig, library: Any = None, pictures: Path | None
     if client is None:
         return checks
     where = f"CARLA {client.get_server_version()} at {config.server.host}:{config.server.port}, as the client library"
-    checks.append(Finding("server", "ok", where))
+    checks.append(CheckFinding("server", "ok", where))
     world = look("map", client.get_world)
     if world is None or not _look_at_map(config, client, world, checks):
         return checks
@@ -70,25 +72,25 @@ def check_server(config: CarlaConfig, library: Any = None, pictures: Path | None
     return checks
 
 
-def _look_at_map(config: CarlaConfig, client: Any, world: Any, checks: list[Finding]) -> bool:
+def _look_at_map(config: CarlaConfig, client: Any, world: Any, checks: list[CheckFinding]) -> bool:
     """Whether the requested map is loaded."""
     loaded, wanted = map_name(world.get_map().name), config.server.town
     if wanted in (None, loaded):
-        checks.append(Finding("map", "ok", loaded))
+        checks.append(CheckFinding("map", "ok", loaded))
         return True
     if wanted not in {map_name(path) for path in client.get_available_maps()}:
         text = f"expected {wanted}, got {loaded}, and the server does not have {wanted}"
-        checks.append(Finding("map", "failure", text))
+        checks.append(CheckFinding("map", "failure", text))
     elif config.server.load_town:
         text = f"{loaded}; an experiment would load {wanted}. To look at that: ask with --set server.town={loaded}, or load it first"
-        checks.append(Finding("map", "warning", text))
+        checks.append(CheckFinding("map", "warning", text))
     else:
         text = f"expected {wanted}, got {loaded}, and server.load_town is off"
-        checks.append(Finding("map", "failure", text))
+        checks.append(CheckFinding("map", "failure", text))
     return False
 
 
-def _look_at_junction(config: CarlaConfig, world: Any, library: Any, checks: list[Finding]) -> bool:
+def _look_at_junction(config: CarlaConfig, world: Any, library: Any, checks: list[CheckFinding]) -> bool:
     drives = drives_in(world.get_map(), library, config)
     lengths = ", ".join(f"{name} {path.length_m:.1f} m" for name, path in drives.paths.items())
     side = "right" if drives.right_hand else "left"
@@ -96,17 +98,17 @@ def _look_at_junction(config: CarlaConfig, world: Any, library: Any, checks: lis
         f"{drives.junction_id}: {lengths}; lanes {drives.lane_width_m:.2f} m, traffic on the {side}, heights within "
         f"{drives.height_range_m:.2f} m"
     )
-    checks.append(Finding("junction", "ok" if drives.right_hand else "warning", text))
+    checks.append(CheckFinding("junction", "ok" if drives.right_hand else "warning", text))
     return True
 
 
-def _look_at_world(config: CarlaConfig, world: Any, checks: list[Finding]) -> bool:
+def _look_at_world(config: CarlaConfig, world: Any, checks: list[CheckFinding]) -> bool:
     check_nobody_else(world, config.server)
-    checks.append(Finding("world", "ok", "nobody else drives it or is in it"))
+    checks.append(CheckFinding("world", "ok", "nobody else drives it or is in it"))
     return True
 
 
-def _look_at_blueprints(config: CarlaConfig, world: Any, checks: list[Finding]) -> bool:
+def _look_at_blueprints(config: CarlaConfig, world: Any, checks: list[CheckFinding]) -> bool:
     for kind in (RGB, DEPTH):
         camera_blueprint(world, kind, config.camera.pinhole, config.render)
     vehicle = config.body.blueprint
@@ -116,12 +118,14 @@ def _look_at_blueprints(config: CarlaConfig, world: Any, checks: list[Finding]) 
         except IndexError as error:
             raise CarlaMapError(f"expected the vehicle {vehicle} (body.blueprint), got: {error}") from error
     checks.append(
-        Finding("blueprints", "ok", f"{RGB}, {DEPTH}, {vehicle or 'no vehicle'}, with all attributes")
+        CheckFinding("blueprints", "ok", f"{RGB}, {DEPTH}, {vehicle or 'no vehicle'}, with all attributes")
     )
     return True
 
 
-def _look_at_pictures(config: CarlaConfig, library: Any, folder: Path | None, checks: list[Finding]) -> bool:
+def _look_at_pictures(
+    config: CarlaConfig, library: Any, folder: Path | None, checks: list[CheckFinding]
+) -> bool:
     with CarlaScene(config, library) as scene:
         scene.reset(*scene.paths["straight"].start_pose)
         rgb, depth = require_depth(scene.observe())
@@ -133,7 +137,7 @@ def _look_at_pictures(config: CarlaConfig, library: Any, folder: Path | None, ch
         text = f"frame numbers and poses as asked, {1e3 * seconds:.0f} ms for a step and its picture"
         if repeated:
             text += f"; {repeated} of {_STEPS + 1} pictures had to be asked for again, which costs time and nothing else"
-        checks.append(Finding("pictures", "warning" if repeated else "ok", text))
+        checks.append(CheckFinding("pictures", "warning" if repeated else "ok", text))
         if folder is not None:
             _write(folder, rgb, depth)
         checks.append(_ground(scene.camera_pinhole, scene.T_car_from_camera, rgb, depth))
@@ -142,7 +146,7 @@ def _look_at_pictures(config: CarlaConfig, library: Any, folder: Path | None, ch
 
 def _ground(
     pinhole: Pinhole, T_car_from_camera: Any, rgb: NDArray[np.uint8], depth: NDArray[np.float32]
-) -> Finding:
+) -> CheckFinding:
     """Check that the road is where depth says, for a camera mounted as ours. Wrong units, a wrong angle or a bonnet in view show here."""
     rows, columns = slice(int(0.75 * pinhole.height), None), slice(pinhole.width // 3, 2 * pinhole.width // 3)
     down = -(pinhole.directions()[rows, columns] @ T_car_from_camera[:3, :3].T)[..., 2]
@@ -152,23 +156,23 @@ def _ground(
     text = f"{100 * share:.0f} % of the lower middle of the picture is road at the expected depth"
     if float(rgb.std()) < 1.0:
         text += ", but the picture is of one colour: does the server render? (-RenderOffScreen)"
-        return Finding("picture", "failure", text)
+        return CheckFinding("picture", "failure", text)
     if share >= _GROUND_SHARE:
-        return Finding("depth", "ok", text)
+        return CheckFinding("depth", "ok", text)
     text += (
         f"; depth there is {float(np.median(ratio)):.2f} of what a flat road gives. Does the camera see the car itself, is the ground at the "
         "height of the map's lanes, is the camera higher than they say? Look at the pictures (-o)"
     )
-    return Finding("depth", "failure", text)
+    return CheckFinding("depth", "failure", text)
 
 
-def _look_at_settings(world: Any, checks: list[Finding]) -> bool:
+def _look_at_settings(world: Any, checks: list[CheckFinding]) -> bool:
     settings = world.get_settings()
     if settings.synchronous_mode:
         raise CarlaFrameError(
             "expected the world to tick by itself again, it does not: `advnerf scene carla release`"
         )
-    checks.append(Finding("put back", "ok", "the world ticks by itself again"))
+    checks.append(CheckFinding("put back", "ok", "the world ticks by itself again"))
     return True
 
 

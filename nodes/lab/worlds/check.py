@@ -34,7 +34,7 @@ from nodes.lab.worlds.named import NamedWorld
 from nodes.lab.worlds.panels import meshes_are_native, panels_are_native
 from nodes.lab.worlds.pictures import form, is_not_late, photographs_match, repeats, takes_no_time
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.findings import Finding, NotMet, look
+from nodes.runtime.findings import CheckFinding, NotMet, look
 
 _DESCRIPTION = "description"
 # Without the first of these the others cannot run.
@@ -62,7 +62,9 @@ _NATIVE: tuple[tuple[type, tuple[str, Check]], ...] = (
 )
 
 
-def check_world(named: NamedWorld, pictures: Path | None = None, only: Collection[str] = ()) -> list[Finding]:
+def check_world(
+    named: NamedWorld, pictures: Path | None = None, only: Collection[str] = ()
+) -> list[CheckFinding]:
     """Run all checks of a world from the outside.
 
     Args:
@@ -81,7 +83,7 @@ def check_world(named: NamedWorld, pictures: Path | None = None, only: Collectio
         if name not in names:
             raise ConfigError(unknown(name, "part of the contract", names))
     closed = _described(named.make())
-    findings: list[Finding] = []
+    findings: list[CheckFinding] = []
     with named.make() as world:
         described = world.describe()
         findings.append(
