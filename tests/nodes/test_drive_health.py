@@ -117,6 +117,22 @@ def test_a_stop_by_silence_is_no_result_in_a_drive_that_was_timely(tmp_path):
     assert found == "the stack stopped the car: no pose of the car for 0.21 s"
 
 
+@pytest.mark.parametrize(
+    ("skipped", "words"),
+    [(0, ""), (3, "; the simulated camera skipped 3 of its pictures: this machine is too slow")],
+)
+def test_a_stop_by_silence_names_a_camera_that_is_too_slow(tmp_path, skipped, words):
+    with BagWriter(tmp_path / "bag") as writer:
+        for number, count in enumerate((5, 5 + skipped)):
+            at_ns = START_NS + number * 700_000_000  # the second after the end
+            message = status("twin", at_ns, **{"missed camera": count})
+            writer.write("/status/twin", encode(message), at_ns, at_ns, number)
+    stop = "no command from the policy for 0.22 s"
+    found = judged(tmp_path / "bag", stop, 0.5)
+    assert found.startswith(f"the stack stopped the car: {stop}{words}")
+    assert bool(words) == ("camera" in found)
+
+
 def test_a_result_does_not_hide_a_graph_that_was_too_slow(tmp_path):
     """An attack that seems to work because every second command is missing is no result."""
     slow = write_bag(tmp_path / "bag", [k for k in ALL if k % 2])

@@ -5,7 +5,7 @@ The rule is the same for every condition and reads no position of the car, so th
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,8 @@ _TICK_SHARE = 0.1
 _LATE_S = 0.2
 # Share of its own ticks that a node's loop may miss.
 _LOOP_SHARE = 0.25
+# Counter of the node twin.
+_MISSED_PICTURES = "missed camera"
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,7 @@ class DriveHealth:
         unserved: Control ticks without a new command at the motor.
         late: Control ticks whose command was late.
         loops: Share of ticks that the loop of each node missed.
+        pictures: Pictures that a simulated camera skipped, because it was still drawing an earlier one; up to the end of the bag.
     """
 
     stopped: str
@@ -45,12 +48,13 @@ class DriveHealth:
     unserved: int = 0
     late: int = 0
     loops: Mapping[str, float] = field(default_factory=dict)
+    pictures: int = 0
 
 
 def spoiled_by(health: DriveHealth) -> str:
     """Return why a drive measures nothing; empty if it counts."""
     if not is_result(health.stopped):
-        return f"the stack stopped the car: {health.stopped}"
+        return f"the stack stopped the car: {health.stopped}{_slow_camera(health.pictures)}"
     most = max(1, int(_TICK_SHARE * health.ticks))
     if health.unserved > most:
         return f"{health.unserved} of {health.ticks} control ticks had no new command; at most {most} may"
@@ -60,6 +64,16 @@ def spoiled_by(health: DriveHealth) -> str:
         if share > _LOOP_SHARE:
             return f"node {node} missed {100 * share:.0f} % of its ticks; at most {100 * _LOOP_SHARE:.0f} % may be missed"
     return ""
+
+
+def _slow_camera(pictures: int) -> str:
+    """Return why a simulated camera may have stopped the car; empty if it skipped none."""
+    if not pictures:
+        return ""
+    return (
+        f"; the simulated camera skipped {pictures} of its pictures: this machine is too slow for it, or something else runs beside it "
+        "(exposure and a rolling shutter cost five pictures for each frame)"
+    )
 
 
 def read_health(
@@ -75,14 +89,23 @@ def read_health(
     ticks = max(0, int((last_ns - start_real_ns) / NS_PER_S / tick_s + 1e-6))
     recorded = {topic.name for topic in read_info(bag).topics}
     ages_s = _command_ages_s(bag, start_real_ns, last_ns) if _SENT in recorded else np.zeros(0)
-    loops = {
-        name.removeprefix(STATUS_PREFIX): share
+    reports = {
+        name.removeprefix(STATUS_PREFIX): _counters(bag, name, start_real_ns)
         for name in sorted(recorded)
         if name.startswith(STATUS_PREFIX)
-        and (share := _missed_share(bag, name, start_real_ns, end_real_ns)) is not None
     }
+    loops = {
+        node: share
+        for node, counters in reports.items()
+        if (share := _missed_share([values for at_ns, values in counters if at_ns <= end_real_ns]))
+        is not None
+    }
+    # Also after the end: a picture that comes so late that the car is stopped is counted when it has come.
+    pictures = sum(
+        int(_rise([values for _, values in counters], _MISSED_PICTURES)) for counters in reports.values()
+    )
     late = int(np.count_nonzero(ages_s > _LATE_S))
-    return DriveHealth(stopped, ticks, max(0, ticks - len(ages_s)), late, loops)
+    return DriveHealth(stopped, ticks, max(0, ticks - len(ages_s)), late, loops, pictures)
 
 
 def _command_ages_s(bag: Path, start_ns: int, end_ns: int) -> Any:
@@ -95,14 +118,22 @@ def _command_ages_s(bag: Path, start_ns: int, end_ns: int) -> Any:
     return np.array(list(written.values()))
 
 
-def _missed_share(bag: Path, topic: str, start_ns: int, end_ns: int) -> float | None:
-    """Share of its ticks that a node's loop missed during the drive; None for a node without ticks, or without two reports."""
-    counts = []
-    for message in read_decoded(bag, topic):
-        values = dict(zip(message.counter_names, message.counter_values, strict=True))
-        if "ticks" in values and start_ns <= ns_from_stamp(message.header.stamp) <= end_ns:
-            counts.append((values["ticks"], values["ticks_missed"]))
-    if len(counts) < 2:
-        return None
-    done, missed = (float(last - first) for first, last in zip(counts[0], counts[-1], strict=True))
+def _counters(bag: Path, topic: str, start_ns: int) -> list[tuple[int, dict[str, float]]]:
+    """The times [ns] and counters of a node's reports from the start of a drive to the end of its bag."""
+    return [
+        (at_ns, dict(zip(message.counter_names, map(float, message.counter_values), strict=True)))
+        for message in read_decoded(bag, topic)
+        if (at_ns := ns_from_stamp(message.header.stamp)) >= start_ns
+    ]
+
+
+def _rise(reports: Sequence[Mapping[str, float]], name: str) -> float:
+    """How far a counter rose from the first to the last report; 0 for a counter that the node does not have."""
+    counts = [values[name] for values in reports if name in values]
+    return counts[-1] - counts[0] if counts else 0.0
+
+
+def _missed_share(reports: Sequence[Mapping[str, float]]) -> float | None:
+    """Share of its ticks that a node's loop missed; None for a node without ticks, or without two reports."""
+    done, missed = _rise(reports, "ticks"), _rise(reports, "ticks_missed")
     return missed / (done + missed) if done + missed > 0 else None
