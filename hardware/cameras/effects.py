@@ -26,8 +26,6 @@ Draw = Callable[[Array], Rgb]
 
 _NotNegative = Annotated[float, Field(ge=0.0)]
 _Share = Annotated[float, Field(ge=0.0, lt=1.0)]
-# Number of pictures drawn between two ticks. Between them the scene is assumed to fade from one to the next.
-_MOMENTS = 5
 # Points in time at which the exposure of a row is sampled.
 _SAMPLES = 16
 
@@ -47,6 +45,8 @@ class CameraEffects(StrictModel):
         jpeg_quality: Quality of JPEG compression, 1 to 100; None for none.
         lost: Share of frames that never arrive.
         seed: Seed of all draws.
+        moments: Pictures that are drawn of each frame of a moving car, from the first row's light to the last one's. Between two of them
+            the scene is assumed to fade from one to the next. Each costs a live lab as much as an ideal frame.
     """
 
     exposure_s: _NotNegative = 0.0
@@ -60,11 +60,12 @@ class CameraEffects(StrictModel):
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] | None = None
     lost: _Share = 0.0
     seed: int = 0
+    moments: Annotated[int, Field(ge=2, le=33)] = 5
 
     @property
     def ideal(self) -> bool:
         """Whether all effects are off."""
-        return self == CameraEffects(seed=self.seed)
+        return self == CameraEffects(seed=self.seed, moments=self.moments)
 
 
 # Typical values, not measured on one camera. A ZED 2 reads 720 rows in 22 ms at 30 Hz, if its exposure register counts rows (1,100 in a
@@ -157,7 +158,7 @@ class ImperfectCamera:
         if span_s == 0.0 or dt_s <= 0.0 or not change.any():
             return self._lens(_decoded(draw(now)))
         back = change * (span_s / dt_s)  # over the whole span, at the speed since the last tick
-        times = np.linspace(-1.0, 0.0, _MOMENTS)
+        times = np.linspace(-1.0, 0.0, self.effects.moments)
         drawn = [self._lens(_decoded(draw(now + back * time))) for time in times]
         weights = _row_weights(self.pinhole.height, self.effects)
         light = np.zeros_like(drawn[0])
@@ -196,12 +197,12 @@ def _row_weights(rows: int, effects: CameraEffects) -> Array:
 
     Row r ends its exposure ``readout (rows - 1 - r) / (rows - 1)`` before the last row does.
     """
-    span_s = effects.exposure_s + effects.readout_s
+    span_s, last = effects.exposure_s + effects.readout_s, effects.moments - 1
     ends_s = -effects.readout_s * (rows - 1 - np.arange(rows)) / max(1, rows - 1)
     inside = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 1.0
     times = (ends_s[:, None] + effects.exposure_s * inside) / span_s  # -1 is the first moment, 0 the last
-    places = np.clip((times + 1.0) * (_MOMENTS - 1), 0.0, _MOMENTS - 1)
-    hats = np.maximum(0.0, 1.0 - np.abs(places[..., None] - np.arange(_MOMENTS)))
+    places = np.clip((times + 1.0) * last, 0.0, last)
+    hats = np.maximum(0.0, 1.0 - np.abs(places[..., None] - np.arange(effects.moments)))
     return np.asarray(hats.mean(axis=1), np.float64)
 
 

@@ -72,7 +72,7 @@ def _slow_camera(pictures: int) -> str:
         return ""
     return (
         f"; the simulated camera skipped {pictures} of its pictures: this machine is too slow for it, or something else runs beside it "
-        "(exposure and a rolling shutter cost five pictures for each frame)"
+        "(a camera with exposure draws its `moments` pictures for each frame: fewer are cheaper)"
     )
 
 

@@ -62,7 +62,8 @@ def test_gain_and_white_balance_are_constant_over_a_drive_and_differ_between_dri
     assert (gains[:, 0] - gains[:, 1]).std() == pytest.approx(0.1, rel=0.15)
 
 
-def test_a_rolling_shutter_leans_and_an_exposure_smears_a_moving_edge():
+@pytest.mark.parametrize("moments", [2, 5])
+def test_a_rolling_shutter_leans_and_an_exposure_smears_a_moving_edge(moments):
     # An edge that moves 40 px in a tick of 0.1 s: light right of it.
     def edge(state):
         columns = np.arange(PINHOLE.width) + 0.5
@@ -71,7 +72,7 @@ def test_a_rolling_shutter_leans_and_an_exposure_smears_a_moving_edge():
         return effects._encoded(light)
 
     def seen(**changes):
-        camera = ImperfectCamera(CameraEffects(**changes), PINHOLE)
+        camera = ImperfectCamera(CameraEffects(moments=moments, **changes), PINHOLE)
         camera.see(edge, np.array([0.0, 0.0, 0.0]), 0.1)
         return effects._decoded(camera.see(edge, np.array([0.1, 0.0, 0.0]), 0.1))[..., 0]
 
@@ -89,15 +90,17 @@ def test_a_rolling_shutter_leans_and_an_exposure_smears_a_moving_edge():
     assert np.array_equal(seen(exposure_s=0.04)[:1].repeat(48, 0), smeared)  # all rows alike
 
 
-def test_row_weights_are_those_of_a_brute_force_exposure():
-    wanted = CameraEffects(exposure_s=0.01, readout_s=0.03)
+@pytest.mark.parametrize("moments", [2, 3, 5])
+def test_row_weights_are_those_of_a_brute_force_exposure(moments):
+    wanted = CameraEffects(exposure_s=0.01, readout_s=0.03, moments=moments)
     weights = effects._row_weights(24, wanted)
     assert np.allclose(weights.sum(axis=1), 1.0)
-    moments = np.linspace(-0.04, 0.0, weights.shape[1])
+    assert weights.shape == (24, moments)
+    drawn_s = np.linspace(-0.04, 0.0, moments)
     for row in range(24):
         end = -0.03 * (23 - row) / 23
         times = np.linspace(end - 0.01, end, 4001)
-        hats = [np.interp(times, moments, np.eye(len(moments))[k]).mean() for k in range(len(moments))]
+        hats = [np.interp(times, drawn_s, np.eye(moments)[k]).mean() for k in range(moments)]
         assert np.allclose(weights[row], hats, atol=0.01)
 
 
