@@ -1,6 +1,6 @@
 """What the paper's table says on one build, and what its assumptions are worth: ``python -m benchmarks.paper_table``.
 
-Reads the published sets of ``launch/paper_*.experiment.yaml`` and ``launch/nothing_idealised.experiment.yaml`` that are complete.
+Reads those published sets of ``launch/``'s ``paper_*``, ``nothing_idealised`` and ``imperfect_camera`` experiments that are complete.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from benchmarks.results import REPOSITORY, LedgerRow
 
 COMMAND = "python -m benchmarks.paper_table"
 PUBLISHED = REPOSITORY / "docs" / "results"
-_PAPER, _IDEALISED = ("paper_car", "paper_junction"), "nothing_idealised"
+_PAPER, _IDEALISED = ("paper_car", "paper_junction"), ("nothing_idealised", "imperfect_camera")
 _METHOD, _VICTIM = "gradient", "hardened"
 # Smallest share of drives off the track, before they run into anything, and smallest share of the excess that may be left.
 _OFF_TRACK = {"green_screen": 80.0, "monitor": 60.0}
@@ -40,14 +40,15 @@ def ledger_rows(published: Path = PUBLISHED) -> list[LedgerRow]:
 
 def _rows(published: Path) -> Iterator[LedgerRow]:
     there = complete_sets(published)
-    sets = {name: read_json(published / name / SET) for name in (*_PAPER, _IDEALISED) if name in there}
+    sets = {name: read_json(published / name / SET) for name in (*_PAPER, *_IDEALISED) if name in there}
     if tests := [test for name in _PAPER if name in sets for test in sets[name]["primary"]]:
         yield _tests(tests)
     for scenario, target in _OFF_TRACK.items():
         if "paper_car" in sets:
             yield _off_track(sets["paper_car"]["rows"], scenario, target)
-    if _IDEALISED in sets:
-        yield from _left(sets[_IDEALISED]["rows"])
+    for name in _IDEALISED:
+        if name in sets:
+            yield from _left(sets[name]["rows"])
 
 
 def _tests(tests: list[dict[str, Any]]) -> LedgerRow:

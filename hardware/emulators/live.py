@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from advnerf_core.geometry import Array, VehicleState
 from advnerf_core.strict import StrictModel
@@ -48,6 +48,9 @@ class LiveLabConfig(StrictModel):
         physics_rate_hz: Steps of the car per second.
         start_pose: Initial pose of the car: x [m], y [m], yaw [rad].
         camera_effects: Imperfections of the camera: ``ideal``, ``webcam``, ``zed``, or the effects themselves.
+        camera_latency_s: Time from the end of an exposure to the picture's arrival [s], as of a camera's readout and USB; less than the
+            camera's period. A picture that takes longer to draw arrives later. Without it a standing car's pictures, which are drawn once,
+            arrive sooner than a moving one's with exposure, and the first of those comes after a gap.
     """
 
     lab: LabConfig = LabConfig()
@@ -56,6 +59,16 @@ class LiveLabConfig(StrictModel):
     physics_rate_hz: float = Field(default=200.0, ge=100.0, le=1000.0)
     start_pose: tuple[float, float, float] = (-1.1, -2.0, 0.0)
     camera_effects: Effects = PRESETS["ideal"]
+    camera_latency_s: float = Field(default=0.0, ge=0.0)
+
+    @model_validator(mode="after")
+    def _pictures_do_not_overtake(self) -> LiveLabConfig:
+        period_s = 1.0 / self.lab.camera.rate_hz
+        if self.camera_latency_s >= period_s:
+            raise ValueError(
+                f"expected camera_latency_s below {period_s:g} s, the period of lab.camera, got {self.camera_latency_s:g} s"
+            )
+        return self
 
 
 class PoseHistory:
@@ -259,6 +272,7 @@ class LiveLab:
                 pose = np.array([state.x_m, state.y_m, state.yaw_rad])
                 rgb = camera.see(drawn, pose, (tick_ns - last_ns) / NS_PER_S)
                 last_ns = tick_ns
+                self._hold_until(tick_ns + round(self.config.camera_latency_s * NS_PER_S))
                 if rgb is None:  # lost on the way: its number is missing
                     sequence += 1
                     continue
@@ -270,6 +284,10 @@ class LiveLab:
                     self._frames.publish(
                         replace(last)
                     )  # a new object: the server distinguishes frames by identity
+
+    def _hold_until(self, mono_ns: int) -> None:
+        if (rest_ns := mono_ns - time.monotonic_ns()) > 0:
+            self._stop.wait(rest_ns / NS_PER_S)
 
     def _light_monitor(self, lab: Lab) -> None:
         assert self._monitor is not None

@@ -162,10 +162,19 @@ def test_a_frozen_camera_gives_no_new_stamp(lab, fault):
         lab.freeze_camera("dusty")
 
 
+def test_a_latency_is_shorter_than_the_cameras_period():
+    with pytest.raises(ValueError, match=r"expected camera_latency_s below 0.1 s, .* got 0.1 s"):
+        LiveLabConfig(camera_latency_s=0.1)
+
+
 def test_its_camera_may_have_the_flaws_of_a_real_one(tmp_path):
-    config = LiveLabConfig(camera_effects={"read_noise": 0.02, "lost": 0.3})
+    config = LiveLabConfig(camera_effects={"read_noise": 0.02, "lost": 0.3}, camera_latency_s=0.09)
+    frames, ages_s = [], []
     with LiveLab(config, tmp_path) as lab, SocketCamera(lab.frames_path) as camera:
-        frames = [camera.read(60.0) for _ in range(12)]
+        for _ in range(12):
+            frames.append(camera.read(60.0))
+            ages_s.append(time.time() - frames[-1].stamp_realtime_ns / 1e9)
+    assert min(ages_s) >= 0.089  # the clock of day may be slewed a little
     # The car stands: one frame differs from the next by noise alone.
     light = np.stack([frame.rgb for frame in frames]).astype(np.float64)
     assert 1.0 < (light[1:] - light[:-1]).std() / np.sqrt(2.0) < 12.0
