@@ -1,6 +1,7 @@
 """Write the numbers, pictures and page of published sets again from what is kept: ``python -m benchmarks.set_pages [SET ...]``.
 
-Registrations, cells and films stay as they are. `advnerf experiment publish` does the same for one set whose run folder is on this machine.
+Registrations, cells and films stay as they are. With --page, only the page and the manifest of the files beside the sets are written:
+after a change of `sets_about.json`. `advnerf experiment publish` does the same for one set whose run folder is on this machine.
 """
 
 from __future__ import annotations
@@ -17,7 +18,9 @@ PUBLISHED = Path(__file__).resolve().parents[1] / "docs" / "results"
 def main() -> None:
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("sets", nargs="*", default=complete_sets(PUBLISHED))
-    for name in parser.parse_args().sets:
+    parser.add_argument("--page", action="store_true", help="only the page and the manifest beside the sets")
+    given = parser.parse_args()
+    for name in () if given.page else given.sets:
         print(write_numbers(PUBLISHED / name).relative_to(PUBLISHED))
     write_page(PUBLISHED)
 

@@ -73,7 +73,8 @@ def beside_problems(published: Path) -> Iterator[str]:
         yield f"{published / BESIDE}: cannot be read: {error}; advnerf experiment publish writes it"
         return
     yield from (f"{published / name}: is listed in {DIGESTS}, and has no registration" for name in missing)
-    yield from _compared(published, BESIDE, listed, digests_beside(published))
+    for problem in _compared(published, BESIDE, listed, digests_beside(published)):
+        yield f"{problem}; restore it from git, or, if the change is meant: python -m benchmarks.set_pages --page"
 
 
 def _compared(
