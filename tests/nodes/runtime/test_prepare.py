@@ -14,7 +14,7 @@ from nodes.lab.doctor.check import OK, WARNING
 from nodes.lab.doctor.priority import shares
 from nodes.runtime.bus import Bus
 from nodes.runtime.descriptors import Reserve
-from nodes.runtime.priority import FIRST, HELPER, Share, nices_to_try, share_of
+from nodes.runtime.priority import FIRST, HELPER, WORLD, Share, nices_to_try, share_of
 from tests.nodes.test_arm_live import Lab
 from tests.support.disarm import ask_to_disarm
 from tests.support.waiting import wait_for
@@ -65,12 +65,12 @@ def test_the_session_of_a_shell_is_left_alone():
     assert share_of("self").autogroup == before
 
 
-def test_safety_and_motor_get_what_the_system_allows_and_doctor_says_what():
+def test_what_stops_the_car_and_the_simulated_lab_get_what_the_system_allows_and_doctor_says_what():
     program = "import os; os.setpriority(os.PRIO_PROCESS, 0, -10)"
     allowed = python(program).returncode == 0
-    for role in ("safety", "motor"):
+    for role, nice in (("safety", FIRST), ("motor", FIRST), ("twin", WORLD)):
         done = python(f"from nodes.runtime.priority import *; print(take_share_of('{role}').nice)")
-        assert int(done.stdout) == (FIRST if allowed else 0)
+        assert int(done.stdout) == (nice if allowed else 0)
     finding = shares()[0]
     assert finding.check == "priority"
     assert finding.state == (OK if allowed else WARNING)
