@@ -29,6 +29,8 @@ from advnerf_core.places import expanded
 from advnerf_core.strict import strict_validator
 
 T = TypeVar("T")
+# What a user's code raises when it fails; a call of sys.exit would end the command as if all were well.
+FAILURES = (Exception, SystemExit)
 
 
 class PluginError(AdvnerfError):
@@ -185,11 +187,9 @@ def load_from_file(reference: str, what: str, folder: Path | None = None) -> Any
             # Not by the loader: its byte code cache compares times to the second, and a file may be saved twice in one.
             with _imports_from(file.parent, modules_beside(file)):
                 exec(compile(file.read_bytes(), file, "exec"), module.__dict__)
-        except Exception as error:
+        except FAILURES as error:
             del sys.modules[name]
-            raise PluginError(
-                f"{what} {reference}: {file} cannot be loaded: {_in_one_line(error)}"
-            ) from error
+            raise PluginError(f"{what} {reference}: {file} cannot be loaded: {in_one_line(error)}") from error
     if not hasattr(module, attribute):
         public = [each for each in vars(module) if not each.startswith("_")]
         raise PluginError(f"{what} {reference}: " + unknown(attribute, f"name in {file.name}", public))
@@ -305,14 +305,32 @@ def unknown(name: str, what: str, known: Iterable[str]) -> str:
 def _load_entry_point(entry: EntryPoint, what: str) -> Any:
     try:
         return entry.load()
-    except Exception as error:
+    except FAILURES as error:
         package = entry.dist.name if entry.dist is not None else "an installed package"
         raise PluginError(
-            f"{what} {entry.name}: {entry.value} of {package} cannot be loaded: {_in_one_line(error)}; update or remove that package"
+            f"{what} {entry.name}: {entry.value} of {package} cannot be loaded: {in_one_line(error)}; update or remove that package"
         ) from error
 
 
-def _in_one_line(error: Exception) -> str:
+@contextmanager
+def exit_refused() -> Iterator[None]:
+    """Make an error of ``sys.exit()`` and ``sys.exit(0)`` in a user's code, which would end a command as if all were well.
+
+    Raises:
+        PluginError: The code inside has called one of them.
+    """
+    try:
+        yield
+    except SystemExit as asked:
+        if asked.code not in (None, 0):
+            raise
+        raise PluginError(
+            "expected a policy, method or other code of yours to return, it has called sys.exit"
+        ) from asked
+
+
+def in_one_line(error: BaseException) -> str:
+    """Type and text of an error, without line breaks."""
     return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 

@@ -50,6 +50,8 @@ _OTHER_KEYS = (
     "white_transparent", "black_transparent", "mask_color", "fix_premult", "fisheye_crop_radius", "depth_file_path", "depth_path",
     "timestamp", "time",
 )  # fmt: skip
+# In the order in which they count where a file has several.
+_FOCAL_FORMS = (("fl_x", "fl_y"), ("camera_angle_x", "camera_angle_y"), ("x_fov", "y_fov"))
 _SPLITS = (TRAIN, *HELD_OUT_SPLITS)
 # Relative to the spread of the cameras, in any unit: single precision resolves a thousandth of the spread there. Anything farther has
 # a map's origin, not a scene's.
@@ -106,9 +108,8 @@ def _read_set(path: Path, split: str | None, require_all: bool) -> PosedImages:
             if image is None:
                 missing.append(path.parent / name)
                 continue
-            frames.append(
-                _frame(path.parent, image, {**content, **entry}, split or split_of.get(_normal(name)))
-            )
+            values = {**_without_other_focal_lengths(content, entry), **entry}
+            frames.append(_frame(path.parent, image, values, split or split_of.get(_normal(name))))
         except ValueError as error:
             label = f" ({entry['file_path']})" if isinstance(entry, dict) and "file_path" in entry else ""
             wrong.append(DatasetError(f"{path}: frame {number}{label}: {error}"))
@@ -267,9 +268,19 @@ def _says_something(value: Any) -> bool:
     return value not in (None, False, 0, "", "none", "pinhole", "perspective", "PINHOLE", "PERSPECTIVE")
 
 
+def _without_other_focal_lengths(content: _Values, entry: _Values) -> _Values:
+    """The file's values without focal lengths in another form than the frame's, which would go before the frame's own."""
+    form = next((keys for keys in _FOCAL_FORMS if any(entry.get(key) is not None for key in keys)), None)
+    others = {key for keys in _FOCAL_FORMS if form not in (None, keys) for key in keys}
+    return {key: value for key, value in content.items() if key not in others}
+
+
 def _pinhole(image: Path, values: _Values) -> Pinhole:
-    if values.get("w") is not None and values.get("h") is not None:
-        width, height = (int(_number(values, key, 0.0, positive=True)) for key in ("w", "h"))
+    given = [key for key in ("w", "h") if values.get(key) is not None]
+    if len(given) == 2:
+        width, height = (int(_number(values, key, 0.0, positive=True)) for key in given)
+    elif given:
+        raise ValueError(f"{given[0]}: expected both w and h, or neither, got {given[0]} alone")
     else:
         width, height = image_size(image)
     fx, fy = _focal_length(values, "x", width), _focal_length(values, "y", height)

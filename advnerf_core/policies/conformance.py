@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from advnerf_core.plugins import in_one_line
 from advnerf_core.policies.adapter import AdaptedPolicy
 from advnerf_core.policies.answer import answer
 from advnerf_core.policies.contract import PolicyContractError
@@ -74,7 +75,12 @@ def check_policy(
     if runs.verdict == FAILURE:
         return findings
     for look in (_finite, _answer, _repeatable, _independent, _gradient):
-        finding = look(examined, images)
+        try:
+            finding = look(examined, images)
+        except Exception as error:  # such as a picture that forward changes in place
+            finding = Finding(
+                look.__name__.strip("_"), FAILURE, f"the network fails: {in_one_line(error):.160}"
+            )
         findings.append(finding)
         if finding.verdict == FAILURE and look in (_finite, _repeatable):
             return findings

@@ -39,6 +39,10 @@ _SECTIONS: dict[str, Any] = {
 # Keys that came later. Without them, declarations keep their text, and policies their hash.
 _LATER = ("input_name", "output_name", "output_index", "output_column", *_SECTIONS)
 RAD_PER_DEG = pi / 180.0
+# Above these, degrees or millimetres were meant.
+_LARGEST = (
+    ("full_steering_rad", 1.5, "rad (25 degrees are 0.436)"), ("wheelbase_m", 20.0, "m"), ("steering_ratio", 100.0, "to 1"),
+)  # fmt: skip
 
 
 class PolicyContractError(AdvnerfError, ValueError):
@@ -170,6 +174,10 @@ class PolicyContract:
                 raise PolicyContractError(
                     f"{name}: expected a number > 0 with output_unit = {unit!r}, got {value}"
                 )
+        for name, most, unit in _LARGEST:
+            value = getattr(self, name)
+            if value is not None and value > most:
+                raise PolicyContractError(f"{name}: expected at most {most:g} {unit}, got {value:g}")
         if self.output_unit in ("normalised", "1/m") and self.steering_ratio != 1.0:
             raise PolicyContractError(
                 f"steering_ratio: expected it with output_unit = 'rad' or 'deg' only, got {self.output_unit!r}"

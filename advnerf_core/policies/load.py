@@ -18,6 +18,7 @@ from weakref import WeakKeyDictionary
 
 from advnerf_core.code_files import module_sha256
 from advnerf_core.inputs import InputFiles
+from advnerf_core.plugins import FAILURES, in_one_line
 from advnerf_core.policies.contract import PolicyContract, PolicyContractError
 from advnerf_core.policies.declaration import DECLARATION_SUFFIX
 from advnerf_core.policies.driver import Driver
@@ -139,12 +140,14 @@ def _from_factory(spec: str) -> tuple[AdaptedPolicy, str]:
         raise PolicyContractError(
             f"cannot find {spec}: {error}; start in the folder that holds it"
         ) from error
+    except FAILURES as error:
+        raise PolicyContractError(f"{spec}: {module_name} cannot be loaded: {in_one_line(error)}") from error
     try:
         policy = factory()
-    except Exception as error:
+    except FAILURES as error:
         if isinstance(error, PolicyContractError):
             raise
-        raise PolicyContractError(f"{spec}() failed: {type(error).__name__}: {error}") from error
+        raise PolicyContractError(f"{spec}() failed: {in_one_line(error)}") from error
     if not isinstance(policy, AdaptedPolicy):
         raise PolicyContractError(
             f"expected {spec}() to return adapt(network, PolicyContract(...)), got {type(policy).__name__}"

@@ -10,6 +10,7 @@ import pytest
 from advnerf_core.plugins import (
     PluginError,
     absolute_reference,
+    exit_refused,
     is_file_reference,
     known_names,
     require_known,
@@ -100,6 +101,7 @@ def test_a_file_is_loaded_from_its_folder_and_again_when_it_changes(tmp_path: Pa
     ("body", "name", "message"),
     [
         (None, "mine.py:Mine", "expected a Python file at"),
+        ("raise SystemExit(0)\n", "mine.py:Mine", "cannot be loaded: SystemExit: 0"),
         ("x = 1 / 0\n", "mine.py:Mine", "cannot be loaded: ZeroDivisionError: division by zero"),
         (
             "Mime = 1\n",
@@ -116,6 +118,14 @@ def test_a_file_that_does_not_do_is_one_line(
     with pytest.raises(PluginError, match=message) as caught:
         resolve(name, "world", {}, GROUP, tmp_path)
     assert "\n" not in str(caught.value)
+
+
+def test_a_user_s_code_does_not_end_a_command_as_if_all_were_well() -> None:
+    for asked in (None, 0):
+        with pytest.raises(PluginError, match=r"to return, it has called sys\.exit"), exit_refused():
+            sys.exit(asked)
+    with pytest.raises(SystemExit, match="143"), exit_refused():  # asked to end by a signal
+        sys.exit(143)
 
 
 def test_references_become_absolute_for_workers(tmp_path: Path) -> None:

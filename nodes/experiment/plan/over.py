@@ -16,6 +16,7 @@ from advnerf_core.plugins import name_in_results
 from advnerf_core.report.conditions import NONE
 from advnerf_core.strict import StrictModel
 from nodes.experiment.plan.method_names import ConditionReference
+from nodes.experiment.plan.numbers import Count
 from nodes.experiment.plan.victims import VictimName
 
 # Names become parts of file names, which are separated by "_" and "."; a variant may hold "_", victims may not.
@@ -50,7 +51,7 @@ class OverConfig(StrictModel):
         description="What victims meet: the controls none (the plain object) and empty (no object), and methods of attack; also file.py:Name, relative "
         "to the experiment file.",
     )
-    seed: tuple[int, ...] = Field(
+    seed: tuple[Count, ...] = Field(
         default=(0,), min_length=1, description="Seeds of the searches: one search of each method per seed."
     )
 

@@ -14,7 +14,7 @@ from advnerf_core.geometry import Array, make_transform, rotation_x, rotation_y,
 from advnerf_core.strict import StrictModel
 from hardware.worlds.paths import ReferencePath
 from hardware.worlds.world import WorldDescription
-from nodes.experiment.plan.numbers import PositiveNumber, Unit
+from nodes.experiment.plan.numbers import Angle, PositiveNumber, Unit
 from nodes.experiment.plan.object_kinds import (
     BALL,
     CUBE,
@@ -122,11 +122,11 @@ class PlacedObject(StrictModel):
     x_m: float
     y_m: float
     z_m: float = 0.0
-    yaw_rad: float = 0.0
+    yaw_rad: Angle = 0.0
     scale: float = Field(default=1.0, gt=0.0, le=2.0)
     bounds: PoseBoundsConfig | None = None
-    pitch_rad: float = 0.0
-    roll_rad: float = 0.0
+    pitch_rad: Angle = 0.0
+    roll_rad: Angle = 0.0
     face: FaceConfig | None = None
     mesh: MeshConfig | None = None
     levels: Annotated[int, Field(ge=0, le=32)] = 0

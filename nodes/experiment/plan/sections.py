@@ -10,7 +10,7 @@ from advnerf_core.attack.objectives import CTE
 from advnerf_core.policies.architecture import PILOTNET, Architecture, require_architecture
 from advnerf_core.strict import StrictModel
 from nodes.experiment.plan.method_names import ArchitectureReference, ObjectiveReference
-from nodes.experiment.plan.numbers import Count, NotNegative, Positive, PositiveNumber, Unit
+from nodes.experiment.plan.numbers import Angle, Count, Delay, NotNegative, Positive, PositiveNumber, Unit
 from nodes.experiment.plan.robustness_config import RobustnessConfig
 
 # Fields of the section policy that define the network; its description replaces them in keys.
@@ -99,7 +99,7 @@ class PolicyConfig(StrictModel):
     feed_forward: Unit = Field(
         default=1.0, description="Share of the path's curvature that the expert steers ahead."
     )
-    delay_s: NotNegative = Field(
+    delay_s: Delay = Field(
         default=0.1,
         description="What the expert looks ahead by: half a tick and part of the deployed car's lag [s].",
     )
@@ -227,10 +227,8 @@ class MeasureConfig(StrictModel):
 class ResponseConfig(StrictModel):
     """Response of the searched car beyond its calibration; the car needs wheels that steer."""
 
-    delay_s: NotNegative = Field(
-        default=0.0, description="From image to wheels, fractions of a tick allowed [s]."
-    )
-    lag_s: NotNegative = Field(default=0.0, description="Time constant of the steering [s].")
+    delay_s: Delay = Field(default=0.0, description="From image to wheels, fractions of a tick allowed [s].")
+    lag_s: Delay = Field(default=0.0, description="Time constant of the steering [s].")
     slew_radps: PositiveNumber | None = Field(
         default=None, description="Limit of the wheels' rate [rad/s]; none: no limit."
     )
@@ -260,7 +258,7 @@ class AttackConfig(StrictModel):
     start_sigma: NotNegative = Field(
         default=0.1, description="Spread of starts [m and rad]; headings a quarter of it."
     )
-    start_poses: tuple[tuple[float, float, float], ...] = Field(
+    start_poses: tuple[tuple[float, float, Angle], ...] = Field(
         default=(), description="x [m], y [m], yaw [rad] of each start; if given, nothing is drawn."
     )
     goals: tuple[tuple[float, ...], ...] = Field(

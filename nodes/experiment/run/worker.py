@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, Literal, TextIO
 
 from advnerf_core.files import write_atomically
+from advnerf_core.plugins import exit_refused, in_one_line
 from advnerf_core.run_module import module_command
 from nodes.experiment.engine.artefact import digests_in
 from nodes.experiment.plan.cell import Cell
@@ -154,9 +155,10 @@ def run_here(job: Job, store: Store, experiment: Experiment, bench: Bench, repor
     with lock:
         work = _begin(job, store, experiment)
         try:
-            _run(job, store, work, experiment, report, bench)
+            with exit_refused():
+                _run(job, store, work, experiment, report, bench)
         except Exception as error:
-            text = _in_one_line(error)
+            text = in_one_line(error)
             store.keep_error(job.name, job.settings_hash, text)
             (work / LOG).write_text(traceback.format_exc(), encoding="utf-8")
             return Ended(job.name, "failed", text, time.monotonic() - began)
@@ -192,15 +194,12 @@ def _run_job() -> None:
         with open(work / LOG, "a", encoding="utf-8", buffering=1) as log:
             os.dup2(log.fileno(), 1)
             try:
-                _run(job, store, work, experiment, _log_progress())
+                with exit_refused():
+                    _run(job, store, work, experiment, _log_progress())
             except Exception as error:
                 traceback.print_exc(file=log)
-                store.keep_error(job.name, job.settings_hash, _in_one_line(error))
+                store.keep_error(job.name, job.settings_hash, in_one_line(error))
                 raise SystemExit(_FAILED) from None
-
-
-def _in_one_line(error: Exception) -> str:
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
 def take_cell(store: Store, name: str) -> TextIO:
@@ -227,7 +226,7 @@ def _checked(job: Job, store: Store) -> Experiment:
                 f"{job.name}: its settings or inputs changed after the experiment was started; run it again"
             )
     except Exception as error:
-        store.keep_error(job.name, job.settings_hash, _in_one_line(error))
+        store.keep_error(job.name, job.settings_hash, in_one_line(error))
         raise SystemExit(_FAILED) from None
     return experiment
 

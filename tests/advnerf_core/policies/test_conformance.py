@@ -226,6 +226,15 @@ def test_no_gradient(before, after, sentence):
     assert findings(around(before, after), replace(DECLARED, differentiable=False))["gradient"].verdict == OK
 
 
+def test_a_picture_that_is_changed_in_place_fails_the_check_of_the_gradient():
+    found = findings(around(lambda x: x.mul_(1.0)))
+    assert found["gradient"].verdict == FAILURE
+    assert (
+        "the network fails: RuntimeError: a view of a leaf Variable that requires grad"
+        in found["gradient"].text
+    )
+
+
 def test_a_constant_output():
     found = findings(around(after=lambda y: 0 * y + 0.1))
     assert "steers 0.1000 rad whatever it sees" in found["range"].text

@@ -251,6 +251,16 @@ def test_a_factory_is_found_frozen_and_named_by_its_content(tmp_path, monkeypatc
     }.items():
         with pytest.raises(PolicyContractError, match=message):
             load_any_policy(f"somebodys_policy:{name}")
+    for number, (code, message) in enumerate(
+        {
+            "import os\nos = = 1\n": "my_broken_0 cannot be loaded: SyntaxError: invalid syntax",
+            "print(undefined)\n": "my_broken_1 cannot be loaded: NameError: name 'undefined'",
+            "import sys\nsys.exit(0)\n": "my_broken_2 cannot be loaded: SystemExit: 0",
+        }.items()
+    ):
+        (tmp_path / f"my_broken_{number}.py").write_text(code)
+        with pytest.raises(PolicyContractError, match=message):
+            load_any_policy(f"my_broken_{number}:factory")
     with pytest.raises(
         PolicyContractError, match=r"expected a file of .safetensors, .onnx, .pt2 or package.module:factory"
     ):
@@ -402,6 +412,14 @@ def test_a_public_pilotnet_steers_alike_live_in_onnx_and_in_an_attack(tmp_path, 
             "full_steering_rad: expected a number > 0 with output_unit = 'normalised'",
         ),
         ({"output_unit": "1/m", "full_steering_rad": None}, "wheelbase_m: expected a number > 0"),
+        (
+            {"full_steering_rad": 25.0},
+            r"full_steering_rad: expected at most 1\.5 rad \(25 degrees are 0\.436\), got 25",
+        ),
+        (
+            {"output_unit": "1/m", "full_steering_rad": None, "wheelbase_m": 2700.0},
+            "wheelbase_m: expected at most 20 m, got 2700",
+        ),
         ({"output_unit": "rad"}, "full_steering_rad: expected it with output_unit = 'normalised' only"),
         ({"steering_ratio": 15.0}, "steering_ratio: expected it with output_unit = 'rad' or 'deg' only"),
         ({"colour_space": "GRAY", "mean": (1.0, 2.0, 3.0)}, "mean: expected 1 number or 1"),

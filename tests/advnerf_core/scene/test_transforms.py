@@ -94,6 +94,16 @@ def test_fields_of_view_in_degrees_and_of_both_axes(tmp_path):
     assert (pinhole.fx, pinhole.fy) == (pytest.approx(WIDTH / 2), pytest.approx(HEIGHT / 2))
 
 
+def test_a_focal_length_of_a_frame_goes_before_one_of_the_file_in_another_form(tmp_path):
+    """Two of three frames have another lens; the file's fl_x and fl_y are those of the third."""
+    own = [{}, {"camera_angle_x": np.pi / 2}, {"fl_x": 50.0}]
+    frames = [{"file_path": f"{k}.png", "transform_matrix": pose(k), **each} for k, each in enumerate(own)]
+    file, wide = write(tmp_path, frames, fl_y=31.0), WIDTH / 2
+    fl_x = json.loads(file.read_text())["fl_x"]
+    found = [(each.pinhole.fx, each.pinhole.fy) for each in load_transforms(file).frames]
+    assert found == [(fl_x, 31.0), (pytest.approx(wide), pytest.approx(wide)), (50.0, 31.0)]
+
+
 def test_cameras_of_one_set_keep_their_own_intrinsics_and_names(tmp_path):
     for name in ("phone.png", "car.png"):
         paint(tmp_path / name)
@@ -165,6 +175,7 @@ FRAME = r"transforms\.json: frame 1 \(1\.png\): "
             {"fl_x": None, "camera_angle_x": 4.0},
             FRAME + "camera_angle_x: expected a field of view below a half turn",
         ),
+        ({"w": WIDTH, "h": None}, FRAME + "w: expected both w and h, or neither, got w alone"),
         ({"cx": "middle"}, FRAME + "cx: expected a number, got 'middle'"),
         ({"mask_path": "no.png"}, FRAME + r"mask_path: expected a mask at .*no\.png"),
         ({"file_path": 7}, r"transforms\.json: frame 1 \(7\): file_path: expected the name"),

@@ -84,6 +84,24 @@ def test_what_stands_in_a_lane_is_found(
             raise ValueError(message)
 
 
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (
+            "objects=[{name: one, kind: hydrant, x_m: 6, y_m: 8, yaw_rad: 180}]",
+            r"yaw_rad: .*at most a turn of 6\.2832, got 180; .* is 3\.1416",
+        ),
+        ("attack.response={delay_s: 160}", r"delay_s: .*5"),
+        ("over.seed=[-1]", "over.seed.*0"),
+    ],
+)
+def test_degrees_milliseconds_and_negative_seeds_are_refused_at_once(
+    tmp_path: Path, change: str, told: str
+) -> None:
+    with pytest.raises(ValueError, match=told):
+        load_experiment(LAUNCH, "full", [change], tmp_path)
+
+
 def test_an_object_in_a_lane_is_told_with_its_line(tmp_path: Path) -> None:
     text = LAUNCH.read_text().replace("x_m: -3.95, y_m: -14.0", "x_m: -2.0, y_m: -14.0")
     file = tmp_path / "moved.experiment.yaml"
