@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from advnerf_core.report.evidence.verify import write_numbers, write_page
+from advnerf_core.report.evidence.publishing import write_numbers, write_page
 from advnerf_core.report.evidence.verifying.layout import complete_sets
 
 PUBLISHED = Path(__file__).resolve().parents[1] / "docs" / "results"

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 
-from advnerf_core.report.evidence.verify import sets_in
+from advnerf_core.report.evidence.verifying.layout import sets_in
 from benchmarks.results import REPOSITORY, record_row
 
 _LIMIT_S = 60.0

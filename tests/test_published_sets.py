@@ -4,8 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from advnerf_core.report.evidence.verify import sets_in, verify_beside, verify_set
+from advnerf_core.report.evidence.verify import verify_beside, verify_set
 from advnerf_core.report.evidence.verifying.history import verify_history
+from advnerf_core.report.evidence.verifying.layout import sets_in
 from benchmarks.kept_commands import kept_by
 from benchmarks.kept_rows import computed_again, row_problems
 from benchmarks.page_numbers import count_numbers

@@ -8,8 +8,8 @@ from pathlib import Path
 from advnerf_core.documents import read_json
 from advnerf_core.report.evidence.page import film_of, picture_of
 from advnerf_core.report.evidence.registration import WITHDRAWN
-from advnerf_core.report.evidence.verify import DIGESTS, PAGE, SET
 from advnerf_core.report.evidence.verifying.digests import write_known_digest
+from advnerf_core.report.evidence.verifying.layout import DIGESTS, PAGE, SET
 from advnerf_core.report.evidence.verifying.victims import DECLARED
 from benchmarks.planting.world import World
 

@@ -9,7 +9,7 @@ from advnerf_core.report.evidence.kept import KeptDrive
 from advnerf_core.report.evidence.page import film_of, picture_of
 from advnerf_core.report.evidence.publishing import write_page
 from advnerf_core.report.evidence.registration import FILE
-from advnerf_core.report.evidence.verify import DIGESTS
+from advnerf_core.report.evidence.verifying.layout import DIGESTS
 from benchmarks.planting.of_cells import a_later_date
 from benchmarks.planting.world import Data, World
 

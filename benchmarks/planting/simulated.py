@@ -15,6 +15,7 @@ from advnerf_core.driving.metrics import DriveMetrics, drive_metrics
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.report.evidence.kept import KeptDrive
 from advnerf_core.report.evidence.page import film_of
+from advnerf_core.report.evidence.publishing import write_numbers, write_page
 from advnerf_core.report.evidence.registration import (
     FILE,
     WITHDRAWN,
@@ -24,7 +25,6 @@ from advnerf_core.report.evidence.registration import (
     RegisteredScenario,
     Registration,
 )
-from advnerf_core.report.evidence.verify import write_set
 
 Floats = NDArray[np.float64]
 NAME, CONDITIONS, GIVEN_UP = "simulated", ("track", "own"), "later"
@@ -57,7 +57,9 @@ def write_simulated_set(folder: Path, searches: int = 6, starts: int = 5, seed: 
     (folder / WITHDRAWN).write_text(json.dumps({GIVEN_UP: "It would have taken two days."}) + "\n")
     _write_cells(folder, Simulated(registration, path, rng))
     _write_beside(folder, registration)
-    return write_set(folder)
+    file = write_numbers(folder)
+    write_page(folder.parent)
+    return file
 
 
 def _registration(

@@ -21,9 +21,8 @@ from advnerf_core.report.evidence.kept import KeptDrive
 from advnerf_core.report.evidence.publishing import write_page
 from advnerf_core.report.evidence.registration import FILE, Registration, read_withdrawn
 from advnerf_core.report.evidence.results import Evidence
-from advnerf_core.report.evidence.verify import SET, digests_of, sets_in
-from advnerf_core.report.evidence.verifying.digests import write_beside, write_known_digest
-from advnerf_core.report.evidence.verifying.layout import read_set
+from advnerf_core.report.evidence.verifying.digests import digests_of, write_beside, write_known_digest
+from advnerf_core.report.evidence.verifying.layout import SET, read_set, sets_in
 from advnerf_core.report.evidence.verifying.numbers import published_numbers
 from advnerf_core.report.evidence.verifying.victims import read_declared
 from benchmarks.page_numbers import write_list

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import pearsonr, spearmanr
 
-from advnerf_core.report.evidence.verify import sets_in
+from advnerf_core.report.evidence.verifying.layout import sets_in
 from benchmarks.predictions import PUBLISHED, evidence_of
 from benchmarks.transfer_correlation import SetPoints, correlation, line, lower_bound, points_of
 

@@ -21,13 +21,6 @@ from advnerf_core.report.evidence.verifying.pictures import write_picture
 from advnerf_core.report.evidence.verifying.victims import read_declared
 
 
-def write_set(folder: Path) -> Path:
-    """Write a set as `write_numbers` does, and the page of all sets."""
-    file = write_numbers(folder)
-    write_page(folder.parent)
-    return file
-
-
 def write_numbers(folder: Path) -> Path:
     """Write the manifest, the numbers and the pictures of a set, and beside its folder its digest.
 

@@ -14,25 +14,12 @@ from pathlib import Path
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.report.cells import CellError, CellResult
 from advnerf_core.report.evidence.about import check_about
-from advnerf_core.report.evidence.publishing import page_text, write_numbers, write_page, write_set
+from advnerf_core.report.evidence.publishing import page_text
 from advnerf_core.report.evidence.registration import RegistrationError, read_withdrawn
 from advnerf_core.report.evidence.results import Evidence
 from advnerf_core.report.evidence.verifying.checks import set_problems
-from advnerf_core.report.evidence.verifying.digests import (
-    beside_problems,
-    digests_of,
-    file_problems,
-    known_digests,
-)
-from advnerf_core.report.evidence.verifying.layout import (
-    BESIDE,
-    DIGESTS,
-    PAGE,
-    SET,
-    SetError,
-    read_set,
-    sets_in,
-)
+from advnerf_core.report.evidence.verifying.digests import beside_problems, file_problems, known_digests
+from advnerf_core.report.evidence.verifying.layout import PAGE, SET, SetError, read_set, sets_in
 from advnerf_core.report.evidence.verifying.numbers import number_problems, published_numbers
 from advnerf_core.report.evidence.verifying.registered import missing_cells
 from advnerf_core.report.evidence.verifying.victims import drives_badly, read_declared
@@ -136,20 +123,3 @@ def _findings(evidence: Evidence, problems: Sequence[str]) -> Iterator[str]:
             f"{row['scenario']} {row['placement']} {row['victim']} does not drive well {row['domain']}: mean |CTE| {row['mean_cte_m']:.4f} m without "
             f"attack, at most {row['limit_m']:.4f} m was registered; {row['off_track']} drives off the track"
         ).replace("  ", " ")
-
-
-__all__ = [
-    "BESIDE",
-    "DIGESTS",
-    "PAGE",
-    "SET",
-    "SetError",
-    "Verified",
-    "digests_of",
-    "sets_in",
-    "verify_beside",
-    "verify_set",
-    "write_numbers",
-    "write_page",
-    "write_set",
-]

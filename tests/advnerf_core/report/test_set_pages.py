@@ -15,8 +15,8 @@ from advnerf_core.report.evidence.above import MOST_BYTES, moment_of, write_abov
 from advnerf_core.report.evidence.page import above_of, film_of, groups_of_searches, searched_apart
 from advnerf_core.report.evidence.registration import PrimaryTest, read_registration
 from advnerf_core.report.evidence.results import Evidence, rows
-from advnerf_core.report.evidence.verify import sets_in, verify_beside, verify_set
-from advnerf_core.report.evidence.verifying.layout import complete_sets
+from advnerf_core.report.evidence.verify import verify_beside, verify_set
+from advnerf_core.report.evidence.verifying.layout import complete_sets, sets_in
 from advnerf_core.report.evidence.words import claim, excesses, p_text, smaller_excess
 from benchmarks.planted_changes import write_simulated_set
 

@@ -13,6 +13,7 @@ from scipy import stats
 from typer.testing import CliRunner
 
 from advnerf_core.report.cells import read_cells
+from advnerf_core.report.evidence.publishing import write_page
 from advnerf_core.report.evidence.registration import (
     FILE,
     WITHDRAWN,
@@ -21,24 +22,15 @@ from advnerf_core.report.evidence.registration import (
     withdraw,
 )
 from advnerf_core.report.evidence.results import Evidence, primary_tests, rows
-from advnerf_core.report.evidence.verify import (
-    BESIDE,
-    DIGESTS,
-    PAGE,
-    SET,
-    SetError,
-    sets_in,
-    verify_beside,
-    verify_set,
-    write_page,
-    write_set,
-)
+from advnerf_core.report.evidence.verify import verify_beside, verify_set
 from advnerf_core.report.evidence.verifying.drives import drive_problems
+from advnerf_core.report.evidence.verifying.layout import BESIDE, DIGESTS, PAGE, SET, SetError, sets_in
 from advnerf_core.report.evidence.verifying.pictures import picture_problems
 from advnerf_core.report.evidence.verifying.victims import DECLARED, declare
 from benchmarks.planting.simulated import write_simulated_set
 from benchmarks.planting.world import World, poses_of
 from nodes.cli.main import app
+from tests.support.published import write_set
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from advnerf_core.attack.artifact import load_attack, save_attack
 from advnerf_core.report.cells import read_cells
 from advnerf_core.report.evidence.hardness import PUBLISHED_FILE
 from advnerf_core.report.evidence.kept_build import LOST
-from advnerf_core.report.evidence.verify import verify_set, write_set
+from advnerf_core.report.evidence.verify import verify_set
 from nodes.experiment.engine.artefact import BUILD, RECORD, ReferenceBuild, read_artefact, write_artefact
 from nodes.experiment.run.cells import keep_build
 from nodes.experiment.run.kept_attacks import attack_problems, with_attacks
@@ -19,6 +19,7 @@ from nodes.experiment.run.redrive import RedriveError, redrive
 from nodes.experiment.run.registering import register
 from nodes.experiment.run.run import Options, run_cells
 from nodes.experiment.steps import run
+from tests.support.published import write_set
 from tests.support.stage_versions import tiny_experiment
 
 CHANGES = ("over.method=[none,gradient]", "over.seed=[0,1]", "measure.starts=2", "deploy.starts=1")
