@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+from junitparser import Error, Failure, Skipped, TestCase, TestSuite
 
 from advnerf_core.files import write_atomically
 from advnerf_core.report.audit_result import AuditResult
-
-if TYPE_CHECKING:
-    from junitparser import TestCase
 
 SUITE = "advnerf audit"
 # The test that the verdict decides.
@@ -23,8 +21,6 @@ def write_junit(file: Path, result: AuditResult) -> None:
     The test of the verdict fails if an object was found, or if the policy is worse than before. It is an error if the audit cannot
     judge. The conditions of a verdict are tests too: a trusted copy of the place, and the planted control.
     """
-    from junitparser import TestSuite
-
     suite = TestSuite(SUITE)
     if result.date is not None:
         suite.timestamp = result.date.replace(microsecond=0).isoformat()
@@ -39,8 +35,6 @@ def write_junit(file: Path, result: AuditResult) -> None:
 
 def _needs(result: AuditResult) -> Iterator[TestCase]:
     """The conditions of a verdict. Those that a verdict did not need are skipped."""
-    from junitparser import Failure, Skipped, TestCase
-
     problem = Failure if result.verdict.outcome == "cannot_judge" else Skipped
     if result.fidelity is not None:
         trusted = TestCase("the learned copy of the place is trusted")
@@ -57,8 +51,6 @@ def _needs(result: AuditResult) -> Iterator[TestCase]:
 
 
 def _verdict(result: AuditResult) -> TestCase:
-    from junitparser import Error, Failure, TestCase
-
     case = TestCase(HOLDS_PATH)
     if result.budget.seconds is not None:
         case.time = round(result.budget.seconds, 3)

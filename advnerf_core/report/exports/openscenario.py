@@ -13,6 +13,9 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+from scenariogeneration import xosc
+from scenariogeneration.helpers import prettify
+
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
 from advnerf_core.report.audit_parts import (
@@ -46,14 +49,10 @@ def write_openscenario(file: Path, result: AuditResult) -> None:
     Raises:
         ExportError: The audit judged no object.
     """
-    from scenariogeneration.helpers import prettify
-
     write_atomically(file, prettify(_scenario(result).get_element(), "utf-8"))
 
 
 def _scenario(result: AuditResult) -> Any:
-    from scenariogeneration import xosc
-
     judged, drives = result.strongest, result.judgement
     if judged is None or result.vehicle is None:
         raise ExportError(
@@ -79,8 +78,6 @@ def _scenario(result: AuditResult) -> Any:
 
 
 def _vehicle(vehicle: AuditedVehicle) -> Any:
-    from scenariogeneration import xosc
-
     base, assumed = vehicle.wheelbase_m, ["wheels", "maxSpeed", "maxAcceleration", "maxDeceleration"]
 
     def known(name: str, value: float | None, otherwise: float) -> float:
@@ -110,8 +107,6 @@ def _vehicle(vehicle: AuditedVehicle) -> Any:
 
 
 def _misc_object(placed: AuditedObject) -> Any:
-    from scenariogeneration import xosc
-
     depth, width, height = placed.size_m
     box = xosc.BoundingBox(width, depth, height, 0.0, 0.0, 0.5 * height)
     category = xosc.MiscObjectCategory.obstacle
@@ -126,8 +121,6 @@ def _misc_object(placed: AuditedObject) -> Any:
 
 
 def _storyboard(vehicle: AuditedVehicle, placed: AuditedObject, drives: AuditedDrives) -> Any:
-    from scenariogeneration import xosc
-
     pose, init = placed.pose, xosc.Init()
     where = xosc.WorldPosition(pose.x_m, pose.y_m, pose.z_m, pose.yaw_rad, pose.pitch_rad, pose.roll_rad)
     init.add_init_action(OBJECT, xosc.TeleportAction(where))
@@ -147,8 +140,6 @@ def _storyboard(vehicle: AuditedVehicle, placed: AuditedObject, drives: AuditedD
 
 def _start(drives: AuditedDrives) -> Any:
     """Position of the vehicle at the beginning: of the stored drive, else of the path, else the first judging start."""
-    from scenariogeneration import xosc
-
     points: list[RoutePoint | JudgedStart] = [*drives.route, *drives.path, *drives.starts]
     first = points[0]
     return xosc.WorldPosition(first.x_m, first.y_m, 0.0, first.yaw_rad)
@@ -156,8 +147,6 @@ def _start(drives: AuditedDrives) -> Any:
 
 def _route(path: tuple[RoutePoint, ...]) -> Any:
     """The path as waypoints: evenly spread points of it, including both ends."""
-    from scenariogeneration import xosc
-
     count = min(_WAYPOINTS, len(path))
     route = xosc.Route("path")
     for index in range(count):
@@ -169,8 +158,6 @@ def _route(path: tuple[RoutePoint, ...]) -> Any:
 
 def _replay(route: tuple[RoutePoint, ...]) -> Any:
     """A maneuver that follows the driven trajectory in time, if the parameter asks for it."""
-    from scenariogeneration import xosc
-
     trajectory = xosc.Trajectory("driven", False)
     trajectory.add_shape(xosc.Polyline([point.t_s for point in route], [_position(point) for point in route]))
     follow = xosc.FollowTrajectoryAction(
@@ -186,6 +173,4 @@ def _replay(route: tuple[RoutePoint, ...]) -> Any:
 
 
 def _position(point: RoutePoint) -> Any:
-    from scenariogeneration import xosc
-
     return xosc.WorldPosition(point.x_m, point.y_m, 0.0, point.yaw_rad)

@@ -9,13 +9,28 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+from urllib.parse import quote
+
+from sarif_pydantic import (
+    Artifact,
+    ArtifactLocation,
+    Invocation,
+    Level,
+    Location,
+    LogicalLocation,
+    Message,
+    PhysicalLocation,
+    ReportingDescriptor,
+    Result,
+    Run,
+    Sarif,
+    Tool,
+    ToolDriver,
+)
 
 from advnerf_core.files import write_atomically
 from advnerf_core.report.audit_result import AuditResult
-
-if TYPE_CHECKING:
-    from sarif_pydantic import Location, Result
 
 SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
 OFF_PATH, WORSE = "ADV1001", "ADV1002"
@@ -37,8 +52,6 @@ _KINDS = {"nothing_found": "pass", "found": "fail", "cannot_judge": "open", "wor
 
 def write_sarif(file: Path, result: AuditResult) -> None:
     """Write the verdict as SARIF 2.1.0 (extra ``audit``)."""
-    from sarif_pydantic import Invocation, ReportingDescriptor, Run, Sarif, Tool, ToolDriver
-
     rules = [
         ReportingDescriptor(
             id=rule,
@@ -61,8 +74,6 @@ def write_sarif(file: Path, result: AuditResult) -> None:
 
 
 def _result(result: AuditResult) -> Result:
-    from sarif_pydantic import Level, Message, Result
-
     rule = WORSE if result.verdict.outcome == "worse" else OFF_PATH
     level = Level.NONE
     if _KINDS[result.verdict.outcome] == "fail":
@@ -84,8 +95,6 @@ def _result(result: AuditResult) -> Result:
 
 def _location(result: AuditResult) -> Location:
     """The policy file; its name for a policy without a file."""
-    from sarif_pydantic import ArtifactLocation, Location, LogicalLocation, PhysicalLocation
-
     path = result.policy.path
     if result.policy.sha256 is None:
         return Location(logical_locations=[LogicalLocation(fully_qualified_name=path, kind="module")])
@@ -95,8 +104,6 @@ def _location(result: AuditResult) -> Location:
 
 
 def _artifacts(result: AuditResult) -> list[Any] | None:
-    from sarif_pydantic import Artifact, ArtifactLocation
-
     if result.policy.sha256 is None:
         return None
     where = ArtifactLocation(uri=_uri(result.policy.path))
@@ -105,8 +112,6 @@ def _artifacts(result: AuditResult) -> list[Any] | None:
 
 def _uri(path: str) -> str:
     """A file as a URI; a relative one stays relative, to the root of the repository."""
-    from urllib.parse import quote
-
     return Path(path).as_uri() if Path(path).is_absolute() else quote(Path(path).as_posix())
 
 
