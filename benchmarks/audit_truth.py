@@ -20,7 +20,7 @@ from nodes.audit.comparing import ATTACK_KEPT, MARGIN
 from nodes.audit.drives import FOUND, NO_OBJECT, PLAIN_OBJECT, Arm, arm_of, learned, with_starts
 from nodes.audit.judging import CONTROLS
 from nodes.audit.learning import OTHER_HALF
-from nodes.audit.question import FILE, VICTIM
+from nodes.audit.question import FILE
 from nodes.audit.verdict import ArmDrives, change_of, judge
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.victims import look_at_given
@@ -58,13 +58,13 @@ def groups_of(experiment: Experiment, folder: Path, count: int) -> list[dict[str
 
 def _group(experiment: Experiment, arms: dict[str, Arm], number: int) -> dict[str, ArmDrives]:
     there = with_starts(experiment, STARTS, FIRST_SEED + number)
-    return {name: learned(there, VICTIM, arm) for name, arm in arms.items()}
+    return {name: learned(there, arm) for name, arm in arms.items()}
 
 
 def joined(groups: list[dict[str, ArmDrives]], name: str) -> ArmDrives:
     """The drives of all groups as one."""
     first = groups[0][name]
-    fields = ("states", "largest_m", "mean_m", "ctes_m", "driven_ticks")
+    fields = ("states", "largest_m", "mean_m", "driven_ticks")
     return replace(
         first, **{field: np.concatenate([getattr(each[name], field) for each in groups]) for field in fields}
     )

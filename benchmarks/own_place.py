@@ -38,7 +38,7 @@ from nodes.audit.drives import FOUND, NO_OBJECT, PLAIN_OBJECT, arm_of, driven, w
 from nodes.audit.images import IMPORTED, POSES
 from nodes.audit.kept import check_audit
 from nodes.audit.learning import OTHER_HALF
-from nodes.audit.question import FILE, VICTIM
+from nodes.audit.question import FILE
 from nodes.audit.verdict import effect_of
 from nodes.experiment.steps.run import load_experiment
 from nodes.lab.scene_training import write_video
@@ -177,7 +177,7 @@ def drive_in_the_lab(folder: Path) -> dict[str, tuple[int, float, float, float]]
     attack = folder / "audit" / ATTACK_KEPT
     with Lab(LabConfig()) as lab:
         found = {
-            name: driven(experiment, VICTIM, arm_of(experiment, name, attack), lab)
+            name: driven(experiment, arm_of(experiment, name, attack), lab)
             for name in (NO_OBJECT, PLAIN_OBJECT, FOUND)
         }
     rows = {}

@@ -14,6 +14,9 @@ from pydantic import Field, model_validator
 from advnerf_core.strict import StrictModel
 
 Evidence = Literal["surrogate", "world", "live"]
+PlaceKind = Literal["images", "video", "scene", "splat", "world"]
+Scale = Literal["world", "poses", "length", "positions", "fiducials"]
+Control = Literal["no_object", "plain_object"]
 
 Text = Annotated[str, Field(min_length=1)]
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
@@ -42,9 +45,9 @@ class AuditedPlace(StrictModel):
     """The place of the audit."""
 
     name: Text = Field(description="As sentences name it: MetaDrive, the hall.")
-    kind: Literal["images", "video", "scene", "splat", "world"]
+    kind: PlaceKind
     source: Text = Field(description="Folder, file or name of the world, as the user gave it.")
-    scale: Literal["world", "poses", "length", "positions", "fiducials"] | None = Field(
+    scale: Scale | None = Field(
         description="What the metre comes from; null if nothing tells it. Then the result holds no effect."
     )
     off_track_m: Positive | None = Field(
@@ -155,9 +158,7 @@ class AuditedDrives(StrictModel):
         description="Where it was driven: in the learned copy of the place, in a world, or by a real vehicle."
     )
     measure: Literal["mean_abs_cte", "max_abs_cte"] = Field(description="What off_path_m is of a drive.")
-    control: Literal["no_object", "plain_object"] = Field(
-        description="Which control gives the smaller effect."
-    )
+    control: Control = Field(description="Which control gives the smaller effect.")
     effect: AuditEffect
     disturbed: DisturbedDrives | None = Field(
         default=None, description="The same under a worse camera; null where the camera is the world's own."

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
 from nodes.audit.drives import PLAIN_OBJECT, arm_of, driven, learned, with_starts
 from nodes.audit.judging import FILMED, LEARNED_ARMS, WORLD_ARMS, open_world, seen_on
-from nodes.audit.question import SELECTION_SEED, VICTIM, AuditedQuestion
+from nodes.audit.question import SELECTION_SEED, SELECTION_STARTS, VICTIM, AuditedQuestion
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.placing import clean_poses
 from nodes.experiment.show.spaces import colour_space
@@ -50,14 +50,14 @@ class Costs:
             differentiable: Whether the policy has a gradient.
         """
         evaluation_s = _seconds_of_evaluation(experiment, differentiable)
-        several = with_starts(experiment, question.selection, SELECTION_SEED)
+        several = with_starts(experiment, SELECTION_STARTS, SELECTION_SEED)
         plain, one = arm_of(experiment, PLAIN_OBJECT), with_starts(experiment, 1, SELECTION_SEED)
-        learned_s = _seconds(lambda: learned(several, VICTIM, plain)) / question.selection
+        learned_s = _seconds(lambda: learned(several, plain)) / SELECTION_STARTS
         driven_s, began_s = [0.0], time.perf_counter()
         with open_world(one, question.place.evidence) as world:
             opening_s = time.perf_counter() - began_s
             if world is not None:
-                driven_s = [_seconds(lambda: driven(one, VICTIM, plain, world)) for _ in range(2)]
+                driven_s = [_seconds(lambda: driven(one, plain, world)) for _ in range(2)]
             poses = clean_poses(one, one.config.paths[0])[:1]
             frame_s = _seconds(lambda: seen_on(one, plain, poses, world))
         every, _ = filmed(one.config.dt_s)
@@ -69,9 +69,9 @@ class Costs:
         drives_s = len(LEARNED_ARMS) * self.learned_s + len(WORLD_ARMS) * self.world_s
         return question.judging * drives_s + self.film_s + 2.0 * self.opening_s
 
-    def choosing_s(self, question: AuditedQuestion, searches: int) -> float:
+    def choosing_s(self, searches: int) -> float:
         """Duration of the drives that compare the results of so many searches [s]."""
-        return searches * question.selection * 2.0 * self.learned_s  # with and without the attack
+        return searches * SELECTION_STARTS * 2.0 * self.learned_s  # with and without the attack
 
     def evaluations(self, left_s: float, question: AuditedQuestion, searches: int) -> int:
         """Evaluations for a policy, such that as many for the planted weakness, and the judging, end in time.
@@ -81,7 +81,7 @@ class Costs:
             question: The audit's question.
             searches: Number of searches of the schedule.
         """
-        searching_s = 0.5 * (left_s - self.judging_s(question)) - self.choosing_s(question, searches)
+        searching_s = 0.5 * (left_s - self.judging_s(question)) - self.choosing_s(searches)
         return max(1, int(searching_s / self.evaluation_s))
 
 

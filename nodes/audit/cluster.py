@@ -5,16 +5,44 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.run_module import search_folder_last
-from nodes.audit.searching import SearchJob
+from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import search_cell
 from nodes.experiment.run.cluster import ray_session, run_on_ray
+from nodes.experiment.show.context import Experiment
+from nodes.experiment.steps.run import load_experiment
 
 HERE = "here"
+
+
+@dataclass(frozen=True)
+class SearchJob:
+    """A search to run; plain data, so that it can go to another machine.
+
+    Attributes:
+        file: Experiment file.
+        setting: Name of its setting.
+        overrides: Changes of the setting.
+        run_folder: Run folder of the copy for searching.
+        cell: The cell.
+        folder: Folder for the search.
+    """
+
+    file: str
+    setting: str
+    overrides: tuple[str, ...]
+    run_folder: str
+    cell: Cell
+    folder: str
+
+    def experiment(self) -> Experiment:
+        """The experiment of the setting."""
+        return load_experiment(Path(self.file), self.setting, self.overrides, Path(self.run_folder))
 
 
 def search_on_cluster(address: str, searches: Sequence[SearchJob]) -> None:

@@ -19,6 +19,7 @@ from advnerf_core.driving.metrics import DriveMetrics
 from advnerf_core.fields.voxel_grid import inverse_squash
 from advnerf_core.geometry import Array
 from hardware.worlds.world import World
+from nodes.audit.question import VICTIM
 from nodes.audit.verdict import ArmDrives
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.drives import deployed_drives, learned_drives
@@ -104,10 +105,10 @@ def camera_effects(limit_m: float, seed: int) -> Disturbances:
     return Disturbances(NOISE, GAIN, BRIGHTNESS, _JITTER * limit_m, JITTER_RAD, seed)
 
 
-def learned(experiment: Experiment, victim: str, arm: Arm) -> ArmDrives:
+def learned(experiment: Experiment, arm: Arm) -> ArmDrives:
     """Drives in the learned scene, as searches render it, from the measured starts."""
     scenario = experiment.config.paths[0]
-    policy = load_victim(experiment, victim)
+    policy = load_victim(experiment, VICTIM)
     space = colour_space(experiment)
     problem = attack_problem(experiment, space, policy, scenario, 0)
     there = replace(problem, sensor=arm.shown.seen_by(space.surrogate))
@@ -120,14 +121,13 @@ def learned(experiment: Experiment, victim: str, arm: Arm) -> ArmDrives:
 
 def driven(
     experiment: Experiment,
-    victim: str,
     arm: Arm,
     world: World,
     report: Callable[[int], None] = lambda done: None,
 ) -> ArmDrives:
     """Drives through an open world, by its own car, from the measured starts; ``report`` gets the number of finished ones."""
     scenario = experiment.config.paths[0]
-    policy = load_victim(experiment, victim).policy
+    policy = load_victim(experiment, VICTIM).policy
     attack = None if arm.attack is None else load_attack(arm.attack)
     there = dress(experiment, world, arm.shown)
     starts = experiment.measured_starts(scenario)

@@ -10,8 +10,8 @@ from typing import Any
 from advnerf_core.data.image_files import HEIF_SUFFIXES, SUFFIXES
 from advnerf_core.data.scan_folder import DATA_SET, SCANS, ScanFolder, scan_of
 from advnerf_core.documents import read_json
+from advnerf_core.report.audit_parts import PlaceKind, Scale
 from nodes.audit.asking import UnansweredError
-from nodes.audit.question import PlaceKind, Scale
 from nodes.lab.importing.metric_options import MetricOptions
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay

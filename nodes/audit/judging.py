@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 
 from advnerf_core.attack.artifact import face_texture, load_attack
 from advnerf_core.geometry import Array, planar_poses
-from advnerf_core.report.audit_parts import AuditedDrives, DisturbedDrives, Evidence, JudgedStart, RoutePoint
+from advnerf_core.report.audit_parts import (
+    AuditedDrives,
+    Control,
+    DisturbedDrives,
+    Evidence,
+    JudgedStart,
+    RoutePoint,
+)
 from advnerf_core.report.audit_result import AuditControl, ControlKind
 from advnerf_core.report.clips import ClipTrack, write_film
 from advnerf_core.report.data import Film
@@ -34,7 +41,7 @@ from nodes.audit.drives import (
     learned,
     with_starts,
 )
-from nodes.audit.verdict import ArmDrives, Control, EffectJudgement, effect_of, judge
+from nodes.audit.verdict import ArmDrives, EffectJudgement, effect_of, judge
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.images import as_uint8
 from nodes.experiment.show.learned_scene import load_background
@@ -153,7 +160,6 @@ def _route(poses: Array, dt_s: float) -> tuple[RoutePoint, ...]:
 
 def judge_found(
     experiment: Experiment,
-    victim: str,
     found: Path,
     count: int,
     seed: int,
@@ -165,7 +171,6 @@ def judge_found(
 
     Args:
         experiment: Experiment with the attacked object, in the copy for judging.
-        victim: Name of the victim.
         found: The attack file.
         count: Number of judging starts.
         seed: Seed of these starts.
@@ -179,14 +184,14 @@ def judge_found(
         effects = camera_effects(limit_m, seed)
         arms[PLAIN_DISTURBED] = replace(arms[PLAIN_OBJECT], disturbances=effects)
         arms[FOUND_DISTURBED] = replace(arms[FOUND], disturbances=effects)
-    drives = drive_arms(with_them, victim, arms, evidence, report)
+    drives = drive_arms(with_them, arms, evidence, report)
     controls = {name: drives[name] for name in CONTROLS}
     judgement = judge(drives[FOUND], controls, limit_m)
     return Judged(evidence, arms, drives, judgement, with_them, limit_m)
 
 
 def drive_arms(
-    experiment: Experiment, victim: str, arms: Mapping[str, Arm], evidence: Evidence, report: Report
+    experiment: Experiment, arms: Mapping[str, Arm], evidence: Evidence, report: Report
 ) -> dict[str, ArmDrives]:
     """Drives of each arm from the measured starts; in the learned scene those of an arm advance together."""
     drives, count, total = {}, experiment.config.measure.starts, len(arms) * experiment.config.measure.starts
@@ -194,10 +199,10 @@ def drive_arms(
         for number, (name, arm) in enumerate(arms.items()):
             told = partial(_tell, report, TITLES[name], number * count, total)
             if world is None:
-                drives[name] = learned(experiment, victim, arm)
+                drives[name] = learned(experiment, arm)
                 told(count)
             else:
-                drives[name] = driven(experiment, victim, arm, world, told)
+                drives[name] = driven(experiment, arm, world, told)
     return drives
 
 

@@ -13,12 +13,12 @@ from advnerf_core.documents import read_json
 from advnerf_core.driving.metrics import Horizon, drive_metrics
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
-from advnerf_core.report.audit_parts import AuditedDrives
+from advnerf_core.report.audit_parts import AuditedDrives, Control
 from advnerf_core.report.audit_result import AuditResult, read_audit
 from hardware.worlds.paths import ReferencePath
 from nodes.audit.drives import FOUND, FOUND_DISTURBED, PLAIN_DISTURBED
 from nodes.audit.judging import CONTROLS, Judged
-from nodes.audit.verdict import ArmDrives, Control, effect_of, judge
+from nodes.audit.verdict import ArmDrives, effect_of, judge
 from nodes.lab.worlds.expert_drive import as_path
 
 DRIVES, RESULT = "drives.json", "audit.json"

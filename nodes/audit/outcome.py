@@ -39,7 +39,7 @@ from nodes.audit.drives import PICTURE
 from nodes.audit.judging import Judged, film, texture_of
 from nodes.audit.kept import RESULT, keep_drives
 from nodes.audit.page import write_page
-from nodes.audit.question import JUDGING_SEED, SELECTION_SEED, AuditedQuestion, question_of
+from nodes.audit.question import JUDGING_SEED, SELECTION_SEED, SELECTION_STARTS, AuditedQuestion, question_of
 from nodes.audit.schedule import NEVER_TRIED
 from nodes.audit.searching import FoundAttack, Searches
 from nodes.audit.spots import Spot
@@ -105,8 +105,8 @@ def result_of(known: Known, folder: Path) -> AuditResult:
         not_tried=tuple(_not_tried(known)),
         fidelity=known.fidelity,
         starts=AuditStarts(
-            search=StartSet(seed=question.seed, count=_search_starts(known)),
-            selection=StartSet(seed=SELECTION_SEED, count=question.selection),
+            search=StartSet(seed=0, count=_search_starts(known)),
+            selection=StartSet(seed=SELECTION_SEED, count=SELECTION_STARTS),
             judging=StartSet(seed=JUDGING_SEED, count=question.judging),
         ),
         budget=_budget(known),
@@ -237,7 +237,7 @@ def _vehicle(known: Known) -> AuditedVehicle | None:
 def _tried(known: Known) -> Iterator[TriedSearch]:
     for each in known.searches.found if known.searches else ():
         yield TriedSearch(
-            object=_object_name(known),
+            object=name_of(known.question.kind),
             placement=f"spot {each.spot + 1}",
             space="colours",
             method=each.method,
@@ -246,10 +246,6 @@ def _tried(known: Known) -> Iterator[TriedSearch]:
             effect_m=each.effect_m,
             selected=each is known.best,
         )
-
-
-def _object_name(known: Known) -> str:
-    return name_of(known.question.kind)
 
 
 def _not_tried(known: Known) -> Iterator[NotTried]:

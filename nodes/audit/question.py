@@ -5,24 +5,23 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from advnerf_core.documents import dump_yaml
 from advnerf_core.files import sha256_of, write_atomically
-from advnerf_core.report.audit_parts import AuditQuestion, Evidence
+from advnerf_core.report.audit_parts import AuditQuestion, Evidence, PlaceKind, Scale
 from nodes.experiment.plan.object_kinds import PANEL
 
 VICTIM, PLANTED, OBJECT = "policy", "planted", "object"
 FILE = "audit.experiment.yaml"
 # Searches draw their starts from their own seeds, counted from 0; selection and judging use none of these.
 SELECTION_SEED, JUDGING_SEED = 10_000, 20_000
+SELECTION_STARTS = 4
 HALF, OTHER_HALF = "half", "other-half"
 # The teacher of the exported steering returns to the path within about this many half lanes.
 _RETURNS_IN = 5.0
 # A small audit: fewer pictures would fail the fidelity gate, so the searches are shortened instead.
 CI_SECTIONS: Mapping[str, Any] = {"scene": {"steps": 600}}
-Scale = Literal["world", "poses", "length", "positions", "fiducials"]
-PlaceKind = Literal["images", "video", "scene", "splat", "world"]
 
 
 @dataclass(frozen=True)
@@ -74,8 +73,6 @@ class AuditedQuestion:
         kind: Kind of the object: ``panel``, or a file.
         size_m: Width of the object [m]; None for a share of the lane.
         overrides: ``key=value`` texts over the experiment file.
-        seed: Seed of all draws except starts.
-        selection: Number of starts for comparing searches.
         judging: Number of starts for the verdict.
         sections: Sections of the experiment file besides place and victim.
     """
@@ -87,8 +84,6 @@ class AuditedQuestion:
     kind: str = PANEL
     size_m: float | None = None
     overrides: Sequence[str] = ()
-    seed: int = 0
-    selection: int = 4
     judging: int = 20
     sections: Mapping[str, Any] = field(default_factory=dict)
 
@@ -107,7 +102,7 @@ def experiment_data(question: AuditedQuestion) -> dict[str, Any]:
         "carrier": {"kind": "composed"},
         "space": {"kind": "colours", "cells": 8},
         "deploy": {"through": "world" if place.is_driven else "nothing"},
-        "measure": {"starts": question.selection, "seed": SELECTION_SEED, "scene": "baked"},
+        "measure": {"starts": SELECTION_STARTS, "seed": SELECTION_SEED, "scene": "baked"},
         "retrain": None,
         "reference": None,
         "gate": None,  # the audit judges the scene itself, and reports the result
@@ -158,7 +153,7 @@ def _of_halves(question: AuditedQuestion) -> dict[str, Any]:
         return {}
     return {
         HALF: {"world": {"half": "even"}},
-        OTHER_HALF: {"world": {"half": "odd"}, "scene": {"seed": question.seed + 1}},
+        OTHER_HALF: {"world": {"half": "odd"}, "scene": {"seed": 1}},
     }
 
 

@@ -35,13 +35,13 @@ from nodes.audit.plan import AuditPlan, as_listed
 from nodes.audit.planted import policy_code, strength, write_module
 from nodes.audit.question import (
     JUDGING_SEED,
-    OBJECT,
     PLANTED,
     SELECTION_SEED,
+    SELECTION_STARTS,
     VICTIM,
     AuditedQuestion,
 )
-from nodes.audit.searching import FoundAttack, Searches, SearchesElsewhere
+from nodes.audit.searching import FoundAttack, Searches
 from nodes.audit.spots import Spot, best_spots
 from nodes.experiment.plan.object_kinds import footprint_m
 from nodes.experiment.show.context import Experiment
@@ -83,7 +83,7 @@ class AuditOptions:
         against: Result of an earlier audit to compare this policy with.
         harden: Whether to export frames for hardening.
         timed: Whether the result says when it ended and how long it took.
-        cluster: Machines for the searches; None for this process.
+        cluster: Address of a Ray cluster for the searches; None for this process.
     """
 
     minutes: float
@@ -91,7 +91,7 @@ class AuditOptions:
     against: Path | None = None
     harden: bool = False
     timed: bool = True
-    cluster: SearchesElsewhere | None = None
+    cluster: str | None = None
 
 
 @dataclass
@@ -183,7 +183,7 @@ class Audit:
     def _require_drives(self, experiment: Experiment, limit_m: float) -> None:
         """Raise for a policy that leaves its lane in the learned place without any object."""
         nothing = arm_of(experiment, NO_OBJECT)
-        there = learned(with_starts(experiment, self.question.selection, SELECTION_SEED), VICTIM, nothing)
+        there = learned(with_starts(experiment, SELECTION_STARTS, SELECTION_SEED), nothing)
         left = there.left(limit_m)
         self.say(
             f"without any object: largest deviation {there.largest_m.mean():.2f} m of {limit_m:g} m, off the lane from {left.sum()} of {len(left)} starts"
@@ -199,7 +199,7 @@ class Audit:
         if plan.spots is None:
             kind, width_m = self.question.kind, footprint_m(self.question.kind)[1]
             wanted_m = self.question.size_m or _WIDTH * experiment.world.off_track_m
-            plan.choose(best_spots(experiment, kind, wanted_m / width_m, _SPOTS, OBJECT))
+            plan.choose(best_spots(experiment, kind, wanted_m / width_m, _SPOTS))
         spots = plan.spots
         if not spots:
             raise CannotJudgeError(
@@ -239,7 +239,7 @@ class Audit:
         judging_s, used_s = costs.judging_s(question), time.monotonic() - self.began_s
         count = sum(map(len, searches.planned))
         searches.evaluations = costs.evaluations(60.0 * minutes - used_s, question, count)
-        search_s = searches.cost * costs.evaluation_s + costs.choosing_s(question, count)
+        search_s = searches.cost * costs.evaluation_s + costs.choosing_s(count)
         self.say(
             f"of {minutes:g} min, {used_s / 60.0:.1f} are used, and judging takes about {judging_s / 60.0:.1f}; searching takes about "
             f"{search_s / 60.0:.1f}, and up to as long again for a planted weakness if nothing is found"
@@ -271,7 +271,7 @@ class Audit:
         with ProgressDisplay(self.console) as display:
             for kind in kinds:
                 report = display.start(_JUDGING[kind])
-                known.judged.append(judge_found(there, VICTIM, best.attack, *starts, kind, report))
+                known.judged.append(judge_found(there, best.attack, *starts, kind, report))
         if self.options.harden:
             self.say(f"frames past the object: {export_frames(known.judged[-1], self.folder / HARDEN)}")
 
@@ -285,14 +285,14 @@ class Audit:
             for name in (NO_OBJECT, PLAIN_OBJECT, FOUND)
         }
         with ProgressDisplay(self.console) as display:
-            drives = drive_arms(there, VICTIM, arms, evidence, display.start("driving as then"))
+            drives = drive_arms(there, arms, evidence, display.start("driving as then"))
         return before.compare(drives, evidence, limit_m)
 
     def _plant(self, copies: Copies, plan: AuditPlan, spots: list[Spot], limit_m: float) -> PlantedControl:
         """Search a planted weakness with the same schedule, until it is found."""
         name, wanted = (
             "it also steers to the left for red, to the right for green",
-            self.question.selection // 2 + 1,
+            SELECTION_STARTS // 2 + 1,
         )
         try:
             spec = self._planted_victim(copies.ready(_FIRST))

@@ -20,37 +20,35 @@ class Round:
     Attributes:
         method: Name of the method.
         spots: Number of spots, the best of those searched before; in the first round, the most visible ones.
-        seeds: Number of searches at each.
         starts: Number of starts of each search.
         share: Share of the budget.
     """
 
     method: str
     spots: int
-    seeds: int
     starts: int
     share: float
 
 
 WITH_GRADIENT = (
-    Round("gradient", spots=3, seeds=1, starts=1, share=0.3),
-    Round("random_coarse", spots=1, seeds=1, starts=1, share=0.1),
-    Round("gradient_coarse", spots=1, seeds=1, starts=1, share=0.2),
-    Round("gradient", spots=1, seeds=1, starts=2, share=0.4),
+    Round("gradient", spots=3, starts=1, share=0.3),
+    Round("random_coarse", spots=1, starts=1, share=0.1),
+    Round("gradient_coarse", spots=1, starts=1, share=0.2),
+    Round("gradient", spots=1, starts=2, share=0.4),
 )
 # `gradient_coarse` needs a flat face.
 WITH_GRADIENT_OF_A_SOLID = (
-    Round("gradient", spots=3, seeds=1, starts=1, share=0.4),
-    Round("random_coarse", spots=1, seeds=1, starts=1, share=0.1),
-    Round("gradient", spots=1, seeds=1, starts=2, share=0.5),
+    Round("gradient", spots=3, starts=1, share=0.4),
+    Round("random_coarse", spots=1, starts=1, share=0.1),
+    Round("gradient", spots=1, starts=2, share=0.5),
 )
 BLACK_BOX = (
-    Round("random_coarse", spots=3, seeds=1, starts=1, share=0.2),
-    Round("cem", spots=2, seeds=1, starts=1, share=0.4),
-    Round("guided", spots=1, seeds=1, starts=1, share=0.4),
+    Round("random_coarse", spots=3, starts=1, share=0.2),
+    Round("cem", spots=2, starts=1, share=0.4),
+    Round("guided", spots=1, starts=1, share=0.4),
 )
 # The student of `guided` learns from single images.
-BLACK_BOX_WITH_MEMORY = (*BLACK_BOX[:2], Round("cem", spots=1, seeds=1, starts=1, share=0.4))
+BLACK_BOX_WITH_MEMORY = (*BLACK_BOX[:2], Round("cem", spots=1, starts=1, share=0.4))
 # Adam's rates: searches of an audit are short, so that they take larger steps than those of an experiment.
 LEARNING_RATE = 0.5
 _FEWEST, _FEWEST_CEM = 4, 20
@@ -107,7 +105,6 @@ def planned(rounds: Sequence[Round], evaluations: int, ticks: int) -> list[list[
 
 
 def _of_round(number: int, wanted: Round, evaluations: int, ticks: int) -> Iterator[PlannedSearch]:
-    each = int(wanted.share * evaluations / (wanted.spots * wanted.seeds * wanted.starts))
+    each = int(wanted.share * evaluations / (wanted.spots * wanted.starts))
     for spot in range(wanted.spots):
-        for seed in range(wanted.seeds):
-            yield PlannedSearch(number, spot, 100 * number + seed, max(fewest(wanted.method, ticks), each))
+        yield PlannedSearch(number, spot, 100 * number, max(fewest(wanted.method, ticks), each))

@@ -11,16 +11,16 @@ import numpy as np
 
 from advnerf_core.documents import read_json
 from advnerf_core.driving.metrics import drive_metrics
+from nodes.audit.cluster import SearchJob, search_on_cluster
 from nodes.audit.learning import Copies
 from nodes.audit.plan import AuditPlan, as_listed
-from nodes.audit.question import VICTIM
+from nodes.audit.question import SELECTION_STARTS, VICTIM
 from nodes.audit.schedule import LEARNING_RATE, PlannedSearch, Round, planned, rounds_for
 from nodes.audit.spots import Spot
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.object_kinds import PANEL
 from nodes.experiment.run.cells import search_cell
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.steps.run import load_experiment
 from nodes.experiment.steps.search_files import ATTACK, SEARCHED
 from nodes.runtime.progress import Report, StageDisplay
 
@@ -63,35 +63,6 @@ class FoundAttack:
         return self.left, self.effect_m
 
 
-@dataclass(frozen=True)
-class SearchJob:
-    """A search to run; plain data, so that it can go to another machine.
-
-    Attributes:
-        file: Experiment file.
-        setting: Name of its setting.
-        overrides: Changes of the setting.
-        run_folder: Run folder of the copy for searching.
-        cell: The cell.
-        folder: Folder for the search.
-    """
-
-    file: str
-    setting: str
-    overrides: tuple[str, ...]
-    run_folder: str
-    cell: Cell
-    folder: str
-
-    def experiment(self) -> Experiment:
-        """The experiment of the setting."""
-        return load_experiment(Path(self.file), self.setting, self.overrides, Path(self.run_folder))
-
-
-SearchesElsewhere = Callable[[Sequence[SearchJob]], None]
-"""Runs the searches of a round on other machines until all have written their results to their folders."""
-
-
 @dataclass
 class Searches:
     """All searches of one victim at one place.
@@ -105,7 +76,7 @@ class Searches:
         differentiable: Whether the policy has a gradient.
         remembers: Whether its output depends on earlier images.
         limit_m: |CTE| beyond which the car has left its lane [m].
-        elsewhere: Machines for the searches; None for this process.
+        cluster: Address of a Ray cluster for the searches; None for this process.
         found: Finished searches.
     """
 
@@ -117,7 +88,7 @@ class Searches:
     differentiable: bool
     remembers: bool
     limit_m: float
-    elsewhere: SearchesElsewhere | None = None
+    cluster: str | None = None
     found: list[FoundAttack] = field(default_factory=list)
 
     @property
@@ -153,9 +124,9 @@ class Searches:
         for wanted, row in zip(self.rounds, self.planned, strict=True):
             spots = self._spots(wanted.spots)
             jobs: Iterable[SearchJob] = (self._job(wanted, each, spots[each.spot]) for each in row)
-            if self.elsewhere is not None:  # its results in the folders are then only read here
+            if self.cluster is not None:  # its results in the folders are then only read here
                 jobs = list(jobs)
-                self.elsewhere(jobs)
+                search_on_cluster(self.cluster, jobs)
             for search, job in zip(row, jobs, strict=True):
                 spot = spots[search.spot]
                 found = self._search(
@@ -164,7 +135,7 @@ class Searches:
                 self.found.append(found)
                 say(
                     f"{found.method} at spot {found.spot + 1}, {found.evaluations} evaluations: largest deviation "
-                    f"{found.effect_m:+.2f} m, off the lane from {found.left} of {self.copies.question.selection} starts"
+                    f"{found.effect_m:+.2f} m, off the lane from {found.left} of {SELECTION_STARTS} starts"
                 )
                 if enough(found):
                     return

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from advnerf_core.geometry import invert_transform, planar_pose
+from nodes.audit.question import OBJECT
 from nodes.experiment.plan.object_kinds import footprint_m
 from nodes.experiment.plan.placed import PlacedObject, in_a_lane
 from nodes.experiment.show.context import Experiment
@@ -44,9 +45,7 @@ class Spot:
     largest_tick: int
 
 
-def best_spots(
-    experiment: Experiment, kind: str, scale: float, count: int, name: str = "object"
-) -> list[Spot]:
+def best_spots(experiment: Experiment, kind: str, scale: float, count: int) -> list[Spot]:
     """The spots at which an object covers most of a drive's pictures, best first.
 
     Args:
@@ -54,12 +53,11 @@ def best_spots(
         kind: Kind of object.
         scale: Size of the object.
         count: Largest number of spots.
-        name: Name of the object.
     """
     scenario = experiment.config.paths[0]
     views = _views(experiment, scenario)
     found = []
-    for placed in _places(experiment, scenario, kind, scale, name):
+    for placed in _places(experiment, scenario, kind, scale):
         if in_a_lane([placed], experiment.world) is None and (spot := _seen(experiment, placed, views)):
             found.append(spot)
     found.sort(key=lambda spot: -spot.seen_px)
@@ -82,9 +80,7 @@ def _views(experiment: Experiment, scenario: str) -> list[SeenFrom]:
     return views
 
 
-def _places(
-    experiment: Experiment, scenario: str, kind: str, scale: float, name: str
-) -> Iterator[PlacedObject]:
+def _places(experiment: Experiment, scenario: str, kind: str, scale: float) -> Iterator[PlacedObject]:
     path, half_lane_m = experiment.paths[scenario], experiment.world.off_track_m
     drive = clean_poses(experiment, scenario)
     begin_m = float(path.project(drive[:1, :2]).s_m[0])
@@ -96,7 +92,7 @@ def _places(
     for along_m in np.arange(begin_m + 0.5 * ahead_m, end_m, _ALONG * half_lane_m).tolist():
         for pose in poses_beside(path, along_m, max(begin_m, along_m - ahead_m), (-1.0, 1.0), away_m):
             x_m, y_m, yaw_rad = (round(each, 3) for each in pose)
-            yield PlacedObject(name=name, kind=kind, x_m=x_m, y_m=y_m, yaw_rad=yaw_rad, scale=scale)
+            yield PlacedObject(name=OBJECT, kind=kind, x_m=x_m, y_m=y_m, yaw_rad=yaw_rad, scale=scale)
 
 
 def _seen(experiment: Experiment, placed: PlacedObject, views: Sequence[SeenFrom]) -> Spot | None:

@@ -9,19 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binomtest
 
 from advnerf_core.driving.metrics import DriveMetrics
-from advnerf_core.report.audit_parts import AuditEffect
+from advnerf_core.report.audit_parts import AuditEffect, Control
 from advnerf_core.report.evidence.mean_estimate import one_sample
 
 Floats = NDArray[np.float64]
 LEVEL = 0.95
-Control = Literal["no_object", "plain_object"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,14 +31,12 @@ class ArmDrives:
         states: ``[S, T + 1, n]``: x [m], y [m], yaw [rad].
         largest_m: Largest |CTE| of each ``[S]`` [m].
         mean_m: Mean |CTE| of each ``[S]`` [m].
-        ctes_m: Signed CTE ``[S, T]`` [m].
         driven_ticks: Ticks until each car stopped ``[S]``; later states repeat the last one.
     """
 
     states: Floats
     largest_m: Floats
     mean_m: Floats
-    ctes_m: Floats
     driven_ticks: NDArray[np.int64]
 
     @classmethod
@@ -49,7 +46,6 @@ class ArmDrives:
             states,
             np.array([score.max_cte_m for score in scores]),
             np.array([score.mean_cte_m for score in scores]),
-            np.array([score.ctes_m for score in scores]),
             np.array(driven_ticks),
         )
 

@@ -6,7 +6,6 @@ import re
 import time
 import traceback
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -276,7 +275,6 @@ def _question(
 ) -> tuple[AuditedQuestion, AuditOptions]:
     from nodes.audit.asking import answer
     from nodes.audit.cars import car_of
-    from nodes.audit.cluster import search_on_cluster
     from nodes.audit.images import posed
     from nodes.audit.places import Answers, AuditedWorld, camera_of, place_of_photographs
     from nodes.audit.policies import resolve_policy
@@ -327,7 +325,7 @@ def _question(
         result.against,
         result.harden,
         timed=not result.ci,
-        cluster=None if search.cluster is None else partial(search_on_cluster, search.cluster),
+        cluster=search.cluster,
     )
 
 

@@ -12,14 +12,14 @@ SEARCHES = 6
 
 
 def question(place: Place) -> AuditedQuestion:
-    return AuditedQuestion("file.onnx", "file.onnx", place, 0.4, judging=20, selection=4)
+    return AuditedQuestion("file.onnx", "file.onnx", place, 0.4, judging=20)
 
 
 @pytest.mark.parametrize("place", [WORLD, PHOTOGRAPHS])
 def test_searches_for_an_object_and_a_planted_weakness_and_the_judging_fill_the_budget(place: Place) -> None:
     asked, left_s = question(place), 1800.0
     count = COSTS.evaluations(left_s, asked, SEARCHES)
-    search_s = count * COSTS.evaluation_s + COSTS.choosing_s(asked, SEARCHES)
+    search_s = count * COSTS.evaluation_s + COSTS.choosing_s(SEARCHES)
     used_s = 2.0 * search_s + COSTS.judging_s(asked)
     assert left_s - 2.0 * COSTS.evaluation_s < used_s <= left_s
 

@@ -15,7 +15,7 @@ LIMIT_M = 0.4
 def drives(largest_m):
     largest = np.asarray(largest_m, dtype=np.float64)
     states = np.zeros((len(largest), 2, 3))
-    return ArmDrives(states, largest, 0.5 * largest, largest[:, None], np.ones(len(largest), dtype=np.int64))
+    return ArmDrives(states, largest, 0.5 * largest, np.ones(len(largest), dtype=np.int64))
 
 
 def test_the_smaller_effect_counts_and_its_interval_is_students_for_symmetric_differences():
