@@ -64,7 +64,6 @@ class CellResult(StrictModel):
         settings: All of these settings, including defaults; empty in cells from before they were stored.
         stages: Digests of the capture, scene, object and policy stages' outputs; empty in cells from before they were stored.
         seconds: Duration of the cell [s].
-        machine: Machine that ran the cell.
         date: Date and time, ISO.
         surrogate: Drives in the learned scene; for an attack over the deployment scene's own frames (meshes) the ideal car's drives there.
         deployed: Drives in the deployment; None until they are driven.

@@ -290,16 +290,10 @@ class ReportData:
     """Input of the sections of an experiment's page.
 
     Attributes:
-        drives: Drives by scenario.
-        manifest: Commands and versions that reproduce the page.
         overview: The world from above; None if it has no such picture.
-        textures: Displayed faces.
-        fidelity: Fidelity of the learned scene.
         done: What was searched and driven, in one paragraph.
         live: Whether the drives were live; the following fields are then shown, or named as missing.
-        latency: Live timing.
         memory: Memory use of the adjoint.
-        laps: The live drive without attack.
         not_measured: Reason for a missing part, by the name of its field.
     """
 

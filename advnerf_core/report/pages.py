@@ -26,11 +26,7 @@ class FirstScreen:
     """What a page opens with.
 
     Attributes:
-        sentence: What happened, in one sentence.
-        film: The drives side by side.
-        film_caption: What it shows.
         above: The drives from above, as SVG that is marked safe.
-        above_caption: What it shows.
         more: Further sentences, each with the name of what it is about.
     """
 

@@ -223,9 +223,7 @@ def _legend_above(ax: Any, handles: list[Any]) -> None:
 def svg(figure: Figure, description: str) -> str:
     """A figure as inline SVG in the page's colours: no scripts, no external names, text as text.
 
-    Args:
-        figure: The figure.
-        description: Alternative text for readers who cannot see it (plain text; it is escaped).
+    The description is plain text for readers who cannot see the figure; it is escaped.
     """
     buffer = io.StringIO()
     nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))

@@ -25,8 +25,6 @@ class Predicted:
     """Prediction and measurement of one attack. Lengths are excess |CTE| per tick over the plain object.
 
     Attributes:
-        name: Name of the cell.
-        method: Method of the search.
         expected_m: Predicted excess of a deployed drive [m].
         low_m: Lower end of its 80 % band [m].
         high_m: Upper end [m].

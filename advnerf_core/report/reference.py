@@ -75,10 +75,6 @@ class Limit(StrictModel):
 
 
 class Reference(StrictModel):
-    """A file of limits.
-
-    Attributes:
-        targets: The limits, in the order of the page.
-    """
+    """A file of limits, in the order of the page."""
 
     targets: tuple[Limit, ...] = Field(default=())

@@ -53,13 +53,7 @@ LEGEND = (
 
 @dataclass(frozen=True)
 class ShownClip:
-    """A clip of a cell.
-
-    Attributes:
-        cell: Name of the drive's cell.
-        outcome: One of `OUTCOMES`.
-        file: Path relative to the page.
-    """
+    """A clip of a cell with one of `OUTCOMES`; its file is relative to the page."""
 
     cell: CellResult
     outcome: str
@@ -185,10 +179,7 @@ def as_markdown(table: ResultTable, targets: Sequence[Target] = ()) -> str:
 def gather_clips(table: ResultTable, cells_folder: Path, page_folder: Path) -> list[ShownClip]:
     """Put the cells' clips beside the page, in one folder per outcome; as hard links if the disk has the file.
 
-    Args:
-        table: The table with the cells.
-        cells_folder: Folder that the cells' clip names are relative to.
-        page_folder: Folder of the page; older clips in its ``videos`` are deleted.
+    The clips' names are relative to the folder of the cells. Older clips beside the page are deleted.
     """
     shutil.rmtree(page_folder / "videos", ignore_errors=True)
     shown = []
@@ -218,13 +209,7 @@ def render_page(
 ) -> str:
     """The page as HTML text; it loads nothing but the clips beside it.
 
-    Args:
-        table: The table.
-        first: What the page opens with.
-        clips: Clips beside the page.
-        sections: Further parts: heading and HTML.
-        targets: Targets of the results.
-        notes: What a reader must know first, such as what is left out.
+    Its notes are what a reader must know first, such as what is left out.
     """
     of = {name: [clip for clip in clips if clip.outcome == name] for name in OUTCOMES}
     groups = [(name, _EXPLAINED[name], found) for name, found in of.items() if found]

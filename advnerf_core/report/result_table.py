@@ -19,13 +19,7 @@ from advnerf_core.report.reference import DOMAINS, Domain
 
 @dataclass(frozen=True)
 class Wanted:
-    """A row that a table should have, with its seeds.
-
-    Attributes:
-        placement: Name of the placement; empty for the scenario's own.
-        seeds: Requested seeds.
-        deployed: Whether deployed drives are requested.
-    """
+    """A row that a table should have, with its seeds; the placement is empty for the scenario's own."""
 
     scenario: str
     placement: str
@@ -50,9 +44,6 @@ class TableRow:
     """One line of the table: all seeds of a scenario, victim and method in one domain. None for missing values.
 
     Attributes:
-        domain: surrogate or deployed.
-        seeds: Finished seeds.
-        missing: Missing seeds.
         off_track: Drives that left the track.
         total_m: Mean total CTE [m].
         total_std_m: Standard deviation over seeds of their mean totals [m]; None for one seed.
@@ -105,12 +96,7 @@ class TableRow:
 
 @dataclass(frozen=True)
 class ResultTable:
-    """All lines, and their cells.
-
-    Attributes:
-        rows: The lines, in the requested order.
-        name: Name of the experiment.
-    """
+    """All lines in the requested order, and their cells by name."""
 
     rows: tuple[TableRow, ...]
     cells: dict[str, CellResult] = field(default_factory=dict)
@@ -127,13 +113,7 @@ class ResultTable:
 
 
 def make_table(wanted: Sequence[Wanted], cells: Iterable[CellResult], name: str = "") -> ResultTable:
-    """Summarise cells.
-
-    Args:
-        wanted: Requested rows; the table names missing ones.
-        cells: Existing cells; unrequested ones are left out.
-        name: Name of the experiment.
-    """
+    """Summarise cells: missing rows are named, and cells that were not requested are left out."""
     seeds = {want.key: want.seeds for want in wanted}
     drives = CellDrives(cell for cell in cells if cell.seed in seeds.get(cell.key, ()))
     rows = tuple(_row(want, drives, domain) for want in wanted for domain in want.domains)

@@ -20,13 +20,10 @@ class Target:
     """A limit and the measured value.
 
     Attributes:
-        what: Title of the measure.
         target: The limit, as text.
         value: The measured value; None without one.
-        measured: The measured value as text.
         met: Whether the limit is kept; None without a measurement, or if seeds are missing.
         verdict: The answer as text.
-        paper: The publication's value.
     """
 
     what: str
@@ -80,10 +77,7 @@ def evaluate(
 ) -> list[Target]:
     """The targets of some limits; those on rows that the table does not have are left out.
 
-    Args:
-        limits: The limits.
-        table: The drives.
-        measured: Further measured values, by measure; None leaves these limits out.
+    Further measured values are given by measure; None leaves their limits out.
     """
     found = []
     for limit in limits:

@@ -18,13 +18,7 @@ class UnansweredError(AdvnerfError):
 
 
 def answer(given: T | None, option: str, question: str, kind: Callable[[str], T]) -> T:
-    """The value of an option, or else the answer of a user at the terminal.
-
-    Args:
-        given: Value of the option; None if it was left out.
-        option: Name of the option.
-        question: Question for the user, with the unit.
-        kind: Converts the answer.
+    """The value of an option, or else the answer of a user at the terminal, converted by ``kind``.
 
     Raises:
         UnansweredError: The option was left out, and there is no terminal.

@@ -42,13 +42,7 @@ class Costs:
 
     @classmethod
     def measured(cls, experiment: Experiment, question: AuditedQuestion, differentiable: bool) -> Costs:
-        """Measure by a few evaluations and drives of the policy past the plain object.
-
-        Args:
-            experiment: Experiment with the object at a spot.
-            question: The audit's question.
-            differentiable: Whether the policy has a gradient.
-        """
+        """Measure by a few evaluations and drives of the policy past the plain object, which stands at a spot."""
         evaluation_s = _seconds_of_evaluation(experiment, differentiable)
         several = with_starts(experiment, SELECTION_STARTS, SELECTION_SEED)
         plain, one = arm_of(experiment, PLAIN_OBJECT), with_starts(experiment, 1, SELECTION_SEED)
@@ -74,13 +68,7 @@ class Costs:
         return searches * SELECTION_STARTS * 2.0 * self.learned_s  # with and without the attack
 
     def evaluations(self, left_s: float, question: AuditedQuestion, searches: int) -> int:
-        """Evaluations for a policy, such that as many for the planted weakness, and the judging, end in time.
-
-        Args:
-            left_s: Remaining time of the budget [s].
-            question: The audit's question.
-            searches: Number of searches of the schedule.
-        """
+        """Evaluations for a policy, such that as many for the planted weakness, and the judging, end in the remaining time [s]."""
         searching_s = 0.5 * (left_s - self.judging_s(question)) - self.choosing_s(searches)
         return max(1, int(searching_s / self.evaluation_s))
 

@@ -24,13 +24,7 @@ HERE = "here"
 class SearchJob:
     """A search to run; plain data, so that it can go to another machine.
 
-    Attributes:
-        file: Experiment file.
-        setting: Name of its setting.
-        overrides: Changes of the setting.
-        run_folder: Run folder of the copy for searching.
-        cell: The cell.
-        folder: Folder for the search.
+    Its run folder is that of the copy for searching; the search itself writes to ``folder``.
     """
 
     file: str

@@ -23,10 +23,7 @@ _ARMS = (NO_OBJECT, PLAIN_OBJECT, FOUND)
 
 
 class Before:
-    """An earlier audit, with its drives and its object.
-
-    Args:
-        file: Path of its ``audit.json``.
+    """An earlier audit, with its drives and its object, from its ``audit.json``.
 
     Raises:
         ConfigError: It judged no object, or its folder lacks the drives or the attack.
@@ -53,10 +50,7 @@ class Before:
         return self.result.strongest.object
 
     def listed(self, kind: str) -> dict[str, Any]:
-        """The object in the form of experiment files.
-
-        Args:
-            kind: The current kind of object, with the path of a file.
+        """The object in the form of experiment files, if it is of the current kind.
 
         Raises:
             ConfigError: The object is of another kind.
@@ -75,13 +69,7 @@ class Before:
         }
 
     def compare(self, now: Mapping[str, ArmDrives], evidence: Evidence, limit_m: float) -> AuditComparison:
-        """The change of the arm that got worst.
-
-        Args:
-            now: Drives past no object, the plain one and the one found then, from the earlier starts.
-            evidence: Kind of the drives.
-            limit_m: |CTE| beyond which the car has left its lane [m].
-        """
+        """The change of the arm that got worst, from drives of all arms from the earlier starts; the lane ends at a |CTE| of ``limit_m`` [m]."""
         then = read_drives(self.folder).get(evidence)
         if then is None:
             raise ConfigError(

@@ -58,13 +58,7 @@ class Arm:
 
 
 def arm_of(experiment: Experiment, name: str, found: Path | None = None) -> Arm:
-    """One arm of an audit.
-
-    Args:
-        experiment: Experiment with the object at its place.
-        name: ``no_object``, ``plain_object``, ``natural_picture`` or ``object``.
-        found: The attack file, for ``object`` only.
-    """
+    """One arm of an audit by its name; ``found`` is the attack file, for `FOUND` only."""
     if name == NO_OBJECT:
         return Arm(Shown((), torch.zeros(0, 3)))
     space = colour_space(experiment)

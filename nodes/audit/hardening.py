@@ -20,14 +20,9 @@ _DRIVES = 5
 
 
 def export_frames(judged: Judged, folder: Path) -> Path:
-    """Write the frames and their labels; the user's policy is not trained.
+    """Write ``images`` and ``labels.csv``, whose path is returned; the user's policy is not trained.
 
-    Args:
-        judged: Result with the drives past the object.
-        folder: Folder for ``images`` and ``labels.csv``: left is positive, in the unit of the car's control.
-
-    Returns:
-        The file of labels.
+    Steering is positive to the left, in the unit of the car's control.
     """
     experiment, drives = judged.experiment, judged.drives[FOUND]
     scenario = experiment.config.paths[0]

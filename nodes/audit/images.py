@@ -26,14 +26,7 @@ _MOVEMENT, _MOST = 0.06, 300  # as in ``advnerf scene from-video``
 
 @dataclass(frozen=True)
 class PosedPlace:
-    """Photographs with poses.
-
-    Attributes:
-        poses: Path of their ``transforms.json``.
-        kind: Kind of the user's input.
-        scale: Source of the metre.
-        ground_at_zero: Whether the ground is known to be at z = 0.
-    """
+    """The ``transforms.json`` of photographs with poses, and whether the ground is known to be at z = 0."""
 
     poses: Path
     kind: PlaceKind
@@ -43,11 +36,6 @@ class PosedPlace:
 
 def posed(given: Path, folder: Path, metric: MetricOptions) -> PosedPlace:
     """The posed photographs of a place; input without poses is imported into the audit's folder, once.
-
-    Args:
-        given: The user's input.
-        folder: Folder of the audit.
-        metric: Known lengths in the place.
 
     Raises:
         ConfigError: The input is of no known kind.

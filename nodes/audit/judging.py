@@ -71,10 +71,7 @@ class Judged:
     """Result of judging one attack.
 
     Attributes:
-        evidence: Kind of the drives.
-        arms: Objects of each arm.
         drives: Drives of each arm, by name.
-        judgement: Judgement of the drives.
         experiment: Experiment with the judging starts.
         limit_m: |CTE| beyond which the car has left its lane [m].
     """
@@ -167,16 +164,9 @@ def judge_found(
     evidence: Evidence,
     report: Report,
 ) -> Judged:
-    """Drive from the judging starts.
+    """Drive past the attacked object, and past the controls, from so many judging starts of a seed.
 
-    Args:
-        experiment: Experiment with the attacked object, in the copy for judging.
-        found: The attack file.
-        count: Number of judging starts.
-        seed: Seed of these starts.
-        limit_m: |CTE| beyond which the car has left its lane [m].
-        evidence: ``surrogate``, or ``world``.
-        report: Progress callback.
+    The car has left its lane beyond a |CTE| of ``limit_m`` [m].
     """
     with_them = with_starts(experiment, count, seed)
     arms = {name: arm_of(with_them, name, found) for name in WORLD_ARMS}

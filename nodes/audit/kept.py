@@ -68,10 +68,7 @@ def _measured(data: Mapping[str, Any]) -> dict[str, ArmDrives]:
 
 
 def check_audit(folder: Path) -> list[str]:
-    """Recompute an audit's numbers from the drives in its folder.
-
-    Returns:
-        The checks, a line each.
+    """Recompute an audit's numbers from the drives in its folder; returns the checks, a line each.
 
     Raises:
         AuditDiffersError: A number differs.

@@ -37,14 +37,7 @@ _EMPTY = Shown((), torch.zeros(0, 3))
 
 @dataclass(frozen=True)
 class Copies:
-    """The copies that an audit searches and judges in.
-
-    Attributes:
-        file: The experiment file.
-        searched: Run folder of the copy for searching.
-        judged: Run folder of the copy for judging; the same if the audit judges in a world.
-        question: The audit's question.
-    """
+    """The copies that an audit searches and judges in, by their run folders; one copy does for both if the audit judges in a world."""
 
     file: Path
     searched: Path

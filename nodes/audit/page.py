@@ -45,13 +45,7 @@ def write_page(
 ) -> FilePath:
     """Write the page of an audit into its folder.
 
-    Args:
-        folder: Folder of the audit.
-        result: Result of the audit.
-        drives: The judged drives by evidence and arm.
-        path: The reference path; None without judged drives.
-        film: Film of the shown start; None without one.
-        pictures: Pictures of the object, each with its caption.
+    Drives are by evidence and arm, and pictures of the object have captions; the reference path and the film are of judged drives only.
     """
     judged = _judged(result, drives)
     above = _above(result, judged, path) if judged and path is not None else ""

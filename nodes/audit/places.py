@@ -52,14 +52,7 @@ class Answers:
 def place_of_photographs(
     given: Path, there: PosedPlace, answers: Answers, car: AuditedCar, camera: Pinhole | None
 ) -> tuple[Place, float]:
-    """A place of posed photographs, and half the width of its lane [m].
-
-    Args:
-        given: The user's input.
-        there: The posed photographs.
-        answers: Values of the options.
-        car: The car.
-        camera: Intrinsics of the policy's camera; None uses the photographs'.
+    """A place of posed photographs, and half the width of its lane [m]; without the policy's own camera it has the photographs'.
 
     Raises:
         ConfigError: The photographs show no path.

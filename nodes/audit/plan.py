@@ -38,13 +38,7 @@ class Decided(StrictModel):
 
 @dataclass
 class AuditPlan:
-    """The decisions of one audit.
-
-    Attributes:
-        folder: Folder of the audit.
-        question: The audit's question; a planted victim may be added to it.
-        decided: The decisions.
-    """
+    """The decisions of one audit in its folder; a planted victim may be added to its question."""
 
     folder: Path
     question: AuditedQuestion

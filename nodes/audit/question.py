@@ -30,9 +30,6 @@ class Place:
 
     Attributes:
         name: Name in sentences.
-        kind: Kind of the user's input.
-        source: The folder, file or name that the user gave.
-        scale: Source of the metre.
         world: The section ``world`` of the experiment.
         base: Experiment file whose settings fit the place; None for the defaults.
         path: Name of the driven path of the world.
@@ -68,7 +65,6 @@ class AuditedQuestion:
     Attributes:
         policy: Name of the policy for experiments.
         given: The user's name for it.
-        place: The place.
         limit_m: |CTE| beyond which the car has left its lane [m]; None uses the world's.
         kind: Kind of the object: ``panel``, or a file.
         size_m: Width of the object [m]; None for a share of the lane.

@@ -63,14 +63,7 @@ NEVER_TRIED = {
 
 @dataclass(frozen=True)
 class PlannedSearch:
-    """One search of a round.
-
-    Attributes:
-        round_: Number of the round.
-        spot: Rank of the spot in the round.
-        seed: Seed of the search.
-        evaluations: Closed-loop evaluations.
-    """
+    """One search of a round, at the spot of a rank."""
 
     round_: int
     spot: int
@@ -94,13 +87,7 @@ def fewest(method: str, ticks: int) -> int:
 
 
 def planned(rounds: Sequence[Round], evaluations: int, ticks: int) -> list[list[PlannedSearch]]:
-    """The searches of each round for a budget.
-
-    Args:
-        rounds: The schedule.
-        evaluations: Evaluations of one start that the budget buys; an evaluation from several starts counts as many.
-        ticks: Control ticks of a drive.
-    """
+    """The searches of each round for so many evaluations of one start; an evaluation from several starts counts as many."""
     return [list(_of_round(number, each, evaluations, ticks)) for number, each in enumerate(rounds)]
 
 

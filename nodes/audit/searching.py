@@ -34,11 +34,7 @@ class FoundAttack:
 
     Attributes:
         setting: Name of its setting in the experiment file.
-        folder: Folder of its attack.
         spot: Number of the spot where the object stands.
-        method: Name of the method.
-        seed: Seed of the search.
-        evaluations: Number of evaluations.
         effect_m: Increase of the largest |CTE| over the drive without the attack, mean over the selection starts [m].
         left: Selection starts from which the car left its lane.
     """
@@ -68,16 +64,13 @@ class Searches:
     """All searches of one victim at one place.
 
     Attributes:
-        copies: Learned copies of the place.
         plan: Plan, to which a setting is added for each search.
         spots: Possible places of the object, the most visible first.
-        victim: Name of the experiment's victim.
         evaluations: Evaluations that the budget buys, from one start.
         differentiable: Whether the policy has a gradient.
         remembers: Whether its output depends on earlier images.
         limit_m: |CTE| beyond which the car has left its lane [m].
         cluster: Address of a Ray cluster for the searches; None for this process.
-        found: Finished searches.
     """
 
     copies: Copies

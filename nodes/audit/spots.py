@@ -46,14 +46,7 @@ class Spot:
 
 
 def best_spots(experiment: Experiment, kind: str, scale: float, count: int) -> list[Spot]:
-    """The spots at which an object covers most of a drive's pictures, best first.
-
-    Args:
-        experiment: Experiment whose scene is learned.
-        kind: Kind of object.
-        scale: Size of the object.
-        count: Largest number of spots.
-    """
+    """The spots at which an object covers most of a drive's pictures, best first; at most ``count``."""
     scenario = experiment.config.paths[0]
     views = _views(experiment, scenario)
     found = []

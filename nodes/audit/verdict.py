@@ -116,9 +116,6 @@ def paired_p(one: NDArray[np.bool_], other: NDArray[np.bool_]) -> float:
 def change_of(now: ArmDrives, then: ArmDrives, of_several: int = 1) -> AuditEffect:
     """Increase of the largest |CTE| since then, mean over the same starts [m].
 
-    Args:
-        now: Drives now.
-        then: Drives then, from the same starts.
-        of_several: Number of compared changes, of which the largest counts (Bonferroni).
+    The interval is that of the largest of so many compared changes (Bonferroni).
     """
     return _effect(now.largest_m - then.largest_m, 1.0 - (1.0 - LEVEL) / of_several)

@@ -63,9 +63,6 @@ class SetAbout(StrictModel):
 def read_about(published: Path) -> dict[str, SetAbout]:
     """The entries by name of the set; empty without a file.
 
-    Args:
-        published: Folder of all published sets.
-
     Raises:
         ConfigError: The file is invalid; the message names the line.
     """

@@ -47,12 +47,8 @@ class _Group:
     """All deployed drives with one condition of the object.
 
     Attributes:
-        title: Name of the condition.
-        colour: Colour of the lines.
         poses: ``[T + 1, 3]`` of each drive: x [m], y [m], yaw [rad].
         ctes_m: ``[T]`` signed cross-track error of each drive [m].
-        off_track: Number of drives that left the track.
-        collided: Number of drives that ran into something.
     """
 
     title: str
@@ -73,9 +69,6 @@ def write_above_of(folder: Path) -> Path | None:
     """Write the picture of a published set beside its folder; None if it has no primary test.
 
     Of a set whose scenarios share their searches the last one is drawn, with stills of its film; otherwise one map for each.
-
-    Args:
-        folder: Folder of the set, with its ``set.json``.
     """
     registration, primary = read_registration(folder), read_json(folder / SET)["primary"]
     if registration is None or not primary:
@@ -118,15 +111,9 @@ def write_above(
     film: Path,
     target: Path,
 ) -> Path:
-    """Write the picture of one primary test of a set.
+    """Write the picture of a set as a ``.webp``: all drives of ``shown``, and stills of the film of ``filmed``.
 
-    Args:
-        evidence: All drives of the set.
-        shown: A primary test from ``set.json`` whose drives are drawn.
-        filmed: The primary test of the film.
-        place: Position of the object; None if it was not stored.
-        film: The published film; without it there are no stills.
-        target: Output file, a ``.webp``.
+    Both are primary tests from ``set.json``. Without the position of the object, or without a film, the picture lacks these.
     """
     test = PrimaryTest.model_validate(shown["test"])
     groups = _groups(evidence, test, shown["baseline"])
@@ -143,11 +130,7 @@ def write_above(
 
 
 def moment_of(evidence: Evidence, test: PrimaryTest) -> tuple[float, bool]:
-    """When the first deployed drive of the first search leaves the track, or deviates most.
-
-    Returns:
-        Time from the start [s], and whether it left.
-    """
+    """Time [s] at which the first deployed drive of the first search leaves the track, or deviates most; and whether it left."""
     cell = evidence.searches((test.scenario, test.placement, test.victim, test.method))[0]
     horizon = evidence.scenario_of(cell).horizon
     deviation = np.abs(evidence.metrics(cell, "deployed")[0].ctes_m)

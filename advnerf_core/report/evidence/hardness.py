@@ -52,13 +52,9 @@ class FamilyHardness(StrictModel):
 
     @classmethod
     def of(cls, scenario: str, family: str, excess_m: ArrayLike, level: float = LEVEL) -> FamilyHardness:
-        """Compute from the excess of every texture and start ``[N, S]`` [m].
+        """Compute from the excess |CTE| per tick of every texture and start ``[N, S]`` [m].
 
-        Args:
-            scenario: Name of the path.
-            family: Method that drew the textures.
-            excess_m: Excess |CTE| per tick ``[N, S]`` [m].
-            level: Level of the one-sided bound: Student's t over the starts of the texture with the largest mean.
+        The bound of ``level`` is Student's t over the starts of the texture with the largest mean.
         """
         from scipy.special import stdtrit  # reading verdicts needs no SciPy
 
@@ -130,11 +126,7 @@ class HardnessVerdict(StrictModel):
 
 
 class HardnessRecord(StrictModel):
-    """All verdicts of one victim's recipes, oldest first; at most three recipes.
-
-    Attributes:
-        format: Format of the file.
-    """
+    """All verdicts of one victim's recipes, oldest first; at most three recipes."""
 
     format: Literal["advnerf-hardness-1"] = FORMAT
     verdicts: tuple[HardnessVerdict, ...] = ()
@@ -205,11 +197,7 @@ def victim_title(
 ) -> str:
     """Name of a victim on pages, which may differ from the ``hardened`` of files and keys.
 
-    Args:
-        victim: Name of the victim in files.
-        cells: Cells of the set; read only if a verdict passed.
-        record: The verdicts published with the set.
-        baselines: Methods that the set's tests compare with; a verdict on one of these families does not count.
+    Cells are read only if a verdict passed. A verdict on one of the ``baselines`` that the set's tests compare with does not count.
     """
     if victim != HARDENED:
         return victim
@@ -221,12 +209,7 @@ def victim_title(
 
 
 def titles_of(folder: Path, data: Mapping[str, Any]) -> dict[str, str]:
-    """Names of a set's victims on pages, by their names in files.
-
-    Args:
-        folder: Folder of the set.
-        data: Content of its ``set.json``.
-    """
+    """Names of a set's victims on pages, by their names in files; ``data`` is the content of its ``set.json``."""
     record = read_hardness(folder / PUBLISHED_FILE)
     baselines = {name for test in data["primary"] for name in test["test"]["against"]}
     names = {row["victim"] for row in data["rows"]}
@@ -238,12 +221,7 @@ def titles_of(folder: Path, data: Mapping[str, Any]) -> dict[str, str]:
 
 
 def with_titles(folder: Path, data: Mapping[str, Any]) -> dict[str, Any]:
-    """The published numbers of a set with its victims' names on pages.
-
-    Args:
-        folder: Folder of the set.
-        data: Content of its ``set.json``.
-    """
+    """The published numbers of a set, the content of its ``set.json``, with its victims' names on pages."""
     titles = titles_of(folder, data)
 
     def titled(row: Mapping[str, Any]) -> dict[str, Any]:

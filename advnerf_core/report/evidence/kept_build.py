@@ -15,11 +15,7 @@ LOST = "cannot be driven again: its scene and victim were not kept"
 
 
 def is_kept(folder: Path) -> bool:
-    """Whether the reference build has the scene and the victim of every scenario of a set.
-
-    Args:
-        folder: Folder of the set; the reference build lies beside it.
-    """
+    """Whether the reference build beside a set has the scene and the victim of every scenario of it."""
     registration = read_registration(folder)
     kept = {read_json(file).get("digest") for file in (folder.parent / BUILD).glob(f"*/{RECORD}")}
     used = _digests_used(folder, registration) if registration is not None else []

@@ -23,9 +23,7 @@ _DOMAINS_APART = 0.27
 def excess_plot(evidence: Evidence, titles: Mapping[str, str] = MappingProxyType({})) -> Figure:
     """Excess |CTE| per tick of each drive, one column per search; for sets with many conditions the means, one line per condition.
 
-    Args:
-        evidence: The set.
-        titles: Names of its victims on pages, if they differ.
+    ``titles`` has the names of victims on pages, if they differ.
     """
     shown = [row for row in rows(evidence) if row.method != NONE]
     return _drives(evidence, shown, titles) if len(shown) <= _MOST_COLUMNS else _means(shown, titles)

@@ -83,13 +83,7 @@ class RegisteredScenario(StrictModel):
 
 
 class RegisteredCell(StrictModel):
-    """One cell.
-
-    Attributes:
-        placement: Name of the placement; empty for the scenario's own.
-        method: Name of the method, or ``none``.
-        seed: Seed of the search.
-    """
+    """One cell; the placement is empty for the scenario's own, and the method may be ``none``."""
 
     scenario: str
     placement: str = ""
@@ -104,11 +98,7 @@ class RegisteredCell(StrictModel):
 
 
 class PrimaryTest(StrictModel):
-    """A claimed test: the method's deployed excess against the baseline's that is strongest in the surrogate.
-
-    Attributes:
-        against: The baselines.
-    """
+    """A claimed test: the method's deployed excess against that of the baseline, one of ``against``, that is strongest in the surrogate."""
 
     scenario: str
     placement: str = ""
@@ -124,8 +114,6 @@ class Contrast(StrictModel):
         name: The difference, for readers.
         before: Name of a scenario.
         after: Another scenario of the same attacks, or the same one.
-        before_in: Domain of the drives under the first condition.
-        after_in: Domain of the drives under the second condition.
     """
 
     name: str = Field(min_length=1)
@@ -142,7 +130,6 @@ class PlaceClaim(StrictModel):
         name: What is claimed about, for readers.
         scenarios: The places, drawn by a rule before any attack.
         victims: Victims of one recipe, each of which was driven at all places.
-        against: The baselines.
     """
 
     name: str = Field(min_length=1)
@@ -163,13 +150,8 @@ class Registration(StrictModel):
     """The planned cells and tests of a set.
 
     Attributes:
-        format: Format of the file.
-        name: Name of the set of results.
         file: The experiment file; `launch_file` gives its current name.
-        setting: The file's setting.
-        overrides: Changes of the setting on the command line.
         date: Date of the registration, ISO.
-        software_version: Version of advnerf.
         scenarios: Scenarios by name, ``NAME`` or ``NAME.PLACEMENT``.
         primary: The claimed tests; Holm's adjustment is over these.
         contrasts: Comparisons of the same attacks under two conditions.
@@ -249,12 +231,8 @@ def read_withdrawn(folder: FilePath) -> dict[str, str]:
 def read_reasons(file: FilePath, what: str) -> dict[str, str]:
     """Reasons by name, from a file of a set; empty without the file.
 
-    Args:
-        file: File in the folder of a set.
-        what: Kind of the names, for messages: ``withdrawn scenarios``.
-
     Raises:
-        RegistrationError: The file is invalid.
+        RegistrationError: The file is invalid; the message calls the names ``what``.
     """
     if not file.exists():
         return {}

@@ -82,9 +82,7 @@ class TestResult:
 class Evidence(CellDrives):
     """Outcomes of all drives of a registered set.
 
-    Args:
-        registration: The registration.
-        cells: The existing cells; those without published drives, not driven live, or of an unregistered scenario, are left out.
+    Cells without published drives, not driven live, or of an unregistered scenario, are left out.
     """
 
     def __init__(self, registration: Registration, cells: Sequence[CellResult]) -> None:

@@ -30,10 +30,8 @@ class Verified:
     """Result of verifying a set.
 
     Attributes:
-        name: Name of the set.
         numbers: Number of recomputed published numbers.
         drives: Number of drives behind them.
-        problems: Problems as text; empty if all is well.
         findings: Findings against itself that the set declares, as text.
         awaits: Number of cells that a set under way lacks: one that was registered and never published whole.
     """

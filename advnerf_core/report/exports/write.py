@@ -13,11 +13,7 @@ SARIF_FILE, JUNIT_FILE, SCENARIO_FILE = "audit.sarif", "audit.junit.xml", "audit
 
 
 def write_exports(folder: Path, result: AuditResult) -> tuple[Path, ...]:
-    """Write SARIF, JUnit and, if an object was judged, OpenSCENARIO into the audit's folder (extra ``audit``).
-
-    Returns:
-        The files that were written.
-    """
+    """Write SARIF, JUnit and, if an object was judged, OpenSCENARIO into the audit's folder (extra ``audit``); returns the files."""
     files = [folder / SARIF_FILE, folder / JUNIT_FILE]
     write_sarif(files[0], result)
     write_junit(files[1], result)

@@ -35,11 +35,7 @@ class Change:
 
 
 class History:
-    """The history of some files of a repository, from its current commit back.
-
-    Args:
-        folder: A folder in the repository.
-        paths: Files and folders to read, relative to ``folder``.
+    """The history of some files and folders of a repository, relative to one of its folders, from its current commit back.
 
     Raises:
         NoHistory: Git, a repository or a commit is missing, or the clone is shallow.

@@ -36,12 +36,7 @@ def published_numbers(
 
 
 def number_problems(folder: Path, expected: Mapping[str, Any]) -> tuple[int, list[str]]:
-    """Count of published numbers, and those that disagree with the drives.
-
-    Args:
-        folder: Folder of the set.
-        expected: Numbers from `published_numbers`.
-    """
+    """Count of published numbers, and those that disagree with the expected ones from `published_numbers`."""
     published, found = read_json(folder / SET), json.loads(json.dumps(expected))
     count, wrong = 0, []
     for key in sorted((published.keys() | found.keys()) - {"files", *_TABLES}):
