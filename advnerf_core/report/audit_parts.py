@@ -201,7 +201,3 @@ class JudgedObject(StrictModel):
         if len(set(kinds)) < len(kinds):
             raise ValueError(f"expected one judgement for each kind of evidence, got {', '.join(kinds)}")
         return self
-
-    def judgement(self, evidence: Evidence | None) -> AuditedDrives | None:
-        """The judgement with this kind of evidence; None without one."""
-        return next((each for each in self.judgements if each.evidence == evidence), None)

@@ -213,7 +213,8 @@ class AuditResult(StrictModel):
     @property
     def judgement(self) -> AuditedDrives | None:
         """The judgement behind the verdict; None if no object was judged."""
-        return self.strongest.judgement(self.verdict.evidence) if self.strongest else None
+        judged = self.strongest.judgements if self.strongest else ()
+        return next((each for each in judged if each.evidence == self.verdict.evidence), None)
 
 
 def _contradictions(result: AuditResult) -> list[str]:

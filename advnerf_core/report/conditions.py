@@ -25,7 +25,6 @@ class Style:
     """Name and style of a condition.
 
     Attributes:
-        title: Name for readers.
         key: Name of its colour in the palettes, and of the page's CSS variable.
         light: Colour on a light page, ``#rrggbb``.
         dark: Colour on a dark page, ``#rrggbb``.

@@ -25,10 +25,8 @@ class Run:
     """One drive over the horizon.
 
     Attributes:
-        domain: Domain of the drive: the learned scene or the live node graph.
         condition: Condition of the object: "none" plain colours, a method's name the result of its search, "empty" no object at all;
             see `conditions`.
-        victim: Name of the policy: "hardened" was trained with random textures, "naive" was not, others are a user's.
         seed: Seed of the attack; 0 without randomness.
         states: Pose of the rear axle at the control ticks, ``[T + 1, 3]``: x [m], y [m], yaw [rad], world.
         cte_m: Signed cross-track error at the control ticks, left positive, ``[T + 1]`` [m].
@@ -160,15 +158,8 @@ class Laps:
 class FidelityView:
     """One held-out view of the driving camera: the real image against the surrogate's.
 
-    Attributes:
-        psnr_full_db: PSNR at the camera's size [dB].
-        psnr_policy_db: PSNR at the policy's size, 200x66 [dB].
-        ssim_full: SSIM at the camera's size.
-        ssim_policy: SSIM at the policy's size.
-        steering_real_rad: The policy's output on the real image [rad].
-        steering_surrogate_rad: The policy's output on the surrogate's image [rad].
-        real: The real image, for the few views that are shown.
-        surrogate: The surrogate's image.
+    PSNR [dB] and SSIM are ``full`` at the camera's size and ``policy`` at the policy's, 200x66. The policy's output on either image is in
+    radians [rad]; only the few views that are shown have their images.
     """
 
     label: str
@@ -255,29 +246,13 @@ class Latency:
 
 
 @dataclass(frozen=True, eq=False)
-class MemoryRow:
-    """Peak memory above idle of one adjoint gradient at one horizon [MiB]."""
-
-    horizon_steps: int
-    adjoint_mib: float
-
-
-@dataclass(frozen=True, eq=False)
 class Manifest:
-    """Commands and versions that reproduce this report.
+    """Commands and versions that reproduce this report, and the wall time of each stage [s].
 
-    Attributes:
-        command: The exact command line.
-        created: Time of the report, ISO 8601 with zone.
-        hashes: Hashes of scene, policy, config, attack files, code, ...
-        versions: Versions of the software.
-        machine: Processor, cores, memory, system.
-        settings: Settings of the run, name to text.
-        timings: Wall time of each stage [s].
+    Hashes are of scene, policy, config, attack files and code; the machine is its processor, cores, memory and system.
     """
 
     command: str
-    created: str
     hashes: Mapping[str, str] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
     machine: Mapping[str, str] = field(default_factory=dict)
@@ -293,8 +268,8 @@ class ReportData:
         overview: The world from above; None if it has no such picture.
         done: What was searched and driven, in one paragraph.
         live: Whether the drives were live; the following fields are then shown, or named as missing.
-        memory: Memory use of the adjoint.
-        not_measured: Reason for a missing part, by the name of its field.
+        memory_mib: Peak memory above idle of one adjoint gradient, by its horizon in ticks [MiB].
+        not_measured: Reason for a missing part, by its name.
     """
 
     drives: tuple[Drives, ...]
@@ -305,7 +280,7 @@ class ReportData:
     done: str = ""
     live: bool = False
     latency: Latency | None = None
-    memory: tuple[MemoryRow, ...] = ()
+    memory_mib: Mapping[int, float] = field(default_factory=dict)
     laps: Laps | None = None
     not_measured: Mapping[str, str] = field(default_factory=dict)
 
@@ -324,6 +299,5 @@ class ReportData:
                 "latency_p99_ms": self.latency.overall.p99_ms,
                 "missed_ticks": self.latency.missed_ticks,
             }
-        rows = {row.horizon_steps: row.adjoint_mib for row in self.memory}
-        short, long = (rows.get(ticks) for ticks in _TICKS_COMPARED)
+        short, long = (self.memory_mib.get(ticks) for ticks in _TICKS_COMPARED)
         return {**found, "memory_ratio": long / short} if short and long else found

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from matplotlib.lines import Line2D
 
 from advnerf_core.files import write_atomically
 from advnerf_core.report.conditions import EMPTY, NONE, order_of, style_of
-from advnerf_core.report.data import Drives, Fidelity, Laps, Latency, MemoryRow, Run
+from advnerf_core.report.data import Drives, Fidelity, Laps, Latency, Run
 from advnerf_core.report.palette import LIGHT, LINE_STYLES, themed_svg
 from advnerf_core.report.reference import Domain
 
@@ -164,11 +164,10 @@ def latency_histogram(latency: Latency) -> Figure:
     return ax.figure
 
 
-def memory_against_horizon(rows: Iterable[MemoryRow]) -> Figure:
+def memory_against_horizon(memory_mib: Mapping[int, float]) -> Figure:
     """Peak memory of the adjoint above idle against the horizon."""
-    ordered = sorted(rows, key=lambda row: row.horizon_steps)
     with new_axes(6.0, 3.0) as ax:
-        horizons, peaks = zip(*((row.horizon_steps, row.adjoint_mib) for row in ordered), strict=True)
+        horizons, peaks = zip(*sorted(memory_mib.items()), strict=True)
         ax.plot(horizons, peaks, "-o", ms=5, color=LIGHT["gradient"])
         ax.set(xlabel="horizon T [control ticks]", ylabel="peak above idle [MiB]")
         ax.set_xlim(left=0.0)

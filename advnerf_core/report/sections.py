@@ -85,8 +85,8 @@ def _figures(data: ReportData) -> dict[str, Any]:
         made["steering"] = plots.steering_agreement(data.fidelity), "Control on learned against real images"
     if data.latency is not None:
         made["latency"] = plots.latency_histogram(data.latency), "Histogram of capture-to-serial latency"
-    if data.memory:
-        made["memory"] = plots.memory_against_horizon(data.memory), "Peak memory against the horizon"
+    if data.memory_mib:
+        made["memory"] = plots.memory_against_horizon(data.memory_mib), "Peak memory against the horizon"
     return {name: _svg(*each) for name, each in made.items()}
 
 
@@ -161,7 +161,7 @@ def _tries_table(table: ResultTable) -> Table:
 
 def _memory_table(data: ReportData) -> Table:
     """Peak memory against the horizon."""
-    cells = tuple((str(row.horizon_steps), number(row.adjoint_mib, 1)) for row in data.memory)
+    cells = tuple((str(ticks), number(mib, 1)) for ticks, mib in data.memory_mib.items())
     return Table("Peak memory above idle", ("T", "adjoint [MiB]"), cells, (True, True))
 
 

@@ -95,8 +95,7 @@ def write_maps(evidence: Evidence, shown: Sequence[Mapping[str, Any]], target: P
             ax = figure.add_axes((left, 0.36, width, 0.46))
             _draw_map(ax, groups, registered.reference_path(), registered.off_track_m, None)
             ax.set_title(" ".join(filter(None, (test.scenario, test.placement))).replace("_", " "), pad=60)
-            handles = [Line2D([], [], color=group.colour, lw=2.2, label=group.label) for group in groups]
-            ax.legend(handles=handles, loc="lower left", bbox_to_anchor=(0.0, 1.0), frameon=False)
+            ax.legend(handles=_handles(groups), loc="lower left", bbox_to_anchor=(0.0, 1.0), frameon=False)
             ax = figure.add_axes((left, 0.085, width, 0.15))
             _draw_deviation(ax, groups, registered.off_track_m, registered.dt_s)
     write_atomically(target, _webp(figure))
@@ -256,17 +255,12 @@ def _frame_at(film: Path, when_s: float) -> list[NDArray[np.uint8]]:
     return [frame[top:, begin + 1 : end - 1] for begin, end in pairwise(edges)]
 
 
+def _handles(groups: Sequence[_Group]) -> list[Line2D]:
+    return [Line2D([], [], color=group.colour, lw=2.2, label=group.label) for group in groups]
+
+
 def _add_legend(figure: Figure, groups: Sequence[_Group], place: ObjectPlace | None) -> None:
-    handles = [
-        Line2D(
-            [],
-            [],
-            color=group.colour,
-            lw=2.2,
-            label=group.label,
-        )
-        for group in groups
-    ]
+    handles = _handles(groups)
     handles.append(Line2D([], [], color=LIGHT["muted"], lw=1.1, label="edge of the track"))
     if place is not None:
         handles.append(

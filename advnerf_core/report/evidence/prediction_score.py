@@ -32,8 +32,8 @@ def interval_score(low: ArrayLike, high: ArrayLike, measured: ArrayLike, level: 
     return np.asarray((highs - lows) + 2.0 / (1.0 - level) * outside)
 
 
-def score_bands(bands: Floats, measured: Floats, level: float = LEVEL) -> Score:
+def score_bands(bands: Floats, measured: Floats) -> Score:
     """Score bands ``[..., 2]`` of drives ``[...]``, both in one unit."""
     low, high = bands[..., 0], bands[..., 1]
     held = int(((low <= measured) & (measured <= high)).sum())
-    return Score(held, measured.size, float(interval_score(low, high, measured, level).mean()))
+    return Score(held, measured.size, float(interval_score(low, high, measured).mean()))

@@ -16,7 +16,6 @@ from typing import Any
 from scenariogeneration import xosc
 from scenariogeneration.helpers import prettify
 
-from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
 from advnerf_core.report.audit_parts import (
     AuditedDrives,
@@ -37,27 +36,18 @@ _LENGTH, _WIDTH, _HEIGHT, _WHEEL, _REAR_OVERHANG = 1.6, 0.65, 0.55, 0.24, 0.3
 _MAX_STEERING_RAD, _MAX_ACCELERATION, _OBJECT_MASS_KG = 0.6, 10.0, 1.0
 
 
-class ExportError(AdvnerfError, ValueError):
-    """The audit's result has nothing to export to this format."""
-
-
 def write_openscenario(file: Path, result: AuditResult) -> None:
-    """Write the judged object and the vehicle's route (extra ``audit``).
+    """Write the object that the audit judged and the vehicle's route (extra ``audit``).
 
     Files that the scenario names (texture, GLB model, road network) are relative to the audit's folder: write it there.
-
-    Raises:
-        ExportError: The audit judged no object.
     """
     write_atomically(file, prettify(_scenario(result).get_element(), "utf-8"))
 
 
 def _scenario(result: AuditResult) -> Any:
     judged, drives = result.strongest, result.judgement
-    if judged is None or result.vehicle is None:
-        raise ExportError(
-            f"expected a judged object and its vehicle for OpenSCENARIO, got none: {result.verdict.sentence} Export SARIF or JUnit"
-        )
+    assert judged is not None, "an object was judged"
+    assert result.vehicle is not None, "its size is known"
     drives = drives or judged.judgements[-1]
     parameters = xosc.ParameterDeclarations()
     parameters.add_parameter(xosc.Parameter(REPLAY, xosc.ParameterType.boolean, "false"))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import platform
 from collections.abc import Iterator, Mapping
-from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
@@ -42,8 +41,8 @@ def gather(
     films: Mapping[str, rd.Film | None],
     seen: Mapping[str, Mapping[str, NDArray[np.uint8]]],
     done: str,
-    overview: NDArray[np.uint8] | None = None,
-    memory: tuple[rd.MemoryRow, ...] = (),
+    overview: NDArray[np.uint8] | None,
+    memory_mib: Mapping[int, float],
 ) -> rd.ReportData:
     """All data of the page.
 
@@ -53,7 +52,7 @@ def gather(
         seen: Camera images of the objects, by scenario and method.
         done: Summary of the searches and drives, in one paragraph.
         overview: The world from above.
-        memory: Memory of the adjoint, if it was measured.
+        memory_mib: Memory of the adjoint by horizon, if it was measured [MiB].
     """
     live = experiment.config.deploy.live
     return rd.ReportData(
@@ -67,7 +66,7 @@ def gather(
         fidelity=None if experiment.given_scene is not None else _fidelity(experiment),
         done=done,
         live=live,
-        memory=memory,
+        memory_mib=memory_mib,
         **(_live_parts(experiment) if live else {}),
     )
 
@@ -303,7 +302,6 @@ def _manifest(experiment: Experiment) -> rd.Manifest:
     }
     return rd.Manifest(
         manifest["command"],
-        datetime.now(timezone.utc).isoformat(timespec="seconds"),
         frozen_hashes(experiment),
         manifest["versions"],
         machine,

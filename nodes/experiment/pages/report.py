@@ -17,7 +17,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.geometry import planar_poses
 from advnerf_core.report.cells import read_cell
 from advnerf_core.report.conditions import NONE, style_of
-from advnerf_core.report.data import MemoryRow, ReportData
+from advnerf_core.report.data import ReportData
 from advnerf_core.report.result_page import not_driven, text_table
 from advnerf_core.report.result_table import ResultTable, make_table
 from advnerf_core.report.targets import Target, evaluate, target_table
@@ -72,9 +72,9 @@ def run(experiment: Experiment, folder: Path, report: Report, notes: Sequence[st
 def _measure(experiment: Experiment, folder: Path, report: Report) -> ReportData:
     """Cut films, and render the objects if the deployed world can be opened; for live drives measure memory."""
     config, names = experiment.config, experiment.config.cell_paths
-    rows: tuple[MemoryRow, ...] = ()
+    memory_mib: dict[int, float] = {}
     if config.deploy.live:
-        rows = memory.measure(experiment, folder, lambda part, text="": report(0.6 * part, text))
+        memory_mib = memory.measure(experiment, folder, lambda part, text="": report(0.6 * part, text))
     filmed, seen, above = {}, {}, None
     with experiment.open_deployed_world() if config.deploy.through == "world" else nullcontext() as scene:
         space = make_space(experiment, scene)
@@ -86,7 +86,7 @@ def _measure(experiment: Experiment, folder: Path, report: Report) -> ReportData
             elif not config.deploy.live:
                 seen[name] = seen_where_learned(experiment, space, name)
         above = None if scene is None else from_above(experiment, scene)
-    return gather(experiment, filmed, seen, how_it_was_run(experiment), above, rows)
+    return gather(experiment, filmed, seen, how_it_was_run(experiment), above, memory_mib)
 
 
 def wording_of(experiment: Experiment) -> Wording:

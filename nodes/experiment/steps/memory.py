@@ -21,7 +21,6 @@ from advnerf_core.attack.spaces.space import Space
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.memory import RETURNS_WHAT_IS_FREED, peak_mib, restart_peak
-from advnerf_core.report.data import MemoryRow
 from advnerf_core.run_module import module_command
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.faces import face_space
@@ -34,10 +33,10 @@ HORIZONS = (50, 400)
 _BEFORE_TICKS = 16
 
 
-def measure(experiment: Experiment, folder: Path, report: Report) -> tuple[MemoryRow, ...]:
-    """Measure the missing horizons; stored in ``memory.json`` so that an interrupted report resumes. Empty for a victim without a gradient."""
+def measure(experiment: Experiment, folder: Path, report: Report) -> dict[int, float]:
+    """Measure the missing horizons, and give all of them with their peaks [MiB]; stored in ``memory.json`` so that an interrupted report resumes. Empty for a victim without a gradient."""
     if victim_without_gradient(experiment):
-        return ()
+        return {}
     kept = folder / "memory.json"
     rows: dict[str, float] = read_json(kept) if kept.exists() else {}
     missing = [ticks for ticks in HORIZONS if str(ticks) not in rows]
@@ -47,7 +46,7 @@ def measure(experiment: Experiment, folder: Path, report: Report) -> tuple[Memor
             rows[str(ticks)] = mib
             write_atomically(kept, json.dumps(rows) + "\n")
             report(len(rows) / len(HORIZONS), f"memory of the adjoint at T = {ticks}")
-    return tuple(MemoryRow(int(ticks), mib) for ticks, mib in rows.items())
+    return {int(ticks): mib for ticks, mib in rows.items()}
 
 
 def in_a_child(module: str, path: Path, horizons: Sequence[int], *more: str) -> Iterator[tuple[int, float]]:

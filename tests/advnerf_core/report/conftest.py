@@ -218,7 +218,6 @@ def all_runs(starts=2, seeds=(0, 1, 2), victims=("hardened", "naive")):
 def manifest():
     return rd.Manifest(
         "advnerf experiment run launch/room.experiment.yaml --setting full",
-        "2025-03-02T10:11:12+00:00",
         {"scene": "b1946ac92492d2347c6235b4d2611184", "policy": "591785b794601e212b260e25925636fd"},
         {"advnerf": "0.1.0", "numpy": np.__version__},
         {"processor": "x86_64, 2 cores", "memory": "8 GiB"},
@@ -261,7 +260,7 @@ def full_report(folder: Path, steps=60):
         fidelity=fidelity(),
         live=True,
         latency=latency(),
-        memory=tuple(rd.MemoryRow(t, 180 + 0.01 * t) for t in (50, 100, 200, 400)),
+        memory_mib={t: 180 + 0.01 * t for t in (50, 100, 200, 400)},
         laps=laps(),
     )
 
@@ -276,7 +275,7 @@ def bare_report():
     """Only what a report cannot do without."""
     return rd.ReportData(
         (drives(),),
-        rd.Manifest("advnerf experiment run", "2025-03-02T10:11:12+00:00"),
+        rd.Manifest("advnerf experiment run"),
         live=True,
         not_measured={"latency": "No <live> drive."},
     )

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import yaml
 
-from advnerf_core.report.data import Fidelity, FidelityView, Laps, Latency, MemoryRow
+from advnerf_core.report.data import Fidelity, FidelityView, Laps, Latency
 from advnerf_core.report.reference import Limit, Reference
 from advnerf_core.report.result_table import ResultTable
 from advnerf_core.report.targets import evaluate, verdict
@@ -73,9 +73,9 @@ def test_latency(bare_report, samples, missed, fast, none_missed):
 
 def test_memory_needs_both_horizons(bare_report):
     name = "adjoint, peak memory above idle, T = 400 against T = 50"
-    assert verdicts(replace(bare_report, memory=(MemoryRow(50, 100.0), MemoryRow(200, 90.0))))[name] is None
-    assert verdicts(replace(bare_report, memory=(MemoryRow(50, 100.0), MemoryRow(400, 110.0))))[name] is True
-    assert verdicts(replace(bare_report, memory=(MemoryRow(50, 100.0), MemoryRow(400, 111.0))))[name] is False
+    assert verdicts(replace(bare_report, memory_mib={50: 100.0, 200: 90.0}))[name] is None
+    assert verdicts(replace(bare_report, memory_mib={50: 100.0, 400: 110.0}))[name] is True
+    assert verdicts(replace(bare_report, memory_mib={50: 100.0, 400: 111.0}))[name] is False
 
 
 def test_fidelity_and_laps(bare_report):

@@ -43,6 +43,7 @@ class History:
 
     def __init__(self, folder: Path, paths: Sequence[str]) -> None:
         self.folder = folder
+        self._known: dict[str, set[str]] = {}
         known = self._git("rev-parse", "--is-shallow-repository", "--show-prefix", "--verify", "HEAD").split(
             "\n"
         )
@@ -100,10 +101,6 @@ class History:
                         waiting.append(parent)
             self._known[commit] = found
         return self._known[commit]
-
-    @cached_property
-    def _known(self) -> dict[str, set[str]]:
-        return {}
 
     @cached_property
     def _parents(self) -> dict[str, list[str]]:

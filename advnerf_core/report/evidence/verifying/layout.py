@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from advnerf_core.errors import AdvnerfError
-from advnerf_core.report.cells import CellResult, read_cell
+from advnerf_core.report.cells import CellResult, read_cells
 from advnerf_core.report.evidence.registration import FILE, Registration, read_registration
 
 SET, DIGESTS, PAGE, FORMAT = "set/set.json", "sets.json", "transfer.md", "advnerf-set-1"
@@ -43,4 +43,4 @@ def read_set(folder: Path) -> tuple[Registration, list[CellResult]]:
     registration = read_registration(folder)
     if registration is None:
         raise SetError(f"{folder}: expected {FILE}, which advnerf experiment register writes, got none")
-    return registration, [read_cell(file) for file in cell_files(folder)]
+    return registration, read_cells(folder)
