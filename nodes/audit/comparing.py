@@ -42,12 +42,7 @@ class Before:
                     f"--against {file}: expected {name} beside it, as advnerf audit leaves it, which is not there"
                 )
         load_attack(self.folder / ATTACK_KEPT)
-
-    @property
-    def object(self) -> AuditedObject:
-        """The object that was found."""
-        assert self.result.strongest is not None
-        return self.result.strongest.object
+        self.object: AuditedObject = self.result.strongest.object
 
     def listed(self, kind: str) -> dict[str, Any]:
         """The object in the form of experiment files, if it is of the current kind.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -52,7 +51,7 @@ def posed(given: Path, folder: Path, metric: MetricOptions) -> PosedPlace:
     kind: PlaceKind = "images" if given.is_dir() or found is not None else "video"
     if not (imported / POSES).is_file() or (metric.gives_metre and _scale_of(imported / POSES) is None):
         with ProgressDisplay() as display:
-            _importer(given, found)(imported, metric, display.start("poses"))
+            _import(given, found, imported, metric, display)
     return _known(imported / POSES, kind)
 
 
@@ -81,13 +80,16 @@ def _facts(folder: Path) -> dict[str, Any]:
     return facts
 
 
-def _importer(given: Path, found: ScanFolder | None) -> Callable[[Path, MetricOptions, Any], object]:
-    """The function that makes a data set of some input."""
+def _import(
+    given: Path, found: ScanFolder | None, output: Path, metric: MetricOptions, display: ProgressDisplay
+) -> None:
+    """Make a data set of some input."""
     if found is not None:
         from calibration.scans.scan import ScanOptions
         from nodes.lab.importing.scan import from_scan
 
-        return lambda output, metric, report: from_scan(given, output, ScanOptions(), metric, report)
+        from_scan(given, output, ScanOptions(), metric, display.start("poses"))
+        return
     if not given.exists():
         raise ConfigError(
             f"--place: expected photographs, a video or a scan, got {given}, which is not there"
@@ -109,16 +111,14 @@ def _importer(given: Path, found: ScanFolder | None) -> Callable[[Path, MetricOp
         raise ConfigError(
             f"--place {given}: expected photographs or a scan in it ({known}), got a folder without; give the folder that holds them"
         )
-    return _from_media(given)
+    _from_media(given, output, metric, display)
 
 
-def _from_media(given: Path) -> Callable[[Path, MetricOptions, Any], object]:
+def _from_media(given: Path, output: Path, metric: MetricOptions, display: ProgressDisplay) -> None:
     from advnerf_core.data.keyframes import KeyframeConfig
     from calibration.photo_model import SfmConfig
     from nodes.lab.importing.data_set import from_media
     from nodes.lab.importing.media import MediaConfig
 
     config = MediaConfig(KeyframeConfig(_MOVEMENT), _MOST, False)
-    return lambda output, metric, report: from_media(
-        [given], output, config, SfmConfig(seed=0), _EXTENT_M, metric, report
-    )
+    from_media([given], output, config, SfmConfig(seed=0), _EXTENT_M, metric, display.start("poses"))

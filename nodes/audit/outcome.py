@@ -18,6 +18,7 @@ from advnerf_core.report.audit_parts import (
     AuditedPlace,
     AuditedPolicy,
     AuditedVehicle,
+    AuditQuestion,
     JudgedObject,
     PlacedPose,
 )
@@ -39,7 +40,7 @@ from nodes.audit.drives import PICTURE
 from nodes.audit.judging import Judged, film, texture_of
 from nodes.audit.kept import RESULT, keep_drives
 from nodes.audit.page import write_page
-from nodes.audit.question import JUDGING_SEED, SELECTION_SEED, SELECTION_STARTS, AuditedQuestion, question_of
+from nodes.audit.question import JUDGING_SEED, SELECTION_SEED, SELECTION_STARTS, AuditedQuestion
 from nodes.audit.schedule import NEVER_TRIED
 from nodes.audit.searching import FoundAttack, Searches
 from nodes.audit.spots import Spot
@@ -111,7 +112,7 @@ def result_of(known: Known, folder: Path) -> AuditResult:
         ),
         budget=_budget(known),
         against=known.against,
-        question=question_of(known.file),
+        question=AuditQuestion(file=known.file.name, sha256=sha256_of(known.file)),
         versions={
             "advnerf": version("advnerf"),
             "python": platform.python_version(),

@@ -24,7 +24,6 @@ class Decided(StrictModel):
     """Content of the decisions' file.
 
     Attributes:
-        question: Hash of the question.
         evaluations: Evaluations that the budget buys; None before they were counted.
         spots: Possible places of the object; None before they were chosen.
         settings: Settings of the experiment file, by name.
@@ -77,18 +76,15 @@ class AuditPlan:
 
     def choose(self, spots: list[Spot]) -> None:
         """Store the possible places of the object."""
-        self._decide(spots=[{**vars(each), "placed": as_listed(each)} for each in spots])
-
-    def set_evaluations(self, evaluations: int) -> None:
-        """Store the evaluations that the budget buys."""
-        self._decide(evaluations=evaluations)
+        self.decide(spots=[{**vars(each), "placed": as_listed(each)} for each in spots])
 
     def add(self, setting: str, objects: list[dict[str, Any]], **sections: Any) -> None:
         """Add a setting with an object to the experiment file."""
         values = setting_of(self.question, objects, **sections)
-        self._decide(settings={**self.decided.settings, setting: values})
+        self.decide(settings={**self.decided.settings, setting: values})
 
-    def _decide(self, **values: Any) -> None:
+    def decide(self, **values: Any) -> None:
+        """Store decisions by their names in `Decided`."""
         self.decided = self.decided.model_copy(update=values)
         self.save()
 

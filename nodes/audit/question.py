@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.documents import dump_yaml
-from advnerf_core.files import sha256_of, write_atomically
-from advnerf_core.report.audit_parts import AuditQuestion, Evidence, PlaceKind, Scale
+from advnerf_core.files import write_atomically
+from advnerf_core.report.audit_parts import Evidence, PlaceKind, Scale
 from nodes.experiment.plan.object_kinds import PANEL
 
 VICTIM, PLANTED, OBJECT = "policy", "planted", "object"
@@ -68,7 +68,6 @@ class AuditedQuestion:
         limit_m: |CTE| beyond which the car has left its lane [m]; None uses the world's.
         kind: Kind of the object: ``panel``, or a file.
         size_m: Width of the object [m]; None for a share of the lane.
-        overrides: ``key=value`` texts over the experiment file.
         judging: Number of starts for the verdict.
         sections: Sections of the experiment file besides place and victim.
     """
@@ -169,8 +168,3 @@ def half_overrides(question: AuditedQuestion, setting: str) -> list[str]:
     return [
         f"{section}.{key}={value}" for section, values in of_half.items() for key, value in values.items()
     ]
-
-
-def question_of(file: Path) -> AuditQuestion:
-    """Name and hash of the experiment file."""
-    return AuditQuestion(file=file.name, sha256=sha256_of(file))

@@ -73,46 +73,33 @@ class CannotJudgeError(AdvnerfError):
         self.reasons = reasons
 
 
-@dataclass(frozen=True)
-class AuditOptions:
-    """Options of an audit.
+@dataclass
+class Audit:
+    """One audit in its folder; existing parts are not repeated.
 
     Attributes:
+        say: Callback for messages.
+        console: Console for progress.
         minutes: Time for the whole audit; converted once into evaluations.
         evaluations: Number of evaluations, instead of the time.
         against: Result of an earlier audit to compare this policy with.
         harden: Whether to export frames for hardening.
         timed: Whether the result says when it ended and how long it took.
         cluster: Address of a Ray cluster for the searches; None for this process.
-    """
-
-    minutes: float
-    evaluations: int | None = None
-    against: Path | None = None
-    harden: bool = False
-    timed: bool = True
-    cluster: str | None = None
-
-
-@dataclass
-class Audit:
-    """One audit in its folder; existing parts are not repeated.
-
-    Attributes:
-        question: The question.
-        folder: Folder for all files.
-        options: Options of the audit.
-        say: Callback for messages.
-        console: Console for progress.
         began_s: When the command began, by the monotonic clock [s].
     """
 
     question: AuditedQuestion
     folder: Path
-    options: AuditOptions
     say: Say
     console: Console
-    began_s: float = field(default_factory=time.monotonic)
+    minutes: float
+    evaluations: int | None
+    against: Path | None
+    harden: bool
+    timed: bool
+    cluster: str | None
+    began_s: float
     before: Before | None = field(default=None, init=False)
 
     def run(self) -> AuditResult:
@@ -121,13 +108,13 @@ class Audit:
         Raises:
             AdvnerfError: The question is wrong, or a file cannot be read.
         """
-        self.before = None if self.options.against is None else Before(self.options.against)
-        known = Known(self.question, self.options.minutes)
+        self.before = None if self.against is None else Before(self.against)
+        known = Known(self.question, self.minutes)
         try:
             self._run(known)
         except CannotJudgeError as ended:
             known.reasons = ended.reasons
-        if self.options.timed:
+        if self.timed:
             known.seconds, known.ended = (
                 time.monotonic() - self.began_s,
                 datetime.now(timezone.utc).replace(microsecond=0),
@@ -219,22 +206,22 @@ class Audit:
             plan,
             spots,
             victim,
-            plan.decided.evaluations or self.options.evaluations or 1,
+            plan.decided.evaluations or self.evaluations or 1,
             declared.differentiable,
             declared.has_memory,
             limit_m,
-            self.options.cluster,
+            self.cluster,
         )
         if plan.decided.evaluations is None:
-            if self.options.evaluations is None:
+            if self.evaluations is None:
                 searches.evaluations = self._bought(copies.ready(_FIRST), searches)
-            plan.set_evaluations(searches.evaluations)
+            plan.decide(evaluations=searches.evaluations)
         self.say(f"searching {searches.cost} evaluations")
         return searches
 
     def _bought(self, experiment: Experiment, searches: Searches) -> int:
         """The evaluations that the rest of the budget buys; at least those of the smallest schedule."""
-        question, minutes = self.question, self.options.minutes
+        question, minutes = self.question, self.minutes
         costs = Costs.measured(experiment, question, searches.differentiable)
         judging_s, used_s = costs.judging_s(question), time.monotonic() - self.began_s
         count = sum(map(len, searches.planned))
@@ -272,7 +259,7 @@ class Audit:
             for kind in kinds:
                 report = display.start(_JUDGING[kind])
                 known.judged.append(judge_found(there, best.attack, *starts, kind, report))
-        if self.options.harden:
+        if self.harden:
             self.say(f"frames past the object: {export_frames(known.judged[-1], self.folder / HARDEN)}")
 
     def _compare(self, before: Before, copies: Copies, plan: AuditPlan, limit_m: float) -> AuditComparison:

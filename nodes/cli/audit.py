@@ -19,8 +19,7 @@ from nodes.runtime.options import with_groups
 from nodes.runtime.terminal import Overrides, say_error
 
 if TYPE_CHECKING:
-    from nodes.audit.question import AuditedQuestion
-    from nodes.audit.run import AuditOptions
+    from nodes.audit.run import Audit
 
 # Codes below are verdicts: see `advnerf_core.report.audit_result.EXIT_CODES`.
 USAGE_EXIT, FAULT_EXIT, CANNOT_JUDGE_EXIT = 64, 70, 2
@@ -242,14 +241,10 @@ def audit(
     if (place.place is None) == (place.world is None):
         say_error("expected either --place or --world")
         raise typer.Exit(USAGE_EXIT)
-    from rich.console import Console
-
     from nodes.audit.asking import UnansweredError
-    from nodes.audit.run import Audit
 
     try:
-        question, options = _question(policy, place, metric, search, result, overrides or [])
-        found = Audit(question, result.output, options, _say, Console(), began_s).run()
+        found = _audit(policy, place, metric, search, result, overrides or [], began_s).run()
     except UnansweredError as error:
         say_error(str(error))
         raise typer.Exit(CANNOT_JUDGE_EXIT) from None
@@ -265,21 +260,24 @@ def audit(
     raise typer.Exit(found.exit_code)
 
 
-def _question(
+def _audit(
     policy: str,
     place: PlaceOptions,
     metric: MetricOptions,
     search: SearchOptions,
     result: ResultOptions,
     overrides: list[str],
-) -> tuple[AuditedQuestion, AuditOptions]:
+    began_s: float,
+) -> Audit:
+    from rich.console import Console
+
     from nodes.audit.asking import answer
     from nodes.audit.cars import car_of
     from nodes.audit.images import posed
     from nodes.audit.places import Answers, AuditedWorld, camera_of, place_of_photographs
     from nodes.audit.policies import resolve_policy
     from nodes.audit.question import CI_SECTIONS, AuditedQuestion
-    from nodes.audit.run import CI_EVALUATIONS, AuditOptions
+    from nodes.audit.run import CI_EVALUATIONS, Audit
 
     if search.kind != "panel" and not Path(search.kind).is_file():
         raise ConfigError(
@@ -318,14 +316,18 @@ def _question(
         judging=search.starts or (50 if where.is_driven and not result.ci else 20),
         sections=CI_SECTIONS if result.ci else {},
     )
-    evaluations = search.evaluations or (CI_EVALUATIONS if result.ci else None)
-    return question, AuditOptions(
-        _minutes(search.budget),
-        evaluations,
-        result.against,
-        result.harden,
+    return Audit(
+        question,
+        folder,
+        _say,
+        Console(),
+        minutes=_minutes(search.budget),
+        evaluations=search.evaluations or (CI_EVALUATIONS if result.ci else None),
+        against=result.against,
+        harden=result.harden,
         timed=not result.ci,
         cluster=search.cluster,
+        began_s=began_s,
     )
 
 
