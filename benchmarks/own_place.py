@@ -150,7 +150,8 @@ def served(folder: Path) -> Iterator[str]:
 def run_small(folder: Path) -> None:
     """The setting for continuous integration, twice: how long it takes, and whether it says the same."""
     (result, first), (_, second) = (
-        run_audit(folder, name, POLICY, "--place", PHOTOS, *OPTIONS, "--ci") for name in ("one", "two")
+        run_audit(folder, name, POLICY, "--place", PHOTOS, "--in-metres", *OPTIONS, "--ci")
+        for name in ("one", "two")
     )
     minutes = max(first, second)
     same = (folder / "one" / "audit.json").read_bytes() == (folder / "two" / "audit.json").read_bytes()
@@ -208,7 +209,7 @@ def main() -> None:
             words = (POLICY, "--place", VIDEO, *OPTIONS, *make_video(folder))
         else:
             make_folder(folder)
-            words = (POLICY, "--place", PHOTOS, *OPTIONS)
+            words = (POLICY, "--place", PHOTOS, "--in-metres", *OPTIONS)
         if options.ci:
             run_small(folder)
             return

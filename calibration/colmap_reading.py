@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.data.errors import DatasetError
+from advnerf_core.data.image_files import natural_order
 from advnerf_core.data.lens import Lens, straightening
 from advnerf_core.geometry import Array, Pinhole
 from calibration.colmap_files import check_binary_files, model_folders
@@ -81,7 +82,9 @@ def _read(folder: Path) -> Any:
 
 
 def _converted(found: Any, folder: Path, sizes: dict[str, int], parts: int) -> ColmapModel:
-    images = sorted((each for each in found.images.values() if each.has_pose), key=lambda each: each.name)
+    images = sorted(
+        (each for each in found.images.values() if each.has_pose), key=lambda each: natural_order(each.name)
+    )
     counts = Counter(each.camera_id for each in images)
     lenses = {number: _intrinsics(found.cameras[number], folder) for number in sorted(counts)}
     cameras = tuple(

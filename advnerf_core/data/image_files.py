@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -91,6 +92,11 @@ def image_size(path: Path) -> tuple[int, int]:
         return int(width), int(height)
     rgb, _ = read_stored(path)
     return rgb.shape[1], rgb.shape[0]
+
+
+def natural_order(name: str) -> list[tuple[int, str]]:
+    """Key that sorts names by the numbers in them: ``9.jpg`` before ``10.jpg``."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 def read_bytes(path: Path) -> bytes:

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import hashlib
+import json
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from advnerf_core.data.image_files import HEIF_SUFFIXES, SUFFIXES
 from advnerf_core.data.scan_folder import DATA_SET, SCANS, ScanFolder, scan_of
 from advnerf_core.documents import read_json
+from advnerf_core.files import write_json
 from advnerf_core.report.audit_parts import PlaceKind, Scale
 from nodes.audit.asking import UnansweredError
 from nodes.lab.importing.metric_options import MetricOptions
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
 
-POSES, IMPORTED, REPORT = "transforms.json", "photos", "import.json"
-# nerfstudio writes this key for poses from structure from motion, whose unit is arbitrary.
-_OF_COLMAP = "applied_transform"
+POSES, IMPORTED, REPORT, INPUT = "transforms.json", "photos", "import.json", "imported_from.json"
 _SPLATS = (".ply", ".spz", ".splat", ".glb")
 _EXTENT_M = 1.0  # of a set without a known metre, which is then rejected
+_HEAD_BYTES = 65536
 _MOVEMENT, _MOST = 0.06, 300  # as in ``advnerf scene from-video``
 
 
@@ -33,45 +35,97 @@ class PosedPlace:
     ground_at_zero: bool
 
 
-def posed(given: Path, folder: Path, metric: MetricOptions) -> PosedPlace:
-    """The posed photographs of a place; input without poses is imported into the audit's folder, once.
+def posed(given: Path, folder: Path, metric: MetricOptions, in_metres: bool = False) -> PosedPlace:
+    """The posed photographs of a place; input without poses, or without metres, is imported into the audit's folder, once.
+
+    Args:
+        given: What the user named.
+        folder: Folder of the audit.
+        metric: What gives the metre.
+        in_metres: Whether the poses of posed photographs are in metres already.
 
     Raises:
-        ConfigError: The input is of no known kind.
+        ConfigError: The input is of no known kind, the folder has photographs of another one, or an option about the metre is not needed.
         UnansweredError: The length of a metre is unknown.
         AdvnerfError: The input cannot be read, or poses cannot be estimated.
     """
     poses = given / POSES if given.is_dir() else given
     found = scan_of(given)
     if found is not None and found.name == DATA_SET and poses.is_file():
-        ours = bool(_facts(poses.parent))
-        if not metric.gives_metre or (ours and _scale_of(poses) is not None):
-            return _known(poses, "images")
+        known = _scale_of(poses)
+        if known is not None and (metric.gives_metre or in_metres):
+            raise ConfigError(
+                f"expected no option that gives the metre, as {poses.parent / REPORT} has it from {known}; leave it out, or import the place anew"
+            )
+        if in_metres and metric.gives_metre:
+            raise ConfigError(
+                "expected one source of the metre, got --in-metres and another; give one of them"
+            )
+        if known is not None or in_metres or not metric.gives_metre:
+            return _known(poses, "images", known or ("poses" if in_metres else None))
+    elif in_metres:
+        raise ConfigError(f"--in-metres: expected photographs with poses ({POSES}), got {given}")
     imported = folder / IMPORTED
     kind: PlaceKind = "images" if given.is_dir() or found is not None else "video"
-    if not (imported / POSES).is_file() or (metric.gives_metre and _scale_of(imported / POSES) is None):
+    there = _scale_of(imported / POSES)
+    _require_same_input(folder, given, metric, has_metre=there is not None)
+    if not (imported / POSES).is_file() or (metric.gives_metre and there is None):
         with ProgressDisplay() as display:
             _import(given, found, imported, metric, display)
-    return _known(imported / POSES, kind)
+    return _known(imported / POSES, kind, _scale_of(imported / POSES))
 
 
-def _known(poses: Path, kind: PlaceKind) -> PosedPlace:
-    scale = _scale_of(poses)
+def _known(poses: Path, kind: PlaceKind, scale: Scale | None) -> PosedPlace:
     if scale is None:
         raise UnansweredError(
             f"expected a known length, as {poses} has none and an audit speaks of metres: --length A B METRES (A and B: two of the images there, "
-            "METRES: between their cameras), --positions CSV or --marker SIDE"
+            "METRES: between their cameras), --positions CSV or --marker SIDE; --in-metres if posed photographs are in metres already"
         )
     return PosedPlace(poses, kind, scale, bool(_facts(poses.parent).get("ground_at_zero", False)))
 
 
 def _scale_of(poses: Path) -> Scale | None:
-    facts = _facts(poses.parent)
-    content = {} if facts else read_json(poses)
-    if isinstance(content, dict) and _OF_COLMAP in content:
-        return None
-    scale: Scale | None = facts.get("scale_from", "poses")
+    """What gave the metre of an import; None if nothing did, or of poses from elsewhere, whose unit no file says."""
+    scale: Scale | None = facts.get("scale_from", "poses") if (facts := _facts(poses.parent)) else None
     return scale
+
+
+def _require_same_input(folder: Path, given: Path, metric: MetricOptions, has_metre: bool) -> None:
+    """Write down what is imported into an audit's folder, or check that it is what was imported there before.
+
+    Raises:
+        ConfigError: It is another place, or another metre.
+    """
+    file = folder / INPUT
+    now = {"given": str(given.resolve()), "content": _digest(given), "metric": asdict(metric)}
+    now = json.loads(json.dumps(now, default=str))
+    before = read_json(file) if file.is_file() else now
+    changed = [key for key in now if before.get(key) != now[key]]
+    if "given" in changed and "content" not in changed:  # the same files elsewhere
+        changed.remove("given")
+    if changed and (changed != ["metric"] or has_metre):
+        what = (
+            "another metre was given"
+            if changed == ["metric"]
+            else f"the photographs of {before['given']} were imported as they then were"
+        )
+        raise ConfigError(
+            f"expected a folder of this audit or a new one, got {folder}, where {what}; name another one with --output"
+        )
+    write_json(file, now)
+
+
+def _digest(given: Path) -> str:
+    """Hash of names, sizes and first bytes of a file, or of all files of a folder: enough to notice another recording."""
+    digest = hashlib.sha256()
+    files = sorted(each for each in given.rglob("*") if each.is_file()) if given.is_dir() else [given]
+    for file in files if given.exists() else ():
+        with file.open("rb") as stream:
+            head = stream.read(_HEAD_BYTES)
+        digest.update(
+            f"{file.relative_to(given)}\0{file.stat().st_size}\0".encode() + hashlib.sha256(head).digest()
+        )
+    return digest.hexdigest()
 
 
 def _facts(folder: Path) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -23,6 +24,7 @@ from nodes.experiment.plan.sections import CaptureConfig
 from nodes.lab.worlds.named import NamedWorld, read_world
 from nodes.lab.worlds.photographs.config import DRIVEN
 from nodes.lab.worlds.photographs.world import PATH, Photographs
+from nodes.runtime.config import apply_overrides
 from nodes.runtime.paths import shipped
 
 _DRIVEN_POSES = "transforms_car.json"
@@ -30,6 +32,7 @@ _DRIVEN_POSES = "transforms_car.json"
 _ROUND = 3.0
 # Relative to the extent of the cameras: nothing is learned beyond. A place with more distant walls fails on its held-out views.
 _REACH = 1.5
+_WORLD = "world."
 
 
 @dataclass(frozen=True)
@@ -50,9 +53,17 @@ class Answers:
 
 
 def place_of_photographs(
-    given: Path, there: PosedPlace, answers: Answers, car: AuditedCar, camera: Pinhole | None
+    given: Path,
+    there: PosedPlace,
+    answers: Answers,
+    car: AuditedCar,
+    camera: Pinhole | None,
+    overrides: Sequence[str] = (),
 ) -> tuple[Place, float]:
     """A place of posed photographs, and half the width of its lane [m]; without the policy's own camera it has the photographs'.
+
+    Args:
+        overrides: ``KEY=VALUE`` texts about the experiment; those of its world count here already.
 
     Raises:
         ConfigError: The photographs show no path.
@@ -82,6 +93,9 @@ def place_of_photographs(
         world["ground_z_m"] = 0.0
     if camera is not None:
         world["camera"]["pinhole"] = asdict(camera)
+    apply_overrides(
+        Document({"world": world}, "--place"), [each for each in overrides if each.startswith(_WORLD)]
+    )
     derived, held_out = _found_out(world)
     world |= derived
     title, source = f"the place of {name_of(given)}", str(given)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
@@ -14,10 +13,12 @@ import typer
 from advnerf_core.documents import dump_yaml, parse_yaml
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Pinhole
+from advnerf_core.inputs import InputFiles
 from advnerf_core.policies.contract import PolicyContract
 from advnerf_core.policies.declaration import DECLARATION_SUFFIX
 from advnerf_core.policies.guess import Question, guess_contract
 from advnerf_core.policies.load import is_address, is_code, load_any_policy
+from advnerf_core.policies.onnx_policy import read_onnx
 from nodes.runtime.errors import ConfigError
 
 FOLDER = "policy"
@@ -57,11 +58,17 @@ def resolve_policy(
     if questions or declared:
         contract = _completed(contract, questions, _read(declared), driven, say)
         target = folder / FOLDER / file.name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(file, target)
+        _copy(file, target)
         write_atomically(target.with_name(target.name + DECLARATION_SUFFIX), dump_yaml(contract.to_dict()))
         file = target
     return str(file.resolve()), contract.view.camera
+
+
+def _copy(file: Path, target: Path) -> None:
+    """Copy a policy file, an ONNX file together with the files of its weights."""
+    files = read_onnx(file) if file.suffix == ".onnx" else InputFiles(file)
+    for name, content in {target.name: files.content, **files.others}.items():
+        write_atomically(target.parent / name, content)
 
 
 def _completed(

@@ -51,6 +51,14 @@ class PlaceOptions:
             _PLACE, "--world", help="Instead: a world that can be driven, as lab, metadrive or file.py:Class."
         ),
     ] = None
+    in_metres: Annotated[
+        bool,
+        _option(
+            _PLACE,
+            "--in-metres",
+            help="Posed photographs of other software are in metres, as from motion capture; else give a length.",
+        ),
+    ] = False
     limit: Annotated[
         str | None,
         _option(
@@ -289,11 +297,11 @@ def _audit(
         named = answer(
             place.car, "--car", "Which car: racecarj, roboracer, donkey, duckiebot, car, or a YAML file", str
         )
-        car, there = car_of(named), posed(place.place, folder, metric)
+        car, there = car_of(named), posed(place.place, folder, metric, place.in_metres)
         spec, wanted = resolve_policy(
             policy, lambda: (camera_of(there, place.path), car.car.max_steering_rad), declared, folder, _say
         )
-        where, limit_m = place_of_photographs(place.place, there, answers, car, wanted)
+        where, limit_m = place_of_photographs(place.place, there, answers, car, wanted, overrides)
     else:
         assert place.world is not None, "one of the two is given"
         world = AuditedWorld(place.world)

@@ -87,7 +87,17 @@ def make_folder(folder: Path) -> None:
 
 def command(policy: str, *options: str, output: str = "") -> list[str]:
     """The command that audits one of the policies, a file, or the driver at an address, run in their folder."""
-    words = ["--place", "photos", "-o", output or policy, "--car", "car.yaml", "--limit", str(LIMIT_M)]
+    words = [
+        "--place",
+        "photos",
+        "--in-metres",
+        "-o",
+        output or policy,
+        "--car",
+        "car.yaml",
+        "--limit",
+        str(LIMIT_M),
+    ]
     words += ["--evaluations", "60", "--starts", "8", "--object-size", "0.5"]
     changes = [word for each in CHANGES for word in ("--set", each)]
     return [

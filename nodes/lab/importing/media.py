@@ -100,10 +100,7 @@ def photographs_in(folder: Path) -> list[Path]:
     if others:
         kinds = ", ".join(f"{count} {suffix}" for suffix, count in sorted(others.items()))
         print(f"{folder}: {len(files)} photographs; left out, as they are of other kinds: {kinds}")
-    return sorted(
-        files,
-        key=lambda path: [(int(p), "") if p.isdigit() else (-1, p) for p in re.split(r"(\d+)", path.name)],
-    )
+    return sorted(files, key=lambda path: image_files.natural_order(path.name))
 
 
 def _is_photograph(path: Path) -> bool:

@@ -6,14 +6,18 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from advnerf_core.data.posed_images import write_posed_images
+from advnerf_core.geometry import Pinhole, camera_mount, planar_pose
+from advnerf_core.policies.load import load_any_policy
 from advnerf_core.report.audit_result import audit_schema
 from hardware.worlds.lab.config import LabConfig
 from hardware.worlds.lab.lab import Lab
 from nodes.audit.cars import CARS, car_of
 from nodes.audit.images import posed
-from nodes.audit.places import AuditedWorld
+from nodes.audit.places import Answers, AuditedWorld, place_of_photographs
 from nodes.audit.policies import resolve_policy
 from nodes.cli.audit import _minutes
 from nodes.experiment.show.experiment_world import as_json
@@ -96,6 +100,51 @@ def test_a_world_is_not_opened_for_what_a_policy_and_the_path_declare(openings: 
         found = resolve_policy(given, lambda: pytest.fail("the world was asked"), (), tmp_path, print)
         assert found[0] == given
     assert not openings.read_text()
+
+
+def test_a_network_with_weights_in_another_file_is_copied_with_them(tmp_path: Path) -> None:
+    """As torch exports it by default; nothing but the file's content says how it steers."""
+    onnx_models = pytest.importorskip("tests.support.onnx_models")
+    given = tmp_path / "mine" / "model.onnx"
+    onnx_models.save_beside(onnx_models.mean_model({"steering": 0.5}), given, weights="model.onnx.data")
+    given.with_name("model.onnx.policy.yaml").unlink()
+    driven = (LabConfig().camera.pinhole, 0.4)
+    spec, camera = resolve_policy(str(given), lambda: driven, (), tmp_path / "audit", print)
+    assert Path(spec).is_relative_to(tmp_path / "audit")
+    assert camera == driven[0]
+    before = load_any_policy(spec).sha256
+    weights = Path(spec).with_name("model.onnx.data")
+    weights.write_bytes(bytes(len(weights.read_bytes())))
+    assert load_any_policy(spec).sha256 != before
+
+
+def test_a_path_from_a_file_takes_ground_and_pitch_from_the_changes_of_the_experiment(tmp_path: Path) -> None:
+    x_m = np.linspace(0.0, 2.0, 24)
+    poses = [planar_pose(x, 0.0, 0.0) @ camera_mount(0.0, 0.0, 0.3, 0.1) for x in x_m]
+    write_posed_images(
+        tmp_path / "photos",
+        poses,
+        Pinhole(32, 24, 20.0, 20.0, 16.0, 12.0),
+        lambda _: np.zeros((24, 32, 3), np.uint8),
+        "png",
+    )
+    (tmp_path / "way.csv").write_text("x_m,y_m\n" + "\n".join(f"{x},0" for x in x_m))
+    there = posed(tmp_path / "photos", tmp_path / "audit", MetricOptions(), in_metres=True)
+    asked = (
+        tmp_path / "photos",
+        there,
+        Answers(0.4, None, 0.3, str(tmp_path / "way.csv")),
+        CARS["donkey"],
+        None,
+    )
+    with pytest.raises(
+        ConfigError, match=r"give both, for example --set world\.ground_z_m=0 --set world\.camera\.pitch"
+    ):
+        place_of_photographs(*asked)
+    changes = ["world.ground_z_m=0", "world.camera.pitch_down_rad=0.1", "horizon=30"]
+    place, limit_m = place_of_photographs(*asked, changes)
+    assert (place.world["ground_z_m"], place.world["camera"]["pitch_down_rad"]) == (0, 0.1)
+    assert (place.world["closed"], limit_m) == (False, 0.4)
 
 
 def test_a_learned_scene_without_its_images_cannot_be_judged_in(tmp_path: Path) -> None:

@@ -41,13 +41,51 @@ def test_a_scan_without_metres_asks_for_a_length_and_takes_it(tmp_path, kind, en
     assert apart == pytest.approx(length(*ends).length[2], rel=1e-9)
 
 
-def test_other_posed_images_are_used_as_they_are(tmp_path):
-    scan = scan_samples.nerfstudio(tmp_path)
-    content = json.loads((scan / "transforms.json").read_text())
-    content.pop("applied_transform")
-    (scan / "transforms.json").write_text(json.dumps(content))
-    there = posed(scan, tmp_path / "audit", MetricOptions())
+def test_other_posed_images_are_used_as_they_are_if_they_are_said_to_be_in_metres(tmp_path):
+    scan, ends = scan_samples.nerfstudio(tmp_path), ("frame_00001.png", "frame_00006.png")
+    with pytest.raises(
+        AdvnerfError, match=r"expected a known length, .* --in-metres if posed photographs are"
+    ):
+        posed(scan, tmp_path / "audit", MetricOptions())
+    there = posed(scan, tmp_path / "audit", MetricOptions(), in_metres=True)
     assert (there.poses, there.scale) == (scan / "transforms.json", "poses")
+    with pytest.raises(AdvnerfError, match="expected one source of the metre, got --in-metres and another"):
+        posed(scan, tmp_path / "audit", length(*ends), in_metres=True)
+    with pytest.raises(
+        AdvnerfError, match=r"--in-metres: expected photographs with poses \(transforms\.json\)"
+    ):
+        posed(
+            scan_samples.write("LLFF", tmp_path / "llff"), tmp_path / "audit", MetricOptions(), in_metres=True
+        )
+
+
+def test_a_length_that_is_not_needed_is_refused(tmp_path):
+    scan = scan_samples.nerfstudio(tmp_path)
+    imported = posed(scan, tmp_path / "audit", length("frame_00001.png", "frame_00006.png")).poses
+    with pytest.raises(
+        AdvnerfError, match=r"expected no option that gives the metre, as .*import\.json has it from length"
+    ):
+        posed(imported, tmp_path / "other", length("frame_00001.png", "frame_00006.png"))
+
+
+def test_the_photographs_of_another_place_or_metre_are_not_those_of_an_audit_s_folder(tmp_path):
+    """Each import is repeated first, which takes what is there; then its place, its content or its metre changes."""
+    ends, audit = ("frame_00001.png", "frame_00006.png"), tmp_path / "audit"
+    one, other = scan_samples.nerfstudio(tmp_path / "one"), scan_samples.nerfstudio(tmp_path / "other")
+    there = posed(one, audit, length(*ends))
+    written = there.poses.read_bytes()
+    assert posed(one, audit, length(*ends)) == there
+    moved = one.rename(tmp_path / "moved")
+    assert posed(moved, audit, length(*ends)) == there
+    content = json.loads((other / "transforms.json").read_text())
+    content["frames"] = content["frames"][:-1]
+    (other / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(AdvnerfError, match=r"where the photographs of .*moved were imported .* --output"):
+        posed(other, audit, length(*ends))
+    twice = MetricOptions(length=(*ends, 2.0 * length(*ends).length[2]))
+    with pytest.raises(AdvnerfError, match="where another metre was given; name another one with --output"):
+        posed(moved, audit, twice)
+    assert there.poses.read_bytes() == written
 
 
 def test_a_folder_of_nothing_names_what_is_taken(tmp_path):

@@ -1,6 +1,8 @@
 """A place of photographs: its path, ground and camera are those of the car that took them."""
 
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -120,8 +122,71 @@ def test_a_leap_ends_a_drive_and_the_longest_part_is_taken() -> None:
     assert np.allclose(driven_track(np.concatenate([elsewhere, cars]))[:, 0], 0.1 * np.arange(20))
     back = np.stack([planar_pose(1.9 - 0.1 * index, 0.0, 0.0) for index in range(1, 12)])
     assert len(driven_track(np.concatenate([cars, back]))) == 20, "a car does not drive backwards"
-    with pytest.raises(WorldError, match=r"at least three photographs.*CSV"):
+    with pytest.raises(WorldError, match=r"one after the other along a drive, got 2 .* at most 2 are; .*CSV"):
         driven_track(cars[[0, 9]])
+
+
+def test_photographs_are_put_in_the_order_of_their_names_if_that_is_the_drive_s(tmp_path: Path) -> None:
+    """Sorted as text (0, 1, 10, 11, 2, ...), and as a program lists them that keeps no order."""
+    file = photographs(tmp_path / "images_of_mine", count=48) / "transforms.json"
+    content = json.loads(file.read_text())
+    whole = place(tmp_path).path_points()
+    assert len(whole) == 48
+    for number, frame in enumerate(content["frames"]):
+        old, new = file.parent / frame["file_path"], file.parent / "images" / f"view{number}.png"
+        old.rename(new)
+        frame["file_path"] = f"images/view{number}.png"
+    for shown in (sorted(content["frames"], key=lambda each: each["file_path"]), shuffled(content["frames"])):
+        file.write_text(json.dumps({**content, "frames": shown}))
+        found = place(tmp_path)
+        assert np.array_equal(found.path_points(), whole)
+        assert [each.path.stem for each in found.along] == [f"view{number}" for number in range(48)]
+    for number, frame in enumerate(shown):  # now no order is that of the drive
+        (file.parent / frame["file_path"]).rename(file.parent / "images" / f"any{number}.png")
+        frame["file_path"] = f"images/any{number}.png"
+    file.write_text(json.dumps({**content, "frames": shown}))
+    with pytest.raises(
+        WorldError, match=r"got 48 of which at most \d are; list or name them in the order of the drive"
+    ):
+        place(tmp_path).path_points()
+
+
+def shuffled(frames: list[Any]) -> list[Any]:
+    return [frames[k] for k in np.random.default_rng(0).permutation(len(frames))]
+
+
+@pytest.mark.parametrize(
+    ("turn", "degrees"),
+    [
+        (np.diag([-1.0, -1.0, 1.0, 1.0]), 180),  # upside down
+        (make_transform(rotation_z(np.pi / 2), [0.0, 0.0, 0.0]), 90),  # a portrait camera
+    ],
+)
+def test_a_rolled_camera_is_refused(tmp_path: Path, turn: Array, degrees: int) -> None:
+    file = photographs(tmp_path / "images_of_mine") / "transforms.json"
+    content = json.loads(file.read_text())
+    for frame in content["frames"]:
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ turn).tolist()
+    file.write_text(json.dumps(content))
+    with pytest.raises(
+        WorldError, match=rf"rolled by {degrees} degrees in the median; turn pictures and poses"
+    ):
+        place(tmp_path).describe()
+
+
+@pytest.mark.parametrize("up", ["y", "-z"])
+def test_a_frame_without_z_up_is_refused(tmp_path: Path, up: str) -> None:
+    file = photographs(tmp_path / "images_of_mine") / "transforms.json"
+    content = json.loads(file.read_text())
+    turn = {
+        "y": [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]],
+        "-z": [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0]],
+    }[up]
+    for frame in content["frames"]:
+        frame["transform_matrix"] = (np.array([*turn, [0, 0, 0, 1]]) @ frame["transform_matrix"]).tolist()
+    file.write_text(json.dumps(content))
+    with pytest.raises(WorldError, match="expected upright photographs in a frame with z up"):
+        place(tmp_path).describe()
 
 
 def test_an_open_path_from_a_file(tmp_path: Path) -> None:

@@ -103,7 +103,8 @@ class PhotographsConfig(StrictModel):
     def _ground_is_known(self) -> PhotographsConfig:
         if not self.shows_path and (self.ground_z_m is None or self.camera.pitch_down_rad is None):
             raise ValueError(
-                "expected ground_z_m and camera.pitch_down_rad with a path from a file, as photographs that nobody drove for do not show them"
+                "expected ground_z_m and camera.pitch_down_rad with a path from a file, as photographs that nobody drove for do not show them; give "
+                "both, for example --set world.ground_z_m=0 --set world.camera.pitch_down_rad=0.1"
             )
         return self
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from advnerf_core.data.image_files import natural_order
 from advnerf_core.documents import read_csv
 from advnerf_core.geometry import Array
 from hardware.worlds.fitting import path_through
@@ -14,22 +16,47 @@ from hardware.worlds.world import WorldError
 
 # Between two photographs of one drive the distance is at most this many times the usual one, and leads forward at least this much (cosine).
 _LONGEST_STEPS, _FORWARD = 5.0, 0.5
+# Of the photographs; a drive in fewer of them is none, or they are not in its order.
+_LEAST_SHARE = 0.25
 # In half lanes: distance of the points that the path passes, and its largest error there.
 _SPACING, _MISS = 0.5, 0.04
+
+
+def driving_order(cars: Array, names: Sequence[str]) -> Array:
+    """Indices of the photographs in the order of the drive: as they are listed, or by the numbers in their names if that continues longer.
+
+    Args:
+        cars: ``T_world_from_car [N, 4, 4]`` as listed.
+        names: Names of their files.
+    """
+    listed = np.arange(len(cars))
+    named = np.array(sorted(listed, key=lambda index: natural_order(names[index])), np.int64)
+    return max((listed, named), key=lambda order: len(_longest_part(cars[order])))
 
 
 def driven_track(cars: Array) -> Array:
     """The longest continuous part of a drive.
 
     Args:
-        cars: ``T_world_from_car [N, 4, 4]`` in the order of the photographs.
+        cars: ``T_world_from_car [N, 4, 4]`` in the order of the drive.
 
     Returns:
         x [m], y [m] ``[M, 2]``.
 
     Raises:
-        WorldError: The photographs show no drive.
+        WorldError: The photographs show no drive, or are not in its order.
     """
+    best = _longest_part(cars)
+    if len(best) < max(3, _LEAST_SHARE * len(cars)):
+        raise WorldError(
+            f"expected photographs one after the other along a drive, got {len(cars)} of which at most {len(best)} are; list or name them "
+            "in the order of the drive, or give the path as a CSV file with columns x_m, y_m"
+        )
+    return np.asarray(cars[best, :2, 3])
+
+
+def _longest_part(cars: Array) -> Array:
+    """Indices of the longest run of photographs that lead forward in usual steps."""
     points, ahead = cars[:, :2, 3], cars[:, :2, 0]
     steps = np.diff(points, axis=0)
     lengths_m = np.linalg.norm(steps, axis=1)
@@ -38,13 +65,7 @@ def driven_track(cars: Array) -> Array:
         np.einsum("ij,ij->i", steps, ahead[:-1]) >= _FORWARD * lengths_m * np.linalg.norm(ahead[:-1], axis=1)
     )
     parts = np.split(np.arange(len(points)), np.flatnonzero(~goes_on) + 1)
-    best = max(parts, key=lambda part: float(lengths_m[part[:-1]].sum()))
-    if len(best) < 3:
-        raise WorldError(
-            f"expected at least three photographs one after the other along a drive, got {len(points)} of which {len(best)} are; give the path "
-            "as a CSV file with columns x_m, y_m"
-        )
-    return points[best]
+    return max(parts, key=lambda part: float(lengths_m[part[:-1]].sum()))
 
 
 def points_of(file: Path) -> Array:

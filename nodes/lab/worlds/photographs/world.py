@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +16,7 @@ from advnerf_core.data.view_loading import load_image
 from advnerf_core.geometry import Array, Pinhole, camera_mount, invert_transform, make_transform
 from hardware.worlds.world import Box, Photograph, Rgb, WorldDescription, WorldError
 from nodes.lab.worlds.photographs.config import PhotographsConfig, read_images
-from nodes.lab.worlds.photographs.track import driven_track, path_along, points_of
+from nodes.lab.worlds.photographs.track import driven_track, driving_order, path_along, points_of
 from nodes.lab.worlds.undriven import Undriven
 
 PATH = "track"
@@ -23,6 +24,8 @@ PATH = "track"
 _BESIDE, _BELOW_M = 0.5, 0.1
 # Of a picture: estimated intrinsics differ from declared ones, so that so much beyond its border is taken from the border.
 _BEYOND = 0.01
+# A camera that is screwed on; its roll is left out of the mount.
+_MOST_ROLL_RAD = math.radians(10.0)
 _HALF_PX = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
 
 
@@ -45,14 +48,15 @@ class Photographs(Undriven):
         camera = self.config.camera
         pitch = camera.pitch_down_rad
         if pitch is None:
-            axes = np.stack([each.T_world_from_camera[:3, 2] for each in self._driven])
-            pitch = float(np.median(np.arcsin(np.clip(-axes[:, 2], -1.0, 1.0))))
+            turned = np.stack([each.T_world_from_camera[:3, :3] for each in self._listed])
+            _require_upright(turned)
+            pitch = float(np.median(np.arcsin(np.clip(-turned[:, 2, 2], -1.0, 1.0))))
         return camera_mount(camera.x_m, camera.y_m, camera.z_m, pitch)
 
     @cached_property
     def camera_pinhole(self) -> Pinhole:
         """Intrinsics of the driving camera."""
-        return self.config.camera.pinhole or load_image(self._driven[0])[1]
+        return self.config.camera.pinhole or load_image(self._listed[0])[1]
 
     @cached_property
     def photo_pinhole(self) -> Pinhole:
@@ -60,8 +64,17 @@ class Photographs(Undriven):
         return load_image(self._all[0])[1]
 
     @cached_property
-    def _driven(self) -> tuple[PosedImage, ...]:
+    def _listed(self) -> tuple[PosedImage, ...]:
+        """The photographs that were taken while driving, as they are listed."""
         return self._checked(self.config.driven.frames)
+
+    @cached_property
+    def _driven(self) -> tuple[PosedImage, ...]:
+        """The same in the order of the drive."""
+        if not self.config.shows_path:
+            return self._listed
+        cars = self._cars_of(self._listed)
+        return tuple(self._listed[k] for k in driving_order(cars, [each.path.name for each in self._listed]))
 
     @cached_property
     def _all(self) -> tuple[PosedImage, ...]:
@@ -74,17 +87,16 @@ class Photographs(Undriven):
             )
         return frames
 
-    @cached_property
-    def _cars(self) -> Array:
-        """``T_images_from_car [N, 4, 4]`` of the driven photographs."""
-        poses = np.stack([each.T_world_from_camera for each in self._driven])
+    def _cars_of(self, driven: Sequence[PosedImage]) -> Array:
+        """``T_images_from_car [N, 4, 4]`` of driven photographs."""
+        poses = np.stack([each.T_world_from_camera for each in driven])
         return poses @ invert_transform(self.T_car_from_camera)
 
     @cached_property
     def _T_world_from_images(self) -> Array:
         ground_m = self.config.ground_z_m
         if ground_m is None:
-            ground_m = float(np.median(self._cars[:, 2, 3]))
+            ground_m = float(np.median(self._cars_of(self._listed)[:, 2, 3]))
         return make_transform(np.eye(3), [0.0, 0.0, -ground_m])
 
     def describe(self) -> WorldDescription:
@@ -104,7 +116,7 @@ class Photographs(Undriven):
     def path_points(self) -> Array:
         """Measured points ``[N, 2]`` of the path [m]."""
         if self.config.shows_path:
-            return driven_track(self._cars)
+            return driven_track(self._cars_of(self._driven))
         return points_of(Path(self.config.path))
 
     def _box(self, points: Array) -> Box:
@@ -177,6 +189,21 @@ class Photographs(Undriven):
 
     def __enter__(self) -> Photographs:
         return self
+
+
+def _require_upright(R_world_from_camera: Array) -> None:
+    """Raise unless cameras ``[N, 3, 3]`` look ahead with the horizon level, as the mount of a driving camera is taken to.
+
+    Raises:
+        WorldError: They are rolled, upside down, or not in a frame with z up.
+    """
+    rolls_rad = np.arctan2(R_world_from_camera[:, 2, 0], -R_world_from_camera[:, 2, 1])
+    roll_rad = float(np.median(np.abs(rolls_rad)))
+    if roll_rad > _MOST_ROLL_RAD:
+        raise WorldError(
+            f"expected upright photographs in a frame with z up, got cameras that are rolled by {math.degrees(roll_rad):.0f} degrees in the "
+            "median; turn pictures and poses together, or make the data set with advnerf scene from-scan, which puts z up"
+        )
 
 
 def _through(pinhole: Pinhole, rgb: Rgb, own: Pinhole, file: Path) -> Rgb:
