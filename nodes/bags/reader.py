@@ -5,7 +5,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
+from heapq import merge
+from operator import itemgetter
 from pathlib import Path
 
 from mcap.records import Channel, Statistics
@@ -17,7 +19,6 @@ from nodes.bags.chunks import messages_in_order, read_attachment_at, read_metada
 from nodes.bags.file import open_bag
 from nodes.bags.foreign import read_stored, stored_messages
 from nodes.bags.formats import BagFormat, no_checksums, recognise
-from nodes.bags.merge import MergeSource, merge_by_time
 from nodes.bags.message_definitions import full_type_name
 from nodes.bags.parts import bag_parts
 from nodes.bags.stored_types import Convert, RecordedTopic, converter, unpacked
@@ -244,15 +245,28 @@ def read_messages(
             f"expected a start offset between 0 and {info.duration_s:.1f} s, the length of {path}, got {start_offset_s}"
         )
     wanted = frozenset(topics or known)
-    sources = [
-        MergeSource(part.start_ns, partial(_messages_of, part, wanted, start_ns, converters))
+    parts = [
+        (part, {} if as_recorded else _converters(part, wanted, types or {}))
         for part in _parts(bag)
         if part.messages
         and part.end_ns >= start_ns
         and not wanted.isdisjoint(topic.name for topic in part.topics)
-        for converters in [{} if as_recorded else _converters(part, wanted, types or {})]
     ]
-    yield from merge_by_time(sources, lambda message: message.log_ns)
+    timed = (
+        _from_start(part, _messages_of(part, wanted, start_ns, converters)) for part, converters in parts
+    )
+    for _, message in merge(*timed, key=itemgetter(0)):
+        if message is not None:
+            yield message
+
+
+def _from_start(
+    part: _FileSummary, messages: Iterator[BagMessage]
+) -> Iterator[tuple[int, BagMessage | None]]:
+    """Yield the start of a file before its messages with their log times, so that a merge opens it only when its time has come."""
+    yield part.start_ns, None
+    for message in messages:
+        yield message.log_ns, message
 
 
 def _messages_of(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
-from nodes.bags.merge import MergeSource, merge_by_time
+from nodes.bags import reader
 from nodes.bags.reader import extract_attachments, read_attachment, read_attachments, read_info, read_messages
 from nodes.runtime.errors import BagError
 from tests.support.bag_samples import START_NS
@@ -41,8 +41,8 @@ def split_bag(tmp_path, parts=4, each=60, chunked=True):
 @pytest.mark.parametrize("chunked", [True, False])
 def test_messages_of_all_parts_come_in_order_of_time(tmp_path, chunked):
     folder, everything, counts = split_bag(tmp_path, chunked=chunked)
-    with AnyReader([folder]) as reader:
-        theirs = [(connection.topic, stamp) for connection, stamp, _ in reader.messages()]
+    with AnyReader([folder]) as theirs_reader:
+        theirs = [(connection.topic, stamp) for connection, stamp, _ in theirs_reader.messages()]
     for bag in (folder, folder / "theirs_2.mcap", folder / "metadata.yaml"):
         ours = [(m.topic, m.log_ns) for m in read_messages(bag)]
         assert ours == [row[:2] for row in everything]
@@ -76,20 +76,23 @@ def test_a_missing_part_is_no_shorter_recording(tmp_path):
             read(folder)
 
 
-def test_files_are_opened_only_when_their_time_has_come():
-    opened = []
+def test_files_are_opened_only_when_their_time_has_come(tmp_path, monkeypatch):
+    folder = tmp_path / "theirs"
+    folder.mkdir()
+    for number, times in enumerate([[0, 1, 2, 5], [3, 4], [100]]):
+        rows = [("/arm", START_NS + time, index) for index, time in enumerate(times)]
+        foreign_part(folder / f"theirs_{number}.mcap", rows)
+    foreign_metadata(folder, [f"theirs_{number}.mcap" for number in range(3)], {"/arm": 7})
+    read_info(folder)  # whose summaries are kept
+    opened, open_bag = [], reader.open_bag
 
-    def source(start, times):
-        def read():
-            opened.append(start)
-            yield from times
+    def opening(path):
+        opened.append(path.stem[-1])
+        return open_bag(path)
 
-        return MergeSource(start, read)
-
-    merged = merge_by_time(
-        [source(0, [0, 1, 2, 5]), source(3, [3, 4]), source(100, [100])], lambda time: time
-    )
-    assert [next(merged) for _ in range(3)] == [0, 1, 2]
-    assert opened == [0]
-    assert list(merged) == [3, 4, 5, 100]
-    assert opened == [0, 3, 100]
+    monkeypatch.setattr(reader, "open_bag", opening)
+    times = (each.log_ns - START_NS for each in read_messages(folder))
+    assert [next(times) for _ in range(3)] == [0, 1, 2]
+    assert opened == ["0"]
+    assert list(times) == [3, 4, 5, 100]
+    assert opened == ["0", "1", "2"]
