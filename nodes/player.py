@@ -16,9 +16,10 @@ from typing import Any
 from pydantic import Field
 
 from advnerf_core.strict import StrictModel
+from nodes.bags.info import BagMessage
 from nodes.bags.keys import Keys
 from nodes.bags.play import PAUSE, RATE, RESUME, STEP, STOP, TOGGLE, PlayerCommand, Playhead
-from nodes.bags.reader import BagMessage, read_info, read_messages, require_readable
+from nodes.bags.reader import read_info, read_messages, require_readable
 from nodes.bags.time_gaps import skipped_gaps
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError, MessageError, NodeFinished

@@ -25,10 +25,8 @@ __all__ = [
 
 if TYPE_CHECKING:
     from nodes.bags.check import Diagnosis, diagnose
+    from nodes.bags.info import BagInfo, BagMessage, TopicInfo
     from nodes.bags.reader import (
-        BagInfo,
-        BagMessage,
-        TopicInfo,
         extract_attachments,
         read_attachment,
         read_attachments,
@@ -43,7 +41,8 @@ else:
         __name__,
         {
             "nodes.bags.check": "Diagnosis diagnose",
-            "nodes.bags.reader": "BagInfo BagMessage TopicInfo extract_attachments read_attachment read_attachments read_info read_messages",
+            "nodes.bags.info": "BagInfo BagMessage TopicInfo",
+            "nodes.bags.reader": "extract_attachments read_attachment read_attachments read_info read_messages",
             "nodes.bags.repair_parts": "repair_bag",
             "nodes.bags.writer": "BagWriter SplitLimits",
             "nodes.runtime.errors": "BagError",

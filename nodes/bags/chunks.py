@@ -6,14 +6,14 @@ The checksum of every chunk is verified before any of its messages is returned.
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator, Mapping
 from heapq import heappop, heappush
-from typing import Any, BinaryIO, NamedTuple
+from typing import BinaryIO
 
 from mcap.opcode import Opcode
-from mcap.records import Attachment, AttachmentIndex, Channel, ChunkIndex, Metadata, MetadataIndex
-from mcap.summary import Summary
+from mcap.records import Attachment, AttachmentIndex, ChunkIndex, Metadata, MetadataIndex
 
+from nodes.bags.info import BagMessage
 from nodes.bags.records import (
     MESSAGE_HEAD,
     MOST_BYTES,
@@ -26,112 +26,86 @@ from nodes.bags.records import (
     unpack_chunk,
 )
 from nodes.bags.scanned import MessageRun
+from nodes.bags.whole import FileSummary
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError
 
-
-class RawMessage(NamedTuple):
-    """A message as stored in the file. Of two with the same log time, the one written first sorts first."""
-
-    log_ns: int
-    chunk_offset: int
-    offset: int
-    channel_id: int
-    sequence: int
-    publish_ns: int
-    data: bytes
-
-
-class _ChunkSpan(NamedTuple):
-    """A chunk, or messages outside of chunks, in order of the first log time."""
-
-    start_ns: int
-    offset: int
-    end_ns: int
-    channels: Collection[int]
-    source: ChunkIndex | MessageRun
+Block = ChunkIndex | MessageRun
 
 
 def messages_in_order(
-    file: BinaryIO, summary: Summary, channels: Collection[int], start_ns: int = 0
-) -> Iterator[RawMessage]:
-    """Yield the messages of some channels from a log time on, in order of log time.
+    file: BinaryIO, summary: FileSummary, names: Mapping[int, str], start_ns: int = 0
+) -> Iterator[tuple[int, BagMessage]]:
+    """Yield channel id and message of some channels from a log time on, in order of log time. Of two with the same, the one written first.
 
     Args:
         summary: Summary of the file.
-        channels: Ids of the channels to read.
+        names: Topics of the channels to read by their ids.
         start_ns: First log time [ns since 1970].
 
     Raises:
         BagError: A chunk is damaged. The messages before it have already been yielded.
     """
-    wanted = frozenset(channels)
-    waiting: list[RawMessage] = []
+    # Log time, offset of the block, offset in it, channel id, message.
+    waiting: list[tuple[int, int, int, int, BagMessage]] = []
     for block in _blocks(summary):
         # Chunks overlap in time if messages arrived late. Messages older than this chunk can be yielded.
-        while waiting and waiting[0].log_ns < block.start_ns:
-            yield heappop(waiting)
-        if block.end_ns < start_ns or (block.channels and wanted.isdisjoint(block.channels)):
+        while waiting and waiting[0][0] < block.message_start_time:
+            yield heappop(waiting)[3:]
+        channels = block.message_index_offsets
+        if block.message_end_time < start_ns or (channels and names.keys().isdisjoint(channels)):
             continue
         try:
-            data = (
-                _run_data(file, block.source)
-                if isinstance(block.source, MessageRun)
-                else _chunk_data(file, block.source)
-            )
-            for message in _messages(data, wanted, block.offset):
+            data = _run_data(file, block) if isinstance(block, MessageRun) else _chunk_data(file, block)
+            for at, channel_id, message in _messages(data, names):
                 if message.log_ns >= start_ns:
-                    heappush(waiting, message)
+                    heappush(waiting, (message.log_ns, block.chunk_start_offset, at, channel_id, message))
         except Damaged as error:
-            raise _damaged(file, summary, block, error) from error
+            raise _damaged(file.name, summary, block, error) from error
     while waiting:
-        yield heappop(waiting)
+        yield heappop(waiting)[3:]
 
 
-def time_spans(summary: Summary) -> list[tuple[int, int]]:
+def time_spans(summary: FileSummary) -> list[tuple[int, int]]:
     """Log times of the first and last message of each chunk, and of each run of messages outside chunks [ns since 1970]."""
-    return [(block.start_ns, block.end_ns) for block in _blocks(summary) if block.channels or block.end_ns]
-
-
-def _blocks(summary: Summary) -> list[_ChunkSpan]:
-    blocks = [
-        _ChunkSpan(
-            index.message_start_time,
-            index.chunk_start_offset,
-            index.message_end_time,
-            index.message_index_offsets,
-            index,
-        )
-        for index in summary.chunk_indexes
+    return [
+        (block.message_start_time, block.message_end_time)
+        for block in _blocks(summary)
+        if block.message_index_offsets or block.message_end_time
     ]
-    for run in getattr(summary, "runs", ()):
-        blocks.append(_ChunkSpan(run.start_ns, run.offset, run.end_ns, run.channels, run))
-    return sorted(blocks, key=lambda block: block[:2])
 
 
-def _damaged(file: Any, summary: Summary, block: _ChunkSpan, error: Damaged) -> BagError:
-    path = getattr(file, "name", "the bag")
-    first_ns = summary.statistics.message_start_time if summary.statistics is not None else block.start_ns
-    since, until = ((moment - first_ns) / NS_PER_S for moment in (block.start_ns, block.end_ns))
+def _blocks(summary: FileSummary) -> list[Block]:
+    """The chunks, and the runs of messages outside chunks, in order of their first log time."""
+    blocks: list[Block] = [*summary.chunk_indexes, *summary.runs]
+    return sorted(blocks, key=lambda block: (block.message_start_time, block.chunk_start_offset))
+
+
+def _damaged(path: str, summary: FileSummary, block: Block, error: Damaged) -> BagError:
+    start_ns, end_ns = block.message_start_time, block.message_end_time
+    since, until = (
+        (moment - summary.statistics.message_start_time) / NS_PER_S for moment in (start_ns, end_ns)
+    )
     topics = [
-        c.topic if isinstance(c := summary.channels.get(i), Channel) else f"channel {i}"
-        for i in block.channels
+        summary.channels[i].topic if i in summary.channels else f"channel {i}"
+        for i in block.message_index_offsets
     ]
     return BagError(
-        f"{path} is damaged: the chunk at byte {block.offset} (log times {block.start_ns} to {block.end_ns} ns, {since:.3f} to "
+        f"{path} is damaged: the chunk at byte {block.chunk_start_offset} (log times {start_ns} to {end_ns} ns, {since:.3f} to "
         f"{until:.3f} s after the first message; {', '.join(sorted(topics)) or 'topics unknown'}): {error}; advnerf bag info {path} "
         f"lists all damage, advnerf bag repair --force {path} keeps the rest"
     )
 
 
-def _messages(data: bytes, wanted: frozenset[int], chunk_offset: int) -> Iterator[RawMessage]:
+def _messages(data: bytes, names: Mapping[int, str]) -> Iterator[tuple[int, int, BagMessage]]:
+    """Offset, channel id and message of the messages of some channels."""
     for opcode, body, end in records_of(data):
         if opcode != Opcode.MESSAGE:
             continue
         channel_id, sequence, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(data, body)
-        if channel_id in wanted:
+        if channel_id in names:
             payload = data[body + MESSAGE_HEAD.size : end]
-            yield RawMessage(log_ns, chunk_offset, body, channel_id, sequence, publish_ns, payload)
+            yield body, channel_id, BagMessage(names[channel_id], payload, log_ns, publish_ns, sequence)
 
 
 def _chunk_data(file: BinaryIO, index: ChunkIndex) -> bytes:
@@ -146,9 +120,9 @@ def _chunk_data(file: BinaryIO, index: ChunkIndex) -> bytes:
 
 
 def _run_data(file: BinaryIO, run: MessageRun) -> bytes:
-    file.seek(run.offset)
-    data = file.read(run.length)
-    if len(data) != run.length:
+    file.seek(run.chunk_start_offset)
+    data = file.read(run.chunk_length)
+    if len(data) != run.chunk_length:
         raise Damaged("the file became shorter while it was read")
     return data
 
@@ -166,7 +140,7 @@ def _record(file: BinaryIO, offset: int, length: int, opcode: int) -> bytes:
     return record[body:end]
 
 
-def read_attachment_at(file: Any, index: AttachmentIndex) -> Attachment:
+def read_attachment_at(file: BinaryIO, index: AttachmentIndex) -> Attachment:
     """Read an attachment and verify its checksum."""
     try:
         attachment, _ = checked_attachment(_record(file, index.offset, index.length, Opcode.ATTACHMENT))
@@ -178,7 +152,7 @@ def read_attachment_at(file: Any, index: AttachmentIndex) -> Attachment:
     return attachment
 
 
-def read_metadata_at(file: Any, index: MetadataIndex) -> Metadata:
+def read_metadata_at(file: BinaryIO, index: MetadataIndex) -> Metadata:
     """Read a metadata record."""
     try:
         found: Metadata = parse(Metadata, _record(file, index.offset, index.length, Opcode.METADATA))

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from rosbags import rosbag1, rosbag2
 from rosbags.interfaces import MessageDefinitionFormat
 
-from nodes.bags.formats import BagFormat
+from nodes.bags.formats import BagFormat, no_checksums
+from nodes.bags.info import BagMessage, FileInfo, TopicInfo
 from nodes.bags.message_definitions import IDL, MSG, full_type_name
 from nodes.bags.stored_types import CDR, ROS1, RecordedTopic
 from nodes.runtime.errors import BagError
@@ -24,66 +25,57 @@ _NONSENSE = (
 _LANGUAGES = {MessageDefinitionFormat.MSG: MSG, MessageDefinitionFormat.IDL: IDL}
 
 
-class StoredTopic(NamedTuple):
-    """One topic of one writer: its number in the file, its description, and its number of messages."""
-
-    number: int
-    recorded: RecordedTopic
-    messages: int
-
-
-class StoredBag(NamedTuple):
-    """Contents of a file. Times are in nanoseconds since 1970, 0 for a file without messages."""
-
-    start_ns: int
-    end_ns: int
-    messages: int
-    topics: tuple[StoredTopic, ...]
-
-
-class StoredMessage(NamedTuple):
-    """One message, with the number of its topic."""
-
-    number: int
-    log_ns: int
-    data: bytes
-
-
-def read_stored(path: Path, form: BagFormat) -> StoredBag:
+def read_stored(path: Path, form: BagFormat, size_bytes: int) -> FileInfo:
     """Read the contents of a file.
 
     Raises:
         BagError: The file is damaged, or its recorder left messages in another file.
     """
     with _opened(path, form) as reader:
-        topics = tuple(_topic(connection, form) for connection in reader.connections)
-        count = sum(topic.messages for topic in topics)
-        if not count:
-            return StoredBag(0, 0, 0, topics)
-        return StoredBag(reader.start_time, reader.end_time - 1, count, topics)
+        recorded = {connection.id: _recorded(connection, form) for connection in reader.connections}
+        counts = [connection.msgcount for connection in reader.connections]
+        return FileInfo(
+            path,
+            form,
+            size_bytes,
+            reader.start_time if sum(counts) else 0,
+            reader.end_time - 1 if sum(counts) else 0,
+            sum(counts),
+            tuple(
+                TopicInfo(each.topic, each.type, count, None)
+                for each, count in zip(recorded.values(), counts, strict=True)
+            ),
+            recorded,
+            (),
+            {},
+            no_checksums(form),
+        )
 
 
 def stored_messages(
-    path: Path, form: BagFormat, numbers: Collection[int], start_ns: int
-) -> Iterator[StoredMessage]:
-    """Yield messages in order of their log time.
+    path: Path, form: BagFormat, names: Mapping[int, str], start_ns: int
+) -> Iterator[tuple[int, BagMessage]]:
+    """Yield number of the topic and message in order of their log time. Publish times and sequence numbers are generated.
 
     Args:
         form: Format of the file.
-        numbers: Numbers of the topics to read.
+        names: Topics to read by their numbers.
         start_ns: First log time [ns since 1970].
     """
+    counts = dict.fromkeys(names.values(), 0)
     with _opened(path, form) as reader:
-        wanted = [connection for connection in reader.connections if connection.id in numbers]
+        wanted = [connection for connection in reader.connections if connection.id in names]
         if wanted:  # an empty list would mean all topics
             for connection, log_ns, data in reader.messages(wanted, start=start_ns):
-                yield StoredMessage(connection.id, log_ns, bytes(data))
+                topic = names[connection.id]
+                yield connection.id, BagMessage(topic, bytes(data), log_ns, log_ns, counts[topic])
+                counts[topic] += 1
 
 
-def _topic(connection: Any, form: BagFormat) -> StoredTopic:
+def _recorded(connection: Any, form: BagFormat) -> RecordedTopic:
     language = _LANGUAGES.get(connection.msgdef.format, "")
     serialization = ROS1 if form is BagFormat.ROS1 else connection.ext.serialization_format or CDR
-    recorded = RecordedTopic(
+    return RecordedTopic(
         connection.topic,
         full_type_name(connection.msgtype),
         "" if form is BagFormat.ROS1 else connection.digest,
@@ -91,7 +83,6 @@ def _topic(connection: Any, form: BagFormat) -> StoredTopic:
         language or MSG,
         serialization,
     )
-    return StoredTopic(connection.id, recorded, connection.msgcount)
 
 
 @contextmanager

@@ -10,8 +10,9 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
+
+from nodes.bags.info import BagMessage
 
 # Signature, and the length of the bag at the start of its current chunk.
 _HEAD = struct.Struct("<8sQ")
@@ -21,17 +22,6 @@ _ENTRY = struct.Struct("<IQQIHI")
 _CRC_BYTES = 4
 # Reserved space for the summaries when the disk is full: the summaries of two parts of 1 GiB take 3 MB.
 RESERVE_BYTES, RESERVE_NAME = 8 * 1024 * 1024, ".reserve"
-
-
-@dataclass(frozen=True)
-class JournalEntry:
-    """A message of the unfinished chunk."""
-
-    topic: str
-    cdr: bytes
-    log_ns: int
-    publish_ns: int
-    sequence: int
 
 
 def journal_of(bag_file: Path) -> Path:
@@ -54,7 +44,7 @@ class Journal:
         self._position = -1
         self.restart(position)
 
-    def add(self, entry: JournalEntry) -> None:
+    def add(self, entry: BagMessage) -> None:
         """Append a message."""
         topic = entry.topic.encode()
         lengths = len(topic), len(entry.cdr)
@@ -79,7 +69,7 @@ class Journal:
             os.close(self._descriptor)
 
 
-def read_journal(bag_file: Path) -> tuple[int, list[JournalEntry]]:
+def read_journal(bag_file: Path) -> tuple[int, list[BagMessage]]:
     """Read the length of the bag at the start of the chunk, and the chunk's messages; no messages without a journal."""
     try:
         content = journal_of(bag_file).read_bytes()
@@ -90,7 +80,7 @@ def read_journal(bag_file: Path) -> tuple[int, list[JournalEntry]]:
     return _HEAD.unpack_from(content)[1], list(_entries(content))
 
 
-def _entries(content: bytes) -> Iterator[JournalEntry]:
+def _entries(content: bytes) -> Iterator[BagMessage]:
     """Yield the intact entries up to the first cut or damaged one."""
     at = _HEAD.size
     while at + _ENTRY.size <= len(content):
@@ -100,7 +90,7 @@ def _entries(content: bytes) -> Iterator[JournalEntry]:
         if end > len(content) or zlib.crc32(content[at + _CRC_BYTES : end]) != crc:
             return
         topic = content[at + _ENTRY.size : middle].decode("utf-8", "replace")
-        yield JournalEntry(topic, content[middle:end], log_ns, publish_ns, sequence)
+        yield BagMessage(topic, content[middle:end], log_ns, publish_ns, sequence)
         at = end
 
 

@@ -10,7 +10,8 @@ from pathlib import Path
 
 from mcap.writer import CompressionType, Writer
 
-from nodes.bags.journal import Journal, JournalEntry
+from nodes.bags.info import BagMessage
+from nodes.bags.journal import Journal
 from nodes.bags.metadata import Contents, rosbag2_metadata
 from nodes.runtime.messages import type_definition, type_hash
 from nodes.runtime.topics import topic as topic_row
@@ -87,7 +88,7 @@ class PartWriter:
         self._journal.restart(self._stream.tell())  # a definition may have filled a chunk
         # A message that fills a chunk completes it at once, so it needs no journal.
         if len(cdr) <= CHUNK_BYTES:
-            self._journal.add(JournalEntry(topic, cdr, log_ns, publish_ns, sequence))
+            self._journal.add(BagMessage(topic, cdr, log_ns, publish_ns, sequence))
         self._writer.add_message(channel, log_ns, cdr, publish_ns, sequence & 0xFFFFFFFF)
         self._journal.restart(self._stream.tell())
         self.contents.add_message(topic, log_ns)

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from heapq import merge
 from operator import itemgetter
 from pathlib import Path
 
-from mcap.records import Channel, Statistics
-from mcap.summary import Summary
+from mcap.records import Channel
 
 from advnerf_core.files import write_atomically
 from nodes.bags.check import diagnose
 from nodes.bags.chunks import messages_in_order, read_attachment_at, read_metadata_at, time_spans
 from nodes.bags.file import open_bag
 from nodes.bags.foreign import read_stored, stored_messages
-from nodes.bags.formats import BagFormat, no_checksums, recognise
+from nodes.bags.formats import BagFormat, recognise
+from nodes.bags.info import BagInfo, BagMessage, FileInfo, TopicInfo
 from nodes.bags.message_definitions import full_type_name
 from nodes.bags.parts import bag_parts
 from nodes.bags.stored_types import Convert, RecordedTopic, converter, unpacked
@@ -26,97 +26,6 @@ from nodes.bags.whole import FileSummary, read_summary
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError
 from nodes.runtime.topics import type_of_topic
-
-
-@dataclass(frozen=True)
-class TopicInfo:
-    """A topic of a bag.
-
-    Attributes:
-        name: Name of the topic.
-        type: ROS 2 type.
-        count: Number of messages.
-        lost: Number of published messages that did not reach the recorder; None if the recorder did not count them.
-    """
-
-    name: str
-    type: str
-    count: int
-    lost: int | None
-
-
-@dataclass(frozen=True)
-class BagInfo:
-    """Contents of a bag; times are log times.
-
-    Attributes:
-        path: The bag's file, or its folder if it was split.
-        parts: The bag's files in order.
-        size_bytes: Size of all files [bytes].
-        start_ns: Time of the first message [ns since 1970].
-        end_ns: Time of the last message [ns since 1970].
-        topics: Topics by name.
-        attachments: Names of the attached files in all parts.
-        metadata: Facts noted by the recorder: versions, git hash.
-        unchecked: Why its messages may have changed unnoticed; empty if checksums cover them. Every figure made from
-            such a bag says so.
-    """
-
-    path: Path
-    parts: tuple[Path, ...]
-    size_bytes: int
-    start_ns: int
-    end_ns: int
-    topics: tuple[TopicInfo, ...]
-    attachments: tuple[str, ...]
-    metadata: dict[str, str]
-    unchecked: str = ""
-
-    @property
-    def duration_s(self) -> float:
-        """Time from the first to the last message [s]."""
-        return (self.end_ns - self.start_ns) / NS_PER_S
-
-    @property
-    def messages(self) -> int:
-        """Number of messages."""
-        return sum(topic.count for topic in self.topics)
-
-
-@dataclass(frozen=True)
-class BagMessage:
-    """One message of a bag.
-
-    Attributes:
-        topic: Name of the topic.
-        cdr: CDR bytes; on a topic of the topic table they are converted to our type if the bag has another definition.
-        log_ns: Time at which the recorder received it [ns since 1970].
-        publish_ns: Time at which it was published [ns since 1970].
-        sequence: Sequence number from its publisher.
-    """
-
-    topic: str
-    cdr: bytes
-    log_ns: int
-    publish_ns: int
-    sequence: int
-
-
-@dataclass(frozen=True)
-class _FileSummary:
-    """Summary of one file without the index of its chunks. ``recorded`` has the topics by their numbers in the file."""
-
-    path: Path
-    format: BagFormat
-    size_bytes: int
-    start_ns: int
-    end_ns: int
-    messages: int
-    topics: tuple[TopicInfo, ...]
-    recorded: Mapping[int, RecordedTopic]
-    attachments: tuple[str, ...]
-    metadata: dict[str, str]
-    unchecked: str
 
 
 def read_info(bag: Path) -> BagInfo:
@@ -145,7 +54,7 @@ def message_spans(bag: Path) -> list[tuple[int, int]]:
     for part in _parts(bag):
         if part.messages:
             whole = [(part.start_ns, part.end_ns)]
-            spans += time_spans(_whole_file(part.path)[0]) if part.format is BagFormat.MCAP else whole
+            spans += time_spans(_whole_file(part.path)) if part.format is BagFormat.MCAP else whole
     return spans
 
 
@@ -169,7 +78,7 @@ def read_attachments(bag: Path) -> dict[str, bytes]:
 
 
 def _attachments(path: Path, names: Sequence[str]) -> dict[str, bytes]:
-    summary, _ = _whole_file(path)
+    summary = _whole_file(path)
     with open_bag(path) as file:
         found = [
             read_attachment_at(file, index) for index in summary.attachment_indexes if index.name in names
@@ -260,9 +169,7 @@ def read_messages(
             yield message
 
 
-def _from_start(
-    part: _FileSummary, messages: Iterator[BagMessage]
-) -> Iterator[tuple[int, BagMessage | None]]:
+def _from_start(part: FileInfo, messages: Iterator[BagMessage]) -> Iterator[tuple[int, BagMessage | None]]:
     """Yield the start of a file before its messages with their log times, so that a merge opens it only when its time has come."""
     yield part.start_ns, None
     for message in messages:
@@ -270,37 +177,25 @@ def _from_start(
 
 
 def _messages_of(
-    part: _FileSummary, topics: frozenset[str], start_ns: int, converters: Mapping[int, Convert]
+    part: FileInfo, topics: frozenset[str], start_ns: int, converters: Mapping[int, Convert]
 ) -> Iterator[BagMessage]:
     """Yield the messages of one file in order of their log time."""
     names = {number: recorded.topic for number, recorded in part.recorded.items() if recorded.topic in topics}
-    stored = _mcap_messages if part.format is BagFormat.MCAP else _stored_messages
-    for number, message in stored(part, names, start_ns):
+    for number, message in _stored(part, names, start_ns):
         data = unpacked(message.cdr, message.topic, str(part.path))
         if convert := converters.get(number):
             data = convert(data)
         yield message if data is message.cdr else replace(message, cdr=data)
 
 
-def _mcap_messages(
-    part: _FileSummary, names: Mapping[int, str], start_ns: int
-) -> Iterator[tuple[int, BagMessage]]:
-    summary, _ = _whole_file(part.path)
+def _stored(part: FileInfo, names: Mapping[int, str], start_ns: int) -> Iterator[tuple[int, BagMessage]]:
+    """Yield number of the topic and message, as they are in the file."""
+    if part.format is not BagFormat.MCAP:
+        yield from stored_messages(part.path, part.format, names, start_ns)
+        return
+    summary = _whole_file(part.path)
     with open_bag(part.path) as file:
-        for raw in messages_in_order(file, summary, names, start_ns):
-            times = raw.log_ns, raw.publish_ns, raw.sequence
-            yield raw.channel_id, BagMessage(names[raw.channel_id], raw.data, *times)
-
-
-def _stored_messages(
-    part: _FileSummary, names: Mapping[int, str], start_ns: int
-) -> Iterator[tuple[int, BagMessage]]:
-    """Yield the messages of a file in another format than MCAP. Publish times and sequence numbers are generated."""
-    counts = dict.fromkeys(names.values(), 0)
-    for number, log_ns, data in stored_messages(part.path, part.format, names, start_ns):
-        topic = names[number]
-        yield number, BagMessage(topic, data, log_ns, log_ns, counts[topic])
-        counts[topic] += 1
+        yield from messages_in_order(file, summary, names, start_ns)
 
 
 def require_readable(bag: Path, topics: Mapping[str, str]) -> None:
@@ -314,7 +209,7 @@ def require_readable(bag: Path, topics: Mapping[str, str]) -> None:
         _converters(part, frozenset(topics), topics)
 
 
-def _converters(part: _FileSummary, topics: frozenset[str], types: Mapping[str, str]) -> dict[int, Convert]:
+def _converters(part: FileInfo, topics: frozenset[str], types: Mapping[str, str]) -> dict[int, Convert]:
     """Converters of a file's messages by the number of their topic; topics without conversion are missing."""
     found = {}
     for number, recorded in part.recorded.items():
@@ -328,12 +223,6 @@ def _converters(part: _FileSummary, topics: frozenset[str], types: Mapping[str, 
     return found
 
 
-def type_of(summary: Summary, channel: Channel) -> str:
-    """Type of a channel's messages; empty if the file does not state it."""
-    schema = summary.schemas.get(channel.schema_id)
-    return full_type_name(schema.name) if schema is not None else ""
-
-
 def _count(text: str) -> int | None:
     return int(text) if text.isascii() and text.isdigit() else None
 
@@ -343,7 +232,7 @@ def _sum(one: TopicInfo, other: TopicInfo) -> TopicInfo:
     return TopicInfo(one.name, one.type or other.type, one.count + other.count, lost)
 
 
-def _parts(bag: Path) -> list[_FileSummary]:
+def _parts(bag: Path) -> list[FileInfo]:
     found = []
     for path in bag_parts(bag):
         state = path.stat()
@@ -354,64 +243,45 @@ def _parts(bag: Path) -> list[_FileSummary]:
 
 
 @lru_cache(maxsize=1024)
-def _part_of(path: Path, mtime_ns: int, size_bytes: int) -> _FileSummary | None:
+def _part_of(path: Path, mtime_ns: int, size_bytes: int) -> FileInfo | None:
     form = recognise(path)
     if form is not BagFormat.MCAP:
-        return _stored_part(path, form, size_bytes)
-    if (found := _summary_of(path, mtime_ns, size_bytes)) is None:
+        return read_stored(path, form, size_bytes)
+    if (summary := _summary_of(path, mtime_ns, size_bytes)) is None:
         return None
-    summary, statistics = found
     with open_bag(path) as file:
         notes = [read_metadata_at(file, index) for index in summary.metadata_indexes]
     records = {record.name: dict(record.metadata) for record in notes}
-    ends = records.get("advnerf_end")
-    topics: dict[str, TopicInfo] = {}
-    for channel in summary.channels.values():
-        lost = None if ends is None else _count(ends.get(f"lost {channel.topic}", "0"))
-        count = statistics.channel_message_counts.get(channel.id, 0)
-        topic = TopicInfo(channel.topic, type_of(summary, channel), count, lost)
-        topics[channel.topic] = _sum(topics[channel.topic], topic) if channel.topic in topics else topic
-    return _FileSummary(
+    ends, statistics = records.get("advnerf_end"), summary.statistics
+    recorded = {channel.id: _recorded(summary, channel) for channel in summary.channels.values()}
+    return FileInfo(
         path,
         form,
         size_bytes,
         statistics.message_start_time,
         statistics.message_end_time,
         statistics.message_count,
-        tuple(topics.values()),
-        {channel.id: _recorded(summary, channel) for channel in summary.channels.values()},
+        tuple(
+            TopicInfo(
+                each.topic,
+                each.type,
+                statistics.channel_message_counts.get(number, 0),
+                None if ends is None else _count(ends.get(f"lost {each.topic}", "0")),
+            )
+            for number, each in recorded.items()
+        ),
+        recorded,
         tuple(index.name for index in summary.attachment_indexes),
         records.get("advnerf", {}),
         summary.unchecked,
     )
 
 
-def _stored_part(path: Path, form: BagFormat, size_bytes: int) -> _FileSummary:
-    stored = read_stored(path, form)
-    topics: dict[str, TopicInfo] = {}
-    for _, recorded, count in stored.topics:
-        topic = TopicInfo(recorded.topic, recorded.type, count, None)
-        topics[topic.name] = _sum(topics[topic.name], topic) if topic.name in topics else topic
-    return _FileSummary(
-        path,
-        form,
-        size_bytes,
-        stored.start_ns,
-        stored.end_ns,
-        stored.messages,
-        tuple(topics.values()),
-        {number: recorded for number, recorded, _ in stored.topics},
-        (),
-        {},
-        no_checksums(form),
-    )
-
-
-def _recorded(summary: Summary, channel: Channel) -> RecordedTopic:
+def _recorded(summary: FileSummary, channel: Channel) -> RecordedTopic:
     schema = summary.schemas.get(channel.schema_id)
     return RecordedTopic(
         channel.topic,
-        type_of(summary, channel),
+        "" if schema is None else full_type_name(schema.name),
         channel.metadata.get("topic_type_hash", ""),
         "" if schema is None else schema.data.decode("utf-8", "replace"),
         "" if schema is None else schema.encoding,
@@ -419,7 +289,7 @@ def _recorded(summary: Summary, channel: Channel) -> RecordedTopic:
     )
 
 
-def _whole_file(path: Path) -> tuple[FileSummary, Statistics]:
+def _whole_file(path: Path) -> FileSummary:
     state = path.stat()
     if (found := _summary_of(path, state.st_mtime_ns, state.st_size)) is None:
         raise _unfinished(path)
@@ -439,7 +309,7 @@ def _unfinished(path: Path) -> BagError:
 
 
 @lru_cache(maxsize=4)
-def _summary_of(path: Path, mtime_ns: int, size_bytes: int) -> tuple[FileSummary, Statistics] | None:
+def _summary_of(path: Path, mtime_ns: int, size_bytes: int) -> FileSummary | None:
     """Summary of a file, cached by time and size, because reading the summary of an hour takes a second."""
     del mtime_ns, size_bytes  # they are the state
     return read_summary(path)

@@ -24,7 +24,8 @@ from advnerf_core.files import write_atomically
 from nodes.bags.assemble import FileLayout, assemble, contents_of
 from nodes.bags.damage import describe
 from nodes.bags.formats import require_mcap
-from nodes.bags.journal import RESERVE_BYTES, RESERVE_NAME, JournalEntry, journal_of, read_journal
+from nodes.bags.info import BagMessage
+from nodes.bags.journal import RESERVE_BYTES, RESERVE_NAME, journal_of, read_journal
 from nodes.bags.metadata import rosbag2_metadata
 from nodes.bags.parts import METADATA_FILE, bag_parts
 from nodes.bags.scan import scan_file
@@ -341,9 +342,7 @@ def _add_journal(scan: Scan, path: Path) -> None:
     scan.pieces.append(_chunk_piece(bytes(builder.end()), entries, indexes))
 
 
-def _chunk_piece(
-    data: bytes, entries: list[JournalEntry], indexes: dict[int, list[tuple[int, int]]]
-) -> Piece:
+def _chunk_piece(data: bytes, entries: list[BagMessage], indexes: dict[int, list[tuple[int, int]]]) -> Piece:
     start_ns, end_ns = min(entry.log_ns for entry in entries), max(entry.log_ns for entry in entries)
     builder = RecordBuilder()
     Chunk("", data, end_ns, start_ns, zlib.crc32(data), len(data)).write(builder)

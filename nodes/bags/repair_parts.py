@@ -66,11 +66,11 @@ def _list(folder: Path, parts: tuple[Path, ...], keep_old: bool) -> None:
 
 def _contents(part: Path) -> Contents:
     """Contents of an intact file according to its summary."""
-    found = read_summary(part)
-    if found is None:
+    summary = read_summary(part)
+    if summary is None:
         raise BagError(
             f"{part}: expected a summary with statistics after the repair, got none; repair it again"
         )
-    summary, statistics = found
+    statistics = summary.statistics
     span_ns = statistics.message_start_time, statistics.message_end_time
     return Contents.of(summary.channels, summary.schemas, statistics.channel_message_counts, span_ns)

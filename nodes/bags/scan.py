@@ -186,14 +186,14 @@ class _Scanner:
         self.found.count(channel_id, sequence, log_ns)
         self.found.unchecked_messages += 1
         self._keep(at, end)
-        runs = self.found.runs
-        if runs and runs[-1].offset + runs[-1].length == at and runs[-1].length < _RUN_BYTES:
-            run = runs[-1]
-            run.length = end - run.offset
-            run.start_ns, run.end_ns = min(run.start_ns, log_ns), max(run.end_ns, log_ns)
-            run.channels.add(channel_id)
+        run = self.found.runs[-1] if self.found.runs else None
+        if run and run.chunk_start_offset + run.chunk_length == at and run.chunk_length < _RUN_BYTES:
+            run.chunk_length = end - run.chunk_start_offset
+            run.message_start_time = min(run.message_start_time, log_ns)
+            run.message_end_time = max(run.message_end_time, log_ns)
+            run.message_index_offsets.add(channel_id)
         else:
-            runs.append(MessageRun(at, end - at, log_ns, log_ns, {channel_id}))
+            self.found.runs.append(MessageRun(at, end - at, log_ns, log_ns, {channel_id}))
 
     def _take_chunk(self, at: int, body: int, end: int) -> int:
         head = chunk_head(self._buffer, body, end - body)

@@ -83,13 +83,13 @@ class Loss:
 
 @dataclass
 class MessageRun:
-    """Consecutive messages outside chunks, with the fields of a `ChunkIndex` for reading."""
+    """Consecutive messages outside chunks. Its fields have the names of a `ChunkIndex`, so that it is read as a chunk is."""
 
-    offset: int
-    length: int
-    start_ns: int
-    end_ns: int
-    channels: set[int]
+    chunk_start_offset: int
+    chunk_length: int
+    message_start_time: int
+    message_end_time: int
+    message_index_offsets: set[int]
 
 
 @dataclass

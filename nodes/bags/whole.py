@@ -24,15 +24,17 @@ class FileSummary(Summary):
     """The summary of a file.
 
     Attributes:
+        statistics: Counts and times, which every file has here.
         runs: Messages outside chunks.
         unchecked: Why damage to messages may go unnoticed; empty if checksums cover them.
     """
 
+    statistics: Statistics
     runs: list[MessageRun]
     unchecked: str
 
 
-def read_summary(path: Path) -> tuple[FileSummary, Statistics] | None:
+def read_summary(path: Path) -> FileSummary | None:
     """Read the summary of a file; None if the file is unfinished because its recorder was killed or is still running.
 
     Raises:
@@ -51,7 +53,7 @@ def read_summary(path: Path) -> tuple[FileSummary, Statistics] | None:
     return _from_data(path) if found is None else found
 
 
-def _from_summary(buffer: Any, ending: Ending) -> tuple[FileSummary, Statistics] | None:
+def _from_summary(buffer: Any, ending: Ending) -> FileSummary | None:
     """Read the summary of the file; None if it is incomplete or has no checksum."""
     # Without a checksum, its list of topics or times may be damaged, and messages would be missed.
     if not ending.summary_start or not ending.summary_crc:
@@ -66,7 +68,7 @@ def _from_summary(buffer: Any, ending: Ending) -> tuple[FileSummary, Statistics]
         at = index.chunk_start_offset + _CRC_AT
         if buffer[at : at + 4] == b"\0\0\0\0" and index.uncompressed_size:
             return None  # only the checksum of all data may cover this chunk
-    return summary, read.statistics
+    return summary
 
 
 def _lists_everything(buffer: Any, ending: Ending, summary: Summary) -> bool:
@@ -89,7 +91,7 @@ def _lists_everything(buffer: Any, ending: Ending, summary: Summary) -> bool:
     return at == ending.summary_start - DATA_END_BYTES and buffer[at] == Opcode.DATA_END
 
 
-def _from_data(path: Path) -> tuple[FileSummary, Statistics]:
+def _from_data(path: Path) -> FileSummary:
     scan = scan_file(path)
     advice = (
         f"advnerf bag info {path} lists what is damaged, advnerf bag repair {path} keeps what can be kept"
@@ -105,7 +107,7 @@ def _from_data(path: Path) -> tuple[FileSummary, Statistics]:
     return summary_of(scan)
 
 
-def summary_of(scan: Scan) -> tuple[FileSummary, Statistics]:
+def summary_of(scan: Scan) -> FileSummary:
     """Make a summary of the contents found in a file."""
     summary = FileSummary()
     summary.schemas, summary.channels = dict(scan.schemas), dict(scan.channels)
@@ -117,7 +119,7 @@ def summary_of(scan: Scan) -> tuple[FileSummary, Statistics]:
             summary.attachment_indexes.append(piece.record)
         elif piece.record is not None:
             summary.metadata_indexes.append(piece.record)
-    summary.statistics = statistics = scan.statistics(
+    summary.statistics = scan.statistics(
         len(summary.attachment_indexes), len(summary.chunk_indexes), len(summary.metadata_indexes)
     )
-    return summary, statistics
+    return summary

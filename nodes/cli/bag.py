@@ -13,7 +13,7 @@ from nodes.cli.trial import evaluate
 from nodes.runtime.terminal import RunDir, Topics, print_table, say_error, table
 
 if TYPE_CHECKING:
-    from nodes.bags.reader import BagInfo
+    from nodes.bags.info import BagInfo
     from nodes.bags.repair import Repaired
 
 _DAMAGED_EXIT = 2  # as for every bag that cannot be read

@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from nodes.bags.reader import BagMessage, read_info, read_messages
+from nodes.bags.info import BagMessage
+from nodes.bags.reader import read_info, read_messages
 from nodes.bags.writer import BagWriter
 from nodes.replaying.replay import Replay
 from nodes.runtime.clock import NS_PER_S

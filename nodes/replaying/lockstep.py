@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from nodes.bags.reader import BagMessage
+from nodes.bags.info import BagMessage
 from nodes.runtime.clock import NS_PER_S, Now
 from nodes.runtime.errors import BagError, MessageError, NodeFinished
 from nodes.runtime.messages import decode, encode, header, type_name, types

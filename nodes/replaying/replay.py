@@ -13,7 +13,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from nodes.bags.reader import BagMessage, read_attachments, read_info, read_messages, require_readable
+from nodes.bags.info import BagMessage
+from nodes.bags.reader import read_attachments, read_info, read_messages, require_readable
 from nodes.bags.time_gaps import silence_s, skipped_gaps
 from nodes.bags.writer import BagWriter
 from nodes.replaying.lockstep import BagClock, Lockstep, Summary

@@ -28,7 +28,8 @@ from advnerf_core.data.logs.drive_log import (
 )
 from advnerf_core.geometry import yaw_of
 from nodes.bags.images import CAMERA_TOPICS, image_messages
-from nodes.bags.reader import BagInfo, read_attachments, read_info, read_messages
+from nodes.bags.info import BagInfo
+from nodes.bags.reader import read_attachments, read_info, read_messages
 from nodes.control.pose_buffer import PoseBuffer
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.image_parts import IMAGE_TYPE

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import yaml
 
-from nodes.bags.reader import BagMessage, read_attachments, read_info, read_messages
+from nodes.bags.info import BagMessage
+from nodes.bags.reader import read_attachments, read_info, read_messages
 from nodes.bags.writer import BagWriter
 from nodes.replaying.lockstep import BagClock, Lockstep
 from nodes.replaying.nodes import Choice

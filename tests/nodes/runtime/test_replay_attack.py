@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nodes.bags.reader import BagMessage, read_attachments, read_messages
+from nodes.bags.info import BagMessage
+from nodes.bags.reader import read_attachments, read_messages
 from nodes.cli import main as cli
 from nodes.replaying.attack import plot_retro_attack, retro_attack
 from nodes.replaying.golden import Golden, Tolerances, compare
