@@ -132,7 +132,7 @@ def _metadata(scan: Scan, file_name: str, notes: dict[str, str], at: int, entrie
         records.append(Metadata(ENDS, {f"lost {topic}": str(lost.get(topic, 0)) for topic in sorted(topics)}))
     if "rosbag2" not in present:
         records.append(
-            Metadata("rosbag2", {"serialized_metadata": rosbag2_metadata(file_name, contents_of(scan))})
+            Metadata("rosbag2", {"serialized_metadata": rosbag2_metadata({file_name: contents_of(scan)})})
         )
     records.append(Metadata(REPAIRS, notes))
     content = b""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import yaml
 
@@ -77,29 +77,11 @@ class Contents:
             self.counts[topic] += other.counts[topic]
 
 
-class FileEntry(NamedTuple):
-    """One file of a bag: its name, log times of its first and last message [ns since 1970], number of messages."""
-
-    name: str
-    start_ns: int
-    end_ns: int
-    messages: int
-
-    @classmethod
-    def of(cls, name: str, contents: Contents) -> FileEntry:
-        """Make the entry of a file with these contents."""
-        return cls(name, contents.start_ns, contents.end_ns, contents.messages)
-
-
-def rosbag2_metadata(file_name: str, contents: Contents, files: Sequence[FileEntry] = ()) -> str:
-    """Make the text of ``metadata.yaml``, version 9.
-
-    Args:
-        file_name: The file, if the bag has only one.
-        contents: Contents of the whole bag.
-        files: The files of a split bag, in order.
-    """
-    files = files or [FileEntry.of(file_name, contents)]
+def rosbag2_metadata(files: Mapping[str, Contents]) -> str:
+    """Make the text of ``metadata.yaml``, version 9, of a bag with these files in order, by name."""
+    contents = Contents()
+    for each in files.values():
+        contents.add(each)
     topics = [
         {
             "topic_metadata": {
@@ -121,14 +103,14 @@ def rosbag2_metadata(file_name: str, contents: Contents, files: Sequence[FileEnt
         "topics_with_message_count": topics,
         "compression_format": "",
         "compression_mode": "",
-        "relative_file_paths": [entry.name for entry in files],
+        "relative_file_paths": list(files),
         "files": [
             {
-                "path": entry.name,
-                **dict(reversed(_times(entry.start_ns, entry.end_ns).items())),
-                "message_count": entry.messages,
+                "path": name,
+                **dict(reversed(_times(each.start_ns, each.end_ns).items())),
+                "message_count": each.messages,
             }
-            for entry in files
+            for name, each in files.items()
         ],
         "custom_data": None,
         "ros_distro": ROS_DISTRO,

@@ -116,7 +116,7 @@ class PartWriter:
         losses = {f"lost {topic}": str(count) for topic, count in self.contents.lost.items()}
         if ends := {**losses, **(metadata or {})}:
             self._writer.add_metadata("advnerf_end", ends)
-        text = rosbag2_metadata(self.path.name, self.contents)
+        text = rosbag2_metadata({self.path.name: self.contents})
         self._writer.add_metadata("rosbag2", {"serialized_metadata": text})
         self._writer.finish()
         os.fsync(self._stream.descriptor)

@@ -319,7 +319,7 @@ def _complete_folder(path: Path, scan: Scan, kept: Path | None) -> None:
     yaml = path.with_name(METADATA_FILE)
     alone = [file for file in path.parent.glob("*.mcap") if file.is_file()] == [path]
     if alone and not yaml.exists():
-        write_atomically(yaml, rosbag2_metadata(path.name, contents_of(scan)))
+        write_atomically(yaml, rosbag2_metadata({path.name: contents_of(scan)}))
 
 
 def _add_journal(scan: Scan, path: Path) -> None:

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from advnerf_core.files import write_atomically
-from nodes.bags.metadata import Contents, FileEntry, rosbag2_metadata
+from nodes.bags.metadata import Contents, rosbag2_metadata
 from nodes.bags.parts import METADATA_FILE, bag_parts, listed_files
 from nodes.bags.repair import Repaired, kept_names, repair
 from nodes.bags.whole import read_summary
@@ -53,15 +53,11 @@ def _remove_what_was_begun(folder: Path) -> None:
 
 def _list(folder: Path, parts: tuple[Path, ...], keep_old: bool) -> None:
     """Write ``metadata.yaml`` from the repaired parts."""
-    total, files = Contents(), []
-    for part in parts:
-        contents = _contents(part)
-        total.add(contents)
-        files.append(FileEntry.of(part.name, contents))
+    files = {part.name: _contents(part) for part in parts}
     file = folder / METADATA_FILE
     if keep_old:
         os.link(file, next(name for name in kept_names(file) if not os.path.lexists(name)))
-    write_atomically(file, rosbag2_metadata(parts[0].name, total, files))
+    write_atomically(file, rosbag2_metadata(files))
 
 
 def _contents(part: Path) -> Contents:

@@ -21,7 +21,7 @@ from pathlib import Path
 
 from advnerf_core.files import write_atomically
 from nodes.bags.journal import RESERVE_BYTES, RESERVE_NAME
-from nodes.bags.metadata import Contents, FileEntry, rosbag2_metadata
+from nodes.bags.metadata import Contents, rosbag2_metadata
 from nodes.bags.part import PartWriter
 from nodes.bags.parts import METADATA_FILE, part_name
 from nodes.runtime.clock import NS_PER_S
@@ -76,7 +76,7 @@ class BagWriter:
         self.folder = Path(folder)
         self.messages = 0
         self._limits, self._metadata, self._compressed = limits, dict(metadata or {}), compressed
-        self._total, self._files = Contents(), list[FileEntry]()
+        self._files: dict[str, Contents] = {}
         self._open = False
         if self.folder.exists() and any(self.folder.iterdir()):
             raise BagError(f"{self.folder} exists and is not empty; record to another folder, or remove it")
@@ -170,10 +170,8 @@ class BagWriter:
     def _finish(self, part: PartWriter, metadata: Mapping[str, str] | None = None) -> None:
         """Finish a part, then list it in ``metadata.yaml``, which never lists an unfinished file."""
         part.finish(metadata)
-        self._total.add(part.contents)
-        self._files.append(FileEntry.of(part.path.name, part.contents))
-        text = rosbag2_metadata(part.path.name, self._total, self._files)
-        write_atomically(self.folder / METADATA_FILE, text)
+        self._files[part.path.name] = part.contents
+        write_atomically(self.folder / METADATA_FILE, rosbag2_metadata(self._files))
 
     def _keep(self) -> None:
         """Run the slow work: sync the file to the disk once a second, and finish full parts."""
