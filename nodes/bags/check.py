@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from nodes.bags.damage import describe
 from nodes.bags.formats import BagFormat, no_checksums, recognise
 from nodes.bags.repair import being_written, examine, refusal_of
 from nodes.runtime.errors import BagError
@@ -43,7 +42,7 @@ def diagnose(path: Path) -> Diagnosis:
     scan = examine(path)
     if scan.whole:
         return Diagnosis(path, True, scan.unchecked, ())
-    lines = [describe(scan, loss) for loss in scan.losses]
+    lines = [scan.describe(loss) for loss in scan.losses]
     if len(lines) > _MOST_LINES:
         lines = [*lines[:_MOST_LINES], f"and {len(lines) - _MOST_LINES} more places"]
     lines += scan.fixes

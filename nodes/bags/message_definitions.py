@@ -149,6 +149,7 @@ class Definition:
         return [self._value(element, reader) for _ in range(count)]
 
 
+@lru_cache(maxsize=256)
 def parse_definition(typename: str, text: str, encoding: str) -> Definition:
     """Parse the definition of a type from the text in a bag.
 
@@ -160,11 +161,6 @@ def parse_definition(typename: str, text: str, encoding: str) -> Definition:
     Raises:
         MessageError: The text is not a valid definition.
     """
-    return _parsed(typename, text, encoding)
-
-
-@lru_cache(maxsize=256)
-def _parsed(typename: str, text: str, encoding: str) -> Definition:
     types: dict[str, Any] = {}
     try:
         if len(text) > _MOST_CHARACTERS:

@@ -18,18 +18,16 @@ from pathlib import Path
 from typing import Any
 
 from mcap.data_stream import RecordBuilder
-from mcap.records import Channel, Chunk, ChunkIndex, Message, MessageIndex, Schema
+from mcap.records import Channel, ChunkIndex, Message, Schema
 
 from advnerf_core.files import write_atomically
 from nodes.bags.assemble import FileLayout, assemble, contents_of
-from nodes.bags.damage import describe
 from nodes.bags.formats import require_mcap
-from nodes.bags.info import BagMessage
 from nodes.bags.journal import RESERVE_BYTES, RESERVE_NAME, journal_of, read_journal
 from nodes.bags.metadata import rosbag2_metadata
-from nodes.bags.parts import METADATA_FILE, bag_parts
-from nodes.bags.scan import scan_file
-from nodes.bags.scanned import Piece, Scan, chunk_index
+from nodes.bags.parts import METADATA_FILE
+from nodes.bags.scan import fill_anew, scan_file
+from nodes.bags.scanned import Piece, Scan
 from nodes.runtime.errors import BagError
 from nodes.runtime.messages import type_definition, type_hash
 from nodes.runtime.topics import topic as topic_row
@@ -74,25 +72,11 @@ class Repaired:
     unchecked: str = ""
 
 
-def mcap_file(bag: Path) -> Path:
-    """Return the ``.mcap`` file of a bag, given as its folder or as the file."""
-    bag = Path(bag)
-    if bag.is_file():
-        return bag
-    files = sorted(bag.glob("*.mcap")) if bag.is_dir() else []
-    if not files:
-        for part in bag_parts(bag):
-            require_mcap(part, "repaired")
-    if len(files) != 1:
-        raise BagError(f"{bag}: expected a bag folder with one .mcap file, got {len(files)}")
-    return files[0]
-
-
-def repair(bag: Path, force: bool = False, keep_original: bool = True, in_place: bool = False) -> Repaired:
+def repair(file: Path, force: bool = False, keep_original: bool = True, in_place: bool = False) -> Repaired:
     """Repair a file. An intact file is not changed.
 
     Args:
-        bag: The file, or a bag folder with one file.
+        file: One file of a bag.
         force: Repair even if this loses messages that are not at the damaged end of an unfinished file.
         keep_original: Keep the old file, as ``NAME.mcap.damaged``.
         in_place: Write no second file. This only works for an unfinished file whose beginning stays the same, for a recorder on a full disk.
@@ -100,7 +84,7 @@ def repair(bag: Path, force: bool = False, keep_original: bool = True, in_place:
     Raises:
         BagError: The file is not MCAP, is being written, or would lose too much. The file is then unchanged.
     """
-    path = mcap_file(bag).resolve()
+    path = file.resolve()
     require_mcap(path, "repaired")
     try:
         before = path.stat()
@@ -112,7 +96,7 @@ def repair(bag: Path, force: bool = False, keep_original: bool = True, in_place:
             _complete_folder(path, scan, None)
             return Repaired(path, scan.messages, was_whole=True, unchecked=scan.unchecked)
         known = _messages_before(scan)
-        losses = tuple(describe(scan, loss) for loss in scan.losses)
+        losses = tuple(scan.describe(loss) for loss in scan.losses)
         if not force and (refusal := refusal_of(scan)):
             raise BagError(f"{path} is not repaired, because {refusal}. {_ADVICE}")
         cut = sum(loss.length for loss in scan.losses)
@@ -153,7 +137,7 @@ def refusal_of(scan: Scan) -> str:
     more = scan.loses_more_than_the_tail()
     if more:
         rest = f", and {len(more) - 1} more places" if len(more) > 1 else ""
-        return f"messages would be lost that are not at the end of an unfinished recording: {describe(scan, more[0])}{rest}"
+        return f"messages would be lost that are not at the end of an unfinished recording: {scan.describe(more[0])}{rest}"
     listed = scan.known.statistics if scan.known is not None else None
     if listed is not None and listed.message_count > scan.messages:
         return f"its summary lists {listed.message_count} messages, but {scan.messages} were found"
@@ -163,7 +147,7 @@ def refusal_of(scan: Scan) -> str:
             "the repaired file would have all messages, unchecked"
         )
     if not scan.messages and scan.losses:
-        return f"no message of its {scan.size} bytes would be left: {describe(scan, scan.losses[0])}"
+        return f"no message of its {scan.size} bytes would be left: {scan.describe(scan.losses[0])}"
     return ""
 
 
@@ -339,20 +323,10 @@ def _add_journal(scan: Scan, path: Path) -> None:
         indexes.setdefault(channel_id, []).append((entry.log_ns, builder.count))
         Message(channel_id, entry.log_ns, entry.cdr, entry.publish_ns, entry.sequence).write(builder)
         scan.count(channel_id, entry.sequence, entry.log_ns)
-    scan.pieces.append(_chunk_piece(bytes(builder.end()), entries, indexes))
-
-
-def _chunk_piece(data: bytes, entries: list[BagMessage], indexes: dict[int, list[tuple[int, int]]]) -> Piece:
-    start_ns, end_ns = min(entry.log_ns for entry in entries), max(entry.log_ns for entry in entries)
-    builder = RecordBuilder()
-    Chunk("", data, end_ns, start_ns, zlib.crc32(data), len(data)).write(builder)
-    length, offsets = builder.count, {}
-    for channel_id, rows in indexes.items():
-        offsets[channel_id] = builder.count
-        MessageIndex(channel_id, rows).write(builder)
-    record = chunk_index(0, length, (start_ns, end_ns), len(data))
-    record.message_index_length, record.message_index_offsets = builder.count - length, offsets
-    return Piece(0, 0, record, bytes(builder.end()))
+    data, times = bytes(builder.end()), [entry.log_ns for entry in entries]
+    piece = Piece(0, 0)
+    fill_anew(piece, data, (min(times), max(times)), zlib.crc32(data), indexes)
+    scan.pieces.append(piece)
 
 
 def _introduce(builder: RecordBuilder, scan: Scan, topic: str, channel_id: int) -> int:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Collection, Mapping
-from typing import NamedTuple
 
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
@@ -18,23 +17,12 @@ _BYTE_OF = {value: byte for byte, value in enumerate(_TABLE)}
 _BY_TOP = {value >> 24: (byte, value) for byte, value in enumerate(_TABLE)}
 
 
-class Salvaged(NamedTuple):
-    """Records of a damaged chunk.
-
-    Attributes:
-        records: The good ones; empty without any.
-        proven: Whether the chunk's checksum proves that they are right. Otherwise the damage is somewhere after them, as far as their
-            order, channels and times tell.
-    """
-
-    records: bytes
-    proven: bool
-
-
 def good_records(
     head: ChunkHead, data: bytes, indexed: Mapping[int, tuple[int, int]], channels: Collection[int]
-) -> Salvaged:
-    """Find the good records of a damaged chunk.
+) -> tuple[bytes, bool]:
+    """Find the good records of a damaged chunk, empty without any, and whether the chunk's checksum proves that they are right.
+
+    Otherwise the damage is somewhere after them, as far as their order, channels and times tell.
 
     Args:
         data: Data of the chunk, compressed or not.
@@ -43,15 +31,15 @@ def good_records(
     """
     records, whole = (data, True) if not head.compression else _unpack_until_damage(head.compression, data)
     if whole and head.crc and (found := _wrong_byte(records, head.crc)) is not None:
-        return Salvaged(_without_record_at(records, *found), True)
+        return _without_record_at(records, *found), True
     ends, failed = _plausible_ends(records, head, indexed, channels)
     if not whole:  # what follows could not be unpacked
-        return Salvaged(records[: ends[-1]] if ends else b"", False)
+        return records[: ends[-1]] if ends else b"", False
     if head.compression or not failed:
         # A wrong compressed byte is copied to many places, and a wrong byte of a message does not show.
-        return Salvaged(b"", False)
+        return b"", False
     # The damage may have begun in the content of the record before.
-    return Salvaged(records[: ends[-2]] if len(ends) > 1 else b"", False)
+    return records[: ends[-2]] if len(ends) > 1 else b"", False
 
 
 def _unpack_until_damage(compression: str, data: bytes) -> tuple[bytes, bool]:

@@ -155,7 +155,8 @@ class _Scanner:
             schema = parse(Schema, content)
             self.found.schemas[schema.id] = schema
         elif opcode == Opcode.CHANNEL:
-            self._add_channel(parse(Channel, content))
+            channel = parse(Channel, content)
+            self.found.channels[channel.id] = channel
         elif opcode == Opcode.HEADER:
             if at != len(MAGIC):
                 raise Damaged("a second header is among the data")
@@ -241,7 +242,7 @@ class _Scanner:
             if isinstance(definition, Schema):
                 self.found.schemas[definition.id] = definition
             else:
-                self._add_channel(definition)
+                self.found.channels[definition.id] = definition
         entries: dict[int, list[tuple[int, int]]] = {}
         for channel_id, sequence, log_ns, place in messages:
             entries.setdefault(channel_id, []).append((log_ns, place))
@@ -261,7 +262,7 @@ class _Scanner:
 
     def _lose_chunk(self, at: int, end: int, head: ChunkHead, reason: str) -> int:
         """Note the loss of a damaged chunk, and keep its good records. Returns the offset of the next record."""
-        indexed = self._index_of(at)
+        indexed = self._listed.get(at)
         span = (head.start_ns, head.end_ns)
         if indexed is not None:
             span = indexed.message_start_time, indexed.message_end_time
@@ -281,10 +282,8 @@ class _Scanner:
         self.found.unchecked_chunks += bool(messages) and not proven
         times = [log_ns for _, _, log_ns, _ in messages] or [head.start_ns, head.end_ns]
         crc = zlib.crc32(records) if proven else 0
-        content = bytes_of(Chunk("", records, max(times), min(times), crc, len(records)))
-        index = chunk_index(at, len(content), (min(times), max(times)), len(records))
-        piece = Piece(at, after - at, index)
-        _index_anew(piece, index, content, self._count_all(definitions, messages))
+        piece = Piece(at, after - at)
+        fill_anew(piece, records, (min(times), max(times)), crc, self._count_all(definitions, messages))
         self.found.pieces.append(piece)
         return after
 
@@ -300,9 +299,6 @@ class _Scanner:
                 found |= {place: (channel_id, log_ns) for log_ns, place in entries}
                 at = end
         return found, at
-
-    def _index_of(self, at: int) -> ChunkIndex | None:
-        return self._listed.get(at)
 
     def _take_index(self, at: int, body: int, end: int) -> None:
         """Assign a message index to the chunk before it. A wrong or cut index is rebuilt from the chunk."""
@@ -405,7 +401,7 @@ class _Scanner:
     def _index_end(self, at: int) -> int | None:
         """End of the message indexes of the current chunk if this offset is certainly among them, because they can be rebuilt."""
         piece = self._chunk
-        listed = self._index_of(piece.offset) if piece is not None else None
+        listed = self._listed.get(piece.offset) if piece is not None else None
         if piece is None or listed is None:
             return None
         end = piece.offset + listed.chunk_length + listed.message_index_length
@@ -451,9 +447,6 @@ class _Scanner:
         messages = opcode != Opcode.CHUNK or bool(found.runs)
         return next_record(self._buffer, at, self._limit, channels, messages)
 
-    def _add_channel(self, channel: Channel) -> None:
-        self.found.channels[channel.id] = channel
-
 
 _KINDS = {Opcode.CHUNK: "a chunk", Opcode.ATTACHMENT: "an attachment", Opcode.MESSAGE: "a message"}
 
@@ -470,6 +463,25 @@ def _contents(records: bytes) -> tuple[list[Schema | Channel], list[tuple[int, i
         elif opcode == Opcode.CHANNEL:
             definitions.append(parse(Channel, records[body:end]))
     return definitions, messages
+
+
+def fill_anew(
+    piece: Piece,
+    records: bytes,
+    span_ns: tuple[int, int],
+    crc: int,
+    by_channel: dict[int, list[tuple[int, int]]],
+) -> None:
+    """Make a piece of a new chunk with these records, and new message indexes.
+
+    Args:
+        span_ns: Log times of the first and last message.
+        crc: Checksum of the records; 0 for none.
+        by_channel: Log time and offset of the messages, by channel.
+    """
+    chunk = bytes_of(Chunk("", records, span_ns[1], span_ns[0], crc, len(records)))
+    piece.record = chunk_index(piece.offset, len(chunk), span_ns, len(records))
+    _index_anew(piece, piece.record, chunk, by_channel)
 
 
 def _index_anew(

@@ -8,6 +8,7 @@ from mcap.records import AttachmentIndex, Channel, ChunkIndex, Header, MetadataI
 from mcap.summary import Summary
 
 from nodes.bags.summary import Ending
+from nodes.runtime.clock import NS_PER_S
 
 # How a loss came about.
 BAD, CUT, ZEROS, JUNK = "bad", "cut", "zeros", "junk"
@@ -210,3 +211,24 @@ class Scan:
             for loss in self.losses
             if not loss.harmless and (not tail_is_fine or loss.offset < last or loss.kind == JUNK)
         ]
+
+    def describe(self, loss: Loss) -> str:
+        """Describe a loss: its offset, times, topics and reason."""
+        words = [f"{loss.what} at byte {loss.offset}"]
+        details = []
+        if loss.span_ns is not None and loss.span_ns[1]:
+            start = min(self.start_ns, loss.span_ns[0]) if self.counts else loss.span_ns[0]
+            first, last = ((moment - start) / NS_PER_S for moment in loss.span_ns)
+            details.append(
+                f"log times {loss.span_ns[0]} to {loss.span_ns[1]} ns, {first:.3f} to {last:.3f} s after the first message"
+            )
+        if loss.counts:
+            known = dict(self.known.channels if self.known is not None else {}) | self.channels
+            topics = [
+                f"{count} of {known[i].topic if i in known else f'channel {i}'}"
+                for i, count in loss.counts.items()
+            ]
+            details.append(f"about {', '.join(topics[:8])}{' ...' if len(topics) > 8 else ''}")
+        if details:
+            words.append(f"({'; '.join(details)})")
+        return f"{' '.join(words)}: {loss.reason}"

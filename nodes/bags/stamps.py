@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from nodes.bags.reader import read_info, read_messages
-from nodes.runtime.errors import TopicError
-from nodes.runtime.messages import types
-from nodes.runtime.topics import topic as topic_row
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.messages import fields_of
+from nodes.runtime.topics import type_of_topic
 
 # In CDR, a message with a header begins with four bytes of encapsulation, followed by the stamp.
 _STAMP = struct.Struct("<iI"), struct.Struct(">iI")
-_STAMP_AT, _NS_PER_S, _NS_PER_MS = 4, 1_000_000_000, 1e6
+_STAMP_AT, _NS_PER_MS = 4, 1e6
 
 
 @dataclass(frozen=True)
@@ -67,17 +67,12 @@ def _delays(times_ns: list[tuple[int, int, int]]) -> Delays:
 
 def _begins_with_stamp(topic: str, typename: str) -> bool:
     """Whether a topic is in the topic table and its type begins with a header."""
-    try:
-        if topic_row(topic).type != typename:
-            return False
-    except TopicError:
-        return False
-    fields = getattr(types, typename.rsplit("/", 1)[-1]).__dataclass_fields__
-    return next(iter(fields), "") == "header"
+    fields = fields_of(typename) or []
+    return type_of_topic(topic) == typename and fields[0][0] == "header"
 
 
 def _stamp_ns(cdr: bytes) -> int:
     if len(cdr) < _STAMP_AT + 8:
         return 0
     seconds, nanoseconds = _STAMP[0 if cdr[1] & 1 else 1].unpack_from(cdr, _STAMP_AT)
-    return int(seconds) * _NS_PER_S + int(nanoseconds)
+    return int(seconds) * NS_PER_S + int(nanoseconds)

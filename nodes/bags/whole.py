@@ -9,7 +9,6 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, ChunkIndex, Statistics
 from mcap.summary import Summary
 
-from nodes.bags.damage import describe
 from nodes.bags.file import mapped
 from nodes.bags.records import DATA_END_BYTES, MAGIC, RECORD_HEAD, Damaged, record_at
 from nodes.bags.scan import scan_file
@@ -99,7 +98,7 @@ def _from_data(path: Path) -> FileSummary:
     if scan.summary_damage:
         raise BagError(f"{path} is damaged: {scan.summary_damage}; {advice}")
     if scan.losses:
-        raise BagError(f"{path} is damaged: {describe(scan, scan.losses[0])}; {advice}")
+        raise BagError(f"{path} is damaged: {scan.describe(scan.losses[0])}; {advice}")
     if scan.data_crc_wrong and scan.unchecked:
         raise BagError(f"{path} is damaged: the checksum of its data is wrong; {advice}")
     if not scan.complete:

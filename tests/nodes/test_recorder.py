@@ -12,7 +12,6 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from nodes.bags.reader import read_attachment, read_info, read_messages
-from nodes.bags.repair import repair
 from nodes.bags.repair_parts import repair_bag
 from nodes.recorder import RecorderConfig, RecorderNode, provenance
 from nodes.runtime.bus import Bus
@@ -128,7 +127,7 @@ def test_killed_process_loses_at_most_what_came_in_its_last_moment(tmp_path):
         sent = drive(bus, 1.0)
         os.kill(process.pid, signal.SIGKILL)
         process.communicate(timeout=600)
-    repaired = repair(tmp_path / "bag")
+    (repaired,) = repair_bag(tmp_path / "bag")
     # Whatever it had received is in the bag or in its journal; only what was on the way to it is gone.
     assert sum(sent.values()) - repaired.messages <= 2
     counts = {t.name: t.count for t in read_info(tmp_path / "bag").topics}

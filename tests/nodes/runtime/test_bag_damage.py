@@ -339,7 +339,7 @@ def test_a_file_that_is_being_written_is_left_alone(tmp_path):
             repair(writer.path)
         with pytest.raises(BagError, match="is being written at this moment"):
             read_info(writer.path)
-    assert repair(tmp_path / "bag").was_whole
+    assert repair(writer.path).was_whole
 
 
 def test_a_copy_of_the_file_that_a_starting_process_has_for_a_moment_is_no_writer(tmp_path):
@@ -347,7 +347,7 @@ def test_a_copy_of_the_file_that_a_starting_process_has_for_a_moment_is_no_write
         writer.write("/vicon/car", b"x" * 100, START_NS, START_NS, 0)
     inherited = writer.path.open("ab")
     threading.Timer(0.1, inherited.close).start()
-    assert repair(tmp_path / "bag").was_whole
+    assert repair(writer.path).was_whole
     assert inherited.closed
 
 

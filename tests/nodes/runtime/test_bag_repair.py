@@ -98,7 +98,7 @@ def journal_bag(tmp_path, count=10):
 def test_repair_takes_the_unfinished_chunk_from_the_journal(tmp_path):
     path = journal_bag(tmp_path)
     assert b"vicon/car" not in path.read_bytes()
-    assert repair(path.parent).messages == 11
+    assert repair(path).messages == 11
     kept = list(read_messages(path, ["/vicon/car"]))
     assert [(m.cdr[0], m.log_ns - START_NS, m.publish_ns - START_NS) for m in kept] == [
         (i, 1 + i, i) for i in range(10)
@@ -169,7 +169,7 @@ def test_bag_of_a_killed_recorder_is_whole_after_repair(tmp_path):
     flushed = int(process.communicate()[0].split()[-1])
     with pytest.raises(BagError, match=r"advnerf bag repair .* keeps all"):
         read_info(tmp_path / "bag")
-    result = repair(tmp_path / "bag")
+    result = repair(tmp_path / "bag" / "bag.mcap")
     assert not result.was_whole
     sequences = [m.sequence for m in read_messages(tmp_path / "bag", ["/vicon/car"])]
     # Nothing that was flushed is lost, and nothing in between.
@@ -177,7 +177,7 @@ def test_bag_of_a_killed_recorder_is_whole_after_repair(tmp_path):
     assert len(sequences) >= flushed
     with AnyReader([tmp_path / "bag"], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
         assert len(list(reader.messages())) == result.messages
-    assert repair(tmp_path / "bag").was_whole
+    assert repair(tmp_path / "bag" / "bag.mcap").was_whole
     assert not (tmp_path / "bag" / ".reserve").exists()
 
 
@@ -202,7 +202,7 @@ def test_repair_wherever_the_file_was_cut(tmp_path):
         folder = tmp_path / f"cut{cut}"
         folder.mkdir()
         (folder / "bag.mcap").write_bytes(content[:cut])
-        result = repair(folder)
+        result = repair(folder / "bag.mcap")
         assert (result.messages == everything) is complete
         assert result.messages > everything / 2
         with open(folder / "bag.mcap", "rb") as file:

@@ -20,7 +20,7 @@ from advnerf_core.geometry import make_transform, rotation_from_quaternion
 from nodes.bags.images import image_messages, image_topic
 from nodes.bags.message_definitions import as_our_message, parse_definition
 from nodes.bags.reader import read_attachments, read_info, read_messages
-from nodes.bags.repair import repair
+from nodes.bags.repair_parts import repair_bag
 from nodes.bags.stamps import read_delays
 from nodes.lab.trials.evaluation import trajectory
 from nodes.runtime.errors import BagError, MessageError
@@ -438,7 +438,7 @@ TAIL = "expected a bag: MCAP (.mcap), rosbag2 in SQLite (.db3), or ROS 1 (.bag)"
 def test_a_file_that_is_no_bag_is_named_for_what_it_is(tmp_path, content, said, name):
     path = tmp_path / name
     path.write_bytes(content)
-    for use in (read_info, lambda p: list(read_messages(p)), read_attachments, repair):
+    for use in (read_info, lambda p: list(read_messages(p)), read_attachments, repair_bag):
         with pytest.raises(BagError) as caught:
             use(path)
         assert said in str(caught.value)
@@ -474,7 +474,7 @@ def test_what_needs_an_mcap_says_how_to_get_one_and_changes_nothing(tmp_path, wr
         BagError,
         match=rf"is {said}; only MCAP bags can be repaired\. Convert it first: rosbags-convert --src ",
     ):
-        repair(bag)
+        repair_bag(bag)
     assert {file: file.read_bytes() for file in (tmp_path / "drive").iterdir()} == before
 
 
