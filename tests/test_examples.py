@@ -168,7 +168,7 @@ def expected():
 
 def test_the_node_steers_by_every_image_of_a_recording(expected):
     with Replay(CORNER, Choice(("policy",), launch=LAUNCH)) as replay:
-        made = [entry.message for entry in replay if entry.message.topic == DRIVE]
+        made = [message for message in replay if message.topic == DRIVE]
     commands = [decode(DRIVE_TYPE, message.cdr) for message in made]
     assert {stamp_ns(command): command.drive.steering_angle for command in commands} == pytest.approx(
         expected

@@ -138,8 +138,8 @@ def _against(
             print(f"wrote {golden}: {count} messages")
             return
         comparison = Golden(golden, allowed, topics)
-        for entry in run:
-            comparison.take(entry.message)
+        for message in run:
+            comparison.take(message)
         difference = comparison.finish()
         _say(run, time.perf_counter() - start)
         if difference is not None:

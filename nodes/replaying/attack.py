@@ -195,11 +195,11 @@ def _steering(
     with Replay(
         bag, Choice(choice.nodes, choice.replacements, choice.launch, (*choice.overrides, setting))
     ) as replay:
-        for entry in replay:
-            if entry.message.topic not in (_DRIVE, _LABEL):
+        for made in replay:
+            if made.topic not in (_DRIVE, _LABEL):
                 continue
-            message = decode(topic_row(entry.message.topic).type, entry.message.cdr)
-            if entry.message.topic == _DRIVE:
+            message = decode(topic_row(made.topic).type, made.cdr)
+            if made.topic == _DRIVE:
                 steering[stamp_ns(message)] = float(message.drive.steering_angle)
             else:
                 labels[stamp_ns(message)] = (bool(message.drawn), str(message.attack_id))

@@ -178,7 +178,7 @@ def compare(golden: BagMessage, got: BagMessage, index: int, tolerances: Toleran
 
 
 def update_golden(path: Path, replay: Replay, topics: Sequence[str] | None = None) -> int:
-    """Replace the golden bag with the messages of a replay. Returns the number of messages.
+    """Replace the golden bag with the messages of a replay without the kept ones. Returns the number of messages.
 
     The same replay gives the same file, byte for byte.
     """
@@ -192,10 +192,9 @@ def update_golden(path: Path, replay: Replay, topics: Sequence[str] | None = Non
         with BagWriter(
             Path(folder) / path.stem, metadata=metadata, attached_ns=replay.info.start_ns
         ) as writer:
-            for entry in replay:
-                message = entry.message
+            for message in replay:
                 wanted = not topics or message.topic in topics
-                if entry.made and wanted and not message.topic.startswith(STATUS_PREFIX):
+                if wanted and not message.topic.startswith(STATUS_PREFIX):
                     writer.write(
                         message.topic, message.cdr, message.log_ns, message.publish_ns, message.sequence
                     )

@@ -10,7 +10,6 @@ from __future__ import annotations
 import tempfile
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 from nodes.bags.info import BagMessage
@@ -23,19 +22,6 @@ from nodes.runtime.errors import BagError
 from nodes.runtime.node import Node
 from nodes.runtime.topics import topic as topic_row
 from nodes.runtime.topics import type_of_topic
-
-
-@dataclass(frozen=True)
-class Replayed:
-    """One message of a replay.
-
-    Attributes:
-        message: The message. For a new message, log and publish time are the time in the recording.
-        made: Whether a replayed node published it. Otherwise it is from the bag.
-    """
-
-    message: BagMessage
-    made: bool
 
 
 class Replay:
@@ -96,20 +82,20 @@ class Replay:
         """Current summary."""
         return self._lockstep.summary
 
-    def __iter__(self) -> Iterator[Replayed]:
-        """Yield every new message, and with ``whole`` also the kept ones, in order."""
+    def __iter__(self) -> Iterator[BagMessage]:
+        """Yield every new message, and with ``whole`` also the kept ones, in order. Times of new ones are those in the recording."""
         recorded = [topic.name for topic in self.info.topics]
         topics = [topic for topic in recorded if topic not in self.left_out] if self._whole else self._heard
         heard = frozenset(self._heard)
         for message in read_messages(self.bag, topics):
             if message.topic in self.made_topics:
                 continue
-            yield from (Replayed(made, True) for made in self._advance_to(message.log_ns))
+            yield from self._advance_to(message.log_ns)
             if self._whole:
-                yield Replayed(message, False)
+                yield message
             if message.topic in heard:
-                yield from (Replayed(made, True) for made in self._lockstep.feed(message))
-        yield from (Replayed(m, True) for m in self._advance_to(self.info.end_ns))
+                yield from self._lockstep.feed(message)
+        yield from self._advance_to(self.info.end_ns)
         self._lockstep.finish()
         self.summary.duration_s = self.info.duration_s - silence_s(self._gaps)
 
@@ -136,7 +122,6 @@ def write_replay(replay: Replay, folder: Path) -> None:
     metadata = {**replay.info.metadata, "replayed": ", ".join(sorted(replay.names))}
     attachments = read_attachments(replay.bag)
     with BagWriter(folder, attachments, metadata, attached_ns=replay.info.start_ns) as writer:
-        for entry in replay:
-            message = entry.message
+        for message in replay:
             writer.write(message.topic, message.cdr, message.log_ns, message.publish_ns, message.sequence)
         writer.close({"digest": replay.summary.digest})

@@ -170,7 +170,7 @@ def test_nodes_that_answer_each_other_for_ever_are_stopped():
 
 def run(choice=GREEN, bag=CORNER):
     with Replay(bag, choice) as replay:
-        made = [entry.message for entry in replay]
+        made = list(replay)
         return made, replay.summary
 
 

@@ -39,7 +39,7 @@ def pose(ms, sequence=0, x=0.0):
 
 def run(choice=GREEN, bag=CORNER):
     with Replay(bag, choice) as replay:
-        made = [entry.message for entry in replay]
+        made = list(replay)
         return made, replay.summary
 
 
